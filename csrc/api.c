@@ -108,10 +108,10 @@ void md_port_fence(struct md_port *port, struct md_mastership *mastership)
     md_engine_leave(port->engine);
 }
 
-int md_port_rs485(struct md_port *port, int mode)
+int md_port_rs485(struct md_port *port, int mode, int is_usb)
 {
     md_engine_enter(port->engine);
-    int failure = md_rs485_begin(port, mode);
+    int failure = md_rs485_begin(port, mode, is_usb);
     md_engine_leave(port->engine);
     return failure;
 }

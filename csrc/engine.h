@@ -18,7 +18,7 @@ struct md_rs485 {
     int64_t sent_ns; /* when the last bit leaves, if the UART sends without delay */
     int64_t look_ns; /* time of the next check whether the last bit has left */
     int64_t empty_ns; /* when the driver's queue was found empty; 0: not found yet */
-    int64_t character_ns;
+    int64_t wire_ns; /* duration on the wire of all bytes written since RTS was switched to sending */
 };
 
 struct md_port {
@@ -93,7 +93,7 @@ int64_t md_port_advance(struct md_port *port, int64_t now_ns);
 
 /* ---- rs485.c ---- */
 
-int md_rs485_begin(struct md_port *port, int mode); /* 0, -errno */
+int md_rs485_begin(struct md_port *port, int mode, int is_usb); /* 0, -errno */
 /* Switch the transceiver to sending, then write; return the same as write(2). */
 ssize_t md_rs485_write(struct md_port *port, const uint8_t *bytes, size_t len);
 /* Switch the transceiver to receiving if the last bit has left; return 0, or -errno if the port is lost. */

@@ -150,7 +150,6 @@ struct md_turn {
     struct md_before before;
     struct md_row_queue *row_queue;
     uint32_t number; /* the port's number in row_queue */
-    int lost_error;
     struct md_progress progress; /* each counter has one writer; readers use atomics */
     struct md_line line;
     struct md_completion completion;
@@ -261,6 +260,12 @@ void md_echo_keep(struct md_line *line);
 /* Return 1 if the reply is an exception, or if its one register is in least .. end - 1 (`end` 0: any). */
 int md_is_in_range(const struct md_message *reply, uint16_t least, uint32_t end);
 int md_is_read(int framing, uint8_t function);
+
+/* Return 1 for a write other than a stop: such a request must not leave late. */
+static inline int md_is_command(const struct md_exchange *exchange)
+{
+    return !exchange->insists && !md_is_read(exchange->framing, exchange->request.function);
+}
 
 int md_proof_is(const struct md_exchange *exchange);
 /* If the ended exchange is a proof, record whether the drive answered it. */

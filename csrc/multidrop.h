@@ -88,12 +88,20 @@ enum md_refusal {
     MD_REFUSED_BAUDRATE = 1,
     MD_REFUSED_DATABITS = 2,
     MD_REFUSED_PARITY = 4,
-    MD_REFUSED_STOPBITS = 8
+    MD_REFUSED_STOPBITS = 8,
+    MD_REFUSED_DIVISOR = 16 /* no whole divisor of the UART's clock yields the baud rate */
 };
 
 /* Make the port raw with these settings, read them back, and return those that the port did not take. */
 int md_port_set(int fd, const struct md_settings *settings);
 int md_port_get(int fd, struct md_settings *settings);
+/* Return the baud rate of divisor 1, from which the UART derives all others; 0: unknown. */
+uint32_t md_port_baud_base(int fd);
+
+/* ---- closing.c: return 0 or -errno ---- */
+
+/* Close the descriptor. The driver's unsent bytes may leave for `most_ns`; then the driver discards them. */
+int md_port_close(int fd, int64_t most_ns);
 
 /* ---- clock.c: return a time ---- */
 
@@ -264,6 +272,9 @@ struct md_progress {
     uint32_t switches;    /* number of changes of baud rate or format */
     uint32_t echo;        /* enum md_echo: whether the adapter echoes */
     uint32_t foreign;     /* another master's bytes, received while listening */
+    uint32_t stalled;     /* 1: at the last timeout the driver still held the request */
+    uint32_t called_off;  /* 1: a command ended, and the driver may still hold its bytes */
+    int32_t lost_error;   /* errno of the loss; 0: the far end hung up */
     int64_t switching_ns; /* total time spent on switches, in ns */
 };
 
@@ -291,8 +302,9 @@ struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, in
  * outlive the port. Before the first request, and after any gap in the mastership, the port first listens to
  * the line, at least for the mastership's guard time. Stops do not wait for the end of listening. */
 void md_port_fence(struct md_port *port, struct md_mastership *mastership);
-/* Set who switches the transceiver (enum md_rs485_mode), before the first request; return 0 or -errno. */
-int md_port_rs485(struct md_port *port, int mode);
+/* Set who switches the transceiver (enum md_rs485_mode), before the first request; return 0 or -errno. A USB
+ * adapter cannot report when the last bit of a request has left. */
+int md_port_rs485(struct md_port *port, int mode, int is_usb);
 /* Copy all bytes of the line to `tap`, which must outlive the port or be replaced first. */
 void md_port_tap(struct md_port *port, struct md_tap *tap);
 /* Start only urgent exchanges from now on, no queued or repeated ones. Return 1 while a queued or repeated

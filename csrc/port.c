@@ -71,6 +71,27 @@ static int is_expired(const struct md_turn *turn)
     return turn->urgent->expires_ns && md_boottime_ns() > turn->urgent->expires_ns;
 }
 
+/* Return 1 if the driver holds bytes that the adapter has not taken. A network's bytes do not count: there
+ * they are unconfirmed, not unsent. */
+static int is_holding(const struct md_port *port)
+{
+    return port->must_take >= 0 && md_descriptor_is_queued(port->fd);
+}
+
+/* Note at a timeout whether the adapter has taken the request. If it has not, and the request is a command,
+ * lose the port: the client closes it, and the driver discards the command. */
+static void check_stall(struct md_port *port)
+{
+    struct md_turn *turn = &port->turn;
+    int is_stalled = is_holding(port);
+    if (turn->progress.stalled != (uint32_t)is_stalled)
+        md_store(&turn->progress.stalled, (uint32_t)is_stalled);
+    if (!is_stalled || !md_is_command(turn->line.exchange))
+        return;
+    md_store(&turn->progress.called_off, 1);
+    lose(port, ETIMEDOUT);
+}
+
 /* Write the request; return 1 if the port took bytes or has other work. The send time is the start of the
  * write. If the thread was suspended during the write, the send time is the end of the write: with too
  * early a time, the waits for the reply and for late replies would be too short. */
@@ -83,6 +104,8 @@ static int write_request(struct md_port *port, int64_t begun_ns)
     }
     if (port->mastership && !may_send(port))
         return 1;
+    if (line->tx_at == 0 && md_is_command(line->exchange) && is_holding(port))
+        return 0; /* behind bytes that the adapter has not taken, the command could leave too late */
     ssize_t written = md_rs485_write(port, line->tx + line->tx_at, (size_t)(line->tx_len - line->tx_at));
     int64_t done_ns = md_now_ns();
     if (written > 0) {
@@ -169,6 +192,8 @@ static int act(struct md_port *port, int want, int64_t *wake_ns, int64_t *now_ns
         port->is_blind = 0;
         if (!port->is_empty)
             *now_ns = md_port_receive(port);
+        if (port->turn.line.state == MD_LAST_LOOK)
+            check_stall(port);
         return 1;
     case MD_WAIT:
         return !is_sent(port) && spin_until(port, *wake_ns, now_ns);

@@ -2,13 +2,17 @@
  * around each request.
  *
  * RTS must fall after the last stop bit, and before a drive answers, 3.5 characters later. No function
- * waits: the thread checks at the time when the last bit should have left. If the UART can report that its
- * last bit has left (TIOCSERGETLSR), that report decides. Otherwise the last bit counts as sent one
- * character after the driver's queue was empty. */
+ * waits: the thread checks repeatedly. A UART reports that its last bit has left (TIOCSERGETLSR), and that
+ * report decides.
+ *
+ * A USB adapter's report may be older than the request. Its driver's queue is empty once the adapter has the
+ * bytes, which then still take their whole time on the wire. */
 #define _GNU_SOURCE
 #include "engine.h"
 
 static const int64_t LOOK_AGAIN_NS = 200000;
+static const int64_t ADAPTER_NS = 1000000; /* a USB frame, which the adapter may use before it sends */
+enum { CLOCK_DEVIATION = 50 };             /* 1/50: the adapter's baud rate may be 2 % too low */
 static const int64_t MOST_HELD_NS = 100000000; /* if sending takes longer, the port is broken */
 
 static int is_by_rts(const struct md_rs485 *rs485)
@@ -35,18 +39,18 @@ static int has_left(struct md_port *port, int64_t now_ns)
     }
     if (!rs485->empty_ns)
         rs485->empty_ns = now_ns;
-    rs485->look_ns = rs485->empty_ns + rs485->character_ns; /* one character is still in the shift register */
+    rs485->look_ns = rs485->empty_ns + rs485->wire_ns + rs485->wire_ns / CLOCK_DEVIATION + ADAPTER_NS;
     return now_ns >= rs485->look_ns;
 }
 
-int md_rs485_begin(struct md_port *port, int mode)
+int md_rs485_begin(struct md_port *port, int mode, int is_usb)
 {
     int failure = 0;
     port->rs485 = (struct md_rs485){.mode = mode};
     if (mode == MD_RS485_KERNEL)
         failure = md_descriptor_take_rs485(port->fd);
     else if (is_by_rts(&port->rs485)) {
-        port->rs485.reports_end = md_descriptor_is_shifted_out(port->fd) >= 0;
+        port->rs485.reports_end = !is_usb && md_descriptor_is_shifted_out(port->fd) >= 0;
         failure = set_direction(port, 0);
         if (!failure && mode == MD_RS485_RTS_DOWN) /* otherwise the closed port would send forever */
             failure = md_port_keep_rts(port->fd);
@@ -69,9 +73,10 @@ ssize_t md_rs485_write(struct md_port *port, const uint8_t *bytes, size_t len)
     ssize_t written = md_descriptor_write(port->fd, bytes, len);
     int error = errno;
     if (written > 0) {
-        rs485->character_ns = port->turn.line.exchange->character_ns; /* the exchange may end first */
-        rs485->sent_ns = later(rs485->sent_ns, md_now_ns()) + written * rs485->character_ns;
-        rs485->look_ns = rs485->sent_ns;
+        int64_t now_ns = md_now_ns(), wire_ns = written * port->turn.line.exchange->character_ns;
+        rs485->wire_ns = was_sending ? rs485->wire_ns + wire_ns : wire_ns;
+        rs485->sent_ns = later(rs485->sent_ns, now_ns) + wire_ns;
+        rs485->look_ns = rs485->reports_end ? rs485->sent_ns : now_ns;
         rs485->empty_ns = 0;
     } else if (!was_sending) {
         set_direction(port, 0);

@@ -8,6 +8,7 @@
 
 #ifdef __linux__
 #include <asm/termbits.h>
+#include <linux/serial.h>
 #include <sys/ioctl.h>
 #ifndef TCGETS2 /* musl does not define these requests, and its ioctl() takes an int */
 #define TCGETS2 ((int)_IOR('T', 0x2A, struct termios2))
@@ -86,6 +87,40 @@ static int is_near(uint32_t baudrate, uint32_t wanted)
     return off <= wanted / 50;
 }
 
+#ifdef __linux__
+/* An 8250 divides its clock by a whole number, but its driver reports the baud rate that was requested. */
+static int is_dividable(int fd, uint32_t baudrate)
+{
+    struct serial_struct uart;
+    if (ioctl(fd, TIOCGSERIAL, &uart) || uart.type == PORT_16C950) /* this one has a prescaler */
+        return 1;
+    uint32_t base = (uint32_t)uart.baud_base;
+    if (uart.baud_base <= 0 || baudrate == 0 || baudrate > base)
+        return 1;
+    int is_custom = ((unsigned)uart.flags & ASYNC_SPD_MASK) == ASYNC_SPD_CUST && baudrate == 38400;
+    uint32_t divisor = is_custom ? (uint32_t)uart.custom_divisor : (base + baudrate / 2) / baudrate;
+    return divisor > 0 && is_near(base / divisor, baudrate);
+}
+
+uint32_t md_port_baud_base(int fd)
+{
+    struct serial_struct uart;
+    return ioctl(fd, TIOCGSERIAL, &uart) || uart.baud_base < 0 ? 0 : (uint32_t)uart.baud_base;
+}
+#else
+static int is_dividable(int fd, uint32_t baudrate)
+{
+    (void)fd, (void)baudrate;
+    return 1;
+}
+
+uint32_t md_port_baud_base(int fd)
+{
+    (void)fd;
+    return 0;
+}
+#endif
+
 int md_port_get(int fd, struct md_settings *settings)
 {
     attributes now;
@@ -127,6 +162,7 @@ int md_port_set(int fd, const struct md_settings *settings)
         return failure;
     struct md_settings taken = describe(&port);
     return (!is_near(taken.baudrate, settings->baudrate) ? MD_REFUSED_BAUDRATE : 0) |
+           (!is_dividable(fd, settings->baudrate) ? MD_REFUSED_DIVISOR : 0) |
            (taken.databits != settings->databits ? MD_REFUSED_DATABITS : 0) |
            (taken.parity != settings->parity ? MD_REFUSED_PARITY : 0) |
            (taken.stopbits != settings->stopbits ? MD_REFUSED_STOPBITS : 0);

@@ -174,7 +174,7 @@ static int begin(struct md_turn *turn, int source, const struct md_exchange *exc
     turn->source = first ? MD_AHEAD : source;
     md_line_begin(&turn->line, first ? first : exchange, first ? &turn->completion : completion, now_ns);
     if (turn->progress.lost)
-        md_line_abandon(&turn->line, MD_LINE_LOST, turn->lost_error);
+        md_line_abandon(&turn->line, MD_LINE_LOST, turn->progress.lost_error);
     return !first;
 }
 
@@ -340,6 +340,8 @@ static void finish(struct md_turn *turn)
         md_store(&turn->progress.echo, (uint32_t)turn->line.echo);
     if (turn->progress.foreign != turn->line.foreign)
         md_store(&turn->progress.foreign, turn->line.foreign);
+    if (turn->progress.stalled && turn->line.completion->result > 0)
+        md_store(&turn->progress.stalled, 0);
     if (source == MD_AHEAD)
         return;
     int goes_on = !turn->progress.lost && (source == MD_URGENT || !turn->is_ending);
@@ -407,7 +409,7 @@ void md_turn_lose(struct md_turn *turn, int error)
 {
     int is_polled = turn->source == MD_QUEUED || turn->source == MD_REPEATED;
     int is_cut_off = is_polled && turn->line.is_proven && md_line_is_under_way(&turn->line);
-    turn->lost_error = error;
+    turn->progress.lost_error = error;
     md_store(&turn->progress.cut_off, (uint32_t)is_cut_off);
     md_store(&turn->progress.lost, 1);
     md_line_abandon(&turn->line, MD_LINE_LOST, error);
@@ -421,6 +423,8 @@ void md_turn_lose(struct md_turn *turn, int error)
 void md_turn_close(struct md_turn *turn)
 {
     int is_reported = turn->source == MD_URGENT || turn->is_ending || turn->line.state == MD_IDLE;
+    if (md_line_is_under_way(&turn->line) && md_is_command(turn->line.exchange))
+        md_store(&turn->progress.called_off, 1);
     if (is_reported && turn->source != MD_NO_SOURCE) {
         md_line_abandon(&turn->line, turn->source == MD_URGENT ? MD_LINE_LOST : MD_POLL_ENDED, 0);
         finish(turn);

@@ -92,6 +92,12 @@ int md_port_get(int fd, struct md_settings *settings)
     return failure;
 }
 
+uint32_t md_port_baud_base(int fd)
+{
+    (void)fd;
+    return 0;
+}
+
 /* RTS and DTR fall when a port is closed; Windows cannot keep them up. */
 int md_port_keep_rts(int fd)
 {

@@ -175,7 +175,7 @@ class Bus:
 
     @property
     def why_lost(self) -> str | None:
-        """The reason why the port is lost ("/dev/ttyUSB0: there is no such port"); None while it is open."""
+        """The reason why the port is lost or stalled ("/dev/ttyUSB0: unplugged"); None while it works."""
         return self.line.why_lost
 
     def __enter__(self) -> Bus:

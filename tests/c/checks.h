@@ -17,7 +17,7 @@
 static int checks, failures;
 static const char *row = ""; /* name of the present check, for the report */
 
-static uint8_t *page_end(void)
+static inline uint8_t *page_end(void)
 {
     static uint8_t *end;
     if (!end) {
@@ -30,7 +30,7 @@ static uint8_t *page_end(void)
     return end;
 }
 
-static const uint8_t *at_the_edge(const uint8_t *bytes, size_t len)
+static inline const uint8_t *at_the_edge(const uint8_t *bytes, size_t len)
 {
     return len ? memcpy(page_end() - len, bytes, len) : page_end();
 }

@@ -11,17 +11,19 @@
 #include <linux/serial.h>
 #endif
 
-enum { CHARACTER_NS = 1145833, FD = 1000 }; /* 9600 8N1 */
+enum { CHARACTER_NS = 1145833, USB_NS = 1200000, FD = 1000 }; /* 9600 8N1 */
 
 static struct {
     int64_t now_ns;
     int64_t start_ns;   /* delay from a write to its first bit */
     int64_t percent;    /* actual time of a character, relative to the nominal one */
+    int64_t taken_ns;   /* when the adapter has taken all bytes */
     int64_t end_ns;     /* when the last bit has been sent */
     int64_t changed_ns; /* when RTS was changed last */
     int is_up, changes, writes_while_receiving;
     int sending_level, takes, rings, keeps;
     int reports_end, rts_error, write_error;
+    int is_usb;
     int has_mode, is_deaf;  /* the driver has an RS-485 mode; it ignores the request to use it */
     uint32_t flags;
 } uart;
@@ -89,10 +91,10 @@ int ioctl(int fd, int request, ...)
         CHECK(*(int *)argument == TIOCM_RTS);
         return change(request == TIOCMBIS);
     case TIOCSERGETLSR:
-        *(unsigned *)argument = is_left ? TIOCSER_TEMT : 0;
+        *(unsigned *)argument = is_left || uart.is_usb ? TIOCSER_TEMT : 0;
         return uart.reports_end ? 0 : refuse(ENOTTY);
-    case TIOCOUTQ: /* does not count the character in the shift register */
-        *(int *)argument = uart.now_ns + CHARACTER_NS < uart.end_ns;
+    case TIOCOUTQ: /* a USB adapter takes all bytes before it sends the first one */
+        *(int *)argument = uart.now_ns < uart.taken_ns;
         return 0;
     case TIOCGRS485:
     case TIOCSRS485:
@@ -110,14 +112,14 @@ ssize_t write(int fd, const void *bytes, size_t len)
     if (uart.write_error)
         return refuse(uart.write_error);
     size_t taken = len < (size_t)uart.takes ? len : (size_t)uart.takes;
-    uart.end_ns = later(uart.end_ns, uart.now_ns + uart.start_ns) +
-                  (int64_t)taken * CHARACTER_NS * uart.percent / 100;
+    uart.taken_ns = uart.now_ns + uart.start_ns;
+    uart.end_ns = later(uart.end_ns, uart.taken_ns) + (int64_t)taken * CHARACTER_NS * uart.percent / 100;
     return (ssize_t)taken;
 }
 
 static const struct md_exchange asked = {.character_ns = CHARACTER_NS};
 
-static struct md_port *new_port(int mode, int reports_end)
+static struct md_port *new_port(int mode, int is_usb)
 {
     static struct md_engine engine;
     static struct md_port port;
@@ -128,8 +130,9 @@ static struct md_port *new_port(int mode, int reports_end)
     uart.takes = 1000;
     uart.sending_level = mode != MD_RS485_RTS_DOWN;
     uart.is_up = 1; /* open() raises RTS */
-    uart.reports_end = reports_end;
-    CHECK(md_rs485_begin(&port, mode) == 0);
+    uart.reports_end = 1; /* also a USB driver: its last report says that the adapter was idle */
+    uart.is_usb = is_usb;
+    CHECK(md_rs485_begin(&port, mode, is_usb) == 0);
     return &port;
 }
 
@@ -150,22 +153,23 @@ static void check_direction(void)
 {
     static const struct {
         const char *row;
-        int mode, reports_end, len;
+        int mode, is_usb, len;
         int64_t start_ns, percent, most_ns; /* most_ns: limit from the last bit to the change of RTS */
     } rows[] = {
-        {"an UART that tells its end", MD_RS485_RTS_UP, 1, 8, 0, 100, 0},
-        {"RTS off while sending", MD_RS485_RTS_DOWN, 1, 8, 0, 100, 0},
-        {"one that begins late", MD_RS485_RTS_UP, 1, 8, 3000000, 100, 200000},
-        {"one that is slower", MD_RS485_RTS_UP, 1, 250, 0, 102, 200000},
-        {"one that is faster", MD_RS485_RTS_UP, 1, 8, 0, 98, 8 * CHARACTER_NS / 50 + 1},
-        {"one that does not tell", MD_RS485_RTS_UP, 0, 8, 0, 100, CHARACTER_NS},
-        {"and is slower", MD_RS485_RTS_UP, 0, 40, 0, 102, CHARACTER_NS},
-        {"and begins late", MD_RS485_RTS_DOWN, 0, 8, 5000000, 100, CHARACTER_NS},
+        {"a UART", MD_RS485_RTS_UP, 0, 8, 0, 100, 0},
+        {"RTS off while sending", MD_RS485_RTS_DOWN, 0, 8, 0, 100, 0},
+        {"a UART that starts late", MD_RS485_RTS_UP, 0, 8, 3000000, 100, 200000},
+        {"a slower UART", MD_RS485_RTS_UP, 0, 250, 0, 102, 200000},
+        {"a faster UART", MD_RS485_RTS_UP, 0, 8, 0, 98, 8 * CHARACTER_NS / 50 + 1},
+        {"a USB adapter", MD_RS485_RTS_UP, 1, 8, 0, 100, USB_NS + 8 * CHARACTER_NS / 50},
+        {"a slower USB adapter", MD_RS485_RTS_UP, 1, 40, 0, 102, USB_NS},
+        {"a USB adapter that takes the bytes late", MD_RS485_RTS_DOWN, 1, 8, 5000000, 100,
+         USB_NS + 8 * CHARACTER_NS / 50},
     };
     static const uint8_t frame[256] = {0};
     for (size_t i = 0; i < COUNT(rows); i++) {
         row = rows[i].row;
-        struct md_port *port = new_port(rows[i].mode, rows[i].reports_end);
+        struct md_port *port = new_port(rows[i].mode, rows[i].is_usb);
         CHECK(uart.is_up != uart.sending_level); /* at first the transceiver receives */
         CHECK(uart.keeps == (rows[i].mode == MD_RS485_RTS_DOWN));
         uart.start_ns = rows[i].start_ns;
@@ -188,7 +192,7 @@ static void check_parts(void)
 {
     static const uint8_t frame[64] = {0};
     row = "a request that the port takes in parts";
-    struct md_port *port = new_port(MD_RS485_RTS_UP, 1);
+    struct md_port *port = new_port(MD_RS485_RTS_UP, 0);
     uart.takes = 10;
     port->turn.line.state = MD_WRITING;
     int before = uart.changes;
@@ -201,14 +205,14 @@ static void check_parts(void)
     CHECK(look_until_received(port) == 0 && uart.changes == before + 2);
 
     row = "a frame behind one that still leaves";
-    port = new_port(MD_RS485_RTS_UP, 0);
+    port = new_port(MD_RS485_RTS_UP, 1);
     md_rs485_write(port, frame, 20);
     uart.now_ns += CHARACTER_NS;
     md_rs485_write(port, frame, 20);
     CHECK(look_until_received(port) == 0 && uart.changed_ns >= uart.end_ns);
 
     row = "a port that takes nothing";
-    port = new_port(MD_RS485_RTS_UP, 1);
+    port = new_port(MD_RS485_RTS_UP, 0);
     uart.write_error = EAGAIN;
     CHECK(md_rs485_write(port, frame, 8) == -1 && errno == EAGAIN);
     CHECK(!uart.is_up && !port->rs485.is_sending);
@@ -219,19 +223,19 @@ static void check_failures(void)
 {
     static const uint8_t frame[8] = {0};
     row = "a driver that does not switch RTS";
-    struct md_port *port = new_port(MD_RS485_RTS_UP, 1);
+    struct md_port *port = new_port(MD_RS485_RTS_UP, 0);
     uart.rts_error = ENOTTY;
     CHECK(md_rs485_write(port, frame, 8) == -1 && errno == ENOTTY && uart.end_ns == 0);
-    CHECK(md_rs485_begin(port, MD_RS485_RTS_UP) == -ENOTTY && port->rs485.mode == MD_RS485_OFF);
+    CHECK(md_rs485_begin(port, MD_RS485_RTS_UP, 0) == -ENOTTY && port->rs485.mode == MD_RS485_OFF);
 
     row = "RTS that does not fall any more";
-    port = new_port(MD_RS485_RTS_UP, 1);
+    port = new_port(MD_RS485_RTS_UP, 0);
     md_rs485_write(port, frame, 8);
     uart.rts_error = EIO;
     CHECK(look_until_received(port) == -EIO && !port->rs485.is_sending);
 
     row = "a request that never leaves";
-    port = new_port(MD_RS485_RTS_UP, 1);
+    port = new_port(MD_RS485_RTS_UP, 0);
     uart.start_ns = INT64_C(1000000000000);
     md_rs485_write(port, frame, 8);
     int64_t begun_ns = uart.now_ns;
@@ -239,13 +243,13 @@ static void check_failures(void)
     CHECK(uart.now_ns - begun_ns < 200000000);
 
     row = "a port that is lost";
-    port = new_port(MD_RS485_RTS_UP, 1);
+    port = new_port(MD_RS485_RTS_UP, 0);
     md_rs485_write(port, frame, 8);
     port->turn.progress.lost = 1;
     CHECK(md_rs485_look(port, uart.now_ns) == 0 && !uart.is_up);
 
     row = "a port that is closed while its last request leaves";
-    port = new_port(MD_RS485_RTS_UP, 1);
+    port = new_port(MD_RS485_RTS_UP, 0);
     md_rs485_write(port, frame, 8);
     port->is_closing = 1;
     CHECK(md_rs485_look(port, uart.now_ns) == 0 && uart.is_up && uart.rings == 0);
@@ -270,11 +274,11 @@ static void check_driver(void)
     };
     for (size_t i = 0; i < COUNT(rows); i++) {
         row = rows[i].row;
-        struct md_port *port = new_port(MD_RS485_OFF, 1);
+        struct md_port *port = new_port(MD_RS485_OFF, 0);
         uart.has_mode = rows[i].has_mode;
         uart.is_deaf = rows[i].is_deaf;
         uart.flags = rows[i].before;
-        CHECK(md_rs485_begin(port, MD_RS485_KERNEL) == rows[i].result);
+        CHECK(md_rs485_begin(port, MD_RS485_KERNEL, 0) == rows[i].result);
         CHECK(uart.flags == rows[i].after);
         CHECK(md_rs485_write(port, frame, 8) == 8 && uart.changes == 0); /* the driver switches RTS */
         row = "";

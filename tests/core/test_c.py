@@ -92,6 +92,12 @@ def test_a_transceiver_sends_until_the_last_bit_has_left(build: Callable[..., No
 
 
 @pytest.mark.long
+@pytest.mark.skipif(sys.platform != "linux", reason="the driver is Linux's")
+def test_a_baud_rate_without_a_whole_divisor_is_refused(build: Callable[..., None]) -> None:
+    build("test_divisors", "termios")
+
+
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
 @pytest.mark.parametrize("program", ["test_waiter", "test_waiter_refused"])
 def test_waits_are_exact_to_the_nanosecond(build: Callable[..., None], program: str) -> None:

@@ -54,6 +54,7 @@ class Sysfs:
             self.add(port.resolve().name, f"{USB}/{place}/{place}:1.0/tty", serial)
             link.symlink_to(port)
             yield wire
+            (self.folder / "class" / "tty" / port.resolve().name / "device").unlink()
         link.unlink()
 
 
@@ -117,6 +118,41 @@ def test_a_port_is_reopened_only_with_the_same_adapter(
                 with pytest.raises(LineError, match="another adapter has this name now"):
                     found.reopen()
             assert found.is_lost != is_same
+        found.close()
+
+
+@table(
+    ("before", "now", "others", "is_found"),
+    [
+        (("1-1", "A1"), ("1-1", "A1"), [], True),  # after a sleep it is ttyUSB1
+        (("1-1", "A1"), ("1-2", "A1"), [("1-1", "B2")], True),  # another adapter has its place
+        (("1-1", ""), ("1-1", ""), [("1-2", "")], True),
+        (("1-1", ""), ("1-2", ""), [], False),
+        (("1-1", "A1"), ("1-2", "A1"), [("1-3", "A1")], False),  # copies with the same serial number
+    ],
+)
+def test_an_adapter_is_followed_to_its_new_name(
+    tmp_path: Path,
+    before: tuple[str, str],
+    now: tuple[str, str],
+    others: list[tuple[str, str]],
+    is_found: bool,
+) -> None:
+    folder = tmp_path / "-".join(map(str, (*before, *now, *others)))
+    with pytest.MonkeyPatch.context() as monkeypatch, ExitStack() as stack:
+        sysfs = Sysfs(folder / "sys", monkeypatch)
+        monkeypatch.setattr(port_identity, "DEVICES", Path("/dev/pts"))
+        found = Line(str(folder / "ttyUSB0"))
+        with sysfs.plugged_in(folder / "ttyUSB0", *before):
+            found.open()
+        for number, place in enumerate([now, *others], 1):
+            stack.enter_context(sysfs.plugged_in(folder / f"ttyUSB{number}", *place))
+        if is_found:
+            found.reopen()
+            assert open_port.device_of(found._opened._serial) == str((folder / "ttyUSB1").resolve())
+        else:
+            with pytest.raises(LineError, match="no such port"):
+                found.reopen()
         found.close()
 
 

@@ -176,8 +176,9 @@ def test_overruns_are_read_from_the_port_s_driver(monkeypatch: pytest.MonkeyPatc
 
     with Simulator([Wire([simulated(Toy(1))], unpaced=True)]) as sim, Bus(sim.wires[0].path) as bus:
         assert bus.statistics().diagnostics.bus_character_overruns is None  # a pty has no such counter
-        monkeypatch.setattr(fcntl, "ioctl", counts)
-        assert bus.line.overruns() == 120
+        with monkeypatch.context() as patched:
+            patched.setattr(fcntl, "ioctl", counts)
+            assert bus.line.overruns() == 120
 
 
 # ---- spans ----

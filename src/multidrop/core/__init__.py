@@ -62,11 +62,14 @@ from multidrop.core.port import (
     why_not_realtime,
 )
 from multidrop.core.port_settings import (
+    NO_DIVISOR,
     REFUSALS,
     CharacterFormat,
+    close_descriptor,
     get_settings,
     is_pseudo_terminal,
     must_take,
+    possible_rates,
     refused_names,
     set_settings,
 )
@@ -80,6 +83,7 @@ __all__ = [
     "LOW_WORD_FIRST",
     "MODBUS",
     "MOST_INVALID",
+    "NO_DIVISOR",
     "PAUSE_NS",
     "REALTIME_ENDED",
     "REFUSALS",
@@ -127,6 +131,7 @@ __all__ = [
     "build_reply",
     "build_request",
     "characters_on_wire",
+    "close_descriptor",
     "crc16",
     "delay_edge",
     "find_replies",
@@ -137,6 +142,7 @@ __all__ = [
     "now_ns",
     "parse_reply",
     "parse_request",
+    "possible_rates",
     "raw_value",
     "refused_names",
     "reply_length",

@@ -327,12 +327,13 @@ class Port:
         """Set whether the adapter echoes."""
         lib.md_port_set_echo(self.c, _ECHOES[echo])
 
-    def switch(self, rs485: RS485) -> None:
+    def switch(self, rs485: RS485, is_usb: bool = False) -> None:
         """Set who switches the transceiver between receiving and sending. Call it before the first request.
 
-        Raises OSError if the driver refuses.
+        A USB adapter (`is_usb`) does not report when a request has left. Raises OSError if the driver
+        refuses.
         """
-        failure = lib.md_port_rs485(self.c, _SWITCHES[rs485])
+        failure = lib.md_port_rs485(self.c, _SWITCHES[rs485], is_usb)
         if failure:
             raise OSError(-failure, "the transceiver cannot be switched")
 
@@ -415,6 +416,21 @@ class Port:
     def lost(self) -> bool:
         """True once the descriptor failed: no further exchange is sent."""
         return bool(self._progress.lost)
+
+    @property
+    def lost_error(self) -> int:
+        """The errno with which the descriptor failed; 0 if the far end hung up."""
+        return int(self._progress.lost_error)
+
+    @property
+    def is_stalled(self) -> bool:
+        """True if at the last timeout the driver still held the request, and no reply has come since."""
+        return bool(self._progress.stalled)
+
+    @property
+    def called_off(self) -> bool:
+        """True if a command has ended whose bytes the driver may still hold: discard them."""
+        return bool(self._progress.called_off)
 
     @property
     def has_echo(self) -> bool:

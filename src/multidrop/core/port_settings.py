@@ -12,6 +12,7 @@ REFUSALS = {
     lib.MD_REFUSED_PARITY: "parity",
     lib.MD_REFUSED_STOPBITS: "stop bits",
 }
+NO_DIVISOR = int(lib.MD_REFUSED_DIVISOR)  # only a failure on UARTs that divide their clock by a whole number
 
 
 class CharacterFormat(NamedTuple):
@@ -40,6 +41,18 @@ def must_take(device: str) -> int:
 def refused_names(mask: int) -> str:
     """Return the names of the refused settings, as text."""
     return ", ".join(name for bit, name in REFUSALS.items() if mask & bit)
+
+
+def possible_rates(fd: int, baudrate: int) -> tuple[int, int, int]:
+    """Return the baud rate at which a UART would run instead of this one, and its nearest possible ones."""
+    base = int(lib.md_port_baud_base(fd))
+    divisor = (base + baudrate // 2) // baudrate
+    return base // divisor, base // -(-base // baudrate), base // (base // baudrate)
+
+
+def close_descriptor(fd: int, seconds: float) -> None:
+    """Close a port's descriptor; its driver's unsent bytes may leave for this time, then are discarded."""
+    lib.md_port_close(fd, round(seconds * 1e9))
 
 
 def get_settings(fd: int) -> tuple[int, str]:

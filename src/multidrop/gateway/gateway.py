@@ -337,7 +337,9 @@ class Gateway:
 
     def _read_statistics(self, poller: Poller) -> None:
         self.recent.tick(self.clock(), utc_ms(), poller.statistics())
-        self.hub.unopened |= {line: why for line, bus in poller.buses.items() if (why := bus.why_lost)}
+        failing = {line: why for line, bus in poller.buses.items() if (why := bus.why_lost)}
+        self.hub.stalled = {line: why for line, why in failing.items() if not poller.buses[line].line.is_lost}
+        self.hub.unopened |= failing
 
     def note_unopened(self, failures: Mapping[str, LineError]) -> None:
         """Log and remember the lines whose ports could not be opened, with the reasons."""

@@ -407,6 +407,7 @@ class PolledLine:
         if seen == self._observed:
             return
         self._observed = seen
+        self.bus.line.note_stall()
         for (drive, peer), (failures, late_until_ns, has_answered) in zip(self._polled, seen, strict=True):
             self._schedule.back_off.observe(
                 drive.address,

@@ -26,6 +26,7 @@ from multidrop.planning.blocks import Block, blocks, halves, least, text_blocks
 from multidrop.transport import clock
 from multidrop.transport.line import Line
 from multidrop.transport.mixed_up import mixed_up, silence_hint
+from multidrop.transport.open_port import STALLED
 from multidrop.transport.peers import Peers
 from multidrop.transport.prepared import (
     NO_ROWS,
@@ -54,7 +55,11 @@ def no_reply(drive: Drive, completion: Completion) -> NoReply:
     if drive.framing is Framing.TCP and completion.raw:
         code = completion.raw[-1]
         return NoReply(drive.name, f" behind the gateway, which says so (exception {code:02X}H)")
-    return NoReply(drive.name, hint="" if drive.bus is None else silence_hint(_port_of(drive)))
+    if drive.bus is None:
+        return NoReply(drive.name)
+    line = drive.bus.line
+    hint = f"; but the port is {STALLED}" if line.is_stalled else silence_hint(line.port)
+    return NoReply(drive.name, hint=hint)
 
 
 def check_master(drive: Drive, completion: Completion) -> None:

@@ -20,7 +20,6 @@ from multidrop.core import (
     Tap,
     TransactionIds,
     build_request,
-    refused_names,
 )
 from multidrop.core.fork import register_at_fork
 from multidrop.core.undisturbed import undisturbed
@@ -28,7 +27,15 @@ from multidrop.drive.line_settings import check_settle, speaks_tcp
 from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.transport.aside_log import flush, log_aside, words_of
 from multidrop.transport.bridge import PORT_FAILURES
-from multidrop.transport.open_port import OpenPort, check_port, is_lost_by, reason_of, why_lost
+from multidrop.transport.open_port import (
+    CLOSING_S,
+    STALLED,
+    OpenPort,
+    check_port,
+    is_lost_by,
+    reason_of,
+    why_lost,
+)
 
 _log = logging.getLogger("multidrop.line")
 
@@ -43,7 +50,7 @@ class LineLog:
         self.shows = _log.isEnabledFor  # function of a log level: whether it is logged
         self._port = port
         self._foreign_here = 0  # part of `foreign` since the port was last opened
-        self._is_lost = False
+        self._is_lost = self._is_stalled = False
         self._why_unopened = ""
         self.forked()
 
@@ -55,7 +62,7 @@ class LineLog:
         """Log that the port was opened; from now on, a loss of the port is logged again."""
         again = " again" if self._is_lost else ""
         log_aside(_log, logging.INFO, "%s: opened%s (%s)", self._port, again, identity)
-        self._is_lost, self._foreign_here, self._why_unopened = False, 0, ""
+        self._is_lost, self._is_stalled, self._foreign_here, self._why_unopened = False, False, 0, ""
 
     def lost(self, why: str) -> None:
         """Log that the port was lost, unless this loss is already logged."""
@@ -63,12 +70,24 @@ class LineLog:
             self._is_lost = True
             log_aside(_log, logging.WARNING, "%s: lost (%s)", self._port, why)
 
+    def note_stall(self, is_stalled: bool) -> None:
+        """Log that the adapter takes no bytes, or takes them again, unless this is already logged."""
+        if is_stalled != self._is_stalled:
+            self._is_stalled = is_stalled
+            said = STALLED if is_stalled else "its adapter takes bytes again"
+            log_aside(_log, logging.WARNING, "%s: %s", self._port, said)
+
     def unopened(self, why: str) -> None:
         """Log why the port could not be opened or reopened, unless the last attempt had the same reason."""
         if why != self._why_unopened:
             self._why_unopened = why
             again = " again" if self._is_lost else ""
             log_aside(_log, logging.WARNING, "%s: not opened%s: %s", self._port, again, why)
+
+    def holds_bytes(self) -> None:
+        """Log that the port is being closed although the adapter has not taken all bytes."""
+        said = "%s: waiting %g s for its adapter, which takes no bytes; then they are discarded"
+        log_aside(_log, logging.WARNING, said, self._port, CLOSING_S)
 
     def closed(self) -> None:
         log_aside(_log, logging.INFO, "%s: closed", self._port)
@@ -201,8 +220,10 @@ class Line:
             if core is None:
                 return
             if core.lost:
-                self._log.lost("it failed")
+                self._why_lost = f"the port was lost ({(why := why_lost(self.port, core.lost_error))})"
+                self._log.lost(why)
             core.stop()
+            self._opened.must_discard |= core.called_off
 
     @undisturbed
     def close(self) -> None:
@@ -222,6 +243,8 @@ class Line:
     def _let_go(self) -> None:
         with self._lock:
             self.drop()
+            if not self._opened.must_discard and self._opened.holds_bytes():
+                self._log.holds_bytes()
             self._opened.close()
 
     @undisturbed
@@ -241,8 +264,16 @@ class Line:
         return not self._is_over and (core is None or core.lost)
 
     @property
+    def is_stalled(self) -> bool:
+        """True if at the last timeout the adapter had not taken the request, and no reply has come since."""
+        core = self.queue
+        return core is not None and core.is_stalled
+
+    @property
     def why_lost(self) -> str | None:
-        """Why a lost port could not be reopened, with its name; None if it is open, or not tried yet."""
+        """Why the port is stalled, lost, or could not be reopened, with its name; None if it works."""
+        if self.is_stalled:
+            return f"{self.port}: {STALLED}"
         return f"{self.port}: {self._why_lost}" if self.is_lost and self._why_lost else None
 
     @undisturbed
@@ -315,23 +346,31 @@ class Line:
         if self._log.shows(DEBUG):
             self._log.frames(exchange, found)
         if is_lost:
-            failure = self._failure(found.result, found.error, found.raw)
+            failure = self._failure(found, exchange)
             failure.is_sent = found.sent_ns > 0
+            if core.called_off:
+                self._discard(core)
             raise failure
         return found
+
+    @undisturbed
+    def _discard(self, core: Port) -> None:
+        """Close the port now, so that the driver discards a command that was called off."""
+        with self._lock:
+            if self.queue in (core, None):  # otherwise another thread has already reopened the port
+                self._let_go()
 
     def is_asking(self, peer: Peer) -> bool:
         """Return True while an exchange with this peer is queued or in flight on the port."""
         with self._lock:
             return self.queue is not None and self.queue.is_asking(peer)
 
-    def _failure(self, result: int, error: int, received: bytes) -> LineError:
-        if result == Failure.SETTINGS_REFUSED:
-            names = refused_names(error)
-            return LineError(self.port, f"the port does not take the {names} that the drive needs")
+    def _failure(self, found: Completion, exchange: Exchange) -> LineError:
+        if found.result == Failure.SETTINGS_REFUSED:
+            return LineError(self.port, self._opened.refusal(found.error, exchange.settings[0]))
         if self.queue is None or self.why_closing:
             return self._closed()
-        why = why_lost(self.port, error, received)
+        why = why_lost(self.port, found.error, found.raw)
         self._log.lost(why)
         return PortLost(self.port, f"the port was lost ({why})")
 
@@ -351,6 +390,10 @@ class Line:
     def may_send(self) -> bool:
         """True if this process is the line's master, or if the line has no mastership."""
         return self.mastership is None or self.mastership.holds
+
+    def note_stall(self) -> None:
+        """Log that the port is stalled, or no longer stalled, unless this is already logged."""
+        self._log.note_stall(self.is_stalled)
 
     def note_foreign(self) -> None:
         """Log another master's bytes, on a line with a mastership."""

@@ -9,20 +9,25 @@ import socket
 import struct
 import sys
 from contextlib import suppress
+from pathlib import Path
 from typing import cast
 from urllib.parse import SplitResult
 
 import serial
 
 from multidrop.core import (
+    NO_DIVISOR,
     RS485,
     Failure,
     Mastership,
     Port,
     TransactionIds,
     Transactions,
+    close_descriptor,
     is_pseudo_terminal,
     must_take,
+    possible_rates,
+    refused_names,
 )
 from multidrop.drive.line_settings import MODBUS_PORT, SCHEMES, URLS, speaks_tcp, url_of
 from multidrop.errors import LineError, NoSuchPort
@@ -89,8 +94,17 @@ def is_lost_by(result: int, port: Port) -> bool:
     return is_lost or (result == Failure.LATE_ANSWER_DUE and port.lost)
 
 
-def why_lost(port: str, error: int, received: bytes) -> str:
+STALLED = "stalled: its adapter takes no bytes"
+_UNPLUGGED = (0, errno.EIO, errno.ENODEV, errno.ENXIO)  # errors of a descriptor whose device is gone
+
+
+def why_lost(port: str, error: int, received: bytes = b"") -> str:
     """Return why a port was lost, from the errno of its descriptor (0: the far end hung up)."""
+    if "://" not in port:
+        if error == errno.ETIMEDOUT:
+            return STALLED
+        if error in _UNPLUGGED and not Path(port).exists() and not is_pseudo_terminal(os.path.realpath(port)):
+            return "unplugged"
     if error != errno.EPROTO:
         return os.strerror(error) if error else "hung up"
     shown = received[:16].hex(" ").upper() or "a damaged header"
@@ -177,6 +191,14 @@ def identity_of(port: serial.SerialBase, name: str) -> str:
         return port_identity.of_name(name)
 
 
+def failing_refusals(device: str) -> int:
+    """Return the mask of REFUSALS that are failures on this device."""
+    return must_take(device) | (NO_DIVISOR if port_identity.has_divisor(device) else 0)
+
+
+TOLERANCE = 0.02  # of a baud rate: the limit of the core and of the kernel
+CLOSING_S = 0.75  # how long the adapter may still take the driver's bytes when a port is closed
+_UNNOTICED_S = 0.05  # a healthy adapter takes all bytes in this time
 BY_PLACE = "/dev/serial/by-path/"  # names of USB sockets, into which any adapter may be plugged
 _NO_SETTINGS = -1
 _TRANSACTIONS = {
@@ -216,13 +238,14 @@ class OpenPort:
         self._serial: serial.SerialBase | None = None
         self._adapter: USBAdapter | None = None  # the adapter at the first opening
         self._terminal: PseudoTerminal | None = None  # the pseudo-terminal at the last opening
+        self.must_discard = False  # the driver may hold a command that was called off
 
     def open(self) -> Port:
         """Open the port, wait for `settle` s, discard the input, and return the core's port.
 
         Raises LineError or one of PORT_FAILURES; the caller must then call `close`.
         """
-        port = self._serial = unopened(self.name)
+        port = self._serial = unopened(self._name_now())
         terminal = self._terminal_now()
         port.timeout = 0
         if isinstance(port, serial.Serial):
@@ -240,6 +263,17 @@ class OpenPort:
         with suppress(*PORT_FAILURES, AttributeError, NotImplementedError):
             port.set_low_latency_mode(True)  # without it, a USB adapter delays bytes by up to 16 ms
         return core
+
+    def _name_now(self) -> str:
+        """Return the port's name, or the device name that its adapter has now instead.
+
+        An adapter gets another name if its old name is in use when it comes back, as after a sleep.
+        """
+        if self._adapter is None:
+            return self.name
+        found = adapter_of(os.path.realpath(self.name))
+        is_same = found is not None and found.is_same(self._adapter)
+        return (None if is_same else port_identity.device_of(self._adapter)) or self.name
 
     def _terminal_now(self) -> PseudoTerminal | None:
         """Return the pseudo-terminal to open. Raises LineError if a later one has got its number.
@@ -268,7 +302,7 @@ class OpenPort:
         """Return a core port that uses this port's descriptor, or that of a new bridge."""
         if type(port).read is serial.Serial.read:
             device = device_of(port)
-            opened = Port(descriptor_of(port), must_take(device), mastership=self._mastership)
+            opened = Port(descriptor_of(port), failing_refusals(device), mastership=self._mastership)
             return self._switched(opened, device)
         if connection := connection_of(port):
             discard_late_bytes(connection)
@@ -287,22 +321,44 @@ class OpenPort:
         Raises LineError if the driver refuses.
         """
         try:
-            core.switch(self._rs485)
+            core.switch(self._rs485, is_usb=adapter_of(device) is not None)
         except OSError as failure:
             if not is_pseudo_terminal(device):
                 core.close()
                 raise LineError(self.name, _refusal(self._rs485, failure)) from failure
         return core
 
+    def _holds_bytes_now(self) -> bool:
+        """Return True if the adapter has not taken all bytes from the driver; False on Windows."""
+        port = self._serial
+        if sys.platform != "win32" and isinstance(port, serial.Serial) and port.is_open and not self.bridge:
+            with suppress(*PORT_FAILURES):
+                return bool(port.out_waiting)
+        return False
+
+    def holds_bytes(self) -> bool:
+        """Return True if the adapter takes longer for the driver's bytes than a healthy one."""
+        if not self._holds_bytes_now():
+            return False
+        clock.sleep(_UNNOTICED_S)
+        return self._holds_bytes_now()
+
     def close(self) -> None:
-        """Close the port, even if opening it failed halfway."""
+        """Close the port, even if opening it failed halfway.
+
+        The adapter may take the driver's bytes for CLOSING_S; later, or with `must_discard`, they are lost.
+        """
         if self.bridge:
             self.bridge.close()
             self.bridge = None
         if self._serial:
             connection = connection_of(self._serial)
+            last = os.dup(self._serial.fileno()) if self._holds_bytes_now() else None
             with suppress(*PORT_FAILURES):
                 self._serial.close()
+            if last is not None:
+                close_descriptor(last, 0.0 if self.must_discard else CLOSING_S)
+            self.must_discard = False
             if connection:  # pyserial leaves a connection open that the far end has closed
                 connection.close()
 
@@ -334,6 +390,20 @@ class OpenPort:
         except PORT_FAILURES as failure:
             raise LineError(self.name, reason_of(failure)) from failure
         self.settings = settings
+
+    def refusal(self, mask: int, baudrate: int) -> str:
+        """Return why the port did not take the settings of this mask of REFUSALS."""
+        if mask != NO_DIVISOR or self._serial is None:
+            return f"the port does not take the {refused_names(mask)} that the drive needs"
+        true, lower, higher = possible_rates(self._serial.fileno(), baudrate)
+        if abs(true - baudrate) <= baudrate * TOLERANCE:
+            return (
+                f"its driver replaces {baudrate} baud by a custom divisor: setserial {self.name} spd_normal"
+            )
+        return (
+            f"the port cannot run at {baudrate} baud: its UART would run at {true}; "
+            f"the nearest possible baud rates are {lower} and {higher}"
+        )
 
     def overruns(self) -> int | None:
         """Return how many characters the port has lost to overruns since its driver was loaded.

@@ -14,6 +14,7 @@ from multidrop.core import is_pseudo_terminal
 from multidrop.drive.line_settings import MODBUS_PORT, speaks_tcp
 
 TTYS = Path("/sys/class/tty")
+DEVICES = Path("/dev")
 _INTERFACE = re.compile(r"[\d.-]+:(\d+\.\d+)")  # 1-4.2:1.0 is an interface of the device at 1-4.2
 
 
@@ -42,6 +43,25 @@ def adapter_of(device: str) -> USBAdapter | None:
             serial = _text(part.parent / "serial")
             return USBAdapter(f"{part.parent.name}:{number}", serial and f"{serial}:{number}")
     return None
+
+
+def device_of(adapter: USBAdapter) -> str | None:
+    """Return the present device name of this adapter; None if it is away, or if several adapters match."""
+    found = {tty.name: one for tty in TTYS.iterdir() if (one := adapter_of(tty.name))}
+    same = [name for name, one in found.items() if one.is_same(adapter)]
+    here = [name for name in same if found[name].place == adapter.place]
+    name, *others = here or same or [""]
+    return str(DEVICES / name) if name and not others else None
+
+
+# Drivers of plain 8250 UARTs, which divide their clock by a whole number. Others may use fractions.
+_DIVIDERS = ("serial8250", "serial")
+
+
+def has_divisor(device: str) -> bool:
+    """Return True if the device is a UART whose true baud rate follows from its clock and a whole divisor."""
+    found = (TTYS / Path(device).name / "device").resolve()
+    return any((part / "driver").resolve().name in _DIVIDERS for part in (found, *found.parents))
 
 
 def _text(file: Path) -> str:

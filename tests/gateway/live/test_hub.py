@@ -148,6 +148,8 @@ def test_line_is_lost_if_all_its_newest_rows_have_that_status(hub: Hub, clock: H
     assert lost_of(hub, "hall") is None
     hub.take(rows((31, FAULT, Status.LINE_LOST)))
     assert lost_of(hub, "hall") == "port lost"
+    hub.stalled["hall"] = "/dev/ttyUSB0: stalled"
+    assert lost_of(hub, "hall") == "/dev/ttyUSB0: stalled"
     clock.now_ns = 31 * PERIOD
     assert hub.seen("pump-1") == Shown("silent", "port lost")
 

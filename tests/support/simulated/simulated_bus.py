@@ -66,7 +66,7 @@ class SimulatedBus:
     def sleep(self, seconds: float) -> None:
         self.seconds += seconds
 
-    is_lost = is_tcp = False
+    is_lost = is_stalled = is_tcp = False
     why_closing = ""
     may_send = True  # no mastership is needed
 

@@ -130,10 +130,12 @@ def _finite(value: float) -> float | None:
 
 
 def lost_of(hub: Hub, line: str) -> str | None:
-    """Return why a line's port is lost; None unless the newest rows of all its registers have that status.
+    """Return why a line's port is stalled or lost; None if it works.
 
-    If the port could not be opened, the reason is the system's message.
+    The port is lost if the newest rows of all its registers have that status.
     """
+    if line in hub.stalled:
+        return hub.stalled[line]
     statuses = set()
     for polled in hub.plant.find_line(line).drives:
         for poll in polled.polls:

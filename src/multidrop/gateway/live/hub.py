@@ -150,6 +150,7 @@ class Hub:
         self.time = 0  # time of the newest row, UTC in ns
         self.taken = 0  # number of batches received
         self.unopened: dict[str, str] = {}  # by line: why its port could not be opened
+        self.stalled: dict[str, str] = {}  # by line: why its open port takes no bytes
         self._cells: dict[int, RegisterRows | None] = {}  # by drive and register code; None: not in the plant
         self._statuses: tuple[str, ...] = ("ok",)
         self._watched: dict[str, _Watched] = {}
