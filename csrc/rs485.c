@@ -13,7 +13,7 @@
 static const int64_t LOOK_AGAIN_NS = 200000;
 static const int64_t ADAPTER_NS = 1000000; /* a USB frame, which the adapter may use before it sends */
 enum { CLOCK_DEVIATION = 50 };             /* 1/50: the adapter's baud rate may be 2 % too low */
-static const int64_t MOST_HELD_NS = 100000000; /* if sending takes longer, the port is broken */
+static const int64_t MOST_HELD_NS = 1000000000; /* if sending takes longer, the port is broken */
 
 static int is_by_rts(const struct md_rs485 *rs485)
 {

@@ -1,4 +1,4 @@
-/* Check which baud rates a UART's clock can yield. This test replaces the driver, which takes every baud rate. */
+/* Check which baud rates the clock of a UART can yield. This test replaces the driver, which accepts any. */
 #define _GNU_SOURCE
 #include "checks.h"
 #include "multidrop.h"

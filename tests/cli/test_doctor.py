@@ -214,6 +214,12 @@ def test_a_long_latency_timer_gets_advice(sysfs: Path) -> None:
             False,
         ),
         (
+            rs485_finding(None, RS485.RTS_UP, is_usb=True),
+            "rts-up: multidrop turns RTS on while a request leaves, and on USB for 1 to 3 ms longer: a drive "
+            "that answers sooner is not heard",
+            True,
+        ),
+        (
             rs485_finding(RS485Mode(True, False), RS485.RTS_DOWN),
             "rts-down: multidrop turns RTS off while a request leaves; the driver's own mode is on too",
             True,

@@ -275,7 +275,7 @@ def _opened(port: str, rs485: RS485) -> Iterator[Finding]:
     try:
         yield low_latency_finding(low_latency(fd), adapter.driver)
         yield latency_finding(adapter)
-        yield rs485_finding(rs485_mode(fd), rs485)
+        yield rs485_finding(rs485_mode(fd), rs485, is_usb=bool(adapter.usb_id))
     finally:
         os.close(fd)
 

@@ -76,9 +76,16 @@ def low_latency_finding(low: bool | None, driver: str = "") -> Finding:
     )
 
 
-def rs485_finding(mode: RS485Mode | None, switch: RS485 = RS485.OFF) -> Finding:
+def rs485_finding(mode: RS485Mode | None, switch: RS485 = RS485.OFF, *, is_usb: bool = False) -> Finding:
     if switch in _LEVELS:
         doubled = "; the driver's own mode is on too" if mode and mode.enabled else ""
+        if is_usb and not doubled:
+            return Finding(
+                "RS-485 mode",
+                f"{switch}: multidrop turns RTS {_LEVELS[switch]} while a request leaves, and on USB for "
+                "1 to 3 ms longer: a drive that answers sooner is not heard",
+                "use an adapter that switches by itself, or its own direction control (TXDEN of an FTDI)",
+            )
         return Finding(
             "RS-485 mode",
             f"{switch}: multidrop turns RTS {_LEVELS[switch]} while a request leaves{doubled}",
