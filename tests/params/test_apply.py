@@ -124,7 +124,7 @@ def test_drive_that_obeys_its_panel_makes_apply_raise(
 ) -> None:
     line, drive, sim = attached(monkeypatch, family(1), ["P01.00"])
     sim["run_source"] = 0
-    with pytest.raises(WriteForbidden, match=r"P00\.00 is KEYPAD"):
+    with pytest.raises(WriteForbidden, match=r"its run_source \(P00\.00\) is KEYPAD"):
         params.plan(drive, {"P01.00": 5})
     assert line.written == []
 

@@ -136,7 +136,9 @@ def _diff(arguments: argparse.Namespace) -> int:
 
 def _side(arguments: argparse.Namespace, words: list[str]) -> tuple[Target | ParameterSet, list[str]]:
     """Return the drive or parameter file that the first words name, and the remaining words."""
-    if words and _is_file(words):
+    if not words:
+        raise _mistaken(arguments, "give two sides to compare: files, drives, or a file and a drive")
+    if _is_file(words):
         return params.load(words[0]), words[1:]
     return _drive_of(arguments, words)
 
@@ -224,8 +226,9 @@ def _print_plan(arguments: argparse.Namespace, made: params.ApplyPlan) -> int:
 
 
 def _applied_lines(result: params.Applied) -> list[str]:
-    rest = len(result.plan.writes) - len(result.written)
-    lines = [f"{counted(len(result.written), 'parameter')} written, {rest} not"]
+    rest, left = len(result.plan.writes) - len(result.written), len(result.plan.left)
+    lines = [f"{counted(len(result.written), 'parameter')} written"]
+    lines[0] += f", {rest} not written" * bool(rest) + f", {left} left out" * bool(left)
     if result.earlier:
         lines += ["before, and not finished:", *(f"  {sentence}" for sentence in result.earlier)]
     if result.failure is not None:

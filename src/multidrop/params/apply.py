@@ -133,7 +133,7 @@ class _Journal:
         outcomes: dict[str, str] = {}
         for record in _records(lines):
             if "began" in record:
-                found = f"{record.get('source')}, begun {str(record['began'])[:19]}Z"
+                found = f"{record.get('source')}, started {str(record['began'])[:19]}Z"
                 outcomes.setdefault("", f"an application of {found}, was interrupted")
             elif "after" in record:
                 write = f"{record.get('code')}: {record.get('before')} -> {record['after']}"

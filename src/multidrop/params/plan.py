@@ -157,9 +157,9 @@ def _check_no_run_command(drive: Drive) -> None:
     line = _member(source, "line")
     if source is not None and line is not None and (held := drive.read(source)) != line:
         raise WriteForbidden(
-            f"nothing is written to {drive.name}: {source.place or source.name} is {source.format(held)}, so "
-            f"its panel or a terminal may start the motor while parameters change; set it to {int(line)} "
-            "(the line) on the panel first"
+            f"nothing is written to {drive.name}: its {source.name} ({source.place}) is "
+            f"{source.format(held)}, so its panel or a terminal may start the motor while parameters change; "
+            f"set it to {int(line)} (the line) on the panel first"
         )
 
 
