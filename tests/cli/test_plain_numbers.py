@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import pytest
+from tables import table
 
 from multidrop.cli import main
 from multidrop.families import InvtCHE
@@ -19,7 +20,7 @@ from multidrop.recording.csv import _parse
 ODD = ["1_0", "\uff11\uff12", "\u0663", "\u0967\u0968", "\U0001d7cf", "\u00bd", "12\u00a0", "1\u066b5"]
 
 
-@pytest.mark.parametrize("text", [*ODD, "", "-", "0x10", "0b1", "1 2", "1,5"])
+@table("text", [*ODD, "", "-", "0x10", "0b1", "1 2", "1,5"])
 def test_texts_with_other_digits_are_not_parsed_as_numbers(text: str) -> None:
     for parse in (plain_number, plain_whole):
         with pytest.raises(ValueError, match="in decimal digits"):
@@ -33,7 +34,7 @@ def test_numbers_in_ascii_digits_are_parsed() -> None:
     assert math.isnan(plain_number("nan"))
 
 
-@pytest.mark.parametrize("text", [text for text in ODD if text.strip() == text])
+@table("text", [text for text in ODD if text.strip() == text])
 def test_other_digits_are_refused_in_requests_and_files(text: str) -> None:
     row = ["2026-11-21T09:30:00.000000000Z", "1", "", "pump", "speed", text, "ok"]
     attempts: list[tuple[Any, Any]] = [
@@ -50,8 +51,8 @@ def test_other_digits_are_refused_in_requests_and_files(text: str) -> None:
             parse(*given) if isinstance(given, tuple) else parse(given)
 
 
-@pytest.mark.parametrize("text", ODD)
-@pytest.mark.parametrize(
+@table("text", ODD)
+@table(
     "words",
     [
         ["set-frequency", "/dev/none", "invt-che", "3", "--yes", "{}"],

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from imported import entries, gaps, omissions, only
+from tables import table
 
 from multidrop.importers import ImportedDevice
 
@@ -26,7 +27,7 @@ def found(device: ImportedDevice) -> list[str]:
 # ---- addresses and tables ----
 
 
-@pytest.mark.parametrize(
+@table(
     ("header", "cells", "at", "table", "gap"),
     [
         ("address,type", "400001,uint16", 0, None, ""),
@@ -93,7 +94,7 @@ def test_unit_of_a_coil_is_left_out_and_reported_as_a_gap(tmp_path: Path) -> Non
 # ---- step and offset ----
 
 
-@pytest.mark.parametrize(
+@table(
     ("header", "cell", "step", "gap"),
     [
         ("factor", "0.1", 0.1, ""),
@@ -143,7 +144,7 @@ def test_offset_together_with_a_scale_is_a_gap(tmp_path: Path) -> None:
 # ---- types ----
 
 
-@pytest.mark.parametrize(
+@table(
     ("header", "cells", "number_format", "gap"),
     [
         ("unit", "C", None, "its type and sign are not stated; uint16 was assumed"),
@@ -187,7 +188,7 @@ def test_register_of_three_words_without_a_type_is_lost(tmp_path: Path) -> None:
         row(tmp_path, "address,count", "0x10,3")
 
 
-@pytest.mark.parametrize(
+@table(
     ("cell", "order", "gap"),
     [
         ("CDAB", "CDAB", ""),
@@ -206,7 +207,7 @@ def test_ambiguous_byte_order_is_a_gap(tmp_path: Path, cell: str, order: str | N
 WRITTEN = ["it is written there; what a write does is not known here"]
 
 
-@pytest.mark.parametrize(
+@table(
     ("word", "said"),
     [
         *((word, []) for word in ("", "R", "RO", "Read", "read-only", "Read Only")),
@@ -218,7 +219,7 @@ def test_write_access_and_unknown_access_are_gaps(tmp_path: Path, word: str, sai
     assert found(row(tmp_path, "address,type,access", f"0x10,uint16,{word}")) == said
 
 
-@pytest.mark.parametrize("word", ["W", "WO", "Write", "write only", "Write-only"])
+@table("word", ["W", "WO", "Write", "write only", "Write-only"])
 def test_write_only_register_is_lost(tmp_path: Path, word: str) -> None:
     with pytest.raises(ValueError, match="a: is only written: a command is never imported"):
         row(tmp_path, "address,type,access", f"0x10,uint16,{word}")
@@ -254,7 +255,7 @@ def test_unit_ids_0_and_255_are_valid_addresses(tmp_path: Path, unit: int) -> No
     assert row(tmp_path, "address,type,slave", f"0x10,uint16,{unit}").address == unit
 
 
-@pytest.mark.parametrize(
+@table(
     ("text", "reason"),
     [
         ("name,x\na,1\n", "no column is called address; the first line names the columns, and it is name, x"),

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from imported import entries, gaps, omissions, only
+from tables import table
 
 from multidrop.importers import csv_tables, esphome, home_assistant, sunspec, telegraf, wb
 from multidrop.importers.device import KeyTable, Treatment, uncarried
@@ -166,7 +167,7 @@ IOBROKER_COLUMNS = "address name description unit type len factor offset formula
 NEURON_COLUMNS = "group interval name address attribute type description decimal precision bias"
 
 
-@pytest.mark.parametrize("source", SCHEMAS)
+@table("source", SCHEMAS)
 def test_every_key_of_a_source_schema_has_a_treatment(source: str) -> None:
     table, keys = SCHEMAS[source]
     assert [key for key in keys.split() if key not in table] == []

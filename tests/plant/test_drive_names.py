@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from tables import table
 
 from multidrop.plant import RESERVED_NAMES, check_drive_name, drive_meant
 
@@ -11,7 +12,7 @@ COMPOSED, APART = "L\u00fcfter", "Lu\u0308fter"
 SHORT, LONG = "\u0439", "\u0438\u0306"
 
 
-@pytest.mark.parametrize(
+@table(
     ("given", "names", "meant"),
     [
         (APART, [COMPOSED, "pump"], COMPOSED),
@@ -31,12 +32,12 @@ def test_a_name_is_found_by_its_unicode_normal_form(given: str, names: list[str]
     assert drive_meant(given, names) == meant
 
 
-@pytest.mark.parametrize("name", [*RESERVED_NAMES, "--all", "-"])
+@table("name", [*RESERVED_NAMES, "--all", "-"])
 def test_reserved_names_are_refused(name: str) -> None:
     with pytest.raises(ValueError, match="give it another name"):
         check_drive_name(name)
 
 
-@pytest.mark.parametrize("name", ["stop-1", "Stop", "gateways", "...", "a-", "__proto"])
+@table("name", ["stop-1", "Stop", "gateways", "...", "a-", "__proto"])
 def test_names_similar_to_reserved_ones_are_allowed(name: str) -> None:
     assert check_drive_name(name)

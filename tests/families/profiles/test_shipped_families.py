@@ -14,6 +14,7 @@ import pytest
 from profile_families import COMMANDED, EXTENDED, OF_PROFILE, READ_ONLY, shipped
 from scripts import rows, typed
 from simulated_bus import SimulatedBus, one
+from tables import table
 
 from multidrop import Bus, Plant
 from multidrop.cli import main
@@ -24,9 +25,9 @@ from multidrop.families.profiles import PROFILES, Profile
 from multidrop.families.registry import GROUP, SHIPPED, find_model, shipped_family
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
-every_family = pytest.mark.parametrize("name", SHIPPED)
-every_profile_family = pytest.mark.parametrize("name", OF_PROFILE)
-every_commanded_family = pytest.mark.parametrize("name", COMMANDED)
+every_family = table("name", SHIPPED)
+every_profile_family = table("name", OF_PROFILE)
+every_commanded_family = table("name", COMMANDED)
 
 # Names that `place` may use for the editions and public programs listed in [family].manual.
 EDITIONS = {

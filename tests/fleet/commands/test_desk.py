@@ -402,7 +402,7 @@ HOSTILE = [
 ]
 
 
-@pytest.mark.parametrize("data", HOSTILE, ids=range(len(HOSTILE)))
+@table("data", HOSTILE, ids=range(len(HOSTILE)))
 def test_hostile_commands_are_refused_in_one_sentence(desk: Desks, data: bytes) -> None:
     answer = desk.desk.offer(LINE, data)
     assert isinstance(answer, CommandAnswer)

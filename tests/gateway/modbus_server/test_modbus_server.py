@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from lines import until
 from modbus_gateway import Gateway, plant_of, request, serving
+from tables import table
 
 from multidrop import (
     BadReply,
@@ -162,8 +163,8 @@ def test_value_from_before_a_command_is_not_used_after_a_reload(gateway: Gateway
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]  # passed
 
 
-@pytest.mark.parametrize("function", [1, 2, 3, 4])
-@pytest.mark.parametrize(
+@table("function", [1, 2, 3, 4])
+@table(
     ("start", "count", "expected"),
     [(0, 0, 3), (0, 2001, 3), (0xFFFF, 2, 2), (0x7000, 1, 2)],
 )
@@ -177,13 +178,13 @@ def test_read_of_126_words_is_refused(gateway: Gateway) -> None:
     assert code(gateway, 1, 3, 0, 126) == 3
 
 
-@pytest.mark.parametrize("function", [1, 3, 5, 6])
-@pytest.mark.parametrize("data", [b"", b"\0", b"\0\0\0", b"\0\0\0\1\0"])
+@table("function", [1, 3, 5, 6])
+@table("data", [b"", b"\0", b"\0\0\0", b"\0\0\0\1\0"])
 def test_request_of_a_wrong_length_is_an_illegal_value(gateway: Gateway, function: int, data: bytes) -> None:
     assert code(gateway, 1, function, data=data) == 3
 
 
-@pytest.mark.parametrize("function", [0, 7, 8, 11, 17, 20, 22, 23, 43, 0x41, 0x80, 0x83, 0xFF])
+@table("function", [0, 7, 8, 11, 17, 20, 22, 23, 43, 0x41, 0x80, 0x83, 0xFF])
 def test_unsupported_functions_are_refused(gateway: Gateway, function: int) -> None:
     with gateway.client() as client:
         client.send(request(1, 1, function, 0, 1))
@@ -199,7 +200,7 @@ def test_unknown_unit_id_is_answered_with_no_path(gateway: Gateway) -> None:
         assert code(gateway, unit, 6, 0, 1) == 0x0A
 
 
-@pytest.mark.parametrize("function", [3, 5, 6, 16, 8])
+@table("function", [3, 5, 6, 16, 8])
 def test_broadcast_closes_the_connection_and_is_not_passed_on(gateway: Gateway, function: int) -> None:
     with gateway.client() as client:
         client.send(request(1, 0, function, BLOCK + 10, 1))
@@ -268,7 +269,7 @@ def test_write_is_carried_out_by_commands_and_echoed(gateway: Gateway) -> None:
     ]
 
 
-@pytest.mark.parametrize(
+@table(
     ("function", "words", "data", "expected"),
     [
         (6, (0x7000, 1), b"", 2),  # no register at this address
@@ -345,7 +346,7 @@ def test_clients_with_the_role_stop_can_only_stop() -> None:
 # ---- stops ----
 
 
-@pytest.mark.parametrize("value", [v for v in range(20) if v not in (5, 6, 8)])
+@table("value", [v for v in range(20) if v not in (5, 6, 8)])
 def test_only_stops_are_accepted_in_a_control_register(gateway: Gateway, value: int) -> None:
     assert code(gateway, 1, 6, CHE_CONTROL, value) == 3
     assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
@@ -365,7 +366,7 @@ def test_every_write_that_means_stop_calls_a_stop(gateway: Gateway) -> None:
     assert stopped == [["mill"]] * 4 + [["pump"]] + [["belt"]] * 4
 
 
-@pytest.mark.parametrize(
+@table(
     ("function", "words", "data", "expected"),
     [
         (6, (BLOCK + 10, 0), b"", 3),
@@ -419,9 +420,7 @@ def test_stop_in_a_write_of_several_coils_is_sent_alone() -> None:
         assert gateway.commands.written == []
 
 
-@pytest.mark.parametrize(
-    ("address", "words"), [(CHE_CONTROL, (1, 5)), (CHE_CONTROL - 1, (5, 1)), (CHE_SETPOINT, (5, 5))]
-)
+@table(("address", "words"), [(CHE_CONTROL, (1, 5)), (CHE_CONTROL - 1, (5, 1)), (CHE_SETPOINT, (5, 5))])
 def test_write_of_several_words_without_a_stop_is_refused(
     gateway: Gateway, address: int, words: tuple[int, ...]
 ) -> None:
@@ -514,7 +513,7 @@ def test_concurrent_stops_are_limited_and_each_request_is_answered(gateway: Gate
         release.set()
 
 
-@pytest.mark.parametrize(
+@table(
     ("failure", "expected"),
     [(BusError("not seen to stand"), 0x0B), (NoReply("mill"), 0x0B), (PortLost("/dev/x", "gone"), 0x0A)],
 )
@@ -595,7 +594,7 @@ def test_values_from_before_a_sleep_read_as_unknown(gateway: Gateway) -> None:
     assert found[8:10] == [0xFFFF, 0xFFFE]  # the longest age
 
 
-@pytest.mark.parametrize(("number", "expected"), [(5.0, 5), (None, 0xFFFE), (0.0, 0xFFFE)])
+@table(("number", "expected"), [(5.0, 5), (None, 0xFFFE), (0.0, 0xFFFE)])
 def test_fault_has_the_number_of_the_drives_family(
     gateway: Gateway, number: float | None, expected: int
 ) -> None:
