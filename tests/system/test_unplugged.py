@@ -35,6 +35,7 @@ def test_five_unplugged_adapters_are_polled_again_when_they_are_back(guest: Gues
     assert found["same names"]
 
 
+@pytest.mark.long
 def test_a_stop_gets_through_when_the_adapter_is_back_and_a_start_does_not(guest: Guest) -> None:
     found = guest.run("commands_while_unplugged", kind="ftdi")
     assert found["ended"]["start"].startswith("PortLost")

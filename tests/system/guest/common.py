@@ -136,7 +136,7 @@ def write_plant(lines: dict[str, tuple[str, Iterable[int]]], more: str = "") -> 
         text += f'[[line]]\nname = "{line}"\nport = "{port}"\n'
         for address in addresses:
             text += f'[[line.drive]]\nname = "{line}-{address}"\nmodel = "{MODEL}"\naddress = {address}\n'
-            text += 'every = "200 ms"\n'
+            text += 'every = "500 ms"\n'
             text += f"poll = {list(POLLED)}\n".replace("'", '"')
     path = Path("/tmp/plant.toml")
     path.write_text(text, "utf-8")

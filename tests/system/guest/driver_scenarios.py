@@ -55,7 +55,6 @@ def rts(kind: str, mode: str, baudrate: int, count: int) -> dict[str, Any]:
         meter = bus.attach(Meter, address=2)
         for _ in range(count):
             good += attempt(meter.read, meter.a) == 0x210
-        utilisation = bus.statistics()
     state = adapter.state
     return {
         "good": good,
@@ -63,7 +62,6 @@ def rts(kind: str, mode: str, baudrate: int, count: int) -> dict[str, Any]:
         "early": state["rts_early"],
         "sent": sum(event["what"] == "sent" for event in state["log"]),
         "levels": [event["rts"] for event in state["log"] if event["what"] == "set"],
-        "statistics": repr(utilisation),
     }
 
 

@@ -35,7 +35,7 @@ def poll_through_unplug(kinds: list[str], names: str) -> dict[str, Any]:
 
     `names` is how the plant names its ports: "path", "by_id" or "by_path".
     """
-    addresses = {kind: [2 * at + 1, 2 * at + 2] for at, kind in enumerate(kinds)}
+    addresses = {kind: [at + 1] for at, kind in enumerate(kinds)}
     adapters = {kind: _encoded(kind, f"un-{kind}", addresses[kind]) for kind in kinds}
     before = [adapter.tty for adapter in adapters.values()]
     lines = {kind: (getattr(adapters[kind], names), addresses[kind]) for kind in kinds}
@@ -148,8 +148,10 @@ def reset_in_start(kind: str, rounds: int) -> list[dict[str, Any]]:
     """Reset the adapter while a start is under way; return each result and the start's frames on the line."""
     adapter = plug.Adapter(kind, f"hub-{kind}", family=FAMILY, addresses=[1])
     facts = []
+    name = Path(adapter.by_id)  # the reset may change the tty's name
     for number in range(rounds):
-        with Bus(adapter.by_id) as bus:
+        plug.wait_until(name.exists)
+        with Bus(str(name)) as bus:
             pump = bus.attach(ErmanERG220, address=1, name="pump")
             insist(pump.set_frequency, 30.0)
             count = len(adapter.state["requests"])
