@@ -34,7 +34,7 @@ FLOORS = [
     {"recording", "sim", "scan", "importers", "params"},
     {"capture", "report", "history"},
     {"gateway", "fleet"},
-    {"cli"},
+    {"cli", "pytest_plugin"},
     {"__init__", "__main__"},
 ]
 TOUCHING_THE_SYSTEM = {"transport", "recording", "history", "sim", "gateway", "fleet", "cli"}
