@@ -59,6 +59,7 @@ COMMANDS = {  # by command: its module in this package, and its help
     "decode": ("decode", "convert a capture into a recording or text"),
     "plot": ("plot", "plot a recording's values"),
     "report": ("report", "summarise a recording on one HTML page"),
+    "completion": ("completion", "print a script by which a shell completes commands"),
     "convert": ("convert", "convert a recording to another format"),
 }
 
