@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from multidrop.gateway.http.rights import Right, digest, new_token, read_tokens
 from multidrop.gateway.settings import read_plant, read_settings
 
 SHA = digest("secret")
+NAMES = ("pump-1", "pump-2", "fan-1")
 
 
 def mistakes(folder: Path, serve: str) -> list[str]:
@@ -106,6 +108,68 @@ verbs = ["pump-1.fly"]
         f"[serve]: audit {tmp_path}/no/such/folder/audit.jsonl cannot be written: No such file or directory",
     ]
     assert sorted(found) == sorted(expected)
+
+
+@table(
+    ("may", "write", "verbs"),
+    [
+        ('verbs = ["pump-*.start"]', set(), {"pump-1.start", "pump-2.start"}),
+        ('verbs = ["*.start"]', set(), {"pump-1.start", "pump-2.start", "fan-1.start"}),
+        ('verbs = ["*-1.start"]', set(), {"pump-1.start", "fan-1.start"}),
+        ('write = ["p*p-1.setpoint"]', {"pump-1.setpoint"}, set()),
+        ('family.invt-che = { write = ["setpoint"] }', {f"{name}.setpoint" for name in NAMES}, set()),
+        (
+            'verbs = ["fan-*.start"]\nfamily.invt-che = { verbs = ["reset_fault"] }',
+            set(),
+            {"fan-1.start", *(f"{name}.reset_fault" for name in NAMES)},
+        ),
+    ],
+)
+def test_patterns_and_families_allow_exactly_the_drives_they_name(
+    tmp_path: Path, may: str, write: set[str], verbs: set[str]
+) -> None:
+    found = read_settings(written(tmp_path, f"[serve.may]\n{may}\n", *NAMES), {}).may
+    assert (found.write, found.verbs) == (write, verbs)
+
+
+def test_a_pattern_allows_only_drives_that_have_the_register(tmp_path: Path) -> None:
+    mixed = plant_text("/dev/ttyUSB0", NAMES, '[serve.may]\nwrite = ["*.setpoint"]\n').replace(
+        'name = "fan-1"\nmodel = "invt-che"', 'name = "fan-1"\nmodel = "yd1000"'
+    )
+    (tmp_path / "plant.toml").write_text(re.sub(r"(?m)^(poll|baudrate) = .*$", "", mixed))
+    found = read_settings(Plant.load(tmp_path / "plant.toml"), {}).may
+    assert found.write == {"pump-1.setpoint", "pump-2.setpoint"}
+
+
+def test_a_drive_whose_name_has_a_star_is_meant_by_its_own_name(tmp_path: Path) -> None:
+    plant = written(tmp_path, '[serve.may]\nverbs = ["p*.start"]\n', "p*", "pump-1")
+    assert read_settings(plant, {}).may.verbs == {"p*.start"}
+
+
+@table(
+    ("may", "sentence"),
+    [
+        ('verbs = ["fan-?.start"]', "there is no drive 'fan-?'; did you mean fan-1"),
+        ('verbs = ["pump-1.*"]', "pump-1 has no verb '*' that a list allows; it has start, "),
+        ('verbs = ["*.stop"]', "*.stop allows nothing: fan-1 has no verb 'stop' that a list allows; it has "),
+        ('verbs = ["Pump-*.start"]', "Pump-*.start allows nothing: there is no drive 'Pump-*'"),
+        ('write = ["*.output_current"]', "fan-1.output_current is never written: it can only be read"),
+        ('write = ["*"]', "'*' is not right; write write = "),
+        (
+            'family.yd1000 = { verbs = ["start"] }',
+            "family yd1000: no drive has this model; the plant has invt-che",
+        ),
+        ('family.invt-che = { verbs = ["pump-1.start"] }', "has no verb 'pump-1.start' that a list allows"),
+        ('family.invt-che = { look = ["token"] }', "family invt-che: unknown key 'look'"),
+        ('family.invt-che = ["start"]', "family invt-che: ['start'] is not a table with write, verbs"),
+    ],
+)
+def test_patterns_and_families_that_allow_nothing_are_refused(
+    tmp_path: Path, may: str, sentence: str
+) -> None:
+    with pytest.raises(PlantError) as wrong:
+        read_settings(written(tmp_path, f"[serve.may]\n{may}\n", *NAMES), {})
+    assert any(sentence in mistake for mistake in wrong.value.mistakes), wrong.value.mistakes
 
 
 def test_mistakes_in_lines_and_serve_table_are_reported_together(tmp_path: Path) -> None:

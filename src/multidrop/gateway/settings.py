@@ -18,7 +18,7 @@ from multidrop import Plant, PlantError
 from multidrop.gateway.http.rights import May, Right, Token, is_loopback, read_tokens
 from multidrop.gateway.live.limits import Limit, read_limits
 from multidrop.gateway.parts import PARTS
-from multidrop.plant import MAY_LISTS, check_listed
+from multidrop.plant import MAY_KEYS, allowed
 from multidrop.supervisor import Hung, in_time
 from multidrop.toml_check import Key, TomlPlace
 
@@ -51,7 +51,7 @@ _SERVE = {
 _MAY = {
     "look": Key(str, 'look = "anyone"'),
     "stop": Key(str, 'stop = "token"'),
-    **MAY_LISTS,
+    **MAY_KEYS,
 }
 
 
@@ -232,15 +232,9 @@ def _may(table: Any, look: str, plant: Plant, place: TomlPlace) -> May:
     for key in ("look", "stop"):
         if given.get(key, "anyone") not in ("anyone", "token"):
             place.wrong(f'{key} = "{given[key]}" is neither "anyone" nor "token"')
-    named = given if plant.lines else {}
-    listed = {
-        key: frozenset(
-            entry for entry in named.get(key, ()) if place.attempt(check_listed, plant, key, entry)
-        )
-        for key in MAY_LISTS
-    }
+    lists = allowed(plant, given if plant.lines else {}, place)
     on_loopback = Right.STOP if given.get("stop") == "anyone" else Right.LOOK
-    return May(given.get("look", look), on_loopback, listed["write"], listed["verbs"])
+    return May(given.get("look", look), on_loopback, lists["write"], lists["verbs"])
 
 
 def _part(name: str, table: Mapping[str, Any], plant: Plant, place: TomlPlace) -> Any:

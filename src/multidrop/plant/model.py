@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Flag
 from importlib import import_module
+from itertools import product
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
@@ -17,12 +19,13 @@ from multidrop.drive.named_verbs import verbs_of
 from multidrop.drive.register import Register
 from multidrop.planning.blocks import Planned, planned
 from multidrop.planning.prediction import prediction_metadata
-from multidrop.toml_check import Key, check_period
+from multidrop.toml_check import Key, TomlPlace, check_period
 
 MAY_LISTS: Final = {
     "write": Key(list, 'write = ["pump-1.frequency_setpoint"]'),
     "verbs": Key(list, 'verbs = ["pump-1.start"]'),
 }
+MAY_KEYS: Final = {**MAY_LISTS, "family": Key(dict, 'family.invt-che = { write = ["setpoint"] }')}
 
 
 @dataclass(frozen=True)
@@ -228,28 +231,76 @@ def _of_register(register: Register[Any]) -> dict[str, Any]:
     }
 
 
-def check_listed(plant: Plant, key: str, entry: object) -> bool:
-    """Check an entry of the list `key`, which names a writable register or a verb of a drive.
+def allowed(plant: Plant, table: Mapping[str, Any], place: TomlPlace) -> dict[str, frozenset[str]]:
+    """Return the registers ("write") and verbs ("verbs"), as "drive.name", that a table `may` allows.
 
-    Returns True, or raises ValueError for a wrong entry. `stop` is never listed: it is always allowed.
+    `table` has checked values of MAY_KEYS. Errors are added to `place`. `stop` is never listed: it is always
+    allowed.
+    """
+    found: dict[str, set[str]] = {key: set() for key in MAY_LISTS}
+    for key, names in found.items():
+        for entry in table.get(key, ()):
+            names.update(place.attempt(_listed, plant, key, entry) or ())
+    for model, lists in table.get("family", {}).items():
+        inside = place.within(f"family {model}")
+        drives = [drive for drive in _drives(plant) if drive.model == model]
+        if not drives:
+            inside.wrong(f"no drive has this model; the plant has {', '.join(sorted(_models(plant)))}")
+        for key, entries in inside.check(lists, MAY_LISTS).items():
+            for drive, entry in product(drives, entries):
+                found[key].update(filter(None, [inside.attempt(_entry, key, drive, entry)]))
+    return {key: frozenset(names) for key, names in found.items()}
+
+
+def _drives(plant: Plant) -> list[Drive]:
+    return [polled.drive for line in plant.lines for polled in line.drives]
+
+
+def _models(plant: Plant) -> set[str]:
+    return {drive.model for drive in _drives(plant)}
+
+
+def _listed(plant: Plant, key: str, entry: object) -> list[str]:
+    """Return what an entry such as "pump-1.start" or "pump-*.start" allows. Raises ValueError if it is wrong.
+
+    `*` stands for any characters of a drive's name. Drives without the register or verb are left out, unless
+    no drive has it.
     """
     name, dot, rest = entry.rpartition(".") if isinstance(entry, str) else ("", "", "")
     if not dot:
         raise ValueError(f"{key}: {entry!r} is not right; write {MAY_LISTS[key].example}")
-    try:
-        _, drive = plant.find_drive(name)
-    except ValueError as unknown:
-        raise ValueError(f"{key}: {str(unknown).replace(f'{plant.path} has', 'there is')}") from None
+    if "*" not in name or any(drive.name == name for drive in _drives(plant)):
+        try:
+            _, drive = plant.find_drive(name)
+        except ValueError as unknown:
+            raise ValueError(f"{key}: {str(unknown).replace(f'{plant.path} has', 'there is')}") from None
+        return [_entry(key, drive, rest)]
+    pattern = re.compile(".*".join(map(re.escape, name.split("*"))))
+    found, refusals = [], [f"there is no drive {name!r}"]
+    for drive in _drives(plant):
+        if pattern.fullmatch(drive.name):
+            try:
+                found.append(_entry(key, drive, rest))
+            except ValueError as refusal:
+                refusals.append(str(refusal).removeprefix(f"{key}: "))
+    if not found:
+        raise ValueError(f"{key}: {entry} allows nothing: {refusals[-1]}")
+    return found
+
+
+def _entry(key: str, drive: Drive, name: object) -> str:
+    """Return "drive.name" if a list may allow this register or verb. Raises ValueError if not."""
+    entry = f"{drive.name}.{name}"
     if key == "write":
         try:
-            register = drive.register(rest)
+            register = drive.register(str(name))
         except ValueError as unknown:
             raise ValueError(f"{key}: {entry}: {unknown}") from None
         if not register.writable:
             raise ValueError(f"{key}: {entry} is never written: {register.never or 'it can only be read'}")
-        return True
-    listed = [verb for verb in verbs_of(drive) if verb != "stop"]
-    if rest not in listed:
-        known = ", ".join(listed) or "none"
-        raise ValueError(f"{key}: {name} has no verb {rest!r} that a list allows; it has {known}")
-    return True
+        return entry
+    verbs = [verb for verb in verbs_of(drive) if verb != "stop"]
+    if name not in verbs:
+        known = ", ".join(verbs) or "none"
+        raise ValueError(f"{key}: {drive.name} has no verb {name!r} that a list allows; it has {known}")
+    return entry

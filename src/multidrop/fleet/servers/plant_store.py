@@ -9,14 +9,14 @@ from __future__ import annotations
 import asyncio
 import json
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 from multidrop import Plant, PlantError, PlantLine
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Bucket, Follower, Record
-from multidrop.plant import MAY_LISTS, check_listed
+from multidrop.plant import MAY_KEYS, allowed
 from multidrop.toml_check import Key, TomlPlace
 
 AT_ONCE = 64  # concurrent writes of records
@@ -47,21 +47,20 @@ def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
     return plant, {table["name"]: _description(table, path.parent, may) for table in document["line"]}
 
 
-def _lists(table: Any, plant: Plant) -> dict[str, list[str]]:
+def _lists(table: Any, plant: Plant) -> dict[str, frozenset[str]]:
     """Return the entries of [fleet.may]: registers and verbs that may be commanded through the fleet."""
     place = TomlPlace(plant.path, ("[fleet]",))
     may = place.check(table, _FLEET).get("may", {})
     inner = place.of_file(plant.path, "[fleet.may]")
-    found = {
-        key: [entry for entry in entries if inner.attempt(check_listed, plant, key, entry)]
-        for key, entries in inner.check(may, MAY_LISTS).items()
-    }
+    found = allowed(plant, inner.check(may, MAY_KEYS), inner)
     if place.config_errors:
         raise PlantError(tuple(place.config_errors))
     return found
 
 
-def _description(table: Mapping[str, Any], folder: Path, may: Mapping[str, Sequence[str]]) -> dict[str, Any]:
+def _description(
+    table: Mapping[str, Any], folder: Path, may: Mapping[str, Collection[str]]
+) -> dict[str, Any]:
     files: dict[str, str] = {}
     for model in {drive["model"] for drive in table["drive"]}:
         if ".py" in model:
