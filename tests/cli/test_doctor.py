@@ -215,8 +215,8 @@ def test_a_long_latency_timer_gets_advice(sysfs: Path) -> None:
         ),
         (
             rs485_finding(None, RS485.RTS_UP, is_usb=True),
-            "rts-up: multidrop turns RTS on while a request leaves, and on USB for 1 to 3 ms longer: a drive "
-            "that answers sooner is not heard",
+            "rts-up: multidrop turns RTS on while a request leaves, and on USB for at least 2 ms longer: a "
+            "drive that answers sooner is not heard",
             True,
         ),
         (

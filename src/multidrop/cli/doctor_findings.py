@@ -83,7 +83,7 @@ def rs485_finding(mode: RS485Mode | None, switch: RS485 = RS485.OFF, *, is_usb: 
             return Finding(
                 "RS-485 mode",
                 f"{switch}: multidrop turns RTS {_LEVELS[switch]} while a request leaves, and on USB for "
-                "1 to 3 ms longer: a drive that answers sooner is not heard",
+                "at least 2 ms longer: a drive that answers sooner is not heard",
                 "use an adapter that switches by itself, or its own direction control (TXDEN of an FTDI)",
             )
         return Finding(
