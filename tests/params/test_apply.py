@@ -7,12 +7,14 @@ from random import Random
 from typing import Any
 
 import pytest
+from disks import full_at
 from examples import usually
 from parameter_drives import factory_reset, obey_the_line, raw_of, set_at_random, with_parameters, writable
 from simulated_bus import SimulatedBus
 
 from multidrop import (
     YD1000,
+    CancelledByStop,
     DelixiModbus,
     DelixiNative,
     Drive,
@@ -180,6 +182,11 @@ def test_backup_file_of_the_gd20_tool_is_restored(monkeypatch: pytest.MonkeyPatc
     assert [*done.plan.left] == ["P00.18", "P14.01"]
 
 
+def test_motor_identification_of_a_delixi_e_is_not_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, drive, _ = attached(monkeypatch, made(DELIXI_E), ["P0.0.24"])
+    assert "identification of the motor" in params.plan(drive, {"P0.0.24": 1}).left["P0.0.24"]
+
+
 def test_parameter_that_the_drive_lacks_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, _ = attached(monkeypatch, YD1000(1), [])
     assert params.plan(drive, {"F240": 5}).left == {"F240": "the drive does not have it"}
@@ -267,6 +274,48 @@ def test_motor_that_starts_meanwhile_ends_the_application(monkeypatch: pytest.Mo
     done = params.apply(drive, {"0009": 200, "0010": 200}, report=start)
     assert [change.parameter.code for change in done.written] == ["0009"]
     assert isinstance(done.failure, WriteForbidden)
+
+
+@pytest.mark.parametrize("family", [YD1000, DelixiModbus])  # a Delixi is sent a stop before its first write
+def test_stop_ends_the_application(monkeypatch: pytest.MonkeyPatch, family: type[Drive]) -> None:
+    values = {"0009": 200, "0010": 200} if family is YD1000 else {"P01.00": 5, "P01.01": 6}
+    line, drive, _ = attached(monkeypatch, family(1), EXTRA[family])
+    done = params.apply(drive, values, report=lambda *_: drive.stop())
+    assert [change.parameter.code for change in done.written] == [next(iter(values))]
+    assert isinstance(done.failure, CancelledByStop)
+    sent = len(line.written)
+    assert params.apply(drive, values).ok
+    assert len(line.written) > sent
+
+
+def test_stop_while_the_plan_is_read_cancels_all_writes(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = attached(monkeypatch, made(GOODRIVE), EXTRA[GOODRIVE])
+    read = drive.link.read_raw
+    monkeypatch.setattr(drive.link, "read_raw", lambda *given: (drive.stop(), read(*given))[1])
+    done = params.apply(drive, {"P00.03": 6000})
+    assert isinstance(done.failure, CancelledByStop)
+    assert {frame[6:11] for frame in line.written} == {"20 00"}  # only the stop
+
+
+@pytest.mark.parametrize("room", [0, 100, 130, 160, 200, 230])  # bytes: cuts each record of the journal
+def test_full_disk_ends_the_application_and_the_next_one_completes_it(
+    monkeypatch: pytest.MonkeyPatch, room: int
+) -> None:
+    line, drive, _ = attached(monkeypatch, ErmanERG220(1), [])
+    monkeypatch.setattr(Ledger, "enter", lambda *given: "")  # its disk has room
+    values = {"b.003": 150, "b.004": 160}
+    with full_at(room):
+        first = params.apply(drive, values)
+    assert isinstance(first.failure, OSError)
+    second = params.apply(drive, values)
+    assert second.ok
+    codes = [change.parameter.code for change in (*first.written, *second.written)]
+    assert codes == [*values]
+    assert len(line.written) == len(values)
+    assert {change.parameter.code for change in first.written} <= {
+        sentence.partition(":")[0] for sentence in second.earlier
+    }
+    assert params.apply(drive, values).earlier == []
 
 
 def test_refusal_of_a_ramp_time_suggests_only_existing_ways(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from hashlib import sha256
 from typing import Any
 
+from multidrop.control.call import Call
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Effect, Outcome
 from multidrop.control.records import commissioning as commissioning_block
@@ -19,7 +22,7 @@ from multidrop.params.plan import ApplyPlan, ParameterChange, check_stands, plan
 from multidrop.params.values import ParameterSet
 from multidrop.transport import clock
 
-NotWritten = BusError | Outcome  # why a parameter was not written; `str` has the sentence
+NotWritten = BusError | OSError | Outcome  # why a parameter was not written; `str` has the sentence
 # Called after each write with its number, the total, the change, and why it was not written (None: it was).
 Report = Callable[[int, int, ParameterChange, NotWritten | None], None]
 
@@ -29,14 +32,15 @@ class Applied:
     """The result of applying parameters: the writes made, and the parameters refused.
 
     `earlier` has a sentence for each write of a previous, interrupted application. `failure` is the error
-    that ended this application early; call `apply` again to continue.
+    that ended this application early; call `apply` again to continue. An OSError comes from the journal or
+    the EEPROM ledger, for example on a full disk.
     """
 
     plan: ApplyPlan
     written: list[ParameterChange] = field(default_factory=list)
     refused: dict[str, NotWritten] = field(default_factory=dict)  # by code
     earlier: list[str] = field(default_factory=list)
-    failure: BusError | None = None
+    failure: BusError | OSError | None = None
 
     @property
     def ok(self) -> bool:
@@ -55,11 +59,12 @@ def apply(
     """Write the parameters that differ to a stopped drive; return the result.
 
     Each parameter is written once, counted in the EEPROM ledger and read back. The drive's state is read
-    before each write; if the motor turns, the application ends. If the process is killed, a second call
-    writes the remaining parameters and reports the first call's writes. With `commissioning`, a register may
-    be written again within a minute. Raises as `plan` does.
+    before each write; if the motor turns, the application ends. A stop of the drive ends it too. If the
+    process is killed, a second call writes the remaining parameters and reports the first call's writes. With
+    `commissioning`, a register may be written again within a minute. Raises as `plan` does.
     """
-    return apply_plan(plan(drive, values, also=also), commissioning=commissioning, report=report)
+    stops = drive.stops_called[0]
+    return _apply(plan(drive, values, also=also), stops, commissioning=commissioning, report=report)
 
 
 def apply_plan(made: ApplyPlan, *, commissioning: bool = False, report: Report | None = None) -> Applied:
@@ -67,15 +72,28 @@ def apply_plan(made: ApplyPlan, *, commissioning: bool = False, report: Report |
 
     If the only evidence of standstill is an output frequency of 0, a stop is sent first.
     """
-    journal = _Journal(made.drive)
+    return _apply(made, made.drive.stops_called[0], commissioning=commissioning, report=report)
+
+
+def _apply(made: ApplyPlan, stops: int, *, commissioning: bool, report: Report | None) -> Applied:
+    """Write a plan's parameters; any stop of the drive after its first `stops` stops cancels the writes."""
+    drive = made.drive
+    journal = _Journal(drive)
     result = Applied(made, earlier=journal.earlier())
+    call = drive.begin_call("application of parameters", stops)
     if made.writes:
-        if not check_stands(made.drive):  # the motor may have a run command at 0 Hz
-            made.drive.stop()
-        journal.begin(made)
+        if not check_stands(drive):  # the motor may have a run command at 0 Hz
+            call.check("the first parameter")
+            drive.stop()
+            call = drive.begin_call("application of parameters", stops + 1)
+        try:
+            journal.begin(made)
+        except OSError as failure:
+            result.failure = failure
+            return result
     with commissioning_block() if commissioning else nullcontext():
         for number, change in enumerate(made.writes, 1):
-            not_written = _write(change, made.drive, result, journal)
+            not_written = _write(change, call, result, journal)
             if report:
                 report(number, len(made.writes), change, not_written)
             if result.failure:
@@ -84,21 +102,25 @@ def apply_plan(made: ApplyPlan, *, commissioning: bool = False, report: Report |
     return result
 
 
-def _write(change: ParameterChange, drive: Drive, result: Applied, journal: _Journal) -> NotWritten | None:
+def _write(change: ParameterChange, call: Call, result: Applied, journal: _Journal) -> NotWritten | None:
     """Write one parameter and note the outcome in `result`; return why it was not written, or None."""
-    parameter = change.parameter
+    drive, parameter = call.drive, change.parameter
     try:
         check_stands(drive)
+        call.check(parameter.code)
         journal.note(code=parameter.code, before=change.before, after=change.after)
         outcome: Outcome = drive.try_write(parameter, parameter.decode(change.after))
-    except BusError as failure:
+    except (BusError, OSError) as failure:
         if isinstance(failure, WriteForbidden) and failure.is_budget:
             return _refused(change, failure, result, journal)
         result.failure = failure
         return failure
     if outcome.effect is Effect.DONE:
-        journal.note(code=parameter.code, outcome="written")
         result.written.append(change)
+        try:
+            journal.note(code=parameter.code, outcome="written")
+        except OSError as failure:
+            result.failure = failure
         return None
     if outcome.effect is Effect.UNCONFIRMED:
         result.failure = outcome.failure
@@ -148,9 +170,16 @@ class _Journal:
         self.note(began=format_time(clock.utc_ns()), source=made.source, drive=made.drive.name)
 
     def note(self, **record: Any) -> None:
-        """Append a record with one system call, so that a killed process leaves only whole records."""
+        """Append a record with one system call, so that a killed process leaves only whole records.
+
+        A line feed before the record separates it from one that a full disk has cut short. Raises OSError if
+        the record cannot be written.
+        """
+        data = b"\n" + json.dumps(record).encode()
         with self._path.open("ab", buffering=0) as file:
-            file.write(json.dumps(record).encode() + b"\n")
+            if file.write(data) != len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._path))
+            os.fsync(file.fileno())  # the record must survive a power failure
 
     def end(self) -> None:
         self._path.unlink(missing_ok=True)
