@@ -9,6 +9,7 @@ _WHOLE = re.compile(r"[+-]?[0-9]+")
 _NUMBER = re.compile(
     r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(nan|inf)", re.IGNORECASE | re.ASCII
 )
+MOST_DIGITS = 100  # Python's own limit is 4300, and its error message advises to change it
 _LOGIN = re.compile(r"(?<=://)[^\s\"]*@")  # up to the last @, because a password may contain one
 
 
@@ -32,6 +33,8 @@ def plain_whole(text: str) -> int:
     """Return a whole number. Raises ValueError for any other text."""
     if not _WHOLE.fullmatch(text.strip(" ")):
         raise ValueError(f"{text!r} is no whole number in decimal digits, such as 10")
+    if len(text) > MOST_DIGITS:
+        raise ValueError(f"a whole number has {MOST_DIGITS} digits at most, and this one has {len(text)}")
     return int(text)
 
 

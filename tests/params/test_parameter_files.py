@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from multidrop import YD1000, params
 from multidrop.params import files
 
+GD20 = "GRUPO_PARAMETRO;CODIGO_FUNCAO;VALOR_PARAMETRO"
 FOUND = params.ParameterSet(
     "yd1000", {"0009": 100, "F240": 7}, source="pump-1", title="YD1000", firmware="104", saved="2026-11-29"
 )
@@ -71,6 +73,11 @@ def test_backup_files_of_the_gd20_tool_are_loaded(tmp_path: Path, quote: str) ->
         ("a.csv", "code;raw\nA;1\nA;2", "A is there twice"),
         ("a.csv", "code;raw\nA;one", "'one' is no whole number"),
         ("a.csv", "# format: 7\ncode;raw\nA;1", "has format 7"),
+        ("a.csv", "code;raw\nA;" + 5000 * "9", "has 100 digits at most, and this one has 5000"),
+        ("a.csv", "# format: " + 5000 * "9" + "\ncode;raw\nA;1", "has 100 digits at most"),
+        ("a.csv", 'code;raw\n"' + 200_000 * "A" + '";1', "is not CSV: field larger than field limit"),
+        ("a.csv", f"{GD20}\n0;3;6000\n00;03;1", r"P00\.03 is there twice"),
+        ("a.csv", f"{GD20}\n0;3;99999999999", r"P00\.03 = 99999999999 is not a raw count"),
         ("a.csv", "GRUPO_PARAMETRO;CODIGO_FUNCAO\n0;1", "lists parameters without values"),
         ("a.csv", "", "is not a parameter file"),
     ],
@@ -83,6 +90,13 @@ def test_invalid_file_raises_a_one_sentence_error(
         params.load(tmp_path / name)
     assert str(raised.value).startswith(str(tmp_path / name))
     assert "\n" not in str(raised.value)
+
+
+def test_a_device_or_directory_is_not_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "port.csv")
+    for path in (tmp_path / "port.csv", tmp_path):
+        with pytest.raises(ValueError, match="is no file, but a directory or a device"):
+            params.load(path)
 
 
 def test_missing_file_raises_a_one_sentence_error(tmp_path: Path) -> None:

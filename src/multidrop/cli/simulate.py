@@ -11,6 +11,7 @@ from multidrop.cli.support.output import print_text
 from multidrop.drive.line_settings import speaks_tcp
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine
+from multidrop.printable import plain_number
 from multidrop.sim import FaultyWire, SimulatedDrive, Simulator, load_faults, serve, simulated
 from multidrop.sim.faults import HELP, Faults
 from multidrop.sim.port import is_dead_link
@@ -73,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _speed(text: str) -> float:
     """Return the factor by which simulated time is faster. Raises ValueError unless it is 0.1 to 100."""
-    speed = float(text)
+    speed = plain_number(text)
     if not 0.1 <= speed <= 100:
         raise ValueError(text)
     return speed

@@ -40,6 +40,8 @@ def is_parameter_file(path: Path | str) -> bool:
 def load(path: Path | str) -> ParameterSet:
     """Return the parameters in a TOML or CSV file. Raises ValueError if the file is invalid."""
     path = Path(path)
+    if path.exists() and not path.is_file():  # reading a serial port would block, and take its drives' bytes
+        raise ValueError(f"{path}: is no file, but a directory or a device; name a parameter file")
     try:
         data = read_bounded(path, MOST_BYTES, "parameter file")
         facts, values = _from_csv(data) if path.suffix.lower() == ".csv" else _from_toml(data)
@@ -147,31 +149,32 @@ def _from_csv(data: bytes) -> tuple[dict[str, str], dict[str, int]]:
     facts = {match[1]: match[2] for line in lines if (match := _FACT.match(line))}
     if "format" in facts:
         number = facts.pop("format")
-        _check_format(int(number) if number.isascii() and number.isdecimal() else number)
+        _check_format(plain_whole(number) if number.isascii() and number.isdecimal() else number)
     table = [line for line in lines if line.strip() and not line.startswith("#")]
     delimiter = ";" if table and ";" in table[0] else ","
     rows = csv.DictReader(table, delimiter=delimiter)
     names = {(name or "").strip().lower(): name for name in rows.fieldnames or ()}
     facts = {name: value for name, value in facts.items() if name in FACTS}
-    if {*names} >= GD20_COLUMNS:
-        group, index, value = (names[name] for name in sorted(GD20_COLUMNS, key=_gd20_order))
-        found = {f"P{_whole(row[group]):02}.{_whole(row[index]):02}": _whole(row[value]) for row in rows}
-        return {"model": GD20_MODEL, **facts}, found
-    if not {"code", "raw"} <= {*names}:
+    if is_gd20 := {*names} >= GD20_COLUMNS:
+        facts = {"model": GD20_MODEL, **facts}
+    elif not {"code", "raw"} <= {*names}:
         if GD20_COLUMNS - {"valor_parametro"} <= {*names}:
             raise ValueError("lists parameters without values; name the tool's backup, not its list")
         raise ValueError("is not a parameter file: its first row has no code and raw")
-    found = {}
-    for row in rows:
-        code = (row[names["code"]] or "").strip()
-        if code in found:
-            raise ValueError(f"{code} is there twice")
-        found[code] = _raw(code, _whole(row[names["raw"]]))
+    found: dict[str, int] = {}
+    try:
+        for row in rows:
+            code = _gd20_code(row, names) if is_gd20 else (row[names["code"]] or "").strip()
+            if code in found:
+                raise ValueError(f"{code} is there twice")
+            found[code] = _raw(code, _whole(row[names["valor_parametro" if is_gd20 else "raw"]]))
+    except csv.Error as failure:
+        raise ValueError(f"is not CSV: {failure}") from failure
     return facts, found
 
 
-def _gd20_order(name: str) -> int:
-    return ("grupo_parametro", "codigo_funcao", "valor_parametro").index(name)
+def _gd20_code(row: Mapping[str, str | None], names: Mapping[str, str]) -> str:
+    return f"P{_whole(row[names['grupo_parametro']]):02}.{_whole(row[names['codigo_funcao']]):02}"
 
 
 def _whole(text: str | None) -> int:
