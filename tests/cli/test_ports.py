@@ -70,3 +70,13 @@ def test_advice_names_the_group_that_owns_the_port(tmp_path: Path, monkeypatch: 
     port.chmod(0o660)
     user = pwd.getpwuid(os.getuid()).pw_name
     assert ports._permission_advice(port).startswith(f"sudo usermod -aG {group.gr_name} {user}")
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="permissions of POSIX")
+def test_advice_in_a_container_whose_user_has_no_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = tmp_path / "ttyUSB0"
+    port.touch(mode=0o660)
+    monkeypatch.setattr(os, "getuid", lambda: 4_123_456)
+    assert f"in group {port.stat().st_gid}" in ports._permission_advice(port)

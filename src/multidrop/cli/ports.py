@@ -71,13 +71,17 @@ def _permission_advice(device: Path) -> str:
     import grp
     import pwd
 
-    about, user = device.stat(), pwd.getpwuid(os.getuid())
-    group = grp.getgrgid(about.st_gid)
+    about = device.stat()
+    try:
+        owner, user = (pwd.getpwuid(number).pw_name for number in (about.st_uid, os.getuid()))
+        group = grp.getgrgid(about.st_gid)
+    except KeyError:  # in a container, numbers may have no names
+        return f"start this program, or its container, in group {about.st_gid}"
     if about.st_mode & 0o060 != 0o060 or not about.st_gid:
-        return f"only {pwd.getpwuid(about.st_uid).pw_name} may; a udev rule can give it to a group"
-    if user.pw_name in group.gr_mem:
+        return f"only {owner} may; a udev rule can give it to a group"
+    if user in group.gr_mem:
         return f"you were added to its group {group.gr_name} after this login: log out and in again"
-    return f"sudo usermod -aG {group.gr_name} {user.pw_name}, then log out and in again"
+    return f"sudo usermod -aG {group.gr_name} {user}, then log out and in again"
 
 
 def _other_ports() -> Iterator[SerialPort]:
