@@ -503,6 +503,57 @@ def test_mistakes_in_the_parameters_section_are_reported(tmp_path: Path, rule: s
     assert any(told in mistake for mistake in mistakes(tmp_path, text))
 
 
+@pytest.mark.parametrize(
+    ("extended", "declared", "told"),
+    [
+        (
+            "yd1000",
+            '[setting]\ncontrol = { at = "1000H" }',
+            "[setting] control: YD1000 has this name already",
+        ),
+        (
+            "yd1000",
+            '[reading]\ncontrol = { at = "1300H" }',
+            "[reading] control: YD1000 has this name already",
+        ),
+        (
+            "yd1000",
+            '[text]\ncontrol = { at = "1300H", length = 4 }',
+            "[family]: control: YD1000 has this name",
+        ),
+        (
+            "yd1000",
+            '[setting]\nhz = { at = "1001H", step = 0.01, unit = "Hz" }',
+            "YD1000 has frequency at this",
+        ),
+        ("yd1000", '[setting]\nx = { at = "0900H", ram_address = "0800H" }', "has baudrate_setting at this"),
+        ("delixi-modbus", "[setting]\nsource = { at = 0 }", "(Modbus) has run_source at this address"),
+        (
+            "yd1000",
+            '[reading]\nx = { at = "1300H" }\n[parameters]\ngroups = [{ code = "F", at = 0, count = 9 }]',
+            "[parameters]: YD1000 has its own rule",
+        ),
+        (
+            "yd1000",
+            '[reading]\nx = { at = "1300H" }\n[[identify]]\nregister = "x"\nis = [5]',
+            "[[identify]]: YD1000 has its own identity check",
+        ),
+    ],
+)
+def test_file_that_extends_a_family_replaces_none_of_its_safeguards(
+    tmp_path: Path, extended: str, declared: str, told: str
+) -> None:
+    (only,) = mistakes(tmp_path, f'{HEAD}extends = "{extended}"\n{declared}\n')
+    assert told in only
+
+
+def test_file_that_extends_a_family_may_read_its_addresses_and_add_settings(tmp_path: Path) -> None:
+    more = '[reading]\nheld = { at = "0009H" }\n[setting]\nfan = { at = "0900H" }\n'
+    assert {"held", "fan", "control"} <= family(
+        tmp_path, f'{HEAD}extends = "yd1000"\n{more}'
+    ).registers.keys()
+
+
 def test_number_format_and_order_of_a_register_are_loaded(tmp_path: Path) -> None:
     text = (
         HEAD

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from multidrop.drive.declaration_check import DeclarationError, declaration_errors
+from multidrop.drive.declaration_check import DeclarationError, declaration_errors, inherited_errors
 from multidrop.drive.family import TAKEN_NAMES, Drive
 from multidrop.drive.register import Access
 from multidrop.families import MODELS
@@ -148,6 +148,7 @@ def _family(
         place.wrong(f"declares more than {MOST_REGISTERS} registers; remove unused ones")
         return None
     base = _base(given, of_family)
+    _check_inherited(base, document, declared, texts, place)
     namespace: dict[str, Any] = {
         "__module__": __name__,
         "model": path.name,
@@ -182,6 +183,30 @@ def _base(given: Mapping[str, Any], place: TomlPlace) -> type[Drive]:
             hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(classes)}"
             place.wrong(f"{key} = {shown(given[key])} is not known; {hint}")
     return Drive
+
+
+def _check_inherited(
+    base: type[Drive],
+    document: Mapping[str, Any],
+    declared: Declared,
+    texts: Iterable[str],
+    place: TomlPlace,
+) -> None:
+    """Report each declaration that would replace a part of the built-in family that this file extends.
+
+    The part may be a limit, or may keep a motor from being started.
+    """
+    if base not in MODELS.values():
+        return
+    own = {name for name in (*declared.places, *texts) if name not in TAKEN_NAMES}
+    taken = [name for name in own if hasattr(base, name)]
+    _report([f"{name}: {base.title} has this name already; rename it" for name in taken], declared, place)
+    others = {name: one for name, one in declared.registers.items() if name not in taken}
+    _report(inherited_errors(others, base.registers, base.title), declared, place)
+    if "parameters" in document and base.parameter_space is not None:
+        place.within("[parameters]").wrong(f"{base.title} has its own rule; leave this section out")
+    if "identify" in document and base.identify is not Drive.identify:
+        place.within("[[identify]]").wrong(f"{base.title} has its own identity check; leave this section out")
 
 
 def _bases(key: str) -> Mapping[str, type[Drive]]:
