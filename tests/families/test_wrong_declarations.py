@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 from examples import usually
 from profile_families import COMMANDED, READ_ONLY, shipped
-from simulated_bus import SimulatedBus
+from simulated_bus import SimulatedBus, is_write
 from tables import table
 
-from multidrop.core import Message
+from multidrop.core import Framing, Message, build_reply
 from multidrop.drive import ANOTHER_FAMILY, Drive
 from multidrop.errors import BusError, DriveException, NoReply, Unconfirmed, WriteForbidden
 from multidrop.families import MODELS, YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
@@ -196,6 +196,22 @@ def test_optidrive_family_at_an_erman_reports_an_unknown_state(monkeypatch: pyte
     with pytest.raises(Unconfirmed, match=r"all read 0, as unused registers .*: look at the motor"):
         pair.drive.stop()
     assert pair.turns
+
+
+@pytest.mark.parametrize("declared", COMMANDED)
+def test_gateway_that_answers_ffff_for_a_drive_prevents_no_stop(
+    monkeypatch: pytest.MonkeyPatch, declared: str
+) -> None:
+    bus = SimulatedBus(monkeypatch)
+    drive = bus.attach(DECLARED[declared](1))
+    bus.answers = lambda request: (
+        None
+        if is_write(request)
+        else build_reply(Framing.RTU, Message(1, request.function, data=b"\xff\xff" * request.count))
+    )
+    with pytest.raises(BusError):
+        drive.stop(seconds=1)
+    assert bus.written
 
 
 # ---- a scan ----

@@ -190,6 +190,7 @@ def _enumeration(kind: Any, name: str, members: dict[str, int]) -> type[Any]:
 
 
 STOP_TIME = 60.0  # s; profiles have no role for the deceleration time
+UNUSED = (0, 0xFFFF)  # words of unused registers, and of gateways that answer for an absent drive
 RESET_TIME = 2.0  # s within which a reset fault must disappear
 
 
@@ -210,8 +211,8 @@ class Profile(Drive):
     is confirmed, and observed until the drive is at rest. A start or a reset is written once. A start is
     refused in a fault, in local control, and without a setpoint in force. A reset is refused while the
     motor turns, never has a bit that runs it, and comes after a stop. `identify` only reads. It withholds a
-    stop only if the status is another profile's and not 0, and `station` or `signature` another drive's:
-    these two are settings, and may not be in force yet.
+    stop only if the status is another profile's, neither 0 nor FFFFH, and `station` or `signature` another
+    drive's: these two are settings, and may not be in force yet.
     """
 
     roles: ClassVar[Mapping[str, Role]] = {}
@@ -361,7 +362,7 @@ class Profile(Drive):
                 wrong.append(f"{register.name} is {register.format(value)}")
         if wrong:
             kind = self.title or type(self).__name__
-            rule = ANOTHER_FAMILY if impossible and status and len(wrong) > 1 else ""
+            rule = ANOTHER_FAMILY if impossible and status not in UNUSED and len(wrong) > 1 else ""
             raise WriteForbidden(f"{self.name} is not known as {kind}: {'; '.join(wrong)}", rule=rule)
 
     @verb
