@@ -77,6 +77,22 @@ def test_a_replaced_drive_is_not_started() -> None:
         assert received.writes == []
 
 
+def test_a_drive_replaced_while_its_write_is_counted_is_not_written(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A locked ledger delays the write; meanwhile the adapter is unplugged, and another line plugged in."""
+    line, drive, _ = one(monkeypatch, YD1000(1))
+
+    def replace(*given: object) -> str:
+        line.sims, line.queue = (simulated(DelixiModbus(1)),), object()
+        return ""
+
+    monkeypatch.setattr(records.Ledger, "enter", replace)
+    with pytest.raises(WriteForbidden):
+        drive.write("acceleration_time", 20.0)
+    assert line.written == []
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("model", MAKE)
 def test_a_silent_drive_is_identified_once_before_the_next_write(

@@ -74,6 +74,7 @@ class Writer:
         self.records.note_called(drive, write_request(drive, register, raw), _in_words(register, asked))
         if kept is not Kept.RAM:
             self.records.count(drive, register, kept)
+        self.identity_check.check(drive, call.look)  # again, because the records may have taken long
         return self._send(drive, register, raw, call, 0.0, self.records.log)
 
     def insist(
