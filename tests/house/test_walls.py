@@ -45,6 +45,7 @@ FILES_TOUCHING_THE_SYSTEM = {
     "control/audit_log.py",
     "control/exit_hook.py",
     "control/latches.py",
+    "params/apply.py",
     "gateway/clock.py",
     "gateway/http/connections.py",
     "gateway/gateway.py",

@@ -477,25 +477,8 @@ def _sharing_errors(registers: list[Register[Any]]) -> Iterator[str]:
                 yield f"{one.name}: its ram_address is that of {other.name}, which commands the motor"
 
 
-def inherited_errors(
-    registers: Mapping[str, Register[Any]], inherited: Mapping[str, Register[Any]], kind: str
-) -> Iterator[str]:
-    """Yield a sentence for each register that would be written at an address of an inherited register.
-
-    It would bypass what the inherited register forbids. `kind` is the title of the family that is extended.
-    """
-    owners = {place: one for one in inherited.values() for place in _written_places(one)}
-    for register in registers.values():
-        for place in _written_places(register):
-            if place in owners:
-                yield (
-                    f"{register.name}: {kind} has {owners[place].name} at this address, with its own limits; "
-                    "leave it out, or declare a reading"
-                )
-                break
-
-
-def _written_places(register: Register[Any]) -> list[tuple[object, int]]:
+def written_places(register: Register[Any]) -> list[tuple[object, int]]:
+    """Return the table and address of each item that a write of this register changes."""
     if register.access is Access.READING:
         return []
     starts = [register.address, *([] if register.ram_address is None else [register.ram_address])]

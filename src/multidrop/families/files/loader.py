@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from multidrop.drive.declaration_check import DeclarationError, declaration_errors, inherited_errors
+from multidrop.drive.declaration_check import DeclarationError, declaration_errors, written_places
 from multidrop.drive.family import TAKEN_NAMES, Drive
-from multidrop.drive.register import Access
+from multidrop.drive.register import Access, Register
 from multidrop.families import MODELS
 from multidrop.families.files import FamilyError
 from multidrop.families.files.notation import Counting
@@ -202,11 +202,28 @@ def _check_inherited(
     taken = [name for name in own if hasattr(base, name)]
     _report([f"{name}: {base.title} has this name already; rename it" for name in taken], declared, place)
     others = {name: one for name, one in declared.registers.items() if name not in taken}
-    _report(inherited_errors(others, base.registers, base.title), declared, place)
+    _report(_inherited_errors(others, base.registers, base.title), declared, place)
     if "parameters" in document and base.parameter_space is not None:
         place.within("[parameters]").wrong(f"{base.title} has its own rule; leave this section out")
     if "identify" in document and base.identify is not Drive.identify:
         place.within("[[identify]]").wrong(f"{base.title} has its own identity check; leave this section out")
+
+
+def _inherited_errors(
+    registers: Mapping[str, Register[Any]], inherited: Mapping[str, Register[Any]], title: str
+) -> Iterator[str]:
+    """Yield a sentence for each register that would be written at an address of an inherited register.
+
+    It would bypass what the inherited register forbids. `title` is that of the extended family.
+    """
+    owners = {place: one for one in inherited.values() for place in written_places(one)}
+    for register in registers.values():
+        found = next((owners[place] for place in written_places(register) if place in owners), None)
+        if found is not None:
+            yield (
+                f"{register.name}: {title} has {found.name} at this address, with its own limits; leave it "
+                "out, or declare a reading"
+            )
 
 
 def _bases(key: str) -> Mapping[str, type[Drive]]:
