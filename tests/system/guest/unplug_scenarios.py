@@ -219,7 +219,8 @@ def gateway() -> dict[str, Any]:
             facts[moment] = health
             return isinstance(health, dict) and (health["lines"]["a"] == "ok") == is_ok
 
-        plug.wait_until(is_there)
+        result = attempt(plug.wait_until, is_there)
+        assert result is None, f"{moment}: {facts[moment]}\n{serving.said}"
         facts[f"drive {moment}"] = _get("/api/drive/a-1")
 
     wait_for("before", is_ok=True)
