@@ -43,6 +43,7 @@ def test_failed_usb_transfers_lose_no_reply(guest: Guest, kind: str) -> None:
 # ---- doctor, and ports that cannot be opened ----
 
 
+@pytest.mark.long
 def test_doctor_advises_only_settings_that_the_driver_has(guest: Guest) -> None:
     """Only ftdi_sio has a latency timer and needs low latency. No driver has an RS-485 mode."""
     found = guest.run("doctor")
@@ -101,6 +102,12 @@ def test_a_16550_switches_rts_and_has_no_mode_of_its_own(guest: Guest) -> None:
     assert "the driver has no RS-485 mode" in found["kernel"]
 
 
+@pytest.mark.long
+def test_a_16550_refuses_a_speed_without_a_divisor(guest: Guest) -> None:
+    (fact,) = guest.run("uart", wanted=[(76800, "8N1")])
+    assert "its UART would run at 57600" in fact["read"]
+
+
 # ---- RTS ----
 
 
@@ -110,6 +117,18 @@ def test_rts_lets_the_transceiver_send_at_each_request(guest: Guest, kind: str, 
     found = guest.run("rts", kind=kind, mode=mode, baudrate=9600, count=5)
     assert found["sent"] > 0  # not always five: a busy computer repeats requests, or loses the port
     assert found["missing"] == 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("mode", ["rts-up", "rts-down"])
+@pytest.mark.parametrize("baudrate", [9600, 38400, 115200])
+@USB
+def test_rts_never_changes_before_the_last_bit_has_left(
+    guest: Guest, kind: str, baudrate: int, mode: str
+) -> None:
+    found = guest.run("rts", kind=kind, mode=mode, baudrate=baudrate, count=100)
+    assert found["sent"] > 0
+    assert found["missing"] == found["early"] == 0
 
 
 @pytest.mark.long

@@ -86,7 +86,7 @@ def doctor() -> dict[str, dict[str, list[str]]]:
     found = {}
     for kind, command in commands.items():
         status, text = command.outcome()
-        assert status == 0, f"{kind}: {text}"
+        assert status == 0, f"{kind}: status {status}: {text}"
         findings = json.loads(text)["findings"]
         found[kind] = {finding["topic"]: [finding["what"], finding["advice"]] for finding in findings}
     return found
