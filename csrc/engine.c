@@ -208,14 +208,14 @@ static int may_have_news(const struct md_port *port)
     return port->turn.source == MD_NO_SOURCE || port->turn.line.listened_ns;
 }
 
-/* Begin or end realtime scheduling, for which a client waits. */
+/* Start or end realtime scheduling if a client waits for that. */
 static void change_realtime(struct md_engine *engine)
 {
     if (engine->is_realtime_changed)
         return;
     engine->realtime_failure = 0;
     if (engine->wants_realtime)
-        engine->realtime_failure = md_realtime_begin(&engine->realtime);
+        engine->realtime_failure = md_realtime_start(&engine->realtime);
     else
         md_realtime_end(&engine->realtime);
     engine->is_realtime_changed = engine->has_news = 1;
@@ -328,7 +328,7 @@ int md_wake_lateness(int is_realtime, int64_t period_ns, int64_t *late_ns, int n
         return -errno;
     void *ready[READY];
     make_punctual();
-    int failure = is_realtime ? md_realtime_begin(&engine->realtime) : 0;
+    int failure = is_realtime ? md_realtime_start(&engine->realtime) : 0;
     int64_t until_ns = md_now_ns();
     for (int i = 0; i < n && !failure; i++) {
         until_ns = later(until_ns, md_now_ns()) + period_ns;

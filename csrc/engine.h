@@ -55,9 +55,9 @@ struct md_engine {
     unsigned count, room;
     int64_t lateness_ns; /* how late the thread usually wakes from a sleep */
     struct md_realtime realtime;
-    int wants_realtime;      /* what the last change was to; the client waits until it is done */
-    int realtime_failure;    /* 0 or -errno of the last change */
-    int is_realtime_changed; /* the last change is done */
+    int wants_realtime;      /* 1: start realtime scheduling, 0: end it */
+    int realtime_failure;    /* 0 or -errno */
+    int is_realtime_changed; /* no client waits for a change */
 };
 
 /* This process's right to send on its lines, which ends at a deadline. */

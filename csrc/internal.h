@@ -178,7 +178,7 @@ struct md_realtime {
 #endif
 };
 
-int md_realtime_begin(struct md_realtime *realtime); /* 0, -errno */
+int md_realtime_start(struct md_realtime *realtime); /* 0, -errno */
 void md_realtime_end(struct md_realtime *realtime);
 /* End realtime scheduling if the thread used more than half of a processor. Call this at least twice a second
  * of the thread's CPU time. */

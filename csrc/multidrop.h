@@ -285,10 +285,10 @@ struct md_tap;
 struct md_mastership;
 
 struct md_engine *md_engine_start(void); /* the thread of all lines; it lives as long as the process */
-/* Begin or end realtime scheduling of the thread, which ends it by itself if it uses too much of a processor;
+/* Start or end realtime scheduling of the thread, which ends it by itself if it uses too much of a processor;
  * 0, -errno. One client at a time may call this. */
 int md_engine_realtime(struct md_engine *engine, int wanted);
-int md_engine_is_realtime(struct md_engine *engine); /* 1: realtime scheduling has begun and not ended */
+int md_engine_is_realtime(struct md_engine *engine); /* 1: under realtime scheduling now */
 /* Sleep `n` times for `period_ns` on the calling thread, as the engine's thread does, and write by how much each
  * sleep was too long; 0, -errno. */
 int md_wake_lateness(int is_realtime, int64_t period_ns, int64_t *late_ns, int n);

@@ -33,7 +33,7 @@ static int is_loaded(const ElfW(Phdr) *segment)
     return segment->p_type == PT_LOAD;
 }
 
-/* Change the memory of an object's segments if one of them contains this file's constants. */
+/* Change an object's segments if it is the core: if it contains this file's constants. */
 static int change_own(struct dl_phdr_info *object, size_t size, void *argument)
 {
     change_function **change = argument;
@@ -88,7 +88,7 @@ static void note_check(struct md_realtime *realtime, int64_t now_ns)
     set_timer(realtime);
 }
 
-int md_realtime_begin(struct md_realtime *realtime)
+int md_realtime_start(struct md_realtime *realtime)
 {
     struct sigevent end = {.sigev_notify = SIGEV_SIGNAL, .sigev_signo = SIGXCPU};
     if (realtime->is_on)
@@ -133,7 +133,7 @@ void md_realtime_check(struct md_realtime *realtime, int64_t now_ns)
 
 #include <avrt.h>
 
-int md_realtime_begin(struct md_realtime *realtime)
+int md_realtime_start(struct md_realtime *realtime)
 {
     DWORD index = 0;
     if (!realtime->is_on)
@@ -156,7 +156,7 @@ void md_realtime_check(struct md_realtime *realtime, int64_t now_ns)
 
 #else
 
-int md_realtime_begin(struct md_realtime *realtime)
+int md_realtime_start(struct md_realtime *realtime)
 {
     (void)realtime;
     return -ENOSYS;

@@ -17,7 +17,7 @@ static long policy(void)
 static void test_half_of_a_processor_is_the_limit(void)
 {
     struct md_realtime realtime = {0};
-    assert(md_realtime_begin(&realtime) == 0 && policy() == SCHED_FIFO);
+    assert(md_realtime_start(&realtime) == 0 && policy() == SCHED_FIFO);
     int64_t due_ns = realtime.checked_ns + CHECK_NS;
 
     realtime.used_ns -= CHECK_NS;
@@ -37,7 +37,7 @@ static void test_children_have_normal_scheduling(void)
 {
     struct md_realtime realtime = {0};
     int status;
-    assert(md_realtime_begin(&realtime) == 0);
+    assert(md_realtime_start(&realtime) == 0);
     pid_t child = fork();
     if (!child)
         _exit((int)policy());
@@ -51,7 +51,7 @@ static void test_a_thread_that_hangs_ends_the_process(void)
     pid_t child = fork();
     if (!child) {
         struct md_realtime realtime = {0};
-        md_realtime_begin(&realtime);
+        md_realtime_start(&realtime);
         realtime.used_ns = used_ns() - MOST_CPU_NS; /* as if it had run for so long without a check */
         set_timer(&realtime);
         for (;;)
@@ -63,7 +63,7 @@ static void test_a_thread_that_hangs_ends_the_process(void)
 int main(void)
 {
     struct md_realtime realtime = {0};
-    if (md_realtime_begin(&realtime)) {
+    if (md_realtime_start(&realtime)) {
         puts("this process may not use realtime scheduling");
         return 77;
     }

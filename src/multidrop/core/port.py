@@ -196,9 +196,10 @@ class Realtime:
         self.is_held = False  # the system did not refuse, and the thread has not ended it
 
     def want(self, wanted: bool) -> None:
-        """Begin or end the wish. Raises OSError if the system refuses realtime scheduling."""
+        """Start or end the wish. Raises OSError if the system refuses realtime scheduling."""
         if wanted != self.is_wanted:
             self.is_wanted = wanted
+            self.is_held = False  # before the thread returns to normal scheduling: see `has_ended`
             _engine.set_realtime(self, wanted)
             self.is_held = wanted
 
