@@ -267,6 +267,9 @@ class ClockedLine:
     def note_foreign(self) -> None:
         pass
 
+    def note_stall(self) -> None:
+        pass
+
     def overruns(self) -> None:
         pass
 

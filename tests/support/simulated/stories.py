@@ -228,7 +228,7 @@ class PathLine:
         self.port = self.identity = wire.where if speaks_tcp(wire.where) else "test line"
         self.now = BEGIN_NS
         self.wire = wire
-        self.has_echo = self.is_lost = False
+        self.has_echo = self.is_lost = self.is_stalled = False
         self.may_send = True  # has no mastership
         self.is_tcp, self.ids = speaks_tcp(self.port), wire.ids
         self.queue = ClockedPort(self, transactions_of(self))
