@@ -82,17 +82,44 @@ def _fits(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Key:
-    """A key that a table may have: the type of its value, and an example."""
+    """A key that a table may have: the type of its value, an example, and keywords for its JSON Schema."""
 
     kind: type | tuple[type, ...]
     example: str
     needed: bool = False
+    keywords: Mapping[str, Any] = field(default_factory=dict)
 
     def takes(self, value: Any) -> bool:
         """Return True for a non-empty value of the key's type. true and false are not numbers."""
         if isinstance(value, bool):
             return self.kind is bool
         return isinstance(value, self.kind) and value not in ("", [])
+
+
+_TYPES: Mapping[type, Mapping[str, Any]] = {
+    str: {"type": "string", "minLength": 1},
+    int: {"type": "integer"},
+    float: {"type": "number"},
+    bool: {"type": "boolean"},
+    list: {"type": "array", "minItems": 1},
+    dict: {"type": "object"},
+}
+
+
+def json_schema(keys: Mapping[str, Key]) -> dict[str, Any]:
+    """Return the JSON Schema of a table with these keys, for editors."""
+    return {
+        "type": "object",
+        "properties": {name: _key_schema(key) for name, key in keys.items()},
+        "required": [name for name, key in keys.items() if key.needed],
+        "additionalProperties": False,
+    }
+
+
+def _key_schema(key: Key) -> dict[str, Any]:
+    kinds = [_TYPES[kind] for kind in (key.kind if isinstance(key.kind, tuple) else (key.kind,))]
+    alternatives = dict(kinds[0]) if len(kinds) == 1 else {"anyOf": kinds}
+    return {**alternatives, **key.keywords, "description": key.example}
 
 
 Steps = tuple[tuple[str, int], ...]  # a table's path: for each level, the array's name and the table's number
@@ -239,9 +266,13 @@ class TomlPlace:
         return meant
 
 
+_DURATION = r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|h)"
+DURATION: Mapping[str, Any] = {"pattern": rf"^\s*(?=.*[1-9]){_DURATION}\s*$"}  # JSON Schema
+
+
 def parse_duration(text: str) -> float:
     """Return the seconds of a duration such as "50 ms". Raises ValueError if it is not a valid one."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|h)", str(text).strip(), re.ASCII)
+    match = re.fullmatch(_DURATION, str(text).strip(), re.ASCII)
     units = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
     seconds = float(match[1]) * units[match[2]] if match else 0
     if not _SHORTEST <= seconds <= _LONGEST:

@@ -29,6 +29,7 @@ _MISNAMED = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 
 COMMANDS = {  # by command: its module in this package, and its help
     "demo": ("demo", "poll simulated drives of every family on one line"),
+    "schema": ("schema", "print the JSON Schema of a plant file, for editors"),
     "models": ("models", "list the families, or one family's registers"),
     "check": ("check", "check a family file or a plant file; opens no port"),
     "import": ("import_family", "convert another program's register table into a family file"),

@@ -12,6 +12,9 @@ from multidrop.core import Framing
 from multidrop.errors import NoSuchPort
 from multidrop.printable import masked
 
+BAUDRATES = (50, 4_000_000)  # least and most
+FORMAT = "[78][NEO][12]"
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -21,9 +24,9 @@ class Settings:
     format: str
 
     def __post_init__(self) -> None:
-        if not isinstance(self.baudrate, int) or not 50 <= self.baudrate <= 4_000_000:
-            raise ValueError(f"baud rate {self.baudrate!r} is outside 50 to 4000000")
-        if not re.fullmatch("[78][NEO][12]", self.format):
+        if not isinstance(self.baudrate, int) or not (BAUDRATES[0] <= self.baudrate <= BAUDRATES[1]):
+            raise ValueError(f"baud rate {self.baudrate!r} is outside {BAUDRATES[0]} to {BAUDRATES[1]}")
+        if not re.fullmatch(FORMAT, self.format):
             raise ValueError(
                 f"format {self.format!r} is not data bits, parity and stop bits, such as 8N1, 8E1 or 7N2"
             )

@@ -11,13 +11,22 @@ from typing import Any
 
 from multidrop.core import RS485, Echo, TransactionIds
 from multidrop.drive.family import Drive
-from multidrop.drive.line_settings import Settings, check_port, check_settle, speaks_tcp
+from multidrop.drive.line_settings import BAUDRATES, FORMAT, Settings, check_port, check_settle, speaks_tcp
 from multidrop.families import MODELS
 from multidrop.families.files import FamilyError
-from multidrop.families.registry import find_model
-from multidrop.plant.drive_names import check_drive_name
+from multidrop.families.registry import SHIPPED, find_model, installed_models, shipped_family
+from multidrop.plant.drive_names import RESERVED_NAMES, check_drive_name
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
-from multidrop.toml_check import Key, TomlPlace, duration_of, grouped, line_numbers, read_document
+from multidrop.toml_check import (
+    DURATION,
+    Key,
+    TomlPlace,
+    duration_of,
+    grouped,
+    json_schema,
+    line_numbers,
+    read_document,
+)
 
 
 class PlantError(ValueError):
@@ -63,6 +72,11 @@ def port_or_address(name: Path | str) -> str:
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/{1,2}(.*)", re.IGNORECASE)  # Path reduces two slashes to one
 _PORTS = ("tcp", "socket", "rfc2217")
 
+NAME = {"not": {"enum": [*RESERVED_NAMES]}, "pattern": "^[^-]"}
+FORMATS = {"pattern": f"^{FORMAT}$"}
+BAUDRATE = {"minimum": BAUDRATES[0], "maximum": BAUDRATES[1]}
+TEXTS = {"items": {"type": "string", "minLength": 1}}
+
 _PLANT = {
     "realtime": Key(bool, "realtime = true"),
     "line": Key(list, "[[line]], in two brackets, with its name, port and drives", needed=True),
@@ -71,37 +85,92 @@ _PLANT = {
 }
 
 _LINE = {
-    "name": Key(str, 'name = "hall-1"', needed=True),
+    "name": Key(str, 'name = "hall-1"', needed=True, keywords=NAME),
     "port": Key(str, 'port = "/dev/ttyUSB0"', needed=True),
-    "baudrate": Key(int, "baudrate = 9600"),
-    "format": Key(str, 'format = "8N1"'),
-    "silence": Key(str, 'silence = "500 us"'),
-    "switching": Key(str, 'switching = "2 ms"'),
-    "echo": Key(str, 'echo = "auto"'),
-    "rs485": Key(str, 'rs485 = "kernel"'),
-    "settle": Key(str, 'settle = "1.5 s"'),
-    "transaction": Key(str, 'transaction = "match"'),
+    "baudrate": Key(int, "baudrate = 9600", keywords=BAUDRATE),
+    "format": Key(str, 'format = "8N1"', keywords=FORMATS),
+    "silence": Key(str, 'silence = "500 us"', keywords=DURATION),
+    "switching": Key(str, 'switching = "2 ms"', keywords=DURATION),
+    "echo": Key(str, 'echo = "auto"', keywords={"enum": [one.value for one in Echo]}),
+    "rs485": Key(str, 'rs485 = "kernel"', keywords={"enum": [one.value for one in RS485]}),
+    "settle": Key(str, 'settle = "1.5 s"', keywords=DURATION),
+    "transaction": Key(
+        str, 'transaction = "match"', keywords={"enum": [one.value for one in TransactionIds]}
+    ),
     "drive": Key(list, "[[line.drive]], in two brackets, with its name, model and address", needed=True),
 }
 
 _DRIVE = {
-    "name": Key(str, 'name = "pump-1"', needed=True),
+    "name": Key(str, 'name = "pump-1"', needed=True, keywords=NAME),
     "model": Key(str, 'model = "innovert-ibd"', needed=True),
-    "address": Key(int, "address = 1", needed=True),
+    "address": Key(int, "address = 1", needed=True, keywords={"minimum": 0, "maximum": 255}),
     "framing": Key(str, 'framing = "rtu"'),
-    "baudrate": Key(int, "baudrate = 9600"),
-    "format": Key(str, 'format = "8N1"'),
-    "ram": Key(list, 'ram = ["frequency"], registers that this drive is known not to store in EEPROM'),
-    "every": Key(str, 'every = "50 ms"'),
+    "baudrate": Key(int, "baudrate = 9600", keywords=BAUDRATE),
+    "format": Key(str, 'format = "8N1"', keywords=FORMATS),
+    "ram": Key(
+        list, 'ram = ["frequency"], registers that this drive is known not to store in EEPROM', keywords=TEXTS
+    ),
+    "every": Key(str, 'every = "50 ms"', keywords=DURATION),
     "poll": Key(list, 'poll = ["output_current"], or leave it out to poll all readings'),
 }
 
 _POLL = {
     "register": Key(str, 'register = "output_current"', needed=True),
-    "every": Key(str, 'every = "50 ms"'),
+    "every": Key(str, 'every = "50 ms"', keywords=DURATION),
 }
 
 _NOT_ARGUMENTS = ("name", "model", "every", "poll")  # keys that are not arguments of a drive's class
+
+
+def plant_schema() -> dict[str, Any]:
+    """Return the JSON Schema of a plant file, from the keys that `load_plant` checks.
+
+    It also has the registers, addresses and options of the built-in and shipped families. [serve] and
+    [fleet] are any tables.
+    """
+    families = [*MODELS.values(), *map(shipped_family, SHIPPED)]
+    drive = json_schema(_DRIVE) | {
+        "additionalProperties": {"type": "number"},  # options of families in files
+        "allOf": [_of_family(name, family) for name, family in zip(_names(), families, strict=True)],
+    }
+    drive["properties"]["model"] |= {
+        "anyOf": [
+            {"enum": [*_names(), *installed_models()]},
+            {"pattern": r"\.toml$"},
+            {"pattern": r"\.py:\w+$"},
+        ]
+    }
+    drive["properties"]["poll"]["items"] = _polls_of({"type": "string", "minLength": 1})
+    line = json_schema(_LINE)
+    line["properties"]["drive"]["items"] = drive
+    plant = json_schema(_PLANT)
+    plant["properties"]["line"]["items"] = line
+    return {"$schema": "http://json-schema.org/draft-07/schema#", "title": "multidrop plant file", **plant}
+
+
+def _names() -> list[str]:
+    return [*MODELS, *SHIPPED]
+
+
+def _polls_of(register: Mapping[str, Any]) -> dict[str, Any]:
+    table = json_schema(_POLL)
+    table["properties"]["register"] = register
+    return {"anyOf": [register, table]}
+
+
+def _of_family(name: str, family: type[Drive]) -> dict[str, Any]:
+    """Return what the schema requires of a drive with this model."""
+    readable = [register.name for register in family.registers.values() if register.readable]
+    return {
+        "if": {"properties": {"model": {"const": name}}, "required": ["model"]},
+        "then": {
+            "propertyNames": {"enum": [*_DRIVE, *family.options]},
+            "properties": {
+                "address": {"minimum": family.addresses[0], "maximum": family.addresses[-1]},
+                "poll": {"items": _polls_of({"enum": ["*", *readable]})},
+            },
+        },
+    }
 
 
 def _line(table: Any, place: TomlPlace) -> PlantLine:
