@@ -67,8 +67,8 @@ def read_audit(path: Path | str) -> Iterator[dict[str, Any]]:
 
     Each record has `time` (UTC), `port`, `drive`, `write` and `outcome`. If known, it also has `model`,
     `address`, `sent` (the newest frame), `frames` (the number of frames of a stop), `held` (the value that
-    the drive holds), `why`, `by` and `way` (see `written_by`). The outcome "called" means that the write is
-    about to be sent.
+    the drive holds), `why`, `by`, `way` and `id` (see `written_by`). The outcome "called" means that the
+    write is about to be sent.
     """
     with Path(path).open("rb") as lines:
         for line in lines:

@@ -13,10 +13,11 @@ MOST_CHARACTERS = 200
 
 
 class Author(NamedTuple):
-    """The author's fields of an audit record: `by` is who wrote, `way` the interface used."""
+    """An audit record's fields: `by` is who wrote, `way` the interface used, `id` the command's id."""
 
     by: str = ""
     way: str = ""
+    id: str = ""
 
 
 class _Named(NamedTuple):
@@ -44,20 +45,23 @@ def check_author() -> None:
 
 
 @contextmanager
-def written_by(who: str, way: str = "") -> Iterator[None]:
+def written_by(who: str, way: str = "", command: str = "") -> Iterator[None]:
     """Record `who` as the author of all writes within the block, and `way` as the interface used.
 
     The audit record of a write or a stop then has `by`, such as "anna", and unless it is empty `way`, such as
-    "web, 10.0.0.7". The block applies to this thread, or to this task and `asyncio.to_thread`; other threads,
-    such as those of `run_in_executor`, need a block of their own. The innermost block counts. It grants no
-    rights.
+    "web, 10.0.0.7". `command` is an id, recorded as `id`: it connects the records of a command with its
+    answer. The block applies to this thread, or to this task and `asyncio.to_thread`; other threads, such as
+    those of `run_in_executor`, need a block of their own. The innermost block counts. It grants no rights.
 
-    Within the block a write raises TypeError if `who` or `way` is not text, and ValueError if one is longer
-    than 200 characters or not printable, or if `who` is empty. A stop is sent nevertheless, and recorded with
-    the printable part.
+    Within the block a write raises TypeError if an argument is not text, and ValueError if one is longer than
+    200 characters or not printable, or if `who` is empty. A stop is sent nevertheless, and recorded with the
+    printable part.
     """
-    mistake = _mistake("who", who) or (_mistake("way", way) if way != "" else None)
-    token = _named.set(_Named(Author(_spelt(who), _spelt(way)), mistake))
+    others = {"way": way, "command": command}
+    given = {"who": who} | {name: text for name, text in others.items() if text != ""}
+    mistakes = (_mistake(name, text) for name, text in given.items())
+    author = Author(_spelt(who), _spelt(way), _spelt(command))
+    token = _named.set(_Named(author, next(filter(None, mistakes), None)))
     try:
         yield
     finally:
