@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from datetime import UTC, datetime
 
 if hasattr(time, "CLOCK_MONOTONIC"):
 
@@ -35,6 +36,12 @@ def now_and_slept_ns() -> tuple[int, int]:
     booted_ns = boottime_ns()
     now_ns = monotonic_ns()
     return now_ns, booted_ns - now_ns
+
+
+def iso_time(ms: int) -> str:
+    """Return a time in ms since 1970 (UTC) as ISO 8601 text, such as 2026-11-22T09:30:00.123Z."""
+    second, rest = divmod(ms, 1000)
+    return f"{datetime.fromtimestamp(second, UTC):%Y-%m-%dT%H:%M:%S}.{rest:03d}Z"
 
 
 def utc_ms() -> int:

@@ -6,6 +6,7 @@ import asyncio
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,7 @@ def test_a_frame_has_values_with_their_own_times(gateway: Served) -> None:
     _, place = pump["values"]["output_current"]
     assert 0 <= pump["ages_ms"][place] < 60_000
     assert pump["seen"] is not None
-    assert abs(int(frame["time"]) - time.time_ns()) < 60e9
+    assert abs(datetime.fromisoformat(frame["time"]).timestamp() - time.time()) < 60
     assert frame["lines"]["hall"]["lost"] is None
     following = gateway.get(f"/api/frame?after={frame['n']}").json
     assert following["n"] > frame["n"] == following["since"]
@@ -124,7 +125,7 @@ def test_values_of_a_silent_drive_are_marked_as_old(gateway: Served) -> None:
     until(lambda: begun["time"] in [one["time"] for one in alarms() if one["ended"]])
     told = gateway.get("/api/alarms?from=0&to=9999999999999").json
     assert begun["time"] in [one["time"] for one in told["alarms"]]
-    assert begun["time"] - 3_600_000 < told["since"] <= begun["time"]
+    assert told["since"] <= begun["time"]
     assert gateway.get("/api/alarms?from=0&to=1").json["alarms"] == []
 
 

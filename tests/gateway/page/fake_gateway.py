@@ -15,6 +15,7 @@ from urllib.parse import parse_qs, unquote, urlsplit
 
 import fake_plant
 
+from multidrop.gateway.clock import iso_time
 from multidrop.gateway.live.frames import changes
 
 PAGE = files("multidrop.gateway") / "page"
@@ -100,7 +101,9 @@ class FakeGateway:
                 for name, drive in told["drives"].items():
                     drive |= {"stops": self.stops.get(name, 0), **self.drive_changes.get(name, {})}
                 newest = [*self._made.items()][-REMEMBERED:]
-                self._made = dict([*newest, (number, {**told, **self.changes})])
+                told |= self.changes
+                told["alarms"] = [*map(as_answer, told["alarms"])]
+                self._made = dict([*newest, (number, told)])
             told = self._made[number]
             if after in self._made and after != number:
                 told = {"n": number, "since": after, **changes(self._made[after], told)}
@@ -304,7 +307,12 @@ def alarms(handler: Any, gateway: FakeGateway, asked: dict[str, list[str]]) -> N
     found = fake_plant.alarms(gateway.renamed, gateway.began)
     found = gateway.changes.get("alarms", found)
     told = [a for a in found if a["time"] < end and (a["ended"] or math.inf) > start]
-    handler.tell({"alarms": told, "since": gateway.knows_since})
+    handler.tell({"alarms": [*map(as_answer, told)], "since": iso_time(gateway.knows_since)})
+
+
+def as_answer(alarm: dict[str, Any]) -> dict[str, Any]:
+    """Return an alarm with its times as ISO text, as the gateway sends it."""
+    return alarm | {key: alarm[key] and iso_time(alarm[key]) for key in ("time", "ended", "acknowledged")}
 
 
 def audit(handler: Any, gateway: FakeGateway, _: object) -> None:

@@ -6,6 +6,8 @@ import math
 import time
 from typing import Any
 
+from multidrop.gateway.clock import iso_time
+
 NAMES = (
     "pump-1 pump-2 pump-3 pump-4 fan-north fan-south mixer-1 mixer-2 conveyor-1 conveyor-2 screw",
     "filler-1 filler-2 filler-3 capper-1 capper-2 labeller infeed outfeed accumulator rinser",
@@ -187,7 +189,7 @@ def frame(n: int, began: float, renamed: dict[str, str], stuck: dict[str, float]
             "missed": {"labeller": 1.0, "tower-fan-2": 0.031}.get(name, 0), "p99": 6.1,
         }  # fmt: skip
     return {
-        "n": n, "revision": 1, "time": str(int(now * 1e9)), "drives": drives, "lines": lines(),
+        "n": n, "revision": 1, "time": iso_time(int(now * 1e3)), "drives": drives, "lines": lines(),
         "alarms": alarms(renamed, began), "troubles": [],
     }  # fmt: skip
 

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable
 from typing import Any, NamedTuple
 
+from multidrop.gateway.clock import iso_time
 from multidrop.gateway.live.hub import (
     FAULT,
     INCOMPLETE,
@@ -47,7 +48,13 @@ class Alarm(NamedTuple):
         return f"{self.time} {self.kind} {self.drive or self.line}"
 
     def as_json(self) -> dict[str, Any]:
+        """Return the alarm as its file keeps it, with times in ms."""
         return {"id": self.id, **self._asdict()}
+
+    def as_answer(self) -> dict[str, Any]:
+        """Return the alarm for clients, with times as ISO 8601 text."""
+        times = {"time": self.time, "ended": self.ended, "acknowledged": self.acknowledged}
+        return self.as_json() | {key: ms and iso_time(ms) for key, ms in times.items()}
 
 
 class Alarms:

@@ -16,6 +16,7 @@ from math import isfinite
 from typing import Any, NamedTuple
 
 from multidrop import WriteForbidden
+from multidrop.gateway.clock import iso_time
 from multidrop.gateway.commands import MOST_AGE_S, Commands
 from multidrop.gateway.live.alarms import LOST, Alarms
 from multidrop.gateway.live.hub import Hub, KeptRow
@@ -56,7 +57,7 @@ def frame_of(
     return {
         "n": n,
         "revision": revision,
-        "time": str(time_ns),
+        "time": iso_time(time_ns // 1_000_000),
         "drives": {
             polled.drive.name: _drive(hub, polled.drive.name, time_ns)
             | {"stops": stops.get(polled.drive.name, 0)}
@@ -67,7 +68,7 @@ def frame_of(
         "lines": {
             line.name: recent.line(line.name) | {"lost": lost_of(hub, line.name)} for line in hub.plant.lines
         },
-        "alarms": [alarm.as_json() for alarm in events.shown()],
+        "alarms": [alarm.as_answer() for alarm in events.shown()],
     }
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from multidrop import Drive
 from multidrop.control import Ledger
+from multidrop.gateway.clock import iso_time
 from multidrop.gateway.commands import drives_of
 from multidrop.gateway.live.frames import lost_of
 from multidrop.gateway.live.recent_statistics import asked_of, misses_of
@@ -114,7 +115,7 @@ def health_of(gateway: Gateway) -> dict[str, Any]:
         "status": "failed" if has_failed else "ok" if is_well else "degraded",
         "version": gateway.version,
         "uptime_s": round(gateway.clock() - gateway.begun, 1),
-        "newest_row": gateway.hub.time // 1_000_000,
+        "newest_row": iso_time(gateway.hub.time // 1_000_000) if gateway.hub.time else None,
         "lines": lost,
         "parts": parts,
         "audit": audit,

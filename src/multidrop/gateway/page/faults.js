@@ -5,7 +5,7 @@ import { confirmForm, send, tell } from "./ask.js";
 import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, tableHead } from "./dom.js";
 import { now } from "./link.js";
-import { alarms, isLive, store } from "./store.js";
+import { alarms, isLive, store, withMs } from "./store.js";
 import { ALARMS } from "./values.js";
 
 const SPAN_MS = 30 * 86400e3;
@@ -20,7 +20,8 @@ let shown = "",
 export async function read(from, to) {
   try {
     const told = await get(`api/alarms?${query({ from: Math.floor(from), to: Math.ceil(to) })}`);
-    return [told.alarms, told.since];
+    told.alarms.forEach(withMs);
+    return [told.alarms, Date.parse(told.since)];
   } catch {
     return [alarms().filter(alarm => (alarm.ended ?? Infinity) > from && alarm.time < to), null];
   }

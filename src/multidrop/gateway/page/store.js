@@ -73,10 +73,11 @@ export function takeMinute(minute) {
 
 // Process a frame, or the changes since the previous frame: store each value that is newer than before.
 export function takeFrame(told) {
+  told.alarms?.forEach(withMs);
   const frame = told.since === undefined ? told : merged(store.frame, told);
   const before = store.time;
   store.frame = frame;
-  store.time = Number(BigInt(frame.time) / 1000000n);
+  store.time = Date.parse(frame.time);
   store.came = performance.now();
   if (before && store.time - before > UNSEEN_MS) leaveGap(before + 1);
   for (const [name, drive] of store.drives) {
@@ -87,6 +88,12 @@ export function takeFrame(told) {
     for (const [register, [value, place, status = "ok", lastValue, lastPlace]] of Object.entries(values))
       keep(drive, register, [value, at(place), status, lastValue, at(lastPlace)]);
   }
+}
+
+// Replace an alarm's ISO times by ms since 1970.
+export function withMs(alarm) {
+  for (const key of ["time", "ended", "acknowledged"])
+    if (alarm[key] !== null) alarm[key] = Date.parse(alarm[key]);
 }
 
 // Note that values after this time (ms) were missed, for example while the page slept: plots get a gap.
