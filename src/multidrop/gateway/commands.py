@@ -55,6 +55,13 @@ _CALL = re.compile(r"(?P<how>call |run `multidrop )?\b(?P<verb>[a-z_-]+)(?P<end>
 _log = logging.getLogger("multidrop.gateway")
 
 
+class UnknownDrive(ValueError):
+    """The plant has no drive of this name."""
+
+    def __init__(self, drive: str) -> None:
+        super().__init__(f"there is no drive {drive!r}")
+
+
 class VerbRule(NamedTuple):
     """The role that a verb needs, and whether the plant file must list it in `verbs` of [serve.may]."""
 
@@ -155,6 +162,7 @@ class Commands:
             wanted = drives_of(self._lines.plant) if drives is None else drives
             return dict.fromkeys(wanted, denied(caller, Right.STOP, "stop"))
         self.called += 1
+        caller = caller.commanding()
         _log.warning("stop of %s, asked for by %s", "all drives" if drives is None else drives, caller.by)
         return await stop_meant(self._lines, drives, partial(self._stop, caller=caller))
 
@@ -178,11 +186,7 @@ class Commands:
             begun = self._repeated[verb].begin(lines)
         for future in begun:
             future.add_done_callback(partial(self._note_end, names))
-        results = {
-            name: result_of_failure(ValueError(f"there is no drive {name!r}"))
-            for name in wanted
-            if name not in names
-        }
+        results = {name: result_of_failure(UnknownDrive(name)) for name in wanted if name not in names}
         for found in await asyncio.gather(*begun):
             results |= found
         return {name: _for_users(results[name]) for name in wanted}
@@ -196,6 +200,8 @@ class Commands:
         what = f"{drive}.{register}"
         if caller.role < Right.WRITE:
             return denied(caller, Right.WRITE, f"a write of {what}")
+        if drive not in drives_of(self._lines.plant):
+            return _refused(UnknownDrive(drive))
         if what not in self.may.write:
             return _refused(not_listed(what, "write"))
         if self._moves(drive, register):
@@ -225,6 +231,8 @@ class Commands:
             return _refused(WriteForbidden(refusal, rule=NEVER_THIS_WAY))
         if caller.role < rule.role:
             return denied(caller, rule.role, what)
+        if drive not in names_of(self._lines):
+            return _refused(UnknownDrive(drive))
         if rule.is_listed and what not in self.may.verbs:
             return _refused(not_listed(what, "verbs"))
         if verb == "stop":
@@ -256,6 +264,7 @@ class Commands:
     async def _carry_out_stop(self, drive: str, verb: str, caller: Caller) -> CommandResult:
         """Carry out a verb that stops the motor, without waiting for writes in progress or other stops."""
         self.called += 1
+        caller = caller.commanding()
         _log.warning("%s.%s, asked for by %s", drive, verb, caller.by)
 
         async def stop(plant: Plant, names: list[str]) -> dict[str, CommandResult]:
@@ -269,8 +278,8 @@ class Commands:
     ) -> CommandResult:
         try:
             line, known = self._lines.plant.find_drive(drive)
-        except ValueError as mistake:
-            return _refused(mistake)
+        except ValueError:  # the drive is only in the plant of a reload in progress
+            return _refused(UnknownDrive(drive))
         if self.withheld:
             return _refused(WriteForbidden(f"{what} was not sent: {self.withheld}", rule=UNAUDITED))
         if self._under_way[line.name] >= MOST_WRITES:
@@ -292,6 +301,7 @@ class Commands:
                 return None
             return _refused(WriteForbidden(f"{what} was not sent: {OVERTAKEN}", rule=OVERTAKEN))
 
+        caller = caller.commanding()
         self._under_way[line.name] += 1
         with _written_by(caller):
             future = begin_command(partial(work, known), limit_ns, why_not)
@@ -309,7 +319,7 @@ class Commands:
 def _written_by(caller: Caller) -> Iterator[None]:
     """Name the caller in the audit log; log each command before it is sent, unless it is a stop."""
     name, way = _printable(caller.name), _printable(f"{caller.way} from {caller.address}")
-    with written_by(name or "anyone", way), noted_first():
+    with written_by(name or "anyone", way, caller.command), noted_first():
         yield
 
 

@@ -41,7 +41,7 @@ async def test_concurrent_broker_writes_are_limited_and_stops_are_not() -> None:
     told: list[tuple[str, str]] = []
     commands: Any = HeldCommands()
     orders = BrokerCommands(
-        commands, CALLER, lambda: NOW_MS, lambda drive, what, end: told.append((what, end.text))
+        commands, CALLER, lambda: NOW_MS, lambda drive, what, end, _: told.append((what, end.text))
     )
     for value in range(MOST_UNDER_WAY + 2):
         orders.write("pump-1", "setpoint", value, NOW_MS)

@@ -37,6 +37,7 @@ from multidrop.control import CommandOutcome, CommandResult
 from multidrop.drive.register import reading, setting
 from multidrop.families import MODELS
 from multidrop.gateway.clock import boottime_ns
+from multidrop.gateway.http.rights import COMMAND_ID
 from multidrop.gateway.mqtt.broker import MOST_UNDER_WAY
 from multidrop.gateway.mqtt.home_assistant import discovery, discovery_topic
 from multidrop.gateway.mqtt.json_topics import JsonTopics
@@ -218,8 +219,8 @@ def told(listener: Listener, drive: str = "pump-1") -> Any:
     return json_of(listener.wait_for(has(f"multidrop/{drive}/told")))
 
 
-def write_of(value: object, time_ms: int) -> bytes:
-    return json.dumps({"value": value, "time": time_ms}).encode()
+def write_of(value: object, time_ms: int, **more: object) -> bytes:
+    return json.dumps({"value": value, "time": time_ms, **more}).encode()
 
 
 def test_fresh_write_is_carried_out_and_its_copy_is_not(
@@ -227,9 +228,9 @@ def test_fresh_write_is_carried_out_and_its_copy_is_not(
 ) -> None:
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
-    fresh = write_of(25, now_ms())
+    fresh = write_of(25, now_ms(), id="order-7")
     publish(broker, "multidrop/pump-1/set/setpoint", fresh)
-    assert told(listener) == {"what": "setpoint = 25", "done": True, "text": "done"}
+    assert told(listener) == {"what": "setpoint = 25", "done": True, "text": "done", "id": "order-7"}
     publish(broker, "multidrop/pump-1/set/setpoint", fresh)
     assert told(listener)["text"] == "not sent: it came a second time"
     assert known.commands.noted == [("write", "pump-1", "setpoint", 25)]
@@ -313,8 +314,10 @@ def test_stop_verb_is_carried_out_whatever_its_age(
     listener.wait_for(has("multidrop/gateway", b"online"))
     known.commands.stopped_at["pump-1"] = known.commands.plant_ns = boottime_ns()
     for _ in range(2):
-        publish(broker, "multidrop/pump-1/act", json.dumps({"verb": verb, **more}).encode())
-        assert told(listener) == {"what": verb, "done": True, "text": "done"}
+        publish(broker, "multidrop/pump-1/act", json.dumps({"verb": verb, "id": [], **more}).encode())
+        answer = told(listener)
+        assert COMMAND_ID.fullmatch(answer.pop("id"))  # its own id instead of the invalid one
+        assert answer == {"what": verb, "done": True, "text": "done"}
     assert known.commands.noted == [("act", "pump-1", verb, {})] * 2
 
 
@@ -755,7 +758,7 @@ def test_all_words_of_topics_are_reserved_names(tmp_path: Path) -> None:
     topics = JsonTopics(MqttSettings(commands=True), inside(tmp_path), now_ms)
     topics.outbox = PutMessages()
     topics.connected()
-    topics._report(FAN.name, "stop", CommandResult(CommandOutcome.DONE, "done"))
+    topics._report(FAN.name, "stop", CommandResult(CommandOutcome.DONE, "done"), "an-id")
     said = {message.topic for message in topics.outbox.put_in} | {topic for topic, _ in topics.topics()}
     words = {word for topic in said for word in topic.removeprefix("multidrop/").split("/")}
     ours = words - {"+", FAN.name, "pump-1"}

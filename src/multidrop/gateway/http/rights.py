@@ -22,6 +22,7 @@ MOST_WRONG, WINDOW_S = 5, 60.0  # wrong tokens allowed to an address within this
 MOST_ADDRESSES = 10_000  # addresses whose wrong tokens are remembered
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
 SCHEMES = ("http", "https")
+COMMAND_ID = re.compile(r"[!-~]{1,64}")
 SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
@@ -40,11 +41,31 @@ class Caller(NamedTuple):
     way: str  # "page", "http", "mqtt", "modbus"
     address: str
     role: Right
+    command: str = ""  # the id of the command that it sends
 
     @property
     def by(self) -> str:
-        """The caller as named in log lines."""
-        return f"{self.name} by {self.way} from {self.address}"
+        """The caller as named in log lines, with the id of its command."""
+        command = f" (command {self.command})" if self.command else ""
+        return f"{self.name} by {self.way} from {self.address}{command}"
+
+    def commanding(self, given: object = None) -> Caller:
+        """Return the caller of a command with this id, or with a new id without one.
+
+        Raises ValueError for an invalid id.
+        """
+        if given is None:
+            return self._replace(command=self.command or secrets.token_hex(8))
+        if not isinstance(given, str) or not COMMAND_ID.fullmatch(given):
+            raise ValueError("id is not a text of 1 to 64 ASCII letters, digits or signs without spaces")
+        return self._replace(command=given)
+
+    def stopping(self, given: object = None) -> Caller:
+        """Return what `commanding` does, with a new id instead of an invalid one: a stop is never refused."""
+        try:
+            return self.commanding(given)
+        except ValueError:
+            return self.commanding()
 
 
 class Token(NamedTuple):

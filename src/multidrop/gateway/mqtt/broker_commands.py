@@ -24,7 +24,7 @@ MOST_UNDER_WAY = 16  # concurrent commands; stops are not counted
 REMEMBERED = 1_000  # newest commands, to recognise copies
 
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
-Report = Callable[[str, str, CommandResult], None]  # the drive, the command's text, and its result
+Report = Callable[[str, str, CommandResult, str], None]  # the drive, the command's text, its result, its id
 
 
 class BrokerCommands:
@@ -38,33 +38,42 @@ class BrokerCommands:
         self._came: deque[object] = deque(maxlen=REMEMBERED)
         self._under_way = 0
 
-    def stop(self, drives: Sequence[str] | None) -> None:
+    def stop(self, drives: Sequence[str] | None, given_id: object = None) -> None:
         """Stop these drives, or all drives if None."""
-        self._begin(self._stop(drives))
+        self._begin(self._stop(drives, self._caller.stopping(given_id)))
 
-    def stop_by(self, drive: str, verb: str, options: Mapping[str, object]) -> None:
+    def stop_by(self, drive: str, verb: str, options: Mapping[str, object], given_id: object = None) -> None:
         """Carry out a verb that stops the motor, whatever its age."""
-        self._begin(self._do(drive, verb, self._commands.act(drive, verb, options, self._caller)))
+        caller = self._caller.stopping(given_id)
+        self._begin(self._do(drive, verb, caller, self._commands.act(drive, verb, options, caller)))
 
-    def write(self, drive: str, register: str, value: float, time_ms: int) -> None:
-        """Write a register if the command may be carried out (see the module); else report why not."""
-        what = f"{register} = {value!r}"
-        stopped_ns = self._commands.stopped_ns(drive)
-        if self._is_taken(drive, what, (drive, register, value, time_ms), time_ms, stopped_ns):
-            work = self._commands.write(drive, register, value, self._caller)
-            self._begin(self._counted(self._do(drive, what, work)))
+    def write(self, drive: str, register: str, value: float, time_ms: int, given_id: object = None) -> None:
+        """Write a register if the command may be carried out (see the module); else report why not.
 
-    def act(self, drive: str, verb: str, options: Mapping[str, object], time_ms: int) -> None:
-        """Carry out a verb if the command may be carried out (see the module); else report why not."""
-        stopped_ns = self._commands.stopped_ns(drive)
-        if self._is_taken(drive, verb, (drive, verb, repr(options), time_ms), time_ms, stopped_ns):
-            work = self._commands.act(drive, verb, options, self._caller)
-            self._begin(self._counted(self._do(drive, verb, work)))
+        Raises ValueError for an invalid id.
+        """
+        what, caller = f"{register} = {value!r}", self._caller.commanding(given_id)
+        if self._is_taken(drive, what, (drive, register, value, time_ms), time_ms, caller):
+            work = self._commands.write(drive, register, value, caller)
+            self._begin(self._counted(self._do(drive, what, caller, work)))
 
-    def refuse(self, drive: str, what: str, why: str) -> None:
+    def act(
+        self, drive: str, verb: str, options: Mapping[str, object], time_ms: int, given_id: object = None
+    ) -> None:
+        """Carry out a verb if the command may be carried out (see the module); else report why not.
+
+        Raises ValueError for an invalid id.
+        """
+        caller = self._caller.commanding(given_id)
+        if self._is_taken(drive, verb, (drive, verb, repr(options), time_ms), time_ms, caller):
+            work = self._commands.act(drive, verb, options, caller)
+            self._begin(self._counted(self._do(drive, verb, caller, work)))
+
+    def refuse(self, drive: str, what: str, why: str, given_id: object = None) -> None:
         """Report that a command was not carried out."""
-        _log.warning("%s of %s was not carried out: %s", what, drive, why)
-        self._report(drive, what, CommandResult(CommandOutcome.FAILED, f"not sent: {why}"))
+        command = self._caller.stopping(given_id).command
+        _log.warning("%s of %s (command %s) was not carried out: %s", what, drive, command, why)
+        self._report(drive, what, CommandResult(CommandOutcome.FAILED, f"not sent: {why}"), command)
 
     @staticmethod
     def _may_be_before(at_ns: int | None, age_ms: int) -> bool:
@@ -76,31 +85,38 @@ class BrokerCommands:
             return False
         return (boottime_ns() - at_ns) // 1_000_000 <= age_ms + MOST_AHEAD_MS
 
-    def _is_taken(self, drive: str, what: str, command: object, time_ms: int, stopped_ns: int | None) -> bool:
-        age_ms = self._utc_ms() - time_ms
+    def _is_taken(self, drive: str, what: str, command: object, time_ms: int, caller: Caller) -> bool:
+        why = self._why_not(drive, command, self._utc_ms() - time_ms)
+        if why:
+            self.refuse(drive, what, why, caller.command)
+            return False
+        self._came.append(command)
+        self._under_way += 1  # here, not in the command's task: a broker may deliver many together
+        return True
+
+    def _why_not(self, drive: str, command: object, age_ms: int) -> str:
+        """Return why a command of this age is not carried out; "" if it is."""
         if not -MOST_AHEAD_MS <= age_ms <= MOST_AGE_MS:
             clocks = "by the clocks of sender and gateway"
-            self.refuse(drive, what, f"it was sent {age_ms / 1000:.1f} s ago {clocks}")
-        elif self._may_be_before(stopped_ns, age_ms):
-            self.refuse(drive, what, "it may have been sent before the latest stop: send it again")
-        elif self._may_be_before(self._commands.plant_ns, age_ms):
-            self.refuse(drive, what, "it may have been sent before the plant was reloaded: send it again")
-        elif command in self._came:
-            self.refuse(drive, what, "it came a second time")
-        elif self._under_way >= MOST_UNDER_WAY:
-            self.refuse(drive, what, f"{MOST_UNDER_WAY} others are under way")
-        else:
-            self._came.append(command)
-            self._under_way += 1  # here, not in the command's task: a broker may deliver many together
-            return True
-        return False
+            return f"it was sent {age_ms / 1000:.1f} s ago {clocks}"
+        if self._may_be_before(self._commands.stopped_ns(drive), age_ms):
+            return "it may have been sent before the latest stop: send it again"
+        if self._may_be_before(self._commands.plant_ns, age_ms):
+            return "it may have been sent before the plant was reloaded: send it again"
+        if command in self._came:
+            return "it came a second time"
+        if self._under_way >= MOST_UNDER_WAY:
+            return f"{MOST_UNDER_WAY} others are under way"
+        return ""
 
-    async def _stop(self, drives: Sequence[str] | None) -> None:
-        for drive, result in (await self._commands.stop(drives, self._caller)).items():
-            self._report(drive, "stop", result)
+    async def _stop(self, drives: Sequence[str] | None, caller: Caller) -> None:
+        for drive, result in (await self._commands.stop(drives, caller)).items():
+            self._report(drive, "stop", result, caller.command)
 
-    async def _do(self, drive: str, what: str, work: Coroutine[Any, Any, CommandResult]) -> None:
-        self._report(drive, what, await work)
+    async def _do(
+        self, drive: str, what: str, caller: Caller, work: Coroutine[Any, Any, CommandResult]
+    ) -> None:
+        self._report(drive, what, await work, caller.command)
 
     async def _counted(self, work: Coroutine[Any, Any, None]) -> None:
         try:

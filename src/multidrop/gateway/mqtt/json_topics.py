@@ -168,7 +168,7 @@ class JsonTopics:
         elif not self._settings.commands:
             _log.warning("the broker sent a command, but commands are off: %.100r", topic)
         elif is_stop:
-            self._commands.stop(None if levels == ["stop"] else [levels[0]])
+            self._commands.stop(None if levels == ["stop"] else [levels[0]], _id_in(payload))
         else:
             self._command(levels, payload, is_retained=is_retained)
 
@@ -187,22 +187,26 @@ class JsonTopics:
             else:
                 self._refuse(drive, what, mistake)
             return
+        named = given.get("id")
         try:
             if what[0] == "act" and str(given.get("verb")) in STOPPING:
                 for one in self._to_stop(drive, given):
-                    self._commands.stop_by(one, given["verb"], {})  # wrong options must not prevent a stop
+                    self._commands.stop_by(
+                        one, given["verb"], {}, named
+                    )  # wrong options must not prevent a stop
             elif is_retained:  # it would be carried out again on every connection
                 kept = "it was retained; publish it without retain"
-                self._commands.refuse(drive, "/".join(what), kept)
+                self._commands.refuse(drive, "/".join(what), kept, named)
             elif what[0] == "set":
-                self._commands.write(drive, what[1], *_read_write(given))
+                self._commands.write(drive, what[1], *_read_write(given), named)
             else:
-                self._commands.act(drive, *_read_act(drive, given))
+                self._commands.act(drive, *_read_act(drive, given), named)
         except ValueError as mistake:
-            self._refuse(drive, what, mistake)
+            self._refuse(drive, what, mistake, named)
 
-    def _refuse(self, drive: str, what: list[str], mistake: ValueError) -> None:
-        self._commands.refuse(drive, "/".join(what), f"it is not {EXAMPLES[what[0]]}: {mistake}")
+    def _refuse(self, drive: str, what: list[str], mistake: ValueError, named: object = None) -> None:
+        why = f"it is not {EXAMPLES[what[0]]}: {mistake}"
+        self._commands.refuse(drive, "/".join(what), why, named)
 
     def _to_stop(self, drive: str, given: Mapping[str, Any]) -> list[str]:
         """Return the topic's drive, and the drive named in the stop if it is another one.
@@ -267,8 +271,9 @@ class JsonTopics:
         }
         return json.dumps(said, ensure_ascii=False).encode()
 
-    def _report(self, drive: str, what: str, result: CommandResult) -> None:
-        said = json.dumps({"what": what, "done": result.ok, "text": result.text}, ensure_ascii=False)
+    def _report(self, drive: str, what: str, result: CommandResult, command: str) -> None:
+        outcome = {"what": what, "done": result.ok, "text": result.text, "id": command}
+        said = json.dumps(outcome, ensure_ascii=False)
         self.outbox.put(Publication(self._topic(drive, "told"), said.encode))
 
     def _discover(self, name: str) -> None:
@@ -337,6 +342,14 @@ def _read(payload: bytes) -> dict[str, Any]:
     if not isinstance(given, dict):
         raise ValueError("it is not a JSON object")
     return given
+
+
+def _id_in(payload: bytes) -> object:
+    """Return the id in a stop's payload; None if it has none or is invalid."""
+    try:
+        return _read(payload).get("id")
+    except ValueError:
+        return None
 
 
 def _check_keys(given: Mapping[str, Any], *keys: str) -> None:

@@ -216,8 +216,9 @@ class SparkplugNode:
         known = {number: name for (owner, name), number in self._aliases.items() if owner == drive}
         return known.get(alias or 0, f"alias {alias}")
 
-    def _report(self, drive: str, what: str, result: CommandResult) -> None:
-        (_log.info if result.ok else _log.warning)("%s of %s: %s", what, drive, result.text)
+    def _report(self, drive: str, what: str, result: CommandResult, command: str) -> None:
+        log = _log.info if result.ok else _log.warning
+        log("%s of %s (command %s): %s", what, drive, command, result.text)
 
 
 def _datatype(register: Register[Any] | None) -> DataType:
