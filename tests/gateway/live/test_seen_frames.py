@@ -279,7 +279,7 @@ def test_documented_start_from_a_shell_works(tmp_path: Path) -> None:
         (tmp_path / "login").write_text(login)
         script = block.replace("localhost:8750", f"localhost:{gateway.gateway.port}")
         ran = subprocess.run(["sh", "-c", script], cwd=tmp_path, stdout=subprocess.PIPE, check=True)
-        assert json.loads(ran.stdout) == {"done": True, "text": "pump-1: start is done"}
+        assert json.loads(ran.stdout)["text"] == "pump-1: start is done"
 
 
 def test_frames_count_the_stops_of_each_drive(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import importlib
 import os
 import shutil
 import subprocess
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
@@ -15,8 +16,8 @@ import pytest
 
 
 def require_program(name: str) -> str:
-    """Return the path of an installed program."""
-    path = shutil.which(name)
+    """Return the path of an installed program, on PATH or beside the interpreter."""
+    path = shutil.which(name) or shutil.which(name, path=str(Path(sys.executable).parent))
     if path is None:
         _missing(f"the program {name} is not installed")
     return path

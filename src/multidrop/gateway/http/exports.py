@@ -7,7 +7,8 @@ Parquet file needs space on the disk of the history.
 from __future__ import annotations
 
 import re
-from collections.abc import AsyncIterator, Callable, Generator, Iterator, Sequence
+import zlib
+from collections.abc import AsyncIterator, Callable, Generator, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from typing import Any, TypeVar
@@ -39,8 +40,10 @@ class Exports:
     def __init__(self) -> None:
         self.under_way = 0
 
-    async def respond(self, part: Any, names: Sequence[str], begin: int, end: int, kind: str) -> Response:
-        """Return a file of series from the historian `part`.
+    async def respond(
+        self, part: Any, names: Sequence[str], begin: int, end: int, kind: str, *, is_gzipped: bool = False
+    ) -> Response:
+        """Return a file of series from the historian `part`, compressed on its way with `is_gzipped`.
 
         Raises Hung, and Denied for wrong arguments or too many exports.
         """
@@ -56,14 +59,21 @@ class Exports:
             if isinstance(failure, ValueError):
                 raise Denied(400, str(failure)) from failure
             raise
-        return _Export(self, pieces, kind, f"{_what(names)} {_moment(begin)} to {_moment(end)}.{kind}")
+        name = f"{_what(names)} {_moment(begin)} to {_moment(end)}.{kind}"
+        headers = _attachment(name) | {"vary": "accept-encoding"}
+        if is_gzipped:
+            pieces = _gzipped(pieces)
+            headers["content-encoding"] = "gzip"
+        return _Export(self, pieces, kind, headers)
 
 
 class _Export(StreamingResponse):
     """One export, until its client has received all or disconnected."""
 
-    def __init__(self, exports: Exports, pieces: Iterator[bytes], kind: str, name: str) -> None:
-        super().__init__(_through(pieces), media_type=KINDS[kind], headers=_attachment(name))
+    def __init__(
+        self, exports: Exports, pieces: Iterator[bytes], kind: str, headers: Mapping[str, str]
+    ) -> None:
+        super().__init__(_through(pieces), media_type=KINDS[kind], headers=headers)
         self._exports = exports
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -85,6 +95,19 @@ def parameter_file(read: ParameterRead, kind: str) -> Response:
 def _attachment(name: str) -> dict[str, str]:
     plain = name.encode("ascii", "replace").decode().replace("?", "_")
     return {"content-disposition": f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name)}"}
+
+
+def _gzipped(pieces: Iterator[bytes]) -> Iterator[bytes]:
+    """Yield the pieces compressed as one gzip stream, in fewer and larger pieces."""
+    stream = zlib.compressobj(wbits=31)
+    try:
+        for piece in pieces:
+            if made := stream.compress(piece):
+                yield made
+        yield stream.flush()
+    finally:
+        if isinstance(pieces, Generator):
+            pieces.close()
 
 
 async def _through(pieces: Iterator[bytes]) -> AsyncIterator[bytes]:

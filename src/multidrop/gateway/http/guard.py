@@ -91,6 +91,8 @@ class Guard:
             scope["caller"] = self._check(scope)
         except Denied as denied:
             response = JsonResponse({"error": str(denied)}, denied.status)
+            if denied.status == 405:
+                response.headers["allow"] = self._find(scope["path"]).method
             if denied.status == 401:
                 response.headers["www-authenticate"] = "Bearer"
                 if COOKIE in Headers(scope=scope).get("cookie", ""):  # remove the wrong token

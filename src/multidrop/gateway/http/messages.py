@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import asyncio
+import gzip
 import json
 import logging
 from collections.abc import Mapping
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
+from functools import partial
 from typing import Any
 
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import Response
+from starlette.responses import Response, StreamingResponse
 
 from multidrop.gateway.http.rights import Caller
 from multidrop.printable import plain_whole
+from multidrop.supervisor import Hung, supervisor
 
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+COMPRESSIBLE = ("text", "json", "javascript", "svg", "toml")  # in the media types of texts
+LEAST_COMPRESSED = 1024  # bytes
+LEVEL = 6
+COMPRESSION_S = 10.0  # time limit
 MOST_BYTES = 64 * 1024  # limit of a body
 BODY_S = 10.0  # time limit for a body
 STOP_BODY_S = 3.0  # time limit for a stop's body, enough for one or two retransmissions
@@ -35,6 +45,29 @@ class JsonResponse(Response):
 
     def render(self, content: Any) -> bytes:
         return json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
+
+
+def takes_gzip(headers: Mapping[str, str]) -> bool:
+    return "gzip" in headers.get("accept-encoding", "")
+
+
+async def compressed(request: Request, response: Response) -> Response:
+    """Return a text response compressed, if its client accepts that and it is long enough to gain from it.
+
+    A thread compresses it, to keep the event loop free for stops. If threads are short, it stays as it is.
+    """
+    kind = response.headers.get("content-type", "")
+    if isinstance(response, StreamingResponse) or not any(one in kind for one in COMPRESSIBLE):
+        return response
+    response.headers.add_vary_header("accept-encoding")
+    if len(response.body) < LEAST_COMPRESSED or not takes_gzip(request.headers):
+        return response
+    work = partial(gzip.compress, response.body, LEVEL, mtime=0)
+    with suppress(Hung, RuntimeError, MemoryError):
+        response.body = await supervisor().within("compression", COMPRESSION_S, work)
+        response.headers["content-length"] = str(len(response.body))
+        response.headers["content-encoding"] = "gzip"
+    return response
 
 
 def caller_of(request: Request) -> Caller:
@@ -65,25 +98,34 @@ async def body_of(request: Request, seconds: float | None = None) -> dict[str, A
     return found
 
 
-async def drives_to_stop(request: Request) -> list[str] | None:
-    """Return the names of the drives that a stop request names; None for all drives.
+async def drives_to_stop(request: Request) -> tuple[list[str] | None, object]:
+    """Return the names of the drives that a stop request names, None for all drives; and the given id.
 
     A request whose body is missing, late, truncated, too long, empty or invalid stops all drives: stopping
     too many is harmless, stopping none is not.
     """
     try:
-        drives = (await body_of(request, STOP_BODY_S)).get("drives")
+        body = await body_of(request, STOP_BODY_S)
     except Denied as unread:
         _log.warning("stopping all drives, because %s", unread)
-        return None
+        return None, None
+    drives, given_id = body.get("drives"), body.get("id")
     if isinstance(drives, str):
-        return [drives]
+        return [drives], given_id
     if drives is None:
-        return None
+        return None, given_id
     if isinstance(drives, list) and drives and all(isinstance(one, str) for one in drives):
-        return drives
+        return drives, given_id
     _log.warning("stopping all drives, because %.100r is not a list of names", drives)
-    return None
+    return None, given_id
+
+
+def commander_in(request: Request, body: Mapping[str, Any]) -> Caller:
+    """Return the caller with the id of its command, made here if the body has none."""
+    try:
+        return caller_of(request).commanding(body.get("id"))
+    except ValueError as mistake:
+        raise Denied(400, str(mistake)) from None
 
 
 def text_in(body: Mapping[str, Any], key: str) -> str:
@@ -108,7 +150,22 @@ def number_in(text: str, key: str) -> int:
         raise Denied(400, f"{key} = {text[:40]!r} is not a whole number") from None
 
 
+def moment_in(text: str, key: str) -> int:
+    """Return a time in ms since 1970. The text is ISO 8601, in UTC unless it has an offset, or such ms."""
+    try:
+        return plain_whole(text)
+    except ValueError:
+        pass
+    try:
+        found = datetime.fromisoformat(text)
+    except ValueError:
+        wrong = f"{key} = {text[:40]!r} is not a time"
+        raise Denied(400, f"{wrong}, such as 2026-11-22T09:30:00Z or 1795253400000 (ms since 1970)") from None
+    utc = found if found.tzinfo else found.replace(tzinfo=UTC)
+    return (utc - EPOCH) // timedelta(milliseconds=1)
+
+
 def span_in(query: Mapping[str, str]) -> tuple[int, int]:
     """Return the times `from` and `to` of a query, UTC in ms."""
-    begin, end = (number_in(query.get(key, ""), key) for key in ("from", "to"))
+    begin, end = (moment_in(query.get(key, ""), key) for key in ("from", "to"))
     return begin, end

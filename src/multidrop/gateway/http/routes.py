@@ -20,25 +20,30 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from multidrop import WriteForbidden
-from multidrop.control import CommandResult, read_audit
+from multidrop.control import CommandOutcome, CommandResult, read_audit
 from multidrop.exposition import expose_metrics
-from multidrop.gateway.clock import utc_ms
-from multidrop.gateway.commands import STOPPING, Admit
+from multidrop.gateway.clock import iso_time, utc_ms
+from multidrop.gateway.commands import STOPPING, Admit, UnknownDrive
 from multidrop.gateway.http.exports import Exports, parameter_file
-from multidrop.gateway.http.guard import COOKIE, HAS_WRONG_TOKEN, SHUT, WRONG, Guard, Needed
+from multidrop.gateway.http.guard import COOKIE, HAS_WRONG_TOKEN, SHUT, WRONG, Guard
 from multidrop.gateway.http.messages import (
     Denied,
     JsonResponse,
     body_of,
     caller_of,
+    commander_in,
+    compressed,
     drives_to_stop,
     frame_in,
+    moment_in,
     number_in,
     span_in,
+    takes_gzip,
     text_in,
 )
+from multidrop.gateway.http.operations import FRAME, NEEDED, OPERATIONS, Operation, openapi
 from multidrop.gateway.http.page_files import PageFiles
-from multidrop.gateway.http.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Right
+from multidrop.gateway.http.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Caller
 from multidrop.gateway.live.descriptions import describe
 from multidrop.gateway.live.frames import WHOLE, Frames
 from multidrop.gateway.live.views import drive_view, health_of, line_views
@@ -58,22 +63,6 @@ HEAD_S = 0.5  # the head of a stop's answer is sent after this time; it confirms
 UNBUFFERED = {"x-accel-buffering": "no"}  # proxies forward the head immediately
 RIGHTS_RULES = (NOT_ALLOWED, NOT_LISTED, NEVER_THIS_WAY)
 
-NEEDED: Mapping[str, Needed] = {
-    "/": Needed("GET", None),
-    "/page/": Needed("GET", None),
-    "/api/": Needed("GET", Right.LOOK),
-    "/health": Needed("GET", Right.LOOK),
-    "/metrics": Needed("GET", Right.LOOK),
-    "/api/stop": Needed("POST", Right.STOP),
-    "/api/fleet/stop": Needed("POST", Right.STOP),
-    "/api/act": Needed("POST", Right.STOP),  # Commands checks the verb's own right
-    "/api/acknowledge": Needed("POST", Right.STOP),
-    "/api/write": Needed("POST", Right.WRITE),
-    "/api/reload": Needed("POST", Right.WRITE),
-    "/api/token": Needed("POST", None),
-    "/api/forget": Needed("POST", None),
-}
-
 _UTC = re.compile(r"\d{4}-\d\d-\d\d(T\d\d:\d\d(:\d\d(\.\d+)?)?Z?)?", re.ASCII)  # the time is optional
 R = TypeVar("R")
 _log = logging.getLogger("multidrop.gateway")
@@ -83,30 +72,10 @@ _GZIPPED = [*_PLAIN, (b"content-encoding", b"gzip")]
 
 def make_app(gateway: Gateway) -> ASGIApp:
     """Return the ASGI application of all routes, behind the guard."""
-    pages, files = _Pages(gateway), PageFiles()
+    pages = Pages(gateway)
     routes = [
-        Route("/", files.index),
-        Route("/page/{name:path}", files.file),
-        Route("/api/plant", pages.plant),
-        Route("/api/drive/{name:path}", pages.drive),
-        Route("/api/parameters/{name:path}", pages.parameters),
-        Route("/api/lines", pages.lines),
-        Route("/api/minute", pages.minute),
-        Route("/api/fleet", pages.fleet),
-        Route("/api/history", pages.history),
-        Route("/api/export", pages.export),
-        Route("/api/audit", pages.audit),
-        Route("/api/alarms", pages.alarms),
-        Route("/health", pages.health),
-        Route("/metrics", pages.metrics),
-        Route("/api/stop", pages.stop, methods=["POST"]),
-        Route("/api/fleet/stop", pages.stop_fleet, methods=["POST"]),
-        Route("/api/write", pages.write, methods=["POST"]),
-        Route("/api/act", pages.act, methods=["POST"]),
-        Route("/api/acknowledge", pages.acknowledge, methods=["POST"]),
-        Route("/api/reload", pages.reload, methods=["POST"]),
-        Route("/api/token", pages.token, methods=["POST"]),
-        Route("/api/forget", pages.forget, methods=["POST"]),
+        Route(one.path.replace("{name}", "{name:path}"), _endpoint(pages, one), methods=[one.method])
+        for one in OPERATIONS
     ]
     handlers: Any = {
         Denied: _denied,
@@ -115,11 +84,10 @@ def make_app(gateway: Gateway) -> ASGIApp:
         500: lambda request, failure: _error(500, "internal error; see the gateway's log"),
     }
     others = Starlette(routes=routes, exception_handlers=handlers)
-    frames = FrameRoute(gateway.frames)
 
     async def app(scope: Scope, receive: Receive, send: Send) -> None:
         """Answer requests for frames without the router, because they are by far the most frequent."""
-        await (frames if scope["path"] == "/api/frame" else others)(scope, receive, send)
+        await (pages.frame if scope["path"] == FRAME else others)(scope, receive, send)
 
     return Guard(
         app,
@@ -132,6 +100,18 @@ def make_app(gateway: Gateway) -> ASGIApp:
     )
 
 
+def _endpoint(pages: Pages, operation: Operation) -> Any:
+    """Return the method of `pages` that answers a route; answers of GET are compressed."""
+    handler = getattr(pages, operation.handler)
+    if operation.method == "POST" or operation.path == FRAME:
+        return handler
+
+    async def answer(request: Request) -> Response:
+        return await compressed(request, await handler(request))
+
+    return answer
+
+
 def _error(status: int, sentence: str) -> Response:
     return JsonResponse({"error": sentence}, status)
 
@@ -140,20 +120,32 @@ async def _denied(request: Request, failure: Exception) -> Response:
     return _error(getattr(failure, "status", 400), str(failure))
 
 
-def _fields(result: CommandResult) -> dict[str, Any]:
-    return {"done": result.ok, "text": result.text}
+def _fields(result: CommandResult, caller: Caller) -> dict[str, Any]:
+    return {"done": result.ok, "text": result.text, "id": caller.command}
 
 
-def _answer(result: CommandResult) -> Response:
-    """Return the HTTP answer with a command's outcome: status 403 if a right was missing, else 200."""
-    is_denied = isinstance(result.error, WriteForbidden) and result.error.rule in RIGHTS_RULES
-    return JsonResponse(
-        _fields(result) | ({"error": result.text} if is_denied else {}), 403 if is_denied else 200
-    )
+def _status(result: CommandResult) -> int:
+    """Return 4xx for a command that was refused for its words or for a missing right; else 200."""
+    error = result.error
+    if isinstance(error, UnknownDrive):
+        return 404
+    if isinstance(error, WriteForbidden):
+        return 403 if error.rule in RIGHTS_RULES else 200
+    return 400 if isinstance(error, ValueError) and result.outcome is CommandOutcome.REFUSED else 200
 
 
-def _answer_all(results: Mapping[str, CommandResult]) -> Response:
-    return JsonResponse({name: _fields(one) for name, one in results.items()})
+def _answer(caller: Caller, result: CommandResult) -> Response:
+    """Return the HTTP answer with a command's outcome."""
+    status = _status(result)
+    error = {} if status == 200 else {"error": result.text}
+    return JsonResponse(_fields(result, caller) | error, status)
+
+
+def _answer_all(caller: Caller, results: Mapping[str, CommandResult]) -> Response:
+    """Return the HTTP answer with the outcome of each drive's stop; 404 if all drives are unknown."""
+    if results and all(isinstance(one.error, UnknownDrive) for one in results.values()):
+        return _error(404, "; ".join(one.text for one in results.values()))
+    return JsonResponse({name: _fields(one, caller) for name, one in results.items()})
 
 
 def _answer_fleet(results: Mapping[str, tuple[bool, str]]) -> Response:
@@ -161,11 +153,10 @@ def _answer_fleet(results: Mapping[str, tuple[bool, str]]) -> Response:
 
 
 def _time_asked(query: Mapping[str, str]) -> str:
-    """Return the parameter `before` of a query, "" without one. Raises Denied if it is not a UTC time."""
-    if "before" in query and not _UTC.fullmatch(query["before"]):
-        wrong = query["before"][:40]
-        raise Denied(400, f"before = {wrong!r} is not a time in UTC, such as 2026-11-22 or 2026-11-22T09:30")
-    return query.get("before", "")
+    """Return the parameter `before` of a query as in audit records, "" without one. Raises Denied."""
+    if "before" not in query or _UTC.fullmatch(query["before"]):
+        return query.get("before", "")
+    return iso_time(moment_in(query["before"], "before"))
 
 
 def newest_records(path: Path | None, before: str = "", count: int = MOST_RECORDS) -> dict[str, Any]:
@@ -199,12 +190,17 @@ async def _answer_stop(work: Coroutine[Any, Any, R], respond: Callable[[R], Resp
     return StreamingResponse(body(), media_type="application/json", headers=UNBUFFERED)
 
 
-class _Pages:
-    """The functions that answer the routes."""
+class Pages(PageFiles):
+    """The functions that answer the routes; `OPERATIONS` names them."""
 
     def __init__(self, gateway: Gateway) -> None:
+        super().__init__()
         self._gateway = gateway
         self._exports = Exports()
+        self.frame = FrameRoute(gateway.frames)
+
+    async def openapi(self, request: Request) -> Response:
+        return JsonResponse(openapi(self._gateway.version))
 
     # ---- queries ----
 
@@ -258,8 +254,8 @@ class _Pages:
 
     async def alarms(self, request: Request) -> Response:
         alarms = self._gateway.alarms
-        found = [alarm.as_json() for alarm in alarms.between(*span_in(request.query_params))]
-        return JsonResponse({"alarms": found, "since": alarms.since})
+        found = [alarm.as_answer() for alarm in alarms.between(*span_in(request.query_params))]
+        return JsonResponse({"alarms": found, "since": iso_time(alarms.since)})
 
     async def acknowledge(self, request: Request) -> Response:
         """Acknowledge an alarm, with the caller's note."""
@@ -272,7 +268,7 @@ class _Pages:
         except KeyError:
             raise Denied(404, "unknown alarm; the list may have changed") from None
         self._gateway.frames.note_news()
-        return JsonResponse(found.as_json())
+        return JsonResponse(found.as_answer())
 
     # ---- history ----
 
@@ -289,7 +285,9 @@ class _Pages:
     async def export(self, request: Request) -> Response:
         part, query = self._history(), request.query_params
         kind = query.get("format", "csv")
-        return await self._exports.respond(part, query.getlist("series"), *span_in(query), kind)
+        is_gzipped = kind == "csv" and takes_gzip(request.headers)
+        span = span_in(query)
+        return await self._exports.respond(part, query.getlist("series"), *span, kind, is_gzipped=is_gzipped)
 
     def _history(self) -> Any:
         part = self._gateway.feeds.get("history")
@@ -300,8 +298,9 @@ class _Pages:
     # ---- commands ----
 
     async def stop(self, request: Request) -> Response:
-        drives = await drives_to_stop(request)
-        return await _answer_stop(self._gateway.commands.stop(drives, caller_of(request)), _answer_all)
+        drives, given_id = await drives_to_stop(request)
+        caller = caller_of(request).stopping(given_id)
+        return await _answer_stop(self._gateway.commands.stop(drives, caller), partial(_answer_all, caller))
 
     async def stop_fleet(self, request: Request) -> Response:
         """Stop all drives of the fleet, with the commander's key of `[serve.fleet]`."""
@@ -318,9 +317,9 @@ class _Pages:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise Denied(400, "value is missing or not a number")
         drive, register = text_in(body, "drive"), text_in(body, "register")
-        caller = caller_of(request)
-        admit = self._admission(drive, (register, value, caller), body)
-        return _answer(await self._gateway.commands.write(drive, register, value, caller, admit))
+        caller = commander_in(request, body)
+        admit = self._admission(drive, (register, value, caller_of(request)), body)
+        return _answer(caller, await self._gateway.commands.write(drive, register, value, caller, admit))
 
     async def act(self, request: Request) -> Response:
         body = await body_of(request)
@@ -330,10 +329,13 @@ class _Pages:
         options = {} if verb in STOPPING else body.get("options", {})  # wrong options must not prevent a stop
         if not isinstance(options, dict):
             raise Denied(400, "options is not a JSON object")
-        caller = caller_of(request)
-        admit = self._admission(drive, (verb, repr(options), caller), body)
+        sender = caller_of(request)
+        caller = sender.stopping(body.get("id")) if verb in STOPPING else commander_in(request, body)
+        admit = self._admission(drive, (verb, repr(options), sender), body)
         acting = self._gateway.commands.act(drive, verb, options, caller, admit)
-        return await _answer_stop(acting, _answer) if verb in STOPPING else _answer(await acting)
+        if verb in STOPPING:
+            return await _answer_stop(acting, partial(_answer, caller))
+        return _answer(caller, await acting)
 
     def _admission(self, drive: str, command: object, body: Mapping[str, Any]) -> Admit:
         """Return a function that checks a command against the frame its sender saw. Stops are not checked."""
@@ -402,9 +404,9 @@ class FrameRoute:
             return
         status, headers, body = 304, list[tuple[bytes, bytes]](), b""
         if frame is not None:
-            takes_gzip = "gzip" in Headers(scope=scope).get("accept-encoding", "")
-            status, headers = 200, _GZIPPED if takes_gzip else _PLAIN
-            body = frame.gzipped if takes_gzip else frame.plain
+            is_gzipped = takes_gzip(Headers(scope=scope))
+            status, headers = 200, _GZIPPED if is_gzipped else _PLAIN
+            body = frame.gzipped if is_gzipped else frame.plain
             headers = [*headers, (b"content-length", str(len(body)).encode())]
         await send({"type": "http.response.start", "status": status, "headers": headers})
         await send({"type": "http.response.body", "body": body})
