@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
-import urllib.parse
-import urllib.request
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
-from brokers import free_port
 from gateways import Served, served
-from lines import PATIENCE, until
+from lines import until
 from peers import require_program
+from prometheus_server import Prometheus, scraping
 
 from multidrop import exposition
 from multidrop.exposition import MetricFamily, expose_metrics
@@ -37,8 +34,19 @@ def families(gateway: Served) -> dict[str, Any]:
 
 
 def values(gateway: Served) -> dict[tuple[str, str], float]:
-    found = families(gateway)["multidrop_value"].samples
+    found = [
+        one
+        for name, family in families(gateway).items()
+        if name.startswith("multidrop_register_") and name != "multidrop_register_age_seconds"
+        for one in family.samples
+    ]
     return {(one.labels["drive"], one.labels["register"]): one.value for one in found}
+
+
+def process_start() -> float:
+    """Return when this process started, in s since 1970, as ps knows it."""
+    age = subprocess.run(["ps", "-o", "etimes=", "-p", str(os.getpid())], capture_output=True, text=True)
+    return time.time() - int(age.stdout)
 
 
 def states(gateway: Served) -> dict[str, str]:
@@ -55,8 +63,17 @@ def test_metrics_have_values_states_and_counters(tmp_path: Path) -> None:
         assert values(gateway)["pump-1", "status"] == 3.0
         assert values(gateway)['fan, the "old" one', "fault"] == 0.0
         assert states(gateway) == {"pump-1": "stands", 'fan, the "old" one': "stands"}
-        labels = [one.labels for one in found["multidrop_value"].samples if one.labels["drive"] == "pump-1"]
-        assert {"line": "hall", "drive": "pump-1", "register": "output_current", "unit": "A"} in labels
+        labels = {"line": "hall", "drive": "pump-1", "register": "output_current"}
+        assert labels in [one.labels for one in found["multidrop_register_amperes"].samples]
+        assert {one.value < 60 for one in found["multidrop_register_age_seconds"].samples} == {True}
+        about = {"line": "hall", "drive": "pump-1", "model": "invt-che", "address": "1"}
+        assert about in [one.labels for one in found["multidrop_drive"].samples]
+        alarms = [one.value for one in found["multidrop_alarm_active"].samples]
+        assert alarms == [0.0] * 9  # of the line its port; of each drive all other kinds
+        health = {one.labels["multidrop_health"]: one.value for one in found["multidrop_health"].samples}
+        assert health == {"ok": 1.0, "degraded": 0.0, "failed": 0.0}
+        assert found["process_open_fds"].samples[0].value > 5
+        assert abs(found["process_start_time_seconds"].samples[0].value - process_start()) < 60
         until(lambda: families(gateway)["multidrop_line_samples"].samples[0].value > 8)
         assert found["multidrop_line_samples"].type == "counter"
         assert found["multidrop_build"].samples[0].labels == {"version": gateway.gateway.version}
@@ -117,57 +134,11 @@ scrape_configs:
     authorization: {{credentials: "{secret}"}}
     static_configs: [{{targets: ["127.0.0.1:{port}"]}}]
 """
-SAMPLES = 'multidrop_value{job="known"}'
+SAMPLES = 'multidrop_register_hertz{job="known"}'
 
 
-class Prometheus:
-    """A client of the HTTP API of a Prometheus server."""
-
-    def __init__(self, port: int) -> None:
-        self._url = f"http://127.0.0.1:{port}/api/v1/"
-
-    def ask(self, path: str, **query: str) -> Any:
-        url = f"{self._url}{path}?{urllib.parse.urlencode(query)}"
-        with urllib.request.urlopen(url, timeout=PATIENCE) as answer:
-            return json.load(answer)["data"]
-
-    def is_there(self) -> bool:
-        try:
-            return bool(self.ask("targets")["activeTargets"])
-        except OSError:
-            return False
-
-    def query(self, text: str) -> dict[tuple[str, ...], float]:
-        """Return the present samples of a query, by the values of their labels."""
-        found = self.ask("query", query=text)["result"]
-        return {tuple(sorted(one["metric"].values())): float(one["value"][1]) for one in found}
-
-    def drives(self) -> set[str]:
-        return {name for (name,) in self.query(f"count by (drive) ({SAMPLES})")}
-
-    def targets(self) -> dict[str, tuple[str, str]]:
-        """Return health and last error of the target of each job."""
-        found = self.ask("targets")["activeTargets"]
-        return {one["labels"]["job"]: (one["health"], one["lastError"]) for one in found}
-
-
-@contextmanager
-def scraping(folder: Path, jobs: str) -> Iterator[Prometheus]:
-    program = require_program("prometheus")
-    (folder / "prometheus.yml").write_text(jobs)
-    port = free_port()
-    command = [
-        *(program, f"--config.file={folder}/prometheus.yml", f"--storage.tsdb.path={folder}/tsdb"),
-        *(f"--web.listen-address=127.0.0.1:{port}", "--log.level=error"),
-    ]
-    with (folder / "prometheus.log").open("w") as log, subprocess.Popen(command, stderr=log) as process:
-        try:
-            found = Prometheus(port)
-            until(lambda: process.poll() is not None or found.is_there())
-            assert process.poll() is None, (folder / "prometheus.log").read_text()
-            yield found
-        finally:
-            process.kill()
+def drives(prometheus: Prometheus) -> set[str]:
+    return {name for (name,) in prometheus.query(f"count by (drive) ({SAMPLES})")}
 
 
 @pytest.mark.slow
@@ -176,7 +147,7 @@ def test_prometheus_scrapes_each_second_and_a_silent_drive_is_stale(tmp_path: Pa
     with served(tmp_path, '[serve]\ntokens = "tokens"\n[serve.may]\nlook = "token"\n') as gateway:
         jobs = JOBS.format(port=gateway.gateway.port, secret=gateway.secrets[Right.LOOK])
         with scraping(tmp_path, jobs) as prometheus:
-            until(lambda: prometheus.drives() == {"pump-1", "pump-2"})
+            until(lambda: drives(prometheus) == {"pump-1", "pump-2"})
             until(lambda: prometheus.targets()["stranger"][0] != "unknown")  # until the first scrape
             assert prometheus.targets() == {
                 "known": ("up", ""),
@@ -187,7 +158,7 @@ def test_prometheus_scrapes_each_second_and_a_silent_drive_is_stale(tmp_path: Pa
 
             gateway.sims["pump-2"].deaf_until = float("inf")
             # Without staleness markers, Prometheus would return the last values for five minutes.
-            until(lambda: prometheus.drives() == {"pump-1"})
+            until(lambda: drives(prometheus) == {"pump-1"})
             states = prometheus.query('multidrop_drive_state{job="known", drive="pump-2"} == 1')
             assert [1 for labels in states if "silent" in labels] == [1]
             until(
@@ -199,7 +170,7 @@ def test_prometheus_scrapes_each_second_and_a_silent_drive_is_stale(tmp_path: Pa
             )
 
             gateway.sims["pump-2"].deaf_until = 0.0
-            until(lambda: prometheus.drives() == {"pump-1", "pump-2"})
+            until(lambda: drives(prometheus) == {"pump-1", "pump-2"})
 
 
 @pytest.mark.slow
@@ -212,4 +183,4 @@ def test_promtool_accepts_the_metrics(tmp_path: Path) -> None:
         assert answer.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
         checked = subprocess.run([program, "check", "metrics"], input=answer.body, capture_output=True)
         assert (checked.returncode, checked.stdout, checked.stderr) == (0, b"", b"")
-        assert b"multidrop_value{" in answer.body
+        assert b"multidrop_register_amperes{" in answer.body

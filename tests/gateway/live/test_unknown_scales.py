@@ -14,7 +14,7 @@ from multidrop.core import NumberFormat
 from multidrop.families import MODELS, DelixiModbus, InvtCHE
 from multidrop.gateway.live.descriptions import describe_line
 from multidrop.gateway.live.hub import Hub, Known, Newest
-from multidrop.gateway.metrics import plant_families
+from multidrop.gateway.metrics import OTHER, base_unit, plant_families
 from multidrop.gateway.modbus_server.common_block import CURRENT, FREQUENCY, NO_NUMBER, SETPOINT, CommonBlock
 from multidrop.gateway.mqtt.home_assistant import discovery
 
@@ -68,11 +68,32 @@ def test_the_common_block_has_no_number_for_a_raw_count() -> None:
     assert [number(pump, at) for at in (FREQUENCY, CURRENT, SETPOINT)] == [2500, 2500, NO_NUMBER]
 
 
-def test_metric_of_raw_counts_has_the_unit_raw_count() -> None:
+def test_metric_of_raw_counts_is_named_raw() -> None:
     drive = DelixiModbus(1, name="fan")
     hub = FullHub(plant(line("/dev/null", polled(drive, [drive.output_frequency, drive.output_current]))))
-    (values,) = (family for family in plant_families(hub, {}) if family.name == "multidrop_value")
-    assert [labels["unit"] for _, labels, _ in values.samples] == ["Hz", "raw count"]
+    found = {
+        family.name: [labels["register"] for _, labels, _ in family.samples]
+        for family in plant_families(hub, {})
+        if family.name.startswith("multidrop_register_") and "age" not in family.name
+    }
+    assert found == {
+        "multidrop_register_hertz": ["output_frequency"],
+        "multidrop_register_raw": ["output_current"],
+    }
+
+
+def test_metrics_are_in_base_units() -> None:
+    registers = {
+        register.value_unit: base_unit(register)
+        for family in MODELS.values()
+        for register in family.registers.values()
+        if register.values is None
+    }
+    assert {unit for unit, base in registers.items() if base is OTHER} == set()
+    assert (registers["V"], registers["%"]) == (("volts", 1.0), ("ratio", 0.01))
+    assert base_unit(reading(0, "kW")) == ("watts", 1000.0)
+    assert base_unit(reading(0, "m³/h")) is OTHER
+    assert base_unit(InvtCHE(1).status).name == "code"
 
 
 def test_home_assistant_number_of_raw_counts_has_that_unit() -> None:

@@ -36,7 +36,8 @@ def test_page_refers_to_all_its_files_and_to_no_others() -> None:
     text = "".join(path.read_text("utf-8") for path in OURS)
     named = set(re.findall(r'(?:from "\./|"page/)([\w./-]+)"', text))
     there = {path.relative_to(str(PAGE)).as_posix() for path in Path(str(PAGE)).rglob("*") if path.is_file()}
-    assert there - named == {"index.html", "vendor/uPlot-LICENSE"}
+    served = {"prometheus/alerts.yml", "prometheus/dashboard.json"}  # for users of Prometheus and Grafana
+    assert there - named == {"index.html", "vendor/uPlot-LICENSE", *served}
     assert named - there == set()
 
 

@@ -21,6 +21,7 @@ TYPES = {  # by suffix; all others are plain text
     ".js": "text/javascript",
     ".css": "text/css",
     ".svg": "image/svg+xml",
+    ".json": "application/json",
 }
 
 
