@@ -54,6 +54,7 @@ NOT_RUN = {
     ".venv/bin/ruff": "is a step of .ci/run",
     ".ci/run": "runs the tests themselves",
     "tools/wheels": "compiles for six machines: many minutes",
+    "sudo apt-get": "installs",
     "sudo tools/kernel/build": "builds a Debian: .ci/run does it",
     "MULTIDROP_KERNEL=": "runs the tests themselves",
     "tools/musl": "builds a Python: many minutes",

@@ -11,7 +11,13 @@ export const STATES = {
   still: "at rest: 0 Hz",
   unknown: "unknown",
 };
-export const ALARMS = { fault: "fault", stopped: "stopped by itself", limit: "limit", port: "port lost", silent: "silent" };
+export const ALARMS = {
+  fault: "fault",
+  stopped: "stopped by itself",
+  limit: "limit",
+  port: "port lost",
+  silent: "silent",
+};
 export const UNKNOWN = "–";
 const MOST_BITS = 32;
 
