@@ -202,10 +202,16 @@ def test_a_brief_lack_of_memory_does_not_end_polling(two: Two, monkeypatch: pyte
     assert two.poller.failure is None
 
 
+def exchanges(two: Two) -> int:
+    return two.poller.statistics()["ill"].counters.exchanges
+
+
 @pytest.fixture
 def failed(two: Two, monkeypatch: pytest.MonkeyPatch) -> Two:
-    """A poller whose thread has ended with a failure."""
+    """A poller whose thread has ended with a failure, and that has rows queued."""
     two.until(("ill", "ok"), ("well", "ok"))
+    taken = exchanges(two)
+    until(lambda: exchanges(two) >= taken + 2)  # so that rows are queued when polling ends
     monkeypatch.setattr(clock, "sleep", lambda seconds: None)
     monkeypatch.setattr(RowQueue, "await_calls", two.fails)
     two.poller._call_thread()
@@ -241,10 +247,10 @@ def test_every_call_of_a_failed_poller_raises_polling_failed(
 
 @patient
 def test_a_failed_poller_stops_polling_but_sends_commands(failed: Two) -> None:
-    exchanges = failed.poller.statistics()["ill"].counters.exchanges
+    before = exchanges(failed)
     bus = failed.poller.bus("ill")
     bus.drives[0].read(CURRENT)
-    assert failed.poller.statistics()["ill"].counters.exchanges - exchanges <= 2  # with one in flight
+    assert exchanges(failed) - before <= 2  # with one in flight
 
 
 def test_waiting_callers_wake_when_polling_fails(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
