@@ -426,6 +426,40 @@ def test_a_mistaken_stop_of_a_plant_is_reported_as_not_sent(
     assert not toy.counters.writes
 
 
+MISTAKES = [
+    'rs485 = "sometimes"\nname = "roof"\nport = "/dev/none-3"\n' + DRIVE.format("fan-9", TOY, 9),
+    DRIVE.format("fan-9", "no-such-model", 9),
+    DRIVE.format("fan-9", TOY, 999),
+    "[serve]\nlisten = 5\n\n[[walls]]\n",
+]
+
+
+@pytest.mark.parametrize("words", [[], ["pump-1"]])
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistake_in_a_plant_file_prevents_no_stop_of_other_drives(
+    run: Run, tmp_path: Path, port: str, toy: SimulatedDrive, mistake: str, words: list[str]
+) -> None:
+    plant = tmp_path / "wrong.toml"
+    head = "\n[[line]]\n" if mistake.startswith("rs485") else ""
+    plant.write_text(LINE.format("hall-1", port) + DRIVE.format("pump-1", TOY, 1) + head + mistake)
+    toy["control"] = Status.RUNNING
+    assert run("state", plant, "pump-1")[0] == 2  # other commands refuse the file
+    status, out, err = run("stop", plant, *words)
+    assert toy["control"] == 0
+    assert "only drives of" in err
+    assert (status, "fan-9" in out) == (0 if words else 1, False)
+
+
+def test_drive_with_a_mistake_of_its_own_is_not_stopped(run: Run, tmp_path: Path, port: str) -> None:
+    plant = tmp_path / "wrong.toml"
+    drives = DRIVE.format("pump-1", TOY, 1) + DRIVE.format("fan-9", "no-such-model", 9)
+    plant.write_text(LINE.format("hall-1", port) + drives)
+    status, _, err = run("stop", plant, "fan-9")
+    assert status == 2
+    assert "the stop was NOT sent: " in err
+    assert "no-such-model" in err
+
+
 def test_an_interrupted_stop_of_a_plant_reports_each_drive(
     run: Run, plant: Path, at: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -262,7 +262,8 @@ def names_plant(arguments: argparse.Namespace) -> bool:
 def stop_plant(arguments: argparse.Namespace, audit: str | None) -> int:
     """Stop the lines in parallel; print the results of each line's drives when the line is done.
 
-    Raises ValueError for mistakes in the plant file or the line's name. In that case no stop is sent.
+    Raises ValueError if the plant file has no drive without a mistake, or for a wrong name of a line. Then no
+    stop is sent.
     """
     try:
         lines = _lines(plant_of(arguments.words[0], arguments), arguments)
@@ -283,7 +284,8 @@ def stop_plant(arguments: argparse.Namespace, audit: str | None) -> int:
     if arguments.json:
         print_text(json.dumps([record for stop in stops for record in stop.records()], indent=2))
     results = [result for stop in stops for result in stop.results]
-    return DONE if all(result.ok for result in results) else FAILED
+    is_partial = getattr(arguments, "is_partial", False)
+    return FAILED if is_partial or not all(result.ok for result in results) else DONE
 
 
 def _lines(plant: Plant, arguments: argparse.Namespace) -> Sequence[PlantLine]:

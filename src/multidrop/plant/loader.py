@@ -32,13 +32,17 @@ from multidrop.toml_check import (
 class PlantError(ValueError):
     """All errors of a plant file; `mistakes` has a sentence for each, with its place and what would be right.
 
-    `rest` is the plant without its lines if the file is valid TOML, else None.
+    `rest` is the plant without its lines if the file is valid TOML, else None. `right` has the lines and
+    drives without a mistake, so that these drives can be stopped.
     """
 
-    def __init__(self, mistakes: tuple[str, ...], rest: Plant | None = None) -> None:
+    def __init__(
+        self, mistakes: tuple[str, ...], rest: Plant | None = None, right: Plant | None = None
+    ) -> None:
         super().__init__("\n".join(mistakes))
         self.mistakes = mistakes
         self.rest = rest
+        self.right = right
 
 
 def load_plant(path: Path | str) -> Plant:
@@ -49,10 +53,12 @@ def load_plant(path: Path | str) -> Plant:
     place = TomlPlace(path, lines=cache(partial(line_numbers, path)))
     document = place.attempt(read_document, path, "plant file")
     given = {} if document is None else place.check(document, _PLANT)
-    lines = tuple(_line(table, at) for table, at in place.inside("line", given.get("line", [])))
-    plant = Plant(lines, path, given.get("serve", {}), given.get("realtime", False))
+    lines = [_line(table, at) for table, at in place.inside("line", given.get("line", []))]
+    right = tuple(line for line in lines if line is not None)
+    plant = Plant(right, path, given.get("serve", {}), given.get("realtime", False))
     if place.config_errors:
-        raise PlantError(grouped(place.config_errors), None if document is None else replace(plant, lines=()))
+        rest = None if document is None else replace(plant, lines=())
+        raise PlantError(grouped(place.config_errors), rest, plant)
     return plant
 
 
@@ -173,7 +179,9 @@ def _of_family(name: str, family: type[Drive]) -> dict[str, Any]:
     }
 
 
-def _line(table: Any, place: TomlPlace) -> PlantLine:
+def _line(table: Any, place: TomlPlace) -> PlantLine | None:
+    """Return the line with its drives that have no mistake; None if the line itself has one."""
+    before = len(place.config_errors)
     given = place.check(table, _LINE)
     name, port = given.get("name", ""), given.get("port", "")
     if name:
@@ -197,8 +205,11 @@ def _line(table: Any, place: TomlPlace) -> PlantLine:
     ids = place.attempt(TransactionIds, given.get("transaction", "match"))
     if "transaction" in given and not speaks_tcp(port):
         place.wrong(f"transaction is a fact of tcp:// ports, and {port} is none; leave it out")
+    is_right = len(place.config_errors) == before
     inherited = {**settings, "silence": silence, "port": port}
     drives = [_drive(drive, inherited, at) for drive, at in place.inside("drive", given.get("drive", []))]
+    if not is_right:
+        return None
     polled = tuple(filter(None, drives))
     return PlantLine(
         name,

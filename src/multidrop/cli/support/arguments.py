@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import TypeVar
 
 from multidrop.bus import Bus
-from multidrop.cli.support.output import command_line
+from multidrop.cli import HARD_WIRED, STOPS
+from multidrop.cli.support.output import command_line, warn
 from multidrop.core import RS485, Echo
 from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import Settings, check_port
 from multidrop.families.registry import find_model
 from multidrop.plant.drive_names import drive_meant
-from multidrop.plant.loader import load_plant
+from multidrop.plant.loader import PlantError, load_plant
 from multidrop.plant.model import Plant, PlantLine
 from multidrop.printable import plain_number, plain_whole
 from multidrop.toml_check import parse_duration
@@ -82,8 +83,19 @@ def add_port_option(parser: argparse.ArgumentParser) -> None:
 
 
 def plant_of(path: str, arguments: argparse.Namespace) -> Plant:
-    """Load a plant, with the ports of --port. Raises ValueError for a mistake in the file or the options."""
-    plant = load_plant(path)
+    """Load a plant, with the ports of --port. Raises ValueError for a mistake in the file or the options.
+
+    A stop gets the drives that have no mistake, with a warning for each mistake of the file; then
+    `arguments.is_partial` becomes True.
+    """
+    try:
+        plant = load_plant(path)
+    except PlantError as wrong:
+        right = wrong.right
+        if arguments.command not in STOPS or right is None or not any(line.drives for line in right.lines):
+            raise
+        plant, arguments.is_partial = right, True
+        warn(f"{wrong}\nonly drives of {path} without a mistake can be stopped; for others {HARD_WIRED}")
     ports: dict[str, str] = {}
     for name, port in arguments.ports:
         if name in ports:
