@@ -171,12 +171,15 @@ def test_a_later_pseudo_terminal_of_the_same_number_is_not_opened(tmp_path: Path
         found.reopen()
     with ExitStack() as stack:
         time.sleep(0.05)  # file times advance in steps of some ms
-        while not device.exists():  # other processes may get the number first
-            for end in pty.openpty():
+        later: list[str] = []
+        while not (device.exists() and later):
+            ends = pty.openpty()
+            later.append(os.ttyname(ends[1]))
+            for end in ends:
                 stack.callback(os.close, end)
         if is_replaced:
             link.unlink()
-            link.symlink_to(device)
+            link.symlink_to(later[-1])  # usually the same number, unless another process has it
             found.reopen()
             found.close()
         else:
