@@ -242,13 +242,13 @@ STOP: Schema = {
     "description": "drives: a name, a list of names, or null for all drives",
 }
 WRITE: Schema = {
-    **some(drive=GIVEN, register=GIVEN, value=NUMBER, seen=SEEN, id=ID),
+    **some(drive=GIVEN, register=GIVEN, value=NUMBER, seen=SEEN, id=maybe(ID)),
     "required": ["drive", "register", "value", "seen"],
 }
 
 
 def _act(verbs: list[str], options: Schema, *required: str) -> Schema:
-    fields = some(drive=GIVEN, verb={"enum": verbs}, options=options, seen=SEEN, id=ID)
+    fields = some(drive=GIVEN, verb={"enum": verbs}, options=options, seen=SEEN, id=maybe(ID))
     return {**fields, "required": ["drive", "verb", *required]}
 
 
