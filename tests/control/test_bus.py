@@ -105,8 +105,8 @@ def test_read_many_returns_values_in_the_requested_order() -> None:
         assert found == {register.name: proof(ours, register) for register in asked}
 
 
-REQUESTS = {  # all readings: from the documents' maps and limits
-    ErmanERG220: 2,  # 1 to 12, across the addresses between; 0400H to 0403H
+REQUESTS = {  # number of requests that read all readings, from the documents' maps and limits
+    ErmanERG220: 2,  # 1 to 12, including unused addresses; 0400H to 0403H
     InvtCHE: 4,  # 1001H; 3000H to 3016H, 16 at a time; 5000H and 5001H
     InnovertIBD: 2,  # PrA.03 and PrA.04; PrA.22
     DelixiModbus: 32,  # one at a time
@@ -163,7 +163,7 @@ def test_baud_rate_and_format_of_a_bus_are_used_by_drives_without_their_own() ->
 
 @patient
 def test_the_silence_of_a_bus_is_used_by_drives_without_their_own() -> None:
-    """On the line one bit is added to it, as to the standard's t3.5."""
+    """A drive without its own silence keeps that of the bus, plus one bit time as for the standard's t3.5."""
     drives = [simulated(ErmanERG220(at, silence=600e-6)) for at in (1, 2)]
     with Simulator([Wire(drives)]) as sim, Bus(sim.wires[0].path, silence=600e-6) as bus:
         for at in (1, 2):

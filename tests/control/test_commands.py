@@ -382,7 +382,7 @@ def test_a_line_is_stopped_as_a_whole_unless_one_of_its_drives_is_being_stopped(
 
 
 class TimedStops:
-    """Stops that last some seconds of the loop's time; the first `given_up` repeated ones do not succeed."""
+    """Stops that last some seconds of the loop's time; the first `given_up` repeated stops do not succeed."""
 
     def __init__(self, drive: Any, given_up: int) -> None:
         self.stops = RepeatedStops(self._stop, self._begin)

@@ -107,7 +107,7 @@ def test_a_third_signal_within_a_second_ends_the_wait_with_a_message(
     monkeypatch.setattr("multidrop.control.exit_hook.time.monotonic", lambda: now)
     hook, act = ExitHook(), Act()
     made = hook.add(act.begin, act.work)
-    for _ in range(5):  # slow signals do not count, however many
+    for _ in range(5):  # signals that come slowly do not count, however many
         signal.raise_signal(signal.SIGINT)
         now += 0.7
     assert caught == []
@@ -148,7 +148,9 @@ def test_repeated_hang_up_signals_do_not_end_the_wait(caught: list[int]) -> None
     try:
         hook, act = ExitHook(), Act()
         made = hook.add(act.begin, act.work)
-        hook._before[signal.SIGHUP] = lambda number, frame: caught.append(number)  # not the end
+        hook._before[signal.SIGHUP] = lambda number, frame: caught.append(
+            number
+        )  # replaces the default action
         for _ in range(4):
             signal.raise_signal(signal.SIGHUP)
         assert act.is_begun

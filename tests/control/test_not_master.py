@@ -232,7 +232,7 @@ def test_commands_are_sent_again_after_the_mastership_returns(scene: Scene) -> N
     assert scene.requests > 0
 
 
-# ---- it ends in the middle ----
+# ---- the mastership ends in the middle of a call ----
 
 
 def hold_back(monkeypatch: pytest.MonkeyPatch, scene: Scene, *, sent_ns: int, after: int) -> None:

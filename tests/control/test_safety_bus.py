@@ -108,7 +108,7 @@ def test_writes_against_a_rule_are_refused_and_not_sent(
     register = drive.register(name)
     with pytest.raises(WriteForbidden, match=sentence) as refusal:
         drive.write(register, value)
-    assert isinstance(refusal.value, ValueError)  # so that it also counts as the caller's mistake
+    assert isinstance(refusal.value, ValueError)  # like Python's own error for an invalid argument
     assert (refusal.value.register, bool(refusal.value.rule), bool(refusal.value.place)) == (name, True, True)
     assert line.written == []
 

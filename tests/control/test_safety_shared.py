@@ -69,7 +69,7 @@ COLLISIONS: Sequence[Collision] = (interleaved, overlaid, cut_off, one_after_ano
 class SharedPair:
     """A pair with the clients' ports `ours` and `theirs`; `sent` has our client's bytes before collisions.
 
-    If `holds(said)` returns True for our client's bytes, they are lost, and the others send `says` instead.
+    If `holds(said)` returns True for our client's bytes, they are lost, and the other client sends `says`.
     """
 
     def __init__(self, drives: str, baudrate: int, seed: int) -> None:

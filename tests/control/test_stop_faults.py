@@ -94,7 +94,7 @@ def check_failing(
     try:
         with calling_at(nth, is_ours, fail) as place:
             stop()
-    except failure as raised:  # keeps all frames of the stop alive during the checks
+    except failure as raised:  # keeps all Python frames of the stop alive during the checks
         told = "".join(getattr(raised, "__notes__", ()))
         assert not line.bus._latches._stops, place
         assert not line.bus.stops_under_way(), place
@@ -373,7 +373,7 @@ def test_a_port_name_that_is_not_text_prevents_no_stop(
     assert "stops were not counted: " in caplog.text
 
 
-# ---- faults at lines of each family ----
+# ---- failures at each line of code of each family's stop ----
 
 
 FAMILIES: dict[str, Callable[[int], Drive]] = {

@@ -253,7 +253,7 @@ def test_a_stop_reopens_a_lost_port(tmp_path: Path, ending: str) -> None:
 def test_closing_a_poller_with_a_lost_port_stops_its_motors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, opener: str
 ) -> None:
-    """Whether the poller or the stop reopens the port."""
+    """The motors are stopped whether the poller or the stop reopens the port."""
     if opener == "the stop":
         monkeypatch.setattr(Reopening, "_attempt", lambda reopening: None)
     pulled = Pulled(tmp_path / "port")

@@ -34,7 +34,7 @@ from multidrop.core import (
 
 Pair = tuple[Printed, Printed]
 REPLIES = [each for each in PRINTED if each.request is not None and isinstance(each.says, Message)]
-WRITE = bytes.fromhex("01 06 20 01 13 88 DE 9C")  # its reply is a copy of it
+WRITE = bytes.fromhex("01 06 20 01 13 88 DE 9C")  # a write, whose reply is a copy
 READ, ANSWER = bytes.fromhex("01 03 00 16 00 01 65 CE"), bytes.fromhex("01 03 02 18 00 B2 44")
 OTHER_READ = bytes.fromhex("01 03 01 F4 00 01 C4 04")
 ALSO_ANSWER = bytes.fromhex("01 03 02 13 88 B5 12")  # as long as ANSWER
@@ -244,7 +244,7 @@ def test_the_framing_of_each_frame_is_detected() -> None:
 
 
 def test_an_interrupted_decoder_reads_no_freed_memory() -> None:
-    """It continues with the known requests, and with the file's next bytes, under a memory sanitizer."""
+    """The decoder continues with the known requests and the file's next bytes, under a memory sanitizer."""
 
     def act(nth: int) -> bool:
         decoder, stream, columns = Decoder(), Stream(), Columns(16)

@@ -287,7 +287,7 @@ def test_the_client_is_called_when_a_drive_fails_and_when_it_answers_again(drive
         silent.clear()
         wait_until(lambda: now_ns() > peer.late_until_ns)
         port.repeat(asked)
-        while peer.failures:  # the client is also called at the end of the queue
+        while peer.failures:  # calls at the queue's end come too
             assert row_queue.await_calls(60) == [17]
 
 
@@ -344,7 +344,7 @@ def test_rows_outlive_their_queue(drive: Drive) -> None:
         wait_until(lambda: not pending(port))
         columns = row_queue.take()
     assert columns is not None
-    ffi.release(row_queue.c)  # as a garbage collector does that finds both together
+    ffi.release(row_queue.c)  # a garbage collector may free the queue before its columns
     assert list(columns.array("value")) == [7]
     del columns
 
@@ -753,7 +753,7 @@ def test_cut_off_is_set_if_the_port_is_lost_after_a_reply(answered: int, way: st
         if way == "queued":
             until(lambda: port.done == answered + 1)
         else:
-            assert port.repeat([]) == 1  # the second exchange was next, or was cut off
+            assert port.repeat([]) == 1  # index of the second exchange, which was next or cut off
     near.close()
 
 
@@ -828,7 +828,7 @@ def test_closing_a_port_ends_the_wait_of_its_clients(drive: Drive) -> None:
 
 
 def test_is_asking_is_true_for_peers_of_queued_repeated_and_urgent_exchanges() -> None:
-    """It is true for exchanges that wait or are in flight, but not for another peer."""
+    """`is_asking` is true while the peer's exchanges wait or are in flight, but not for another peer."""
     near, far = socket.socketpair()
     with near, far:
         near.setblocking(False)
@@ -881,7 +881,7 @@ def descriptors() -> Iterator[int]:
 
 @pytest.mark.long
 def test_a_thousand_ports_can_be_open_together(descriptors: int) -> None:
-    """This is done twice. Each port is closed while the others still have exchanges in flight."""
+    """All ports are opened twice. Each is closed while the others still have exchanges in flight."""
     if descriptors < 2500:
         pytest.skip(f"a process may have no more than {descriptors} descriptors here")
 

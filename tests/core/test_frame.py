@@ -77,7 +77,7 @@ def carry_out(framing: Framing, request: Message, received: bytes, piece: int = 
 def test_every_printed_frame_is_parsed() -> None:
     assert (
         len({(each.framing, each.direction, each.frame) for each in PRINTED}) == 49 + 19
-    )  # 19 replies are copies
+    )  # 19 replies are copies of their requests
     assert len(GOOD_REQUESTS) + len(GOOD_REPLIES) + len(REFUSED) == len(PRINTED)
 
 
@@ -103,7 +103,7 @@ def test_function_89h_is_accepted_for_88h_but_never_sent() -> None:
     request = Message(1, 0x08, 0, data=words(0xA537))
     assert parse_reply(RTU, bytes.fromhex(MISPRINTED), request) == (5, refusal)
     assert build_reply(RTU, refusal) == bytes.fromhex("01 88 01 87 C0")
-    # it is an exception only to function 08
+    # 89H is accepted as an exception only to function 08
     assert parse_reply(RTU, bytes.fromhex(MISPRINTED), Message(1, 0x03, 0, 1))[0] == FrameFault.BAD_FUNCTION
 
 
@@ -208,7 +208,7 @@ WRONG = [
     ("another start confirmed", RTU, WRITE_TWO, rtu("01 10 00 11 00 02"), FrameFault.BAD_ECHO),
     ("fewer registers confirmed", RTU, WRITE_TWO, rtu("01 10 00 10 00 01"), FrameFault.BAD_ECHO),
     ("another loopback", RTU, LOOPBACK, rtu("01 08 00 00 A5 38"), FrameFault.BAD_ECHO),
-    # all of them accept a late reply of the right shape; these differ in function, address or length
+    # every library accepts a late reply of the right shape; these differ in function, address or length
     (
         "late reply to a longer read",
         RTU,

@@ -1,4 +1,6 @@
-"""After the window of late replies, requests with ambiguous replies wait for the reply to a proof."""
+"""After the window of late replies, requests with ambiguous replies wait for the reply to a proof.
+
+A proof is a read whose reply no late reply can resemble."""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ AGAIN = Message(1, 6, 9, data=words(1))
 
 @pytest.fixture
 def proof(line: LineDriver, drive: Peer) -> Exchange:
-    """Return the drive's proof, a longer read, after READ got no reply and its window is over."""
+    """Let READ get no reply and its window end; return the drive's proof, a longer read."""
     found = exchange(LONGER, drive)
     drive.prove_by([found])
     time_out(line, drive, READ)
@@ -48,7 +50,7 @@ def test_a_read_of_the_same_length_waits_for_a_proof(line: LineDriver, drive: Pe
 
 @pytest.mark.usefixtures("proof")
 def test_a_write_waits_for_the_reply_to_an_earlier_write(line: LineDriver, drive: Peer) -> None:
-    """A late exception to the first write would be taken for the second's, whose motor has started."""
+    """Otherwise a late exception to the first write would be taken for a refusal of the second."""
     time_out(line, drive, WRITE)
     assert is_barred(line, drive, AGAIN)
 
@@ -193,7 +195,7 @@ def test_a_reply_is_found_after_noise_before_its_request(line: LineDriver, drive
 
 @pytest.fixture
 def first(drive: Peer) -> Exchange:
-    """Return the proof of a drive whose first reply, as long as READ's, may be to another process."""
+    """Return the proof of a drive whose first reply may be to a read by another process, as long as READ."""
     found = exchange(LONGER, drive)
     drive.prove_by([found, exchange(Message(1, 3, 0, 3), drive)])
     drive.doubt_first_reply()

@@ -116,7 +116,7 @@ def given_up(line: LineDriver, drive: Peer, request: Message = READ) -> int:
 
 
 def time_out(line: LineDriver, drive: Peer, request: Message = READ) -> int:
-    """Return the same time, but without the reply's length, which is awaited on an unknown adapter."""
+    """Return the result of `given_up` without a reply's duration, which an unknown adapter may add."""
     return given_up(line, drive, request) - 7 * CHARACTER
 
 
@@ -378,7 +378,7 @@ def test_a_delixi_request_waits_for_a_late_reply_that_could_be_its_own(
 
 
 def test_a_late_reply_to_a_write_is_expected_after_the_writes_timeout(line: LineDriver, drive: Peer) -> None:
-    """Its late exception would be taken for the next write's, whose motor has started."""
+    """Otherwise a late exception to it would be taken for a refusal of the next write."""
     line.begin(exchange(WRITE, drive, timeout=5 * MOST / 1e9))
     line.wait_until_write()
     line.wait_until_done()
@@ -516,7 +516,7 @@ def test_a_late_reply_is_not_reported_as_a_reply_from_another_address(line: Line
 
 
 def test_data_like_a_late_reply_stay_part_of_the_reply(line: LineDriver, drive: Peer) -> None:
-    """It comes at once or byte by byte: the bar stays, and the reply is read."""
+    """The reply comes whole or byte by byte; it is read, and the earlier late reply is still expected."""
     time_out(line, drive)
     until = drive.late_until_ns
     inside = reply(1111) + b"\x00"

@@ -85,7 +85,7 @@ def test_the_time_of_a_value_is_never_after_its_reply(line: LineDriver) -> None:
         line.now = max(line.now, line.wake)
     begun = line.now
     line.take(held_up=10 * MS)
-    line.receive(reply_of(7))  # it had come when the thread continued
+    line.receive(reply_of(7))  # the reply had arrived before the thread continued
     assert line.want == "done"
     assert (line.completion.sent_ns, line.completion.first_ns) == (begun, begun + 10 * MS)
 
@@ -294,7 +294,7 @@ def test_a_reply_is_found_if_it_comes_in_pieces(line: LineDriver, piece: int) ->
     found = line.completion
     assert (found.result, found.raw, found.reply.data) == (7, frame, words(5000))
     last = sent + 15 * MS + (len(frame) - 1) // piece * MS
-    # Bytes that come in one piece took the time of their characters too.
+    # Bytes that arrive in one piece are assumed to have taken the time of their characters on the wire.
     assert found.first_ns == min(sent + 15 * MS, last - (len(frame) - 1) * CHARACTER)
     assert (found.sent_ns, found.last_ns) == (sent, last)
     assert (found.stale, found.skipped) == (0, 0)
@@ -571,7 +571,7 @@ DAMAGED_ECHOES = {
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
 @pytest.mark.parametrize("echo", DAMAGED_ECHOES)
 def test_a_damaged_echo_of_a_write_confirms_nothing(line: LineDriver, echo: str, piece: int) -> None:
-    """Nor does a copy after it: that may be the echo, after noise. The register can be read back."""
+    """A later copy confirms nothing either: it may be the echo, after noise. A read back is possible."""
     teach_echo(line)
     ask(line, WRITE)
     line.receive(DAMAGED_ECHOES[echo] + confirmation(), piece)
@@ -662,7 +662,7 @@ def test_a_lone_copy_is_rejected_while_it_is_unknown_whether_the_adapter_echoes(
     answer(line, confirmation())
     assert (line.completion.result, line.completion.raw) == (Failure.MAYBE_ECHO, confirmation())
     ask(line, WRITE)
-    answer(line, confirmation() + confirmation())  # an echo before a confirmation: it was an echo
+    answer(line, confirmation() + confirmation())  # two copies: the adapter echoes
     assert (line.completion.result, line.completion.skipped) == (8, 8)
     ask(line, WRITE)
     answer(line, confirmation())
@@ -814,7 +814,7 @@ def test_a_paced_value_of_0_ends_the_exchange_of_a_steady_drive(line: LineDriver
 def test_a_copy_that_may_be_an_echo_waits_for_the_whole_time_out(
     line: LineDriver, steady: Peer, insists: bool
 ) -> None:
-    """The copy was whole earlier than a reply can be, or it is the read of a stop, which ignores times."""
+    """The copy came earlier than a reply can come, or the read insists, which ignores arrival times."""
     make_steady(line, steady)
     end = send_query(line, steady, insists=insists)
     if insists:

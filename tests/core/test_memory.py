@@ -92,7 +92,7 @@ def last_line(struct: str, *fields: str) -> int:
 
 
 def test_the_fields_that_every_exchange_uses_are_in_few_cache_lines() -> None:
-    """Two of the drive and two of the exchange; one of the drive whose exchange is next."""
+    """These are two of the drive and two of the exchange, and one of the next exchange's drive."""
     assert last_line("md_drive", "most_timeout_ns", "ready_ns", "failures", "owed_count", "is_doubted") == 1
     assert last_line("md_drive", "counters", "answered_ns") == 2
     assert last_line("md_exchange", "values", "period_ns", "insists", "frame") == 2

@@ -54,7 +54,7 @@ def test_only_the_cores_thread_is_scheduled_in_real_time(realtime: Realtime) -> 
     assert policies()[core] & os.SCHED_FIFO
     second.want(False)
     assert not policies()[core] & os.SCHED_FIFO
-    assert not second.has_ended()  # because a client ended it
+    assert not second.has_ended()  # a client ended it, not the core after a flood
 
 
 def locked_kb() -> int:
@@ -63,7 +63,7 @@ def locked_kb() -> int:
 
 
 def test_the_cores_code_is_locked_in_memory(realtime: Realtime) -> None:
-    assert 64 < locked_kb() < 4096  # of a library, not the whole process
+    assert 64 < locked_kb() < 4096  # kB: the size of a library, not of the whole process
     realtime.want(False)
     assert locked_kb() == 0
 

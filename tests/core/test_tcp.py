@@ -138,7 +138,7 @@ def test_the_longest_tcp_frame_is_built_and_parsed() -> None:
         ("00 00 00 00 00 05 02 03 02 00 07", FrameFault.BAD_ADDRESS),
         ("00 00 00 00 00 05 01 04 02 00 07", FrameFault.BAD_FUNCTION),
         ("00 00 00 00 00 05 01 03 02 00", FrameFault.INCOMPLETE),
-        ("00 00 00 00 00 01 01", FrameFault.INCOMPLETE),  # may become an exception
+        ("00 00 00 00 00 01 01", FrameFault.INCOMPLETE),  # may be the start of an exception
         ("00 00 00", FrameFault.INCOMPLETE),
     ],
 )

@@ -1,4 +1,4 @@
-"""Compute the three checksums after the documents, independent of the library."""
+"""Append CRC, LRC or Delixi's sum to frames, computed from the documents, without the library."""
 
 from __future__ import annotations
 
@@ -20,5 +20,5 @@ def ascii(body: str) -> bytes:
 
 
 def delixi(body: str) -> bytes:
-    """Return the frame with its sum (Delixi, part 3)."""
+    """Return the frame with the sum of its bytes modulo 256 (Delixi's manual, part 3)."""
     return f":{body}{sum(bytes.fromhex(body)) & 0xFF:02X}\r\n".encode()

@@ -91,7 +91,7 @@ class Meter(Drive):
 
 
 def write_meter(folder: Path, name: str = "meter.toml") -> Path:
-    """Write the meter's two files; return the path of the first."""
+    """Write the meter's family file and its table meter.csv; return the path of the family file."""
     path = folder / name
     path.write_text(METER, "utf-8")
     (folder / "meter.csv").write_text(METER_CSV, "utf-8")

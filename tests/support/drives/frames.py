@@ -64,7 +64,7 @@ MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
         Message(1, 0x06, 2, data=words(285)),
         {"same": Message(1, 0x06, 2, data=words(285)), "01 86 03 02 61": Message(1, 0x06, exception=3)},
     ),
-    "01 0F 00 00 00 09 02 01 01 25 2C": (  # E4: like E3
+    "01 0F 00 00 00 09 02 01 01 25 2C": (  # E4: like E3, valid but never to be sent
         Message(1, 0x0F, 0, 9, bytes([0x01, 0x01])),
         {
             "01 0F 00 00 00 09 95 CD": Message(1, 0x0F, 0, 9),

@@ -1,4 +1,4 @@
-"""The shipped families that command motors, with the options of a plant file, and their start words."""
+"""Shipped families that command motors: their plant-file options, and control words that start motors."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ REPRESENTATIVES = (
 )
 MAKE = {name: ALL[name] for name in REPRESENTATIVES}
 
-# Family classes for tests that derive from them.
+# Family classes that tests subclass.
 Acs355: Any = shipped_family("abb-acs355")
 Atv320: Any = shipped_family("schneider-atv320")
 Fc51: Any = shipped_family("danfoss-fc51")
@@ -58,7 +58,7 @@ def _jog_or_run(word: int) -> bool:
     return word in (1, 2, 3, 4)
 
 
-# Writes (address, word) that start the motor, typed from the manuals.
+# Writes (address, control word) that start the motor, typed from the manuals.
 STARTS: dict[str, Callable[[Message], bool]] = {
     "abb-acs355": _at(0, lambda word: word & 0x09 == 0x09),
     "siemens-v20": _at(99, lambda word: word & 0x09 == 0x09),

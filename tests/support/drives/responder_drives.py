@@ -35,7 +35,7 @@ class Kind:
     stops: Judge
     memory: Mapping[int, int]  # raw counts by address, for all read functions
     turning: Mapping[int, int]  # replaces entries of `memory` while the motor turns
-    mark: str  # name of a register that no verb reads
+    mark: str  # name of a register that tests read to mark a place in the log: no verb reads it
     protocol: str = STANDARD
     makes: Mapping[str, Any] = field(default_factory=dict)  # keyword arguments for the class
     halts: tuple[str, ...] = ("stop",)
@@ -131,7 +131,7 @@ KINDS = {
             {},
             {0x0010: 900},
             "current",
-            makes={"confirmed": 1},  # declared by its owner, because no reply identifies it
+            makes={"confirmed": 1},  # the user confirms the family, because no reply identifies it
         ),
     )
 }

@@ -133,7 +133,9 @@ def rows(drive: type[Drive]) -> set[tuple[str, str, str, str, float | None]]:
 
 
 def typed(table: str) -> set[tuple[str, str, str, str, float | None]]:
-    """Parse a typed table into such tuples; a step "-" means none, "?" not stated."""
+    """Parse a table typed from a manual into tuples like those of `rows`.
+
+    A step "-" means that there is none, "?" that the manual does not state it; both become None."""
     found = set()
     for line in table.strip().splitlines():
         functions, address, name, step, *unit = line.split()
@@ -141,7 +143,7 @@ def typed(table: str) -> set[tuple[str, str, str, str, float | None]]:
     return found
 
 
-# Readings that both Delixi protocols have, for `typed`.
+# Readings that both Delixi protocols have, as a table for `typed`.
 DELIXI_MONITORS = """
 01F4 output_frequency     0.01 Hz
 01F5 reference_frequency  ? Hz

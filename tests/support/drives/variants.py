@@ -18,7 +18,7 @@ VARIANTS = (  # family, framing, and baud rate for `fast_drives`
     (YD1000, Framing.RTU, 1_000_000),
 )
 REASONS = {str(each) for each in Status} - {str(Status.OK)}
-TIMEOUT = 0.02  # s, the shortest timeout, learnt for drives that mostly reply immediately
+TIMEOUT = 0.02  # s, the shortest timeout; the client learns it, because these drives mostly reply immediately
 LATEST = 3 * TIMEOUT
 
 

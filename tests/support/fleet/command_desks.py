@@ -72,12 +72,12 @@ class Desks:
 
     @property
     def writes(self) -> list[tuple[str, int]]:
-        """Return the writes that the drive has accepted, as (register name, raw count)."""
+        """Return the writes that the drive has accepted, as (register name, raw value)."""
         return [(one.name, one.raw) for one in self.sim.counters.writes]
 
     @property
     def written(self) -> set[str]:
-        """Return the names of written registers as a set, because a slow reply makes a stop repeat."""
+        """Return the names of written registers; a set, because a stop is repeated if its reply is slow."""
         return {name for name, _ in self.writes}
 
     @property
@@ -105,7 +105,7 @@ class Desks:
         return await self.stop_by(json.dumps(what).encode())
 
     async def stop_by(self, data: bytes) -> CommandAnswer | None:
-        """Send a stop message; return the desk's answer, or None."""
+        """Pass a stop message to the desk; repeat it until the stop is over; return the answer, or None."""
         answer = await self.stops.stop(LINE, data)
         while answer is not None and answer.outcome is CommandOutcome.UNDER_WAY:
             answer = await self.stops.stop(LINE, data)

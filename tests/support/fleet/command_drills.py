@@ -41,7 +41,7 @@ class CommandRecord(NamedTuple):
     way: str
     offered_s: float  # monotonic time of the offer, in s
     told: CommandOutcome
-    sent: int  # number of times the drive received it
+    sent: int  # how often the drive received the command
 
 
 class Verdict(NamedTuple):
@@ -184,7 +184,7 @@ class CommandDrill(FleetProcesses):
         twice = wrongly = unknown_sent = unnoted = 0
         oldest = 0.0
         for one in asked:
-            if one.raw is None:  # stops may repeat
+            if one.raw is None:  # a stop may be sent repeatedly
                 wrongly += (one.told in SENT and not one.sent) or (one.told in UNSENT and bool(one.sent))
                 continue
             sent = seen[one.drive][one.raw]

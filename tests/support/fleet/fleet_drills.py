@@ -1,4 +1,4 @@
-"""Fleet drills: gateway processes, three NATS nodes, and serial servers that record who sent when."""
+"""Fleet drills: gateway processes, three NATS nodes, and serial servers that record who sends when."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class FleetProcesses:
         assert made.returncode == 0, made.stderr
 
     def run(self, *words: str) -> subprocess.CompletedProcess[str]:
-        """Run `multidrop fleet` with these words."""
+        """Run `multidrop fleet` with these arguments."""
         command = [sys.executable, "-m", "multidrop", "fleet", *words]
         return subprocess.run(
             command, env=self._environment, capture_output=True, text=True, check=False, timeout=PATIENCE_S
@@ -137,7 +137,7 @@ class FleetDrill(FleetProcesses):
                 self.start(name)
 
     def are_leaders_home(self) -> bool:
-        """Return True if each node leads one bucket of each group; else killing a node hits several."""
+        """Return True if each node leads one bucket of each group, so that no node's loss affects several."""
         leads = [node.leads() for node in self.nats.nodes]
         return all(
             sum(f"KV_{bucket}" in found for bucket in group) == 1
@@ -253,7 +253,7 @@ async def _end_record(nats: Cluster, gateway: str, bucket: str) -> None:
     other = LeaseBucket(bucket, lambda: path, "another")
     while True:
         record = await other.get(gateway)
-        with suppress(Conflict):  # its gateway renewed it in between
+        with suppress(Conflict):  # the gateway renewed the record after it was read
             await other.put(gateway, {**record.value, "ended": True}, record.revision)
             break
     await path.close()

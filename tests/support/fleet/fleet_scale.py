@@ -103,7 +103,7 @@ class LargeFleet:
             await path.close()
 
     def start(self, *groups: Sequence[str]) -> float:
-        """Start a process for each group of gateways; return when all were ready (CLOCK_MONOTONIC, s)."""
+        """Start a process per group of gateways; return the time when all were ready (CLOCK_MONOTONIC, s)."""
         started = [MemberProcess(self.nats.urls, group) for group in groups]
         self.processes += started
         until(lambda: all(process.is_ready for process in started), "the processes are ready")

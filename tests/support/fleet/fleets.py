@@ -169,7 +169,7 @@ class RecordingLines:
 
 
 class Hall:
-    """The lines of all gateways, from the drives' view."""
+    """All gateways of a fake fleet; records each claim of a line, and whether another gateway may send."""
 
     def __init__(self) -> None:
         self.gateways: list[RecordingLines] = []

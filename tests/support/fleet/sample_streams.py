@@ -15,7 +15,7 @@ from multidrop.fleet.servers.connections import ServerPath
 
 @asynccontextmanager
 async def empty_stream(servers: Cluster) -> AsyncIterator[ServerPath]:
-    """Yield a connected path to the servers, with an empty stream of samples."""
+    """Yield an open ServerPath to the servers, on which the stream of samples is empty."""
     async with samples_path(servers.urls) as path:
         with suppress(FleetError):
             await samples_stream._ask(path, "STREAM.DELETE.samples", {})

@@ -33,7 +33,7 @@ PASS_EVERY = 10  # one in ten requests of the second master reads an unpolled re
 ASKED_ONES = 200  # requests that a stalled viewer sends without reading
 PATIENCE_S = 30.0
 ROUND_S = 1.0  # s before a user reconnects
-WORDS, COMMON, COMMON_WORDS = 10, 0xF000, 6  # polled registers; common block
+WORDS, COMMON, COMMON_WORDS = 10, 0xF000, 6  # number of polled registers; common block: address, size
 
 SERVE = """[serve]
 listen = "127.0.0.1:{http}"

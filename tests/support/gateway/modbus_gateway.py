@@ -83,7 +83,7 @@ class FakeCommands:
 
 
 class FakeLine:
-    """A fake line that answers uncached reads: each address with its own number, or as the test sets."""
+    """A fake line for uncached reads: a register holds its own address, a coil its lowest bit."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[str, int, int, int]] = []

@@ -102,7 +102,7 @@ class Fence:
         self.far = FarEnd(lines)
         self._lease, self._guard, self._beyond = lease, guard, beyond
         self.early = 0  # masters that died before the test suspended them
-        self._timer = timer or guard  # the kernel's timer fires after half of it
+        self._timer = timer or guard  # s; the kernel's timer fires after half of this time
         self._ours, self._theirs = socket.socketpair()
         self._theirs.set_inheritable(True)
         self._client = subprocess.Popen(
@@ -154,7 +154,7 @@ class Fence:
     def stop_once(self, chance: random.Random) -> Round:
         """Suspend a polling master at a random moment, take over, and let it continue; return the result.
 
-        If the kernel killed the master before, because the test machine was busy, retry with another master.
+        If the kernel killed the master before its suspension, as on a busy machine, retry with another one.
         """
         while True:
             with self._master() as master:

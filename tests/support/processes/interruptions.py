@@ -23,7 +23,7 @@ def interrupted_at(nth: int, counts: Callable[[FrameType], bool]) -> AbstractCon
 def failing_at(
     nth: int, counts: Callable[[FrameType], bool], failure: BaseException
 ) -> AbstractContextManager[list[str]]:
-    """Raise `failure` before the nth line in such frames; yield a list to which the line's place is added."""
+    """Raise `failure` before the nth line for which `counts(frame)` is true; yield a list for its place."""
 
     def fail() -> None:
         raise failure
@@ -35,7 +35,9 @@ def failing_at(
 def calling_at(
     nth: int, counts: Callable[[FrameType], bool], call: Callable[[], object], event: str = "opcode"
 ) -> Iterator[list[str]]:
-    """Call `call` before the nth opcode or line in such frames; yield a list to which its place is added."""
+    """Call `call` before the nth opcode or line for which `counts(frame)` is true.
+
+    Yields a list to which the place of this opcode or line is added."""
     left, before = nth, sys.gettrace()
     found: list[str] = []
 

@@ -29,7 +29,7 @@ NAME = "counted"
 
 
 class Counted(Drive):
-    """A drive that counts its reads, and has a writable number of unknown memory type."""
+    """A drive that counts its reads, and has a writable register, `number`, not declared as RAM or EEPROM."""
 
     framings = (Framing.RTU,)
     baudrates = (115_200,)

@@ -40,7 +40,7 @@ class Sniffer:
         return dict(self.told[-1]["summary"])
 
 
-# Checks the pairing of replies, which on a busy machine may come after the master's timeout.
+# Run `multidrop sniff` without time limits, because replies may be late on a busy machine.
 PATIENT = """
 import sys
 from multidrop.cli import main

@@ -72,7 +72,7 @@ def random_rows(seed: int, begin: int, count: int, step: int = SECOND // 5) -> l
 
 
 def record(folder: Path, segments: Sequence[Sequence[Row]], piece: int = 40, after: int = 0) -> None:
-    """Write each list of rows as a segment of a history."""
+    """Write each list of rows as a segment of a history; each write has at most `piece` rows."""
     folder.mkdir(exist_ok=True)
     with SegmentWriter(folder / "rows.arrows", METADATA, every=1e9, after=after) as writer:
         for rows in segments:

@@ -24,7 +24,7 @@ def patient_peer(*, interval: float, **timeouts: float) -> Peer:
 
 
 def be_patient(set_attribute: Callable[..., None], set_item: Callable[..., None]) -> None:
-    """Lengthen the timeouts of drives and writes with these functions that set attributes and items."""
+    """Lengthen the timeouts of drives and writes, with functions like monkeypatch.setattr and .setitem."""
     set_attribute(peers, "Peer", patient_peer)
     await_turns(set_attribute, set_item)
 

@@ -40,7 +40,7 @@ def text(frame: bytes) -> str:
 class SimulatedBus:
     """Simulated drives and a `Bus` to them; every sent frame is recorded.
 
-    If `loses(request)` is true, the reply is lost; if `deafens(request)` is true, the request is.
+    If `loses(request)` is true, the reply is lost; if `deafens(request)` is true, the request is lost.
     """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *sims: SimulatedDrive, **details: Any) -> None:
