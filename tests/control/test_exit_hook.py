@@ -148,9 +148,7 @@ def test_repeated_hang_up_signals_do_not_end_the_wait(caught: list[int]) -> None
     try:
         hook, act = ExitHook(), Act()
         made = hook.add(act.begin, act.work)
-        hook._before[signal.SIGHUP] = lambda number, frame: caught.append(
-            number
-        )  # replaces the default action
+        hook._before[signal.SIGHUP] = lambda number, frame: caught.append(number)  # not the default
         for _ in range(4):
             signal.raise_signal(signal.SIGHUP)
         assert act.is_begun

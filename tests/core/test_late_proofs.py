@@ -1,6 +1,7 @@
 """After the window of late replies, requests with ambiguous replies wait for the reply to a proof.
 
-A proof is a read whose reply no late reply can resemble."""
+A proof is a read whose reply no late reply can resemble.
+"""
 
 from __future__ import annotations
 

@@ -135,7 +135,8 @@ def rows(drive: type[Drive]) -> set[tuple[str, str, str, str, float | None]]:
 def typed(table: str) -> set[tuple[str, str, str, str, float | None]]:
     """Parse a table typed from a manual into tuples like those of `rows`.
 
-    A step "-" means that there is none, "?" that the manual does not state it; both become None."""
+    A step "-" means that there is none, "?" that the manual does not state it; both become None.
+    """
     found = set()
     for line in table.strip().splitlines():
         functions, address, name, step, *unit = line.split()

@@ -37,7 +37,8 @@ def calling_at(
 ) -> Iterator[list[str]]:
     """Call `call` before the nth opcode or line for which `counts(frame)` is true.
 
-    Yields a list to which the place of this opcode or line is added."""
+    Yields a list to which the place of this opcode or line is added.
+    """
     left, before = nth, sys.gettrace()
     found: list[str] = []
 

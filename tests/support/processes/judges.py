@@ -118,7 +118,8 @@ def _confirmed(request: Message, values: str) -> Message:
 def expected(used: int, request: Message) -> Understood:
     """Return the result that the application protocol V1.1b3, section 6, requires for this request.
 
-    `used` is the number of bytes that the server must consume."""
+    `used` is the number of bytes that the server must consume.
+    """
     changes: dict[tuple[int, int], int] = {}
     reply = _carry_out(request, changes)
     return Understood(used, reply if request.address else b"", changes)
