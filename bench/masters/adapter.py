@@ -99,7 +99,7 @@ def multidrop(
 
 @contextmanager
 def leased(job: Job) -> Iterator[Callable[[], tuple[int, int]]]:
-    """Do the same with a mastership: the core then checks the clock before each request."""
+    """Poll like `multidrop`, but with a mastership: the core then checks the clock before each request."""
     mastership = Mastership()
     mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + LEASE_NS)
     try:

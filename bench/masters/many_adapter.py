@@ -46,7 +46,7 @@ def _opened(port: str, *facts: Any) -> Line:
 
 @contextmanager
 def _polling_drives(lines: Mapping[str, Sequence[Drive]], every: float | None) -> Iterator[Poller]:
-    """Yield a poller of all registers of the drives on each port: a path, or the number of a descriptor."""
+    """Yield a poller of all registers of these drives; a port is a path, or the number of a descriptor."""
     declared = tuple(
         PlantLine(
             port,
@@ -99,7 +99,7 @@ def start_lateness_us(ports: Sequence[str], baudrate: int, every: float, seconds
 
 @dataclass(frozen=True)
 class Mixed:
-    """A line of all families, as arguments of mixed_line.c, and its predicted bus cycle."""
+    """A line with drives of all families: the arguments for mixed_line.c, and the predicted bus cycle."""
 
     drives: Sequence[Drive]
     words: Sequence[str]
@@ -166,7 +166,7 @@ def judge(ports: Sequence[str], exchanges: int, drives: int) -> Judged:
 
 
 def judge_for(ports: Sequence[str], seconds: float, drives: int) -> Judged:
-    """Do the same as `judge` for `seconds`."""
+    """Poll and compare values like `judge`, for `seconds`."""
     end = time.monotonic() + seconds
     return _judged(ports, drives, lambda judged: time.monotonic() >= end)
 

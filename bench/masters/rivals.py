@@ -230,7 +230,10 @@ def measure(master: str, job: Job) -> dict[str, Any]:
 
 
 def measure_bare(job: Job, silence: float, asleep: float = 0.0) -> dict[str, Any]:
-    """Do the same with bare_master.c: `silence` s before each request, and `asleep` s of sleep after it."""
+    """Run bare_master.c; return the same values as `measure`.
+
+    It waits `silence` s before each request, and sleeps `asleep` s after it.
+    """
     command = [compiled("masters/bare_master.c"), "--seconds", job.seconds, "--drives", job.drives]
     command += ["--registers", REGISTERS, "--silence-us", silence * 1e6]
     command += ["--asleep-us", asleep * 1e6, job.port]

@@ -26,7 +26,7 @@ from bench.support.programs import module, paced_line
 DRIVES = 31
 BAUDRATE = 38400
 REFUSALS = 20
-CHARACTERS = 8 + 5  # in a request and its exception reply
+CHARACTERS = 8 + 5  # characters of a request and of its exception reply
 WIRE_MS = CHARACTERS * 10 / BAUDRATE * 1e3 + 2
 
 

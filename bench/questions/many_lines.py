@@ -32,7 +32,7 @@ from bench.support.programs import FRAMES, compiled, module, on_processor
 BAUDRATE = 115200
 DELAY_US = 2000
 SETTLE_S = 2.0  # time for the first exchanges of thousands of drives
-DESCRIPTORS = 5  # a poller's, per line: port and two pipes; the responders need fewer
+DESCRIPTORS = 5  # a poller's descriptors per line: port and two pipes; responders need fewer
 OTHERS = 64  # other descriptors of the process
 PTYS = Path("/proc/sys/kernel/pty")
 

@@ -38,7 +38,7 @@ from multidrop.toml_check import parse_duration
 PLAYERS = Path(__file__).parents[1] / "players"
 MOST_GROWTH_KB = 2048  # limit for resident memory after the first period
 COMMAND_EVERY = 20.0  # s between the start and the stop of a motor
-IN_FLIGHT = 2  # latest slots of a register, whose rows may not be taken yet
+IN_FLIGHT = 2  # number of latest slots of a register whose rows may not be taken yet
 HELD_UP = 1.0  # s; a delay of the line in this time before a wrong value excuses it
 HEAD: tuple[str, ...] = (
     "hours",

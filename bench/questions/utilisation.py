@@ -4,9 +4,9 @@ A minimal master in C with multidrop's silences runs before every measurement; d
 that master. Figures are medians of all measurements, and counts are sums. A default run takes a quarter of
 an hour.
 
-With `--beside N`, each master runs beside N busy loops, and after multidrop without loops, to which its
-differences and ratios are. The simulated line then has realtime scheduling, which needs root: otherwise the
-line itself would be late.
+With `--beside N`, each master runs beside N busy loops. Differences and ratios are then to multidrop without
+loops, measured before each master. The simulated line has realtime scheduling, which needs root: otherwise
+the line itself would be late.
 """
 
 from __future__ import annotations

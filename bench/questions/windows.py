@@ -42,7 +42,7 @@ def here(job: Job, folder: Path) -> dict[str, Any]:
 
 
 def on_windows(job: Job, folder: Path) -> dict[str, Any]:
-    """Run a job with Wine; return the same."""
+    """Run a job with Wine; return its CPU seconds and misses."""
     link = folder / "wine" / "dosdevices" / f"com{COM}"
     link.unlink(missing_ok=True)
     link.symlink_to(job.port)

@@ -52,7 +52,7 @@ class Talker:
 
 @contextmanager
 def talking(command: Sequence[object], **details: Any) -> Iterator[Talker]:
-    """Run a program during the block; then end its standard input, and read its report, which is JSON."""
+    """Run a program during the block; then close the program's standard input, and read its JSON report."""
     words = [str(word) for word in command]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen(words, text=True, **pipes, **details) as process:

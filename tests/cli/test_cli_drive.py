@@ -527,7 +527,8 @@ def test_an_interrupted_stop_is_sent_once_more(run: Run, che: Che) -> None:
     status, _, err = run("stop", *words)
     assert status == 130
     until(lambda: len(received.writes) >= begun + 3)  # the drive may receive it after the client has left
-    assert [write.data for write in received.writes[begun:]] == [b"\0\5", b"\0\5", b"\0\x08"]  # a jog's too
+    # The last write ends a jog.
+    assert [write.data for write in received.writes[begun:]] == [b"\0\5", b"\0\5", b"\0\x08"]
     assert "the stop was sent" in err
     assert "multidrop: to stop it, type: multidrop stop " in err
 

@@ -180,7 +180,7 @@ def test_verbs_take_a_plant_file_and_a_drive_name(
 def test_a_stop_finds_its_drive_by_another_spelling_and_a_start_does_not(
     run: Run, tmp_path: Path, port: str, toy: SimulatedDrive
 ) -> None:
-    """By keyboard, a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
+    """Depending on the keyboard, a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
     plant = tmp_path / "spelt.toml"
     text = LINE.format("hall-1", port) + DRIVE.format("L\u00fcfter", TOY, 1)
     plant.write_text(text, encoding="utf-8")

@@ -137,7 +137,7 @@ def test_a_pty_has_no_low_latency_flag_and_no_rs485_mode() -> None:
 def test_a_driver_that_refuses_its_own_rs485_mode_has_none(
     monkeypatch: pytest.MonkeyPatch, settable: bool, mode: RS485Mode | None
 ) -> None:
-    """As serial8250 does: TIOCGRS485 returns zeros, TIOCSRS485 fails with ENOTTY."""
+    """The driver serial8250 behaves so: TIOCGRS485 returns zeros, TIOCSRS485 fails with ENOTTY."""
     written: list[bytes] = []
 
     def ioctl(fd: int, request: int, data: bytearray) -> int:

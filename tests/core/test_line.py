@@ -846,7 +846,7 @@ def test_after_two_copies_of_a_value_of_0_it_is_unknown_whether_the_adapter_echo
 
 
 def test_coils_equal_to_their_request_are_accepted_at_the_timeout(line: LineDriver) -> None:
-    """A read of 17 coils from 03xxH has a reply of its own request's length and first three bytes."""
+    """The reply to a read of 17 coils from 03xxH has its request's length and first three bytes."""
     copy = rtu("01 01 03 20 00 11")
     ask(line)
     answer(line, reply_of(1))

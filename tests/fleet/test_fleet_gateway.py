@@ -37,7 +37,7 @@ class Asked:
 
 
 async def test_a_gateway_that_waits_for_its_namesake_answers_no_requests(tmp_path: Path) -> None:
-    """The namesake gets the request too. `status` would show the wrong one, `drain` would trust it."""
+    """Its namesake gets the request too: `fleet status` would show, and `drain` trust, a wrong answer."""
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     lease = gateway.member.lease
     for wanted in ("state", "drain"):

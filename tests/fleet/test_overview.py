@@ -104,7 +104,7 @@ def test_invalid_moves_are_ignored(moves: Any) -> None:
 def test_a_gateway_whose_session_others_ended_is_missing() -> None:
     now_ms = time.time_ns() // 1_000_000
     made = view()
-    died = {  # by gateway: the newest record of each path, and whether it is missing
+    died = {  # by gateway: the newest record on each path, and whether the gateway is missing
         "gw-4": (lease(2, ended=True) | {"by": "gw-1", "at_ms": now_ms - 60_000}, True),
         "gw-5": (lease(2, ended=True) | {"at_ms": now_ms}, False),  # it ended its session itself
         "gw-6": (lease(2, ended=True) | {"by": "gw-6", "at_ms": now_ms}, False),

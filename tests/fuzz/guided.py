@@ -30,7 +30,7 @@ import multidrop.sim.faulty_wire
 import multidrop.toml_check
 from multidrop.capture import decoding
 
-PACKAGES: dict[str, tuple[types.ModuleType, ...]] = {  # to instrument, by reader; all would take seconds
+PACKAGES: dict[str, tuple[types.ModuleType, ...]] = {  # modules to instrument, by reader
     "plant": (multidrop.families.files,),
     "family": (multidrop.families.files,),
     "import": (multidrop.families.files, multidrop.importers),

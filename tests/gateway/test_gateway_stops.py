@@ -77,7 +77,7 @@ def stands(gateway: Served, drive: str) -> bool:
 def test_head_of_the_answer_confirms_an_unfinished_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str, body: dict[str, object]
 ) -> None:
-    """A page that gets no head can tell that the gateway has not accepted the stop."""
+    """A page that gets no HTTP head can tell that the gateway has not accepted the stop."""
     held = threading.Event()
 
     async def slow(*args: object, **options: object) -> object:

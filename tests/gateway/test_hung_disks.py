@@ -300,7 +300,8 @@ def test_hung_page_files_end_their_requests_and_delay_no_others(
     monkeypatch.setattr(page_files, "READ_S", SHORT_S)
     with served(tmp_path, SERVE) as gateway:
         monkeypatch.setattr(Path, "read_bytes", read_bytes)
-        for path in ("/", "/page/app.js", "/", "/page/app.js", "/page/boot.js"):  # above the limit
+        # These are more requests than may wait for the disk.
+        for path in ("/", "/page/app.js", "/", "/page/app.js", "/page/boot.js"):
             answer = gateway.get(path)
             assert (answer.status, answer.json["error"][:11]) == (503, "page files:")
         assert list(health(gateway)["hung"]) == ["page files"]

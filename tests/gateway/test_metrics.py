@@ -44,7 +44,7 @@ def values(gateway: Served) -> dict[tuple[str, str], float]:
 
 
 def process_start() -> float:
-    """Return when this process started, in s since 1970, as ps knows it."""
+    """Return when this process started, by `ps`, in s since 1970."""
     age = subprocess.run(["ps", "-o", "etimes=", "-p", str(os.getpid())], capture_output=True, text=True)
     return time.time() - int(age.stdout)
 
@@ -69,7 +69,7 @@ def test_metrics_have_values_states_and_counters(tmp_path: Path) -> None:
         about = {"line": "hall", "drive": "pump-1", "model": "invt-che", "address": "1"}
         assert about in [one.labels for one in found["multidrop_drive"].samples]
         alarms = [one.value for one in found["multidrop_alarm_active"].samples]
-        assert alarms == [0.0] * 9  # of the line its port; of each drive all other kinds
+        assert alarms == [0.0] * 9  # kinds: port for the line, all others for each drive
         health = {one.labels["multidrop_health"]: one.value for one in found["multidrop_health"].samples}
         assert health == {"ok": 1.0, "degraded": 0.0, "failed": 0.0}
         assert found["process_open_fds"].samples[0].value > 5

@@ -37,7 +37,7 @@ def alerts() -> Iterator[tuple[str, str]]:
 
 
 def queries() -> Iterator[tuple[str, str]]:
-    """Yield the name and text of each query that must return data; those of alerts without their limit."""
+    """Yield the name and text of each query that must return data; queries of alerts lack their limit."""
     dashboard = json.loads(DASHBOARD.read_text())
     for panel in dashboard["panels"]:
         for target in panel["targets"]:

@@ -307,7 +307,7 @@ def test_requests_decode_as_in_libmodbus_server(libmodbus: Libmodbus) -> None:
         ours = message if isinstance(message, str) else expected(used, message)
         if isinstance(theirs, Understood) and isinstance(message, Message) and theirs.reply:
             used, _ = parse_reply(RTU, theirs.reply, message)
-            assert used == len(theirs.reply), said  # we accept its encoding
+            assert used == len(theirs.reply), said  # we accept libmodbus's encoding
             theirs = replace(theirs, reply=theirs.reply[1:-2])
             answers += 1
         differences += compare(said, ours, theirs)

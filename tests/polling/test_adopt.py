@@ -331,7 +331,7 @@ def test_learnt_timing_survives_a_reopened_port() -> None:
 
 
 def test_a_drive_inherits_the_late_replies_due_at_its_address() -> None:
-    """Queued requests are sent before the next drive is added, which then knows of their late replies."""
+    """The old drive's queued requests are sent before the new drive is added: it knows the replies due."""
     wires = {"port of hall": wire(Toy(1))}
     with ClockedLines.of_lines(wires, plant(hall(toy("pump-1", 1), toy("deaf", 5, 0.05)))) as made:
         made.run(0.2)

@@ -88,7 +88,7 @@ def lines(every: float | None, port: str = "pty") -> Iterator[tuple[list[Simulat
 
 
 class Rows:
-    """Return the statuses of a poller's rows, by drive."""
+    """Takes a poller's rows, and waits for rows with given statuses."""
 
     def __init__(self, poller: Poller) -> None:
         self._poller = poller

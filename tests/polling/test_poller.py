@@ -144,7 +144,7 @@ def test_requests_at_a_rate_stay_on_their_grid_without_bursts(port: str) -> None
         mine = [row for row in polling.rows if row.register == name]
         # A late reply adds another row with the time of its request, hence the set.
         sent = sorted({row.monotonic_ns for row in mine if row.status not in NOT_SENT})
-        # The n-th request is not sent before the n-th slot: no request is early, or made up for.
+        # The n-th request is not sent before the n-th slot: no request is early.
         assert all(at >= before_ns + number * every * 1e9 for number, at in enumerate(sent))
     left_out = polling.poller.summary()["lines"]["line"]["overrun_slots"]
     # Each slot until the last row has a row, or is counted as skipped.
@@ -434,7 +434,7 @@ def test_polling_continues_after_a_stop_reopened_the_port(port: str) -> None:
     with Polling(line(port, polled(drive(), ONE, every))) as polling:
         (hall,) = polling.poller._lines
         queued = 0
-        while not queued:  # a busy computer may be late, when all queued requests are over
+        while not queued:  # on a busy computer, all queued requests may be over already
             polling.until("ok", 3)
             queued = queued_before_a_stop(hall)
         polling.until("ok", 100)  # more than was queued ahead
@@ -590,7 +590,7 @@ def test_closing_waits_for_exchanges_in_flight(
 def test_a_request_unanswered_at_the_end_has_a_row(
     responder: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The request in flight has a row, and so has a queued slot that is over, but not one that continues."""
+    """The request in flight has a row. A queued slot has a row only if it is over."""
     monkeypatch.setattr(line_set, "ENDING_NS", 10_000_000)
     master, path = responder
     short = polled(Patient(2, name="pump-2"), [Patient.fault], 0.0002)

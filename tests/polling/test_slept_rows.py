@@ -72,7 +72,7 @@ def test_rows_have_the_time_of_their_exchange_although_the_computer_slept(tmp_pa
     slept_for = {
         True: set[int](),
         False: set[int](),
-    }  # hours; True: requests sent before the sleep
+    }  # hours of sleep in the rows' UTC; True: rows of requests before the sleep
     before_ns, amid_ns = asked_ns[48], asked_ns[49]  # the second request may be timed before or after it
     for time_ns, monotonic_ns in json.loads(ran.stdout):
         if not before_ns < monotonic_ns <= amid_ns:

@@ -184,7 +184,7 @@ def test_misses_that_grow_with_speed_are_found(look: Recording) -> None:
     assert miss_shares(look, "fan") is None
 
 
-# At 1 ms a character: a read of one register is 8 and 7 characters, of two 8 and 9.
+# At 1 ms a character. Request and reply have 8 and 7 characters for one register, 8 and 9 for two.
 PLANNED: dict[str, Any] = {
     "hall-1": {
         "utilisation": 1.0,

@@ -19,7 +19,7 @@ PATIENCE = 60.0
 
 
 def test_signal_ends_serve_even_if_its_handler_has_not_run() -> None:
-    """As for a signal just before the sleep: here another thread gets the signal, and no handler runs."""
+    """Another thread gets the signal, so no handler runs, as for a signal just before the sleep."""
 
     def terminate() -> None:
         time.sleep(0.2)

@@ -54,7 +54,7 @@ def test_adapters_that_exchange_their_names_are_not_mistaken(guest: Guest, names
     found = guest.run("changed_names", how=names)
     assert found["names after"] == found["names"][::-1]
     assert found["wrong"] == []
-    if names != "by_path":  # a name of the USB socket, in which the other adapter is now
+    if names != "by_path":  # by_path names the USB socket, which now has the other adapter
         assert found["requests to the other"] == [0, 0]
     assert found["came back"] == (names != "by_path")
 

@@ -40,7 +40,7 @@ def test_read_raw_sends_and_parses_the_standards_example(simulated: SimulatedBus
 
 
 def test_read_raw_is_not_treated_as_a_write(simulated: SimulatedBus, tmp_path: Path) -> None:
-    """It is not audited, retried or reported as unconfirmed, and no identity check precedes it."""
+    """The read is not audited, retried or reported as unconfirmed, and no identity check precedes it."""
     (toy,) = simulated.bus.drives
     simulated.loses = lambda request: True
     with pytest.raises(NoReply):
@@ -79,7 +79,7 @@ def test_read_raw_waits_for_late_replies_only_until_it_expires(
 
 
 def test_a_copy_of_the_request_is_not_returned_as_a_raw_reply(simulated: SimulatedBus) -> None:
-    """A read of 17 coils from 03xxH has a reply of its own request's length and first three bytes."""
+    """The reply to a read of 17 coils from 03xxH has its request's length and first three bytes."""
     (toy,) = simulated.bus.drives
     echo = checksums.rtu(bytes.fromhex("07 01 03 20 00 11"))
     simulated.answers = lambda request: echo
@@ -151,7 +151,7 @@ def test_read_raw_is_limited_by_the_familys_limits(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.slow
 def test_read_raw_works_on_a_polled_line() -> None:
-    """On a busy computer too, neither the read nor the poll accepts a delayed reply as another's."""
+    """On a busy computer too, neither accepts a delayed reply to the other's request."""
     drive = polled(Toy(1), [Toy.output_frequency, Toy.mystery])
     expected = proofs(drive)
     status = int(proof(drive.drive, Toy.status)).to_bytes(2)

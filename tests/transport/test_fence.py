@@ -62,7 +62,7 @@ def test_a_suspended_master_sends_nothing_after_it_resumes() -> None:
 @pytest.mark.long
 @pytest.mark.slow
 def test_a_master_without_the_deadline_check_does_send() -> None:
-    """So the tests above can fail. This master is given a later deadline than the other master knows."""
+    """So the tests above can fail. This master's deadline is later than the other master assumes."""
     with fence(beyond=1000) as made:
         found = rounds(made, 4)
     assert any(each.stale > 0 for each in found)  # on a busy computer it may not resume in time

@@ -53,7 +53,7 @@ def test_a_port_that_was_never_opened_is_not_logged_as_lost(
 
 
 def test_losing_and_reopening_a_port_is_logged_once(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
-    """Its loss is logged only once, although several requests fail."""
+    """The port's loss is logged only once, although several requests fail."""
     link = tmp_path / "port"
 
     def plugged_in() -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Why a port was lost, how one with a stalled adapter is closed, and baud rates that a UART cannot have."""
+"""Lost ports: the reported reason, closing with a stalled adapter, baud rates that a UART cannot have."""
 
 from __future__ import annotations
 

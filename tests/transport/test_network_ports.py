@@ -96,7 +96,7 @@ def test_an_endless_telnet_suboption_does_not_fill_the_memory() -> None:
         for _ in range(100):
             for _, content in telnet.split(flood):
                 assert len(content) <= len(flood)
-        assert tracemalloc.get_traced_memory()[0] < len(flood)  # less than one of the hundred
+        assert tracemalloc.get_traced_memory()[0] < len(flood)  # bytes: less than one of the hundred floods
     finally:
         tracemalloc.stop()
 

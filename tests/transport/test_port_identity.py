@@ -74,7 +74,7 @@ def sysfs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sysfs:
             "1",
             USBAdapter("1-1:1.0.1", "MX:1.0.1"),
         ),  # several ports on one USB interface
-        (f"{USB}/1-1/1-1:1.0/ttyUSB0", "", "0", USBAdapter("1-1:1.0.0", "")),  # many CH340: no serial number
+        (f"{USB}/1-1/1-1:1.0/ttyUSB0", "", "0", USBAdapter("1-1:1.0.0", "")),  # CH340: no serial number
         (f"{USB}/1-3/1-3:1.0", "E66", "", USBAdapter("1-3:1.0.0", "E66:1.0.0")),  # ttyACM0
         ("devices/pnp0/00:05", "", "", None),  # ttyS0
     ],
@@ -124,8 +124,8 @@ def test_a_port_is_reopened_only_with_the_same_adapter(
 @table(
     ("before", "now", "others", "is_found"),
     [
-        (("1-1", "A1"), ("1-1", "A1"), [], True),  # after a sleep it is ttyUSB1
-        (("1-1", "A1"), ("1-2", "A1"), [("1-1", "B2")], True),  # another adapter has its place
+        (("1-1", "A1"), ("1-1", "A1"), [], True),  # same adapter, renamed ttyUSB1 after a sleep
+        (("1-1", "A1"), ("1-2", "A1"), [("1-1", "B2")], True),  # another adapter is in its former USB socket
         (("1-1", ""), ("1-1", ""), [("1-2", "")], True),
         (("1-1", ""), ("1-2", ""), [], False),
         (("1-1", "A1"), ("1-2", "A1"), [("1-3", "A1")], False),  # copies with the same serial number
@@ -202,7 +202,7 @@ def test_lasting_name_returns_the_name_with_the_serial_number(
         sysfs.add(device.name, f"{USB}/1-{number}/1-{number}:1.0/{device.name}", serial)
     named, nameless = names
     assert lasting_name(str(named)) == str(names[named])
-    assert lasting_name(str(nameless)) == str(nameless)  # any adapter can have that link
+    assert lasting_name(str(nameless)) == str(nameless)  # a link without a serial number fits any adapter
     for other in (str(names[named]), "/dev/ttyS0", "socket://127.0.0.1:4001", "COM5"):
         assert lasting_name(other) == other
 

@@ -206,7 +206,7 @@ def plant_of_two(path: Path, port: str, second: int) -> Path:
 
 
 def answer_when_both_asked(listening: socket.socket) -> None:
-    """Reply to the first requests of two connections only once both have come."""
+    """Wait for the first request on each of two connections, then reply to both."""
     both_asked, answered = threading.Barrier(2), set[int]()
 
     def serve(connection: socket.socket) -> None:

@@ -299,7 +299,8 @@ def test_the_fleet_command_line_writes_and_stops(drill: CommandDrill) -> None:
         stopped = drill.run("stop", *words)
         assert stopped.returncode == 0, stopped.stderr
     stops = [drill.stops(drive) for drive in drill.sims]
-    assert all(got >= asked for got, asked in zip(stops, (3, 2, 1, 1), strict=True)), stops  # or repeated
+    # A stop may be sent repeatedly.
+    assert all(got >= asked for got, asked in zip(stops, (3, 2, 1, 1), strict=True)), stops
 
 
 def test_commands_are_carried_out_once_and_answers_are_true(drill: CommandDrill) -> None:

@@ -499,7 +499,7 @@ def test_a_stop_with_an_unknown_drive_stops_the_others(desk: Desks) -> None:
 
 
 def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_path: Path) -> None:
-    """By keyboard, a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
+    """Depending on the keyboard, a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
     fan, spelt = "L\u00fcfter", "Lu\u0308fter"
     with desks(tmp_path, {"write": [f"{spelt}.frequency"]}, name=fan) as desk:
         told = desk.ask(drive=spelt, register="frequency", value=20.0)

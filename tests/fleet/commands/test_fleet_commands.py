@@ -328,7 +328,7 @@ def test_the_drives_of_one_line_are_stopped_by_one_message(tmp_path: Path) -> No
 
 
 def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_path: Path) -> None:
-    """By keyboard, a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
+    """Depending on the keyboard, a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
     fan, spelt = "L\u00fcfter", "Lu\u0308fter"
     plant = Plant()
     plant.records["hall-3"] = Record("hall-3", 1, {"line": {"drive": [{"name": fan}]}})

@@ -551,7 +551,7 @@ async def test_an_ended_session_stays_over_after_an_outage() -> None:
     assert observer.is_over("a", 1)
     assert observer.sessions() == {}
     second = trial.lease()
-    assert not await second.try_to_begin()  # another gateway wrote the end, and it is unknown how old that is
+    assert not await second.try_to_begin()  # another gateway wrote the end, of unknown age
     trial.clock.pass_s(USUAL.lease / SECOND)
     assert await second.try_to_begin()
     await look(observer)

@@ -375,7 +375,7 @@ async def test_without_servers_all_lines_are_closed_and_no_gateway_is_killed(
 ) -> None:
     """The timer is cancelled after the lines were closed, and never set to a time in the past."""
     async with gateways(fleet, "a", "b") as running:
-        await until(running.are_shared, "shares")  # otherwise one may never have had a lease, nor a timer
+        await until(running.are_shared, "shares")  # otherwise a gateway may never have had a lease or a timer
         with fleet.paused():
             await until(lambda: not any(running.taken().values()), "silence")
             masterships = [lines.mastership for lines in running.hall.gateways]

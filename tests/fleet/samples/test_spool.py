@@ -109,7 +109,7 @@ def test_a_new_folder_starts_a_new_log(tmp_path: Path) -> None:
 def test_a_newest_file_cut_at_any_byte_loses_no_earlier_message(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, step: int
 ) -> None:
-    """Such a file remains if the disk stored its name but not all bytes. One without a name is there too."""
+    """A power cut may leave a file with its name but not all bytes. A file not yet renamed is there too."""
     whole = tmp_path / "whole"
     filled(whole, 3, exchanges=2)
     newest = max(whole.glob("*.arrows"))

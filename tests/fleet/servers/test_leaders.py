@@ -27,7 +27,7 @@ ASKS_S = 4.0  # a server without contact may ask for votes after this time
 
 
 class Servers:
-    """Three servers. Each bucket has a leader and a Raft term."""
+    """Three fake servers. Each bucket has a leader and a Raft term."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.leaders = dict(zip((*names.LEASES, *names.OWNERS), 2 * SERVERS, strict=True))

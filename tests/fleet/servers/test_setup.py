@@ -91,7 +91,7 @@ def test_lines_can_be_claimed_while_two_of_three_buckets_have_a_leader(said: byt
 def test_a_cluster_that_grants_a_key_twice_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An old server fails the contest, even if its version is ignored."""
+    """In a trial its servers grant a key to two writers; this is found even if versions are ignored."""
     monkeypatch.setattr(servers, "OLDEST", (0, 0))
     with cluster(tmp_path, 3, old_server_program()) as old:
         sentence = re.escape("claimants at once: no lease is safe there")

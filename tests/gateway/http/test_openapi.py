@@ -86,7 +86,8 @@ def test_answer_log_and_audit_log_name_the_command(gateway: Served, caplog: pyte
     assert COMMAND_ID.fullmatch(own)
     found = gateway.get("/api/audit").json["entries"]
     assert [one["outcome"] for one in found if one.get("id") == "order-7"] == ["done", "called"]
-    until(lambda: len([one for one in audit(gateway) if one.get("id") == own]) == 4)  # two of each drive
+    # Two records of each drive.
+    until(lambda: len([one for one in audit(gateway) if one.get("id") == own]) == 4)
     assert (
         "pump-1.setpoint = 40.0, asked for by anyone by http from 127.0.0.1 (command order-7)" in caplog.text
     )
@@ -116,7 +117,7 @@ def test_long_answers_are_compressed(gateway: Served, path: str) -> None:
     assert "accept-encoding" in plain.headers["vary"]
     assert packed.headers["content-encoding"] == "gzip"
     assert len(packed.body) < len(plain.body) / 2
-    if path != "/metrics":  # which change
+    if path != "/metrics":  # metrics change between two requests
         assert gzip.decompress(packed.body) == plain.body
 
 
@@ -161,7 +162,7 @@ def test_schemathesis_finds_no_undeclared_answer(gateway: Served, tmp_path: Path
 
 
 def narrowed(node: Any, key: str = "", *, is_answer: bool = False) -> Any:
-    """Return the description with the names of drives, and without further keys in answers."""
+    """Return the API's description, narrowed: only the names in DRIVES, and no additional keys in answers."""
     if isinstance(node, list):
         return [narrowed(one, key, is_answer=is_answer) for one in node]
     if not isinstance(node, dict):

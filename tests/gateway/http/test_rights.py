@@ -77,7 +77,7 @@ def test_each_caller_has_the_rights_of_the_table(tmp_path: Path, serve: str, add
         for right, look, acts in TABLE[serve, address]:
             headers = {} if right is None else {"authorization": gateway.bearer(right)}
             if address is OTHER:
-                headers["x_forwarded_for"] = f"127.0.0.1, {address}"  # the client made the first one up
+                headers["x_forwarded_for"] = f"127.0.0.1, {address}"  # the client invented the first address
             looks = {path: gateway.get(path, **headers).status for path in LOOKS}
             assert looks == dict.fromkeys(LOOKS, look), right
             assert tuple(gateway.command(path, body, **headers).status for path, body in ACTS) == acts, right

@@ -353,7 +353,7 @@ def test_frame_has_no_value_that_is_overdue_or_followed_by_a_miss(hub: Hub, cloc
 
 
 def test_age_is_right_if_a_clock_was_set_back_or_stopped_in_sleep(hub: Hub, clock: HubClock) -> None:
-    """If it were too short, the last value of a silent drive would look new."""
+    """If the age were too short, the last value of a silent drive would look new."""
     hub.take(rows((10, FREQUENCY, 25), (20, FREQUENCY, Status.NO_REPLY)))
     asked_ns = UTC_0 + 10 * PERIOD
     hour_ns = 3600 * SECOND

@@ -21,7 +21,7 @@ BELOW = Limit("pump", "pressure", "bar", False, 1.0, hysteresis=0.5)
     ("values", "beyond"),
     [
         ([31, 31, 31, 31, 31, 31], [False, False, False, False, False, True]),
-        ([31, 31, 29, 31, 31, 31], [False] * 6),  # the time starts anew
+        ([31, 31, 29, 31, 31, 31], [False] * 6),  # the time restarts
         ([31, 31, 31, 31, 31, 31, 28.5, 28.0], [False] * 5 + [True, True, False]),
         ([31, None, None, None, None, 31, None], [False] * 5 + [True, True]),
         ([30] * 7, [False] * 7),  # the bound itself is allowed

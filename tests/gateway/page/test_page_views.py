@@ -525,5 +525,5 @@ def test_log_shows_callers_writes_and_results(opened: Opener) -> None:
     assert rows.nth(4).locator(".bad").inner_text().strip() == "unconfirmed; no reply"
     for repeated, drive in ((rows.nth(2), "labeller"), (rows.nth(3), "mixer-2")):
         assert drive in repeated.inner_text()
-        written = repeated.locator("td").nth(2).inner_text()  # the repetitions stand in the write's column
+        written = repeated.locator("td").nth(2).inner_text()  # repetitions are in the write's cell
         assert re.search(r"^stop\s+42 times since .*\d\d:\d\d:\d\d", written)

@@ -138,7 +138,7 @@ def test_a_double_click_on_start_does_not_confirm_it(opened: Opener, gateway: Fa
 
 
 def tap(page: Any, x: float, y: float, made_s: float) -> None:
-    """Dispatch a tap whose time stamp is `time`, as if it had waited in the browser's queue since."""
+    """Dispatch a tap with the time stamp `made_s`, as if it had waited in the browser's queue since then."""
     session = page.context.new_cdp_session(page)
     for kind, points in (("touchStart", [{"x": x, "y": y}]), ("touchEnd", [])):
         touch = {"type": kind, "touchPoints": points, "timestamp": made_s}
@@ -179,7 +179,7 @@ def test_a_second_tap_on_start_does_not_confirm_it(
 
 
 def press(page: Any, key: str, made_s: float, text: str = "") -> None:
-    """Dispatch a key press whose time stamp is `time`."""
+    """Dispatch a key press with the time stamp `made_s`."""
     session = page.context.new_cdp_session(page)
     code = {"Enter": 13, "Tab": 9, " ": 32}[key]
     named = {"key": key, "code": "Space" if key == " " else key, "windowsVirtualKeyCode": code}

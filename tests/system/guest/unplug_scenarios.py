@@ -84,7 +84,7 @@ def changed_names(how: str) -> dict[str, Any]:
         adapter.unplug()
     seen = poll.wait_for("port lost", "a")
     count = len(first.state["requests"])
-    second.plug_in(first.socket_number)  # which now has the other one's name and place
+    second.plug_in(first.socket_number)  # `second` now has the name and socket of `first`
     time.sleep(3)
     alone = len(second.state["requests"])
     first.plug_in(second.socket_number + 1)
