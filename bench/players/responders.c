@@ -30,7 +30,7 @@ static struct {
 
 struct line {
     int fd;
-    int64_t last_due_ns; /* of the last reply: a path keeps the order of replies */
+    int64_t last_due_ns; /* due time of the last reply: a path keeps the order of replies */
     size_t have;
     uint8_t received[256];
 };

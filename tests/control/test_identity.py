@@ -190,7 +190,7 @@ def _on_another_port(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_setpoint_that_cannot_be_read_is_forgotten_once_the_drive_may_have_lost_its_power(
     model: str, lose: Callable[[Bus, Any, pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It may also have been replaced, even if it was polled."""
+    """The drive may also have been replaced, even if it was polled."""
     with known(model) as (bus, drive, received):
         drive.set_frequency(10)
         received.requests.clear()
@@ -477,7 +477,7 @@ def test_two_different_odd_replies_do_not_prove_another_family(monkeypatch: pyte
 
 
 def test_a_drive_that_missed_a_reply_is_never_refused_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its reply may belong to an earlier request."""
+    """The drive's next reply may belong to an earlier request."""
     line, drive, sim = one(monkeypatch, InvtCHE(1))
     sim["device"] = 0x010A
     line.bus.peer(drive).c.history.ended[10] = 1

@@ -99,7 +99,7 @@ def test_detached_drives_are_stopped_with_stop_on_exit(
 
 
 def test_a_drive_being_detached_cannot_be_started_after_its_stop(pair: RunningPair) -> None:
-    """Its start is called at the moment when the first request of its stop is sent."""
+    """The drive's start is called at the moment when the first request of its stop is sent."""
     pair.bus.stop_on_exit()
     first = pair.drives[0]
     permits: list[bool] = []

@@ -292,7 +292,7 @@ class Tidy(Drive):
 
 @pytest.mark.parametrize("result", [Failure.EXPIRED, Failure.NOT_MASTER])
 def test_an_unsent_write_is_not_unconfirmed(monkeypatch: pytest.MonkeyPatch, result: Failure) -> None:
-    """It is not reported as unconfirmed even if a later read of the script fails."""
+    """The write is not reported as unconfirmed even if a later read of the script fails."""
     line = SimulatedBus(monkeypatch, simulated(Tidy(1)))
     drive = line.attach(Tidy(1, confirmed=1))
     carry_out = line.carry_out

@@ -80,7 +80,7 @@ def in_thread(act: Callable[[], object]) -> tuple[threading.Thread, list[BaseExc
 def test_a_write_in_flight_is_unconfirmed_when_another_thread_closes(
     monkeypatch: pytest.MonkeyPatch, ending: str, what: str
 ) -> None:
-    """It is never reported as unsent."""
+    """The write is never reported as unsent."""
     monkeypatch.setattr(exchanges, "READ_ATTEMPTS", 1)
     with line("invt-che") as (bus, drive, received, _):
         drive.set_frequency(20)

@@ -854,7 +854,7 @@ def test_is_asking_is_true_for_peers_of_queued_repeated_and_urgent_exchanges() -
 
 @pytest.mark.slow
 def test_opening_and_closing_a_thousand_ports_leaks_no_descriptor(drive: Drive) -> None:
-    """They are opened and closed on one engine, with an exchange in flight or not."""
+    """The ports are opened and closed on one engine, with or without an exchange in flight."""
 
     def come_and_go(start: int) -> int:
         near, far = socket.socketpair()

@@ -188,7 +188,7 @@ def test_a_request_is_sent_after_the_timeout_even_if_the_flood_continues(line: L
 
 
 def test_a_flood_on_an_idle_line_belongs_to_no_exchange(line: LineDriver) -> None:
-    """This also holds before the first exchange."""
+    """A flood before the first exchange belongs to none either."""
     for value in range(3):
         line.receive(b"\xff" * 4000)
         ask(line)

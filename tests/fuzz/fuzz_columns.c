@@ -73,7 +73,7 @@ static double expected(const uint8_t *data, size_t len, size_t at, int wire)
     return (double)value;
 }
 
-/* Return the same for a field with addend, scale register, invalid values and bit range. */
+/* Return a field's value like `expected`, with its addend, scale register, invalid values and bit range. */
 static double expected_with(const uint8_t *data, size_t len, const struct md_field *field,
                             const struct md_extra *extra)
 {

@@ -71,7 +71,7 @@ static size_t mend_request(uint8_t *body, size_t have)
     return 7 + data;
 }
 
-/* Do the same in a reply's body; if the request is known, also repair the fields that repeat it. */
+/* Repair a reply's body; return its length. If the request is known, repair the fields that repeat it too. */
 static size_t mend_reply(uint8_t *body, size_t have, const struct md_message *request)
 {
     if (body[1] & 0x80) {
@@ -209,7 +209,7 @@ static size_t repair(uint8_t *data, size_t size, size_t most, unsigned seed)
     if (framing < 0)
         framing = draw(&seed, 6) ? MD_RTU : draw(&seed, 2) ? MD_ASCII : MD_DELIXI;
     size_t junk = draw(&seed, 8) || framing == MD_TCP ? 0 : draw(&seed, 4); /* bytes before the frame */
-    if (junk < wire.len && !wire.is_fixed) { /* keep them */
+    if (junk < wire.len && !wire.is_fixed) { /* keep these bytes */
         wire.at += junk;
         wire.len -= junk;
     } else

@@ -82,7 +82,7 @@ def read_plant(path: Path) -> None:
 
 
 def read_family(path: Path) -> None:
-    """Read a family's TOML file and its CSV file; a line with a zero byte separates them in the input."""
+    """Read a family's TOML file and its CSV file; in the input, a line with a NUL byte separates them."""
     toml, _, csv = path.read_bytes().partition(b"\n\0\n")
     path.write_bytes(toml)
     path.with_suffix(".csv").write_bytes(csv)

@@ -258,7 +258,7 @@ def test_certificate_without_its_key_is_reported(tmp_path: Path, certificates: P
 
 
 def test_unwritable_audit_folder_is_reported(tmp_path: Path) -> None:
-    """Not even root may create a file in /sys."""
+    """The test uses /sys, where not even root may create a file."""
     with pytest.raises(PlantError) as wrong:
         read_settings(written(tmp_path), {"STATE_DIRECTORY": "/sys"})
     (only,) = wrong.value.mistakes

@@ -97,7 +97,7 @@ OTHERS = (
 @pytest.mark.long
 @pytest.mark.parametrize("every", usually(None, 0.1, 0.08), ids=str)
 def test_adopting_other_lines_does_not_shift_an_unchanged_line_s_requests(every: float | None) -> None:
-    """Its requests are sent at exactly the same times as without an adoption."""
+    """The unchanged line's requests are sent at exactly the same times as without an adoption."""
 
     def exchanges(*, adopts: bool) -> list[tuple[int, str, str]]:
         with clocked(hall(*pumps(every)), yard(*fans(every))) as made:

@@ -308,7 +308,7 @@ def test_replaced_drives_stay_attached_until_all_stops_are_over(
 def test_a_drive_stays_attached_until_another_line_releases_the_new_name(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch, is_circle: bool
 ) -> None:
-    """Its motor can be stopped while the adoption waits for a stop on the line that has the name now."""
+    """The drive's motor can be stopped while the adoption waits for a stop on the line that has the name."""
     hall, yard = both.hall(1), both.yard(1)
     names = ("fan-1", "pump-1" if is_circle else "fan-2")
     anew = [

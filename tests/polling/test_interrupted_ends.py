@@ -221,7 +221,7 @@ def test_a_poller_left_open_at_exit_does_not_corrupt_memory(hall: Received, end:
 def test_an_interrupted_opening_of_several_ports_leaves_none_open(
     monkeypatch: pytest.MonkeyPatch, interrupted: int
 ) -> None:
-    """Neither ports opened before the interruption stay open, nor ports opened while it propagates."""
+    """Ports opened before the interruption are closed, and so are ports opened while it propagates."""
     wires = [Wire([simulated(Toy(1))], unpaced=True, port=ANY_PORT) for _ in range(3)]
     buses: list[Bus] = []
     open_bus, others_are_open = Bus.__init__, threading.Semaphore(0)

@@ -113,7 +113,7 @@ def test_a_stop_is_the_first_request_after_the_least_interval() -> None:
             while len(sim.times) == before:
                 clocked.run(0.001)
             assert len(its_sim.asked) - asked <= 1  # at most the request in flight
-            assert sim.times[-1] <= called + INTERVAL + 0.06  # plus two exchanges, of which one is its own
+            assert sim.times[-1] <= called + INTERVAL + 0.06  # plus two exchanges, one of them this drive's
     assert sim.early == 0
 
 

@@ -355,7 +355,7 @@ def test_a_drive_that_answers_every_second_request_has_values_and_misses(pump: S
 
 @pytest.mark.slow
 def test_a_silence_too_short_for_the_drive_causes_misses() -> None:
-    """The drive takes a request that arrives before its own silence is over for a part of the last frame."""
+    """The drive takes a request within its own longer silence for a part of the last frame."""
     strict = simulated(Brisk(1, name="pump-1"))
     strict.needs_silence = True
     hasty = polled(Brisk(1, name="pump-1", silence=400e-6), ONE)

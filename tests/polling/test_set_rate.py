@@ -91,7 +91,7 @@ def test_the_first_value_at_a_new_rate_is_read_immediately(two: ClockedLines) ->
 
 
 def test_registers_with_an_unchanged_rate_keep_their_slots() -> None:
-    """They keep their slots although they are in a new block, without the register whose rate changed."""
+    """The registers keep their slots in a new block, which lacks the register whose rate changed."""
     with clocked(polled(toy(), ALL, 0.1)) as made:
         begun = made.run(3)[0].monotonic_ns
         made.poller.set_rate("pump-1", "output_frequency", 0.25)

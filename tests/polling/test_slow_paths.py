@@ -254,7 +254,7 @@ def test_timeouts_of_a_delixi_are_at_least_80_ms(
 def test_a_stop_over_a_slow_path_is_confirmed(
     model: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
-    """Its first frame is sent immediately; later reads wait as long as replies are known to take."""
+    """The stop's first frame is sent immediately; later reads wait as long as replies are known to take."""
     sim = simulated(MAKE[model](1))
     assert check_stop(*path_of([sim], constant(seconds)), sim, seconds) <= 6
 

@@ -43,7 +43,7 @@ class Bench:
         return self.wire.advance(self.now)
 
     def say(self, frame: str) -> str:
-        """Send and return frames like `hear`, as the documents print them: RTU in hex, text without its line end."""
+        """Send a frame and return the reply as documents print them: RTU in hex, text without line end."""
         if frame.startswith(":"):
             return self.hear(f"{frame}\r\n".encode()).decode().removesuffix("\r\n")
         return self.hear(bytes.fromhex(frame)).hex(" ").upper()

@@ -246,7 +246,7 @@ def test_ctrl_c_does_not_interrupt_a_stop(wine: Wine, pump: MotorDrive) -> None:
     assert not pump.motor.energised
 
 
-# Waits for a motor that does not turn, as long as Ctrl-C may take.
+# A start waits up to 300 s for the motor to turn, so that Ctrl-C arrives during the wait.
 START = """
 import sys
 import multidrop.cli

@@ -173,6 +173,6 @@ def test_a_reported_line_moves_to_a_gateway_that_has_not_tried_it() -> None:
 
 
 def test_a_gateway_without_a_list_of_unopened_lines_gets_no_others() -> None:
-    """Such a gateway has another version, which would not take lines that are handed over."""
+    """A gateway without a list has another version, which would not take lines that are handed over."""
     assert hand_over(SHARED, {"a": OF_A}) == SHARED
     assert set(hand_over(SHARED, {"a": OF_A, "c": []}).values()) == {"b", "c"}

@@ -295,7 +295,7 @@ async def test_hub_files_are_read_by_history_and_duckdb(running: Cluster, tmp_pa
 
 
 async def test_an_unfinished_file_is_not_a_commit(running: Cluster, tmp_path: Path) -> None:
-    """A killed hub leaves such a file, and reads its rows again."""
+    """A killed hub leaves an unfinished file, and reads the rows again from the stream."""
     async with empty_stream(running) as path:
         await say(path, 1, message(5))
         await kept_in_files(path, tmp_path, 1)

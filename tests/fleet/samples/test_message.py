@@ -180,7 +180,7 @@ def written(options: pa.ipc.IpcWriteOptions | None = None, **other: pa.Array) ->
     ],
 )
 def test_rows_that_no_store_accepts_are_rejected(column: str, rows: pa.Array, said: str) -> None:
-    """Such a message would block all later messages of all gateways."""
+    """A message with such rows would block all later messages of all gateways."""
     with pytest.raises(MessageError, match=f"bytes are not a message of samples: {said}"):
         unpack(written(**{column: rows}))
 

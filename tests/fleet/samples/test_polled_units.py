@@ -70,7 +70,7 @@ def units_in(table: pa.Table, register: str) -> list[tuple[int, str | None]]:
 
 
 def test_rows_keep_the_unit_that_they_were_polled_in(tmp_path: Path) -> None:
-    """This includes rows that are packed together with rows of the new unit, after the change."""
+    """Rows that are packed after the change, together with rows of the new unit, keep their old unit too."""
     (table,) = tables(changed(tmp_path))
     assert units_in(table, "value_1") == [(at, "V" if at < 20 else "A") for at in range(0, 40, 4)]
     assert units_in(table, "value_2") == [(at, "names of meter.toml") for at in range(0, 40, 4)]

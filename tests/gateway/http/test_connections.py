@@ -203,7 +203,7 @@ def test_longest_idle_connection_is_closed_for_a_new_one(
 def test_new_connection_is_not_closed_before_its_first_request(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
 ) -> None:
-    """Its request may be a stop, so a later connection must not displace it."""
+    """The first request may be a stop, so a later connection must not displace this connection."""
     connections = Connections(clock)
     for n in range(MOST_OPEN):
         connections.add(pairs[n][1], ("10.0.0.1", n))

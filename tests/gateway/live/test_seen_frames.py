@@ -178,7 +178,7 @@ def test_stop_delayed_as_long_is_sent(tmp_path: Path) -> None:
 
 
 def test_start_from_a_frame_before_a_stop_is_not_sent(tmp_path: Path) -> None:
-    """So a proxy that repeats or delays a start cannot start a motor after a stop."""
+    """Otherwise a proxy that repeats or delays a start could start a motor after a stop."""
     writer = {}
     with served(tmp_path, MAY) as gateway:
         writer["authorization"] = gateway.bearer(Right.WRITE)

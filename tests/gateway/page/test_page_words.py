@@ -190,7 +190,7 @@ def test_old_register_shows_its_age(opened: Opener) -> None:
 
 
 def test_values_of_viewed_registers_become_old_without_answers(opened: Opener, gateway: FakeGateway) -> None:
-    """Such a register may be read only once a minute; its value stays current while the drive answers."""
+    """A viewed register may be read only once a minute; its value stays current while the drive answers."""
     page = opened()
     value = page.locator("#panel tr", has_text="run hours").locator(".value")
     until_met(page, lambda: value.inner_text() == "4012h")

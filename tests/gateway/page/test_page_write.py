@@ -131,7 +131,7 @@ def test_a_double_click_on_start_does_not_confirm_it(opened: Opener, gateway: Fa
     start.dblclick()
     assert page.locator("#ask").evaluate("dialog => dialog.open")
     assert gateway.posts == []
-    page.wait_for_timeout(600)  # a click of its own
+    page.wait_for_timeout(600)  # makes the next click a separate one
     page.mouse.click(x, y)
     page.locator("#outcomes li").wait_for()
     assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]
@@ -172,7 +172,7 @@ def test_a_second_tap_on_start_does_not_confirm_it(
     tap(page, x, y, made_s + later_s)
     assert page.locator("#ask").evaluate("dialog => dialog.open")
     assert gateway.posts == []
-    page.wait_for_timeout(600)  # a tap of its own
+    page.wait_for_timeout(600)  # makes the next tap a separate one
     tap(page, x, y, time.time())
     page.locator("#outcomes li").wait_for()
     assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]

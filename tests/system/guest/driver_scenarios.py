@@ -108,7 +108,7 @@ def refused_ports() -> dict[str, tuple[int, str]]:
 
 
 def absent_uart() -> dict[str, tuple[int, str]]:
-    """Return what commands say about a port without a UART, and about a name without a port."""
+    """Return what commands print for /dev/ttyS3, which has no UART, and for ttyS99, which does not exist."""
     found = {"doctor": run("doctor", "/dev/ttyS3")}
     for name in ("ttyS3", "ttyS99"):
         found[name] = run("read", f"/dev/{name}", "erman-er-g-220", "2", "output_frequency")
