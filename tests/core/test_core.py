@@ -287,7 +287,8 @@ def test_the_client_is_called_when_a_drive_fails_and_when_it_answers_again(drive
         silent.clear()
         wait_until(lambda: now_ns() > peer.late_until_ns)
         port.repeat(asked)
-        while peer.failures:  # calls at the queue's end come too
+        # The client is called when the drive answers again, but also at the end of the queue.
+        while peer.failures:
             assert row_queue.await_calls(60) == [17]
 
 

@@ -116,7 +116,7 @@ def given_up(line: LineDriver, drive: Peer, request: Message = READ) -> int:
 
 
 def time_out(line: LineDriver, drive: Peer, request: Message = READ) -> int:
-    """Return the result of `given_up` without a reply's duration, which an unknown adapter may add."""
+    """Return the time-out alone: `given_up` minus the time of a reply, awaited on an unknown adapter."""
     return given_up(line, drive, request) - 7 * CHARACTER
 
 

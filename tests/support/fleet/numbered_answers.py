@@ -1,7 +1,7 @@
 """Simulated drives that number their replies, and a check that each number appears in a poller's rows.
 
-The drives speak Modbus TCP, whose replies name their requests. So each sent request
-has one row: with the number in its own reply, or without a number, however late the reply came.
+The drives speak Modbus TCP, whose replies name their requests. So each sent request has one row: with the
+number in its own reply, or without a number, however late the reply came.
 """
 
 from __future__ import annotations
