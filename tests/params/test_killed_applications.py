@@ -33,7 +33,7 @@ class Lives:
         self._line = f"{port} {file} {report}\n"
 
     def live(self, seconds: float) -> int:
-        """Apply the file in a process that is killed after `seconds`; return its wait status, 0 if complete."""
+        """Apply the file in a process that is killed after `seconds`; return its status, 0 if complete."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(self._line)
