@@ -26,7 +26,7 @@ from multidrop.sim.wire import Wire
 pytestmark = pytest.mark.usefixtures("_turns_awaited")
 
 FAN = f"{Path(__file__).parents[1]}/support/drives/own_drives.py:Fan"
-find_model(FAN)  # prints once per process that the file is run: not during a test
+find_model(FAN)  # load the file now, so that its log entry does not appear during a test
 LINE = '[[line]]\nname = "{}"\nport = "{}"\n'
 DRIVE = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'
 READINGS = ("output_current", "output_frequency")

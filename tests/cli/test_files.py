@@ -45,7 +45,7 @@ class PollerOf:
 def test_the_error_of_a_full_disk_counts_the_readable_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The second batch does not fit. The third one would, but must not follow a gap."""
+    """The second batch does not fit. The third batch would fit, but must not follow a gap."""
     monkeypatch.setattr(PollerOf, "batches", (counting(20), counting(2000), counting(5)))
     monkeypatch.setattr(polling, "Poller", PollerOf)
     out = tmp_path / "run.arrows"

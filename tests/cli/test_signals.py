@@ -147,7 +147,7 @@ def test_simulate_removes_its_links_when_its_terminal_is_closed(tmp_path: Path) 
 @pytest.mark.long
 @pytest.mark.slow
 def test_the_demo_of_serve_ends_when_its_terminal_is_closed() -> None:
-    """The demo has no plant file that could be read again."""
+    """SIGHUP makes `serve` reload its plant file, but the demo has none."""
     require_module("uvicorn")
     with closing_terminal("serve", "--demo", "--no-browser") as terminal:
         terminal.wait_for("Ctrl-C ends it")

@@ -191,7 +191,7 @@ def test_an_interrupted_stop_is_recorded_as_sent_but_unknown(
 def test_a_stop_has_two_audit_records_however_often_it_is_sent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """The first line is written before the first frame, so that it exists if the process is killed."""
+    """The first record is written before the first frame is sent, so it exists if the process is killed."""
     path = tmp_path / "audit.jsonl"
     line = SimulatedBus(monkeypatch, *(simulated(InvtCHE(address)) for address in (1, 2)), audit=path)
     drives = [line.attach(InvtCHE(address)) for address in (1, 2)]
@@ -323,7 +323,7 @@ def test_a_clock_set_back_restores_no_budget(tmp_path: Path) -> None:
         assert "10 times in a year" in ledger.enter(CELL, NOON - set_back, 0.0)
 
 
-# ---- both, under a drive ----
+# ---- ledger and audit log together, used by a drive ----
 
 
 @pytest.mark.long

@@ -64,7 +64,7 @@ tripped   reset_fault   ok   ok/?      ?    ?     ok/?    x         ?/ok ?      
 """
 SEVERAL_WORDS = {"abb-acs355", "siemens-v20", "schneider-atv320"}  # a start takes several control words
 SECOND: dict[tuple[str, str], set[str]] = {
-    ("set_frequency", "?"): {"innovert-ibd", "delixi-native", "danfoss-fc51", "delta-vfd-el"},  # unreadable
+    ("set_frequency", "?"): {"innovert-ibd", "delixi-native", "danfoss-fc51", "delta-vfd-el"},  # not readable
     ("set_frequency", "-"): {
         "erman-er-g-220",
         "delixi-modbus",

@@ -387,7 +387,7 @@ def test_a_ramp_above_the_drive_s_limit_is_refused_before_its_first_step(
 
 
 def test_a_ramp_starts_from_a_setpoint_of_a_plain_write(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The setpoint cannot be read; starting from the older one of `set_frequency` would be a jump."""
+    """The setpoint cannot be read; starting from the older setpoint of `set_frequency` would be a jump."""
     line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
     drive.set_frequency(40)
     drive.write(drive.frequency, 10.0)

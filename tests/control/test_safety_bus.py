@@ -202,7 +202,7 @@ def test_a_write_is_done_taken_as_another_value_refused_or_unconfirmed(
     assert str(outcome).startswith("innovert-ibd@1: frequency = 25.00 Hz: unconfirmed: innovert-ibd@1: ")
     with pytest.raises(Unconfirmed, match="no reply"):
         assert outcome.value
-    assert drive.try_write(drive.acceleration_time, 10.0).effect is Effect.DONE  # read back
+    assert drive.try_write(drive.acceleration_time, 10.0).effect is Effect.DONE  # confirmed by a read back
     line.deafens = line.loses
     outcome = drive.try_write(drive.acceleration_time, 30.0)
     assert (outcome.effect, outcome.held) == (Effect.UNCONFIRMED, 10.0)

@@ -198,7 +198,7 @@ class Stops(RuleBasedStateMachine):
         self.far.release(self.line)
 
     def _signal(self, signals: list[signal.Signals]) -> None:
-        """Raise the first signal; send the second one once stops of the first are on the wire."""
+        """Raise the first signal; once its stops are on the wire, send the second signal."""
 
         def again() -> None:
             while not self._received("stops") and not over.is_set():

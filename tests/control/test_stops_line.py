@@ -140,7 +140,7 @@ def test_a_start_whose_reply_is_lost_is_sent_once(model: str) -> None:
         with pytest.raises(Unconfirmed, match="no reply"):
             drive.start()
         assert len(received.starts) == 1
-        assert received.sim.motor.energised  # as the error Unconfirmed said that it may
+        assert received.sim.motor.energised  # the motor runs, as the error Unconfirmed warned
 
 
 @pytest.mark.long

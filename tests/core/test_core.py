@@ -490,7 +490,7 @@ def test_an_urgent_exchange_that_expires_while_it_waits_is_not_sent(drive: Drive
 
 
 def test_a_stop_precedes_waiting_requests_and_cancels_earlier_ones_of_its_drive(drive: Drive) -> None:
-    """A start sent after the stop would undo it; a start sent before it would move the motor first."""
+    """A start sent after the stop would undo the stop; a start sent before the stop would move the motor."""
     latch, other = Latch(), Latch()
     requested: list[int] = []
     found: dict[int, Completion] = {}

@@ -155,7 +155,7 @@ def test_a_late_reply_is_recognised_after_the_port_is_reopened(line: LineDriver,
 
 @pytest.mark.usefixtures("proof")
 def test_a_late_reply_is_counted_once(line: LineDriver, drive: Peer) -> None:
-    """Noise comes after it, before the next request is sent."""
+    """Noise comes after the late reply, before the next request is sent."""
     time_out(line, drive, LONGER)
     time_out(line, drive, LONGER)
     line.receive(PROOF_REPLY)

@@ -99,7 +99,7 @@ def test_an_exception_ends_the_wait_for_a_longer_reply(line: LineDriver, drive: 
 
 
 def test_the_port_is_read_earlier_when_a_drive_becomes_quicker(line: LineDriver, drive: Peer) -> None:
-    """At first its reply is complete long before the port is read. Then each read comes a little earlier."""
+    """At first the reply is complete long before the port is read. Then each read comes a little earlier."""
     for _ in range(40):
         answer(line, drive, 40 * MS)
     for _ in range(120):

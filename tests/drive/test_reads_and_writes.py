@@ -14,7 +14,7 @@ from multidrop.sim import SimulatedDrive
 
 
 class Meter(Drive):
-    """Two neighbouring readings, a setting, and a text."""
+    """A device with two neighbouring readings, a setting, and a text."""
 
     level = reading(0, "m", step=0.1)
     flow = reading(1, "l/s")

@@ -117,7 +117,7 @@ async def refused(servers: SecuredCluster) -> set[Attempt]:
                 await client.publish(subject, b"{}")
             else:
                 await client.subscribe(subject)
-        for _ in range(2):  # this flush's ping may overtake pending data; the second one's cannot
+        for _ in range(2):  # the first flush's ping may overtake pending data; the second's cannot
             await client.flush()
         await client.close()
         for attempt, subject in mine.items():

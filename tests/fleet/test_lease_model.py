@@ -30,7 +30,7 @@ class PathState(NamedTuple):
     request: int | None = None  # a renewal on its way to the server: when it was sent
     ack: int | None = None  # the server's acknowledgement on its way back: when that renewal was sent
     renewed: int | None = 0  # the newest renewal that the holder counts
-    seen: tuple[bool, int] | None = None  # by the taker: is its revision the present one, and since when
+    seen: tuple[bool, int] | None = None  # record read by the taker: is it the newest, and since when
     ending: bool | None = None  # the taker's write in flight: whether it replaces the present revision
 
 

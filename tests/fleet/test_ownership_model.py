@@ -194,7 +194,7 @@ class Model:
     def claims(
         self, name: str, known: Records, over: frozenset[str], doubted: tuple[int, ...]
     ) -> list[tuple[tuple[int, int], ...]]:
-        """Return the buckets and votes that a session may write: the first ones; these and the spare ones."""
+        """Return sets of (bucket, votes) that a session may write: first buckets, or also spare buckets."""
         records = as_read(known)
         buckets = list(records)
         if not self.looks_home and not known[0].revision:

@@ -72,7 +72,7 @@ def test_steps_are_never_taken_without_a_pause() -> None:
 
 @pytest.mark.parametrize(("left_s", "ends"), [(2.0, True), (0.9, False), (-1.0, False)])
 def test_a_gateway_with_an_expiring_lease_ends_no_other_session(left_s: float, ends: bool) -> None:
-    """The servers may be failing for all gateways: an ended one could not continue afterwards."""
+    """The servers may be failing for all gateways: an ended session could not continue afterwards."""
 
     async def main() -> bool:
         member = a_member()

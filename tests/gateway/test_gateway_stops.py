@@ -89,7 +89,7 @@ def test_head_of_the_answer_confirms_an_unfinished_stop(
         monkeypatch.setattr(gateway.gateway.commands, "act" if path == "/api/act" else "stop", slow)
         connection = http.client.HTTPConnection("127.0.0.1", gateway.gateway.port, timeout=PATIENCE)
         connection.request("POST", path, json.dumps(body), {"content-type": "application/json"})
-        response = connection.getresponse()  # returns after the head
+        response = connection.getresponse()  # returns after the HTTP head
         assert (response.status, held.is_set()) == (200, False)
         assert response.getheader("x-accel-buffering") == "no"
         held.set()

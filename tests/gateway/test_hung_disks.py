@@ -300,7 +300,7 @@ def test_hung_page_files_end_their_requests_and_delay_no_others(
     monkeypatch.setattr(page_files, "READ_S", SHORT_S)
     with served(tmp_path, SERVE) as gateway:
         monkeypatch.setattr(Path, "read_bytes", read_bytes)
-        # These are more requests than may wait for the disk.
+        # At most four reads of files may hang concurrently.
         for path in ("/", "/page/app.js", "/", "/page/app.js", "/page/boot.js"):
             answer = gateway.get(path)
             assert (answer.status, answer.json["error"][:11]) == (503, "page files:")

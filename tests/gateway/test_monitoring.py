@@ -100,7 +100,7 @@ CALM = {  # by series: values that must make no alert fire
 
 
 def rule_test(series: dict[str, str], alert: str, count: int) -> dict[str, Any]:
-    """Return a test for promtool: with these series, so many alerts of this name fire after 15 min."""
+    """Return a test for promtool: with these series, `count` alerts of this name fire after 15 min."""
     samples = [{"labels": "{}", "value": count}] if count else []
     query = f'count(ALERTS{{alertname=~"{alert}", alertstate="firing"}})'
     return {

@@ -40,7 +40,7 @@ def over(alarm: Alarm, ended: int = 2_000) -> Alarm:
 
 
 def flaps(number: int) -> list[Alarm]:
-    """Return an alarm that begins and ends this many times."""
+    """Return the events of an alarm that begins and ends `number` times."""
     return [
         one for at in range(number) for one in (BEGUN._replace(time=at), over(BEGUN._replace(time=at), at))
     ]
@@ -79,7 +79,7 @@ def test_thousand_flaps_are_sent_as_one_message_for_each_begin_and_end() -> None
     part = Notifications([target.sender], [FAULT])
     for alarm in alarms:
         part.note_alarm(alarm)
-        target.now_s += 2  # within the limit of 3600 an hour
+        target.now_s += 2  # within the limit of 3600 messages an hour
         target.send_all()
     assert [(one["event"], one["id"]) for one in target.messages] == [
         ("begin" if alarm.ended is None else "end", alarm.id) for alarm in alarms
@@ -249,7 +249,7 @@ def test_missing_apprise_is_one_sentence(tmp_path: Path, monkeypatch: pytest.Mon
         build("notify", settings, context)
 
 
-@pytest.mark.filterwarnings("ignore:.*imghdr:DeprecationWarning")  # which Apprise imports
+@pytest.mark.filterwarnings("ignore:.*imghdr:DeprecationWarning")  # Apprise imports imghdr
 def test_apprise_sends_title_and_text(webhook: SimpleNamespace) -> None:
     pytest.importorskip("apprise")
     send = sender_to(Target("target", webhook.url.replace("http://", "json://")))

@@ -30,7 +30,7 @@ from multidrop.planning.bus_time import gap, in_order, silence
 
 
 class Example(Drive):
-    """A read has at most four registers, and reserved addresses up to 20 may be read."""
+    """A family whose reads have at most four registers, and may include reserved addresses up to 20."""
 
     most_registers = {HOLDING: 4, INPUT: 2}
     readable_gaps = {HOLDING: range(0, 21)}
@@ -101,7 +101,7 @@ def test_the_duration_of_a_block_is_characters_silence_and_delay() -> None:
 
 def test_other_readable_registers_are_read_across_but_never_a_command() -> None:
     class Sparse(Drive):
-        """Undeclared addresses are never read."""
+        """A family whose undeclared addresses are never read."""
 
         most_registers = {HOLDING: 10}
         low = reading(1)

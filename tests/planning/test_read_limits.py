@@ -132,7 +132,7 @@ def test_by_default_requests_to_the_meter_include_only_declared_registers() -> N
 
 
 class Mixed(Drive):
-    """Some registers are written by function 06, others only by 10H. All are read by 03."""
+    """A family with registers written by function 06, and others only by 10H. All are read by 03."""
 
     low = setting(1, "", span=(0, 9))
     multiple = setting(2, "", span=(0, 9), table=HOLDING_MULTIPLE)
@@ -230,7 +230,7 @@ def test_no_other_plan_for_overlapping_registers_takes_less_time(
 
 
 class Grouped(Drive):
-    """Energy in two registers with others between them, a state that is read first, and large gaps."""
+    """A family with energy in two separate registers, a state that is read first, and large gaps."""
 
     most_registers = {HOLDING: 100}
     readable_gaps = {HOLDING: range(200)}

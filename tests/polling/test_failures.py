@@ -161,7 +161,7 @@ def test_a_failing_line_is_retried_at_growing_intervals(
 def test_requests_queued_when_a_line_failed_are_carried_out(
     two: Two, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If it fails right after queueing requests, the poller does not know how many are queued."""
+    """If the line fails right after queueing requests, the poller does not know how many are queued."""
     submit, repeat = Port.submit, Port.repeat
     left = 3
 
@@ -227,7 +227,7 @@ def test_every_call_of_a_failed_poller_raises_polling_failed(
     poller = failed.poller
     assert repr(poller).startswith("<Poller polling has ended on all lines: Ill: of this line;")
     rows: list[Row] = []
-    with pytest.raises(PollingFailed) as raised:  # after the rows that are still queued
+    with pytest.raises(PollingFailed) as raised:  # raised after the rows that are still queued
         rows.extend(row for batch in poller.batches() for row in batch)
     assert rows
     assert isinstance(raised.value.__cause__, Ill)

@@ -102,7 +102,7 @@ def test_a_delixi_reply_equal_to_its_request_is_not_taken_for_an_echo(register: 
 
 
 def test_an_echo_of_a_silent_delixi_drive_is_not_read_as_0_for_long() -> None:
-    """A broken wire may cause both. After two values of 0, a probe checks whether the adapter echoes."""
+    """A broken wire may silence a drive and cause an echo. After two values of 0, a probe shows the echo."""
     drive = DelixiNative(1, name="drive-1")
     asked = polled(drive, [DelixiNative.output_frequency, DelixiNative.output_current])
     wire = ClockedWire([simulated(drive)], Faults())

@@ -29,7 +29,7 @@ SLACK = 1e-6
 
 
 class Slow(Picky):
-    """Records the times of its requests, and counts those that came too early after its last reply."""
+    """A drive that records when requests come, and counts those that come too early after its last reply."""
 
     def __init__(self, drive: Drive) -> None:
         super().__init__(drive)

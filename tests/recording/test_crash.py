@@ -118,7 +118,7 @@ def check_rows(rows: Sequence[Row]) -> None:
 
 
 def check_recordings(directory: Path, life: str, acknowledged: int | None) -> int:
-    """Check that both recordings open and have at least the acknowledged rows; return the number of these."""
+    """Check that both recordings open and have the acknowledged rows; return the number of these rows."""
     for suffix in (".arrows", ".csv"):
         path = directory / f"{life}{suffix}"
         if acknowledged is None and (not path.exists() or not path.stat().st_size):

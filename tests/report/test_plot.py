@@ -514,7 +514,7 @@ def test_no_state_has_the_colour_of_a_drive(tmp_path: Path) -> None:
 
 
 def test_a_state_of_one_row_is_drawn(tmp_path: Path) -> None:
-    """Its pale bar is one pixel wide, and would be invisible without a dark edge."""
+    """The state's pale bar is one pixel wide, and would be invisible without a dark edge."""
     rows = [row(at, "che", "status", 3 if at == 500 else None) for at in range(1000)]
     (axes,) = plot(states(tmp_path, rows))[0].axes
     (bars,) = axes.collections

@@ -102,7 +102,7 @@ def test_rts_switches_to_sending_only_while_a_request_is_sent(
     assert len(read) == 20
     writes = [at for at, event in enumerate(events) if event.what == "write"]
     assert len(writes) >= 21
-    assert {event.what for event in events[: writes[0] - 1]} == {receiving}  # since its opening
+    assert {event.what for event in events[: writes[0] - 1]} == {receiving}  # from the opening on
     late = []
     for at in writes:
         before, write, after = events[at - 1 : at + 2]

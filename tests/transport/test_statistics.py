@@ -89,7 +89,7 @@ def test_utilisation_follows_the_wire_s_settings(line: LineDriver, drive: Peer, 
 def test_the_utilisation_of_a_port_faster_than_its_settings_is_at_most_1(
     line: LineDriver, drive: Peer
 ) -> None:
-    """The whole reply comes after 0.1 ms; a wire would take 15 characters."""
+    """The whole reply comes after 0.1 ms; on a wire it would take the time of 15 characters."""
     begun = line.now
     for _ in range(100):
         ask(line, drive)
@@ -293,7 +293,7 @@ STEPS = 400
 @pytest.mark.long
 @table("seconds", [0.001, 0.003, 0.01, 0.03, 0.1])
 def test_the_utilisation_of_a_polled_line_is_at_most_1(seconds: float) -> None:
-    """An exchange in flight at a reading counts only after it, with its whole time."""
+    """An exchange in flight when statistics are read counts only later, with its whole time."""
     pumps = [Toy(address, name=f"pump-{address}") for address in (1, 2)]
     wire = ClockedWire([EncodedDrive(pump) for pump in pumps], Faults())
     drives = [polled(pump, [Toy.output_frequency, Toy.acceleration_time]) for pump in pumps]

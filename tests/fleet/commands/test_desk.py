@@ -1,4 +1,4 @@
-"""Commands at a gateway: the line's master sends each one once and in time, or not at all."""
+"""Commands at a gateway: the line's master sends each command once and in time, or not at all."""
 
 from __future__ import annotations
 

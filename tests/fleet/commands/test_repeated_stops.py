@@ -1,4 +1,4 @@
-"""Stops of one silent drive: the gateway repeats one of them and sends each other one once."""
+"""Stops of one silent drive: the gateway repeats one of the stops, and sends each of the others once."""
 
 from __future__ import annotations
 

@@ -346,7 +346,7 @@ async def test_of_two_simultaneous_starts_at_most_one_is_valid() -> None:
 
 
 async def test_a_starting_session_takes_no_path_of_a_living_one() -> None:
-    """The first session renews path 0 right before the second one takes it, and keeps renewing path 2."""
+    """The first session renews path 0 right before the second session takes it, and keeps renewing path 2."""
     trial = Trial()
     gate = trial.buckets[0] = GatedBucket("lease_0")
     first, second = trial.lease(), trial.lease()

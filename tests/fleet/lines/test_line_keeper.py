@@ -333,7 +333,7 @@ async def test_if_all_leases_lag_no_bucket_is_written_last() -> None:
 async def test_a_bucket_that_lost_its_home_server_does_not_delay_claims(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Until a second bucket was read, this bucket is the only one to write."""
+    """Until the gateway has read a second bucket, it can write a claim only in this bucket."""
     monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
     trial = Trial()
     await trial.read_and_begin()

@@ -38,7 +38,7 @@ def test_a_more_complete_report_of_a_move_replaces_another() -> None:
 
 
 def test_a_release_and_a_claim_by_two_gateways_are_one_move() -> None:
-    """Each gateway sees half of the move: the first one does not follow the line, the next started late."""
+    """Each gateway reports half of the move: the releasing one sees no claim, the claiming one no release."""
     giver, taker = [FIRST, move(2, "gw-1", "")], [move(2, None, ""), move(3, "", "gw-2")]
     back = [move_of(one.as_json()) for one in (*giver, *taker, *giver)]
     assert told(*back) == [("gw-1", "gw-2"), ("", "gw-1")]

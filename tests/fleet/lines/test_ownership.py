@@ -1,4 +1,4 @@
-"""Ownership of lines: how evenly they are assigned, and which gateway may claim or release one when."""
+"""Ownership of lines: how evenly they are assigned, and when a gateway may claim or release a line."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from multidrop.fleet.lines.releases import WAIT_S, Releases
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.leaders import Cluster, Replica
 
-FIRST = {names.owner_buckets(line)[0]: line for line in (f"line-{at}" for at in range(30))}  # one line each
+FIRST = {names.owner_buckets(line)[0]: line for line in (f"line-{at}" for at in range(30))}  # a line of each
 LINES = set(FIRST.values())
 
 

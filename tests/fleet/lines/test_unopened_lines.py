@@ -56,7 +56,7 @@ def test_a_polled_line_is_reported_when_its_port_is_lost_for_6_s() -> None:
 
 @pytest.mark.parametrize(
     ("silent_s", "named_after_s"),
-    [(2.0, 4.0), (REPLY_NS / SECOND, 3.0), (60.0, 6.0), (None, 6.0)],  # incl. an old reply, and none
+    [(2.0, 4.0), (REPLY_NS / SECOND, 3.0), (60.0, 6.0), (None, 6.0)],  # also an old last reply, and no reply
 )
 def test_a_loss_counts_from_the_last_reply(silent_s: float | None, named_after_s: float) -> None:
     """The port's loss and the failure of reopening are noticed only some seconds after the line was cut."""

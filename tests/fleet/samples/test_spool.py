@@ -140,7 +140,7 @@ def test_a_newest_file_cut_at_any_byte_loses_no_earlier_message(
 
 
 def test_the_number_of_a_damaged_message_is_not_reused(folder: Path) -> None:
-    """The stream may have the whole message, and would take another one of this number for its copy."""
+    """The stream may have the whole message, and take another message of this number for its copy."""
     filled(folder, 2, exchanges=2)
     newest = max(folder.glob("*.arrows"))
     newest.write_bytes(newest.read_bytes()[:100])

@@ -103,7 +103,7 @@ async def arrivals(servers: SecuredCluster, wanted: Set[str]) -> set[str]:
 
 
 async def arrivals_at(servers: SecuredCluster, url: str, wanted: Set[str]) -> set[str]:
-    """Return the arrivals as above, for requests to one server."""
+    """Return the subjects that got an answer, like `arrivals`, for requests to one server."""
     heard: set[str] = set()
 
     async def hear(message: Msg) -> None:

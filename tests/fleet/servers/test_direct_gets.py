@@ -77,7 +77,7 @@ def test_a_prompt_answer_takes_one_request() -> None:
 
 
 def test_an_unanswered_read_is_repeated_on_all_paths() -> None:
-    """The server may have forwarded the request to one that is cut off."""
+    """The server may have forwarded the request to a server that is cut off."""
     ways = [SlowWay("a"), SlowWay("b", NEVER, 0.01), SlowWay("c")]
     assert answer(*ways) == ("b", 0.21)
     assert asked(ways) == [[0.0, 0.2], [0.1, 0.2], [0.1, 0.2]]

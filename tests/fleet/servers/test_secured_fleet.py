@@ -355,7 +355,7 @@ def test_a_new_gateway_shares_the_lines_and_ends_no_session(tmp_path: Path) -> N
 
 @pytest.mark.long
 def test_a_stolen_gateway_key_can_only_silence_lines(tmp_path: Path) -> None:
-    """A thief with gw-c's key ends the others' sessions again and again. They start new ones."""
+    """A thief with gw-c's key ends the others' sessions again and again. The others start new sessions."""
     with secured_fleet(tmp_path, 1) as fleet:
         fleet.wait_for_polling()
         fleet.running["gw-c"].kill()
@@ -415,7 +415,7 @@ def test_clocks_an_hour_apart_are_logged_and_harmless(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_second_machine_with_a_gateways_name_waits_for_it(tmp_path: Path) -> None:
-    """The second one has another folder, as on another machine. It waits, reports that, and takes over."""
+    """The second gateway has another folder, as on another machine. It waits, reports it, and takes over."""
     with secured_fleet(tmp_path, 1, ("gw-a",)) as fleet:
         fleet.wait_for_polling()
         fleet.start("gw-a", "second")

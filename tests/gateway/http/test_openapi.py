@@ -24,7 +24,7 @@ from multidrop.gateway.http.rights import COMMAND_ID, May, Right
 DRIVES = ["pump-1", "pump-2", "pump-9"]  # the last one is unknown
 MAY = May("anyone", Right.WRITE, frozenset({"pump-1.setpoint"}), frozenset({"pump-1.start"}))
 PHASES = os.environ.get("SCHEMATHESIS_PHASES", "fuzzing")
-EXAMPLES = os.environ.get("SCHEMATHESIS_EXAMPLES", "3")  # of each route, in each phase
+EXAMPLES = os.environ.get("SCHEMATHESIS_EXAMPLES", "3")  # examples of each route, in each phase
 START = {"drive": "pump-1", "verb": "start"}
 
 

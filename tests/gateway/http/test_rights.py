@@ -342,7 +342,7 @@ def test_audit_log_names_the_caller_and_its_interface(tmp_path: Path) -> None:
         assert gateway.command(*WRITE, **writer).json["done"] is True
         assert gateway.post(*STOP, origin=f"http://127.0.0.1:{gateway.gateway.port}").status == 200
         records = gateway.get("/api/audit").json["entries"]
-        written = [(one["drive"], one["by"], one["way"]) for one in records[-2:]]  # call, result
+        written = [(one["drive"], one["by"], one["way"]) for one in records[-2:]]  # call and result
         assert written == [("pump-1", "writer", "http from 127.0.0.1")] * 2
         assert {(one["by"], one["way"]) for one in records[:-2]} == {("anyone", "page from 127.0.0.1")}
         oldest = records[-1]["time"]

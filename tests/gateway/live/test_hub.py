@@ -349,7 +349,7 @@ def test_frame_has_no_value_that_is_overdue_or_followed_by_a_miss(hub: Hub, cloc
         assert [*told["output_current"][:1], *told["output_current"][2:4]] == current
         assert told["fault"] == (None, told["fault"][1], "not asked yet")
         said = {"status": None, "output_frequency": frequency[0], "output_current": None, "fault": None}
-        assert fresh_values(hub, "pump-1") == said  # by MQTT
+        assert fresh_values(hub, "pump-1") == said  # values published by MQTT
 
 
 def test_age_is_right_if_a_clock_was_set_back_or_stopped_in_sleep(hub: Hub, clock: HubClock) -> None:

@@ -42,7 +42,7 @@ WRITE = {"drive": "pump-1", "register": "setpoint", "value": 50.0}
 
 
 class Times:
-    """SeenFrames with a clock and times of stops that a test sets."""
+    """SeenFrames with a clock, and with the times of drives' stops, which a test sets."""
 
     def __init__(self) -> None:
         self.now_ns = 10**12

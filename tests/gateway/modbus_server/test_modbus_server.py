@@ -148,7 +148,7 @@ def test_value_from_before_a_write_is_not_used_after_the_write(gateway: Gateway)
     gateway.hub.ages["mill", "output_voltage"] = 0.2
     with gateway.client() as client:
         assert client.ask(1, 6, CHE_SETPOINT, 5000).code is None
-        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]  # passed
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]  # passed on to the drive
         gateway.hub.ages["mill", "output_voltage"] = 0.0
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
 
@@ -160,7 +160,7 @@ def test_value_from_before_a_command_is_not_used_after_a_reload(gateway: Gateway
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
         gateway.commands.ended["mill"] = time.monotonic_ns()
         gateway.server.adopt(plant())
-        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]  # passed
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]  # passed on to the drive
 
 
 @table("function", [1, 2, 3, 4])
@@ -402,7 +402,7 @@ def test_stop_in_a_write_of_several_words_is_sent_alone(mixed: str, may: str) ->
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", may=may)) as gateway:
         for _ in range(MOST_STOPS + 1):
             assert code(gateway, unit, 16, address, len(words), data=data) == 3
-        until(lambda: bool(gateway.commands.stopped))  # the answer does not wait for it
+        until(lambda: bool(gateway.commands.stopped))  # the answer does not wait for the stop
         names = {1: "mill", 3: "pump", 4: "belt"}
         assert {str(drives) for drives, _ in gateway.commands.stopped} == {f"['{names[unit]}']"}
         assert gateway.commands.written == []
@@ -415,7 +415,7 @@ def test_stop_in_a_write_of_several_coils_is_sent_alone() -> None:
         assert code(gateway, 1, 15, 0, 3, data=b"\1\1") == 3  # the write has a start but no stop
         assert gateway.commands.stopped == []
         assert code(gateway, 1, 15, 0, 3, data=b"\1\2") == 3
-        until(lambda: bool(gateway.commands.stopped))  # the answer does not wait for it
+        until(lambda: bool(gateway.commands.stopped))  # the answer does not wait for the stop
         assert [drives for drives, _ in gateway.commands.stopped] == [["mixer"]]
         assert gateway.commands.written == []
 

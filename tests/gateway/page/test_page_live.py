@@ -177,7 +177,7 @@ def test_unknown_values_are_shown_as_a_dash_and_never_as_zero(opened: Opener, ga
     assert cell(page, "pump-2", "frequency").inner_text().strip() == DASH
     assert cell(page, "pump-1", "state").inner_text().strip() == "unknown"
     shown = page.locator(".registers .number")
-    until_met(page, lambda: {*shown.all_inner_texts()} == {DASH, "20.0", "4012", "50.0"})  # 3 known
+    until_met(page, lambda: {*shown.all_inner_texts()} == {DASH, "20.0", "4012", "50.0"})  # dash: unknown
     assert page.locator("tr.head .wire").first.inner_text().split() == [
         "wire",
         DASH,
