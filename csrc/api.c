@@ -185,7 +185,7 @@ static int is_attended(const struct md_port *port)
 int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                       int64_t expires_ns, struct md_completion *completion, double *values)
 {
-    struct md_engine *engine = port->engine; /* read now: the port may be freed before the end */
+    struct md_engine *engine = port->engine; /* read now: another thread may free the port meanwhile */
     struct md_urgent urgent = {.exchange = exchange, .not_before_ns = not_before_ns, .expires_ns = expires_ns,
                                .completion = completion};
     md_engine_enter(engine);

@@ -107,7 +107,7 @@ static size_t put_body(int layout, const struct md_message *message, uint8_t *bo
     return (size_t)(at - body) + message->data_len;
 }
 
-/* Write only the data bytes that the body has: clearing the others costs more than parsing. */
+/* Write only the data bytes that the body has: clearing the unused bytes takes longer than parsing. */
 static void get_body(int layout, const uint8_t *body, struct md_message *message)
 {
     const struct fields *fields = &fields_of[layout];
@@ -170,7 +170,7 @@ static int reply_length(int framing, const uint8_t *body, size_t have, const str
         return MD_INCOMPLETE;
     if (framing == MD_DELIXI && is_delixi_refusal(body[1]))
         return DELIXI_BODY;
-    /* ERMAN, section 8, prints 89H for an exception to 08 (as Yaskawa's manuals do). */
+    /* ERMAN's manual, section 8, shows an exception to function 08 with 89H (as Yaskawa's manuals do). */
     if (framing != MD_DELIXI && (body[1] == (request->function | MD_EXCEPTION_BIT) ||
                                  (request->function == MD_LOOPBACK && body[1] == 0x89)))
         return have >= EXCEPTION_BODY && body[2] == 0 ? MD_BAD_FUNCTION : EXCEPTION_BODY;

@@ -1,9 +1,9 @@
 /* Captures: packets of capture files, frames of both directions and all framings, and rows.
  *
- * The splitter knows the table of functions only. A frame is a byte sequence with a good checksum at a
- * place that allows one. Bytes after a request are tried as its reply, then as a request, then as a reply
- * without its request. At most three frames are tried at a byte, so the cost is linear in the length of
- * garbage. */
+ * The splitter knows no drives, only the table of functions in body.c. A frame is a byte sequence with a good
+ * checksum at a place that allows one. Bytes after a request are tried as the reply to it, then as a request,
+ * then as a reply without its request. At most three frames are tried at a byte, so the cost is linear in the
+ * length of garbage. */
 #include "internal.h"
 
 #include <string.h>
@@ -26,7 +26,7 @@ static const struct { uint32_t port; uint8_t side; } senders[] = {
     {50000, MD_ASKING}, {502, MD_ANSWERING}, {1, MD_FAILED}, {2, MD_NOISE},
 };
 
-/* Read 32 bits in the file's own order. */
+/* Read a 32-bit number in the capture file's byte order. */
 static uint32_t number(const struct md_capture *capture, const uint8_t *at)
 {
     uint32_t value = 0;
@@ -41,7 +41,7 @@ static size_t skip_header(struct md_channel *channel, const uint8_t *packet, siz
 {
     uint32_t link = channel->link;
     if (link == MD_LINK_RTAC) {
-        if (len > RTAC_HEADER && (packet[8] == 1 || packet[8] == 2)) /* data sent, data received */
+        if (len > RTAC_HEADER && (packet[8] == 1 || packet[8] == 2)) /* 1: data sent, 2: data received */
             *side = packet[8] == 1 ? MD_ASKING : MD_ANSWERING;
         return len < RTAC_HEADER ? len : RTAC_HEADER;
     }
@@ -318,7 +318,7 @@ int md_split(struct md_splitter *splitter, const struct md_stream *stream, struc
         return 1;
     }
     if (span->len)
-        span->kind = MD_JUNK; /* the next call finds the frame after it */
+        span->kind = MD_JUNK; /* the next call finds the frame after this junk */
     else if (used <= 0)
         return 0;
     else
@@ -442,7 +442,7 @@ static int take_request(struct md_decoder *decoder, struct md_columns *columns)
     return MD_ALL_DECODED;
 }
 
-/* Add these bytes to those received instead of a reply, and set the failure that follows from them all. */
+/* Add the span to the bytes received instead of a reply, and derive the failure from all these bytes. */
 static void explain(struct md_decoder *decoder, const struct md_stream *stream)
 {
     const struct md_span *span = &decoder->span;
@@ -469,7 +469,7 @@ static int take(struct md_decoder *decoder, const struct md_stream *stream, stru
     case MD_REQUEST:
     case MD_EITHER:
         if (!decoder->is_sure)
-            decoder->block = NULL; /* it may be a reply to a write: then no further reply comes */
+            decoder->block = NULL; /* the "request" may be a reply to a write: then no further reply comes */
         int undone = take_request(decoder, columns);
         if (undone)
             return undone;

@@ -17,7 +17,7 @@ enum md_side {
     MD_SIDES
 };
 
-/* A ring buffer with one writer and one reader. All zero except `ring` and `room`: empty. */
+/* A ring buffer with one writer and one reader. It is empty if all fields except `ring` and `room` are 0. */
 struct md_tap {
     uint8_t *ring;
     uint32_t room;       /* bytes, a power of two */
@@ -26,7 +26,8 @@ struct md_tap {
     int64_t ahead_ns;    /* UTC - CLOCK_MONOTONIC for the next bytes; 0: the reader's value */
 };
 
-/* Header and trailer of a packet. Each side has two such pairs: for bytes that start with ':', and others. */
+/* Header and trailer of a packet. Each side has two such pairs: one for bytes that start with ':', one for
+ * all others. */
 struct md_wrapping {
     const uint8_t *head, *tail;
     uint32_t head_len, tail_len; /* tail_len is a multiple of 4 */
@@ -70,7 +71,7 @@ enum md_kind {
 /* A frame, or junk between frames. */
 struct md_span {
     size_t at, len;
-    int64_t time_ns; /* of its first piece, as is `side` */
+    int64_t time_ns; /* `time_ns` and `side` are those of the frame's first piece */
     int side;
     int kind, framing;
     struct md_message message;
@@ -80,7 +81,7 @@ struct md_span {
 struct md_splitter {
     size_t at, piece;          /* index of the next byte, and of its piece */
     size_t junk;               /* bytes since the last frame */
-    int is_in_step;            /* a frame ended at `at`; else a request looks like its copy */
+    int is_in_step;            /* whether a frame ended at `at`; after junk, a "request" may be a reply */
     int awaited, framing;      /* `awaited`: the reply to `request` is due, in this framing */
     struct md_message request; /* the last request */
 };
@@ -109,7 +110,7 @@ struct md_decoder {
     size_t places, taken;
     const struct md_block *block; /* fields in the reply to the last request */
     int64_t asked_ns;
-    int is_sure, failure;         /* 1: the last frame was surely a request; its result if no reply comes */
+    int is_sure, failure;         /* 1: the last frame was surely a request; the result if no reply comes */
     int is_due;                   /* `span` is not processed yet */
     uint64_t frames, exchanges, junk, strays;
     struct md_completion completion;

@@ -324,7 +324,7 @@ const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int6
         const struct md_exchange *proof = drive->proofs[n];
         if (is_free(drive, proof))
             return proof;
-        if (!latest || sent_last_ns(drive, proof) > sent_last_ns(drive, latest)) /* the last settles most */
+        if (!latest || sent_last_ns(drive, proof) > sent_last_ns(drive, latest)) /* the latest settles most */
             latest = proof;
     }
     return is_answering ? last_proof(drive) : latest;

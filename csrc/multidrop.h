@@ -164,7 +164,7 @@ struct md_drive {
     uint32_t failures;                 /* number of consecutive failures */
     uint8_t owed_count, proof_count;
     uint8_t is_doubted;                /* its first reply may be to another process */
-    uint8_t sure_looks;                /* number of coming replies to read only once whole */
+    uint8_t sure_looks;                /* number of coming replies that are read only when whole */
     struct md_counters counters;
     int64_t answered_ns;               /* replies to requests sent before this time cannot come */
     int64_t late_until_ns;             /* late replies may come in any order until then */
@@ -433,7 +433,7 @@ enum md_status {
 
 /* Rows. All arrays have `room` elements. */
 struct md_columns {
-    int64_t *time, *sent;           /* when the request was sent, else its turn came; UTC and monotonic */
+    int64_t *time, *sent;           /* UTC and monotonic time of sending, or else of the request's turn */
     int64_t *uncertainty;           /* time between the request and the reply's first byte */
     uint16_t *drive, *reg, *status; /* enum md_status */
     double *value;

@@ -67,7 +67,7 @@ static int64_t used_ns(void)
     return used.tv_sec * MD_SECOND_NS + used.tv_nsec;
 }
 
-/* The flag returns threads and processes that this thread starts to normal scheduling. */
+/* With SCHED_RESET_ON_FORK, threads and processes that this thread starts get normal scheduling. */
 static int schedule(int policy, int priority)
 {
     struct sched_param parameters = {.sched_priority = priority};

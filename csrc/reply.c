@@ -112,7 +112,7 @@ void md_echo_keep(struct md_line *line)
 /* ---- replies ---- */
 
 enum { MOST_BURST = 16 }; /* characters that a UART gathers before it hands them over */
-static const int64_t OLDEST_IN_DOUBT = INT64_C(2000000000); /* ns; a row may have no older value in doubt */
+static const int64_t OLDEST_IN_DOUBT = INT64_C(2000000000); /* ns; an older request's value makes no row */
 
 int md_reply_parse(const struct md_line *line, size_t at, struct md_message *reply)
 {

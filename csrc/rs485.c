@@ -52,7 +52,7 @@ int md_rs485_begin(struct md_port *port, int mode, int is_usb)
     else if (is_by_rts(&port->rs485)) {
         port->rs485.reports_end = !is_usb && md_descriptor_is_shifted_out(port->fd) >= 0;
         failure = set_direction(port, 0);
-        if (!failure && mode == MD_RS485_RTS_DOWN) /* otherwise the closed port would send forever */
+        if (!failure && mode == MD_RS485_RTS_DOWN) /* RTS off after closing would mean sending forever */
             failure = md_port_keep_rts(port->fd);
     }
     if (failure)

@@ -148,7 +148,7 @@ static void call(struct md_turn *turn)
         md_row_queue_call(turn->row_queue, turn->number);
 }
 
-/* Return 1 if the time `from_ns` has come; otherwise set wake_ns to it at the latest. */
+/* Return 1 if the time `from_ns` has come; otherwise lower wake_ns to `from_ns`. */
 static int is_time(int64_t from_ns, int64_t *wake_ns, int64_t now_ns)
 {
     if (now_ns >= from_ns)

@@ -1,4 +1,4 @@
-/* COM ports: wait for one byte, read all that has come, and let a request leave while the thread goes on. */
+/* COM ports: wait for one byte, read all available bytes, and send requests without blocking the thread. */
 #include "file.h"
 #include "../engine.h"
 
@@ -61,7 +61,7 @@ static ssize_t write_port(struct md_file *file, const void *bytes, size_t len)
     return (ssize_t)most;
 }
 
-/* No time-outs: a read ends with its byte alone, and a write with its last byte. */
+/* Remove the timeouts: a read ends only when its byte has come, a write only when its last byte has left. */
 int md_port_prepare(HANDLE handle)
 {
     COMMTIMEOUTS none = {0};
@@ -117,7 +117,7 @@ static void set_databits(DCB *port, const struct md_settings *settings)
     port->ByteSize = settings->databits;
 }
 
-/* The driver hands on a character with a parity error, and its frame's checksum is wrong. */
+/* The driver delivers a character even with a parity error; the frame's checksum is then wrong. */
 static void set_parity(DCB *port, const struct md_settings *settings)
 {
     port->Parity = settings->parity == 'N' ? NOPARITY : settings->parity == 'O' ? ODDPARITY : EVENPARITY;
@@ -175,7 +175,7 @@ int md_port_set(int fd, const struct md_settings *settings)
 
 /* ---- the direction of a transceiver ---- */
 
-/* The direction of an RS-485 transceiver that hangs on a COM port's RTS. */
+/* The direction of an RS-485 transceiver that a COM port's RTS controls. */
 
 /* The driver raises RTS while it has bytes to send: Windows' own RS-485 mode. */
 int md_descriptor_take_rs485(int fd)
@@ -197,7 +197,7 @@ int md_descriptor_set_rts(int fd, int is_up)
 int md_descriptor_is_shifted_out(int fd)
 {
     (void)fd;
-    return -ENOTTY; /* Windows has no such call */
+    return -ENOTTY; /* Windows has no call that reports this */
 }
 
 int md_descriptor_is_queued(int fd)

@@ -1,8 +1,8 @@
-/* Reads and writes COM ports and sockets on the engine's thread.
+/* Read and write COM ports and sockets on the engine's thread.
  *
- * A watched file has an overlapped read of one byte in progress. Its completion routine runs while the
- * thread waits, and so the waiter learns that bytes have come; the other bytes are then read at once.
- * Timeouts of COM ports are no substitute: they are whole milliseconds. */
+ * A watched file has an overlapped read of one byte in progress. The read's completion routine runs while
+ * the thread waits, and reports to the waiter that bytes have come; the other bytes are then read without
+ * waiting. Timeouts of COM ports would be too coarse: they are whole milliseconds. */
 #include "file.h"
 #include "../engine.h"
 
@@ -52,7 +52,7 @@ int md_errno_of(DWORD error)
 }
 
 enum {
-    MOST_LEAVING_MS = 100, /* a file that is removed waits so long for its last request to leave */
+    MOST_LEAVING_MS = 100, /* how long removing a file waits until its last request has left */
     MOST_CANCELLED_MS = 1000,
     MOST_COMPLETING_MS = 5
 };
@@ -112,8 +112,8 @@ static void begin(struct md_file *file)
 
 /* ---- for port.c ---- */
 
-/* Complete the read of a byte that has come. Windows completes it at once, Wine in another process: until
- * then the byte lies in the queue, and must not be taken for missing. */
+/* Complete the pending read if a byte has come. Windows completes the read immediately, Wine later, in
+ * another process: until then the byte is in the queue, and must not count as missing. */
 static void complete(struct md_file *file)
 {
     if (file->is_reading)
@@ -128,7 +128,7 @@ ssize_t md_descriptor_read(int fd, void *bytes, size_t room)
     if (!file)
         return md_fail(ERROR_INVALID_HANDLE);
     complete(file);
-    if (file->is_reading) /* no byte has come since */
+    if (file->is_reading) /* no byte has come */
         return md_fail(WSAEWOULDBLOCK);
     size_t held = 0;
     if (file->is_held) {
@@ -143,7 +143,7 @@ ssize_t md_descriptor_read(int fd, void *bytes, size_t room)
     }
     ssize_t got = file->kind->read(file, (uint8_t *)bytes + held, room - held);
     int error = errno;
-    if (file->is_watched) /* this finds an end or a failure of just now again */
+    if (file->is_watched) /* if the file has just ended or failed, the new read reports that again */
         begin(file);
     errno = error;
     return got > 0 ? got + (ssize_t)held : held ? 1 : got;
@@ -200,7 +200,7 @@ void md_file_watch(int fd, int is_watched)
     if (!file)
         return;
     file->is_watched = is_watched;
-    if (!is_watched) /* the read under way costs one more waking; cancelling it would cost as much */
+    if (!is_watched) /* the pending read causes one more wake-up; cancelling it would cost as much */
         return;
     begin(file);
     tell(file);
@@ -224,12 +224,12 @@ void md_file_remove(int fd)
     file->is_watched = 0;
     int is_broken = file->error || file->is_ended;
     for (int ms = 0; ms < MOST_LEAVING_MS && file->is_writing && !is_broken; ms++)
-        SleepEx(1, TRUE); /* a stop on its way out must not be cut off */
+        SleepEx(1, TRUE); /* do not cut off a stop that is leaving */
     CancelIoEx(file->handle, NULL);
     for (int ms = 0; ms < MOST_CANCELLED_MS && (file->is_reading || file->is_writing); ms++)
         SleepEx(1, TRUE);
     unlist(file);
-    if (!file->is_reading && !file->is_writing) /* else the system may still write there */
+    if (!file->is_reading && !file->is_writing) /* otherwise the system may still use its memory */
         free(file);
 }
 

@@ -17,9 +17,9 @@ struct md_file {
     void *owner;
     int is_watched;
     int is_reading, is_writing; /* the system is reading `byte`, or writing `leaving` */
-    int is_held;                /* `byte` has come, and is not taken yet */
-    int is_ended, error;        /* the far end hung up; an errno */
-    int is_ready;               /* it is in the list of ready files */
+    int is_held;                /* `byte` has come, but was not read by the core yet */
+    int is_ended, error;        /* whether the far end hung up; the errno of a failure, or 0 */
+    int is_ready;               /* whether the file is in the list of ready files */
     struct md_file *next_ready;
     OVERLAPPED reading, writing;
     uint8_t byte;
@@ -42,20 +42,20 @@ int md_port_prepare(HANDLE handle); /* remove the timeouts of its reads and writ
 
 /* ---- file.c ---- */
 
-/* Note that the read of `byte`, or the write, is complete. */
+/* Record that the read of `byte`, or the write, is complete. */
 void md_file_has_read(struct md_file *file, DWORD error, DWORD got);
 void md_file_has_written(struct md_file *file, DWORD error);
 
 int md_file_add(int fd, void *owner); /* -1: see errno */
 void md_file_watch(int fd, int is_watched);
 void md_file_remove(int fd);
-/* Write the owners of watched files that can be read into `owners`, and return how many. */
+/* Fill `owners` with the owners of watched files that can be read; return their number. */
 int md_files_ready(void **owners, int room);
 int md_file_is_writing(int fd); /* the last request has not left yet */
 
-int md_errno_of(DWORD error); /* of GetLastError() or WSAGetLastError() */
+int md_errno_of(DWORD error); /* `error` is from GetLastError() or WSAGetLastError() */
 
-static inline ssize_t md_fail(DWORD error) /* -1, and errno */
+static inline ssize_t md_fail(DWORD error) /* set errno, return -1 */
 {
     errno = md_errno_of(error);
     return -1;

@@ -1,4 +1,4 @@
-/* Sockets, which Python made and does not wait on. */
+/* Sockets that Python has created; only the core reads, writes and waits for them. */
 #include "file.h"
 
 static void CALLBACK socket_has_read(DWORD error, DWORD got, OVERLAPPED *reading, DWORD flags)

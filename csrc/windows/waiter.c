@@ -1,5 +1,5 @@
-/* Waits for many handles at once: an alertable wait for a timer and for the wake-up, during which completion
- * routines run. */
+/* Wait for many handles together: an alertable wait for a timer and for the wake-up event, during which
+ * completion routines run. */
 #include "file.h"
 
 #include <errno.h>
@@ -15,7 +15,7 @@ struct md_waiter {
     HANDLE objects[OBJECTS];
 };
 
-/* The other kind of timer, before Windows 10 1803, keeps time to 1 to 16 ms. */
+/* Windows before 10 1803 has only normal timers, which are up to 16 ms late. */
 static HANDLE new_timer(void)
 {
     HANDLE timer =
@@ -38,7 +38,7 @@ void md_waiter_free(struct md_waiter *waiter)
     free(waiter);
 }
 
-/* Without an owner it is the wake-up. */
+/* `owner` NULL: `fd` is the wake-up event. */
 int md_waiter_add(struct md_waiter *waiter, int fd, void *owner)
 {
     if (owner)

@@ -38,7 +38,7 @@ EchoMode = Echo | Literal["auto", "on", "off"]
 TransactionMode = TransactionIds | Literal["match", "ignore"]
 RS485Mode = RS485 | Literal["off", "kernel", "rts-up", "rts-down"]
 
-EXPIRY = 1.0  # s
+EXPIRY = 1.0  # s; default of `expiry`
 
 
 def _facts(port: str, echo: str, transaction: str, rs485: str) -> tuple[Echo, TransactionIds, RS485]:
@@ -380,7 +380,7 @@ class Bus:
         """
         self._leaving.part_with(drives, to_stop)
 
-    # ---- how it went ----
+    # ---- audit log and statistics ----
 
     @property
     def audit_trouble(self) -> str:

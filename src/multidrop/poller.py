@@ -32,7 +32,7 @@ from multidrop.transport import clock
 from multidrop.transport.aside_log import log_aside, traceback_of, words_of
 from multidrop.transport.statistics import LineStatistics
 
-LOOK_NS = 50_000_000  # interval between checks of the lines, if one is not well or `fileno` is in use
+LOOK_NS = 50_000_000  # interval between checks of the lines, if a line has a problem or `fileno` is in use
 BUSY_NS = 100_000_000  # the same interval if lines only need new exchanges: a third of AHEAD_NS
 REST_NS = 500_000_000  # the same interval if no line needs attention
 MOST_FAILURES = 8  # consecutive failures of the poller's thread before polling ends
@@ -433,7 +433,7 @@ class Poller(RowSource):
         for line in self._lines:
             line.bus.stop_on_exit()
 
-    # ---- how it went ----
+    # ---- failures and statistics ----
 
     @property
     def line_failures(self) -> dict[str, str]:

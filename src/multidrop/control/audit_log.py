@@ -21,7 +21,7 @@ _sync = getattr(os, "fdatasync", os.fsync)  # macOS has no fdatasync
 
 
 class AuditLog:
-    """The log in this file. Raises OSError if it cannot be opened, or is not opened within OPENING_S."""
+    """The audit log in the file `path`. Raises OSError if it cannot be opened within OPENING_S seconds."""
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)

@@ -21,7 +21,7 @@ class Author(NamedTuple):
 
 
 class _Named(NamedTuple):
-    """The author of a block in printable text, and the error in the given names, if any."""
+    """The author that `written_by` sets, as printable text, and the error in its arguments, if any."""
 
     author: Author
     mistake: Exception | None
@@ -83,7 +83,7 @@ def noted_first() -> Iterator[None]:
 
 
 def is_noted_first() -> bool:
-    """Return True within `noted_first`."""
+    """Return True if the caller is inside a `noted_first` block."""
     return _noted_first.get()
 
 

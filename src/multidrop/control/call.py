@@ -14,7 +14,7 @@ from multidrop.drive.family import Drive
 from multidrop.errors import CancelledByStop, Expired, Unconfirmed, WriteForbidden
 from multidrop.transport import clock
 
-MOST_CHARACTERS = 64  # length of a request for one register plus its reply, at most
+MOST_CHARACTERS = 64  # characters of a request for one register plus its reply, at most
 
 _log = logging.getLogger("multidrop.control")
 
@@ -42,14 +42,14 @@ class Call:
         self._limit_ns = limit_ns
 
     def restarted(self) -> Call:
-        """Return a copy of the call that starts now. A stop since the original call still cancels it."""
+        """Return a copy of the call that starts now. Stops since the original call still cancel the copy."""
         return Call(self.drive, self.permit, self.expiry, self.verb, self._limit_ns)
 
     @property
     def expires_ns(self) -> int:
         """The CLOCK_BOOTTIME in ns after which the next write is not sent.
 
-        It allows for the interval that the drive needs between two requests.
+        The time includes the interval that the drive needs between two requests.
         """
         expires_ns = self._due_ns + round((self.expiry + self.drive.least_interval) * 1e9)
         return expires_ns if self.sent else int(min(expires_ns, self._limit_ns))

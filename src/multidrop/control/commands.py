@@ -29,10 +29,10 @@ from multidrop.errors import NotAttached
 from multidrop.supervisor import supervisor
 
 COMMAND_S = 60.0  # a command that takes longer is reported as hanging (a stop may take 30 s)
-AGAIN_S = 0.2  # pause between turns of stops that have no thread
-TURN_S = 0.2  # duration of such a turn, which blocks the event loop
+AGAIN_S = 0.2  # s between the turns in which the event loop carries out stops, if no thread can be started
+TURN_S = 0.2  # s; length of such a turn, which blocks the event loop
 STOP_S = 30.0  # how long a stop without a thread is repeated
-REPEATED_S = 30.0  # least time from a stop's call for which it, or another stop of the drive, is repeated
+REPEATED_S = 30.0  # least time in s after a stop's call in which the drive's stops are repeated
 BEGINNING_S = 0.25  # longest time from a stop's call until it is listed as under way
 
 R = TypeVar("R")

@@ -90,7 +90,7 @@ class EchoCheck:
 class _Confirmed(NamedTuple):
     """The line's state when a drive was confirmed to be of its family."""
 
-    port: object  # the open port; another object after it is reopened
+    port: object  # the open port's object; reopening creates another one
     silences: int  # number of unanswered requests until then
     pauses: int  # number of pauses of PAUSE_NS or more between the drive's replies until then
     at_ns: int

@@ -1,4 +1,4 @@
-"""Latches: cancel calls that may move a motor when its stop is called, and block new ones until it ends."""
+"""Latches: a stop of a drive cancels calls that may move its motor, and blocks new calls until it ends."""
 
 from __future__ import annotations
 
@@ -69,9 +69,9 @@ class Latches:
 
     def latch(self, drive: Drive) -> Latch:
         """Return a drive's latch. Raises NotAttached if the drive is not on this bus."""
-        self._exchanges.peer(drive)  # raises it too
+        self._exchanges.peer(drive)  # raises NotAttached
         latch = self._latches.get(drive)
-        if latch is None:  # it is being removed
+        if latch is None:  # the drive is being removed
             raise NotAttached(f"{drive.name} is not attached to this bus: use bus.attach(...)")
         return latch
 

@@ -152,7 +152,7 @@ class WriteRecords:
         log(logging.INFO, "%s%s", text, by)
 
     def _complete(self, record: dict[str, Any]) -> dict[str, Any]:
-        """Add the port and the author."""
+        """Return the record with the port and the author added."""
         author = {key: text for key, text in present_author()._asdict().items() if text}
         set_up = {"commissioning": True} if _commissioning.get() else {}
         return {"port": self._line.port, **record, **author, **set_up}

@@ -286,7 +286,7 @@ class StopAttempt:
         return Stopped(self.drive.name, seen, seconds, why)
 
     def so_far(self) -> str:
-        """Return a sentence on the progress so far; it stays the same until something changes."""
+        """Return a sentence on the stop's progress; the sentence changes only if the progress does."""
         why = f": {self.failure}" if self.failure else ""
         if self._is_confirmed:
             return f"{self.drive.name}: the stop was confirmed, but the motor is not yet seen to stand{why}"

@@ -95,7 +95,7 @@ class Completion:
 
     Times are CLOCK_MONOTONIC, in ns. `numbers` are the values of the exchange's fields, NaN for a missing
     value. `count` is the number of values that exist; -1 without a good reply and after an exception. A
-    successful read uses only these two, because with cold caches each further field and call costs
+    successful read uses only these two attributes, because with cold caches each further field and call costs
     microseconds. An exchange with the same number of values (`room`) can reuse a completion.
     """
 
@@ -171,7 +171,7 @@ class Peer:
                 "history": self._history,
             },
         )
-        self.number = next(_NUMBERS)  # of this peer, unique in this process
+        self.number = next(_NUMBERS)  # identifies this peer within the process
         self.proofs: tuple[Exchange, ...] = ()
         self.unasked: Counter[Status] = Counter()  # due values that were not requested, by status
 

@@ -185,18 +185,18 @@ class _Engine:
 
 
 class Realtime:
-    """A client's wish to run the core's thread under realtime scheduling, before all normal threads.
+    """A client's request to run the core's thread under realtime scheduling, before all normal threads.
 
-    The thread does so while any client wants it. It returns to normal scheduling by itself if it uses more
-    than half of a processor.
+    The thread has realtime scheduling while any client requests it. It returns to normal scheduling by itself
+    if it uses more than half of a processor.
     """
 
     def __init__(self) -> None:
         self.is_wanted = False
-        self.is_held = False  # the system did not refuse, and the thread has not ended it
+        self.is_held = False  # whether it was granted, and has not ended by itself since
 
     def want(self, wanted: bool) -> None:
-        """Start or end the wish. Raises OSError if the system refuses realtime scheduling."""
+        """Request realtime scheduling, or withdraw the request. Raises OSError if the system refuses."""
         if wanted != self.is_wanted:
             self.is_wanted = wanted
             self.is_held = False  # before the thread returns to normal scheduling: see `has_ended`
@@ -309,7 +309,7 @@ class Port:
         self._abandoned.atexit = False  # other exit handlers may use the port
         if mastership is not None:
             lib.md_port_fence(self.c, mastership.c)
-        # Read in place: a call into the core would release the GIL and wait for it afterwards.
+        # Python reads this struct directly: a call into the core would release the GIL and wait for it again.
         self._progress = lib.md_port_progress(self.c)
         register_at_fork(self)
 

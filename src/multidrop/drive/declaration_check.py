@@ -20,13 +20,13 @@ from multidrop.drive.text import Text
 LAST_ADDRESS = 0xFFFF
 LONGEST_TIME = 60.0  # s; larger numbers are probably ms
 MOST_CHARACTERS = 1000
-UNIT_IDS = range(256)  # of Modbus TCP; a serial line has fewer
+UNIT_IDS = range(256)  # addresses on Modbus TCP; a serial line has fewer
 EXCEPTION_CODES = range(1, 256)
-# Function codes that write the same registers: one at a time, and several at once.
+# Function codes that write the same items: from the code for a single item to the code for several.
 _SAME_SPACE = {0x05: 0x0F, 0x06: 0x10}
 _TAKEN = "reserved name; every drive has it for something else"
 
-# A fact, the test of a right value, and the rest of the sentence "FACT = VALUE …" about a wrong one.
+# A fact's name, the test of its value, and the end of the sentence "FACT = VALUE …" if the test fails.
 Rules = tuple[tuple[str, Callable[[Any], Any], str], ...]
 
 
@@ -186,7 +186,7 @@ def fact_errors(family: Any) -> list[str]:
                 wrong["options"] = (
                     f"options[{name!r}]: span = {option.span!r} is not the smallest and the largest value"
                 )
-    registers = {*family.registers, *family.texts}  # reported as such if one has a fact's name
+    registers = {*family.registers, *family.texts}  # a register with a fact's name is reported as a register
     return [sentence for name, sentence in wrong.items() if name not in registers]
 
 
@@ -308,14 +308,14 @@ def _fits_table(register: Register[Any]) -> bool:
     return register.number_format is wanted
 
 
-# Whole numbers that may have parts.
+# Formats of whole numbers, of which a register may be a part (a range of bits).
 _PARTED = frozenset(
     {
         *(NumberFormat.U16, NumberFormat.U32, NumberFormat.U64),
         *(NumberFormat.I16, NumberFormat.I32, NumberFormat.I64),
     }
 )
-# Facts of numbers in words, with their defaults.
+# Facts that only registers of 16-bit words may have, with their defaults.
 _OF_WORDS = {"part": None, "invalid": (), "order": "ABCD", "scale_register": ""}
 
 
@@ -360,7 +360,7 @@ def _is_flags(register: Register[Any]) -> bool:
 
 
 def _counts(register: Register[Any]) -> tuple[Fraction, Fraction]:
-    """Return the least and the greatest raw count; flags have no sign."""
+    """Return the least and the greatest raw count; flags are never negative."""
     if _is_flags(register):  # also in a signed format, whose highest bit may have a name
         return Fraction(0), Fraction((1 << register.coding.mask.bit_count()) - 1)
     return register.coding.raw_span

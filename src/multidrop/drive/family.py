@@ -231,7 +231,7 @@ class Drive(RegisterAccess):
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
         self.link: Link = NO_LINK
         self.stops_called: Sequence[int] = (0,)  # the first item is the number of stops called so far
-        # Takes a verb's name and a number of stops; returns a new call, which any stop after these cancels.
+        # A function of a verb's name and the stops so far; it returns a call that a later stop cancels.
         self.begin_call: Callable[[str, int], Any] = lambda verb, seen: None
         self.carry_out_move: Callable[[Script[Any], Any], Any] = self._move_nowhere
         self.begin_stop: Callable[[str, Callable[[], Script[Any]], float | None], CalledStop] = (

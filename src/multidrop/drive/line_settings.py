@@ -12,7 +12,7 @@ from multidrop.core import Framing
 from multidrop.errors import NoSuchPort
 from multidrop.printable import masked
 
-BAUDRATES = (50, 4_000_000)  # least and most
+BAUDRATES = (50, 4_000_000)  # lowest and highest
 FORMAT = "[78][NEO][12]"
 
 

@@ -82,7 +82,7 @@ def arranged(data: bytes, order: str) -> bytes:
 
 
 def bits_in(data: bytes, at: int, number_format: NumberFormat, order: str) -> int | None:
-    """Return the bits of the number at word (BIT: bit) `at` of a reply's data; None if it is too short."""
+    """Return the bits of the number at word (BIT: bit) `at` of a reply's data; None if data is missing."""
     if number_format is NumberFormat.BIT:
         return data[at // 8] >> at % 8 & 1 if at // 8 < len(data) else None
     size = 2 * WORDS[number_format]
@@ -215,7 +215,7 @@ class Coding:
     def _pattern(self, count: float) -> tuple[int, int]:
         whole = (1 << width(self.number_format)) - 1
         if self.number_format in FLOATS:
-            mask = whole >> 1 if count == 0 else whole  # a zero has no sign
+            mask = whole >> 1 if count == 0 else whole  # +0.0 and -0.0 are the same count
             return mask, bits_of(count, self.number_format) & mask
         if self.part and self.raw_span[0] <= count < 1 << self._part_width:
             return self.mask, int(count) << self.part[0] & self.mask

@@ -294,7 +294,7 @@ class Register(Generic[T]):
         if self.span is None:
             return True
         low, high = self.span
-        if self.is_float:  # the drive holds the float nearest to an end
+        if self.is_float:  # at a limit the drive holds the nearest float, which may be outside the span
             low, high = (self.coding.value_of(self.coding.count_of(end)) for end in self.span)
         return low <= value <= high
 

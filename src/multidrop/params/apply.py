@@ -22,7 +22,7 @@ from multidrop.params.plan import ApplyPlan, ParameterChange, check_stands, plan
 from multidrop.params.values import ParameterSet
 from multidrop.transport import clock
 
-NotWritten = BusError | OSError | Outcome  # why a parameter was not written; `str` has the sentence
+NotWritten = BusError | OSError | Outcome  # why a parameter was not written; str() gives a sentence
 # Called after each write with its number, the total, the change, and why it was not written (None: it was).
 Report = Callable[[int, int, ParameterChange, NotWritten | None], None]
 

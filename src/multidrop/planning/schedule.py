@@ -184,7 +184,7 @@ class Schedule(Generic[J]):
         self._await(job)
 
     def _due(self, at_ns: int) -> J | None:
-        """Return the started job whose slot ends first, or one of the last kind if that misses no slot.
+        """Return the started job whose slot ends first, or one of the last job's kind if that misses no slot.
 
         If slots were skipped, return the job that has waited longest. Return None if no job can be sent.
         """

@@ -35,7 +35,7 @@ class Suggestions:
     """Three changes, each of which alone makes the line reach its rates; None if that change cannot."""
 
     every: tuple[tuple[float, float], ...]  # pairs: wanted period, reachable period (s)
-    baudrate: tuple[int, tuple[Drive, ...]] | None  # lowest sufficient one, and the drives slower now
+    baudrate: tuple[int, tuple[Drive, ...]] | None  # lowest sufficient rate, and the drives with a lower one
     registers: int | None  # most registers of each drive whose rates do not fit
 
     def __str__(self) -> str:
@@ -51,7 +51,7 @@ class Suggestions:
 
 
 def duration_text(seconds: float) -> str:
-    """Return a duration as a plant file has it, such as "50 ms"."""
+    """Return a duration as it is written in a plant file, such as "50 ms"."""
     return f"{seconds:g} s" if seconds >= 1 else f"{seconds * 1e3:g} ms"
 
 
@@ -144,7 +144,7 @@ def _registers(exchanges: Sequence[Planned], tight: Sequence[Rate], switching: f
 
 @dataclass(frozen=True)
 class ReadingGain:
-    """Readable gaps that a class could declare, and the cost of its reads with and without them (now)."""
+    """Readable gaps that a class could declare, and the cost of its reads with these gaps and now."""
 
     drive: Drive
     gaps: tuple[tuple[Table, range], ...]

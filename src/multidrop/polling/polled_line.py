@@ -117,7 +117,7 @@ class PolledLine:
     def __init__(
         self, declared: PlantLine, number: int, bus: Bus, row_queue: RowQueue, names: RowNames
     ) -> None:
-        self.declared = declared  # its `drives` are those of the start; `polled` has the present drives
+        self.declared = declared  # the line at the start; `polled` has the present drives
         self.bus = bus
         self.switching = declared.switching  # s that a change of port settings takes; measured after `end`
         self.started_ns = clock.now_ns()
@@ -135,7 +135,7 @@ class PolledLine:
         self._since_ns: dict[Drive, int] = {}  # when each drive's polls were last changed
         self._gone: dict[int, Peer] = {}  # by address, removed drives' peers, maybe still in an exchange
         self._polled: list[tuple[Drive, Peer]] = []  # the present drives that have jobs
-        self._observed: list[tuple[int, int, bool]] = []  # for each of `_polled`, as in `_observe`
+        self._observed: list[tuple[int, int, bool]] = []  # what `_observe` last saw, for each of `_polled`
         self._is_started = False
         self._learnt_ns = 0
         self._reopening = Reopening(bus)
@@ -514,7 +514,7 @@ class PolledLine:
         else:
             self._miss(self._schedule.pass_slots(ended_ns), Status.LINE_LOST)
 
-    # ---- how it went ----
+    # ---- summary ----
 
     def summary(self) -> dict[str, Any]:
         """Return the summary of the line and its drives since the start, as plain numbers."""

@@ -32,7 +32,7 @@ def check_function(function: object) -> None:
         raise TypeError(f"on_batch takes a function of one batch, not {function!r}")
     while isinstance(function, partial):
         function = function.func
-    calls = (function, getattr(type(function), "__call__", None))  # noqa: B004 (its class's own)
+    calls = (function, getattr(type(function), "__call__", None))  # noqa: B004 (the `__call__` of its class)
     if any(is_deferred(call) for is_deferred in _DEFERRED for call in calls):
         raise TypeError(_DEFERS.format(function))
 

@@ -28,7 +28,8 @@ class AsideThread:
     def forked(self) -> None:
         self._work: SimpleQueue[Callable[[], object]] = SimpleQueue()
         self._begun = threading.Lock()  # locked once the thread has started
-        # of the last flush that timed out: a queue that gets an item when its work is done; its timeout in s
+        # The last flush that timed out: a queue that gets an item when the flushed work is done, and the
+        # flush's timeout in s.
         self._late: tuple[SimpleQueue[None], float] | None = None
 
     def put(self, work: Callable[[], object]) -> None:

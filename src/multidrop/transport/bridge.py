@@ -35,7 +35,7 @@ MOST_CHUNK = 1024  # most bytes that the core reads in one call
 LOOK_EVERY = 0.1  # s between checks of whether the bridge is closed
 CLOSING_TIME = 2.0  # s; limit of the wait for a thread that the port blocks
 
-# On Linux the socket pair keeps requests separate, and states for each when the core wrote it.
+# On Linux the socket pair keeps requests separate, and gives the time at which the core wrote each.
 _STAMPED = sys.platform == "linux"
 _KIND = socket.SOCK_SEQPACKET if _STAMPED else socket.SOCK_STREAM
 _SO_TIMESTAMPNS = 35  # asm-generic/socket.h; the control message is a struct timespec
@@ -153,7 +153,7 @@ class Bridge:
             self._ours.shutdown(socket.SHUT_RDWR)
 
     def forget(self) -> None:
-        """Close both ends of the pair without hanging up; the parent of a fork still uses the connection."""
+        """Close both ends of the pair without hanging up: the parent of a fork still uses the connection."""
         self._ours.close()
         self.theirs.close()
 

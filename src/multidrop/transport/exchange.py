@@ -87,7 +87,7 @@ def _port_of(drive: Drive) -> str:
 T = TypeVar("T")
 
 READ_ATTEMPTS = 3
-WRITE_TIMEOUT = 1.0  # s; long, because a write wrongly reported as unconfirmed costs more
+WRITE_TIMEOUT = 1.0  # s; long, because a write wrongly reported as unconfirmed is worse than a wait
 ILLEGAL_FUNCTION = 1  # exception code after which shorter requests of the function fail too
 
 

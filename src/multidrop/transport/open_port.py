@@ -111,7 +111,7 @@ def why_lost(port: str, error: int, received: bytes = b"") -> str:
     return f"the received bytes are not Modbus TCP: {shown}{mixed_up(port, received)}"
 
 
-_FOR_PROGRAMS = ("loop", "spy")  # pyserial's; no options: spy://DEVICE?file=PATH would empty the file
+_FOR_PROGRAMS = ("loop", "spy")  # pyserial's, allowed without options: spy://DEVICE?file=PATH empties a file
 
 
 def _socket_url(url: SplitResult) -> str:
@@ -250,7 +250,7 @@ class OpenPort:
         port.timeout = 0
         if isinstance(port, serial.Serial):
             port.exclusive = True
-            port.rts = self._rs485 is not RS485.RTS_UP  # otherwise opening starts sending
+            port.rts = self._rs485 is not RS485.RTS_UP  # opening with the other level would start sending
         port.open()
         if isinstance(port, serial.Serial) and not self.name.startswith(BY_PLACE):
             self._require_same_adapter(device_of(port))

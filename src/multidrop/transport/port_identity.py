@@ -85,7 +85,7 @@ class PseudoTerminal:
 
 
 def pseudo_terminal_of(name: str) -> PseudoTerminal | None:
-    """Return the pseudo-terminal with this name; None if the name is not one's."""
+    """Return the pseudo-terminal with this name; None if the name is not that of a pseudo-terminal."""
     path = Path(name)
     links: list[tuple[int, int]] = []
     try:

@@ -36,7 +36,8 @@ class BlockDecoder:
     def __init__(self, registers: tuple[Register[Any], ...], start: int) -> None:
         places = [(register, register.address - start) for register in registers]
         exact = [(register, at) for register, at in places if _is_exact(register)]
-        self.names = tuple(register.name for register, _ in exact)  # of the registers that the core decodes
+        # The names of the registers that the core decodes.
+        self.names = tuple(register.name for register, _ in exact)
         self.layout = RowLayout(0, [row_field(register, at, 0) for register, at in exact])
         self.count = len(exact)
         self._named = [(one.name, one.decode) for one, _ in exact if one.values is not None or one.is_bit]
@@ -67,7 +68,7 @@ def decoder_of(block: Block) -> BlockDecoder:
 
 
 MOST_PREPARED = 256  # most cached read plans of a drive, and most cached blocks
-NO_ROWS = core.RowLayout(0, [])  # for commands: values without rows are not in the poll's summary
+NO_ROWS = core.RowLayout(0, [])  # for commands: the poll's summary does not count their values
 
 
 def make_exchange(

@@ -51,7 +51,7 @@ class Counting:
         raise ValueError(f'"{text}" is not an address; write 0x2000, 8192, "2000H" or "40001"')
 
     def address_in_cell(self, text: str, table: str | None, default: str) -> tuple[int, str]:
-        """Return the same for a CSV cell, where a number such as 40001 has no quotes.
+        """Return the same as `address` for a CSV cell, where a number such as 40001 has no quotes.
 
         If the file states `counts_from`, such a number is a plain address, unless its first digit is that
         of its table.

@@ -63,8 +63,8 @@ class Delta(Profile):
     - The role `fault` is required, because the status shows no fault. Only its low byte is used; the high
       byte of newer drives is a warning.
     - The direction is sent with every run. The word that toggles it is never sent.
-    - 2002H keeps its bits. It is written 2 once and then 0, or else a later fault would be reset immediately.
-      Clearing bit 2, the base block, lets the motor continue, so a stop is sent before.
+    - 2002H keeps its bits. The library writes 2 once and then 0, because a 2 left there would immediately
+      reset a later fault. Clearing bit 2, the base block, lets the motor continue, so a stop is sent before.
     - Bit 10 of the status says that the drive takes its commands from the line; a start requires it.
     - No word coasts.
     """

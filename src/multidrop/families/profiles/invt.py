@@ -51,7 +51,7 @@ class Invt(Profile):
       a family names its own numbers in `control`: `{ forward = 1, stop = 6, coast = 5, reset_fault = 7 }`. A
       word that it leaves out is never sent. Compare them with the manual's list, word by word.
     - A stop may not end a jog: if the motor still turns after it, the stop is refused, or the state is
-      unknown, STOP_JOG follows at once. A start may not end a jog either: after a jog a stop is required.
+      unknown, STOP_JOG follows immediately. A start may not end a jog either: after a jog a stop is required.
     """
 
     stop_word: ClassVar[int] = InvtControl.STOP
