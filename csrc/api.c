@@ -173,7 +173,7 @@ const struct md_progress *md_port_progress(struct md_port *port)
 }
 
 /* Return 1 if the thread will serve the port before the next request can leave, so that the client need not
- * wake the thread. Return 0 while the port listens, because a stop does not wait for the end of listening. */
+ * wake the thread. Return 0 while the port listens for another master, because stops do not wait for that. */
 static int is_attended(const struct md_port *port)
 {
     if (port->turn.line.listened_ns)

@@ -152,13 +152,13 @@ static int request_length(int framing, const uint8_t *body, size_t have)
     return head + body[6];
 }
 
-/* Only serial lines have broadcasts: a Modbus TCP unit id of 0 is a device. */
+/* Address 0 is the broadcast on serial lines only: with Modbus TCP, unit id 0 is a device. */
 static int is_answered(int framing, uint8_t address)
 {
     return address != 0 || framing == MD_TCP;
 }
 
-/* Return the length of the body of the reply to `request`, or an error as soon as its first bytes differ. */
+/* Return the length of the body of the reply to `request`; an error once the bytes rule that reply out. */
 static int reply_length(int framing, const uint8_t *body, size_t have, const struct md_message *request)
 {
     const struct function *function = find_function(framing, request->function);

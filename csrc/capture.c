@@ -134,7 +134,7 @@ int md_unpack(struct md_capture *capture)
 
 enum { MOST_NOISE = 3 }; /* most bytes between a request and its reply; more may be a damaged request */
 
-/* Return the index of the first pause after this piece. */
+/* Return the index of the first byte that comes after a pause, and after this piece. */
 static size_t end_of_run(const struct md_stream *stream, size_t piece)
 {
     while (++piece < stream->count)
@@ -269,13 +269,13 @@ static void pass(struct md_splitter *splitter, const struct md_span *span)
     splitter->awaited = span->message.address != 0 || span->framing == MD_TCP;
 }
 
-/* Return 1 if the capture marks these bytes as not being frames. */
+/* Return 1 if the capture says that these bytes are not a frame. */
 static int is_ruled_out(const struct md_piece *piece)
 {
     return piece->side == MD_FAILED || piece->side == MD_NOISE;
 }
 
-/* Parse the frame at `at` in the splitter's piece; `end` is the index of the next pause. */
+/* Parse the frame at `at` in the splitter's piece; `end` is the index of the byte after the next pause. */
 static int look_at(const struct md_splitter *splitter, const struct md_stream *stream, size_t at, size_t end,
                    struct md_span *span)
 {
@@ -311,7 +311,7 @@ int md_split(struct md_splitter *splitter, const struct md_stream *stream, struc
     span->at = splitter->at;
     span->len = at - splitter->at;
     if (!span->len && is_junk) {
-        span->kind = MD_JUNK; /* the position between frames, and so their parsing, stays the same */
+        span->kind = MD_JUNK; /* do not pass(): the frames around these bytes are parsed as if adjacent */
         size_t next = splitter->piece + 1;
         splitter->at = next < stream->count ? pieces[next].at : stream->len;
         span->len = splitter->at - span->at;

@@ -297,9 +297,9 @@ int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const in
     return (int64_t)used;
 }
 
-/* ---- columns as recordings hold them ---- */
+/* ---- columns in the format of recordings ---- */
 
-static const float BEYOND = 0x1p63F; /* the least float above all int64 */
+static const float BEYOND = 0x1p63F; /* the least float that exceeds every int64 */
 
 /* Return the next float towards plus infinity. The number is not zero. */
 static float next_up(float number)

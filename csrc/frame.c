@@ -73,7 +73,7 @@ static uint8_t text_checksum(int framing, const uint8_t *body, size_t len)
     return framing == MD_ASCII ? md_lrc(body, len) : md_sum(body, len);
 }
 
-/* Decode the hex digits of a text frame's body, and return the frame's length. */
+/* Decode the hex digits in the body of a Modbus ASCII or Delixi frame; return the frame's length. */
 static int open_text(int framing, const uint8_t *text, size_t len, const struct md_message *request,
                      uint8_t body[MD_MOST_BODY + 1])
 {
@@ -150,7 +150,7 @@ static int open_tcp(const uint8_t *bytes, size_t len, const struct md_message *r
     return whole;
 }
 
-/* Find the body of the frame at the start of `bytes`: in place, or (of a text frame) decoded into `text`. */
+/* Find the body of the frame at the start of `bytes`: in place, or decoded from hex digits into `text`. */
 static int open_frame(int framing, const uint8_t *bytes, size_t len, const struct md_message *request,
                       uint8_t text[MD_MOST_BODY + 1], const uint8_t **body)
 {

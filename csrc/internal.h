@@ -15,10 +15,10 @@
 
 /* Count an exchange that ended. */
 void md_counters_end(const struct md_exchange *exchange, const struct md_completion *completion);
-/* Count a reply with its delay and the least line time of its exchange. */
+/* Count a reply with its delay and the least time that its exchange needs on the line. */
 void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_ns);
 uint64_t md_replies(const struct md_drive *drive);
-const uint64_t *md_usual_delays(const struct md_drive *drive); /* counter of the smoothed delay's bucket */
+const uint64_t *md_usual_delays(const struct md_drive *drive); /* counter of the usual delay's bucket */
 
 /* ---- clock.c ---- */
 

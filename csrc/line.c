@@ -65,7 +65,7 @@ void md_listen_receive(struct md_line *line, size_t len, int64_t now_ns)
 
 static int end_listening(struct md_line *line, int64_t now_ns)
 {
-    if (!md_listen_is_held(line)) /* a stop ignores it; later exchanges listen */
+    if (!md_listen_is_held(line)) /* a stop does not wait; later exchanges still listen */
         return 1;
     if (now_ns < line->listened_ns)
         return 0;
@@ -73,7 +73,7 @@ static int end_listening(struct md_line *line, int64_t now_ns)
     return 1;
 }
 
-/* ---- what an exchange leaves: bytes for the tap, its completion, counts of its drive and block ---- */
+/* ---- results of an exchange: bytes for the tap, the completion, counters of the drive and the block ---- */
 
 /* Return 1 if the result means that the drive is silent or unreachable; 0 after a damaged reply, because the
  * drive did answer. */
@@ -198,7 +198,7 @@ void md_line_abandon(struct md_line *line, int result, int error)
     if (line->state == MD_IDLE)
         return;
     if (line->state >= MD_AWAITING && line->transactions != MD_MATCHED)
-        md_late_expect(line, md_window_ns(line->exchange)); /* it may come on the reopened port */
+        md_late_expect(line, md_window_ns(line->exchange)); /* its reply may come on the reopened port */
     line->completion->error = error;
     fail(line, result);
 }
@@ -234,7 +234,7 @@ static int load(struct md_line *line, const struct md_exchange *exchange)
 void md_line_begin(struct md_line *line, const struct md_exchange *exchange, struct md_completion *completion,
                    int64_t now_ns)
 {
-    memset(completion, 0, offsetof(struct md_completion, reply.data)); /* the other fields have lengths */
+    memset(completion, 0, offsetof(struct md_completion, reply.data)); /* the arrays behind have lengths */
     completion->begun_ns = now_ns;
     completion->stale = line->rx_len;
     line->exchange = exchange;

@@ -78,7 +78,7 @@ struct md_line {
     uint32_t looks;      /* number of reads of the port since the request was sent */
     uint32_t cut;        /* bytes of late replies since the request was sent */
     uint32_t foreign;    /* bytes received while listening */
-    uint16_t sight_at, sight; /* offset where the reply may start; its bytes in the first read */
+    uint16_t sight_at, sight; /* where the reply may start; how many of its bytes the first read got */
     uint16_t burst;      /* most characters that the adapter delivers together; 0: maybe whole replies */
     uint8_t rx[MD_RX_ROOM];
     uint8_t long_tx[MD_MOST_FRAME]; /* bytes of a request too long to be stored in its exchange */
@@ -181,7 +181,7 @@ static inline void md_line_go(struct md_line *line, enum md_line_event event)
         line->state = next;
 }
 
-void md_listen_receive(struct md_line *line, size_t len, int64_t now_ns); /* bytes came meanwhile */
+void md_listen_receive(struct md_line *line, size_t len, int64_t now_ns); /* bytes came while listening */
 
 /* Return 1 if the exchange in flight waits for the end of listening. Stops do not wait. */
 static inline int md_listen_is_held(const struct md_line *line)

@@ -117,7 +117,7 @@ struct md_counters {
     uint64_t exchanges, answered, values;
     uint64_t sent;        /* requests of which at least one byte was sent */
     uint64_t stray_bytes; /* bytes outside of replies */
-    uint64_t ideal_ns;    /* least line time of the answered exchanges */
+    uint64_t ideal_ns;    /* total of the least times that the answered exchanges need on the line */
     int64_t longest_ns;   /* longest response delay */
 };
 
@@ -145,7 +145,7 @@ struct md_history {
     uint64_t ended[MD_STATUSES];       /* exchanges without a reply, by status; MD_OK: broadcasts */
     uint64_t missed[MD_STATUSES];      /* missing values, by status */
     uint64_t late;                     /* replies after their timeout */
-    uint64_t exceptions, naks, busies; /* replies with any exception, code 7, code 6 */
+    uint64_t exceptions, naks, busies; /* replies with any exception; with code 7; with code 6 */
     uint32_t refused[MD_EXCEPTION_CODES]; /* missing values, by exception code */
     uint64_t pauses;                      /* replies MD_PAUSE_S or more after the previous reply */
     struct md_owed owed[MD_MOST_OWED];
@@ -289,8 +289,8 @@ struct md_engine *md_engine_start(void); /* the thread of all lines; it lives as
  * 0, -errno. One client at a time may call this. */
 int md_engine_realtime(struct md_engine *engine, int wanted);
 int md_engine_is_realtime(struct md_engine *engine); /* 1: under realtime scheduling now */
-/* Sleep `n` times for `period_ns` on the calling thread, as the engine's thread does, and write by how much each
- * sleep was too long; 0, -errno. */
+/* Sleep `n` times for `period_ns` on the calling thread, as the engine's thread does. Write to the array by how
+ * much each sleep was too long; return 0 or -errno. */
 int md_wake_lateness(int is_realtime, int64_t period_ns, int64_t *late_ns, int n);
 
 /* Open a port on a descriptor. `must_take`: mask of the refusals (enum md_refusal) that are failures; -1:

@@ -172,7 +172,7 @@ static int spin_until(struct md_port *port, int64_t until_ns, int64_t *now_ns)
     return 1;
 }
 
-/* Carry out the wanted action; return 1 if the next one can follow immediately. */
+/* Carry out the wanted action; return 1 if the next action can follow immediately. */
 static int act(struct md_port *port, int want, int64_t *wake_ns, int64_t *now_ns)
 {
     const struct md_exchange *exchange = port->turn.line.exchange;

@@ -189,8 +189,8 @@ static void measure(struct md_line *line, int reply_len)
     int64_t request_ns = md_wire_ns(exchange, line->tx_len), reply_ns = md_wire_ns(exchange, reply_len);
     int64_t left_ns = line->quiet_ns, begun_ns = completion->last_ns - reply_ns;
     /* Compute the first character's time from the last one's: that is more exact than the time of a late
-     * read. It fails on ports that are faster than their settings, such as pseudo-terminals, because all
-     * their bytes may come together. */
+     * read. This calculation fails on ports that are faster than their settings, such as pseudo-terminals,
+     * because all their bytes may come together. */
     line->is_quicker |= begun_ns < left_ns;
     if (!line->is_quicker)
         completion->first_ns =
@@ -198,7 +198,7 @@ static void measure(struct md_line *line, int reply_len)
     int is_whole = line->waited && line->looks == 1;
     int64_t delay_ns = md_learn_delay(exchange, later(begun_ns - left_ns, 0), is_whole);
     int64_t ideal_ns = line->silence_ns + request_ns + delay_ns + reply_ns;
-    /* On a port that is faster than its settings, such as a network's, the time taken is the bound. */
+    /* On a port that is faster than its settings, such as a network's, count at most the time taken. */
     int64_t ended_ns = line->transactions ? completion->last_ns : later(completion->last_ns, left_ns);
     int64_t took_ns = line->silence_ns + ended_ns - completion->sent_ns;
     md_counters_answer(drive, delay_ns, sooner(ideal_ns, took_ns));
@@ -255,9 +255,9 @@ void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns)
     }
 }
 
-/* End the exchange with a reply to this request or an earlier one; the other reply may still come. A row can
- * hold this value, with an uncertainty that covers both requests. A client that waits needs the present
- * value: read it again. */
+/* End the exchange with a reply to this request or to an earlier, equal one; a second reply may still come. A
+ * row can hold this value, with an uncertainty that covers both requests. A client that waits needs the
+ * present value: read it again. */
 static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used,
                                      const struct md_message *reply, int64_t now_ns, int64_t since_ns)
 {

@@ -15,11 +15,11 @@ struct md_row_queue {
     pthread_cond_t is_called;
     size_t chunk_rows, most_chunks;
     struct md_columns **chunks; /* a ring buffer */
-    size_t first, count;        /* index of the oldest chunk with rows, and their number */
+    size_t first, count;        /* index of the oldest chunk with rows; number of chunks with rows */
     struct md_columns *spare[MOST_SPARE]; /* empty chunks that clients gave back */
     size_t spares;
     size_t lent;                /* number of chunks that clients hold, plus ports that report to the queue */
-    int is_done;                /* its client has freed it */
+    int is_done;                /* the client has freed the queue */
     uint64_t dropped;
     uint64_t called[WORDS];     /* a bit for each called number */
     uint32_t calls;             /* number of bits that are set in `called` */

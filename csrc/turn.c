@@ -80,7 +80,7 @@ void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent)
     if (*at && turn->source == MD_URGENT) /* the first urgent request is in flight: stay behind it */
         at = &(*at)->next;
     for (struct md_urgent **waiting = at; *waiting; waiting = &(*waiting)->next)
-        if (!urgent->exchange->insists || (*waiting)->exchange->insists) /* else it goes in front */
+        if (!urgent->exchange->insists || (*waiting)->exchange->insists) /* a stop goes before others */
             at = &(*waiting)->next;
     urgent->next = *at;
     *at = urgent;

@@ -9,7 +9,7 @@
 #include <unistd.h>
 
 #ifndef SYS_epoll_pwait2
-#define SYS_epoll_pwait2 (-1) /* headers before Linux 5.11 lack it; a call -1 always fails */
+#define SYS_epoll_pwait2 (-1) /* headers before Linux 5.11 lack it; system call -1 always fails */
 #endif
 
 enum { EVENTS = 256 }; /* most events fetched by a system call */

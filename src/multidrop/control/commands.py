@@ -196,7 +196,7 @@ class LineStop(NamedTuple):
 
 
 class RepeatedStops:
-    """Repeats only one stop per drive at a time, however many clients of a server call one.
+    """Repeats only one stop per drive at a time, however many clients of a server call stops.
 
     The stop of a silent drive is repeated for 30 s, and each time its line waits for the reply. If the stop
     of every call were repeated, this would delay the stops of other drives, and all reads. `stop` is the

@@ -31,7 +31,7 @@ class LedgerCell:
     """One register of one drive in a ledger.
 
     `port` is the port's identity (see port_identity). `spelt` is the port's name, which older entries have
-    instead.
+    instead of the identity.
     """
 
     port: str

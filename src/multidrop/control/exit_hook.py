@@ -284,7 +284,7 @@ class ExitHook:
 def without_internals(interruption: BaseException) -> None:
     """Cut an interruption's traceback before the first frame of this package.
 
-    Also remove a BusError as its context: such a call was only cancelled by the stops.
+    Also remove a BusError from the interruption's context: it only says that the stops cancelled a call.
     """
     if isinstance(interruption.__context__, BusError):
         interruption.__context__ = None

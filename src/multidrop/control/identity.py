@@ -288,7 +288,7 @@ class IdentityCheck:
                 baudrate=drive.settings.baudrate,
                 format=drive.settings.format,
             )
-        except ValueError:  # not Modbus
+        except ValueError:  # the drive does not speak Modbus
             return None
         is_silent = False
         for make in makes:

@@ -135,7 +135,7 @@ def _check(drive: Drive, hz: float) -> Script[None]:
         step = next(script)
         while not isinstance(step, Write):
             step = script.send((yield step))
-    except StopIteration:  # it writes no setpoint
+    except StopIteration:  # the script writes no setpoint
         return
     raw = raw_count(drive, step.register, step.value)
     yield from conditions(drive, step.register, step.register.decode(raw))
