@@ -289,8 +289,8 @@ struct md_engine *md_engine_start(void); /* the thread of all lines; it lives as
  * 0, -errno. One client at a time may call this. */
 int md_engine_realtime(struct md_engine *engine, int wanted);
 int md_engine_is_realtime(struct md_engine *engine); /* 1: under realtime scheduling now */
-/* Sleep `n` times for `period_ns` on the calling thread, as the engine's thread does. Write to the array by how
- * much each sleep was too long; return 0 or -errno. */
+/* Sleep `n` times for `period_ns` on the calling thread, as the engine's thread does. Write to `late_ns` by
+ * how much each sleep was too long; return 0 or -errno. */
 int md_wake_lateness(int is_realtime, int64_t period_ns, int64_t *late_ns, int n);
 
 /* Open a port on a descriptor. `must_take`: mask of the refusals (enum md_refusal) that are failures; -1:

@@ -173,7 +173,7 @@ class StopAttempt:
         self._resume = lambda: script.send(None)
 
     def _share_line(self, begun: float, now: float) -> None:
-        """After a step without a good reply, delay the next one, unless the stop's time would end first."""
+        """After a step without a good reply, delay the next step, unless the stop would be over by then."""
         self._unanswered += 1
         limit = LEAST_S if self._seconds is None else self._seconds
         due = now + SHARE * (now - begun)

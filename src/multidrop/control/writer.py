@@ -254,7 +254,7 @@ class Writer:
             return None, failure
 
     def _look(self, drive: Drive, step: Step, call: Call) -> Any:
-        """Carry out a step of a rule's conditions."""
+        """Carry out one step of checking a rule: a wait, or a read of a register."""
         if isinstance(step, Wait):
             with call.step(step.seconds):
                 return clock.sleep(step.seconds)

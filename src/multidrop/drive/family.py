@@ -57,7 +57,7 @@ class Drive(RegisterAccess):
     # ---- the line ----
 
     framings: ClassVar[tuple[Framing, ...]] = (Framing.RTU,)
-    formats: ClassVar[Mapping[Framing, tuple[str, ...]]] = {}  # the first is the default
+    formats: ClassVar[Mapping[Framing, tuple[str, ...]]] = {}  # the first format is the default
     baudrates: ClassVar[tuple[int, ...]] = (9600, 1200, 2400, 4800, 19200, 38400, 57600, 115200)
     addresses: ClassVar[range] = range(1, 248)
     line_terminals: ClassVar[str] = ""  # the drive's two terminals for the line

@@ -47,7 +47,7 @@ class BackOff:
         self.health[drive].is_new = self.has_silent = True
 
     def forget(self, drive: int) -> None:
-        """Forget a drive without jobs."""
+        """Forget a drive that has no jobs left."""
         self.health.pop(drive, None)
 
     def conclude(self, drive: int) -> None:

@@ -130,7 +130,7 @@ class PolledLine:
         self._maker = JobMaker(bus, names)
         self._queue = PortQueue(self._schedule)
         self._refusals = Refusals(self._schedule, self._maker)
-        self._planned: dict[PolledDrive, PlannedJobs] = {}  # includes removed drives, until `forget`
+        self._planned: dict[PolledDrive, PlannedJobs] = {}  # removed drives stay until `forget`
         self._present: dict[Drive, PolledDrive] = {}  # the drives on the line
         self._since_ns: dict[Drive, int] = {}  # when each drive's polls were last changed
         self._gone: dict[int, Peer] = {}  # by address, removed drives' peers, maybe still in an exchange

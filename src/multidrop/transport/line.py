@@ -47,7 +47,7 @@ class LineLog:
 
     def __init__(self, port: str) -> None:
         self.foreign = 0  # number of another master's bytes, received while listening
-        self.shows = _log.isEnabledFor  # function of a log level: whether it is logged
+        self.shows = _log.isEnabledFor  # function that returns whether a log level is logged
         self._port = port
         self._foreign_here = 0  # part of `foreign` since the port was last opened
         self._is_lost = self._is_stalled = False

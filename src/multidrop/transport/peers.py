@@ -72,15 +72,15 @@ class Peers:
     def __init__(self, line: Line) -> None:
         self._line = line
         self.present: dict[Drive, Peer] = {}  # peers of the drives that are on the line now
-        self._asked: dict[object, Peer] = {}  # peers of threads' exchanges, by a key for each
+        self._asked: dict[object, Peer] = {}  # the peer of each exchange that a thread carries out
         # All peers by address and description of the drive, including removed drives.
         self._known: dict[tuple[int, *tuple[object, ...]], Peer] = {}
 
     def add(self, drive: Drive) -> None:
-        """Add a drive; one that was on the line before keeps its learnt timing and late replies.
+        """Add a drive; a drive that was on the line before keeps its learnt timing and late replies.
 
-        First wait until no exchange with an earlier drive at this address is in flight: only then it is known
-        which of its replies are late.
+        First wait until no exchange with an earlier drive at this address is in flight: only then is it known
+        which replies of that drive are late.
         """
         for other, known in self._known.items():
             while other[0] == drive.address and self._is_asked(known):
