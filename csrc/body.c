@@ -289,7 +289,7 @@ int md_body_put_reply(int framing, const struct md_message *message, uint8_t *bo
         return MD_BAD_REQUEST;
     if (!message->exception)
         return (int)put_body(find_function(framing, message->function)->reply, message, body);
-    if (framing == MD_DELIXI) { /* the other bytes are 0: "no meaning" */
+    if (framing == MD_DELIXI) { /* the other bytes are 0: "no meaning" in the document */
         body[1] = message->exception;
         return DELIXI_BODY;
     }

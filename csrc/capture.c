@@ -217,7 +217,7 @@ static int find_reply(int framing, const uint8_t *bytes, size_t len, struct md_m
     }
     int used = md_parse_reply(framing, bytes, len, &guess, message);
     if (used > 0 && guess.function <= 0x04)
-        message->count = 0; /* a reply does not contain it */
+        message->count = 0; /* a reply does not contain the count */
     return used;
 }
 
@@ -376,7 +376,7 @@ static uint64_t key_of(int framing, const struct md_message *request)
            start << 24 | (uint64_t)request->count << 40;
 }
 
-/* Return the slot that holds the key, or else the empty slot for it. */
+/* Return the slot that holds the key, or else the empty slot for the key. */
 static struct md_known *place_of(const struct md_decoder *decoder, uint64_t key)
 {
     size_t place = (size_t)(key * 0x9E3779B97F4A7C15u >> 32);

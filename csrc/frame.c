@@ -135,7 +135,7 @@ static int open_tcp(const uint8_t *bytes, size_t len, const struct md_message *r
     if (md_tcp_is_exception(bytes, len, request))
         whole = MD_TCP_EXCEPTION;
     else if (whole == MD_NO_START && request && len < MD_TCP_HEAD + 2 && (len < 4 || !md_get16(bytes + 2)))
-        return MD_INCOMPLETE; /* it may become an exception with a wrong length in its header */
+        return MD_INCOMPLETE; /* the frame may become an exception with a wrong length in its header */
     if (whole <= 0)
         return whole;
     size_t have = len < (size_t)whole ? len : (size_t)whole;

@@ -160,7 +160,7 @@ void md_proof_end(const struct md_exchange *exchange, int result)
     int is_silent_to_it = result == MD_NO_REPLY && replies != drive->failed_at;
     if (result > 0)
         drive->proof_failures[at] = ANSWERED;
-    if (!is_silent_to_it && result != MD_BAD_ECHO) /* MD_BAD_ECHO: the value is out of its range */
+    if (!is_silent_to_it && result != MD_BAD_ECHO) /* MD_BAD_ECHO: value outside the proof's range */
         return;
     drive->failed_at = replies;
     if (++drive->proof_failures[at] == MOST_FAILURES)

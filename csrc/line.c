@@ -114,7 +114,7 @@ static void count(const struct md_exchange *exchange, const struct md_completion
     struct md_block *block = exchange->block;
     md_counters_end(exchange, completion);
     md_proof_end(exchange, completion->result);
-    int is_alive = completion->result == MD_BAD_ECHO && md_proof_is(exchange); /* its value is out of range */
+    int is_alive = completion->result == MD_BAD_ECHO && md_proof_is(exchange); /* value outside its range */
     if (is_failure(completion->result)) {
         md_count_failures(drive, is_alive ? 0 : drive->failures + 1);
         if (block)
@@ -284,7 +284,7 @@ int md_line_want(struct md_line *line, int64_t now_ns)
             now_ns + line->exchange->drive->most_timeout_ns + md_wire_ns(line->exchange, line->tx_len);
         return MD_WRITE;
     case MD_READY:
-    case MD_WRITING: /* if the port takes no bytes for so long, it is broken */
+    case MD_WRITING: /* a port that takes no bytes for so long is broken */
         if (now_ns < line->wake_ns)
             return MD_WRITE;
         md_line_abandon(line, MD_LINE_LOST, ETIMEDOUT);

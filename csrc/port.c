@@ -137,7 +137,7 @@ static int64_t apply(struct md_port *port, const struct md_settings *settings)
     md_store(&progress->switches, progress->switches + 1);
     port->settings = *settings;
     if (refused < 0 || (refused & port->must_take))
-        port->settings = (struct md_settings){0}; /* unknown: it may have taken some of them */
+        port->settings = (struct md_settings){0}; /* unknown: some may have been taken by the port */
     if (refused < 0)
         lose(port, -refused);
     else if (refused & port->must_take)

@@ -111,7 +111,7 @@ void md_echo_keep(struct md_line *line)
 
 /* ---- replies ---- */
 
-enum { MOST_BURST = 16 }; /* characters that a UART gathers before it hands them over */
+enum { MOST_BURST = 16 }; /* most characters that a UART collects before it delivers them */
 static const int64_t OLDEST_IN_DOUBT = INT64_C(2000000000); /* ns; an older request's value makes no row */
 
 int md_reply_parse(const struct md_line *line, size_t at, struct md_message *reply)

@@ -11,7 +11,7 @@
 #include "engine.h"
 
 static const int64_t LOOK_AGAIN_NS = 200000;
-static const int64_t ADAPTER_NS = 1000000; /* a USB frame, which the adapter may use before it sends */
+static const int64_t ADAPTER_NS = 1000000; /* one USB frame: the adapter may start to send so much later */
 enum { CLOCK_DEVIATION = 50 };             /* 1/50: the adapter's baud rate may be 2 % too low */
 static const int64_t MOST_HELD_NS = 1000000000; /* if sending takes longer, the port is broken */
 

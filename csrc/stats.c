@@ -120,7 +120,7 @@ int64_t md_reply_due_ns(const struct md_exchange *exchange)
 
 /* ---- late replies ---- */
 
-/* Set the longer timeout; 0 if it does not exceed the usual one. */
+/* Set the longer timeout, or 0 if it does not exceed the usual timeout. */
 static void set_patience(struct md_drive *drive, int64_t patience_ns)
 {
     learn(&drive->patience_ns, patience_ns > usual_timeout_ns(drive) ? patience_ns : 0);
@@ -189,7 +189,7 @@ void md_counters_end(const struct md_exchange *exchange, const struct md_complet
     struct md_counters *counters = &drive->counters;
     uint64_t values = exchange->block ? (uint64_t)exchange->block->count : 1;
     if (completion->result == MD_LATE_ANSWER_DUE && completion->sent_ns)
-        values = 0; /* not counted as missing: the client reads them again */
+        values = 0; /* do not count values as missing: the client reads them again */
     uint8_t exception = completion->reply.exception;
     counters->exchanges++;
     counters->sent += completion->sent_ns != 0;

@@ -92,7 +92,7 @@ static int is_near(uint32_t baudrate, uint32_t wanted)
 static int is_dividable(int fd, uint32_t baudrate)
 {
     struct serial_struct uart;
-    if (ioctl(fd, TIOCGSERIAL, &uart) || uart.type == PORT_16C950) /* this one has a prescaler */
+    if (ioctl(fd, TIOCGSERIAL, &uart) || uart.type == PORT_16C950) /* the 16C950 has a prescaler */
         return 1;
     uint32_t base = (uint32_t)uart.baud_base;
     if (uart.baud_base <= 0 || baudrate == 0 || baudrate > base)

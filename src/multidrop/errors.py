@@ -191,7 +191,7 @@ class Advice(NamedTuple):
         )
 
 
-ANOTHER_FAMILY = "another family is at its address"  # `rule` of refusals that even a stop may raise
+ANOTHER_FAMILY = "another family is at its address"  # the `rule` with which even a stop may be refused
 
 
 class WriteForbidden(BusError, ValueError):

@@ -202,7 +202,7 @@ class Poller(RowSource):
         try:
             with self._lines.tended():
                 self._poll()
-        except BaseException as failure:  # of any kind: polling must not end silently
+        except BaseException as failure:  # any failure: polling must not end silently
             self.failure = PollingFailed(f"polling has ended on all lines: {words_of(failure)}")
             self.failure.__cause__ = failure
             self._lines.end_polling()

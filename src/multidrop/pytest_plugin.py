@@ -92,7 +92,7 @@ def _simulate(
     for name in faults.drives:
         loaded.find_drive(name)  # raises ValueError for an unknown drive
     make = simulated if capture is None else Replay(capture, loaded).drive
-    serial = "socket://127.0.0.1:0" if faults.hang_up else "pty"  # a pty cannot return under its name
+    serial = "socket://127.0.0.1:0" if faults.hang_up else "pty"  # a pty cannot reopen under its old name
     lines = {}
     for line in loaded.lines:
         port = "tcp://127.0.0.1:0" if line.port.lower().startswith("tcp:") else serial

@@ -104,7 +104,7 @@ class Supervisor:
         task.add_done_callback(self._short.discard)
         return task
 
-    # ---- threads of others ----
+    # ---- threads started by other modules ----
 
     def watch(self, name: str, is_alive: Callable[[], bool]) -> None:
         """Watch a thread that another module started; `look` calls `is_alive`."""
@@ -138,7 +138,7 @@ class Supervisor:
         """
         loop = asyncio.get_running_loop()
         future: asyncio.Future[R] = loop.create_future()
-        future.add_done_callback(lambda done: done.cancelled() or done.exception())  # it may not be awaited
+        future.add_done_callback(lambda done: done.cancelled() or done.exception())  # maybe never awaited
 
         def finish(settle: Callable[[], None]) -> None:
             del self._works[future]

@@ -86,7 +86,7 @@ def _failed(failure: BaseException, outcome: CommandOutcome) -> CommandResult:
 
 
 def _outcome_of(failure: BaseException) -> CommandOutcome:
-    if isinstance(failure, (LineError, NotMaster)):  # both know whether a frame may have left
+    if isinstance(failure, (LineError, NotMaster)):  # these errors say whether a frame may have been sent
         return CommandOutcome.UNKNOWN if failure.is_sent else CommandOutcome.NOT_SENT
     found = (outcome for kind, outcome in _OUTCOMES if isinstance(failure, kind))
     return next(found, CommandOutcome.UNKNOWN)

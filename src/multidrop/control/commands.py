@@ -48,7 +48,7 @@ def carry_out_verb(drive: Drive, verb: str, arguments: Mapping[str, Any]) -> Com
     """Carry out a verb that may move the motor; return the result, never raise."""
     try:
         getattr(drive, verb)(**arguments)
-    except Exception as failure:  # of any kind: the caller must see it
+    except Exception as failure:  # any failure: the result reports it to the caller
         return result_of_failure(failure)
     return CommandResult(CommandOutcome.DONE, f"{drive.name}: {verb} is done")
 
@@ -64,7 +64,7 @@ def write_register(drive: Drive, name: str, value: float | str) -> CommandResult
         return result_of_failure(NotAttached(f"{drive.name} is no longer on a line"))
     try:
         outcome: Outcome = drive.try_write(register, typed)
-    except Exception as failure:  # of any kind: the caller must see it
+    except Exception as failure:  # any failure: the result reports it to the caller
         return result_of_failure(failure)
     return result_of_write(outcome)
 
@@ -89,7 +89,7 @@ def stop_drive_by(verb: str, drive: Drive, seconds: float | None) -> Results:
     """Stop one drive with this verb, such as `coast`; return the result by its name."""
     try:
         return {drive.name: getattr(drive, verb)(seconds=seconds)}
-    except Exception as failure:  # of any kind: the caller must see it
+    except Exception as failure:  # any failure: the result reports it to the caller
         return {drive.name: result_of_failed_stop(failure)}
 
 
@@ -97,7 +97,7 @@ def stop_line(bus: Callable[[], Any], names: Sequence[str], seconds: float | Non
     """Stop all drives on the bus that `bus` returns; return the results of the drives `names`, by name."""
     try:
         found: Mapping[str, Stopped] = bus().stop_all(seconds=seconds)
-    except Exception as failure:  # of any kind: each drive's result must show it
+    except Exception as failure:  # any failure: each drive's result reports it
         return dict.fromkeys(names, result_of_failed_stop(failure))
     gone = result_of_failure(NotAttached("it is no longer on its line"))
     return {name: result_of_stop(found[name]) if name in found else gone for name in names}
@@ -210,7 +210,7 @@ class RepeatedStops:
     ) -> None:
         self._stop = stop
         self._begin = begin
-        self._repeated: dict[Drive, tuple[StopFuture, float]] = {}  # newest repeated stop, time of its call
+        self._repeated: dict[Drive, tuple[StopFuture, float]] = {}  # newest repeated stop, and its call's time
         self._sent: dict[Drive, StopFuture] = {}  # stops that are sent once, in flight
         self._waiting: dict[Drive, StopFuture] = {}  # stops to send once after the one in flight
         self._tasks: set[StopFuture] = set()

@@ -37,7 +37,7 @@ class Latches:
 
     def add(self, drive: Drive) -> Latch:
         latch = self._latches[drive] = Latch()
-        if self.is_shut:  # checked after adding it: a later `shut` sees this latch
+        if self.is_shut:  # checked after adding the latch: a later `shut` sees the latch
             latch.shut(LEFT)
         return latch
 

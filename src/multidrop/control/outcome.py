@@ -58,7 +58,7 @@ class Outcome:
 class Seen(Enum):
     STOPPED = "stopped"  # the motor was seen to stand
     SENT = "sent but unknown"
-    REFUSED = "refused by the drive"  # every time it was sent
+    REFUSED = "refused by the drive"  # each time that the stop was sent
     FAILED = "failed"  # no stop was sent
 
 

@@ -39,7 +39,7 @@ _ENDING = (NoReply, BadReply, DriveException, LineError, NotAttached, NotMaster)
 
 
 class _Over(Exception):
-    """The script continued after CancelledByStop was raised in it."""
+    """Raised if a script continues after CancelledByStop was raised in it."""
 
 
 class Performer:

@@ -16,7 +16,7 @@ from multidrop.drive.script import Script, Write, read, wait
 from multidrop.drive.state import Direction
 from multidrop.errors import WriteForbidden
 
-# interval in s between reads of waiting drives: one silent for PAUSE_NS may have lost its power (identity.py)
+# s between reads of waiting drives: a drive silent for PAUSE_NS may have lost its power (identity.py)
 HEARD_S = PAUSE_NS / 2e9
 
 

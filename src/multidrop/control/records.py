@@ -60,7 +60,7 @@ class WriteRecords:
         self._line = line
         self._ledger = ledger
         self._uncounted: deque[LedgerCell] = deque()
-        self._unlogged: deque[tuple[int, dict[str, Any]]] = deque()  # each with its UTC in ns
+        self._unlogged: deque[tuple[int, dict[str, Any]]] = deque()  # records, each with its UTC in ns
         self._writers: list[None] = []  # threads in `catch_up`; a list needs no lock
 
     def count(self, drive: Drive, register: Register[Any], kept: Kept) -> None:

@@ -343,7 +343,7 @@ class StopRun:
         self._drives = drives
         self._make = make
         self._seconds = seconds
-        self._broadcast: Callable[[], bool] | None = broadcast  # None after its call
+        self._broadcast: Callable[[], bool] | None = broadcast  # None once it was called
         self._tries = 0
         self.attempts: list[StopAttempt] = []
 

@@ -58,9 +58,9 @@ class Extra(NamedTuple):
     addend: float = 0.0
     low: int = 0  # lowest bit of the raw number that belongs to the field
     bits: int = 0  # number of bits that belong to the field; 0: all
-    scale_at: int | None = None  # offset of the 16-bit word that holds the decimal exponent
+    scale_at: int | None = None  # index in the reply of the 16-bit word with the decimal exponent
     scale_format: int = NumberFormat.I16  # format of the exponent; its low 16 bits are signed
-    invalid: tuple[tuple[int, int], ...] = ()  # masks and patterns that mean "no value"
+    invalid: tuple[tuple[int, int], ...] = ()  # pairs of mask and bit pattern that mean "no value"
     scale_invalid: tuple[tuple[int, int], ...] = ()
 
     @property

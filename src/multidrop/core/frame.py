@@ -37,7 +37,7 @@ class Message:
     transaction: int = 0  # transaction id; only with Modbus TCP
 
 
-MODBUS = (Framing.RTU, Framing.ASCII, Framing.TCP)  # framings that carry the standard's PDU
+MODBUS = (Framing.RTU, Framing.ASCII, Framing.TCP)  # framings that carry the PDU of the Modbus standard
 _LONGER_THAN_RTU = 4  # bytes by which a Modbus TCP frame exceeds the same frame in RTU
 
 

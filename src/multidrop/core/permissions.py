@@ -20,7 +20,7 @@ class Latch:
 
     def __init__(self) -> None:
         self.c: Any = ffi.new("uint32_t *")
-        self.why = ""  # why permits were last invalidated, or why they always will be
+        self.why = ""  # why permits were last invalidated, or why all are invalid from now on
         self._is_shut = False
         self._holds: set[object] = set()  # stops in progress, during which new permits are invalid
 

@@ -193,7 +193,7 @@ class Realtime:
 
     def __init__(self) -> None:
         self.is_wanted = False
-        self.is_held = False  # whether it was granted, and has not ended by itself since
+        self.is_held = False  # whether realtime scheduling was granted, and has not ended by itself since
 
     def want(self, wanted: bool) -> None:
         """Request realtime scheduling, or withdraw the request. Raises OSError if the system refuses."""
@@ -247,12 +247,12 @@ class _PortMemory:
     def __init__(self, room: int, mastership: Mastership | None) -> None:
         self.mastership = mastership
         self.lasting: set[object] = set()  # objects kept until the port closes
-        self.queued: list[Exchange | None] = [None] * room  # by index in the core's ring
+        self.queued: list[Exchange | None] = [None] * room  # queued exchanges, by index in the core's ring
         self._newest: dict[str, tuple[object, ...]] = {}
 
     @contextmanager
     def replacing(self, kind: str, new: object) -> Iterator[None]:
-        """Keep the new object of a kind, and the old object until the core uses the new one."""
+        """Keep alive the new object of this kind, and within the block also the object that it replaces."""
         self._newest[kind] = (*self._newest.get(kind, ()), new)
         yield
         self._newest[kind] = (new,)
@@ -264,9 +264,10 @@ _engine = _Engine()
 def _owner_of(port: Any, memory: _PortMemory) -> Any:
     """Return the owner of a port and of its memory.
 
-    When the last reference is gone, the core's thread first releases the port, then the memory is freed: cffi
-    calls its destructor before it drops the handle, and the garbage collector calls all destructors before it
-    frees memory, also at interpreter exit. No Python code runs in between, so no signal can interrupt this.
+    When the last reference to the owner is gone, the core's thread first releases the port. Then the memory
+    is freed: cffi calls its destructor before it drops the handle, and the garbage collector calls all
+    destructors before it frees memory, also at interpreter exit. No Python code runs in between, so no signal
+    can interrupt this.
     """
     return ffi.gc(ffi.new_handle(memory), partial(lib.md_port_free, port))
 
@@ -383,7 +384,7 @@ class Port:
         """
         if self.c is None:
             return 0
-        self._memory.lasting.update(exchanges)  # may be in flight when a new round replaces them
+        self._memory.lasting.update(exchanges)  # an exchange may be in flight when a new round replaces it
         rounds = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
         with self._memory.replacing("round", rounds):
             return int(lib.md_port_repeat(self.c, rounds, len(exchanges)))

@@ -97,7 +97,7 @@ def _wrong_facts(owner: Any, rules: Rules) -> dict[str, str]:
     }
 
 
-# ---- facts of a class, besides its registers ----
+# ---- facts of a class other than its registers ----
 
 _TIMES = {
     "silence": LONGEST_SILENCE,
@@ -262,7 +262,7 @@ _REGISTER_RULES: Rules = (
 )
 
 
-# ---- a register, its facts together ----
+# ---- a register: facts that must fit together ----
 
 
 def _errors_together(

@@ -64,9 +64,9 @@ class Drive(RegisterAccess):
     most_devices: ClassVar[int] = 0  # limit of devices on a line with such a drive; 0: not stated
 
     silence: ClassVar[float] = 0.0  # s, before and after a frame; with RTU at least t3.5
-    silence_characters: ClassVar[float] = 0.0  # the same, in characters
+    silence_characters: ClassVar[float] = 0.0  # the same silence, in characters
     response_delay: float = 0.005  # s, typical, from the request's end to the reply's start
-    response_delay_characters: ClassVar[float] = 0.0  # the same in characters, if that is longer
+    response_delay_characters: ClassVar[float] = 0.0  # the same delay in characters; the longer delay applies
     response_timeout: ClassVar[float] = 0.3  # s without a reply before an exchange fails
     answering_time: ClassVar[float] = 0.0  # s that the document gives the drive for a reply; 0: not stated
     turnaround_delay: ClassVar[float] = 0.1  # s without requests after a broadcast
@@ -77,7 +77,7 @@ class Drive(RegisterAccess):
 
     # ---- registers, exceptions and commands ----
 
-    most_registers: ClassVar[Mapping[Table, int]] = {}  # in one read; by default the standard's limit
+    most_registers: ClassVar[Mapping[Table, int]] = {}  # limit in one read; by default the standard's
     readable_gaps: ClassVar[Mapping[Table, range]] = {}  # reserved addresses that one read may include
     read_together: ClassVar[tuple[tuple[str, ...], ...]] = ()  # registers that share a request, in this order
     exceptions: ClassVar[Mapping[int, str]] = {
@@ -286,7 +286,7 @@ class Drive(RegisterAccess):
 
     def needed_silence(self) -> float:
         """Return the silence in s that this drive needs before a request and after its reply."""
-        if self.framing is Framing.TCP:  # the gateway keeps it
+        if self.framing is Framing.TCP:  # the gateway keeps the silence
             return 0.0
         if self.framing is not Framing.RTU:
             return self._own_silence()

@@ -63,7 +63,7 @@ class Settings:
 
 
 MODBUS_PORT = 502  # the default port number of tcp:// URLs
-SCHEMES = ("tcp", "socket", "rfc2217")  # not all of pyserial's: its spy:// writes to any file
+SCHEMES = ("tcp", "socket", "rfc2217")  # not all of pyserial's schemes: spy:// writes to any file
 URLS = "tcp://10.0.0.7, socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001"
 
 
@@ -114,7 +114,7 @@ def check_settle(settle: float) -> None:
         raise ValueError(f"settle = {settle!r} is not a number of seconds from 0 to {MOST_SETTLE:g}")
 
 
-# ---- one drive on a line ----
+# ---- framing and silence of one drive ----
 
 LONGEST_SILENCE = 1.0  # s
 SERIAL_ADDRESSES = range(1, 248)  # 0 is the broadcast address

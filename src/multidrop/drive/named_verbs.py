@@ -35,7 +35,7 @@ _OPTIONS: Mapping[str, Mapping[str, Callable[[object], Any]]] = {
     "jog": {"direction": _direction},
     "reset_fault": {},
     "set_frequency": {"hz": _hertz},
-    "coast": {},  # a hoist would drop its load
+    "coast": {},  # a hoist drops its load
     "emergency_stop": {},
     "stop": {},
 }

@@ -129,7 +129,7 @@ class Register(Generic[T]):
     outside: str = ""
     note: str = ""
     name: str = field(default="", init=False)
-    scaled_by: Register[float] | None = field(default=None, init=False)  # its scale register, once found
+    scaled_by: Register[float] | None = field(default=None, init=False)  # register of its power of ten
 
     def __post_init__(self) -> None:
         carrier = getattr(self.table, "carrier", Carrier.WORD)  # the class reports a wrong table

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from multidrop.drive.register import HOLDING, Table
 
 _LAST_ADDRESS = 0xFFFF
-MOST_WORDS = 125  # of one request
+MOST_WORDS = 125  # limit of one request, in registers
 _ORDERS = ("AB", "BA", "B")  # B: one character a register, in its low byte
 
 

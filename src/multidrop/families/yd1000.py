@@ -201,7 +201,7 @@ class YD1000(Drive):
     response_delay_characters = 24
     response_timeout = 0.5  # 24 characters are 220 ms at 1200 bit/s
     answers_every_read = True
-    most_registers = {HOLDING: 1}  # its table of functions has no other read
+    most_registers = {HOLDING: 1}  # the document has only reads of one register
     exceptions = {
         1: "no such function (after VF-S15)",
         2: "no such register (after VF-S15)",

@@ -93,7 +93,7 @@ def plan(
             except TypeError as mistake:
                 mistakes.append(f"{code}: {mistake}")
             except WriteForbidden as mistake:
-                if not mistake.rule.startswith(one.name):  # not a mistake in a value
+                if not mistake.rule.startswith(one.name):  # the refusal is not about this value
                     raise
                 mistakes.append(f"{code}: {mistake.rule}")
     if mistakes:

@@ -46,7 +46,7 @@ class Prediction:
 
     cycle: float  # s for one exchange of each block
     switches: int  # number of changes of baud rate or format in a cycle
-    utilisation: float  # if above 1, the line would have to be faster by this factor
+    utilisation: float  # fraction of the line's time; above 1, the factor by which the line is too slow
     rates: tuple[Rate, ...]
 
     @property

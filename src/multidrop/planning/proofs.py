@@ -22,7 +22,7 @@ MOST_PROOFS = 4  # limit per drive, because each proof uses memory
 
 # Tables to read if all replies of a device look alike: replies, even exceptions, name their function.
 OTHER_TABLES = (INPUT, COIL, HOLDING, DISCRETE)
-ENOUGH = 3  # one may be outstanding itself, and the last is kept for a drive that answers again
+ENOUGH = 3  # one proof may be outstanding itself, the last is kept for a drive that answers again
 
 RawRange = tuple[int, int]  # lowest and highest raw value of the only register in a reply
 

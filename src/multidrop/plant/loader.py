@@ -131,8 +131,8 @@ _NOT_ARGUMENTS = ("name", "model", "every", "poll")  # keys that are not argumen
 def plant_schema() -> dict[str, Any]:
     """Return the JSON Schema of a plant file, from the keys that `load_plant` checks.
 
-    It also has the registers, addresses and options of the built-in and shipped families. [serve] and
-    [fleet] are any tables.
+    The schema also has the registers, addresses and options of the built-in and shipped families. It accepts
+    any tables [serve] and [fleet].
     """
     families = [*MODELS.values(), *map(shipped_family, SHIPPED)]
     drive = json_schema(_DRIVE) | {

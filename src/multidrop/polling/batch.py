@@ -68,7 +68,7 @@ class BatchColumns(NamedTuple):
     """
 
     time: memoryview  # int64 (format "q"): UTC in ns at which the request was sent
-    monotonic_ns: memoryview  # int64: the same time of CLOCK_MONOTONIC
+    monotonic_ns: memoryview  # int64: the same moment by CLOCK_MONOTONIC, in ns
     uncertainty_ns: memoryview  # int64; undefined for a miss
     drive: memoryview  # uint16 ("H"): a code in `drives`
     register: memoryview  # uint16: a code in `registers`

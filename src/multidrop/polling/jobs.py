@@ -80,7 +80,7 @@ class JobMaker:
         self._bus = bus
         self._names = names
         self._made: dict[tuple[Drive, Block, int | None], PolledJob] = {}
-        self._rows: dict[tuple[Drive, Block], RowLayout] = {}  # shared by all rates; they count refusals
+        self._rows: dict[tuple[Drive, Block], RowLayout] = {}  # shared by all rates; a layout counts refusals
         self._skipped = 0  # skipped slots of forgotten jobs
 
     def plan(self, polled: PolledDrive, delay: float) -> PlannedJobs:

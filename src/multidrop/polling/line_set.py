@@ -143,7 +143,7 @@ class LineSet:
 
     def _opened(self, line: PlantLine) -> Bus | OSError:
         try:
-            if self._mastership and not self._mastership.holds:  # open it once this process is the master
+            if self._mastership and not self._mastership.holds:  # opened once this process is master
                 return self.await_port(line)
             return self._bus(Bus, line)
         except OSError as failure:  # a LineError of the port, or another OSError of the audit log

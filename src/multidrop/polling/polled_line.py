@@ -60,7 +60,7 @@ class Reopening:
         try:
             self._bus.line.regain()
         except LineError:
-            pass  # the line has logged it
+            pass  # the line has logged the failure
         except BaseException as failure:
             log_aside(
                 _log, logging.ERROR, "%s: not opened again\n%s", self._bus.line.port, traceback_of(failure)
@@ -162,7 +162,7 @@ class PolledLine:
     def name(self) -> str:
         return self.declared.name
 
-    # ---- its drives ----
+    # ---- the line's drives ----
 
     @property
     def polled(self) -> tuple[PolledDrive, ...]:
@@ -283,8 +283,8 @@ class PolledLine:
         """
         present = self._jobs(drive)
         old = [job for job in present if job not in wanted]
-        # A new job's first slot is the earliest slot of the old jobs with its period, or else of any present
-        # job with its period.
+        # A new job's first slot is the earliest slot of the old jobs with the same period, or else of any
+        # present job with the same period.
         latest_first = [*sorted(present, key=_due, reverse=True), *sorted(old, key=_due, reverse=True)]
         dues = {job.period_ns: job.due_ns for job in latest_first}
         self._refusals.forget(drive)

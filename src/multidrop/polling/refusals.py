@@ -50,7 +50,7 @@ class Refusals:
             self._make_whole(trial, now_ns)
         for rare in [rare for rare in self._set_aside if not rare.rows.refusals]:
             job = self._set_aside.pop(rare)
-            job.rows.refusals = 0  # not earlier: a reply in flight when it was set aside may add a refusal
+            job.rows.refusals = 0  # not earlier: a reply in flight when the job was set aside may add one
             self._schedule.replace([rare], [job], now_ns)
         for job in [job for job in self._schedule.jobs if self._is_refused(job)]:
             if parts := halves(job.owner, job.block):

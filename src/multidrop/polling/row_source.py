@@ -47,7 +47,7 @@ def _check_returned(function: object, returned: object) -> None:
     """Raise TypeError if the function returned a coroutine or a generator."""
     if isinstance(returned, Awaitable | Generator | AsyncIterator):
         if inspect.iscoroutine(returned):
-            returned.close()  # otherwise Python also warns that it was never awaited
+            returned.close()  # otherwise Python also warns that the coroutine was never awaited
         raise TypeError(_DEFERS.format(function))
 
 
@@ -70,7 +70,7 @@ class BatchCaller:
                 _check_returned(self._function, self._function(batch))
         except PollingFailed:
             pass  # the poller has logged it, and raises it itself
-        except BaseException as failure:  # of any kind: the caller of close() must see it
+        except BaseException as failure:  # any failure: close() raises it to its caller
             self._failure = failure
             _log.error("on_batch: the function failed and is no longer called", exc_info=failure)
 

@@ -28,7 +28,7 @@ _log = logging.getLogger("multidrop.line")
 # All exceptions that pyserial's ports may raise.
 PORT_FAILURES = (OSError, _terminal_error, serial.SerialException, ValueError, EOFError)
 
-# The next two are shorter than WRITE_TIMEOUT, so that no write is sent after its caller got an outcome.
+# The next two limits are below WRITE_TIMEOUT, so that no write is sent after its caller got an outcome.
 MOST_STALL_MS = 750  # ms; the kernel cuts a connection that stalls for longer
 MOST_AGE = 0.25  # s; an older request is not forwarded
 MOST_CHUNK = 1024  # most bytes that the core reads in one call

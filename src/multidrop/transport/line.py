@@ -355,7 +355,7 @@ class Line:
 
     @undisturbed
     def _discard(self, core: Port) -> None:
-        """Close the port now, so that the driver discards a command that was called off."""
+        """Close the port now, so that the driver discards the unsent bytes of a command that has ended."""
         with self._lock:
             if self.queue in (core, None):  # otherwise another thread has already reopened the port
                 self._let_go()

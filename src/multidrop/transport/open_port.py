@@ -198,7 +198,7 @@ def failing_refusals(device: str) -> int:
 
 TOLERANCE = 0.02  # of a baud rate: the limit of the core and of the kernel
 CLOSING_S = 0.75  # how long the adapter may still take the driver's bytes when a port is closed
-_UNNOTICED_S = 0.05  # a healthy adapter takes all bytes in this time
+_UNNOTICED_S = 0.05  # s; time in which a healthy adapter takes all bytes
 BY_PLACE = "/dev/serial/by-path/"  # names of USB sockets, into which any adapter may be plugged
 _NO_SETTINGS = -1
 _TRANSACTIONS = {
@@ -238,7 +238,7 @@ class OpenPort:
         self._serial: serial.SerialBase | None = None
         self._adapter: USBAdapter | None = None  # the adapter at the first opening
         self._terminal: PseudoTerminal | None = None  # the pseudo-terminal at the last opening
-        self.must_discard = False  # the driver may hold a command that was called off
+        self.must_discard = False  # the driver may hold bytes of a command that has ended
 
     def open(self) -> Port:
         """Open the port, wait for `settle` s, discard the input, and return the core's port.
@@ -378,7 +378,7 @@ class OpenPort:
 
         Raises LineError if the port already has other settings, or rejects these.
         """
-        if self._serial is None or self.bridge is None:  # not open yet: it may be bridged
+        if self._serial is None or self.bridge is None:  # not open yet: the port may be bridged
             self.settings = self.settings or settings
             return
         if self.settings == settings:

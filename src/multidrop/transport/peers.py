@@ -89,7 +89,7 @@ class Peers:
         least = min(drive.response_timeout, documented)
         asked_as = type(drive), drive.framing, drive.settings, silence(drive), least, drive.response_timeout
         key = drive.address, *asked_as
-        if key not in self._known:  # otherwise keep it: the core may still use its proofs
+        if key not in self._known:  # otherwise keep the known peer: the core may still use its proofs
             self._known[key] = self._new(drive, least)
         # A late reply of a removed drive could be mistaken for a reply of the next drive at its address.
         peer = self.present[drive] = self._known[key]

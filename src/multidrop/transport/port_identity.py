@@ -76,8 +76,8 @@ class PseudoTerminal:
     """A pseudo-terminal, and the links that lead to it. After its end, the system reuses its number."""
 
     device: str
-    changed_ns: int  # ns; later for another terminal with the same number
-    links: tuple[tuple[int, int], ...]  # inode and time of each link; a replaced link has others
+    changed_ns: int  # ns; a later terminal with the same number has a later time
+    links: tuple[tuple[int, int], ...]  # inode and time of each link; they change if a link is replaced
 
     def is_replaced_by(self, other: PseudoTerminal) -> bool:
         """Return True if the same links now lead to another terminal."""

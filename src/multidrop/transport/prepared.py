@@ -167,8 +167,8 @@ class PreparedReads:
         self.of = of
         self.newest = NOTHING  # the last plan used: to use it again, no registers are hashed
         self.prepare = prepare
-        self.parts: dict[Block, tuple[Block, ...]] = {}  # of blocks not answered as a whole
-        self.answered: set[Block] = set()  # maybe too long, but the drive answered them
+        self.parts: dict[Block, tuple[Block, ...]] = {}  # of each block that is not answered as a whole
+        self.answered: set[Block] = set()  # blocks that the drive answered, although maybe too long
 
     def ask_first(self, block: Block) -> None:
         """From now on read a refused block before the other parts of its larger block.

@@ -468,7 +468,7 @@ def _rows(text: str, place: TomlPlace) -> Iterator[tuple[int, list[str]]]:
 def _columns(header: list[str], place: TomlPlace) -> list[str] | None:
     """Return the names of the columns; None if one is invalid."""
     columns = [name.lower().replace(" ", "_") for name in header]
-    while columns and not columns[-1]:  # trailing empty columns, as spreadsheets write them
+    while columns and not columns[-1]:  # spreadsheets write empty columns at the end
         columns.pop()
     before = len(place.config_errors)
     meant = place.unknown(dict.fromkeys(columns), COLUMNS) if set(columns) - COLUMNS.keys() else set()
