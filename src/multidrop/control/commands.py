@@ -210,7 +210,7 @@ class RepeatedStops:
     ) -> None:
         self._stop = stop
         self._begin = begin
-        self._repeated: dict[Drive, tuple[StopFuture, float]] = {}  # newest repeated stop, and its call's time
+        self._repeated: dict[Drive, tuple[StopFuture, float]] = {}  # newest repeated stop, time of its call
         self._sent: dict[Drive, StopFuture] = {}  # stops that are sent once, in flight
         self._waiting: dict[Drive, StopFuture] = {}  # stops to send once after the one in flight
         self._tasks: set[StopFuture] = set()
