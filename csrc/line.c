@@ -133,7 +133,8 @@ static void tap_bytes(const struct md_line *line, int side, int64_t time_ns, con
         md_tap_put(line->tap, side, time_ns ? time_ns : line->completion->sent_ns, bytes, len);
 }
 
-/* Pass the bytes since the request was sent to the tap: the reply or the bytes instead, and all others. */
+/* Pass to the tap all bytes that came since the request was sent: the reply or the bytes that came instead of
+ * it, and all others. */
 static void tap_received(const struct md_line *line, struct md_ending ending)
 {
     const struct md_completion *completion = line->completion;

@@ -43,7 +43,7 @@ static void learn(int64_t *ns, int64_t value)
     __atomic_store_n(ns, value, __ATOMIC_RELAXED);
 }
 
-/* Smoothed delay plus four deviations, as in TCP's retransmission timeout (RFC 6298). */
+/* Return the smoothed delay plus four deviations, as in TCP's retransmission timeout (RFC 6298). */
 static int64_t usual_timeout_ns(const struct md_drive *drive)
 {
     int64_t usual_ns = 3 * drive->least_timeout_ns, delay_ns = learnt(&drive->delay_ns);
@@ -54,10 +54,10 @@ static int64_t usual_timeout_ns(const struct md_drive *drive)
 }
 
 /* The first request after a failure gets the longest timeout that the document allows, because the drive
- * may have become slower. While the drive stays silent, only one request in RARELY gets it,
- * because the other drives lose that time. A stop must be repeated sooner: its timeout doubles after each
- * failure except the first, which is the identity check's. If replies are known to be late, a stop may wait
- * as long as its sender allows. */
+ * may have become slower. While the drive stays silent, only one request in RARELY gets that timeout, because
+ * the other drives lose that time. A stop must be repeated sooner: its timeout doubles after each failure
+ * except the first, which is that of the identity check. If replies are known to be late, a stop may wait as
+ * long as its sender allows. */
 enum { RARELY = 16, MOST_DOUBLINGS = 8 };
 static const int64_t MOST_PATIENCE = INT64_C(20000000000);
 

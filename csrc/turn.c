@@ -225,7 +225,7 @@ static int is_over(const struct md_turn *turn, const struct md_slot *slot, int64
     return 0;
 }
 
-/* Start a queued exchange and return 1, or set wake_ns to its time. */
+/* Start the next queued exchange and return 1; if it is not due yet, set wake_ns and return 0. */
 static int take_queued(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 {
     const struct md_slot *slot = &turn->slots[turn->progress.done & (turn->room - 1)];
@@ -290,7 +290,7 @@ static int is_polling_due(const struct md_turn *turn)
     return !is_stop_waiting(turn) && turn->owed_ns > 0 && turn->last == MD_URGENT;
 }
 
-/* Start the next exchange and return 1, or set wake_ns to its time. */
+/* Start the next exchange and return 1; if no exchange is due yet, set wake_ns and return 0. */
 static int take(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 {
     int is_held = 0;

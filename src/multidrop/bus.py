@@ -317,12 +317,12 @@ class Bus:
     def stop_all(self, seconds: float | None = None) -> dict[str, Stopped]:
         """Stop every drive, before all queued requests; return the results by drive name.
 
-        If all drives are confirmed to be of one family with a stop broadcast, that is sent first. Then the
-        drives are sent their stops in turn, until each motor is seen to stand. Stops are repeated for
-        `seconds`; by default for at least 30 s, and as long as the ramp may take. An invalid `seconds` is
-        logged and ignored. A failure of one drive is in its result and never ends the others. Calls that move
-        a motor, made before or during this call, raise CancelledByStop. If interrupted, the stop is sent once
-        more to each drive that is not seen to stand.
+        If `identify` has confirmed that all drives are of one family with a stop broadcast, that is sent
+        first. Then the drives are sent their stops in turn, until each motor is seen to stand. Stops are
+        repeated for `seconds`; by default for at least 30 s, and as long as the ramp may take. An invalid
+        `seconds` is logged and ignored. The failure of one drive's stop is in its result, and never ends the
+        other stops. Calls that move a motor, made before or during this call, raise CancelledByStop. If this
+        call is interrupted, the stop is sent once more to each drive that is not seen to stand.
         """
         run: StopRun | None = None
         tried = 0

@@ -46,13 +46,13 @@ class Suspicion(NamedTuple):
 
 
 class EchoCheck:
-    """Reads registers to find out whether the line's adapter echoes what it sends."""
+    """Reads registers to find out whether the line's adapter echoes the requests."""
 
     def __init__(self, exchanges: Exchanges) -> None:
         self._exchanges = exchanges
 
     def read_any(self, drive: Drive, attempts: int, *, insists: bool = False, timeout: float = 0.0) -> None:
-        """Read one register, because a read's reply is never a copy of its request.
+        """Read one register, to see whether the drive answers: a read's reply is never a copy of its request.
 
         A Modbus exception counts as a reply. Does nothing if the drive has no readable register.
         """
@@ -72,7 +72,7 @@ class EchoCheck:
             self.read_any(drive, 1, insists=insists, timeout=WRITE_TIMEOUT)
 
     def why_doubtful(self, drive: Drive) -> str:
-        """Return why the reply to a write may be the adapter's echo; "" if it is the drive's.
+        """Return why the reply to a write may be the adapter's echo; "" if the reply is the drive's own.
 
         An adapter may start to echo at any time while the drive is dead, so a register is read after the
         write. If the adapter is known to echo, the core has already separated echo and reply.
@@ -88,7 +88,7 @@ class EchoCheck:
 
 
 class _Confirmed(NamedTuple):
-    """The line's state when a drive was confirmed to be of its family."""
+    """The state of line and drive when the drive's family was last confirmed."""
 
     port: object  # the open port's object; reopening creates another one
     silences: int  # number of unanswered requests until then
@@ -103,19 +103,19 @@ class IdentityCheck:
     def __init__(self, exchanges: Exchanges, echo: EchoCheck) -> None:
         self._exchanges = exchanges
         self._echo = echo
-        self._known: dict[Drive, _Confirmed] = {}  # confirmed drives
+        self._known: dict[Drive, _Confirmed] = {}  # drives whose family was confirmed
         self._stoppable: dict[
             Drive, tuple[object, set[float]]
-        ] = {}  # the port, and raw counts of allowed stops
+        ] = {}  # the open port, and the raw counts of stops that were allowed
         self._doubted: dict[Drive, tuple[object, str]] = {}  # the open port, and why it may be another make
-        self._suspected: dict[Drive, tuple[object, Suspicion]] = {}  # the port, and the first suspicion
+        self._suspected: dict[Drive, tuple[object, Suspicion]] = {}  # the open port, and the first suspicion
 
     def is_known(self, drive: Drive) -> bool:
         last = self._known.get(drive)
         return last is not None and last.port is self._exchanges.line.queue
 
     def _was_heard(self, drive: Drive) -> bool:
-        """Return True if the drive was confirmed on this port, and not silent for PAUSE_NS since then."""
+        """Return True if the family was confirmed on this port, and no silence of PAUSE_NS came since."""
         last = self._known.get(drive)
         if last is None or last.port is not self._exchanges.line.queue:
             return False
@@ -124,7 +124,7 @@ class IdentityCheck:
         return last.pauses == peer.pauses and idle_ns + _slept_ns() - last.slept_ns < PAUSE_NS
 
     def _has_answered_all(self, drive: Drive) -> bool:
-        """Return True if the drive answered every request since it was confirmed."""
+        """Return True if the drive answered every request since its family was confirmed."""
         last = self._known.get(drive)
         return last is not None and last.silences == self._exchanges.peer(drive).silences
 
@@ -181,7 +181,7 @@ class IdentityCheck:
         self._know(drive, port, silences, was_heard=was_heard)
 
     def _know(self, drive: Drive, port: object, silences: int, *, was_heard: bool) -> None:
-        """Record that the drive was confirmed now; `was_heard` is False if it was silent before."""
+        """Record that the family was confirmed; `was_heard` is False if the drive was silent before."""
         before, pauses = self._known.get(drive), self._exchanges.peer(drive).pauses
         if not was_heard or before is None or before.pauses != pauses:
             _forget_setpoint(drive)

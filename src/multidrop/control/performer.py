@@ -70,8 +70,8 @@ class Performer:
     def move(self, script: Script[Any], call: Call) -> Any:
         """Carry out the script of a verb that may move the motor; return the script's result.
 
-        Raises CancelledByStop if a stop was called before the script's first write, and Unconfirmed if one
-        was called after it.
+        Raises CancelledByStop if a stop was called before the script's first write, and Unconfirmed if a stop
+        was called after that write.
         """
         with call.noted():
             call.check(f"the {call.verb}")

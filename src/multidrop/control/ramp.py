@@ -26,8 +26,8 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
     If a start fails, stop that drive and all started before it, and raise the failure. That drive itself is
     sent no stop if its identity is not confirmed and nothing was sent to it: the stop of its declared family
     may start a drive of another family. A drive whose stop is called on any thread during this call is not
-    started. Drives that wait for their turn are read regularly, because after a silence a setpoint that cannot
-    be read back is assumed lost.
+    started. Drives that wait for their turn are read regularly, because after a silence a setpoint that
+    cannot be read back is assumed lost.
     """
     if not 0 <= gap < inf:
         raise ValueError(f"gap = {gap:g} s: it must be 0 or more")

@@ -47,7 +47,7 @@ def raw_count(drive: Drive, register: Register[T], value: T) -> float:
 
 
 def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden if this write may command the motor and the drive's class is not confirmed.
+    """Raise WriteForbidden if this write may command the motor and the owner must still confirm the class.
 
     A stop needs no confirmation. In a family file, all other raw counts need it, even harmless ones.
     """
@@ -62,7 +62,8 @@ def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
 def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
     """Raise WriteForbidden if only a verb may send this write, such as one that starts a motor.
 
-    A command that does not move the motor by itself is allowed if the drive's class is confirmed.
+    A command that does not move the motor by itself is allowed unless the owner must still confirm the
+    drive's class.
     """
     if is_harmless(register, raw) or not register.commands:
         check_known(drive, register, raw)
@@ -89,7 +90,7 @@ def _has(drive: Drive, name: str) -> bool:
 
 
 def check_broadcast(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden if the drive's class is not confirmed and this broadcast is not a stop."""
+    """Raise WriteForbidden if the owner must still confirm the class and this broadcast is not a stop."""
     if not is_stop(drive, register, raw):
         drive.check_confirmed(register.name)
 

@@ -58,7 +58,7 @@ Do = Callable[["StopAttempt", Step], Any]
 
 
 class StopAttempt:
-    """One drive's stop, repeated until it is confirmed and the motor is seen to stop.
+    """One drive's stop, repeated until the drive confirms it and the motor is seen to stop.
 
     The stop is repeated for `seconds`. With None it is repeated for LEAST_S, and a repetition that started by
     then may last as long as the motor's ramp. After AT_ONCE steps without a good reply, it leaves more than
@@ -107,7 +107,7 @@ class StopAttempt:
         self.frame = request
 
     def note_broadcast(self) -> None:
-        """Note that the stop was broadcast: sent, but not confirmed."""
+        """Note that the stop was broadcast: sent, but not confirmed by the drive."""
         self.is_sent = True
         self.times_sent += 1
 
@@ -242,7 +242,7 @@ class StopAttempt:
         """
         self._begin()
         is_written = False
-        with suppress(Exception):  # StopIteration too
+        with suppress(Exception):  # also StopIteration, the script's end
             for _ in range(MOST_STEPS):
                 step = self._next_step()
                 if isinstance(step, Wait):

@@ -345,7 +345,7 @@ class Drive(RegisterAccess):
         return code in self.exceptions and code in self.damaged | self.later
 
     def check_confirmed(self, what: str) -> None:
-        """Raise WriteForbidden if the drive must be confirmed and is not.
+        """Raise WriteForbidden if the owner must confirm the drive's class and has not.
 
         Two kinds of families need confirmation: those without `identify`, because the same write may start
         the motor of another make; and those from a file, which are untested.

@@ -126,10 +126,12 @@ class RegisterAccess:
         """Write a value; return the value that the drive then holds, or `value` if that cannot be read.
 
         The write is sent once. It is skipped if the register may be in EEPROM and already holds the value.
-        The identity of the drive is checked before the first write to it. Raises WriteForbidden (also a
-        ValueError) for a write that the library does not send, TypeError for an invalid value, Expired if the
-        write cannot be sent within the bus's `expiry`, DriveException if the drive refuses it, and
-        Unconfirmed if there is no reply, so that the write may have happened.
+        The identity of the drive is checked before the first write to it.
+
+        Raises WriteForbidden (also a ValueError) for a write that the library does not send, TypeError for an
+        invalid value, and Expired if the write cannot be sent within the bus's `expiry`. Raises
+        DriveException if the drive refuses the write, and Unconfirmed if there is no reply, so that the write
+        may have happened.
         """
         return self.try_write(register, value).value
 
@@ -157,7 +159,8 @@ class RegisterAccess:
         """Send any request except a Modbus read once, without checks; return the reply's data.
 
         This deliberately bypasses the rules: no identity check, no limits, no EEPROM budget. It may start a
-        motor. Raises Unconfirmed if there is no reply, DriveException if the drive refuses, CancelledByStop
-        or Expired if the request was not sent, and ValueError for functions 1 to 4, which `read_raw` sends.
+        motor. Raises Unconfirmed if there is no reply, DriveException if the drive refuses, and
+        CancelledByStop or Expired if the request was not sent. Raises ValueError for functions 1 to 4, which
+        `read_raw` sends.
         """
         return self.link.send_raw(self, function, start, data, count)

@@ -48,7 +48,7 @@ def confirmation(declared_in: str, *, identifies: bool) -> Mapping[str, Option]:
 
 
 def doubt(family: str, declared_in: str, *, identifies: bool) -> str:
-    """Return why a drive of this class must be confirmed; "" if it need not be."""
+    """Return why the owner must confirm that a drive is of this class; "" if that is not needed."""
     if declared_in:
         return (
             f"its class is the untested file {declared_in}: compare `multidrop check {declared_in}` with the "

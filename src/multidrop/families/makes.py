@@ -1,4 +1,4 @@
-"""Makes that can be recognised by their registers, and the words that run their motors.
+"""Makes (brands) of drives that their registers identify, and the control words that run their motors.
 
 Two families may have their control words at the same address with different meanings, so that one family's
 stop runs another make's motor. A stop is withheld only if the drive's registers show that it is such another
@@ -42,14 +42,14 @@ Test = Callable[[int, Drive], bool]
 
 @dataclass(frozen=True)
 class Make:
-    """A make: the model to declare, its control register, the words that run it, and how to recognise it."""
+    """A make: the model to declare, its control register and run words, and how to recognise its drives."""
 
     model: str
     title: str
-    control: int  # address of its control word, a holding register
-    runs: Callable[[float], bool]  # returns True for a word that runs the motor
+    control: int  # address of the make's control word, a holding register
+    runs: Callable[[float], bool]  # returns True for a control word that runs the motor
     evidence: tuple[tuple[Register[Any], Test], ...]
-    may_be_silent: bool = False  # True if it may not reply to reads of registers that it lacks
+    may_be_silent: bool = False  # True if such a drive may not reply to reads of registers that it lacks
     copies: tuple[str, ...] = ()  # models that these registers do not distinguish from this make
 
     def shows(self, drive: Drive) -> Script[bool]:

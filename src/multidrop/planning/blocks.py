@@ -71,8 +71,8 @@ def plan(
     one function share a request if that is quicker. A request may include other readable registers, and
     reserved addresses if the family's document allows that, up to the family's limit or else the standard's.
     Registers of different rates never share a request, because some would be read too often. Registers of a
-    group in `read_together` with the same rate always share one, and the blocks are in the groups' order.
-    Raises ValueError for a register that cannot be read.
+    group in `read_together` with the same rate always share a request, and the blocks are in the order of the
+    groups. Raises ValueError for a register that cannot be read.
     """
     rates: dict[float | None, list[Register[Any]]] = {}
     for register, every in wanted:
@@ -96,7 +96,7 @@ def plan(
 
 
 def in_declared_order(drive: Drive, found: Iterable[Planned]) -> list[Planned]:
-    """Return the blocks, sorted: first the blocks with registers of `read_together`, in its order."""
+    """Return the blocks sorted: first the blocks with registers of `read_together`, in declared order."""
     places = {name: place for place, group in enumerate(drive.read_together) for name in group}
     return sorted(
         found, key=lambda one: min(places.get(each.name, len(places)) for each in one.block.registers)

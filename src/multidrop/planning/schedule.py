@@ -129,7 +129,10 @@ class Schedule(Generic[J]):
     # ---- the next jobs ----
 
     def cycle(self, now_ns: int) -> list[J]:
-        """Return the round; [] if any job has slots or an interval, or if any drive is silent."""
+        """Return the jobs of the round, the next one first.
+
+        Return [] if any job has slots or an interval, or if any drive is silent.
+        """
         if self.back_off.may_sleep(now_ns) or self._waiting or self._begun or self._ready:
             return []
         return self._round[self._next :] + self._round[: self._next]

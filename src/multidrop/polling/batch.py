@@ -60,10 +60,10 @@ def shown_span(rows: Sequence[Row]) -> str:
 class BatchColumns(NamedTuple):
     """Columns of a batch as read-only one-dimensional memoryviews, without a copy.
 
-    Each column except `valid` has one number per row (shape `(len(batch),)`). A view stays unchanged while it
-    or any object made from it without a copy, such as `numpy.asarray(view)`, exists, even after the batch is
-    deleted and the poller closed. `drives`, `registers` and `statuses` are tuples of names; a code is the
-    index of its name. A name's code is the same in all batches of one poller; later batches may have more
+    Each column except `valid` has one number per row (shape `(len(batch),)`). A view keeps its memory
+    unchanged, even after the batch is deleted and the poller closed. So does an object that shares the
+    memory, such as `numpy.asarray(view)`. `drives`, `registers` and `statuses` are tuples of names; a code is
+    the index of its name. A name's code is the same in all batches of one poller; later batches may have more
     names.
     """
 

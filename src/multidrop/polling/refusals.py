@@ -64,7 +64,10 @@ class Refusals:
             self._end_probes()
 
     def _is_refused(self, job: PolledJob) -> bool:
-        """Return True if a job must be split or set aside: after REFUSALS, or 1 for part of a split block."""
+        """Return True if a job must be split or set aside.
+
+        That is after REFUSALS exceptions in a row; a part of a split block needs only one.
+        """
         count = job.rows.refusals
         if not count or job in self._trials or job is self._probes.get(job.drive):
             return False

@@ -179,7 +179,7 @@ class Exchanges:
         )
 
     def _again(self, read: Callable[[], T]) -> T:
-        """Reopen a lost port and call `read`; if the port is lost again, do both a second time.
+        """Reopen a lost port and call `read`; if the port is then lost again, repeat both steps once.
 
         Use this only for a user's own reads, not for a script's: after the port is reopened, a script's
         writes need another identity check.

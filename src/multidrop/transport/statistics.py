@@ -129,7 +129,7 @@ class Statistics:
     def timeout(self) -> float:
         """Present timeout in s; for a line, the longest timeout of its drives.
 
-        It follows the drive's response delay, and grows if replies are late repeatedly.
+        The timeout follows the drive's response delay, and grows if replies are late repeatedly.
         """
         return self.counters.timeout_ns / 1e9
 
@@ -161,7 +161,7 @@ class Statistics:
 
     @property
     def delay_counts(self) -> list[tuple[float, int]]:
-        """A histogram of the response delays: pairs of a bucket's least delay in s and its count.
+        """A histogram of the response delays: pairs of a bucket's least delay in s and its number of replies.
 
         Empty buckets are omitted. The width of a bucket is an eighth of its least delay.
         """
