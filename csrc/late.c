@@ -178,7 +178,7 @@ static void note_late_proof(struct md_drive *drive, const struct md_owed *owed)
 
 static const int64_t FORGET_NS = INT64_C(120000000000); /* no network delays bytes by 2 minutes */
 
-/* Return the same request among the drive's outstanding requests; NULL: none. */
+/* Return the drive's outstanding request that is the same as the exchange's request; NULL: none. */
 static struct md_owed *find_same(struct md_drive *drive, const struct md_exchange *exchange)
 {
     for (uint32_t i = 0; i < drive->owed_count; i++)

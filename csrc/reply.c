@@ -32,7 +32,7 @@ int md_echo_is_copy(const struct md_line *line, size_t at)
     return at + line->tx_len <= line->rx_len && memcmp(line->rx + at, line->tx, line->tx_len) == 0;
 }
 
-/* Return 1 if all bytes from `at` on are the start of a copy. */
+/* Return 1 if all bytes from `at` on are the start of a copy of the request. */
 static int may_become_copy(const struct md_line *line, size_t at)
 {
     size_t len = line->rx_len - at;
@@ -53,7 +53,7 @@ static int64_t echo_whole_ns(const struct md_line *line)
     return due_ns ? line->quiet_ns + due_ns : 0;
 }
 
-/* Return 1 if the copy is the reply, because it was incomplete when an echo would have been whole. */
+/* Return 1 if the copy of the request is the reply: it was incomplete when an echo would have been whole. */
 static int is_timely_copy(const struct md_line *line)
 {
     return line->copy_by_ns && line->missing_ns >= line->copy_by_ns;
@@ -255,9 +255,9 @@ void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns)
     }
 }
 
-/* End the exchange with a reply to this request or to an earlier, equal one; a second reply may still come. A
- * row can hold this value, with an uncertainty that covers both requests. A client that waits needs the
- * present value: read it again. */
+/* End the exchange with a reply to this request or to an earlier one; a second reply may still come. If the
+ * earlier request is the same, a row can hold the value, with an uncertainty that covers both requests. A
+ * client that waits needs the present value: read it again. */
 static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used,
                                      const struct md_message *reply, int64_t now_ns, int64_t since_ns)
 {
