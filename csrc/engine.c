@@ -81,8 +81,8 @@ static void bring_rest(const struct md_port *port)
         bring((*next_pointer(port))->drive, offsetof(struct md_drive, counters));
 }
 
-/* Each step reads memory that the step below has prefetched earlier: the last step runs for the port farthest
- * ahead. */
+/* Each step reads memory that the next step in this list has prefetched earlier: the last step runs for the
+ * port farthest ahead. */
 static void (*const steps[STEPS_AHEAD])(const struct md_port *port) = {
     bring_rest, bring_drives, bring_exchanges, bring_port,
 };

@@ -132,7 +132,7 @@ class ExitHook:
 
     def __init__(self) -> None:
         self._acts: list[LastAct] = []  # changed atomically, because any thread may add and remove acts
-        self._before: dict[signal.Signals, Any] = {}  # the handlers before ours
+        self._before: dict[signal.Signals, Any] = {}  # the program's handlers before ours
         self._has_taken = False
         self._held: int | None = None  # the first signal, while its effect is delayed
         self._came: list[float] = []  # times of recent signals

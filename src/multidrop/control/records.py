@@ -66,8 +66,8 @@ class WriteRecords:
     def count(self, drive: Drive, register: Register[Any], kept: Kept) -> None:
         """Count a write in the ledger before it is sent. Raises WriteForbidden if the budget is used up.
 
-        For a register in EEPROM, also raises it if the last write was less than LEAST_INTERVAL seconds ago,
-        unless within `commissioning`.
+        For a register in EEPROM, also raises WriteForbidden if the last write was less than LEAST_INTERVAL
+        seconds ago, unless within `commissioning`.
         """
         least = LEAST_INTERVAL if kept is Kept.EEPROM and not _commissioning.get() else 0.0
         ledger = self._ledger.at(self._line.identity)

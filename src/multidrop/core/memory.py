@@ -60,7 +60,7 @@ _chunks = Chunks()
 def new_beside(kind: str, fields: dict[str, Any]) -> tuple[Any, Any]:
     """Return a pointer to a new struct, placed after the previous one, and the object that owns its memory.
 
-    Keep a reference to the owner: the struct exists only as long.
+    Keep a reference to the owner: without it, the struct's memory is freed.
     """
     made, owner = _chunks.take(kind)
     made[0] = fields

@@ -112,11 +112,11 @@ class _BoundVerb(Generic[P, R]):
 
 
 class _BoundMove(_BoundVerb[P, R]):
-    """A verb that may move the motor. A stop that is called after the start of the call cancels it."""
+    """A verb that may move the motor. A stop that is called after the start of the call cancels the call."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        # Read the count first, without calling a Python function. Then a signal handler that stops the drive
-        # either runs before this call, or cancels it.
+        # Read the number of stops first, without calling a Python function. Then a signal handler that stops
+        # the drive either runs before this line, or cancels the call.
         seen = self.drive.stops_called[0]
         script = self.script(*args, **kwargs)
         self.drive.check_confirmed(self.name)
