@@ -51,7 +51,7 @@ void md_file_watch(int fd, int is_watched);
 void md_file_remove(int fd);
 /* Fill `owners` with the owners of watched files that can be read; return their number. */
 int md_files_ready(void **owners, int room);
-int md_file_is_writing(int fd); /* the last request has not left yet */
+int md_file_is_writing(int fd); /* 1: the last request has not left yet */
 
 int md_errno_of(DWORD error); /* `error` is from GetLastError() or WSAGetLastError() */
 

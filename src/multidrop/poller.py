@@ -210,7 +210,7 @@ class Poller(RowSource):
             log_aside(_log, logging.CRITICAL, "%s\n%s", self.failure, traceback_of(failure))
 
     def _poll(self) -> None:
-        """Tend the lines until the poller is closed.
+        """Queue exchanges and handle lost ports of all lines until the poller is closed.
 
         A failure is raised only after MOST_FAILURES in a row, because memory may be short for a moment.
         """
@@ -226,7 +226,7 @@ class Poller(RowSource):
                 clock.sleep(FAILED_NS / 1e9)
 
     def _tend_lines(self) -> None:
-        """Wait until the core calls for lines or a check is due, and tend those lines."""
+        """Wait until the core calls for lines or a check is due, and call `tend` of those lines."""
         seconds = max(0, self._look_ns - clock.now_ns()) / 1e9
         called = self._lines.called(self._row_queue.await_calls(seconds))
         now = clock.now_ns()
@@ -291,8 +291,8 @@ class Poller(RowSource):
     def add_line(self, line: PlantLine) -> None:
         """Open one more line and poll it from now on.
 
-        Raises LineError if its port cannot be opened, and ValueError if the plant with it would be wrong;
-        then the poller is unchanged.
+        Raises LineError if its port cannot be opened, and ValueError if the plant would be invalid with this
+        line; then the poller is unchanged.
         """
         self._take_signals()
         self._add_line(line)

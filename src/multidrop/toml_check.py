@@ -19,7 +19,7 @@ MOST_PARTS = 100  # limit of parts in a dotted key
 
 
 def read_document(path: Path, what: str) -> dict[str, Any]:
-    """Return the tables of a TOML file. Raises ValueError, without the path, if it cannot be read.
+    """Return the tables of a TOML file. Raises ValueError, whose text lacks the path, if it cannot be read.
 
     A byte order mark before the text is skipped, because some editors write one. A device is refused: reading
     a serial port would block forever, and would take bytes from its drives.
@@ -34,7 +34,7 @@ def read_document(path: Path, what: str) -> dict[str, Any]:
 
 
 def read_bounded(path: Path, most: int, what: str) -> bytes:
-    """Return a file's bytes. Raises ValueError, without the path, if it has over `most` or cannot be read."""
+    """Return a file's bytes, at most `most`. Raises ValueError, whose text lacks the path, if that fails."""
     try:
         with path.open("rb") as file:
             data = file.read(most + 1)

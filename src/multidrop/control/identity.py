@@ -195,7 +195,7 @@ class IdentityCheck:
     # ---- before a stop ----
 
     def check_before_stop(self, drive: Drive, register: Register[Any], count: float) -> None:
-        """Check once per open port, without waits. Raises WriteForbidden only on proof of another make.
+        """Check the family once per open port, without waits. Raises WriteForbidden on proof of another make.
 
         Raises CheckAgain after the first suspicion: call this again after the stops of other drives.
 

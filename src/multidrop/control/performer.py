@@ -131,7 +131,7 @@ class Performer:
     def watchdog(self, drive: Drive) -> str:
         """Return a sentence on what the motor does if this client dies.
 
-        It uses the drive's `communication_timeout` if that can be read, else the family's text.
+        The sentence has the drive's `communication_timeout` if that can be read, else the family's text.
         """
         register = drive.registers.get("communication_timeout")
         if register is None or not register.readable:
@@ -190,8 +190,8 @@ class Performer:
 def _check(step: Step, call: Call, cancelled: list[CancelledByStop]) -> None:
     """Raise CancelledByStop in the script if a stop was called, and _Over if the script continues anyway.
 
-    A verb's script ends at any step, another script at its next write. An `Insist` step is always carried
-    out, because it is harmless and undoes an earlier write.
+    After a stop, a verb's script ends at any step, and any other script at its next write. An `Insist` step is
+    always carried out, because it is harmless and undoes an earlier write.
     """
     if isinstance(step, Insist) or not (call.verb or isinstance(step, Write)) or call.permit.is_good:
         return

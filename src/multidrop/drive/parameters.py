@@ -92,9 +92,9 @@ def _matches(code: str, patterns: tuple[str, ...]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Parameter(Register[Any]):
-    """A parameter as a register of its family: declared, or only known by the rule.
+    """A parameter as a register of its family: declared, or known only by the family's address rule.
 
-    It is always written to the memory that keeps it, even if its setting has a RAM address.
+    A parameter is always written to the memory that keeps it, even if the setting has a RAM address.
     """
 
     code: str = ""
@@ -103,7 +103,7 @@ class Parameter(Register[Any]):
     is_line: bool = False  # the drive's address, baud rate, format or protocol
 
     def changed(self, **facts: Any) -> Parameter:
-        """Return a copy with other facts."""
+        """Return a copy of the parameter with these facts changed."""
         own = {one.name: getattr(self, one.name) for one in fields(self) if one.init}
         copy = Parameter(**own | facts)
         copy.__set_name__(self.family, self.name)

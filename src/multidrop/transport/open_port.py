@@ -276,7 +276,7 @@ class OpenPort:
         return (None if is_same else port_identity.device_of(self._adapter)) or self.name
 
     def _terminal_now(self) -> PseudoTerminal | None:
-        """Return the pseudo-terminal to open. Raises LineError if a later one has got its number.
+        """Return the pseudo-terminal to open. Raises LineError if a later one has its number now.
 
         The later terminal may belong to any program, such as a shell, and opening it changes its settings.
         """

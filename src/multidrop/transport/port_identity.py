@@ -39,7 +39,7 @@ def adapter_of(device: str) -> USBAdapter | None:
     found = (TTYS / Path(device).name / "device").resolve()
     for part in (found, *found.parents):
         if interface := _INTERFACE.fullmatch(part.name):
-            number = f"{interface[1]}.{_text(found / 'port_number') or 0}"  # the adapter's port
+            number = f"{interface[1]}.{_text(found / 'port_number') or 0}"  # its port's number
             serial = _text(part.parent / "serial")
             return USBAdapter(f"{part.parent.name}:{number}", serial and f"{serial}:{number}")
     return None
