@@ -190,7 +190,7 @@ class Performer:
 def _check(step: Step, call: Call, cancelled: list[CancelledByStop]) -> None:
     """Raise CancelledByStop in the script if a stop was called, and _Over if the script continues anyway.
 
-    After a stop, a verb's script ends at any step, and any other script at its next write. An `Insist` step is
+    After a stop, a verb's script ends at any step, another script at its next write. An `Insist` step is
     always carried out, because it is harmless and undoes an earlier write.
     """
     if isinstance(step, Insist) or not (call.verb or isinstance(step, Write)) or call.permit.is_good:
