@@ -255,8 +255,8 @@ static void *run(void *argument)
         pthread_mutex_unlock(&engine->mutex);
         if (has_news) /* after unlocking: the waiting clients get the mutex immediately */
             pthread_cond_broadcast(&engine->changed);
-        /* Yield, otherwise this thread would always win the mutex. A realtime thread would only yield to other
-         * realtime threads; a thread that holds the mutex inherits its priority instead. */
+        /* Yield, otherwise this thread would always win the mutex. A realtime thread would only yield to
+         * other realtime threads; a client that holds the mutex inherits the thread's priority instead. */
         while (atomic_load(&engine->callers) && !engine->realtime.is_on)
             sched_yield();
         int n = wait_until(engine, ready, until_ns);

@@ -5,8 +5,8 @@
  * waits: the thread checks repeatedly. A UART reports that its last bit has left (TIOCSERGETLSR), and that
  * report decides.
  *
- * A USB adapter's report may be older than the request. Its driver's queue is empty once the adapter has the
- * bytes, which then still take their whole time on the wire. */
+ * A USB adapter's report may be older than the request. The driver's queue is empty once the adapter has the
+ * bytes, but then these bytes still take their whole time on the wire. */
 #define _GNU_SOURCE
 #include "engine.h"
 

@@ -164,7 +164,7 @@ class Staying:
         return all(leaving.get(polled.drive.name, self) is self for polled in self.drives.joining)
 
     def take_in(self) -> None:
-        """Start polling the new drives and registers.
+        """Start polling the joining drives, and the changed registers and rates of kept drives.
 
         Raises LineError if the port cannot have a drive's settings.
         """

@@ -82,7 +82,7 @@ class LineSet:
             raise ValueError(f"{name} is not polled here; {hint}")
         return line, known
 
-    # ---- coming ----
+    # ---- opening and adding lines ----
 
     def fill(self, declared: Sequence[PlantLine]) -> None:
         """Open and add all these lines, or none.
@@ -191,7 +191,7 @@ class LineSet:
         if self._audit:
             AuditLog(self._audit).close()
 
-    # ---- going ----
+    # ---- closing and removing lines ----
 
     @contextmanager
     def tended(self) -> Iterator[None]:

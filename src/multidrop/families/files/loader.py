@@ -50,7 +50,7 @@ MOST_CSV_FILES = 20
 
 @dataclass(frozen=True)
 class _Loaded:
-    """A loaded family, and the contents of its files, by which a change is detected."""
+    """A loaded family, and the contents of its files, to detect changes."""
 
     files: Mapping[Path, bytes]
     family: type[Drive]
@@ -214,7 +214,7 @@ def _inherited_errors(
 ) -> Iterator[str]:
     """Yield a sentence for each register that would be written at an address of an inherited register.
 
-    It would bypass what the inherited register forbids. `title` is that of the extended family.
+    Such a register would bypass what the inherited register forbids. `title` is that of the extended family.
     """
     owners = {place: one for one in inherited.values() for place in written_places(one)}
     for register in registers.values():
