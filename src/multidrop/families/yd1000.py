@@ -175,7 +175,7 @@ class YD1000(Drive):
       rest, as an emergency stop may be, only as a change in the fault record.
     - Registers marked "panel only" are never written, although section 8.1 writes 0007H to initialise.
       0800H to 0802H neither: they are the drive's end of the line. 0800H and 0801H take effect after a
-      reset or at the next power-on, 0802H and 0803H immediately (section 7).
+      reset or at the next power-on, 0802H and 0803H at once (section 7).
     - CNOD, FNOD, FR, F103, F104 and F110 to F115 belong to the command over the motor, and what AU3
       sets by itself is not stated: they are read and never written.
     - 0803H, the watchdog, is written only while the motor is at rest (the document does not require that): a
