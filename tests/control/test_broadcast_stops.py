@@ -63,7 +63,7 @@ def test_there_are_families_with_broadcasts() -> None:
 
 @every_broadcasting
 def test_stop_all_does_not_broadcast_if_families_differ(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
-    """The stop of one family may run the motor of the other, in whichever order they were attached."""
+    """The stop of one family may run a motor of the other family. Drives are attached in either order."""
     models = deque(MAKE)
     models.rotate(-models.index(model))
     line, drives, sims = line_of(monkeypatch, *models)

@@ -282,7 +282,7 @@ def test_a_thread_does_not_wait_for_its_own_interrupted_stop(monkeypatch: pytest
 def test_a_drive_attached_after_leave_cannot_be_moved(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The process is ending and could not stop the drive. The same applies to drives attached before."""
+    """The process is ending and could not stop the drive. Drives attached before cannot be moved either."""
     line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     line.bus.leave()
     line.bus.detach(drive)

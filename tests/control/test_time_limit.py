@@ -59,7 +59,7 @@ def test_a_call_within_its_time_limit_is_sent(line: SimulatedBus) -> None:
 
 @pytest.mark.parametrize("seconds", [0, 0.5, 0.9])
 def test_a_call_delayed_past_its_time_limit_raises_expired(line: SimulatedBus, seconds: float) -> None:
-    """Without the limit it would be sent, because the bus's own expiry is 1 s."""
+    """Without the limit the call would send its request, because the bus's own expiry is 1 s."""
     before = len(written(line))
     with within(line, seconds):
         line.sleep(0.45)
@@ -144,7 +144,7 @@ def test_a_stop_is_sent_after_the_time_limit(line: SimulatedBus) -> None:
 
 
 def test_a_stop_called_by_the_limit_function_cancels_the_call(line: SimulatedBus) -> None:
-    """So a `limit` that checks whether a stop was announced misses no stop."""
+    """A `limit` that checks for announced stops therefore misses no stop."""
     drive = line.bus.drives[0]
     before = len(written(line))
 

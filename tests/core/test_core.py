@@ -561,7 +561,7 @@ def test_a_permit_of_a_call_that_began_before_a_stop_is_invalid() -> None:
 
 
 def test_closing_a_port_reports_whether_each_pending_request_was_sent(drive: Drive) -> None:
-    """A request that was still waiting is never sent."""
+    """A request that was still waiting when its port was closed is never sent."""
     came = threading.Event()
 
     def answer(request: Message) -> bytes:

@@ -1,4 +1,4 @@
-"""Tasks and threads that a fleet's gateway needs: if one ends, that is logged, and the gateway shuts down.
+"""Tasks and threads that a fleet's gateway needs: if one ends, this is logged and the gateway shuts down.
 
 A failure on one line affects only that line.
 """

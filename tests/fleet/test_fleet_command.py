@@ -1,4 +1,4 @@
-"""`multidrop fleet`: each mistake is reported in one sentence; output about a fleet."""
+"""`multidrop fleet`: its output about a fleet, and one sentence for each mistake of the user."""
 
 from __future__ import annotations
 

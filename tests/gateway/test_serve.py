@@ -120,7 +120,7 @@ def test_sigterm_ends_it_while_viewers_wait(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_stop_does_not_wait_for_an_unread_log(tmp_path: Path) -> None:
-    """The log is unread if a user pressed Ctrl-S in the terminal, or if the journal hangs."""
+    """Nothing reads the log if a user pressed Ctrl-S in the terminal, or if the journal hangs."""
     with simulated_plant(tmp_path, '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\n') as path:
         unread, log = os.pipe()
         words = [*MULTIDROP, "serve", str(path)]

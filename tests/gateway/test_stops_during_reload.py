@@ -75,7 +75,7 @@ NEW_FAN = InvtCHE(2, name="fan")
 def test_new_drive_is_stopped_while_the_stop_of_its_predecessor_continues(
     names: list[str] | None,
 ) -> None:
-    """For example, the stop of a silent drive takes half a minute."""
+    """The predecessor's stop may take half a minute, for example if that drive is silent."""
     silent = asyncio.Event()
     lines = Lines(plant_of(PUMP, FAN), held={FAN.address: silent})
 

@@ -1,4 +1,4 @@
-"""The supervisor, and a gateway's permanent tasks and threads: if one ends, /health fails."""
+"""The supervisor, and a gateway's permanent tasks and threads: if a task or thread ends, /health fails."""
 
 from __future__ import annotations
 

@@ -104,7 +104,7 @@ def test_pandas_through_pyarrow_has_the_same_times() -> None:
 
 @pytest.mark.parametrize("library", ["pandas", "numpy"])
 def test_a_consumer_without_time_types_gets_advice(library: str) -> None:
-    """The constructors of pandas and NumPy ignore Arrow's interface and would read row by row."""
+    """The constructors of pandas and NumPy ignore Arrow's interface, and would read a batch row by row."""
     taker = pytest.importorskip(library, reason=f"needs {library}")
     take = taker.DataFrame if library == "pandas" else taker.asarray
     with pytest.raises(TypeError, match=r"use batch\.to_pandas\(\)"):

@@ -368,7 +368,7 @@ def test_a_tap_continues_after_the_port_is_reopened(tmp_path: Path) -> None:
 
 
 def test_a_bridged_port_keeps_its_settings_when_it_is_reopened() -> None:
-    """The port is pyserial's spy://. At another baud rate the drive would not answer."""
+    """The port is pyserial's spy://. At another baud rate than before, the drive would not answer."""
     with Simulator([Wire([simulated(Toy(1, baudrate=19200))], unpaced=True)]) as sim:
         path = sim.wires[0].path
         with Bus(f"spy://{path}", baudrate=19200) as bus:

@@ -178,7 +178,7 @@ class HeldUp:
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="this system does not say when a request was written")
 def test_a_request_that_waited_behind_a_blocked_request_is_never_sent() -> None:
-    """The request has expired, and may be a start."""
+    """The waiting request has expired, and may be a start."""
     port = HeldUp()
     bridge = Bridge(port)  # type: ignore[arg-type]
     os.write(bridge.theirs.fileno(), b"first")

@@ -483,7 +483,7 @@ async def test_ending_the_dead_does_not_wait_for_a_leaderless_path(has_rival: bo
 
 
 async def test_only_the_stale_revision_is_ended() -> None:
-    """A record that is renewed between the decision and its end is kept, even if it was read again."""
+    """A record that is renewed between the decision to end it and the write is kept, even if read again."""
     trial, lease, observer = await watched()
     trial.clock.pass_s(USUAL.lease / SECOND)
     await look(observer)

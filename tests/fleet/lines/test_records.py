@@ -1,4 +1,4 @@
-"""Records of the lines in a gateway's share: when they are read, and that no change is missed."""
+"""Records of the lines in a gateway's share: they are read when needed, and no change is missed."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ def test_servers_that_ignore_other_writers_records_are_refused(
 def test_an_unanswered_removal_is_checked_and_repeated(
     is_carried_out: bool, nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A busy leader may answer late when the contest's bucket is removed."""
+    """A busy leader may answer late when the bucket of the trial of writers is removed."""
     removals = []
 
     async def ask_in_vain(path: ServerPath, subject: str, data: Any = None) -> dict[str, Any]:

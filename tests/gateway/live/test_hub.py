@@ -1,4 +1,4 @@
-"""The hub: newest rows and drives' states, from rows of the core. Alarms from these states."""
+"""The hub: newest rows and drives' states, computed from the core's rows; alarms from these states."""
 
 from __future__ import annotations
 
