@@ -25,7 +25,7 @@ BOTH = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 
 
 class Act:
-    """A last act that takes as long as the test wants."""
+    """Work to be done at the process's end, which takes as long as the test wants."""
 
     def __init__(self) -> None:
         self.is_begun = False

@@ -544,7 +544,7 @@ def test_writes_allowed_only_at_rest_are_refused_if_the_state_is_unreadable(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     class Mute(Drive):
-        """A family without a state."""
+        """A family without the verb `state`."""
 
         speed = reading(1, "rpm")
         ratio = setting(2, kept=Kept.RAM, while_running=False)

@@ -178,7 +178,7 @@ def test_no_call_moves_a_motor_after_the_bus_is_closed(monkeypatch: pytest.Monke
 def test_the_stop_of_a_silent_drive_leaves_others_more_than_half_of_the_line(
     monkeypatch: pytest.MonkeyPatch, model: str, seconds: float | None
 ) -> None:
-    """Only the first frames of the stop are not delayed. The total time of the stop stays the same."""
+    """Only the first frames of the stop are sent without delay. The total time of the stop stays the same."""
     line, drive, _ = one(monkeypatch, MAKE[model](1))
     line.bus.check_identity(drive)
     sent: list[float] = []

@@ -913,7 +913,7 @@ def test_memory_does_not_grow_over_many_exchanges(drive: Drive, exchanges: int) 
     asked.c.silence_ns = 1000
 
     def resident_after(exchanges: int) -> int:
-        """Return the resident memory in bytes after so many exchanges."""
+        """Return the resident memory in bytes after this number of exchanges."""
         while exchanges > 0:
             time.sleep(0.01)
             while columns := row_queue.take():

@@ -214,7 +214,7 @@ def test_an_echo_does_not_count_as_the_start_of_a_reply(line: LineDriver, drive:
 def test_the_wait_includes_the_replys_length_if_the_adapter_delivers_whole_replies(
     line: LineDriver, drive: Peer, asked: Message
 ) -> None:
-    """No byte of a reply is visible before its end."""
+    """Such an adapter delivers no byte before the end of the reply."""
     for _ in range(20):
         gathered(line, drive, asked)
     assert given_up(line, drive, LONG) >= LEAST + 205 * CHARACTER
@@ -292,7 +292,7 @@ def test_a_row_with_a_value_in_doubt_has_the_time_of_the_earlier_request(
 def test_a_read_is_repeated_after_a_doubtful_reply_and_a_write_is_not(
     drive: Peer, asked: Message, times: int
 ) -> None:
-    """The doubtful reply may be to an earlier request. A write may have started a motor."""
+    """A doubtful reply may be to an earlier request. A write is not repeated: it may have started a motor."""
     slots, turn = ffi.new("struct md_slot[]", 1), ffi.new("struct md_turn *")
     wake, found = ffi.new("int64_t *"), ffi.new("struct md_completion *")
     made = exchange(asked, drive)

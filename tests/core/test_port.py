@@ -69,7 +69,7 @@ def test_the_same_settings_can_be_set_repeatedly(pty: int, format: str) -> None:
 
 
 def test_a_port_is_set_to_raw_mode(pty: int) -> None:
-    """No echo, no line editing, no flow control, no signals."""
+    """In raw mode there is no echo, no line editing, no flow control, and no signals."""
     set_settings(pty, 9600, "8N1")
     iflag, oflag, cflag, lflag, *_ = termios.tcgetattr(pty)
     assert (iflag, oflag, lflag) == (0, 0, 0)

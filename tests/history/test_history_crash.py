@@ -89,7 +89,7 @@ def test_kills_of_recorder_and_compaction_lose_no_row(tmp_path: Path, kills: int
         time.sleep(0.1)
     assert not found.segments
     assert len(found.rows) > kills // 2
-    assert any(file.first < file.last for file in found.tens)  # the tens of a day were merged
+    assert any(file.first < file.last for file in found.tens)  # a day's ten-second summaries merged
     assert not [*tmp_path.rglob("*.part"), *(tmp_path / "damaged").iterdir()]
     with History(tmp_path) as history:
         assert check(history, written) == total

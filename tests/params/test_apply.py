@@ -302,7 +302,7 @@ def test_full_disk_ends_the_application_and_the_next_one_completes_it(
     monkeypatch: pytest.MonkeyPatch, room: int
 ) -> None:
     line, drive, _ = attached(monkeypatch, ErmanERG220(1), [])
-    monkeypatch.setattr(Ledger, "enter", lambda *given: "")  # its disk has room
+    monkeypatch.setattr(Ledger, "enter", lambda *given: "")  # the ledger's disk has room
     values = {"b.003": 150, "b.004": 160}
     with full_at(room):
         first = params.apply(drive, values)

@@ -713,7 +713,7 @@ def test_silent_new_drives_get_a_second_request_immediately_if_they_are_few() ->
         answer(made, living, 90)
         assert lost not in {asked for asked, _ in take(made, 100, 90)}
         assert {asked for asked, _ in take(made, 200, 20)} - {living} == again
-        assert lost not in {asked for asked, _ in take(made, 230, 20)}  # still pending itself
+        assert lost not in {asked for asked, _ in take(made, 230, 20)}  # this drive is still pending
 
 
 def test_when_a_silent_drive_answers_again_exactly_one_other_is_tried() -> None:

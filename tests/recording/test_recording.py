@@ -63,7 +63,7 @@ def test_rows_are_read_as_they_were_written(tmp_path: Path, suffix: str) -> None
     assert reader.metadata == METADATA
     assert reader.truncated == 0
     assert rows(reader) == RECORDED
-    assert rows(reader) == RECORDED  # and again
+    assert rows(reader) == RECORDED  # a second iteration gives the same rows
 
 
 @every_format

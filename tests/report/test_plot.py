@@ -25,7 +25,7 @@ from multidrop.recording import open_writer
 require_installed("matplotlib")
 
 PNG = b"\x89PNG\r\n\x1a\n"
-REQUEST_9600 = 9 * 10 / 9600  # 8 characters of the request and the first one of the reply
+REQUEST_9600 = 9 * 10 / 9600  # s: 8 characters of the request, and the first character of the reply
 
 
 @pytest.fixture(scope="module", autouse=True)

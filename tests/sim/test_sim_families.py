@@ -144,7 +144,7 @@ def test_erman_refuses_an_unknown_function_with_exception_01(erman: Bench) -> No
         bytes.fromhex("01 04 00 01 00 05 15 C9"),  # the printed checksum, which is wrong
         checksums.rtu("02 04 00 01 00 05"),  # request to another drive
         checksums.rtu("00 05 00 01 FF 00"),  # a broadcast
-        checksums.rtu("01 03 00 01 00"),  # of a wrong length
+        checksums.rtu("01 03 00 01 00"),  # a request of a wrong length
         checksums.rtu("01 10 00 0C 00 02 03 00 C8 01"),
     ],
 )
@@ -583,7 +583,7 @@ def test_native_fault_code_is_shown_in_the_printed_digits(
         (checksums.delixi("0102000900000000"), b":01F0000000000000F1\r\n"),  # no such command
         (checksums.delixi("0107270F00000000"), checksums.delixi("01FC000000000000")),  # no such parameter
         (b":010200020000000006\r\n", b":01FF00000000000000\r\n"),  # wrong checksum instead of 05
-        (b":0102000205\r\n", b""),  # of a wrong length
+        (b":0102000205\r\n", b""),  # a request of a wrong length
     ],
 )
 def test_native_invalid_requests_get_the_documented_error_replies(

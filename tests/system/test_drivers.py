@@ -11,7 +11,7 @@ pytestmark = pytest.mark.slow
 
 KINDS = ("ftdi", "cp210x", "ch341", "pl2303", "acm")
 USB = pytest.mark.parametrize("kind", KINDS)
-RIGHT = [0x210, 0x215]  # of device 2: see tools/kernel/far_end.py
+RIGHT = [0x210, 0x215]  # values of device 2: see tools/kernel/far_end.py
 SETTINGS = [(1200, "8N1"), (9600, "8E1"), (19200, "8O1"), (57600, "8E2"), (115200, "8N1"), (250000, "8N2")]
 
 

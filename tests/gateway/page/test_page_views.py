@@ -428,7 +428,7 @@ DOTS = """async values => {
 
 
 def test_value_between_two_gaps_is_drawn_as_a_dot(opened: Opener) -> None:
-    """Three values of a register that is read once a second, in a plot with ten points a second."""
+    """The plot has ten points a second. The register is read once a second, and has three values."""
     page = opened()
     nothing = [None] * 9
     assert page.evaluate(DOTS, [None, *nothing, None, *nothing, None]) == 0

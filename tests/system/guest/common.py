@@ -180,7 +180,7 @@ class Poll:
         return len(self.rows())
 
     def end(self) -> dict[str, Any]:
-        """End the poll by Ctrl-C; return its exit status and output, and its rows in short.
+        """End the poll by Ctrl-C; return its exit status and output, and a summary of its rows.
 
         `statuses` has the statuses of each line in their order, `wrong` the values that are not the drive's.
         """

@@ -1,4 +1,4 @@
-"""Stalled adapters: they take no bytes, and the driver keeps these."""
+"""Stalled adapters: they accept no bytes, so the driver keeps the bytes to send."""
 
 from __future__ import annotations
 

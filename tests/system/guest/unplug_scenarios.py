@@ -31,7 +31,7 @@ def _encoded(kind: str, serial: str, addresses: list[int], **options: Any) -> pl
 
 
 def poll_through_unplug(kinds: list[str], names: str) -> dict[str, Any]:
-    """Poll one line for each kind; unplug all adapters at once and plug them in again.
+    """Poll one line for each kind; unplug all adapters together, and plug them in again.
 
     `names` is how the plant names its ports: "path", "by_id" or "by_path".
     """
@@ -159,7 +159,7 @@ def reset_in_start(kind: str, rounds: int) -> list[dict[str, Any]]:
             resetting.start()
             result = str(attempt(pump.start))
             resetting.join()
-            time.sleep(1.0)  # a frame that were repeated would come in this time
+            time.sleep(1.0)  # a repeated frame would come during this time
             sent = adapter.state["requests"][count:]
             plug.settle()
             stopped = str(attempt(pump.stop, seconds=20))
@@ -184,7 +184,7 @@ def damaged_replies(format: str, kinds: list[str]) -> dict[str, Any]:
 
 
 def damaged_poll(kind: str, count: int) -> dict[str, Any]:
-    """Poll while some replies are damaged; return the rows in short, and how many have each status."""
+    """Poll while some replies are damaged; return a summary of the rows, and counts by status."""
     adapter = _encoded("ftdi", "noisy", [1, 2])
     poll = Poll({"a": (adapter.path, [1, 2])})
     poll.wait_for("ok", "a")
