@@ -47,9 +47,7 @@ def test_each_byte_is_delivered_at_its_last_bit_or_slightly_later(baudrate: int)
         passed += len(piece)
         ends = begin + passed * character
         assert at == pytest.approx(ends)  # the last byte of the piece is on time
-        assert (
-            at - (ends - (len(piece) - 1) * character) <= max(1e-3, character) + 1e-9
-        )  # so is the first byte
+        assert at - (ends - (len(piece) - 1) * character) <= max(1e-3, character) + 1e-9  # and the first one
     assert passed == 9
 
 

@@ -198,7 +198,7 @@ def test_files_are_synced_before_they_are_renamed(folder: Path, monkeypatch: pyt
 @pytest.mark.slow
 @pytest.mark.parametrize(("kills", "longest_s"), usually((2, 0.1), (12, 0.6)))
 def test_kills_at_any_moment_lose_no_reported_row(folder: Path, kills: int, longest_s: float) -> None:
-    """The runs number their exchanges differently. All reported rows are stored once, in order, without gaps."""
+    """The numbers of exchanges show their run. All reported rows are stored once, in order, without gaps."""
     dice = random.Random(kills)
     support = os.pathsep.join(map(str, Path(spooled.__file__).parents[1].iterdir()))
     told = []
