@@ -45,7 +45,8 @@ static int change_own(struct dl_phdr_info *object, size_t size, void *argument)
                                                  segments[i].p_memsz;
     for (int i = 0; is_own && i < object->dlpi_phnum; i++)
         if (is_loaded(&segments[i]))
-            (*change)((const void *)(uintptr_t)(object->dlpi_addr + segments[i].p_vaddr), segments[i].p_memsz);
+            (*change)((const void *)(uintptr_t)(object->dlpi_addr + segments[i].p_vaddr),
+                      segments[i].p_memsz);
     return is_own;
 }
 

@@ -1,5 +1,5 @@
-/* Realtime scheduling returns to normal if a thread uses too much of a processor, and a thread that hangs ends
- * the process. */
+/* Realtime scheduling returns to normal if a thread uses too much of a processor, and a thread that hangs
+ * ends the process. */
 #include "realtime.c"
 
 #include <assert.h>

@@ -77,6 +77,7 @@ FIRING = {  # by alert: series and their values each minute, which make it fire 
     "MultidropLineLost": {f'multidrop_line_up{{{GATEWAY}, line="hall"}}': "0x20"},
     "MultidropDriveFault": {f'multidrop_alarm_active{{{PUMP}, kind="fault"}}': "1x20"},
     "MultidropMotorStopped": {f'multidrop_alarm_active{{{PUMP}, kind="stopped"}}': "1x20"},
+    "MultidropLimit": {f'multidrop_alarm_active{{{PUMP}, kind="limit"}}': "1x20"},
     "MultidropDriveSilent": {f'multidrop_alarm_active{{{PUMP}, kind="silent"}}': "1x20"},
     "MultidropValuesOld": {f'multidrop_register_age_seconds{{{PUMP}, register="load"}}': "0+60x20"},
     "MultidropMisses": {

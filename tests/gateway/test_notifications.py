@@ -17,15 +17,15 @@ from gateways import served
 from lines import until
 from tables import table
 
-from multidrop.gateway.live.alarms import FAULT, SILENT, Alarm, Alarms
+from multidrop.gateway.live.alarms import FAULT, PORT, Alarm, Alarms, Change
 from multidrop.gateway.live.hub import RUNS, Shown
 from multidrop.gateway.notifications import (
     MOST_RETRY_S,
     MOST_WAITING,
+    AlarmQueue,
+    AlarmTarget,
     Notifications,
-    Outbox,
     Sender,
-    Target,
     message_of,
     read_targets,
     sender_to,
@@ -40,10 +40,15 @@ def over(alarm: Alarm, ended: int = 2_000) -> Alarm:
 
 
 def flaps(number: int) -> list[Alarm]:
-    """Return the events of an alarm that begins and ends `number` times."""
+    """Return an alarm that begins and ends this many times."""
     return [
         one for at in range(number) for one in (BEGUN._replace(time=at), over(BEGUN._replace(time=at), at))
     ]
+
+
+def note(part: Notifications, alarm: Alarm) -> None:
+    """Tell the part that an alarm began or ended."""
+    part.note_alarm(alarm, Change.BEGAN if alarm.ended is None else Change.ENDED)
 
 
 def described(alarm: Alarm, left_out: int) -> dict[str, Any]:
@@ -57,7 +62,7 @@ class Clocked:
         self.now_s = 0.0
         self.failure: Exception | None = None
         self.messages: list[dict[str, Any]] = []
-        self.sender = Sender("target", self._send, Outbox(most, 0.0), described, lambda: self.now_s)
+        self.sender = Sender("target", self._send, AlarmQueue(most, 0.0), described, lambda: self.now_s)
 
     def _send(self, message: dict[str, Any]) -> None:
         if self.failure:
@@ -78,8 +83,8 @@ def test_thousand_flaps_are_sent_as_one_message_for_each_begin_and_end() -> None
     target, alarms = Clocked(), flaps(1000)
     part = Notifications([target.sender], [FAULT])
     for alarm in alarms:
-        part.note_alarm(alarm)
-        target.now_s += 2  # within the limit of 3600 messages an hour
+        note(part, alarm)
+        target.now_s += 2  # within the limit of 3600 an hour
         target.send_all()
     assert [(one["event"], one["id"]) for one in target.messages] == [
         ("begin" if alarm.ended is None else "end", alarm.id) for alarm in alarms
@@ -88,20 +93,25 @@ def test_thousand_flaps_are_sent_as_one_message_for_each_begin_and_end() -> None
 
 def test_acknowledgements_new_texts_and_other_kinds_are_not_sent() -> None:
     target = Clocked()
-    part = Notifications([target.sender], [FAULT])
-    better, seen = BEGUN._replace(text="overcurrent at start"), BEGUN._replace(acknowledged=1_500, by="anna")
-    for alarm in (BEGUN, better, seen, BEGUN._replace(kind=SILENT), over(seen)):
-        part.note_alarm(alarm)
+    alarms = Alarms(note=Notifications([target.sender], [PORT]).note_alarm)
+    alarms.look(1_000, "pump", Shown(FAULT, "overcurrent"))
+    alarms.look_at_line(1_000, "hall", "the port is lost")
+    alarms.look_at_line(1_100, "hall", "there is no such port")
+    [alarm] = [one for one in alarms.lasting if one.kind == PORT]
+    alarms.acknowledge(alarm.id, 1_200, "anna")
+    alarms.look_at_line(1_300, "hall", None)
+    alarms.acknowledge(alarm.id, 1_400, "anna")
     target.send_all()
-    assert [one["event"] for one in target.messages] == ["begin", "end"]
+    assert [(one["event"], one["line"]) for one in target.messages] == [("begin", "hall"), ("end", "hall")]
 
 
 def test_restart_repeats_no_message() -> None:
     target = Clocked()
-    part = Notifications([target.sender], [FAULT])
-    alarms = Alarms(note=part.note_alarm)
-    alarms.restore([BEGUN], 1_500, ["pump"])
+    alarms = Alarms(note=Notifications([target.sender], [FAULT, PORT]).note_alarm)
+    lost = Alarm(1_000, "", "the port is lost", None, PORT, "hall")
+    alarms.restore([BEGUN, lost], 1_500, ["pump", "hall"])
     alarms.look(1_600, "pump", Shown(FAULT, BEGUN.text))
+    alarms.look_at_line(1_600, "hall", "there is no such port")
     assert target.send_all() == inf
     alarms.look(2_000, "pump", Shown(RUNS, ""))
     target.send_all()
@@ -125,10 +135,10 @@ def test_beyond_the_hourly_limit_the_newest_message_is_sent_when_allowed() -> No
 
 
 def test_waiting_messages_are_bounded() -> None:
-    outbox = Outbox(60, 0.0)
+    queue = AlarmQueue(60, 0.0)
     for number in range(3 * MOST_WAITING):
-        outbox.put(BEGUN._replace(drive=f"pump-{number}"))
-    assert (len(outbox), outbox.left_out) == (MOST_WAITING, 2 * MOST_WAITING)
+        queue.put(BEGUN._replace(drive=f"pump-{number}"))
+    assert (len(queue), queue.left_out) == (MOST_WAITING, 2 * MOST_WAITING)
 
 
 def test_failed_message_is_sent_again_after_growing_pauses() -> None:
@@ -143,15 +153,38 @@ def test_failed_message_is_sent_again_after_growing_pauses() -> None:
     assert (len(target.messages), target.sender.trouble) == (1, "")
 
 
+def test_message_that_a_target_refuses_for_good_does_not_block_later_ones() -> None:
+    target = Clocked()
+    target.sender.put(BEGUN)
+    target.failure = ValueError("no JSON")
+    target.send_all()
+    target.sender.put(over(BEGUN))
+    target.failure = None
+    target.send_all()
+    assert [one["text"] for one in target.messages] == [
+        "pump: fault is over: overcurrent (1 earlier messages were left out)"
+    ]
+
+
+def test_message_put_right_before_the_end_is_sent() -> None:
+    target = Clocked()
+    thread = threading.Thread(target=target.sender.run)
+    thread.start()
+    target.sender.put(BEGUN)
+    target.sender.close()
+    thread.join()
+    assert len(target.messages) == 1
+
+
 def test_target_that_hangs_delays_no_other_target() -> None:
     hang, other = threading.Event(), Clocked()
-    hanging = Sender("hanging", lambda message: hang.wait() and None, Outbox(60, 0.0), described)
+    hanging = Sender("hanging", lambda message: hang.wait() and None, AlarmQueue(60, 0.0), described)
     threads = [threading.Thread(target=one.run, daemon=True) for one in (hanging, other.sender)]
     for thread in threads:
         thread.start()
     part = Notifications([hanging, other.sender], [FAULT])
     for alarm in flaps(500):
-        part.note_alarm(alarm)
+        note(part, alarm)
     until(lambda: len(other.messages) == 1000)
     assert hanging.sent == 0
     hang.set()
@@ -191,7 +224,7 @@ def webhook() -> Iterator[SimpleNamespace]:
 
 @pytest.mark.parametrize("status", [302, 404, 500])
 def test_webhook_gets_json_and_its_refusal_is_an_error(webhook: SimpleNamespace, status: int) -> None:
-    send = sender_to(Target("target", webhook.url))
+    send = sender_to(AlarmTarget("target", webhook.url))
     send(described(BEGUN, 0))
     webhook.status = status
     with pytest.raises(OSError, match=str(status)):
@@ -249,10 +282,10 @@ def test_missing_apprise_is_one_sentence(tmp_path: Path, monkeypatch: pytest.Mon
         build("notify", settings, context)
 
 
-@pytest.mark.filterwarnings("ignore:.*imghdr:DeprecationWarning")  # Apprise imports imghdr
+@pytest.mark.filterwarnings("ignore:.*imghdr:DeprecationWarning")  # which Apprise imports
 def test_apprise_sends_title_and_text(webhook: SimpleNamespace) -> None:
     pytest.importorskip("apprise")
-    send = sender_to(Target("target", webhook.url.replace("http://", "json://")))
+    send = sender_to(AlarmTarget("target", webhook.url.replace("http://", "json://")))
     send(described(BEGUN, 0))
     [posted] = webhook.posted
     assert (posted["title"], posted["message"]) == ("plant: pump", "pump: fault: overcurrent")

@@ -41,6 +41,7 @@ TOUCHING_THE_SYSTEM = {"transport", "recording", "history", "sim", "gateway", "f
 FILES_TOUCHING_THE_SYSTEM = {
     "supervisor.py",
     "core/fork.py",
+    "core/port.py",
     "control/eeprom_ledger.py",
     "control/audit_log.py",
     "control/exit_hook.py",
@@ -50,6 +51,7 @@ FILES_TOUCHING_THE_SYSTEM = {
     "gateway/http/connections.py",
     "gateway/gateway.py",
     "gateway/mqtt/part.py",
+    "gateway/notifications.py",
     "gateway/sd_notify.py",
     "gateway/live/views.py",
 }

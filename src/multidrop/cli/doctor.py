@@ -177,7 +177,8 @@ def _add_wake_findings(found: list[tuple[_Target, list[Finding]]]) -> None:
     except OSError as failure:
         best = why_not_realtime(failure)
     for target, findings in found:
-        if not speaks_tcp(target.port):
+        is_open = not any(one.topic == "port" and one.is_failure for one in findings)
+        if is_open and not speaks_tcp(target.port):
             is_realtime = target.is_realtime
             findings.append(wake_finding(usual, best, target.settings, target.rs485, is_realtime=is_realtime))
 

@@ -92,7 +92,8 @@ def families_of(gateway: Gateway) -> Iterator[MetricFamily]:
     for feed in gateway.feeds.values():
         with suppress(Exception):  # a failing part hides only its own figures
             yield from getattr(feed, "figures", list)()
-    yield from process_families()
+    with suppress(OSError):  # no /proc, or no file descriptor left
+        yield from process_families()
 
 
 def plant_families(hub: Hub, statistics: Mapping[str, LineStatistics]) -> Iterator[MetricFamily]:

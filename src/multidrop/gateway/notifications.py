@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import os
 import re
 import threading
 import time
@@ -25,9 +26,10 @@ from urllib.parse import urlsplit
 
 from multidrop import Batch, Plant
 from multidrop.exposition import MetricFamily
-from multidrop.gateway.live.alarms import KINDS, Alarm
+from multidrop.gateway.live.alarms import KINDS, Alarm, Change
 from multidrop.gateway.metrics import counter
 from multidrop.gateway.parts import PartContext
+from multidrop.gateway.settings import Folders
 from multidrop.printable import printable
 from multidrop.supervisor import supervisor
 
@@ -35,15 +37,16 @@ MOST_TARGETS = 20
 MOST_BYTES = 65_536  # limit of the file of targets
 MOST_WAITING = 1000  # alarms that wait for a target
 MOST_AN_HOUR = 1000
-SEND_S = 20.0  # time limit of one attempt at a webhook
+SEND_S = 20.0  # how long a webhook may be silent during an attempt
 RETRY_S, MOST_RETRY_S = 5.0, 300.0  # pause after the first failed attempt, and the longest pause
 CLOSE_S = 2.0
+REFUSED = (400, 413, 422)  # statuses with which a webhook refuses a message for good
 SCHEME = re.compile(r"[a-z][a-z0-9+.-]*")
 
 _log = logging.getLogger("multidrop.gateway.notify")
 
 
-class Target(NamedTuple):
+class AlarmTarget(NamedTuple):
     """Where messages go; `name` shows no secret."""
 
     name: str
@@ -75,7 +78,7 @@ class NotifySettings:
 
     def check(self, plant: Plant) -> list[str]:
         """Return a sentence for each mistake in the file of targets."""
-        path = plant.path.parent / self.targets
+        path = _path_of(self.targets, plant)
         try:
             return read_targets(path)[1]
         except OSError as failure:
@@ -85,7 +88,12 @@ class NotifySettings:
 Settings = NotifySettings
 
 
-def read_targets(path: Path) -> tuple[list[Target], list[str]]:
+def _path_of(targets: str, plant: Plant) -> Path:
+    """Return the file of targets: among the service's credentials, else beside the plant file."""
+    return Folders(plant.path, os.environ).find(targets)
+
+
+def read_targets(path: Path) -> tuple[list[AlarmTarget], list[str]]:
     """Return the targets in a file, and a sentence for each mistake. Raises OSError."""
     with path.open("rb") as file:
         text = file.read(MOST_BYTES).decode("utf-8", "replace")
@@ -95,7 +103,7 @@ def read_targets(path: Path) -> tuple[list[Target], list[str]]:
         if not url or url.startswith("#"):
             continue
         try:
-            found.append(Target(f"target {_shown(url)} in line {number} of {path.name}", url))
+            found.append(AlarmTarget(f"target {_shown(url)} in line {number} of {path.name}", url))
         except ValueError as mistake:
             wrong.append(f"{path}:{number}: {mistake}")
     if not found and not wrong:
@@ -118,17 +126,18 @@ def _shown(url: str) -> str:
         host = user = None
     if not host or user is not None:
         raise ValueError(
-            "a webhook is https://HOST/PATH without a user; with one, write Apprise's json://USER:PASSWORD@HOST/PATH"
+            "a webhook is https://HOST/PATH without a user; with a user, write an address of Apprise, "
+            "json://USER:PASSWORD@HOST/PATH"
         )
     return f"{scheme}://{host}"
 
 
 def build(settings: NotifySettings, context: PartContext) -> Notifications:
     """Return the part. Raises ImportError if a target needs Apprise and it is not installed, and OSError."""
-    targets, _ = read_targets(context.plant.path.parent / settings.targets)
+    targets, _ = read_targets(_path_of(settings.targets, context.plant))
     describe = partial(message_of, context.plant.path.stem, context.page)
     senders = [
-        Sender(target.name, sender_to(target), Outbox(settings.most, time.monotonic()), describe)
+        Sender(target.name, sender_to(target), AlarmQueue(settings.most, time.monotonic()), describe)
         for target in targets
     ]
     return Notifications(senders, settings.on)
@@ -164,7 +173,7 @@ def _iso(time_ms: int) -> str:
     return datetime.fromtimestamp(time_ms / 1000, UTC).isoformat(timespec="milliseconds")
 
 
-class Outbox:
+class AlarmQueue:
     """Alarms that wait for one target, oldest first, and how many messages it may still get.
 
     `most` messages an hour are allowed. If more alarms begin and end, the target gets the newest message of
@@ -208,6 +217,11 @@ class Outbox:
         self._allowed -= 1
         self.left_out = 0
 
+    def drop(self, alarm: Alarm) -> None:
+        """Remove an alarm that `next` returned, and that the target refuses for good."""
+        self._waiting = [one for one in self._waiting if one is not alarm]
+        self.left_out += 1
+
     def _keep_newest(self) -> None:
         newest = {(alarm.line, alarm.drive, alarm.kind): alarm for alarm in self._waiting}
         self.left_out += len(self._waiting) - len(newest)
@@ -228,7 +242,7 @@ class _NoRedirects(urllib.request.HTTPRedirectHandler):
         return None
 
 
-def sender_to(target: Target) -> Callable[[dict[str, Any]], None]:
+def sender_to(target: AlarmTarget) -> Callable[[dict[str, Any]], None]:
     """Return a function that sends a message to this target, and raises OSError if it was not taken."""
     if target.is_webhook:
         return partial(_post, urllib.request.build_opener(_NoRedirects), target.url)
@@ -241,7 +255,7 @@ def sender_to(target: Target) -> Callable[[dict[str, Any]], None]:
 
 
 def _post(opener: urllib.request.OpenerDirector, url: str, message: dict[str, Any]) -> None:
-    body = json.dumps(message, ensure_ascii=False).encode()
+    body = json.dumps(message).encode()
     headers = {"content-type": "application/json", "user-agent": "multidrop"}
     with opener.open(urllib.request.Request(url, body, headers), timeout=SEND_S):
         pass  # the opener raises HTTPError, an OSError, unless the status is 2xx
@@ -259,7 +273,7 @@ class Sender:
         self,
         name: str,
         send: Callable[[dict[str, Any]], None],
-        outbox: Outbox,
+        queue: AlarmQueue,
         describe: Callable[[Alarm, int], dict[str, Any]],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -267,17 +281,25 @@ class Sender:
         self.trouble = ""  # why the target does not take messages now
         self.sent = 0
         self._send = send
-        self._outbox = outbox
+        self._queue = queue
         self._describe = describe
         self._clock = clock
         self._retry_s = RETRY_S
+        self._sending_since_s = inf
         self._changed = threading.Condition()
         self._is_closed = False
+
+    @property
+    def problem(self) -> str:
+        """Why the target takes no messages now; "" if it does."""
+        if self._clock() - self._sending_since_s > 2 * SEND_S:
+            return f"{self.name} has not answered for {2 * SEND_S:g} s"
+        return self.trouble
 
     def put(self, alarm: Alarm) -> None:
         """Queue a message for an alarm that began or ended."""
         with self._changed:
-            self._outbox.put(alarm)
+            self._queue.put(alarm)
             self._changed.notify()
 
     def close(self) -> None:
@@ -292,29 +314,35 @@ class Sender:
             pause_s = self.step()
             with self._changed:
                 if pause_s == inf:
-                    self._changed.wait_for(lambda: self._is_closed or len(self._outbox))
+                    self._changed.wait_for(lambda: self._is_closed or len(self._queue))
                 elif pause_s > 0:
                     self._changed.wait_for(lambda: self._is_closed, pause_s)
-                if self._is_closed and (pause_s > 0 or not len(self._outbox)):
+                if self._is_closed and (0 < pause_s < inf or not len(self._queue)):
                     return
 
     def step(self) -> float:
         """Send the next message, and return the seconds until the next attempt (inf: until `put`)."""
         with self._changed:
-            alarm, wait_s = self._outbox.next(self._clock())
-            left_out = self._outbox.left_out
+            alarm, wait_s = self._queue.next(self._clock())
+            left_out = self._queue.left_out
         if alarm is None:
             return wait_s
+        self._sending_since_s = self._clock()
         try:
             self._send(self._describe(alarm, left_out))
         except Exception as failure:  # the library of any service may raise anything
             self._note_failure(failure)
+            if isinstance(failure, ValueError) or getattr(failure, "code", 0) in REFUSED:
+                with self._changed:
+                    self._queue.drop(alarm)  # otherwise it would block all later messages
             pause_s, self._retry_s = self._retry_s, min(2 * self._retry_s, MOST_RETRY_S)
             return pause_s
+        finally:
+            self._sending_since_s = inf
         self.trouble, self._retry_s = "", RETRY_S
         self.sent += 1
         with self._changed:
-            self._outbox.note_sent(alarm)
+            self._queue.note_sent(alarm)
         return 0.0
 
     def _note_failure(self, failure: Exception) -> None:
@@ -332,24 +360,15 @@ class Notifications:
         self._senders = senders
         self._kinds = kinds
         self._threads: list[asyncio.Future[None]] = []
-        self._begun: dict[tuple[str, str, str], str] = {}  # ids of active alarms by line, drive and kind
 
     def take(self, batch: Batch) -> None:
         """Ignore the batch: alarms arrive by `note_alarm`."""
 
-    def note_alarm(self, alarm: Alarm) -> None:
+    def note_alarm(self, alarm: Alarm, change: Change) -> None:
         """Queue a message for an alarm that began or ended, but none for an acknowledgement or a new text."""
-        if alarm.kind not in self._kinds:
-            return
-        key = _key(alarm)
-        if alarm.ended is not None:
-            self._begun.pop(key, None)
-        elif alarm.acknowledged is not None or self._begun.get(key) == alarm.id:
-            return
-        else:
-            self._begun[key] = alarm.id
-        for sender in self._senders:
-            sender.put(alarm)
+        if alarm.kind in self._kinds and change is not Change.CHANGED:
+            for sender in self._senders:
+                sender.put(alarm)
 
     async def run(self) -> None:
         """Run the senders, each in its own thread, until cancelled."""
@@ -365,7 +384,7 @@ class Notifications:
 
     def health(self) -> str:
         """Return why messages are not sent; "" if they are."""
-        return next((one.trouble for one in self._senders if one.trouble), "")
+        return next((one.problem for one in self._senders if one.problem), "")
 
     def figures(self) -> list[MetricFamily]:
         """Return a metric: messages sent since the start."""

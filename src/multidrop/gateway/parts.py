@@ -56,8 +56,9 @@ class PartContext(NamedTuple):
 class Part(Protocol):
     """The methods of a part.
 
-    Four more methods are optional: `adopt(plant)` is called after a reload, `note_alarm(alarm)` when an alarm
-    starts, changes or ends; `health()` returns a problem or "", and `figures()` returns metric families.
+    Four more methods are optional: `adopt(plant)` is called after a reload, and `note_alarm(alarm, change)`
+    when an alarm starts, changes or ends. `health()` returns a problem or "",
+    and `figures()` metric families.
     """
 
     def take(self, batch: Batch) -> None:

@@ -212,7 +212,7 @@ def test_alarm_at_the_first_observation_may_have_started_earlier() -> None:
 
 def test_alarms_of_an_earlier_run_continue_or_end() -> None:
     kept: dict[str, Alarm] = {}
-    before = Alarms(0, lambda alarm: kept.update({alarm.id: alarm}))
+    before = Alarms(0, lambda alarm, change: kept.update({alarm.id: alarm}))
     for drive in ("goes-on", "is-over", "is-another", "is-gone", "is-silent"):
         before.look(1, drive, RUNS, 0)
         before.look(2, drive, Shown("fault", "overheat"))

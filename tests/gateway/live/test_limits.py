@@ -23,7 +23,8 @@ BELOW = Limit("pump", "pressure", "bar", False, 1.0, hysteresis=0.5)
         ([31, 31, 31, 31, 31, 31], [False, False, False, False, False, True]),
         ([31, 31, 29, 31, 31, 31], [False] * 6),  # the time restarts
         ([31, 31, 31, 31, 31, 31, 28.5, 28.0], [False] * 5 + [True, True, False]),
-        ([31, None, None, None, None, 31, None], [False] * 5 + [True, True]),
+        ([31, 31, 31, 31, None, 31, 31], [False] * 7),  # unknown: the time starts anew
+        ([31, 31, 31, 31, 31, 31, None, 29], [False] * 5 + [True] * 3),
         ([30] * 7, [False] * 7),  # the bound itself is allowed
     ],
 )
@@ -37,17 +38,19 @@ def test_limit_is_exceeded_after_its_duration_and_until_its_hysteresis(
     assert seen == beyond
 
 
-def test_drive_with_two_exceeded_limits_has_one_alarm() -> None:
-    limits, noted = Limits([ABOVE._replace(lasting_s=0.0), BELOW]), list[Alarm]()
-    alarms = Alarms(note=noted.append)
+def test_further_exceeded_limit_begins_a_new_alarm_and_a_smaller_excess_does_not() -> None:
+    limits = Limits([ABOVE._replace(lasting_s=0.0), BELOW])
+    noted: list[Alarm] = []
+    alarms = Alarms(note=lambda alarm, change: noted.append(alarm))
     for time, current, pressure in ((1, 31, 2), (2, 31, 0.5), (3, 20, 1.4), (4, 20, 1.5)):
         values = {"current": current, "pressure": pressure}
         alarms.look_at_limits(time, "pump", lambda before, v=values: limits.exceeded(0, "pump", v, before))
     assert [(one.time, one.text, one.ended) for one in noted] == [
         (1, "current above 30 A", None),
-        (1, "current above 30 A; pressure below 1 bar", None),
-        (1, "pressure below 1 bar", None),
-        (1, "pressure below 1 bar", 4),
+        (1, "current above 30 A", 2),
+        (2, "current above 30 A; pressure below 1 bar", None),
+        (2, "pressure below 1 bar", None),
+        (2, "pressure below 1 bar", 4),
     ]
 
 

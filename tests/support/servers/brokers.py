@@ -263,7 +263,8 @@ def inside(folder: Path, fan: Drive = FAN) -> Any:
     plant = Plant((PlantLine("hall", "/dev/null", None, None, drives),), folder / "plant.toml")
     hub: Any = ScriptedHub(fan.name)
     commands: Any = RecordedCommands()
-    return PartContext(plant, hub, commands, SimpleNamespace(), folder, "0.2", Alarms())  # type: ignore[arg-type]
+    ask: Any = SimpleNamespace()
+    return PartContext(plant, hub, commands, ask, folder, "0.2", Alarms())
 
 
 def without_fan(known: Any) -> Plant:

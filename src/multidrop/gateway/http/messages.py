@@ -19,6 +19,7 @@ from multidrop.gateway.http.rights import Caller
 from multidrop.printable import plain_whole
 from multidrop.supervisor import Hung, supervisor
 
+LEAST_MS, MOST_MS = -62_135_596_800_000, 253_402_300_799_999  # years 1 to 9999, in ms since 1970
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 COMPRESSIBLE = ("text", "json", "javascript", "svg", "toml")  # in the media types of texts
 LEAST_COMPRESSED = 1024  # bytes
@@ -151,7 +152,17 @@ def number_in(text: str, key: str) -> int:
 
 
 def moment_in(text: str, key: str) -> int:
-    """Return a time in ms since 1970. The text is ISO 8601, in UTC unless it has an offset, or such ms."""
+    """Return a time in ms since 1970. The text is ISO 8601, in UTC unless it has an offset, or such ms.
+
+    Raises Denied for another text, and for a time outside the years 1 to 9999.
+    """
+    ms = _moment(text, key)
+    if not LEAST_MS <= ms <= MOST_MS:
+        raise Denied(400, f"{key} = {text[:40]!r} is not in the years 1 to 9999")
+    return ms
+
+
+def _moment(text: str, key: str) -> int:
     try:
         return plain_whole(text)
     except ValueError:

@@ -267,7 +267,7 @@ COMMANDED = record(done=FLAG, **SENTENCE, id=ID)
 STOPPED = by_name(COMMANDED)
 FLEET_STOPPED = by_name(record(done=FLAG, **SENTENCE))
 ACKNOWLEDGE: Schema = {
-    **some(alarm=GIVEN, note={"type": "string", "maxLength": 500, "pattern": "^[ -~]*$"}),
+    **some(alarm=GIVEN, note={"type": "string", "maxLength": 500}),
     "required": ["alarm"],
 }
 RELOAD: Schema = record(confirm={"const": True})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection, Iterable
+from enum import Enum
 from typing import Any, NamedTuple
 
 from multidrop.gateway.clock import iso_time
@@ -25,7 +26,16 @@ UNCALLED = "the motor stopped, and no stop was called here"
 STANDS_MS = 2000  # a motor must be at rest this long, because a reversing motor passes 0 Hz
 MOST_ENDED = 1000  # ended alarms kept
 MOST_SHOWN = 20  # ended alarms shown
+SEPARATOR = "; "  # between the exceeded limits of a drive in the text of its alarm
 LOST = ("port lost", "port refused its settings")  # statuses of a line's rows while its port is lost
+
+
+class Change(Enum):
+    """What happened to an alarm."""
+
+    BEGAN = "began"
+    CHANGED = "changed"  # it was acknowledged, or has a better text
+    ENDED = "ended"
 
 
 class Alarm(NamedTuple):
@@ -61,10 +71,12 @@ class Alarms:
     """The active alarms, and the latest ended ones.
 
     `since` is the UTC time in ms from which the record is complete. `note` is called with each alarm that
-    started, ended or changed.
+    started, ended or changed, and with what happened to it.
     """
 
-    def __init__(self, since: int = 0, note: Callable[[Alarm], object] = lambda alarm: None) -> None:
+    def __init__(
+        self, since: int = 0, note: Callable[[Alarm, Change], object] = lambda alarm, change: None
+    ) -> None:
         self.since = since
         self._note = note
         self._lasting: dict[tuple[str, str, str], Alarm] = {}  # active, oldest first; keys: line, drive, kind
@@ -160,7 +172,7 @@ class Alarms:
             self._lasting[_key(found)] = changed
         else:
             self._ended[self._ended.index(found)] = changed
-        self._note(changed)
+        self._note(changed, Change.CHANGED)
         if changed.kind == STOPPED and changed.ended is None:
             self._end(time, *_key(changed))
         return changed
@@ -187,7 +199,7 @@ class Alarms:
             self._lasting[key] = alarm  # the same alarm
         elif present is not None or is_seen or (alarm.drive or alarm.line) not in names:
             self._ended.append(alarm._replace(ended=time))
-            self._note(self._ended[-1])
+            self._note(self._ended[-1], Change.ENDED)
         else:
             self._lasting[key] = alarm
 
@@ -222,15 +234,16 @@ class Alarms:
         self._known.add(key[:2])
         if before is not None and (text in (before.text, UNNAMED) or kind == SILENT):
             return
-        if before is not None and (before.text == UNNAMED or kind in (PORT, LIMIT)):
+        is_less = kind == LIMIT and before is not None and _parts(text) < _parts(before.text)
+        if before is not None and (before.text == UNNAMED or kind == PORT or is_less):
             # This is the same alarm, with a better text.
             self._lasting[key] = before._replace(text=text)
-            self._note(self._lasting[key])
+            self._note(self._lasting[key], Change.CHANGED)
             return
         self._end(time, *key)
         self._lasting[key] = Alarm(time, drive, text, None, kind, line, is_before)
         self.begun += 1
-        self._note(self._lasting[key])
+        self._note(self._lasting[key], Change.BEGAN)
 
     def _end(self, time: int, line: str, drive: str, kind: str) -> None:
         before = self._lasting.pop((line, drive, kind), None)
@@ -238,8 +251,13 @@ class Alarms:
             if len(self._ended) == MOST_ENDED:
                 self.since = max(self.since, self._ended[0].ended or 0)
             self._ended.append(before._replace(ended=time))
-            self._note(self._ended[-1])
+            self._note(self._ended[-1], Change.ENDED)
 
 
 def _key(alarm: Alarm) -> tuple[str, str, str]:
     return alarm.line, alarm.drive, alarm.kind
+
+
+def _parts(text: str) -> set[str]:
+    """Return the limits in the text of an alarm of kind LIMIT."""
+    return {*text.split(SEPARATOR)}

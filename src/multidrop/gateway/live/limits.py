@@ -7,10 +7,10 @@ from math import isfinite
 from typing import Any, NamedTuple
 
 from multidrop import Plant
+from multidrop.gateway.live.alarms import SEPARATOR
 from multidrop.gateway.live.hub import Hub
 from multidrop.toml_check import Key, TomlPlace, parse_duration
 
-SEPARATOR = "; "  # between the texts of a drive's exceeded limits
 _KEYS = {
     "drive": Key(str, 'drive = "pump-1"', needed=True),
     "register": Key(str, 'register = "output_current"', needed=True),
@@ -59,7 +59,8 @@ class Limits:
     def exceeded(self, now_s: float, drive: str, values: Mapping[str, float], before: str) -> str:
         """Return the drive's exceeded limits as a text; "" if there are none.
 
-        `values` has the current values by register. While a value is missing, its limit stays as it was.
+        `values` has the current values by register. While a value is missing, its limit stays as it was, and
+        its time starts anew afterwards.
         `before` is the text that the previous call returned, or the text of an alarm of an earlier run.
         """
         found = []
@@ -67,6 +68,7 @@ class Limits:
             was = str(limit) in before.split(SEPARATOR)
             value = values.get(limit.register)
             if value is None:
+                self._since_s.pop(limit, None)
                 is_exceeded = was
             elif limit.is_beyond(value, limit.hysteresis if was else 0.0):
                 since_s = self._since_s.setdefault(limit, now_s)
@@ -79,11 +81,11 @@ class Limits:
 
 
 def current_values(hub: Hub, drive: str) -> dict[str, float]:
-    """Return the current values of a drive's polled registers by name, without those that are missing."""
+    """Return the newest values of a drive's polled registers by name, without those that are too old."""
     return {
         register.name: good[2]
-        for register, newest, good, is_current in hub.known(drive)
-        if is_current and good is not None and newest is good
+        for register, _, good, is_current in hub.known(drive)
+        if is_current and good is not None
     }
 
 
