@@ -18,8 +18,20 @@ static void watch(struct md_port *port, int is_watched)
     port->is_watched = is_watched;
 }
 
+/* Return 1 if the driver holds bytes that the adapter has not taken. A network's bytes do not count: there
+ * they are unconfirmed, not unsent. */
+static int is_holding(const struct md_port *port)
+{
+    return port->must_take >= 0 && md_descriptor_is_queued(port->fd);
+}
+
+/* Lose the port. A command that the driver holds is called off: the client closes the port, and the driver
+ * discards the command. */
 static void lose(struct md_port *port, int error)
 {
+    struct md_line *line = &port->turn.line;
+    if (md_line_is_under_way(line) && md_is_command(line->exchange) && is_holding(port))
+        md_store(&port->turn.progress.called_off, 1);
     md_waiter_remove(port->engine->waiter, port->fd); /* a port that hung up is always readable */
     md_turn_lose(&port->turn, error);
 }
@@ -69,13 +81,6 @@ static int is_expired(const struct md_turn *turn)
     if (turn->source != MD_URGENT || turn->line.tx_at > 0)
         return 0;
     return turn->urgent->expires_ns && md_boottime_ns() > turn->urgent->expires_ns;
-}
-
-/* Return 1 if the driver holds bytes that the adapter has not taken. A network's bytes do not count: there
- * they are unconfirmed, not unsent. */
-static int is_holding(const struct md_port *port)
-{
-    return port->must_take >= 0 && md_descriptor_is_queued(port->fd);
 }
 
 /* Note at a timeout whether the adapter has taken the request. If it has not, and the request is a command,

@@ -92,6 +92,15 @@ def test_a_transceiver_sends_until_the_last_bit_has_left(build: Callable[..., No
 
 
 @pytest.mark.long
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
+def test_a_command_that_rts_cannot_wait_for_is_called_off(build: Callable[..., None]) -> None:
+    build(
+        "test_stuck_rts", *[path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem != "waiter_poll"]
+    )
+
+
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="the driver is Linux's")
 def test_a_baud_rate_without_a_whole_divisor_is_refused(build: Callable[..., None]) -> None:
     build("test_divisors", "termios")
