@@ -125,7 +125,9 @@ def test_a_port_is_reopened_only_with_the_same_adapter(
     ("before", "now", "others", "is_found"),
     [
         (("1-1", "A1"), ("1-1", "A1"), [], True),  # same adapter, renamed ttyUSB1 after a sleep
-        (("1-1", "A1"), ("1-2", "A1"), [("1-1", "B2")], True),  # another adapter is in its former USB socket
+        (("1-1", "A1"), ("1-1", "A1"), [("1-2", "A1")], True),  # its twin has the same serial number
+        (("1-1", "A1"), ("1-2", "A1"), [], False),  # in another USB socket, it may be a twin
+        (("1-1", "A1"), ("1-2", "A1"), [("1-1", "B2")], False),
         (("1-1", ""), ("1-1", ""), [("1-2", "")], True),
         (("1-1", ""), ("1-2", ""), [], False),
         (("1-1", "A1"), ("1-2", "A1"), [("1-3", "A1")], False),  # copies with the same serial number
@@ -154,6 +156,22 @@ def test_an_adapter_is_followed_to_its_new_name(
             with pytest.raises(LineError, match="no such port"):
                 found.reopen()
         found.close()
+
+
+def test_a_twin_with_the_same_serial_number_is_not_used(tmp_path: Path, sysfs: Sysfs) -> None:
+    """The twin was plugged in when the port was opened; after a USB reset it gets the port's name."""
+    link, later = tmp_path / "ttyUSB0", tmp_path / "ttyUSB1"
+    found = Line(str(link))
+    with sysfs.plugged_in(later, "1-2", "A1"), sysfs.plugged_in(link, "1-1", "A1"):
+        found.open()
+    with (
+        sysfs.plugged_in(link, "1-2", "A1"),
+        pytest.raises(LineError, match="another adapter has this name now"),
+    ):
+        found.reopen()
+    with sysfs.plugged_in(link, "1-1", "A1"):
+        found.reopen()
+    found.close()
 
 
 @pytest.mark.parametrize("is_replaced", [False, True])

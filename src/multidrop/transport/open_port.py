@@ -9,6 +9,7 @@ import socket
 import struct
 import sys
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 from urllib.parse import SplitResult
@@ -236,7 +237,7 @@ class OpenPort:
         self._mastership = mastership
         self._settle = settle
         self._serial: serial.SerialBase | None = None
-        self._adapter: USBAdapter | None = None  # the adapter at the first opening
+        self._adapter: USBAdapter | None = None  # the adapter at the last opening
         self._terminal: PseudoTerminal | None = None  # the pseudo-terminal at the last opening
         self.must_discard = False  # the driver may hold bytes of a command that has ended
 
@@ -272,7 +273,7 @@ class OpenPort:
         if self._adapter is None:
             return self.name
         found = adapter_of(os.path.realpath(self.name))
-        is_same = found is not None and found.is_same(self._adapter)
+        is_same = found is not None and self._adapter.is_same(found)
         return (None if is_same else port_identity.device_of(self._adapter)) or self.name
 
     def _terminal_now(self) -> PseudoTerminal | None:
@@ -288,15 +289,15 @@ class OpenPort:
     def _require_same_adapter(self, device: str) -> None:
         """Raise LineError if another adapter has this device name now: there are other motors on its line."""
         found = adapter_of(device)
-        if self._adapter is None:
-            self._adapter = found
-        elif found is None or not found.is_same(self._adapter):
+        if self._adapter and (found is None or not self._adapter.is_same(found)):
             raise LineError(
                 self.name,
                 f"another adapter has this name now ({found or 'none on USB'}, and not {self._adapter}); "
                 "if that is intended, restart the program; a name in /dev/serial/by-id always means the same "
                 "adapter",
             )
+        had_twin = self._adapter is not None and self._adapter.has_twin
+        self._adapter = found and replace(found, has_twin=had_twin or port_identity.has_twin(found))
 
     def _drive(self, port: serial.SerialBase) -> Port:
         """Return a core port that uses this port's descriptor, or that of a new bridge."""

@@ -20,15 +20,20 @@ _INTERFACE = re.compile(r"[\d.-]+:(\d+\.\d+)")  # 1-4.2:1.0 is an interface of t
 
 @dataclass(frozen=True)
 class USBAdapter:
-    """A port of a USB adapter: its place on the USB bus, and the adapter's serial number (or "")."""
+    """A port of a USB adapter: its place on the USB bus, and the adapter's serial number (or "").
+
+    `has_twin` means that another adapter has the same serial number: then the place must be the same too.
+    """
 
     place: str
     serial: str
+    has_twin: bool = False
 
     def is_same(self, other: USBAdapter) -> bool:
+        is_here = self.place == other.place
         if self.serial and other.serial:
-            return self.serial == other.serial
-        return self.place == other.place
+            return self.serial == other.serial and (is_here or not self.has_twin)
+        return is_here
 
     def __str__(self) -> str:
         return self.serial or f"at {self.place}"
@@ -46,12 +51,23 @@ def adapter_of(device: str) -> USBAdapter | None:
 
 
 def device_of(adapter: USBAdapter) -> str | None:
-    """Return the present device name of this adapter; None if it is away, or if several adapters match."""
-    found = {tty.name: one for tty in TTYS.iterdir() if (one := adapter_of(tty.name))}
-    same = [name for name, one in found.items() if one.is_same(adapter)]
-    here = [name for name in same if found[name].place == adapter.place]
-    name, *others = here or same or [""]
-    return str(DEVICES / name) if name and not others else None
+    """Return the present device name of this adapter; None if it is not in its USB socket.
+
+    In another socket it may be a twin: serial numbers are not unique.
+    """
+    here = [name for name, one in _adapters().items() if one.place == adapter.place and adapter.is_same(one)]
+    return str(DEVICES / here[0]) if len(here) == 1 else None
+
+
+def has_twin(adapter: USBAdapter) -> bool:
+    """Return True if an adapter in another USB socket has the same serial number."""
+    others = [one for one in _adapters().values() if one.place != adapter.place]
+    return bool(adapter.serial) and any(one.serial == adapter.serial for one in others)
+
+
+def _adapters() -> dict[str, USBAdapter]:
+    """Return the present USB adapters by device name."""
+    return {tty.name: one for tty in TTYS.iterdir() if (one := adapter_of(tty.name))}
 
 
 # Drivers of plain 8250 UARTs, which divide their clock by a whole number. Others may use fractions.
