@@ -15,8 +15,9 @@ from tables import table
 from toy import Toy
 
 from multidrop.bus import Bus
-from multidrop.core import NO_DIVISOR, RS485, TransactionIds, port_settings
-from multidrop.errors import NoReply
+from multidrop.core import NO_DIVISOR, RS485, Failure, Port, TransactionIds, port_settings
+from multidrop.errors import NoReply, PortLost
+from multidrop.sim import Simulator, Wire, simulated
 from multidrop.transport import clock, open_port, port_identity
 from multidrop.transport.line import Line
 from multidrop.transport.open_port import CLOSING_S, STALLED, OpenPort, failing_refusals, why_lost
@@ -74,6 +75,54 @@ def test_a_lost_port_states_why_before_it_is_reopened(terminal: str, monkeypatch
     found.drop()
     assert found.why_lost == f"{terminal}: the port was lost (hung up)"
     assert found._opened.must_discard
+    found.close()
+
+
+def test_reads_reopen_a_port_that_was_closed_to_discard_a_command() -> None:
+    with Simulator([Wire([simulated(Toy(1))])]) as sim, Bus(sim.wires[0].path) as bus:
+        toy = bus.attach(Toy, 1)
+        assert bus.line.queue
+        bus.line._discard(bus.line.queue)
+        assert bus.line.queue is None
+        assert toy.read(toy.output_current) is not None
+
+
+@table(
+    ("sent_ns", "said"),
+    [
+        (0, f"nothing was sent: the port took no bytes until the time-out ({STALLED})"),
+        (1, f"the request was sent only in part: the port took no bytes until the time-out ({STALLED})"),
+    ],
+)
+def test_a_command_that_was_held_back_is_not_logged_as_a_lost_port(
+    sent_ns: int, said: str, terminal: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    found = Line(terminal).open()
+    held = SimpleNamespace(
+        count=-1, result=Failure.LINE_LOST, error=errno.ETIMEDOUT, sent_ns=sent_ns, raw=b""
+    )
+    monkeypatch.setattr(Port, "carry_out", lambda *given: held)
+    with pytest.raises(PortLost) as failure:
+        found.carry_out(SimpleNamespace())  # type: ignore[arg-type]
+    assert failure.value.reason == said
+    assert not found.is_lost
+    found.close()
+    assert "lost" not in caplog.text
+
+
+def test_ctrl_c_does_not_leave_a_called_off_command_in_the_driver(
+    terminal: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = Line(terminal).open()
+
+    def interrupted(*given: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Port, "called_off", True)
+    monkeypatch.setattr(Port, "carry_out", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        found.carry_out(SimpleNamespace())  # type: ignore[arg-type]
+    assert found.queue is None  # the port is closed
     found.close()
 
 

@@ -143,13 +143,13 @@ class Exchanges:
         """Return the registers' values by name, as `values` does; reopen the port if it is lost.
 
         This is for a gateway that closes the connection after each reply. If the port is lost after the drive
-        has answered on it, reopen it and read block by block. Raises PortLost if the port is lost twice
-        in a row at the same block, or before the drive has answered.
+        has answered on it, or is already closed, reopen it and read block by block. Raises PortLost if the
+        port is lost twice in a row at the same block, or before the drive has answered.
         """
         try:
             return self.values(drive, registers, READ_ATTEMPTS)
         except PortLost:
-            if not self.has_answered(drive):
+            if self.line.queue is not None and not self.has_answered(drive):
                 raise
         known = [drive.register(one) if isinstance(one, str) else one for one in registers]
         wanted = [one for one in known if isinstance(one, Register)]
@@ -165,11 +165,11 @@ class Exchanges:
         return found
 
     def read_text(self, drive: Drive, text: Text) -> str:
-        """Return a text, as `text` does; if the port is lost after the drive has answered, reopen it."""
+        """Return a text, as `text` does; reopen a port that is lost, as `read` does."""
         try:
             return self.text(drive, text)
         except PortLost:
-            if not self.has_answered(drive):
+            if self.line.queue is not None and not self.has_answered(drive):
                 raise
         return text.decode(
             b"".join(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import threading
 from logging import DEBUG
@@ -340,16 +341,20 @@ class Line:
         core = self.queue
         if core is None:
             raise self._closed()
-        found = core.carry_out(exchange, not_before_ns, expires_ns, into)
-        is_lost = found.count < 0 and is_lost_by(found.result, core)
-        self.note_foreign()
-        if self._log.shows(DEBUG):
-            self._log.frames(exchange, found)
-        if is_lost:
-            failure = self._failure(found, exchange)
-            failure.is_sent = found.sent_ns > 0
+        failure = None
+        try:
+            found = core.carry_out(exchange, not_before_ns, expires_ns, into)
+            is_lost = found.count < 0 and is_lost_by(found.result, core)
+            self.note_foreign()
+            if self._log.shows(DEBUG):
+                self._log.frames(exchange, found)
+            if is_lost:
+                failure = self._failure(found, exchange, core)
+                failure.is_sent = found.sent_ns > 0
+        finally:  # also after Ctrl-C during the exchange
             if core.called_off:
                 self._discard(core)
+        if failure:
             raise failure
         return found
 
@@ -365,12 +370,16 @@ class Line:
         with self._lock:
             return self.queue is not None and self.queue.is_asking(peer)
 
-    def _failure(self, found: Completion, exchange: Exchange) -> LineError:
+    def _failure(self, found: Completion, exchange: Exchange, core: Port) -> LineError:
         if found.result == Failure.SETTINGS_REFUSED:
             return LineError(self.port, self._opened.refusal(found.error, exchange.settings[0]))
         if self.queue is None or self.why_closing:
             return self._closed()
         why = why_lost(self.port, found.error, found.raw)
+        if found.error == errno.ETIMEDOUT and not core.lost:
+            self.note_stall()
+            sent = "the request was sent only in part" if found.sent_ns else "nothing was sent"
+            return PortLost(self.port, f"{sent}: the port took no bytes until the time-out ({why})")
         self._log.lost(why)
         return PortLost(self.port, f"the port was lost ({why})")
 
