@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_load_initial_conftests(early_config: pytest.Config) -> None:
-    """Keep pytest from compiling all of multidrop again, as it does with a plugin's whole distribution."""
+    """Keep pytest from rewriting the assertions in all of multidrop, as in any plugin's distribution."""
     hook: Any = early_config.pluginmanager.rewrite_hook
     getattr(hook, "_must_rewrite", set()).discard("multidrop")
 

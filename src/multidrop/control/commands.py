@@ -107,7 +107,7 @@ def stop_line(bus: Callable[[], Any], names: Sequence[str], seconds: float | Non
 
 
 def in_thread(work: Callable[[], R]) -> asyncio.Future[R]:
-    """Do work in a new thread; it continues to its end even if its caller is cancelled.
+    """Do work in a new thread; the work continues to its end even if its caller is cancelled.
 
     Raises RuntimeError or MemoryError if the system has no thread left.
     """
@@ -261,7 +261,7 @@ class RepeatedStops:
         return [drive for drive in drives if drive not in again], again
 
     def send_once(self, drive: Drive) -> StopFuture:
-        """Send one more stop; return a future for the result of the repeated stop.
+        """Send a drive one more stop beside its repeated stop; return a future for the repeated stop.
 
         If the repeated stop gives up before REPEATED_S after this call, start another one.
         """

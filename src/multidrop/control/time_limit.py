@@ -50,7 +50,7 @@ def written_before(limit: Limit) -> Iterator[None]:
     computer sleeps within the block counts. A verb's later writes expire by the bus's own `expiry`. Stops
     are always sent.
 
-    The block applies to this thread, or to this task and `asyncio.to_thread`. If `limit` is not a function,
+    The block applies to this thread, or to this task and its `asyncio.to_thread`. If `limit` is not a function,
     each call except a stop raises TypeError.
     """
     outer = _limit.get()

@@ -212,7 +212,7 @@ class Peer:
         self.c.proofs, self.c.proof_count = self._c_proofs, len(self.proofs)
 
     def doubt_first_reply(self) -> None:
-        """Repeat the first read after a proof, because its first reply may be to another process.
+        """After a proof, repeat the first read: the first reply may answer another process's request.
 
         If the peer has no proofs, its first reply is accepted.
         """

@@ -126,7 +126,7 @@ def _at(drive: Drive, baudrate: int) -> Drive:
 
 
 def _registers(exchanges: Sequence[Planned], tight: Sequence[Rate], switching: float) -> int | None:
-    """Return the most registers with which each rate is reached; None if even one register is too many."""
+    """Return the largest number of registers with which each rate is reached; None if one is too many."""
     crowded = {(rate.drive, rate.every) for rate in tight}
     others = [each for each in exchanges if (each.drive, each.every) not in crowded]
 

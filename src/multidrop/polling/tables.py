@@ -69,7 +69,7 @@ class _WideColumn:
         self.values = array("d")
 
     def dense(self, places: Sequence[int]) -> tuple[bytearray, array[float]]:
-        """Return a bitmap (1 for each row with a value) and the values; `places` has each row's new place."""
+        """Return a bitmap (1 for each row with a value) and the values; `places`: each row's new number."""
         valid = bytearray((len(places) + 7) // 8)
         values = array("d", bytes(8 * len(places)))
         for row, value in zip(self.rows, self.values, strict=True):

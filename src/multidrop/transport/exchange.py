@@ -360,7 +360,7 @@ class Exchanges:
         return reply
 
     def _good(self, drive: Drive, exchange: Exchange, attempts: int, completion: Completion) -> Completion:
-        """Return the good reply to a read that was sent once, with `completion`; retry it if that failed.
+        """Return the good reply to a read whose first attempt ended with `completion`; retry a failed read.
 
         If all attempts fail: raises BadReply if bytes were received in any attempt, else NoReply.
         """
@@ -393,10 +393,10 @@ class Exchanges:
         timeout: float = WRITE_TIMEOUT,
         permit: Permit | None = None,
     ) -> Completion:
-        """Send a write once, before queued polling, once late replies have come or can no longer come.
+        """Send a write a single time, before queued polling, after all late replies that may still come.
 
-        The write is not sent after `expires_ns` (CLOCK_BOOTTIME; 0: no limit), or if `permit` was withdrawn.
-        It waits for its reply at least `timeout` seconds. With `insists` it does not wait for late replies;
+        The write is not sent after `expires_ns` (CLOCK_BOOTTIME; 0: no limit), or if `permit` has ended. The
+        call waits for the reply at least `timeout` seconds. With `insists` it does not wait for late replies;
         on a slow connection, it waits up to `timeout` seconds for its own reply. Raises NoReply without
         sending if late replies are due and the drive is silent.
         """
