@@ -50,8 +50,9 @@ def written_by(who: str, way: str = "", command: str = "") -> Iterator[None]:
 
     The audit record of a write or a stop then has `by`, such as "anna", and unless it is empty `way`, such as
     "web, 10.0.0.7". `command` is an id, recorded as `id`: it connects the records of a command with its
-    answer. The block applies to this thread, or to this task and its `asyncio.to_thread`; other threads, such as
-    those of `run_in_executor`, need a block of their own. The innermost block counts. It grants no rights.
+    answer. The block applies to this thread, or to this task and its calls of `asyncio.to_thread`. Other
+    threads, such as those of `run_in_executor`, need a block of their own. The innermost block counts. Naming
+    an author grants no rights.
 
     Within the block a write raises TypeError if an argument is not text, and ValueError if one is longer than
     200 characters or not printable, or if `who` is empty. A stop is sent nevertheless, and recorded with the

@@ -20,7 +20,7 @@ FAULT_RECORDS = ("last_fault", "fault_record_1")  # registers of the newest faul
 class StateReader:
     """Computes a drive's state by its family's rules, from values such as those of polled rows.
 
-    The reader sends no request. Attributes that the family's script sets on the drive are kept in this reader's copy.
+    No request is sent. Attributes that the family's script sets on the drive are kept in this reader's copy.
     """
 
     def __init__(self, drive: Drive) -> None:
