@@ -57,7 +57,7 @@ struct md_engine {
     struct md_realtime realtime;
     int wants_realtime;      /* 1: start realtime scheduling, 0: end it */
     int realtime_failure;    /* 0 or -errno */
-    int is_realtime_changed; /* no client waits for a change */
+    int is_realtime_changed; /* 1: no client waits for a change */
 };
 
 /* This process's right to send on its lines, which ends at a deadline. */

@@ -154,7 +154,7 @@ struct md_history {
 
 /* A drive. The caller sets the bounds of its timeout and its interval; the core learns the other fields,
  * which start as 0. A timeout runs from the request's last bit to the reply's first. The start of a
- * request accesses only the first cache line, its end also the second one. */
+ * request accesses only the first cache line, its end also the second line. */
 struct md_drive {
     int64_t least_timeout_ns, most_timeout_ns;
     int64_t delay_ns, deviation_ns;    /* smoothed response delay, and its mean deviation */
@@ -163,24 +163,24 @@ struct md_drive {
     int64_t ready_ns;                  /* earliest time of the next request */
     uint32_t failures;                 /* number of consecutive failures */
     uint8_t owed_count, proof_count;
-    uint8_t is_doubted;                /* its first reply may be to another process */
+    uint8_t is_doubted;                /* the drive's first reply may answer another process */
     uint8_t sure_looks;                /* number of coming replies that are read only when whole */
     struct md_counters counters;
     int64_t answered_ns;               /* replies to requests sent before this time cannot come */
     int64_t late_until_ns;             /* late replies may come in any order until then */
     uint64_t failed_at;                /* the drive's reply count when a proof last failed */
     uint8_t proof_failures[MD_MOST_PROOFS]; /* 255: the proof was answered once */
-    uint32_t doubtful;                 /* number of replies that may have been to another process */
+    uint32_t doubtful;                 /* number of replies that may have answered another process */
     uint32_t unanswered_count;
-    const struct md_exchange **proofs; /* reads whose replies are not mistakable for a missing reply */
+    const struct md_exchange **proofs; /* reads whose replies cannot be mistaken for late replies */
     struct md_drive *next_late;        /* next in the line's list of drives with late replies due */
     struct md_history *history;        /* separate because exchanges seldom need it */
     uint64_t delays[MD_DELAY_BUCKETS]; /* replies by delay; bucket n starts at md_delay_edge(n) */
 };
 
 int64_t md_present_timeout_ns(const struct md_drive *drive); /* usual timeout of a read */
-int64_t md_next_timeout_ns(const struct md_drive *drive);    /* of the next read, after failures */
-int64_t md_delay_edge(int bucket); /* least delay of a bucket, whose width is 1/8 of it */
+int64_t md_next_timeout_ns(const struct md_drive *drive);    /* timeout of the next read, maybe longer */
+int64_t md_delay_edge(int bucket); /* least delay of a bucket; the bucket's width is 1/8 of that delay */
 /* Copy to `drive` the outstanding requests of `before`, the drive that it replaces. */
 void md_late_inherit(struct md_drive *drive, const struct md_drive *before);
 
@@ -232,7 +232,7 @@ struct md_exchange {
     uint32_t stops_seen;
 };
 
-/* The reasons why an exchange has no reply; if other bytes came, it is an enum md_frame_fault. */
+/* The reasons why an exchange has no reply; if other bytes came, the reason is an enum md_frame_fault. */
 enum md_failure {
     MD_CUT_SHORT = -9,         /* the reply was incomplete at the timeout */
     MD_NO_REPLY = -10,         /* no byte within the timeout except the request's echo */
@@ -285,8 +285,8 @@ struct md_tap;
 struct md_mastership;
 
 struct md_engine *md_engine_start(void); /* the thread of all lines; it lives as long as the process */
-/* Start or end realtime scheduling of the thread, which ends it by itself if it uses too much of a processor;
- * 0, -errno. One client at a time may call this. */
+/* Start or end realtime scheduling of the thread; return 0 or -errno. The thread ends it by itself if the
+ * thread uses too much of a processor. One client at a time may call this. */
 int md_engine_realtime(struct md_engine *engine, int wanted);
 int md_engine_is_realtime(struct md_engine *engine); /* 1: under realtime scheduling now */
 /* Sleep `n` times for `period_ns` on the calling thread, as the engine's thread does. Write to `late_ns` by

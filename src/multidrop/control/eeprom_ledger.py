@@ -46,8 +46,8 @@ class Wear:
     """The number of writes to a cell."""
 
     cell: LedgerCell
-    writes: int  # in all
-    this_year: int  # within the last year
+    writes: int  # all writes so far
+    this_year: int  # writes within the last year
     last: float  # UTC in s of the latest entry
 
 
@@ -64,7 +64,7 @@ def default_path() -> Path:
 
 
 class Ledger:
-    """The ledger in this file, created at the first entry. Times are UTC in s."""
+    """The ledger in the file `path`, which is created at the first entry. Times are UTC in s."""
 
     def __init__(self, path: Path | str | None = None, *, budget: int = BUDGET) -> None:
         self.path = Path(path) if path else default_path()

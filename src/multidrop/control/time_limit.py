@@ -50,8 +50,8 @@ def written_before(limit: Limit) -> Iterator[None]:
     computer sleeps within the block counts. A verb's later writes expire by the bus's own `expiry`. Stops
     are always sent.
 
-    The block applies to this thread, or to this task and its calls of `asyncio.to_thread`. If `limit` is not a
-    function, each call except a stop raises TypeError.
+    The block applies to this thread, or to this task and its calls of `asyncio.to_thread`. If `limit` is not
+    a function, each call except a stop raises TypeError.
     """
     outer = _limit.get()
     slept_ns = clock.boottime_ns() - clock.now_ns()  # read in this order, the difference is never too large

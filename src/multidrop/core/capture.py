@@ -220,7 +220,7 @@ class Tap:
 
     @property
     def lost(self) -> int:
-        """Bytes that were lost because the ring buffer was full."""
+        """Number of bytes that were lost because the ring buffer was full."""
         return int(self.c.lost)
 
     def take(self, wrappings: Wrappings, interface: int, utc_minus_monotonic_ns: int) -> Iterator[bytes]:

@@ -65,7 +65,7 @@ class Device(IntEnum):
 
 
 OTHER_SERIES = {0x010A: "Goodrive300L", 0x010C: "Goodrive200L"}  # values of 3016H in their manuals
-CHF = 0x02  # the high byte of 3016H in the CHF series (CHE100 manual v1.4, p. 119), whose words are the same
+CHF = 0x02  # the high byte of 3016H in the CHF series (CHE100 manual v1.4, p. 119), with the same words
 
 
 class CHEFault(Worded):

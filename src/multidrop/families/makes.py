@@ -2,8 +2,8 @@
 
 Two families may have their control words at the same address with different meanings, so that one family's
 stop runs another make's motor. A stop is withheld only if the drive's registers show that it is such another
-make. The table lists these registers for each make. A drive of the declared family refuses or holds other
-values there.
+make. The table lists these registers for each make. A drive of the declared family refuses to read these
+registers, or holds other values there.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Make:
     copies: tuple[str, ...] = ()  # models that these registers do not distinguish from this make
 
     def shows(self, drive: Drive) -> Script[bool]:
-        """Return True if all the make's registers have its values in this drive. Only reads."""
+        """Return True if all the make's registers have the make's values in this drive. Only reads."""
         for register, test in self.evidence:
             if not test(int((yield from read(register))), drive):
                 return False
@@ -155,7 +155,8 @@ def run_by(register: Register[Any], count: float) -> list[Make]:
 def easily_mistaken_for(drive: Drive) -> list[Make]:
     """Return the makes to exclude before writing to a drive whose identity is weak.
 
-    These are the makes whose motors one of its harmless words would run, and those whose registers it copies.
+    These are the makes whose motors one of the drive's harmless control words would run, and those that their
+    registers do not distinguish from the drive's model.
     """
     control = drive.registers.get("control")
     harmless = control.harmless or () if control is not None else ()

@@ -45,7 +45,7 @@ def _made_ns(device: str) -> int:
 
 
 def remember_former_peers(names: Iterable[str], peers: Iterable[tuple[int, Peer]]) -> None:
-    """Remember, under these names of a closed port, its peers (with addresses) with late replies due."""
+    """Remember a closed port's peers (with addresses) that have late replies due, under the port's names."""
     now_ns = clock.now_ns()
     for name, former in [*_former.items()]:
         if now_ns - former.closed_ns > KEPT_NS:

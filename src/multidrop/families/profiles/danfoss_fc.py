@@ -14,12 +14,12 @@ from multidrop.families.profiles.profile import COMMON, Profile, Role
 class DanfossControl(IntFlag):
     """The control word CTW (FC 300 design guide MG.33.B6, p. 277; FC 51 manual p. 29, coils 1 to 16)."""
 
-    RAMP = 1 << 2  # 0 brakes with direct current
+    RAMP = 1 << 2  # 0: brake with direct current
     NO_COAST = 1 << 3
     NO_QUICK_STOP = 1 << 4
     NO_FREEZE = 1 << 5
     START = 1 << 6
-    RESET = 1 << 7  # from 0 to 1
+    RESET = 1 << 7  # acts on a change from 0 to 1
     VALID = 1 << 10
     REVERSE = 1 << 15
 

@@ -58,7 +58,7 @@ MODES = range(5)  # bits 15 to 13: reserved, or a C2000 Plus's HOA and LOC/REM m
 
 
 class Delta(Profile):
-    """Delta's words: 1 stops, 12H runs forward, 22H in reverse; a separate register resets faults.
+    """Delta's control words: 1 stops, 12H runs forward, 22H in reverse; a separate register resets faults.
 
     - The role `fault` is required, because the status shows no fault. Only its low byte is used; the high
       byte of newer drives is a warning.

@@ -45,7 +45,7 @@ _DIRECTIONS: Mapping[int, Direction] = {
 
 
 class Invt(Profile):
-    """INVT's words: a number for each of forward, reverse, jog, stop, coast and reset.
+    """INVT's control words: a number for each of forward, reverse, jog, stop, coast and reset.
 
     - Other makes have copied the words with 5 and 6 exchanged (both stop), and some with 5 for reverse. Such
       a family names its own numbers in `control`: `{ forward = 1, stop = 6, coast = 5, reset_fault = 7 }`. A
@@ -137,7 +137,7 @@ class Invt(Profile):
         yield from self._watch_stop()
 
     def _take_reset_back(self) -> Script[None]:
-        """Do nothing: the drive acts on a word only once, so the reset may stay in the register."""
+        """Do nothing: the drive acts on a control word once, so the reset may stay in the register."""
         yield from ()
 
 
@@ -163,7 +163,7 @@ class InovanceStatus(IntEnum):
 
 
 class Inovance(Invt):
-    """The words of Inovance MD, Powtran PI and their copies: 5 coasts, 6 stops along the ramp.
+    """The control words of Inovance MD, Powtran PI and their copies: 5 coasts, 6 stops along the ramp.
 
     - The role `fault` is required, because the status shows no fault. Any value except 0 is a fault.
     - The status is 1 forward, 2 reverse or 3 stopped. With any other number the state is unknown.
@@ -194,5 +194,5 @@ class Inovance(Invt):
 
     @property
     def identity_is_weak(self) -> bool:
-        """True, because its stop word runs makes with Delta's words, which may not reply to its reads."""
+        """True: the stop word runs makes with Delta's words, which may not reply to this profile's reads."""
         return True

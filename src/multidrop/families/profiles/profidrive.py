@@ -25,7 +25,7 @@ class ProfidriveControl(IntFlag):
     ENABLE_RAMP = 1 << 4
     CONTINUE_RAMP = 1 << 5
     ENABLE_SETPOINT = 1 << 6
-    RESET = 1 << 7  # from 0 to 1
+    RESET = 1 << 7  # acts on a change from 0 to 1
     BY_LINE = 1 << 10
 
 
@@ -51,7 +51,7 @@ class ProfidriveStatus(IntFlag):
 
 
 STOP, COAST, RESET, START = 0x047E, 0x047C, 0x04FE, 0x047F
-SWITCH_OFF, SWITCH_ON = 0x0476, 0x0477  # with neither does the motor turn: operation is not enabled
+SWITCH_OFF, SWITCH_ON = 0x0476, 0x0477  # the motor turns with neither: operation is not enabled
 
 
 class Profidrive(Profile):

@@ -43,7 +43,7 @@ class Role:
     moves: bool | None = None
     units: tuple[str, ...] = ()  # allowed units; empty: any
     extra: tuple[str, ...] = ()  # names of bits that a family may add
-    renumbered: tuple[str, ...] = ()  # words that a family with its own numbers must define
+    renumbered: tuple[str, ...] = ()  # control words that a family with its own numbers must define
     needed: bool = True
 
     @property
@@ -190,7 +190,7 @@ def _enumeration(kind: Any, name: str, members: dict[str, int]) -> type[Any]:
 
 
 STOP_TIME = 60.0  # s; profiles have no role for the deceleration time
-UNUSED = (0, 0xFFFF)  # words of unused registers, and of gateways that answer for an absent drive
+UNUSED = (0, 0xFFFF)  # values of unused registers, and of gateways that answer for an absent drive
 RESET_TIME = 2.0  # s within which a reset fault must disappear
 
 
