@@ -385,7 +385,7 @@ static void take_stray(struct md_line *line, const uint8_t *bytes, size_t len, i
     md_reply_find_late(line, line->rx_from, now_ns);
 }
 
-/* Take frames of Modbus TCP. With ids in replies, unexpected frames delay no request. */
+/* Take frames of Modbus TCP. If replies have their requests' ids, unexpected frames delay no request. */
 static void take_frames(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
 {
     struct md_ending ending;

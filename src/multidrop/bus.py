@@ -298,7 +298,7 @@ class Bus:
     def watchdog(self, drive: Drive) -> str:
         """Return a sentence on what the motor does if this client dies.
 
-        It is read from the drive if possible, and otherwise taken from the family's document.
+        The answer is read from the drive if possible, and otherwise taken from the family's document.
         """
         check_drive(drive)
         return self._performer.watchdog(drive)
@@ -348,8 +348,8 @@ class Bus:
     def stops_under_way(self) -> dict[str, str]:
         """Return the state of each pending stop in a sentence, by the drive's name.
 
-        It says whether the stop was sent and confirmed, and why it is repeated. Any thread may call this; it
-        does not wait.
+        The sentence says whether the stop was sent and confirmed, and why it is repeated. Any thread may call
+        this; it does not wait.
         """
         return self._stopper.so_far()
 

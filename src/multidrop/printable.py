@@ -30,7 +30,7 @@ def printable(text: str) -> str:
 
 
 def plain_whole(text: str) -> int:
-    """Return a whole number. Raises ValueError for any other text."""
+    """Return the whole number that a text has in decimal digits. Raises ValueError for any other text."""
     if not _WHOLE.fullmatch(text.strip(" ")):
         raise ValueError(f"{text!r} is no whole number in decimal digits, such as 10")
     if len(text) > MOST_DIGITS:
@@ -39,7 +39,7 @@ def plain_whole(text: str) -> int:
 
 
 def plain_number(text: str) -> float:
-    """Return a number with a point, or nan or inf. Raises ValueError for any other text."""
+    """Return the number that a text such as "42.5", "nan" or "inf" has. Raises ValueError for other texts."""
     if not _NUMBER.fullmatch(text.strip(" ")):
         raise ValueError(f"{text!r} is no number in decimal digits, such as 42.5")
     return float(text)

@@ -209,7 +209,7 @@ class _Reader:
 
 
 def rows(family: Any, held: ParameterSet | None = None) -> list[dict[str, Any]]:
-    """Return a dict for each parameter of a set: texts to show, and why it is not written, if so.
+    """Return a dict for each parameter of a set: texts to show, and the reason if it is never written.
 
     Without a set, return the family's declared parameters, with an empty "value" and no "raw".
     """
