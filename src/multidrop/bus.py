@@ -248,7 +248,7 @@ class Bus:
     def detach(self, drive: Drive) -> None:
         """Take a drive off the bus: its reads, writes and verbs raise NotAttached from then on.
 
-        Its motor continues as it is. The drive's pending verbs raise CancelledByStop, or Unconfirmed if they
+        The motor continues as it is. The drive's pending verbs raise CancelledByStop, or Unconfirmed if they
         were sent already. Waits for the drive's pending stops.
 
         """

@@ -56,7 +56,7 @@ def simulated_plant() -> Iterator[Callable[..., SimulatedPlant]]:
 def simulated_line() -> Iterator[Callable[..., FaultyWire]]:
     """Return a function that simulates drives on one line until the test ends: `simulated_line(YD1000(1))`.
 
-    It also takes the keywords of `simulated_plant`. A program opens the line's `path`.
+    The function also takes the keywords of `simulated_plant`. A program opens the line's `path`.
     """
     with ExitStack() as stack:
         yield partial(_simulate_line, stack)

@@ -98,7 +98,7 @@ class Supervisor:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     def start(self, name: str, work: Coroutine[Any, Any, R]) -> asyncio.Task[R]:
-        """Start a task that ends by itself. Its failure is logged unless it is awaited."""
+        """Start a task that ends by itself. The failure is logged unless the task is awaited."""
         task = asyncio.get_running_loop().create_task(work, name=name)
         self._short.add(task)  # the event loop itself keeps only weak references to tasks
         task.add_done_callback(self._short.discard)

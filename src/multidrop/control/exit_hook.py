@@ -40,7 +40,7 @@ STOPPING = "{} received: stopping {}; Ctrl-C three times within a second gives u
 def _ending() -> tuple[signal.Signals, ...]:
     """Return the signals to handle.
 
-    They include SIGHUP (the terminal was closed) unless the program handles it or nohup ignores it.
+    The signals include SIGHUP (the terminal was closed) unless the program handles it or nohup ignores it.
     """
     if sys.platform != "win32" and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:
         return (*_SIGNALS, signal.SIGHUP)

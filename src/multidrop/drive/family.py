@@ -324,7 +324,7 @@ class Drive(RegisterAccess):
     def echo_probe(self) -> Register[Any] | None:
         """Register whose reply is never a copy of its request; None if the family has none.
 
-        It is read first while it is unknown whether the adapter echoes.
+        The register is read first while it is unknown whether the adapter echoes.
         """
         return None
 

@@ -125,7 +125,7 @@ class RegisterAccess:
     def write(self, register: Register[Any] | str, value: Any) -> Any:
         """Write a value; return the value that the drive then holds, or `value` if that cannot be read.
 
-        The write is sent once. It is skipped if the register may be in EEPROM and already holds the value.
+        The write is sent once, or skipped if the register may be in EEPROM and already holds the value.
         The identity of the drive is checked before the first write to it.
 
         Raises WriteForbidden (also a ValueError) for a write that the library does not send, TypeError for an

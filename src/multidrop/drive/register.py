@@ -404,7 +404,7 @@ class Details(TypedDict, total=False):
 
     step: float | None  #: value of one raw count; None if the document does not state it
     offset: float  #: value of the raw count 0: value = raw * step + offset
-    #: Raw counts that mean "no value". One outside the format's span names the bits: 0x8000 of an I16.
+    #: Raw counts that mean "no value". A count outside the format's span gives the bits: 0x8000 of an I16.
     invalid: float | tuple[float, ...]
     #: Lowest and highest bit of a reading that is only a part of the number in its words. `invalid` counts
     #: that do not fit into the part are compared with the whole number.

@@ -1,4 +1,4 @@
-"""PortQueue: the exchanges that the core carries out on a port. They are queued in advance, or repeated.
+"""PortQueue: the exchanges that the core carries out on a port. Exchanges are queued ahead or repeated.
 
 If all drives of a line answer and are polled as fast as possible, the core repeats the bus cycle by itself.
 Otherwise the queue is refilled with many exchanges at a time.

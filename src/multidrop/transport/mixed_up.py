@@ -1,6 +1,7 @@
 """Detect when Modbus TCP (tcp://) and RTU over TCP (socket://) were confused in a port's name.
 
-A gateway is set to one of these protocols. It is silent to requests of the other, or replies with junk.
+A gateway is set to one of these protocols. To requests of the other protocol it is silent, or replies with
+junk.
 """
 
 from __future__ import annotations

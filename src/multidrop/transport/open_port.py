@@ -217,7 +217,7 @@ def _refusal(rs485: RS485, failure: OSError) -> str:
 class OpenPort:
     """A pyserial port, with a bridge if the core cannot use it directly.
 
-    It may be opened and closed repeatedly, by one thread at a time.
+    The port may be opened and closed repeatedly, by one thread at a time.
     """
 
     def __init__(

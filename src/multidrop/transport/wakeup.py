@@ -7,7 +7,7 @@ from contextlib import suppress
 
 
 class WakeUp:
-    """A descriptor that is readable from `set` to `clear`. It is a socket because of Windows."""
+    """A descriptor that is readable from `set` to `clear`; a socket, as Windows' select needs."""
 
     def __init__(self) -> None:
         self._reader, self._writer = socket.socketpair()
