@@ -37,9 +37,9 @@ class LimitExceeded(Exception):
 
 
 def record_step(poller: Poller, writer: RecordingWriter, seconds: float) -> list[float]:
-    """Record for this time; return its currents in A. Raises LimitExceeded if one is too high or all miss."""
+    """Record for this time; return currents in A. Raises LimitExceeded for a high or a missing current."""
     currents: list[float] = []
-    begin_ns = time.time_ns()  # rows from before it belong to the ramp
+    begin_ns = time.time_ns()  # earlier rows belong to the ramp
     for batch in poller.batches(seconds=seconds):
         writer.write(batch)
         for row in batch:

@@ -202,7 +202,7 @@ class FTDI(Adapter):
         return 0 if self.is_sending else 0x60
 
     def _tick(self) -> None:
-        """Send the status alone. A real chip does so each latency period, this one only while RTS matters."""
+        """Send the status alone: each latency period, but unlike a real chip only while RTS matters."""
         if self.ins and not self._received:
             sequence, _ = self.ins.popleft()
             self.complete(sequence, 0, bytes((self.STATUS, self._line_status)))

@@ -13,7 +13,8 @@ class FarEnd:
     """Modbus RTU devices that share no code with multidrop.
 
     Register r of address a holds (a << 8 ^ r) & 0xFFFF until function 06 or 10 writes another value.
-    Requests at other settings than `settings`, such as (19200, "8E1"), are noise; with None, none are.
+    Requests at other settings than `settings`, such as (19200, "8E1"), are noise.
+    Without `settings`, requests at all settings are valid.
     """
 
     def __init__(self, addresses: Sequence[int], settings: Sequence[object] | None = None) -> None:

@@ -97,7 +97,7 @@ class Hardware:
     # ---- QEMU's own hardware ----
 
     def do_connect(self, wanted: dict[str, Any]) -> None:
-        """Connect drives to QEMU's port "uart" or "usb"; this plugs the latter in."""
+        """Connect drives to QEMU's port "uart" or "usb"; connecting to "usb" also plugs its adapter in."""
         name = wanted["serial"]
         if name in self._connected:
             self._disconnect(self._connected[name])
@@ -131,7 +131,7 @@ class Hardware:
         with socket.socket(socket.AF_UNIX) as sock:
             sock.connect(str(self._folder / "qmp"))
             lines = sock.makefile("rw", encoding="utf-8")
-            lines.readline()  # its greeting
+            lines.readline()  # QEMU's greeting
             for command in ("qmp_capabilities", "system_wakeup"):
                 print(json.dumps({"execute": command}), file=lines, flush=True)
                 lines.readline()

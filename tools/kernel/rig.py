@@ -2,8 +2,8 @@
 
     python tools/kernel/rig.py FOLDER SCENARIO [NAME=VALUE]...
 
-This boots it once, runs one scenario of tests/system/guest, and prints the facts that it returns. A value is
-JSON, such as kind='"ftdi"'. Any number of rigs may run at once.
+The command boots the guest once, runs one scenario of tests/system/guest, and prints the facts that the
+scenario returns. A value is JSON, such as kind='"ftdi"'. Any number of rigs may run at once.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ class Timers:
         heapq.heappush(self._heap, (when, self._count, call, arguments))
 
     def run(self) -> float | None:
-        """Make all calls that are due; return the time in s until the next one, or None."""
+        """Make all calls that are due; return the time in s until the next call, or None."""
         while self._heap and self._heap[0][0] <= monotonic():
             _, _, call, arguments = heapq.heappop(self._heap)
             call(*arguments)
@@ -48,7 +48,7 @@ def interface(number: int, endpoints: int, *, kind: tuple[int, int, int] = (255,
 
 
 class Connection(NamedTuple):
-    """What every device needs."""
+    """What a USB device gets when it is plugged in: its connection, serial number and timers."""
 
     sock: socket.socket  # to the guest's vhci_hcd
     serial: str  # the device's serial number; "": it has none
@@ -72,10 +72,10 @@ class USBDevice:
     # ---- a subclass implements these ----
 
     def offered(self) -> None:
-        """The guest waits for data."""
+        """React to the guest's waiting for data: a transfer was added to `ins`."""
 
     def take(self) -> None:
-        """The guest has sent data: they are in `outs`."""
+        """Take the data that the guest has sent, from `outs`."""
 
     def on_control(self, kind: int, request: int, value: int, index: int, size: int, data: bytes) -> bytes:
         """Return the answer to a control request that is not a standard one."""

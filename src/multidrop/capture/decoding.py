@@ -152,7 +152,7 @@ class RequestTarget:
 
 
 def line_of(plant: Plant | None, name: str) -> PlantLine | None:
-    """Return the plant's line with this name; its only line matches any name."""
+    """Return the plant's line with this name. If the plant has only one line, return that for any name."""
     lines = plant.lines if plant else ()
     named = [line for line in lines if line.name == name]
     return named[0] if named else lines[0] if len(lines) == 1 else None
@@ -285,7 +285,7 @@ class ExchangeFormatter:
 
 
 def data_of(exchange: SniffedExchange, request: Message) -> bytes:
-    """Return the data that was read or written; of a write, from its request: not all replies repeat it."""
+    """Return the data read or written. Written data are from the request: not all replies repeat them."""
     if exchange.framing is Framing.DELIXI and request.function == 0x02:
         return struct.pack(">I", request.start)
     if exchange.framing is not Framing.DELIXI and request.function >= 0x05:

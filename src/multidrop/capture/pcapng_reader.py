@@ -25,7 +25,7 @@ from multidrop.core import Stream, Unpacked, Unpacker
 _OLD_PACKET, _SIMPLE_PACKET = 2, 3
 _IF_OFFSET = 14
 _BINARY, _MOST_DIGITS, _MOST_BITS = 0x80, 9, 32
-_MOST_OFFSET = 1 << 33  # s; times in ns since 1970 must fit into 64 bits
+_MOST_OFFSET = 1 << 33  # limit in s: times in ns since 1970 must fit into 64 bits
 _PCAP = {  # by a file's first four bytes: True if it is big-endian, and its clock ticks per second
     b"\xd4\xc3\xb2\xa1": (False, 10**6),
     b"\xa1\xb2\xc3\xd4": (True, 10**6),

@@ -25,10 +25,10 @@ class CapturedReply(NamedTuple):
 
 
 class Replay:
-    """The exchanges in a capture, by drive. Its time starts with the first request to a replayed drive.
+    """The exchanges in a capture, by drive. Replay time starts at the first request to a replayed drive.
 
-    `plant` describes the captured lines; a plant with one line fits any line's name. Raises CaptureError for
-    an invalid file, and ValueError if the capture has no exchange with a drive of the plant.
+    `plant` describes the captured lines. If it has only one line, captured lines may have any name. Raises
+    CaptureError for an invalid file, and ValueError if the capture has no exchange with a drive of the plant.
     """
 
     def __init__(self, path: Path | str, plant: Plant) -> None:
@@ -84,7 +84,7 @@ class Replay:
 class ReplayedDrive(SimulatedDrive):
     """A drive with captured values. A register has its first captured value until the time of the second.
 
-    It stays silent while the captured drive did, and from the start if it was not captured. Registers that
+    It stays silent when the captured drive did, and always if the capture has no such drive. Registers that
     were not captured keep their defaults. Replies have the family's delay, not the captured one.
     """
 

@@ -165,7 +165,7 @@ def _guarded(run: Callable[[], int]) -> int:
     except (ValueError, TypeError, Unsupported) as mistake:
         return _fail(str(mistake), MISTAKE)
     except OSError as failure:
-        if failure.strerror is None:  # multidrop's own error, not the system's
+        if failure.strerror is None:  # raised by multidrop, not by the operating system
             return _fail(str(failure), FAILED)
         _abandon_output()
         where = f"{failure.filename}: " if failure.filename else ""

@@ -168,7 +168,7 @@ def _add_wake_findings(found: list[tuple[_Target, list[Finding]]]) -> None:
     """Measure how late this computer wakes the core; add the finding for each line with a silence."""
     if all(speaks_tcp(target.port) for target, _ in found):
         return
-    with ThreadPoolExecutor(2) as threads:  # side by side, for the same load
+    with ThreadPoolExecutor(2) as threads:  # measured at the same time, under the same load
         normal = threads.submit(wake_lateness, WAKE_S, realtime=False)
         realtime = threads.submit(wake_lateness, WAKE_S, realtime=True)
     usual = WakeLateness.of(normal.result())
@@ -306,10 +306,10 @@ def _text(findings: list[Finding]) -> Iterator[str]:
 # ---- the round trip ----
 
 
-UNANSWERED = 5  # requests to a drive that does not answer
+UNANSWERED = 5  # number of requests to a drive that never answers
 MOST_S = 5.0  # time limit of all requests, for slow and silent drives
 RETRY_S = 0.05  # pause before a delayed request is tried again
-OF_GATEWAYS = (0x0A, 0x0B)  # codes: no path; no response from the device (application protocol V1.1b3, 7)
+OF_GATEWAYS = (0x0A, 0x0B)  # exception codes: no path; no response of the device (application protocol, 7)
 
 
 def measure(port: str, rs485: RS485, settle: float, drive: Drive | None) -> tuple[Finding, bool]:
@@ -345,7 +345,7 @@ def measure(port: str, rs485: RS485, settle: float, drive: Drive | None) -> tupl
 
 
 def _bad_bytes(completions: Sequence[Completion]) -> str:
-    """Return the most frequent reason for invalid replies, with an example; "" if there were none."""
+    """Return the most frequent reason for invalid replies, with an example; "" without invalid replies."""
     bad = [done for done in completions if done.result < 0 and done.raw and done.result != Failure.NO_REPLY]
     if not bad:
         return ""
@@ -355,7 +355,7 @@ def _bad_bytes(completions: Sequence[Completion]) -> str:
 
 
 def _exception(framing: Framing, request: Message, done: Completion) -> int:
-    """Return the exception code of a reply, from the drive or from a gateway; 0 if it is no exception."""
+    """Return the exception code of a reply, from the drive or from a gateway; 0 for any other reply."""
     if done.result > 0:
         return done.reply.exception
     if framing is not Framing.TCP:
@@ -422,7 +422,7 @@ def other_way_finding(port: str, request: Message, settings: Settings) -> Findin
         found = ask_once(other, request, settings)
     except LineError as failure:
         return Finding("other framing", f"{way} was not tested: {failure.reason}")
-    if found.result > 0 or mixed_up(port, found.raw):  # other bytes prove nothing
+    if found.result > 0 or mixed_up(port, found.raw):  # any other received bytes prove nothing
         return Finding(
             "other framing",
             f"the far end speaks {way}, not {spoken_on(port)}",

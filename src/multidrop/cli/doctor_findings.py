@@ -20,7 +20,7 @@ from multidrop.transport.port_identity import of_name
 
 LATENCY_MS = 1  # advise to change a larger latency timer
 ROUNDS = 20
-SLOW_S = 0.005  # advise if the delay exceeds the family's usual one by more than this
+SLOW_S = 0.005  # a delay that exceeds the family's usual delay by more gets advice
 
 
 _LEVELS = {RS485.RTS_UP: "on", RS485.RTS_DOWN: "off"}
@@ -37,7 +37,7 @@ class Finding:
 def adapter_finding(adapter: Adapter, port: str, lasting: str) -> Finding:
     """Describe the adapter.
 
-    `lasting` is its device name that contains the serial number, or the port if there is no such name.
+    `lasting` is the device name that contains the adapter's serial number, or else the port.
     """
     advice = f"name it {lasting} in plant files: {port} is assigned in the order of plugging in"
     return Finding("adapter", str(adapter), advice if lasting != port else "")
@@ -58,7 +58,7 @@ def latency_finding(adapter: Adapter) -> Finding:
 
 
 # Drivers that delay received bytes unless the low-latency flag is set; others store the flag and ignore it.
-HEEDING_LOW_LATENCY = ("", "ftdi_sio", "serial8250")  # "": unknown
+HEEDING_LOW_LATENCY = ("", "ftdi_sio", "serial8250")  # "": the driver is unknown
 
 
 def low_latency_finding(low: bool | None, driver: str = "") -> Finding:
@@ -109,7 +109,7 @@ def rs485_finding(mode: RS485Mode | None, switch: RS485 = RS485.OFF, *, is_usb: 
 
 
 def echo_finding(found: Completion, sent: bytes, settings: Settings) -> Finding:
-    """Return a finding: whether the adapter echoes, judged by what came back from an unused address.
+    """Return a finding: whether the adapter echoes a request to an unused address.
 
     `found` is the outcome of the request whose bytes are `sent`.
     """
@@ -222,9 +222,9 @@ def wake_finding(
     """Return a finding: whether this computer wakes the core in time for a line with these settings.
 
     `realtime` is the lateness under realtime scheduling, or the reason why the system refuses it.
-    `is_realtime` is that key of the plant file. Good enough is a p99 below t3.5, the silence that precedes
-    each request anyway. If multidrop switches RTS, the maximum must be below that: a drive may answer after
-    t3.5, and a later switch would cut off its first bytes.
+    `is_realtime` is the plant file's key `realtime`. A p99 below t3.5, the silence that precedes each request
+    anyway, is in time. If multidrop switches RTS, even the greatest lateness must be below t3.5: a drive may
+    answer after t3.5, and a later switch would cut off the first bytes of its reply.
     """
     limit, kind = settings.t3_5, "max" if switch in _LEVELS else "p99"
 

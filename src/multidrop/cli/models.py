@@ -182,7 +182,7 @@ def sheet(family: type[Drive]) -> str:
     notes = inspect.cleandoc(family.__doc__ or "")
     for block in notes.split("\n\n") if notes else ():
         lines.append("")
-        for paragraph in re.split(r"\n(?=[-*] |    )", block):  # an indented line is not joined with others
+        for paragraph in re.split(r"\n(?=[-*] |    )", block):  # list items and indented lines
             item = "  " if paragraph[:2] in ("- ", "* ") else ""
             first = " " * (len(paragraph) - len(paragraph.lstrip()))
             lines += wrapped(" ".join(paragraph.split()), first, first + item)
@@ -223,9 +223,9 @@ def _lines_of(family: type[Drive]) -> Iterator[tuple[str, str]]:
 
 
 def gain_of(family: type[Drive]) -> ReadingGain | None:
-    """Return the time that would be saved at default settings, if a gap between registers may be read.
+    """Return the gaps between registers that reads may span if declared, and the bus time that this saves.
 
-    None for a built-in family: only users' own classes can allow it.
+    Assumes default settings. None for a built-in family: only users' own classes can declare such gaps.
     """
     drive = family(family.addresses[0])
     if not is_users_own(family):

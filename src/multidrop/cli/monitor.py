@@ -45,7 +45,7 @@ from multidrop.plant.model import Plant
 from multidrop.poller import Poller
 
 DRAW_S = 0.25
-SCROLL_S = 2.0  # between two pictures on a terminal that scrolls
+SCROLL_S = 2.0  # time between two pictures on a terminal that scrolls
 PAGE = 10  # lines per press of a page key
 _STOP_KEYS = ("s", "S")
 STILL_STOPPING = "waiting for a stop in progress; press Ctrl-C repeatedly to leave, and watch the motors"
@@ -94,7 +94,7 @@ def watch(
             try:
                 monitor.show(seconds)
             finally:
-                failures = monitor.await_stops()  # while ports are open: a stop may not have been sent yet
+                failures = monitor.await_stops()  # before ports are closed: a stop may not have been sent yet
         for sentence in failures:
             warn(sentence)
     return session.poller.summary()
@@ -220,7 +220,7 @@ class Monitor:
             self._turn_page()
 
     def _acknowledge(self) -> None:
-        """Remove those failures that were on the screen, so that the others are shown."""
+        """Remove the failures that were on the screen, so that the remaining failures are shown."""
         del self._at.failures[: self._at.failures_shown]
 
     def _leave(self) -> None:
@@ -246,8 +246,8 @@ class Monitor:
     def _stop_lines(self) -> None:
         """Stop all lines in parallel, so that no line waits for the deceleration of another.
 
-        If some threads cannot be started, first send a stop to each line that has none, and only then wait
-        for them.
+        If some threads cannot be started, first send a stop to each line without a thread, and only then wait
+        for these stops.
         """
         self._stop_results = {}
         stops = {
@@ -316,11 +316,11 @@ KEYS = {  # keys by the escape sequences and letters that terminals send
     b"\n": ENTER,
 }
 UNKNOWN = "unknown"
-# Any other escape sequence, and the start of one. F4's sequence ends in S, which must not stop motors.
+# Any other escape sequence, or the start of a sequence. F4's sequence ends in S, which must not stop motors.
 _SEQUENCE = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*[@-Z\\-~]|O[ -~])")
 _BEGUN = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*|O)?")
 SPLIT_S = 0.05  # how long to wait for the rest of an escape sequence
-MOST_BYTES = 4  # bytes of a character in UTF-8
+MOST_BYTES = 4  # limit of a character's bytes in UTF-8
 # Letters of the Russian and Ukrainian layouts, and the Latin letters on the same keys.
 LATIN = str.maketrans("йыіфнолЙЫІФНОЛ", "qssayjkQSSAYJK")
 

@@ -17,10 +17,10 @@ from multidrop.cli.support.values import columns_of, counted, padded
 from multidrop.printable import printable
 
 LEAST_WIDTH, LEAST_HEIGHT = 60, 12
-WIDE, WIDEST = 100, 110  # widths in columns from which more is shown
+WIDE, WIDEST = 100, 110  # columns: from WIDE on delays are shown too, from WIDEST on models
 OLD_NOTE, NOT_POLLED = "old", "not polled"  # notes beside a register's value
 NEVER = "never"
-LEAST_VALUE, AROUND = 12, 13  # columns for a register's value; columns for its age and all blanks
+LEAST_VALUE, AROUND = 12, 13  # widths: of a register's value; of its age and all blanks together
 OLD = "?"  # mark before an old value
 HISTORY = "LAST MINUTE"  # table heading
 BLOCKS, PLAIN_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*#@"

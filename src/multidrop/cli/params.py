@@ -152,7 +152,7 @@ def _is_file(words: list[str]) -> bool:
 
 
 def _both(one: Target | ParameterSet, other: Target | ParameterSet) -> tuple[ParameterSet, ParameterSet]:
-    """Return the parameters of both sides. From a drive, only those of the other side's file are read."""
+    """Return the parameters of both sides. If one side is a file, read only its parameters from the drive."""
     models = [each.drive.model if isinstance(each, Target) else each.model for each in (one, other)]
     if all(models) and models[0] != models[1]:
         names = [each.drive.name if isinstance(each, Target) else each.source for each in (one, other)]

@@ -214,7 +214,7 @@ _UP_AND_CLEAR = "\x1b[{}F\x1b[J"
 class LiveTable:
     """A table with one line per drive: numbers of samples and misses so far, and newest values.
 
-    It is redrawn in place.
+    Each drawing replaces the previous one.
     """
 
     def __init__(self, plant: Plant, terminal: TextIO) -> None:
@@ -239,7 +239,7 @@ class LiveTable:
 
     def draw(self) -> None:
         columns, height = shutil.get_terminal_size()
-        encoding = self._terminal.encoding or "utf-8"  # an escape for a missing character would be longer
+        encoding = self._terminal.encoding or "utf-8"  # encode with `?`: escapes would be longer
         shown = (printable(line).encode(encoding, "replace").decode(encoding) for line in self._lines())
         lines = [cut_to(line, columns - 1) for line in shown]
         if len(lines) > height - 1:
@@ -283,7 +283,7 @@ def compare(line: PlantLine, summary: dict[str, Any]) -> dict[str, Figures]:
         if drives[polled.drive.name]["exchanges_per_second"]  # no delay was measured for a silent drive
     }
     polls = [poll for polled in line.drives for poll in polled.polls]
-    is_timed = any(poll.every is not None for poll in polls)  # if so, cycles have no measured duration
+    is_timed = any(poll.every is not None for poll in polls)  # True: no cycle time is measured
     cycles = (summary["samples"] + sum(summary["misses"].values())) / len(polls)
     by_delays = predict(planned_on(line, delays), delays, summary["switching_ms"] / 1e3)
     return {

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from multidrop.gateway.reload import Read
     from multidrop.gateway.settings import ServeSettings
 
-DEMO_PORTS = (8750, 0)  # the usual port, or any free one
+DEMO_PORTS = (8750, 0)  # the usual port; if it is in use, any free port
 END_S = 4.7  # from the end signal until the process ends itself
 ROLES = ("look", "stop", "write")
 
@@ -102,7 +102,7 @@ def serve_demo(*, is_shown: bool = True, log: str = "text") -> int:
 
 
 def blind_spots(plant: Plant) -> list[str]:
-    """Return a sentence for each drive whose faults none of its polled registers can show."""
+    """Return a sentence for each drive whose polled registers cannot show a fault."""
     found = []
     for line in plant.lines:
         for drive, polled in ((one.drive, [poll.register.name for poll in one.polls]) for one in line.drives):

@@ -130,7 +130,7 @@ def _listen(listener: Listener, printer: TrafficPrinter, seconds: float | None) 
 # socket, and only the serial settings to an rfc2217 server.
 
 
-LISTEN_S = 0.05  # longest wait for bytes
+LISTEN_S = 0.05  # longest wait for bytes in one read
 _MOST = 4096  # limit of bytes per read
 
 
@@ -275,7 +275,7 @@ class TrafficPrinter:
 def replay(
     capture: Capture, plant: Plant | None, *, as_json: bool, out: CaptureWriter | None = None
 ) -> Counter[str]:
-    """Print the traffic in a capture; return the numbers of exchanges and others for `summary`."""
+    """Print the traffic in a capture; return the counts that `summary` prints, such as of exchanges."""
     printers: list[TrafficPrinter] = []
     for _ in capture:
         printers += [
@@ -296,7 +296,7 @@ _COUNTED = {  # singular and plural
     "strays": ("reply without a request", "replies without a request"),
     "unknown_bytes": ("unknown byte", "unknown bytes"),
 }
-_ALWAYS = ("exchanges", "unknown_bytes")  # printed even if 0
+_ALWAYS = ("exchanges", "unknown_bytes")  # counts that are printed even if 0
 
 
 def summary(counts: Mapping[str, int]) -> str:

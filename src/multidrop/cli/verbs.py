@@ -142,7 +142,7 @@ def _target(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
 
 
 def _opened(target: Target, arguments: argparse.Namespace) -> Bus:
-    """Return the open bus with the drive. Raises LineError, or OSError for a stop: it was not sent."""
+    """Open the drive's port and return the bus. Raises LineError; OSError for a stop, which was not sent."""
     audit = _audit_file(arguments)
     try:
         return target.open_bus(audit)
@@ -182,7 +182,7 @@ def _annotating(command: str, target: Target) -> Iterator[list[str]]:
 def _setpoint(drive: Drive, hz: float) -> Write | None:
     """Return the first write of set_frequency, with a value that the register can hold.
 
-    None if the verb starts with a read.
+    Return None if the verb's first request is a read.
     """
     step = next(drive.set_frequency.script(hz))
     if not isinstance(step, Write):
@@ -244,7 +244,7 @@ def _as_json(state: State | None) -> dict[str, Any] | None:
 
 
 def add_plant_stop_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add --all and --line, and a usage line with a plant file only."""
+    """Add --all and --line, and a usage line for a plant file without a drive."""
     parser.usage = f"{parser.usage}\n       {parser.prog} PLANT.toml [--line LINE] [options]"
     parser.add_argument(
         "--all", action="store_true", help="all drives of the plant; the default if no drive is named"

@@ -37,7 +37,7 @@ from multidrop.supervisor import Ended, end_tasks, supervisor
 SPOOL_BYTES = 10_000_000_000
 STATE = {"state": str, "lines": int, "margin_s": float, "trouble": str, "troubles": dict, "spool": dict}
 SPOOL = {"bytes": int, "lost": int, "behind": int | None, "lag_s": float | None, "trouble": str | None}
-FORWARD_S = 10.0  # time limit at shutdown for forwarding; the next start forwards the other samples
+FORWARD_S = 10.0  # time limit at shutdown for forwarding samples; the rest is forwarded after the next start
 IN_TROUBLE_S = 3.0  # the same time limit if the samples' stream has a problem
 SYNC_S = 3.0  # time limit at shutdown for writing the last rows to the disk
 ENDING_S = 0.05
@@ -217,7 +217,7 @@ class FleetGateway:
 
 
 async def ask_gateway(path: ServerPath, gateway: str, wanted: str) -> dict[str, Any]:
-    """Return a gateway's answer to "state" or "drain". Raises FleetError if there is none."""
+    """Return a gateway's answer to "state" or "drain". Raises FleetError if no answer comes."""
     try:
         message = await path.request(names.gateway_subject(gateway, wanted))
     except NoRight:

@@ -21,7 +21,7 @@ from multidrop.fleet.leases.member import MemberState
 
 
 class _Figure(NamedTuple):
-    """A metric, and where its value is in a gateway's state."""
+    """A metric, and the place of its value in a gateway's state."""
 
     name: str
     kind: str  # "gauge" or "counter"

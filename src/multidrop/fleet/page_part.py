@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from multidrop.fleet.servers.connections import ServerPath
 
 EXAMPLE = "nats://127.0.0.1:4222"
-OLD_S = 5.0  # a view of the fleet that is older makes the part unhealthy
+OLD_S = 5.0  # an older view of the fleet makes the part unhealthy
 AGAIN_S = 1.0  # pause between attempts to connect as a commander
 LOG = "fleet-commands.jsonl"
 

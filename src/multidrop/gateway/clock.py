@@ -29,7 +29,7 @@ else:  # on macOS and Windows the monotonic clock includes sleep
 
 
 def now_and_slept_ns() -> tuple[int, int]:
-    """Return the monotonic time, and how long the computer has slept since its boot, both in ns.
+    """Return the monotonic time and the computer's total time asleep since its boot, both in ns.
 
     The boot-time clock is read first, so that a pause between the two reads never counts as sleep.
     """

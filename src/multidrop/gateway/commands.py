@@ -41,7 +41,7 @@ from multidrop.supervisor import supervisor
 
 MOST_AGE_S = 5.0  # an older write or verb, such as one that a network delayed, is refused; stops never are
 LOOK_S = 0.02  # during a reload: interval of checking for changed drives that must be stopped again
-MOST_WRITES = 8  # concurrent writes on one line; stops are not counted
+MOST_WRITES = 8  # limit of concurrent writes on one line; stops are not counted
 BUSY = "too many writes are under way"  # a value of WriteForbidden.rule
 UNAUDITED = "the audit log cannot be written"  # a value of WriteForbidden.rule
 OVERTAKEN = "a stop was called"  # a value of WriteForbidden.rule
@@ -63,7 +63,7 @@ class UnknownDrive(ValueError):
 
 
 class VerbRule(NamedTuple):
-    """The role that a verb needs, and whether the plant file must list it in `verbs` of [serve.may]."""
+    """The role that a verb needs, and whether `verbs` of [serve.may] must list the verb."""
 
     role: Right
     is_listed: bool
@@ -90,7 +90,7 @@ class PolledLines(Protocol):
     def plant_now(self) -> Plant: ...
     @property
     def plant_coming(self) -> Plant | None:
-        """The plant of a reload in progress; None without one."""
+        """The new plant of a reload in progress; None if no reload is in progress."""
 
     def bus(self, line: str) -> Bus: ...
 
@@ -105,12 +105,12 @@ class Commands:
         self, lines: PolledLines, may: May, on_reset: Callable[[str], object] = lambda drive: None
     ) -> None:
         self.may = may
-        self.withheld = ""  # why all commands but stops are refused; "" if they are not
+        self.withheld = ""  # why all commands except stops are refused now; "": they are allowed
         self._on_reset = on_reset
-        self._halts: Counter[str] = Counter()  # by drive: other commands that can end a run
+        self._halts: Counter[str] = Counter()  # by drive: commands, besides stops, that can end a run
         self._jogging: Counter[str] = Counter()  # by drive: jogs in progress
         self._lines = lines
-        self.called = 0  # number of commands so far whose callers had all rights
+        self.called = 0  # number of admitted commands so far
         self._under_way: Counter[str] = Counter()  # by line: writes in progress
         self.stops: Counter[str] = Counter()  # by drive: number of stops called
         self._stopped_ns: dict[str, int] = {}  # by drive: when its latest stop was called (CLOCK_BOOTTIME)
@@ -196,7 +196,7 @@ class Commands:
     async def write(
         self, drive: str, register: str, value: float, caller: Caller, admit: Admit = lambda what: inf
     ) -> CommandResult:
-        """Write a register that the plant file lists, once."""
+        """Write a register once; the plant file must list the register."""
         what = f"{drive}.{register}"
         if caller.role < Right.WRITE:
             return denied(caller, Right.WRITE, f"a write of {what}")

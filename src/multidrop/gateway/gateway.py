@@ -40,12 +40,12 @@ from multidrop.gateway.sd_notify import Notifier
 from multidrop.gateway.settings import AUDIT_S, ServeSettings, check_writable
 from multidrop.supervisor import Hung, in_time, supervisor
 
-TAKE_S = 0.1  # interval of taking rows from the poller: half the interval of frames
-LOOK_S = 0.2  # interval of checking for alarms; a frame follows each check
+TAKE_S = 0.1  # time between two deliveries of rows by the poller: half the time between frames
+LOOK_S = 0.2  # time between checks for alarms; a frame follows each check
 TICK_S = 1.0  # interval of reading statistics
 LOG_S = 60.0  # interval of log lines about a part that keeps failing
 RESTORE_S = 2.0  # how long to wait for the alarms of earlier runs
-MOST_ASKED = 16  # concurrent requests for registers outside the drives' tables
+MOST_ASKED = 16  # limit of concurrent requests for registers outside the drives' tables
 ASKED_S = 30.0  # time limit of one such request
 END_S = 4.0  # time limit of shutdown, stops included
 GRACE_S = 1  # part of END_S for finishing HTTP requests in flight
@@ -71,7 +71,7 @@ class Gateway:
         self.revision = secrets.randbits(32)  # version of the plant: random at first, plus 1 for each reload
         self.failures: dict[str, int] = {}
         self.audit = settings.audit
-        self.unaudited = ""  # why the audit log is not written; "" if it is
+        self.unaudited = ""  # why the audit log is not written; "": it is written
         self.parts = LiveParts(self)
         self.feeds = self.parts.feeds
         self.guard_clock: Callable[[], float] = self.clock
@@ -195,7 +195,7 @@ class Gateway:
             await asyncio.wait_for(work, seconds)
         except TimeoutError:
             _log.error("%s did not end in time", name)
-        except Exception:  # the other parts of the gateway are ended nevertheless
+        except Exception:  # continue: the other parts must be closed too
             _log.exception("ending %s failed", name)
 
     async def _find_audit(self) -> None:
@@ -276,7 +276,7 @@ class Gateway:
             if lost is None and any(self.hub.last_answer(polled.drive.name) for polled in line.drives):
                 self.alarms.note_there(line.name)
             if lost is None and self.hub.taken:
-                self.hub.unopened.pop(line.name, None)  # a later loss has another reason
+                self.hub.unopened.pop(line.name, None)  # the port works now, so this reason is outdated
 
     def _restore_alarms(self) -> bool:
         """Take over the alarms of earlier runs; return False while these are read (RESTORE_S at most)."""
@@ -330,7 +330,7 @@ class Gateway:
             self.guarded("minute", self.hub.note_minute)
             self.guarded("connections", self.connections.sweep)
             supervisor().look()
-            self._has_news = True  # a frame is due: its time shows pages that the gateway is alive
+            self._has_news = True  # also without new rows: a frame's time shows that the gateway is alive
             if notifier.watchdog_s:
                 notifier.send("WATCHDOG=1")
             await asyncio.sleep(every)

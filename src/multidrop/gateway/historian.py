@@ -27,7 +27,7 @@ MS_NS = 1_000_000
 LOOK_S = 1.0  # interval of checking that the writing thread is alive
 CLOSING_S = 3.0  # time limit for writing the last rows
 QUERY_S = 30.0  # time limit of a query, and of its wait for other queries
-MOST_QUERIES = 2  # concurrent queries
+MOST_QUERIES = 2  # limit of concurrent queries
 PIECE = 1 << 16  # bytes of an export read at a time
 UNFINISHED = ".export-"  # prefix of temporary folders of exports
 MOST_BUCKETS = 200_000  # limit of one answer (5 MB): the page's 24 series on a screen of 8000 px
@@ -57,7 +57,7 @@ Settings = HistorySettings
 
 
 def build(settings: HistorySettings, context: PartContext) -> Historian:
-    """Return the historian of a gateway. Loads DuckDB now, so that the first query need not wait for that."""
+    """Return the historian of a gateway. Imports DuckDB now, so that the first query is not delayed."""
     with suppress(ImportError):
         import_module("duckdb")
     folder = context.folder / settings.folder
@@ -83,7 +83,7 @@ class Historian:
             keep=parse_age(settings.keep),
             most=parse_size(settings.most),
         )
-        for left in folder.glob(f"{UNFINISHED}*"):  # left by a killed process; no other process records here
+        for left in folder.glob(f"{UNFINISHED}*"):  # left by a killed process: no other one records here now
             rmtree(left, ignore_errors=True)
         self.history = History(folder)
         self._is_closed = False
@@ -131,7 +131,7 @@ class Historian:
 
     @property
     def state(self) -> HistoryState:
-        """Rows written, rows lost, and the present problem."""
+        """The number of rows written and lost so far, and the present problem."""
         return self._writer.state()
 
     # ---- queries; times are UTC in ms ----
@@ -165,7 +165,7 @@ class Historian:
             raise ValueError(f"format = {kind!r} is neither csv nor parquet")
         if kind == "csv":
             return self.history.csv(series, begin_ns, end_ns)
-        self.history.read(series, begin_ns, end_ns)  # raises errors of wrong arguments now
+        self.history.read(series, begin_ns, end_ns)  # raises the errors for wrong arguments now
         return self._parquet(series, begin_ns, end_ns)
 
     def _parquet(self, names: Sequence[str] | None, begin: int, end: int) -> Iterator[bytes]:

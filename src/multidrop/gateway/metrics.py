@@ -37,7 +37,7 @@ class BaseUnit(NamedTuple):
     factor: float = 1.0
 
 
-UNITS = {  # by unit of registers
+UNITS = {  # keys: units of registers
     "Hz": BaseUnit("hertz"),
     "kHz": BaseUnit("hertz", 1e3),
     "A": BaseUnit("amperes"),
@@ -60,8 +60,8 @@ UNITS = {  # by unit of registers
     "raw count": BaseUnit("raw"),
     "": BaseUnit("number"),
 }
-CODE = BaseUnit("code")  # named values, as their numbers
-OTHER = BaseUnit("other")  # its series have the label `unit`
+CODE = BaseUnit("code")  # unit of registers with named values; the metric has the raw counts
+OTHER = BaseUnit("other")  # series of this unit have the label `unit`
 TEXTS = {
     "code": "Numbers of named values, such as states.",
     "number": "Values without a unit.",
@@ -218,7 +218,7 @@ def counter(name: str, text: str, value: float) -> MetricFamily:
 
 
 def process_families() -> Iterator[MetricFamily]:
-    """Yield the usual metrics of a process. Where the system has no /proc, only its CPU time."""
+    """Yield the usual metrics of a process. Except on Linux, yield only its CPU time."""
     yield counter("process_cpu_seconds", "CPU time of user and system.", time.process_time())
     if sys.platform != "linux":
         return

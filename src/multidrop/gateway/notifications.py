@@ -35,7 +35,7 @@ from multidrop.supervisor import supervisor
 
 MOST_TARGETS = 20
 MOST_BYTES = 65_536  # limit of the file of targets
-MOST_WAITING = 1000  # alarms that wait for a target
+MOST_WAITING = 1000  # limit of alarms that wait for a target
 MOST_AN_HOUR = 1000
 SEND_S = 20.0  # how long a webhook may be silent during an attempt
 RETRY_S, MOST_RETRY_S = 5.0, 300.0  # pause after the first failed attempt, and the longest pause
@@ -63,7 +63,7 @@ class NotifySettings:
 
     targets: str = "targets"  # path of a file with a URL on each line
     on: tuple[str, ...] = KINDS  # kinds of alarms that are sent
-    most: int = 60  # messages an hour to each target
+    most: int = 60  # limit of messages an hour to each target
 
     def __post_init__(self) -> None:
         wrong = [
@@ -114,7 +114,7 @@ def read_targets(path: Path) -> tuple[list[AlarmTarget], list[str]]:
 
 
 def _shown(url: str) -> str:
-    """Return the part of a target's URL that is no secret. Raises ValueError if it is not a valid URL."""
+    """Return the part of a target's URL that is not secret. Raises ValueError for an invalid URL."""
     scheme, separator, rest = url.partition("://")
     if not separator or not rest or not SCHEME.fullmatch(scheme):
         raise ValueError("this is not a URL, such as https://HOST/PATH or ntfy://TOPIC")
@@ -174,10 +174,10 @@ def _iso(time_ms: int) -> str:
 
 
 class AlarmQueue:
-    """Alarms that wait for one target, oldest first, and how many messages it may still get.
+    """Alarms that wait for one target, oldest first, and the number of messages that the target may get now.
 
-    `most` messages an hour are allowed. If more alarms begin and end, the target gets the newest message of
-    each, as soon as it is allowed, with the number of those left out.
+    `most` messages an hour are allowed. Above that rate, only the newest message of each alarm waits; it also
+    states how many messages were left out.
     """
 
     def __init__(self, most: int, now_s: float) -> None:
@@ -200,7 +200,7 @@ class AlarmQueue:
             self.left_out += excess
 
     def next(self, now_s: float) -> tuple[Alarm | None, float]:
-        """Return the alarm to send now, or None and the seconds until one is allowed (inf: none waits)."""
+        """Return the alarm to send now, or None and the seconds until the next one (inf: none waits)."""
         rate = self._most / 3600
         self._allowed = min(self._most, self._allowed + (now_s - self._filled_s) * rate)
         self._filled_s = now_s
@@ -383,7 +383,7 @@ class Notifications:
             await asyncio.wait(self._threads, timeout=CLOSE_S)
 
     def health(self) -> str:
-        """Return why messages are not sent; "" if they are."""
+        """Return why messages cannot be sent; "" if sending works."""
         return next((one.problem for one in self._senders if one.problem), "")
 
     def figures(self) -> list[MetricFamily]:

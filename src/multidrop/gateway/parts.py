@@ -21,7 +21,7 @@ from multidrop.gateway.live.alarms import Alarms
 from multidrop.gateway.live.hub import Hub
 from multidrop.supervisor import supervisor
 
-BUILD_S = 3.0  # how long a start or a reload waits for parts whose files do not answer
+BUILD_S = 3.0  # how long a start or a reload waits for parts whose disks do not answer
 END_S = 3.0  # time limit for closing a part
 
 # Module of each part, imported when its table is used. It has `Settings`, a frozen dataclass of the table's
@@ -238,5 +238,5 @@ async def _close_when_built(built: Mapping[str, Building]) -> None:
 async def _close(name: str, part: Part, seconds: float) -> None:
     try:
         await asyncio.wait_for(part.close(), seconds)
-    except Exception:  # the other parts are closed nevertheless
+    except Exception:  # continue: the other parts must be closed too
         _log.exception("closing %s failed", name)

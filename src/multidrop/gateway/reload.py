@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 Read = Callable[[], "tuple[Plant, ServeSettings]"]
 AT_ONCE = ("names", "tokens", "may", "limit", *PARTS)  # keys of [serve] that need no restart
 READ_S = 10.0  # time limit for reading the file
-QUICK_S = 1.0  # least time that reading gets before a later reload cancels it
-MOST_READS = 8  # concurrent reads, all of which may hang
+QUICK_S = 1.0  # least time for reading the file before a later reload cancels the read
+MOST_READS = 8  # limit of concurrent reads, because reads may hang
 ADOPTION_S = 60.0  # a longer adoption, which opens ports and stops drives, counts as hanging
 RESTART = "takes effect after a restart"
 NO_FILE = "this plant has no file to be read again"
@@ -123,7 +123,7 @@ class Reload:
         if self._read is None or poller is None:
             return Reloaded(False, NO_FILE)
         plant, settings, planned = await self._read_within(self._read)
-        if gateway.audit:  # the adoption opens this log
+        if gateway.audit:  # adopting the plant opens this log
             await supervisor().within("audit log", AUDIT_S, partial(check_writable, gateway.audit))
         await gateway.parts.replace(settings.parts, plant)
         gateway.hand_out(poller)
@@ -134,7 +134,7 @@ class Reload:
             self._take_up(poller, settings, planned)
             gateway.parts.take_up()
         except Exception:
-            if poller.plant.lines != gateway.plant.lines:  # some lines were adopted: use these
+            if poller.plant.lines != gateway.plant.lines:  # some new lines are polled already: use these
                 self._take_up(poller, gateway.settings, None)
             await gateway.parts.take_back()
             raise
@@ -193,7 +193,7 @@ class Reload:
         gateway, may = self._gateway, settings.may
         now = gateway.settings
         if (settings.behind_proxy, settings.host) != (now.behind_proxy, now.host):
-            may = may.bounded_by(now.may)  # a restart changes which clients can connect
+            may = may.bounded_by(now.may)  # until a restart, other clients can connect than the file says
         gateway.settings = replace(
             gateway.settings, names=settings.names, tokens=settings.tokens, may=may, limits=settings.limits
         )

@@ -63,7 +63,7 @@ class ServeSettings:
     port: int = 8750
     names: tuple[str, ...] = ()
     tls: ssl.SSLContext | None = None
-    certificate: str = ""  # digest of the certificate and key files, which may be renewed in place
+    certificate: str = ""  # digest of certificate and key, because these files may be renewed in place
     behind_proxy: bool = False
     tokens: tuple[Token, ...] = ()
     may: May = May()  # noqa: RUF009 (it cannot change)
@@ -87,7 +87,7 @@ class ServeSettings:
 class Folders:
     """Finds the files that `[serve]` names: among the service's credentials, else beside the plant file.
 
-    Output files are in the service's state folder, or beside the plant file without one.
+    Output files are in the service's state folder; without a service, beside the plant file.
     """
 
     def __init__(self, plant: Path, environment: Mapping[str, str]) -> None:
@@ -105,7 +105,7 @@ class Folders:
 
 
 def read_plant(load: Callable[[], Plant], environment: Mapping[str, str]) -> tuple[Plant, ServeSettings]:
-    """Return a plant and its `[serve]` settings. Raises PlantError with all mistakes in both."""
+    """Return a plant and its `[serve]` settings. Raises PlantError with all mistakes in the file."""
     try:
         plant = load()
     except PlantError as wrong:

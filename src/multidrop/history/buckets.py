@@ -31,8 +31,8 @@ class Buckets:
 
     begin: int  # UTC in ns
     step: int  # in ns
-    n: list[int]  # number of values
-    missed: list[int]  # number of misses
+    n: list[int]  # number of values, for each bucket
+    missed: list[int]  # number of misses, for each bucket
     least: list[float | None]
     mean: list[float | None]
     most: list[float | None]
@@ -187,7 +187,7 @@ class UnitBuckets:
         return self._by_unit.setdefault(unit, Accumulator(self._grid))
 
     def buckets(self, unit: str | None, left_out: Sequence[str]) -> Buckets:
-        """Return the buckets of `unit`; if it is None, those of the unit of the newest row."""
+        """Return the buckets of the rows with this unit; with None, of rows with the newest row's unit."""
         if unit is None and self._by_unit:
             unit, *others = sorted(self._by_unit, key=self._newest_ns.__getitem__, reverse=True)
             parts, left_out = [self._by_unit[unit]], others

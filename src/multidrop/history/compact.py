@@ -84,7 +84,7 @@ def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
 
 
 def clean(folder: Path) -> None:
-    """Remove what a killed process left: incomplete files, and files that newer files replace."""
+    """Remove the remains of a killed process: incomplete files, and files that newer files replace."""
     for directory in (folder / "rows", folder / "tens"):
         for path in directory.glob(".*.part"):
             path.unlink()
@@ -181,7 +181,7 @@ def _without_tens(folder: Path, tens: list[HistoryFile]) -> set[int]:
 def finished(tens: list[HistoryFile], seconds: int, missing: set[int]) -> list[list[HistoryFile]]:
     """Return the groups of files to merge: one group for each past period of `seconds`, an hour or a day.
 
-    A group is left out while a segment within it lacks tens: the merged file would hide that they are
+    A group is left out while a segment within it lacks tens: the merged file would hide that these tens are
     missing.
     """
     runs = [list(run) for _, run in groupby(tens, key=lambda file: file.begin // seconds)]

@@ -16,7 +16,7 @@ from multidrop.polling.batch import Rows, assemble, schema
 from multidrop.recording.format import METADATA_KEY, Metadata
 from multidrop.recording.rows import RecordedRows
 
-MOST_INSERTED = 60_000  # rows per insert; each takes 70 bytes, as its names are text
+MOST_INSERTED = 60_000  # limit of rows per insert; each takes 70 bytes, as its names are text
 TABLE = (
     "create temp table recorded (time timestamptz_ns, monotonic_ns bigint, uncertainty_ns bigint,"
     " drive varchar, register varchar, value double, status varchar)"
@@ -171,7 +171,7 @@ def files_of(paths: Iterable[Path]) -> str:
 
 
 def with_units(paths: Iterable[Path]) -> str:
-    """Return the SQL that reads Parquet files as one table, with file names; a missing `unit` is null."""
+    """Return the SQL that reads Parquet files as one table with file names; a missing `unit` becomes null."""
     files = f"read_parquet({_list(paths)}, union_by_name = true, filename = true)"
     return f"(select * from {files} union all by name select null::varchar as unit where false)"
 

@@ -85,7 +85,7 @@ class Listing:
 
 
 def listing(folder: Path) -> Listing:
-    """List a history, or a recording in segments such as run.arrows. Raises OSError if there is none."""
+    """List a history, or a recording in segments such as run.arrows. Raises OSError if neither exists."""
     if folder.suffix == ".arrows":
         return Listing(dict(segments_of(folder)))
     segments = dict(segments_of(folder / STEM))  # first: see the order of listing in __init__

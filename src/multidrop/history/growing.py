@@ -17,7 +17,7 @@ from multidrop.polling.batch import Row
 from multidrop.recording.arrow_decoder import RecordedColumns
 from multidrop.recording.arrows import ArrowsTail, BatchPlace
 
-MOST_TENS = 4096  # series whose tens are cached; limited because queries may name unknown series
+MOST_TENS = 4096  # limit of series whose tens are cached, because queries may name unknown series
 
 Ten = list[float]  # numbers of values and misses; sum, least and most of the values
 
@@ -75,7 +75,7 @@ class GrowingSegment:
             self._holders += 1
 
     def let_go(self) -> None:
-        """End one `hold`, and close the file if no other `hold` remains."""
+        """Undo one call of `hold`, and close the file if no other `hold` remains."""
         with self._changing:
             self._holders -= 1
             if not self._holders:
@@ -115,7 +115,7 @@ class GrowingSegment:
         return list(_rows(columns, wanted, begin, end))
 
     def gather(self, found: Mapping[Series, Accumulator], grid: Grid) -> None:
-        """Add the series' rows to the buckets of the grid."""
+        """Add the series' rows in this segment to their buckets of the grid."""
         with self._changing:
             if grid.is_of_tens:
                 self._gather_tens(found, grid)
@@ -221,7 +221,7 @@ class SeriesRows:
     """Rows of one series from a range of batches."""
 
     def __init__(self, first: int) -> None:
-        self.first = self.past = first  # batch numbers: the first, and the one after the last
+        self.first = self.past = first  # batch numbers: of the first batch, and of the batch after the last
         self.times = array("q")
         self.values = array("d")
         self.valid = bytearray()
@@ -262,6 +262,6 @@ class KeptSeries:
         return sum(len(rows.times) for rows in self._kept.values())
 
     def _found(self, series: Series, batches: range) -> SeriesRows:
-        """Return the series' cached rows if they reach to the first batch, else an empty entry."""
+        """Return the cached rows if they reach up to the batch `batches.start`; else an empty entry."""
         rows = self._kept.pop(series, None)
         return rows if rows and rows.first <= batches.start <= rows.past else SeriesRows(batches.start)

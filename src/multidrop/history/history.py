@@ -117,7 +117,7 @@ class History:
                 try:
                     yield from self._rows_of_segment(number, found, series, begin, end, parting)
                     break
-                except Replaced:  # before the segment's first row was yielded: another file has its rows now
+                except Replaced:  # raised before the segment's first row: another file has the rows now
                     found = self._sources.listing()
                     self._check_merged(number, found)
             else:

@@ -1,4 +1,4 @@
-"""Quantities: what the values of a series measure, from the metadata of their segments. Pure.
+"""Quantities: what the values of a series measure, from the metadata of their segments.
 
 In a new segment, a name may belong to another drive or family. Values of two quantities are never combined.
 """
@@ -85,7 +85,7 @@ class OtherColumn(NamedTuple):
 
 
 class Parting:
-    """The newest quantity of each series, and its earlier quantities, whose values buckets exclude.
+    """The newest quantity of each series, and the series' earlier quantities. Buckets exclude their values.
 
     In rows, values of an earlier quantity get a column of their own, such as "load [A]". `series` None means
     all series that the segments describe.
@@ -135,7 +135,7 @@ class Parting:
         ]
 
     def described(self, metadata: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the metadata, with descriptions of the columns that it lacks or describes wrongly."""
+        """Return the metadata with a correct description of each column."""
         columns = {series: (series[1], quantity) for series, quantity in self.newest.items()}
         drives = {name: dict(_table(about)) for name, about in _table(metadata.get("drives")).items()}
         said = quantities_of(metadata)

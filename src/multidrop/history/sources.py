@@ -31,8 +31,8 @@ from multidrop.recording.format import Metadata
 T = TypeVar("T")
 ALWAYS = -(2**63), 2**63 - 1  # ns: a range that includes every time
 MEMORY = "200MB"  # limit for DuckDB
-MOST_TRIES = 50  # attempts to read files that are being replaced; a slow reader may need many
-MOST_GROWING = 4  # number of segments whose index is cached
+MOST_TRIES = 50  # limit of attempts to read files that are being replaced
+MOST_GROWING = 4  # limit of segments whose index is cached
 FILES_AT_ONCE = 200  # files per query of metadata; a file's metadata may take 100 kB
 
 
@@ -199,7 +199,7 @@ def rows_of_file(
     """Yield the series' rows (None: all) in order of request times. Raises Replaced before the first row."""
     condition, values = _condition(series)
     with sources.cursor() as cursor, while_there([file]):
-        # Sorting reads the whole file before the first row is yielded, so Replaced is never raised after it.
+        # Sorting reads the whole file before the first row is yielded, so Replaced is never raised later.
         query = _ROWS.format(_columns(renamed), with_units([file.path]), condition) + " order by monotonic_ns"
         yield from rows_of(cursor, query, {"begin": begin, "end": end, **values})
 

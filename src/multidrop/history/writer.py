@@ -20,8 +20,8 @@ from multidrop.recording.segments import SegmentWriter, outlived, segments_of
 from multidrop.transport import clock
 
 MOST_WAITING = 250_000  # limit of unwritten rows (12 MB); while the disk is slow, further rows are dropped
-WRITING_S = 0.4  # between writes; each write makes a batch, and many small batches slow down queries
-TENDING_S = 60.0  # between removals of old files
+WRITING_S = 0.4  # time between writes; each write makes a batch, and many small batches slow down queries
+TENDING_S = 60.0  # time between removals of old files
 HANGING_S = 5.0  # a write that takes longer is reported
 ENDING_S = 10.0  # how long `close` waits for the disk
 
@@ -93,7 +93,7 @@ class HistoryWriter:
             self._waiting_rows += len(batch)
 
     def begin(self, metadata: Metadata) -> None:
-        """Start a new segment with the metadata of a changed plant. Earlier rows stay in the last one."""
+        """Start a new segment with the metadata of a changed plant. Earlier rows stay in the old segment."""
         with self._changing:
             self._ended.append((self._waiting, metadata))
             self._waiting = []
@@ -194,7 +194,7 @@ class HistoryWriter:
 class Compactor:
     """Runs a child process that compacts closed segments, and again when more segments are closed."""
 
-    PAUSE_S = 60.0  # after a failure
+    PAUSE_S = 60.0  # pause after a failed compaction
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

@@ -1,4 +1,4 @@
-"""Convert register tables of other programs into family files; facts that the source lacks become gaps."""
+"""Convert register tables of other programs into family files; missing facts become comments "gap: ..."."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from multidrop.toml_check import parse_document, read_bounded
 __all__ = ["SUFFIXES", "ImportedDevice", "all_devices", "family_text", "plant_text", "read_devices"]
 
 MOST_BYTES = 5_000_000
-MOST_REASONS = 3  # reasons listed in an error
+MOST_REASONS = 3  # limit of reasons listed in an error
 
 
 def read_devices(path: Path) -> list[ImportedDevice]:
@@ -58,7 +58,7 @@ def _make_titles_unique(devices: list[ImportedDevice], stem: str) -> None:
 
 
 def all_devices(path: Path) -> list[ImportedDevice]:
-    """Return all devices, including those without an importable register. Raises as `read_devices` does."""
+    """Return all devices, even without importable registers. Raises the errors of `read_devices`."""
     read = _READERS.get(path.suffix.lower())
     if read is None:
         raise ValueError(f"{path}: its suffix is not one of {', '.join(_READERS)}")

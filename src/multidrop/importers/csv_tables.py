@@ -101,7 +101,7 @@ _NAMED_TABLES = (  # the first matching prefix of a cell decides
 _FUNCTIONS = {1: "coil", 2: "discrete", 3: "holding", 4: "input"}
 _WRITES = {5: "coil", 6: "holding", 15: "coil", 16: "holding"}
 _BARE_HEX = re.compile(r"(?=[0-9]*[a-fA-F])[0-9a-fA-F]{1,8}")
-_REFERENCE = re.compile(r"[0134][0-9]{4,5}")  # as 40001 or 400001: table's digit, then number from 1
+_REFERENCE = re.compile(r"[0134][0-9]{4,5}")  # 40001 or 400001: digit of the table, then number from 1
 _ACCESS = {  # cell: whether the register is read, whether it is written
     **dict.fromkeys(("r", "ro", "read", "readonly", "rd"), (True, False)),
     **dict.fromkeys(("w", "wo", "write", "writeonly"), (False, True)),
@@ -112,8 +112,8 @@ _ACCESS = {  # cell: whether the register is read, whether it is written
 _SIGNED = {"signed": True, "yes": True, "y": True, "true": True, "s": True}
 _SIGNED |= {"unsigned": False, "no": False, "n": False, "false": False, "u": False}
 
-MOST_TITLES = 20  # title lines allowed before the column header
-MOST_UNKNOWN = 20  # unknown columns named in a message
+MOST_TITLES = 20  # limit of title lines before the column header
+MOST_UNKNOWN = 20  # limit of unknown columns named in a message
 
 Cells = Mapping[str, str]
 
@@ -219,7 +219,7 @@ def _plain_name(cell: str) -> tuple[str, str]:
 
 
 def _places(header: list[str]) -> dict[str, int]:
-    """Return the indexes of the imported columns, by key. If a column fits two keys, the first gets it."""
+    """Return the indexes of the imported columns, by key. A column that fits two keys goes to the first."""
     found: dict[str, int] = {}
     for key, aliases in CARRIED.items():
         for alias in aliases:
@@ -269,7 +269,7 @@ def _assume_number(register: ImportedRegister, stated: str | None) -> None:
 
 
 def _referred(register: ImportedRegister, given: str, stated: str | None, cells: Cells) -> tuple[int, str]:
-    """Return address and table of a number such as 40001; a plain address if other cells contradict it."""
+    """Return address and table of a number such as 40001; a plain address if other cells contradict 40001."""
     address, table = Counting(None).address_in_cell(given, None, "holding")
     is_bit = table in ("coil", "discrete")
     if (stated not in (None, table)) or (is_bit and stated is None and _is_number(cells)):
@@ -442,7 +442,7 @@ def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
         what = "type and sign are" if signed is None else "type is"
         register.gaps.append(f"its {what} not stated; {assumed}{16 * (words or 1)} was assumed")
         return format_of_width(assumed, words or 1)
-    kind = re.sub(r"^(\d+)bits?(.*)$", r"\2\1", kind)  # 16 bit unsigned
+    kind = re.sub(r"^(\d+)bits?(.*)$", r"\2\1", kind)  # such as "16 bit unsigned"
     if match := _WHOLE.fullmatch(kind):
         kind = f"{'uint' if match[1] else 'int'}{match[2]}"
     if found := format_of_width(kind, words or 1):
@@ -461,7 +461,7 @@ def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
 
 
 def _order(register: ImportedRegister, given: str) -> str:
-    """Return the byte order that a cell states; add a gap if it states none."""
+    """Return the byte order that a cell states; add a gap if the cell states no byte order."""
     word = re.sub(r"[^a-z]|endian|first", "", given.lower())
     if not given:
         register.gaps.append("the order of its words is not stated")
@@ -471,7 +471,7 @@ def _order(register: ImportedRegister, given: str) -> str:
 
 
 def _scale(register: ImportedRegister, cells: Cells, *, is_neuron: bool) -> None:
-    """Set step and offset; if a column's meaning varies between programs, add a gap with the assumed one."""
+    """Set step and offset; if a column's meaning varies by program, add a gap with the assumed meaning."""
     found = _steps(cells)
     key, given = found[0] if found else ("scale", "")
     offset = cells.get("offset", "")

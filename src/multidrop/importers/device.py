@@ -177,7 +177,7 @@ class ImportedRegister:
 
 @dataclass(frozen=True)
 class Lost:
-    """An entry that could not be imported, and why; for other facts, such as keys, `is_entry` is False."""
+    """An entry that could not be imported, and why. `is_entry` is False for lost keys and other facts."""
 
     name: str
     reason: str
@@ -197,7 +197,7 @@ class ImportedDevice:
     texts: list[ImportedRegister] = field(default_factory=list)
     commands: list[ImportedRegister] = field(default_factory=list)
     lost: list[Lost] = field(default_factory=list)
-    readable: range = range(0)  # holding registers that a read may span, unnamed ones included
+    readable: range = range(0)  # holding registers that a read may span, including unnamed registers
     together: int = 0  # most registers per read request; 0: not stated
     line: LineSettings = UNKNOWN_LINE
     names: UniqueNames = field(default_factory=lambda: UniqueNames())

@@ -19,7 +19,7 @@ from multidrop.importers.device import UNKNOWN_HOST, ImportedDevice, ImportedReg
 from multidrop.printable import printable
 from multidrop.toml_check import TomlPlace, parse_document
 
-MOST_LOST = 500  # lost entries listed in the family file
+MOST_LOST = 500  # limit of lost entries listed in the family file
 UNKNOWN_PORT = f"the port, which the file does not state; tcp://{UNKNOWN_HOST}:502 if it is Modbus TCP"
 _LONGEST = 200  # limit of a text, in characters
 _MOST_POINTS = 20  # limit of dots in a text; the TOML parser is slow on a line with very many dots
@@ -165,7 +165,7 @@ def _keep(
     most: int,
     kind: str,
 ) -> dict[str, Any]:
-    """Drop the entries of `listed` that no family can declare; return the others' declarations by name."""
+    """Drop the entries of `listed` that no family can declare; return the other declarations by name."""
     held: dict[str, Any] = {}
     kept: list[ImportedRegister] = []
     for found in listed:

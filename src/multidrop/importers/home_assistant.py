@@ -228,7 +228,7 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
         _sensor(device, register, entry)
         return
     if register.table in ("holding", "input") and kind == "binary_sensors":
-        register.details["part"] = "0"  # the word's other bits are never used
+        register.details["part"] = "0"  # Home Assistant uses only bit 0 of the word
     _repeat(device, register, entry, 1)
 
 

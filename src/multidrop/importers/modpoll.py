@@ -57,7 +57,7 @@ def _reference(device: ImportedDevice, cells: list[str], table: str, order: str)
         device.lose(name, f"which bits {kind} means is not known")
         return
     if text := _STRING.fullmatch(kind):
-        register.details = {"length": (int(text[1]) + 1) // 2}  # bytes as received, not in the poll's order
+        register.details = {"length": (int(text[1]) + 1) // 2}  # the poll's order is not for texts
         device.add(register, is_text=True)
         return
     kind = kind.lower()

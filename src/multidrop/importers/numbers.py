@@ -62,7 +62,7 @@ def put_number(details: dict[str, Any], number: str, order: str = "") -> None:
 
 
 def scaled(details: dict[str, Any], step: Any, offset: Any = 0) -> None:
-    """Set step and offset in `details`, unless 1 and 0; ignore a step of 0. Raises as `number` does."""
+    """Set step and offset in `details`, unless 1 and 0; ignore a step of 0. Raises ValueError."""
     step, offset = number(step, 1, "scale"), number(offset, 0, "offset")
     if step not in (0, 1):
         details["step"] = step
@@ -86,7 +86,7 @@ def number(given: Any, default: float, key: str = "number") -> float:
 def whole(entry: Mapping[str, Any], key: str, default: int | None = None) -> int:
     """Return the key's whole number, which may be text, also in hex.
 
-    Raises KeyError if the key is missing and there is no default, ValueError if it is no whole number.
+    Raises KeyError if the key is missing and there is no default, ValueError if it is not a whole number.
     """
     given = entry.get(key)
     if given is None:

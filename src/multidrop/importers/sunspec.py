@@ -65,7 +65,7 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
 
 
 def _size(point: Mapping[str, Any]) -> int:
-    """Return a point's number of registers. Raises ValueError if missing: later addresses depend on it."""
+    """Return a point's number of registers. Raises ValueError without it: later addresses depend on it."""
     try:
         return whole(point, "size")
     except KeyError:

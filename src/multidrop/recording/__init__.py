@@ -56,7 +56,7 @@ from multidrop.recording.segments import SegmentWriter as SegmentWriter
 from multidrop.recording.segments import parse_age as parse_age
 from multidrop.recording.segments import parse_size as parse_size
 
-FORMATS = {".arrows": "arrows", ".csv": "csv", ".parquet": "parquet"}  # suffix: module
+FORMATS = {".arrows": "arrows", ".csv": "csv", ".parquet": "parquet"}  # by suffix: the format's module
 
 
 def open_writer(

@@ -36,7 +36,7 @@ class RecordedColumns(NamedTuple):
     uncertainty_ns: memoryview  # 0 for a miss
     drive: memoryview
     register: memoryview
-    value: memoryview  # any number for a miss
+    value: memoryview  # undefined for a miss
     status: memoryview
     valid: bytes | None  # one bit per row, 0 for a miss; None: no row is a miss
     drives: tuple[str, ...]
@@ -75,7 +75,7 @@ class BatchDecoder:
 
     @property
     def known(self) -> dict[int, Names]:
-        """The dictionaries decoded so far, by id. A change makes a new mapping, so callers may keep this."""
+        """The dictionaries decoded so far, by id. Callers may keep the returned mapping: it never changes."""
         return self._names
 
     def columns(self, header: FlatTable, body: memoryview, names_of: dict[int, Names]) -> RecordedColumns:

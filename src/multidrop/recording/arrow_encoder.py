@@ -32,7 +32,7 @@ from multidrop.recording.rows import texts_of
 VERSION = ("<h", 4)  # version of the Arrow format: V5
 LONGEST_TEXTS = (1 << 31) - 1  # limit in bytes for a dictionary's texts
 DRIVE, REGISTER, STATUS = CODED  # ids of the dictionaries
-MOST_NAMES = {DRIVE: 1 << 16, REGISTER: 1 << 16, STATUS: MOST_NARROW}  # number of codes, by dictionary
+MOST_NAMES = {DRIVE: 1 << 16, REGISTER: 1 << 16, STATUS: MOST_NARROW}  # limit of names, by dictionary
 
 Names = tuple[str, ...]
 Column = Any  # memoryview, array or bytes: anything with a buffer

@@ -193,7 +193,7 @@ class FileColumn(NamedTuple):
 
     @property
     def buffers(self) -> int:
-        """The number of the column's buffers in a batch; a column of codes has two, like one of numbers."""
+        """The number of the column's buffers in a batch. Columns of codes have two, as of numbers."""
         return 2 if self.code_bits else BUFFERS[self.kind]
 
 
@@ -206,7 +206,7 @@ COLUMNS = (
     FileColumn(b"value", FLOAT, DOUBLE, nullable=True),
     FileColumn(b"status", UTF8, code_bits=8),
 )
-COLUMNS_BEFORE = (  # in files of versions up to 0.1, and of other programs that write our batches
+COLUMNS_BEFORE = (  # in files of versions up to 0.1, and of other programs that save our batches
     *COLUMNS[:2],
     FileColumn(b"uncertainty_ns", INT, 64, nullable=True),
     *(FileColumn(name, UTF8) for name in (b"drive", b"register")),

@@ -65,7 +65,7 @@ class ArrowsReader(RecordingReader):
             for message in messages(file, size):
                 if not self._whole:
                     self.metadata = self._read_schema(message)
-                elif message.kind == DICTIONARY_BATCH:  # other libraries fail if its batch is missing
+                elif message.kind == DICTIONARY_BATCH:  # without its batch, other libraries would fail
                     continue
                 self._whole = message.end
         if not self._whole:
@@ -156,7 +156,7 @@ class ArrowsTail:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._file = path.open("rb", buffering=0)  # a buffer could return bytes that were cut off
+        self._file = path.open("rb", buffering=0)  # a buffer could return bytes that were cut off since
         try:
             reader = ArrowsReader(path)
             self.metadata = reader.metadata
@@ -181,7 +181,7 @@ class ArrowsTail:
                 return
             body = self._body(message)
             try:
-                if message.kind != RECORD_BATCH:  # read again with its batch: a failed write cuts off both
+                if message.kind != RECORD_BATCH:  # read again with its batch, as a failed write cuts both off
                     self._decoder.decode(message, message.header, body)
                     continue
                 place = BatchPlace(message, self._decoder.known)

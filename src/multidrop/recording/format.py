@@ -159,7 +159,7 @@ class RecordingReader(ArrowTable):
         ]
 
     def _damaged(self, rows: int, error: Exception | str) -> ValueError:
-        """Return a ValueError whose message has the damage and the number of readable rows."""
+        """Return a ValueError that states the damage and the number of readable rows."""
         reason = next((text for kind, text in _REASONS.items() if isinstance(error, kind)), error)
         return ValueError(f"{self.path} is damaged after row {rows}: {reason}")
 

@@ -20,7 +20,7 @@ from multidrop.recording.arrows import ArrowsReader, ArrowsWriter
 from multidrop.recording.format import Metadata, RecordingWriter, writing
 from multidrop.transport import clock
 
-MOST_CUT = 1 << 24  # bytes; a longer unreadable end is kept, as damage rather than a truncated batch
+MOST_CUT = 1 << 24  # limit of a truncated batch in bytes; a longer unreadable end is damage and is kept
 
 
 def segments_of(path: Path) -> list[tuple[int, Path]]:
@@ -75,7 +75,7 @@ class SegmentWriter(RecordingWriter):
 
     @property
     def open_number(self) -> int:
-        """The number of the open segment, or of the next one. All segments with lower numbers are closed."""
+        """The number of the open segment, or of the next segment. Segments with lower numbers are closed."""
         return self.number if self._segment else self.number + 1
 
     def write(self, batch: Rows) -> None:

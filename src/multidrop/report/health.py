@@ -26,12 +26,12 @@ from multidrop.report.style import (
     set_title,
 )
 
-MOST_REASONS = 6  # reasons for misses in a picture; all others are drawn as one
-LEAST_IN_BIN = 20  # values; with fewer values, a bin's share of misses is not significant
+MOST_REASONS = 6  # limit of reasons for misses in a picture; all others are drawn as one reason
+LEAST_IN_BIN = 20  # least number of values in a bin; with fewer, its share of misses is not significant
 BINS = 12  # number of bins of the output frequency
 FREQUENCY = "output_frequency"
 ROOM = 2.0  # length of an axis, as a multiple of the 99 % quantile of the delays
-SHORTEST_AXIS = 0.001  # s, of the axis of delays
+SHORTEST_AXIS = 0.001  # least length of the axis of delays, in s
 SHADES = ("#B00020", "#E69F00", "#56B4E9", "#CC79A7", "#009E73", "#0072B2", "#999999")
 
 
@@ -41,7 +41,7 @@ class DelaySeries:
 
     drive: str
     seconds: Array
-    exact: bool  # if False, the delay includes the request, whose length is unknown
+    exact: bool  # False: the delays include the time of the request, which is unknown
 
     def quantile(self, part: float) -> float:
         return float(np.quantile(self.seconds, part))
@@ -206,7 +206,7 @@ MOST_FIGURE = 1e9  # sanity limit of a plan's figures
 
 @dataclass(frozen=True, eq=False)
 class LineUse:
-    """A line's answered exchanges: the time of each, and the time for which each needed the line."""
+    """A line's answered exchanges: when each took place, and how long it occupied the line."""
 
     line: str
     planned: Mapping[str, Any]
@@ -222,7 +222,7 @@ class LineUse:
 
     @property
     def cycle(self) -> float | None:
-        """The time in s to read each register once; None if one has its own rate, or without values."""
+        """Seconds to read each register once; None if a register has its own rate, or without values."""
         blocks = [block for drive in self.planned["drives"].values() for block in drive["blocks"]]
         if any(block["every_ms"] is not None for block in blocks) or not self.values:
             return None

@@ -26,7 +26,7 @@ from multidrop.report.load import Recording, Series
 from multidrop.report.style import MOST_DRIVES, png
 from multidrop.report.value_plot import FAULTS, plot
 
-SHORT = 32  # characters; a table cell with no more than these is not wrapped
+SHORT = 32  # table cells with at most this many characters are not wrapped
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; }

@@ -18,10 +18,10 @@ from multidrop.recording import open_recording
 RAW = "raw count"  # unit of values without a known scale
 LARGEST = 1e150  # larger values are not drawn: matplotlib computes products of values
 LATEST_NS = 230 * 365 * 86400 * 10**9  # UTC; no dates can be computed for later times
-PAUSE_NS, PAUSE_STEPS = 2 * 10**9, 5  # a longer step is a pause, for example of a suspended process
-MOST_ROWS = 100_000_000  # of a recording: these take 5 GB of memory
+PAUSE_NS, PAUSE_STEPS = 2 * 10**9, 5  # a longer step between rows is a pause, as of a suspended process
+MOST_ROWS = 100_000_000  # limit of a recording's rows: so many take 5 GB of memory
 MOST_NAMES = 4096  # limit for the names of drives, of registers and of statuses
-LONGEST_NAME = 4096  # bytes
+LONGEST_NAME = 4096  # limit in bytes
 LARGEST_COUNT = 2**53  # largest count that a float64 holds exactly
 Array = NDArray[Any]
 
@@ -63,7 +63,7 @@ class Series:
 
     @cached_property
     def pauses(self) -> Array:
-        """For each row except the last: True if polling paused after it, without values and misses."""
+        """For each row except the last: True if polling paused after the row (no values and no misses)."""
         steps = np.diff(self.time)
         beside = np.maximum(np.append(steps[1:], 0), np.append(0, steps[:-1]))
         return np.asarray((steps > PAUSE_NS) & (steps / PAUSE_STEPS > beside) & (beside > 0))
@@ -180,7 +180,7 @@ class Recording:
 
 
 def load(path: str | Path) -> Recording:
-    """Load a recording. Raises OSError; ValueError if it is not a recording, empty, or too large."""
+    """Load a recording. Raises OSError, or ValueError for an empty, too large or invalid file."""
     reader = open_recording(path)
     codes: dict[str, dict[str, int]] = {"drive": {}, "register": {}, "status": {}}
     parts: list[list[Array]] = []

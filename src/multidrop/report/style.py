@@ -16,18 +16,18 @@ from multidrop.printable import printable
 from multidrop.report.load import Array
 
 # Okabe and Ito's colours without black and yellow. Further drives get the same colours, dashed.
-MOST_DRIVES = 100  # in a picture; tables list all drives
+MOST_DRIVES = 100  # limit of a picture; tables list all drives
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#555555")
 DASHES = ("solid", "dashed", "dotted", "dashdot")
 TEXT = "#555555"
 FAULT = "#B00020"
 GRID = "#DDDDDD"
 FEWEST_BINS, MOST_BINS = 10, 120  # limits of the number of bins on the time axis
-BIN_NS = 2_000_000_000  # width of a bin, unless the number of bins would exceed these limits
+BIN_NS = 2_000_000_000  # usual width of a bin; others keep the number of bins within the limits
 SHORTEST_NS = 1_000_000_000  # least length of the time axis
-WIDTH = 11.0  # inches
+WIDTH = 11.0  # of a figure, in inches
 DPI = 110
-LEGEND_MARK, LEGEND_LETTER, LEGEND_ROW = 0.7, 0.09, 0.21  # inches
+LEGEND_MARK, LEGEND_LETTER, LEGEND_ROW = 0.7, 0.09, 0.21  # sizes in inches
 
 _DATES: Any = dates  # matplotlib.dates has no type hints
 
@@ -54,7 +54,7 @@ class TimeBins:
 
 
 def label(text: str) -> str:
-    """Return the text with an escape where matplotlib would read a formula or omit the legend's entry."""
+    """Return the text, escaped so that matplotlib reads no formula and omits no legend entry."""
     shown = printable(text).replace("$", r"\$")
     return f" {shown}" if shown.startswith("_") else shown
 
@@ -68,7 +68,7 @@ def line_style(number: int) -> dict[str, Any]:
 
 
 def new_figure(heights: Sequence[float], **details: Any) -> tuple[Figure, list[Axes]]:
-    """Return a figure and its axes, which are below each other and have these heights in inches."""
+    """Return a figure, and its axes one below the other, which have these heights in inches."""
     figure = Figure(figsize=(WIDTH, sum(heights) + 0.6), layout="constrained", dpi=DPI)
     axes = figure.subplots(len(heights), 1, squeeze=False, height_ratios=list(heights), **details)[:, 0]
     for one in axes:

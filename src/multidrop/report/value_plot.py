@@ -43,7 +43,7 @@ FIRST = (  # registers whose panels are drawn first if not all fit
     "heatsink_temperature",
 )
 MOST_PANELS = 8
-MOST_POINTS = 4000  # per curve: more points cannot be seen
+MOST_POINTS = 4000  # limit of points per curve: more cannot be seen
 FEW_POINTS = 200  # up to this number of points in a curve, each is drawn as a dot
 FAULTS = "fault"
 
@@ -79,7 +79,7 @@ class Content:
 def plot(
     recording: Recording, drives: Sequence[str] = (), registers: Sequence[str] = ()
 ) -> tuple[Figure, list[str]]:
-    """Return a picture of these drives and registers (default: all), and the names that had no room in it.
+    """Return a picture of these drives and registers (default: all), and the names that did not fit into it.
 
     Raises ValueError for unknown names, and if there is no value to draw.
     """
@@ -270,8 +270,8 @@ def thinned(time: Array, value: Array) -> tuple[Array, Array]:
 
 # Tol's pale colours: no state has the colour of a drive.
 COLOURS = ("#BBCCEE", "#CCDDAA", "#EEEEBB", "#CCEEFF", "#DDDDDD", "#FFCCCC")
-HATCHES = ("", "////", "....")  # patterns, for when the colours are used up
-MOST_LANES = 64  # per panel
+HATCHES = ("", "////", "....")  # patterns that distinguish states if there are more states than colours
+MOST_LANES = 64  # limit of a panel
 NARROWEST = 1 / 1500  # least width of a state, as a fraction of the time axis
 LETTER = 1 / 140  # width of a letter, as a fraction of the time axis
 LANE_INCHES = 0.24
@@ -285,9 +285,9 @@ class Lane:
     drive: str
     title: str
     is_bit: bool  # the state is on or off
-    time: Array  # of each row, ns UTC
+    time: Array  # time of each row, ns UTC
     missed: Array
-    state: tuple[str, ...]  # name of each state: one for each run of equal rows
+    state: tuple[str, ...]  # names of the successive states; equal successive rows are one state
     begin: Array  # start of each state, ns UTC
     end: Array
 
@@ -349,7 +349,7 @@ def lanes_inches(lanes: Sequence[Lane]) -> float:
 
 
 def draw_lanes(axes: Axes, lanes: Sequence[Lane], recording: Recording) -> None:
-    """Draw each lane as a row of bars, one per state. Names that fit into no bar go into a legend."""
+    """Draw each lane as a row of bars, one per state. Names that do not fit into a bar go into a legend."""
     names = dict.fromkeys(state for lane in lanes if not lane.is_bit for state in lane.state)
     styles = {name: _style(number) for number, name in enumerate(names)}
     span = max(recording.end - recording.begin, 1)

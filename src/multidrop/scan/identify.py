@@ -25,7 +25,7 @@ from multidrop.transport.peers import LEAST_TIMEOUT
 R = TypeVar("R")
 Ask = Callable[[Drive, Message], Message]  # sends a request; raises BusError unless a valid reply comes
 
-MOST_READINGS = 3  # readings that a drive must answer if its family has no `identify` script
+MOST_READINGS = 3  # number of readings that a drive must answer if its family has no `identify` script
 
 
 def identify(
@@ -52,7 +52,8 @@ def candidate(family: type[Drive], settings: Settings, framing: Framing, address
     """Return a drive object of the family with these settings; None if its manual does not allow them.
 
     A drive can answer in the sweep's format although its own differs: in its stop bits, or on a
-    pseudo-terminal in its parity. If the family does not allow the sweep's format, its usual one is set.
+    pseudo-terminal in its parity. If the family does not allow the sweep's format, the drive gets
+    the family's usual format.
     """
     if not family.speaks(framing) or address not in family.addresses:
         return None
@@ -78,7 +79,7 @@ def _score(drive: Drive, ask: Ask) -> int:
         try:
             held = _read(drive, setting, ask)
         except BusError:
-            return score  # not every firmware has it
+            return score  # not every firmware has this register
         if held != drive.address:
             raise WriteForbidden(f"{drive.name} holds {held:g} as its address")
         score += 1
@@ -114,10 +115,10 @@ def _read(drive: Drive, register: Register[Any] | Text, ask: Ask) -> Any:
     return value
 
 
-MOST_TIMEOUT = 1.0  # s; only for a drive whose address is known
+MOST_TIMEOUT = 1.0  # timeout in s; only for a drive whose address is known
 TRIES = 3
 LATE_NS = 500_000_000  # how long to wait for late replies
-SHORTEST_REPLY = 5  # bytes of an exception reply; fewer bytes are noise
+SHORTEST_REPLY = 5  # size of an exception reply in bytes; fewer bytes are noise
 
 
 # Results for frames that answer another request.
@@ -132,7 +133,7 @@ def is_whole(framing: Framing, received: bytes) -> bool:
 
 
 class Scan(Protocol):
-    """The part of a scan that a probe needs."""
+    """The methods of a scan that a probe uses."""
 
     def ask(self, sweep: Sweep, request: Message, peer: Peer, not_before_ns: int = 0) -> Completion: ...
 

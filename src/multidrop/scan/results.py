@@ -28,7 +28,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Crowd:
-    """An address whose replies never match the request; probably several drives have it.
+    """An address whose replies never match the request; probably several drives have this address.
 
     If a reply had a valid checksum, `reply` says why it does not match; else `reply` is empty.
     """
@@ -60,7 +60,7 @@ class Untried:
 
 @dataclass(frozen=True)
 class Progress:
-    """One more address is done; `left` is the scan's remaining time in s if no further drive answers."""
+    """A report after each address. `left` is the scan's remaining time in s if no further drive answers."""
 
     settings: Settings
     framing: Framing

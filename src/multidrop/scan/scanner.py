@@ -26,10 +26,10 @@ from multidrop.scan.identify import MOST_TIMEOUT, TRIES, Probe, is_whole
 from multidrop.scan.results import Crowd, Finding, Noise, Progress, Untried
 from multidrop.scan.sweep import Sweep
 
-NOISY = 1 / 3  # share of a sweep's addresses; invalid bytes at more addresses count as noise
+NOISY = 1 / 3  # invalid bytes at more than this share of a sweep's addresses count as noise
 LEAST_NOISY = 4  # least number of addresses with invalid bytes that counts as noise
-BEGUN = 2  # received characters after which a reply counts as started
-LATE = 8  # a reply is still matched to its request while the next so many addresses are asked
+BEGUN = 2  # number of received characters after which a reply counts as started
+LATE = 8  # number of later requests during which a late reply is still matched to its request
 
 
 class CarryOut(Protocol):
@@ -51,7 +51,7 @@ class _Scan:
     def __init__(self, carry_out: CarryOut, families: Sequence[type[Drive]]) -> None:
         self._carry_out = carry_out
         self._families = families
-        self._peers: list[Peer] = []  # keeps the peers alive that the line refers to
+        self._peers: list[Peer] = []  # references that keep the peers alive while the C core uses them
         self._found: set[tuple[int, Framing, int]] = set()
         self._crowded: set[tuple[int, Framing, int]] = set()
         self._excess = 0.0  # s by which a drive's response delay exceeded its family's usual one
@@ -70,7 +70,7 @@ class _Scan:
 
     def _sweep(self, sweep: Sweep, left_after: float) -> Iterator[Finding]:
         addresses = [address for address in sweep.addresses if _key(sweep, address) not in self._found]
-        garbled: dict[int, str] = {}  # by address: the whole frame that did not match, or ""
+        garbled: dict[int, str] = {}  # by address: a whole frame that did not match the request, or ""
         peers: dict[int, Peer] = {}
         for number, address in enumerate(addresses, 1):
             peers[address] = self._sweep_peer(sweep)
@@ -154,7 +154,7 @@ class _Scan:
 
 
 def _key(sweep: Sweep, address: int) -> tuple[int, Framing, int]:
-    """Return a key for a drive, without its format: a drive that answers in several is reported once."""
+    """Return a drive's key. It lacks the format, so a drive that answers in several is reported once."""
     return address, sweep.framing, sweep.settings.baudrate
 
 

@@ -1,4 +1,4 @@
-"""Plan a scan: its requests and their order. Pure functions; no request is sent.
+"""Plan a scan: its requests and their order. This module sends no request.
 
 A sweep sends one request to many addresses at one setting.
 """
@@ -23,7 +23,8 @@ Setting = tuple[Settings, Framing]
 GATEWAY_PATIENCE = 1.0  # s within which a Modbus TCP gateway reports that a drive does not answer
 ADDRESSES = range(1, 32)  # scanned by default
 _ILLEGAL_ADDRESS = 2  # exception code: illegal data address
-# With these carriers a reply with the value 0 equals an echo of the request. An address register is never 0.
+# In tables of these kinds, a reply with the value 0 equals an echo of the request. The register that holds
+# the drive's address is never 0.
 _ECHOED = (Carrier.LONG, Carrier.NUMBER)
 
 
@@ -157,7 +158,7 @@ def _sweeps(
 
 
 def _best(families: Collection[type[Drive]]) -> Register[Any] | None:
-    """Return the register that most families answer; in a tie, the register that most families declare."""
+    """Return the register that most families answer; among equals, the one that most families declare."""
     registers = (one for family in families for one in family.registers.values() if one.readable)
     return max(
         registers,

@@ -7,7 +7,7 @@ from multidrop.sim.memory import MemoryCell
 from multidrop.sim.motor_drive import MotorDrive
 from multidrop.sim.protocol import COMMAND, SET, STORE, Reason, Refusal
 
-MOST_GAP = 10e-3  # longest gap in s between two bytes; only part 3 of the document states one
+MOST_GAP = 10e-3  # longest gap in s between two bytes; stated only in part 3 of the document
 UNDER_VOLTAGE = 7  # fault number of POFF
 
 BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400)  # indexed by P04.28
@@ -58,7 +58,7 @@ class SimulatedDelixi(MotorDrive):
 
 
 class SimulatedDelixiNative(MotorDrive):
-    """Delixi in its own protocol: the reply to a write is a copy of the request, to a query the value.
+    """Delixi in its own protocol: replies to writes repeat the request, replies to queries have the value.
 
     While `locked` is set, writes of parameters are refused with FEH. A start during a fault is refused with
     F0H. The manual does not say what happens to a run command if P00.00 is not 2; here F0H refuses it. It

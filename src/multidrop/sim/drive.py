@@ -20,8 +20,8 @@ from multidrop.sim.memory import Memory, MemoryCell, decode, pack
 from multidrop.sim.protocol import PROTOCOLS, Reason, Refusal
 from multidrop.sim.receiver import Frame
 
-MOST_REMEMBERED = 10_000  # most writes in a drive's record, to limit memory
-_COUNTED_AS = {0x06: 0x03, 0x10: 0x03}  # function code of a write: the read whose length limit applies
+MOST_REMEMBERED = 10_000  # limit of a drive's recorded writes, to save memory
+_COUNTED_AS = {0x06: 0x03, 0x10: 0x03}  # write function: the read function whose length limit applies to it
 # Longest gap within a frame in s: serial-line guide 2.5.2.1; Delixi, part 3; generous over a network.
 GAPS = {Framing.ASCII: 1.0, Framing.DELIXI: 10e-3, Framing.TCP: 10.0}
 
@@ -68,7 +68,7 @@ class SimulatedDrive:
     """
 
     functions: ClassVar[Collection[int] | None] = None  # supported function codes; None: all of the protocol
-    codes: ClassVar[Mapping[Reason, int] | None] = None  # exception codes by reason; None: the protocol's
+    codes: ClassVar[Mapping[Reason, int] | None] = None  # by reason; None: the protocol's exception codes
     needs_silence: ClassVar[bool] = False  # the manual says that a frame without silence before it is ignored
 
     def __init__(self, drive: Drive, *, response_delay: float | None = None) -> None:
@@ -164,7 +164,7 @@ class SimulatedDrive:
             return self.answer(frame.message, frame.end)
         if not self._is_for_all(frame.address) and not self._knows(frame.function):
             return self.answer(Message(frame.address, frame.function), frame.end)
-        return None  # its length does not fit its function
+        return None  # the frame's length does not fit its function code
 
     def _is_for_all(self, address: int) -> bool:
         return address == 0 and self.drive.framing is not Framing.TCP
@@ -223,7 +223,7 @@ class SimulatedDrive:
             raise Refusal(Reason.COUNT)
 
     def read(self, function: int, start: int, count: int) -> list[int]:
-        """Return the raw counts of `count` adjacent cells. Raises Refusal if one is unreadable."""
+        """Return the raw counts of `count` adjacent cells. Raises Refusal if a cell is unreadable."""
         self.check_count(function, count)
         raws = []
         for address in range(start, start + count):
@@ -235,7 +235,7 @@ class SimulatedDrive:
         return raws
 
     def write(self, function: int, start: int, raws: list[int]) -> None:
-        """Write adjacent cells. Raises Refusal if one rejects its count; then no cell is written."""
+        """Write adjacent cells. If a cell rejects its count, raises Refusal and writes no cell."""
         found = [self.memory.writable(function, start + at) for at in range(len(raws))]
         cells = [cell for cell in found if cell is not None]
         if len(cells) < len(raws):
@@ -252,7 +252,7 @@ class SimulatedDrive:
             self.changed(cell)
 
     def wears(self, cell: MemoryCell, function: int, address: int) -> bool:
-        """Return True if a write to this cell wears the EEPROM, as a setting of unknown memory may."""
+        """Return True if a write to this cell may wear the EEPROM: also for a setting of unknown memory."""
         register = cell.register
         if register is None or (function, address) in self.memory.aliases:
             return False

@@ -10,8 +10,8 @@ from multidrop.sim.protocol import Reason
 
 COILS = range(13)  # including reserved coils, 3 to 8 and 10 to 12
 STOP, EMERGENCY_STOP = 1, 2
-EMERGENCY_STOPPED = 1 << 0  # bit of the last fault
-OVERLOADED = 1 << 5  # bit of the state
+EMERGENCY_STOPPED = 1 << 0  # bit of the register for the last fault
+OVERLOADED = 1 << 5  # bit of the register for the state
 _STATES = {Phase.STOPPED: 0, Phase.CONSTANT: 1, Phase.ACCELERATING: 2, Phase.DECELERATING: 3}
 
 
@@ -25,7 +25,7 @@ class SimulatedERMAN(MotorDrive):
     """
 
     functions = (0x01, 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F, 0x10)
-    codes = {  # 03 for a wrong address as in all examples, against the table of section 5
+    codes = {  # 03 for a wrong address: all examples have it, contrary to section 5's table
         Reason.FUNCTION: 1,
         Reason.READ_ADDRESS: 3,
         Reason.WRITE_ADDRESS: 3,

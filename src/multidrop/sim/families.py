@@ -57,6 +57,6 @@ FAMILIES: Mapping[type[Drive], type[SimulatedDrive]] = {
 
 
 def simulated(drive: Drive, *, response_delay: float | None = None) -> SimulatedDrive:
-    """Return the simulation of a drive: its family's, or a general one for a user's class or family file."""
+    """Return a simulation of the drive: for a user's class or family file, of the general class."""
     kinds = (kind for family, kind in FAMILIES.items() if isinstance(drive, family))
     return next(kinds, SimulatedDrive)(drive, response_delay=response_delay)

@@ -97,7 +97,7 @@ def _keys(kind: type) -> dict[str, Key]:
 
 
 def _help(kind: type) -> str:
-    lines = zip(_keys(kind).values(), fields(kind), strict=False)  # drops `drives`, which is no key
+    lines = zip(_keys(kind).values(), fields(kind), strict=False)  # without the field `drives`
     return "".join(f"  {key.example:<20}{one.metadata['means']}\n" for key, one in lines)
 
 

@@ -67,7 +67,7 @@ class FaultyWire(Wire):
         return True
 
     def _damaged(self, frame: bytes) -> bytes:
-        """Return the frame, perhaps with one fault, so that every checksum detects the damage."""
+        """Return the frame, perhaps with one fault: more than one might escape a checksum."""
         for fault, damage in DAMAGES.items():
             if self._strikes(fault):
                 return damage(frame, self._random.randrange(len(frame)), self._random.randrange(8))

@@ -19,7 +19,7 @@ from multidrop.drive.number_format import arranged, bits_of
 from multidrop.drive.register import Access, Carrier, Register, Table
 from multidrop.drive.text import Text
 
-_ALSO_WRITES = {0x05: 0x0F, 0x06: 0x10}  # single write: multiple write of the same cells
+_ALSO_WRITES = {0x05: 0x0F, 0x06: 0x10}  # function that writes one cell: function that writes several
 _DELIXI_ALSO_WRITES = {0x05: 0x06, 0x06: 0x05}  # 05 writes to RAM, 06 to EEPROM
 _DELIXI_STORES = 0x06
 _MASKS = {Carrier.BIT: 0x1, Carrier.WORD: 0xFFFF, Carrier.NUMBER: 0xFFFF, Carrier.LONG: 0xFFFF_FFFF}
@@ -50,7 +50,7 @@ class Memory:
         self._read: dict[tuple[int, int], MemoryCell | None] = {}  # None: unreadable, even in a gap
         self._gaps = [(table.read, table, addresses) for table, addresses in drive.readable_gaps.items()]
         self._written: dict[tuple[int, int], MemoryCell] = {}
-        self.aliases: set[tuple[int, int]] = set()  # (function, address) whose writes do not reach the EEPROM
+        self.aliases: set[tuple[int, int]] = set()  # (function, address): writes there spare the EEPROM
         for register in drive.registers.values():
             self.declare(register)
         for text in drive.texts.values():
@@ -71,7 +71,7 @@ class Memory:
             if _is_better(register, cell.register):
                 cell.register = register
             if table.read is not None and register.access is Access.COMMAND:
-                self._read.setdefault((table.read, cell.address), None)  # unless it is also readable
+                self._read.setdefault((table.read, cell.address), None)  # unless declared readable
             elif table.read is not None:
                 self._read[table.read, cell.address] = cell
             if register.access is Access.READING:

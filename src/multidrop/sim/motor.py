@@ -46,7 +46,7 @@ class Motor:
     """The state of one motor at the time of the last `run_to`.
 
     `target`, `acceleration_time`, `deceleration_time`, `maximum_frequency` and `load` may be changed at any
-    time. The ramp times are s from 0 to the maximum frequency and from there to 0.
+    time. The ramp times, in s, are those from 0 to the maximum frequency, and back to 0.
     """
 
     def __init__(self, rating: Rating | None = None, *, now: float = 0.0) -> None:
@@ -71,7 +71,7 @@ class Motor:
         self._brakes = False  # True while direct current holds the motor
 
     def run(self, direction: int | None = None) -> None:
-        """Run at `target`, which may change meanwhile. Without `direction`, keep the present direction."""
+        """Run at `target`, which may change at any time. Without `direction`, keep the present direction."""
         self._start(direction, None)
 
     def jog(self, direction: int | None = None) -> None:

@@ -31,11 +31,11 @@ _SETTINGS = ("acceleration_time", "deceleration_time", "maximum_frequency")
 
 
 class MotorDrive(SimulatedDrive):
-    """A simulated drive with a motor. A monitor that is set with `drive[name] = value` keeps that value."""
+    """A simulated drive with a motor. A monitor register set by `drive[name] = value` keeps that value."""
 
     obeys: ClassVar[Mapping[str, Callable[[Any, int], None]]] = {}
-    shows: ClassVar[Mapping[str, Callable[[Any], int]]] = {}  # functions that return raw counts
-    begins: ClassVar[Mapping[int, int]] = {}  # initial raw counts by holding register address
+    shows: ClassVar[Mapping[str, Callable[[Any], int]]] = {}  # by register: function for its raw count
+    begins: ClassVar[Mapping[int, int]] = {}  # initial raw counts, by address of holding registers
 
     def __init__(
         self, drive: Drive, *, response_delay: float | None = None, rating: Rating | None = None

@@ -138,7 +138,7 @@ SimulatedEnd = PtyPort | TCPPort  # non-blocking ends
 
 
 def open_port(where: str, settings: Settings) -> SimulatedEnd:
-    """Open the pty or TCP port named by `where`; see `Wire` for its forms."""
+    """Open the pty or TCP port named by `where`; see `Wire` for the forms of `where`."""
     if where.startswith(("socket://", "tcp://")):
         return TCPPort(where)
     return PtyPort(settings, None if where == "pty" else Path(where))

@@ -214,13 +214,14 @@ class SimulatedDanfossFC(ProfileDrive):
     shows = {"status": _state}
 
 
-EXTERNAL_FAULT = 49  # fault EF
+EXTERNAL_FAULT = 49  # fault code of EF, an external fault
 
 
 class SimulatedDelta(ProfileDrive):
     """Delta: a run command during a fault is ignored. While the reset bit is set, it resets every fault.
 
-    The manuals do not say the latter; it is simulated to detect a client that leaves the bit set.
+    The manuals do not mention that effect of the bit; it is simulated to detect a client that leaves the bit
+    set.
     """
 
     def pass_time(self, now: float) -> None:

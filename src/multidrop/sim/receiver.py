@@ -15,7 +15,7 @@ MOST_RTU = 256
 TCP_HEAD, MOST_TCP = 6, 260  # bytes before the unit id; longest frame in bytes
 MOST_TEXT = 513
 LEAST_RTU = 4  # shortest frame in bytes: address, function, CRC
-# Function codes of requests: a byte is a request's address only if one of these follows.
+# Function codes of requests: a byte can be a request's address only if one of these codes follows.
 _REQUESTS = frozenset(code for code in range(256) if parse_request(Framing.RTU, bytes([1, code]))[0] == 0)
 
 
@@ -31,7 +31,7 @@ class Frame:
     intact: bool
     begin: float  # s, time of the first bit
     end: float  # s, time of the last bit
-    transaction: int = 0  # id of a Modbus TCP frame
+    transaction: int = 0  # transaction id of a Modbus TCP frame
 
     @property
     def address(self) -> int:
@@ -72,14 +72,14 @@ class Receiver:
         return frames
 
     def silence(self, now: float) -> list[Frame]:
-        """Return the frame, if any, that silence until `now` has ended; it is not a valid request."""
+        """Return the frame that silence until `now` has ended, if any: not a valid request."""
         if not self._buffer or now < self._end + self.most_gap:
             return []
         rest = bytes(self._buffer)
         self._buffer.clear()
         if self.framing is not Framing.RTU or not LEAST_RTU <= len(rest) <= MOST_RTU:
             return []
-        if _first_request(rest) is not None:  # a valid request with further bytes after it
+        if _first_request(rest) is not None:  # a valid request followed by other bytes: ignored
             return []
         intact = crc16(rest[:-2], len(rest) - 2) == int.from_bytes(rest[-2:], "little")
         return [self._frame(rest[:-2], None, intact, 0, len(rest))]

@@ -55,7 +55,7 @@ class Simulator:
     @undisturbed
     def _start(self) -> None:
         with self._changing:
-            if not self._is_over:  # not if the thread has ended already
+            if not self._is_over:  # False if the thread has ended already
                 self.open()
                 self._is_open = True
                 self._thread.start()
@@ -84,7 +84,7 @@ class Simulator:
             _log.critical("the simulator has ended: no drive answers any more", exc_info=failure)
 
     def open(self) -> None:
-        """Open all ports, so that their paths are known; if one fails, close all and raise its error."""
+        """Open all ports, so that their paths are known; if one fails, close all and raise that error."""
         self._selector = selectors.DefaultSelector()
         self._interrupted, self._interrupter = socket.socketpair()
         self._interrupter.setblocking(False)

@@ -137,7 +137,7 @@ class Wire:
             if now < self._outgoing[0].end:
                 break
             self._quiet_since = self._outgoing.pop(0).end
-            if self._outgoing:  # a second reply waits for the first to end
+            if self._outgoing:  # replies queue: each waits until the previous reply ends
                 self._outgoing[0].begin = max(self._outgoing[0].begin, self._quiet_since)
         return bytes(received)
 

@@ -39,7 +39,7 @@ class SimulatedYD1000(MotorDrive):
     """
 
     functions = (0x03, 0x06)
-    needs_silence = True  # 4.3
+    needs_silence = True  # notes, section 4.3
 
     _panel_runs = False
     _in_force = 0  # control word in force
@@ -61,7 +61,7 @@ class SimulatedYD1000(MotorDrive):
 
     @property
     def most_gap(self) -> float:
-        return 24 * self.drive.settings.character  # 4.2 (2)
+        return 24 * self.drive.settings.character  # notes, section 4.2 (2)
 
     def takes_broadcast(self, request: Message) -> bool:
         return request.function == 0x06 and request.start in (CONTROL, COMMUNICATION_FREQUENCY)
@@ -89,7 +89,7 @@ class SimulatedYD1000(MotorDrive):
         return cell.address not in PANEL_ONLY and super().wears(cell, function, address)
 
     def pass_time(self, now: float) -> None:
-        limit = self.word(TIMEOUT_SETTING) or math.inf  # F803; 0 disables the timeout
+        limit = self.word(TIMEOUT_SETTING) or math.inf  # F803, in s; 0 disables the timeout
         if now > self._message_at + limit and not self.motor.fault:
             self.motor.run_to(self._message_at + limit)
             self.trip(COMMUNICATION_LOST)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 HOST = "10.0.2.2"  # QEMU's name of the host
-HARDWARE = (HOST, 0)  # of hardware.py, set by the agent
+HARDWARE = (HOST, 0)  # address of hardware.py; the agent sets the port
 HUB = Path("/sys/devices/platform/vhci_hcd.0")
 FREE, USB_2 = "004", "hs"
 HIGH_SPEED_ID, FULL_SPEED = 0x10001, 2

@@ -97,7 +97,7 @@ async def _asking(arguments: argparse.Namespace) -> AsyncIterator[FleetCommands]
 
 
 def _user() -> str:
-    with suppress(OSError, KeyError):  # a user id may have no name, as in a container
+    with suppress(OSError, KeyError):  # in a container, the user id may have no name
         return getpass.getuser()
     return str(os.getuid())
 

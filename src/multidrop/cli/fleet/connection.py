@@ -96,8 +96,8 @@ def urls_of(arguments: argparse.Namespace) -> list[str]:
 def state_folder() -> Path:
     """Return the folder for the state of this user's gateways and the log of commands.
 
-    The EEPROM ledger is beside this folder. A user without a home folder cannot keep a ledger, and stops do
-    not need one.
+    The EEPROM ledger is beside this folder. A user without a home folder cannot keep a ledger, but stops do
+    not need a ledger.
     """
     return default_path().parent / "fleet"
 

@@ -79,7 +79,7 @@ class Stage:
             raise OSError(f"{what} not within {WAIT_S:.0f} s: the demo has failed") from None
 
     async def calm(self, seconds: float) -> None:
-        """Wait until no line has changed its master for this time: a view may be late."""
+        """Wait until no line has changed its master for this time, because a view may be late."""
         before: dict[str, str | None] | None = None
         while (found := self.masters()) != before:
             before = found

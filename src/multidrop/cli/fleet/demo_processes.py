@@ -98,7 +98,7 @@ class Children:
         _reap(self._running[name])
 
     def end(self, *names: str) -> None:
-        """Ask these processes to exit, and wait for them. Raises OSError if one does not exit."""
+        """Ask these processes to exit, and wait for them. Raises OSError if a process does not exit."""
         for name in names:
             self._running[name].terminate()
         for name in names:

@@ -24,7 +24,7 @@ from multidrop.cli.support.screen import TextLine, cut
 
 OLD_S = 3.0  # an older view is dimmed
 NOTES = 4  # limit of the lines for notes, and for problems
-MOVES = 8  # limit of the table of moves, with its head, if the lines need all remaining room
+MOVES = 8  # limit of the moves' table, with its head, if the lines' table needs the other room
 
 
 def picture(fleet: FleetState, size: tuple[int, int], head: str) -> list[TextLine]:

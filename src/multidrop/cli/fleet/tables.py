@@ -141,7 +141,7 @@ def failing_lines(fleet: FleetState) -> list[str]:
 
 
 def _lines_in(says: FleetState | None, key: str) -> list[str]:
-    """Return the lines that a gateway's answer lists under this key; none if there is no valid list."""
+    """Return the lines that a gateway's answer lists under this key; [] if there is no valid list."""
     found = (says or {}).get(key)
     return [line for line in found if isinstance(line, str)] if isinstance(found, list) else []
 

@@ -110,7 +110,7 @@ def is_plant(word: str) -> bool:
 
 
 def add_line_arguments(parser: argparse.ArgumentParser, *, name: str = "LINE", kind: str = "line") -> None:
-    """Add PORT, or PLANT.toml and the name of a line, which is optional if the plant has only one.
+    """Add PORT, or PLANT.toml and the name of a line, which is optional for a plant with one line.
 
     `name` is the second argument's name in the help, and `kind` is what it may name, such as "line or drive".
     """
@@ -213,7 +213,7 @@ _SETTINGS = ("baudrate", "format", "framing")  # options only for a drive that i
 class Target:
     """A drive and its port, as given on the command line.
 
-    `words` are the words that name both there, and `model` is the family's name there.
+    `words` are the command-line words that name drive and port; `model` is the family's name as given.
     """
 
     drive: Drive

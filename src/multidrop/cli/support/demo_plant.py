@@ -49,7 +49,7 @@ LINES = {  # by line: name, model and framing of its drives
 }
 DRIVES = [name for drives in LINES.values() for name, *_ in drives]
 POLLED = ("status", "terminals", "output_frequency", "output_current", "fault", "last_fault")
-POLLED_OF = {"yd1000": ("status", "output_frequency")}  # its line at 9600 bit/s has time for two requests
+POLLED_OF = {"yd1000": ("status", "output_frequency")}  # at 9600 bit/s there is time for two requests
 SLOWLY = ("output_m01", "output_m02", "output_yabc", "output_virtual")  # settings of terminals, polled slowly
 EVERY, SLOW = "450 ms", "2 s"
 MAXIMUM_HZ = 50
@@ -60,9 +60,9 @@ TROUBLE = {  # faults that some drives simulate
     "pump-2": 'silence = "70 s"',
     "fan-3": "loss = 0.02",
 }
-DRIFT = 0.25  # share by which every load varies
+DRIFT = 0.25  # relative change of every simulated load
 STEP_S = 0.8  # pause before the operator turns to the next drive of a line
-CALM = 3  # the operator changes the setpoint at one of this many visits to a running motor
+CALM = 3  # mean number of visits to a running motor for one change of its setpoint
 
 
 def demo_files(folder: Path) -> tuple[Path, Path]:
@@ -99,7 +99,7 @@ def _polled(family: type[Drive]) -> Iterator[str]:
 
 
 def _port(link: Path) -> str:
-    """Return a simulated line's port: a link to a pseudo-terminal, or TCP if the system has none."""
+    """Return a simulated line's port: a link to a pseudo-terminal, or a TCP port if there are no ptys."""
     if hasattr(os, "openpty"):
         return str(link)
     with socket.create_server(("127.0.0.1", 0)) as free:
@@ -109,7 +109,7 @@ def _port(link: Path) -> str:
 class Operator:
     """Runs motors while its `with` block is active: starts them, changes setpoints, resets trips.
 
-    A motor that a user has stopped stays stopped.
+    The operator does not restart a motor that a user has stopped.
     """
 
     def __init__(self, buses: Iterable[Bus]) -> None:

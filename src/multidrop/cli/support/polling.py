@@ -82,9 +82,9 @@ def polling_session(
 
 
 POINT_S = 0.25  # s between two points of a history
-HISTORY = 240  # number of points: the last minute
+HISTORY = 240  # limit of a history's points: those of the last minute
 RECENT = 5.0  # period in s over which rates are measured
-MISSED = 1.0  # a value is old if its register was missed, and the value is older than this, in s
+MISSED = 1.0  # age in s from which a value is old if newer requests for it failed
 FREQUENCY, CURRENT, FAULT, STATE = "output_frequency", "output_current", "fault", "status"
 
 _NOTHING = Statistics(1.0, Counters())
@@ -97,10 +97,10 @@ class LiveDrive:
     line: PlantLine
     polled: PolledDrive
     cycle: float = 0.0  # planned cycle time of its line, in s
-    line_utilisation: float = 1.0  # planned; at 1 or more, polling leaves no spare time
+    line_utilisation: float = 1.0  # planned; from 1 on, polling leaves no spare line time
     newest: dict[str, Row] = field(default_factory=dict)  # newest sample by register
     missed: dict[str, Row] = field(default_factory=dict)  # misses that are newer than the register's sample
-    last_miss: str = ""  # status of the last miss whose request was sent
+    last_miss: str = ""  # status of the last miss, except misses whose request was not sent
     so_far: Statistics = _NOTHING
     recent: Statistics = _NOTHING
     history: deque[float | None] = field(default_factory=lambda: deque(maxlen=HISTORY))
@@ -123,14 +123,14 @@ class LiveDrive:
             self.missed.pop(row.register, None)
 
     def shown(self, name: str) -> str:
-        """Return a register's newest value with its unit; "" if there is none."""
+        """Return a register's newest value with its unit; "" without any value."""
         row = self.newest.get(name)
         if row is None or row.value is None:
             return ""
         return value_text(self.polled.drive.register(name), row.value)
 
     def age(self, now_ns: int) -> float | None:
-        """Return how old the newest sample is, in s; None if there is none."""
+        """Return how old the newest sample is, in s; None without any sample."""
         newest = max((row.time_ns for row in self.newest.values()), default=None)
         return None if newest is None else max(0.0, (now_ns - newest) / 1e9)
 
@@ -248,7 +248,7 @@ MOST_SHARE, LEAST_SHARE = 0.05, 0.01  # share of a line's time: with spare time,
 
 
 class SideRead(NamedTuple):
-    """One read of a register: its value as text, or why it has none."""
+    """One read of a register: the value as text, or why the read failed."""
 
     text: str
     time: int  # end of the read, UTC in ns

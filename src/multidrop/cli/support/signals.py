@@ -48,7 +48,7 @@ def end_signals_interrupt() -> Iterator[None]:
 
     def close(number: int, frame: FrameType | None) -> None:
         nonlocal is_closed
-        if not is_closed:  # further ones are ignored: a shell and the system may send one each
+        if not is_closed:  # ignore further SIGHUPs: a shell and the system may send one each
             is_closed = True
             raise KeyboardInterrupt
 
@@ -61,7 +61,7 @@ class Interruption:
 
     def __init__(self) -> None:
         self.came = False
-        self._is_asked = False  # True after SIGINT or SIGTERM: the next one raises
+        self._is_asked = False  # True after SIGINT or SIGTERM: the next of these raises
 
     def note(self, number: int, frame: FrameType | None) -> None:
         if self._is_asked:

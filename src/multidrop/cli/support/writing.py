@@ -27,7 +27,7 @@ def confirm(question: str, arguments: argparse.Namespace) -> None:
         interruption.add_note("nothing was sent")
         raise
     finally:
-        if not answer.endswith("\n"):  # end the line of the question after end of input
+        if not answer.endswith("\n"):  # at the end of input, end the question's line
             print(file=sys.stderr)
     if answer.strip().lower() not in ("y", "yes"):
         raise WriteForbidden("nothing was sent")

@@ -1,6 +1,6 @@
 """The two desks of a gateway: CommandDesk carries out each command once, StopDesk carries out stops.
 
-Both act only on lines of which this gateway is the master. The command desk checks a command and sends the
+Both act only on lines whose master is this gateway. The command desk checks a command and sends the
 sender an offer with a token. If the sender returns the token within a second of this computer's
 CLOCK_BOOTTIME, the desk carries out the command. The command is recorded on the disk before it is sent, and
 again when it has ended.
@@ -45,8 +45,8 @@ from multidrop.supervisor import supervisor
 HOLD_S = 0.5  # how long to wait for a command's end before answering "under way"
 AWAITED_S = 3.0  # time limit for commands when a line is released; most writes and read-backs are faster
 POLL_S = 0.01  # pause between checks whether the commands have ended
-MOST_WRITES = 8  # concurrent commands on one line; stops are not counted
-WAY = "fleet"  # the audit log's word for commands that came through the fleet
+MOST_WRITES = 8  # limit of concurrent commands on one line; stops are not counted
+WAY = "fleet"  # how commands that came through the fleet are marked in the audit log
 STOPS_REMEMBERED = 1000  # limit of stops in memory; the oldest are removed
 CALLED = "a stop was called"
 
@@ -158,7 +158,7 @@ class CommandDesk:
         return answer
 
     def _limit_ns(self, offer: Offer) -> float:
-        """Return until when the command may be sent (CLOCK_MONOTONIC, ns); 0 if its offer is void."""
+        """Return the deadline for sending the command (CLOCK_MONOTONIC, ns); 0 if its offer is void."""
         now_ns = time.monotonic_ns()  # read first: a pause between the two clocks' reads shortens the limit
         return 0 if offer.why_void else now_ns + self.offers.left_ns(offer)
 
@@ -167,7 +167,7 @@ class CommandDesk:
         return CommandResult(CommandOutcome.NOT_SENT, offer.unsent(why).text) if why else None
 
     def _why_not(self, offer: Offer) -> str:
-        """Return why the command must not be sent now; "" if it may."""
+        """Return why the command must not be sent now; "" if it may be sent."""
         line = offer.held.name
         if offer.why_void:
             return offer.why_void
@@ -186,7 +186,10 @@ class CommandDesk:
 
 
 def _prepared(held: HeldLine, request: CommandRequest) -> Prepared:
-    """Return the command for a request. Raises ValueError if the plant's list lacks it, and as `prepare`."""
+    """Return the checked command for a request.
+
+    Raises ValueError if the plant's list does not allow the command, and the errors of `prepare`.
+    """
     drive = held.drive(request.drive)
     if request.verb == "stop":
         raise ValueError("a stop needs no offer: it goes to the line's own subject of stops")

@@ -35,7 +35,7 @@ from multidrop.supervisor import Ended, end_tasks, reason_of
 
 LOST_S = 6.0  # after this long without any answer, a command's result is reported as unknown
 AGAIN_S = 0.2
-NO_MASTER_S = 6.0  # repeat a stop this long without a master; a line has one after 1 s, or 4 s after a death
+NO_MASTER_S = 6.0  # how long a stop waits for a new master, which takes 1 s, or 4 s after a gateway's death
 HARD_WIRED = "use the hard-wired stop"
 
 News = Callable[[CommandAnswer], object]
@@ -104,7 +104,7 @@ class FleetCommands:
         return await self.carry_out(self.request(drive, register=register, value=value))
 
     async def act(self, drive: str, verb: str, **options: object) -> CommandAnswer:
-        """Carry out a verb once, such as "start" with direction="forward". Raises errors as `write` does."""
+        """Carry out a verb once, such as "start" with direction="forward". Raises the errors of `write`."""
         return await self.carry_out(self.request(drive, verb=verb, options=options))
 
     def request(self, drive: str, **what: Any) -> CommandRequest:
@@ -112,7 +112,7 @@ class FleetCommands:
         return CommandRequest(uuid.uuid4().hex, self.by, drive, **what)
 
     async def carry_out(self, request: CommandRequest, agreed: str = "") -> CommandAnswer:
-        """Send a command once, and return its result. Raises errors as `write` does.
+        """Send a command once, and return its result. Raises the errors of `write`.
 
         `agreed` is the text of the preview that a person has confirmed. If the command's text has changed
         since, the command is not sent.
@@ -203,9 +203,9 @@ class FleetCommands:
         """Stop these drives, or all drives of the plant if None; the lines are stopped in parallel.
 
         With `line` the plant is not read, and the drives are those of the line. `by` replaces this object's
-        `by` in the logs. `on_news` is called in the loop with the progress of a stop that takes longer than
-        half a second, and at each change of it. A drive that is not in the plant gets the answer "refused";
-        the others are stopped.
+        `by` in the logs. If a stop takes longer than half a second, `on_news` is called in the loop with its
+        progress, and again at each change. A drive that is not in the plant gets the answer "refused"; the
+        other drives are stopped.
 
         Raises ValueError if none of the drives is in the plant, FleetError if the plant cannot be read. In
         both cases no stop was sent.
@@ -311,8 +311,8 @@ async def _first_answer(
 ) -> CommandAnswer:
     """Send a stop until a gateway answers or may have received it; return that answer or UNDER_WAY.
 
-    Return NOT_SENT if no gateway can have received it within NO_MASTER_S, or if this client may not send it.
-    Until then, `on_news` reports that the stop was not sent yet.
+    Return NOT_SENT if no gateway can have received the stop within NO_MASTER_S, or if this client may not
+    send stops. Until then, `on_news` reports that the stop was not sent yet.
     """
     loop = asyncio.get_running_loop()
     ends, reported = loop.time() + NO_MASTER_S, ""
@@ -335,8 +335,8 @@ async def _ask_all(paths: Sequence[ServerPath], line: str, request: StopRequest,
     """Send a stop on all paths in parallel, and return the first answer.
 
     Return UNDER_WAY if a gateway may have received the stop without answering. Raises NobodyThere if no path
-    delivered the stop and one reports that the line has no master. Raises NotDelivered if no path delivered
-    it for other reasons.
+    delivered the stop, and one path reports that the line has no master. Raises NotDelivered if all paths
+    failed for other reasons.
     """
     subject, data = names.stop_subject(line), encode(request)
     asking = [asyncio.create_task(path.request(subject, data)) for path in paths]

@@ -34,7 +34,7 @@ class HeldLine:
         return {drive.name: drive for drive in self.bus.drives}
 
     def drive(self, name: str) -> Drive:
-        """Return the drive of this name. Raises ValueError if the line has none."""
+        """Return the drive of this name. Raises ValueError if the line has no such drive."""
         drives = self.drives
         if name not in drives:
             raise ValueError(f"line {self.name} has no drive {name!r}; it has {', '.join(drives) or 'none'}")

@@ -12,7 +12,7 @@ from typing import Any
 from multidrop.control import AuditLog
 from multidrop.supervisor import supervisor
 
-WRITING_S = 10.0  # a record whose writing takes longer is reported as hanging
+WRITING_S = 10.0  # if writing a record takes longer, the disk is reported as hanging
 CLOSING_S = 1.0  # closing waits this long for the record that is being written
 
 

@@ -12,7 +12,7 @@ from multidrop.control import CommandResult, with_name
 
 MOST_BYTES = 64 * 1024  # limit of a message's size
 MOST_CHARACTERS = 200  # limit of a name's, an id's or a value's length
-UNNAMED = "somebody"  # the sender's name if a stop has none
+UNNAMED = "somebody"  # name of a stop's sender if the message has no name
 
 
 class CommandAnswer(NamedTuple):

@@ -37,7 +37,7 @@ class Prepared(NamedTuple):
 
 
 def commands_of(drive: Drive) -> list[str]:
-    """Return the verbs for which an offer can be made; a stop needs none."""
+    """Return the verbs for which an offer can be made. Stops are not among them: they need no offer."""
     return [verb for verb in verbs_of(drive) if verb != "stop"]
 
 
@@ -103,7 +103,7 @@ class Offer:
 
 
 class Offers:
-    """The offers that this gateway process has made. `clock` returns its CLOCK_BOOTTIME in ns."""
+    """The offers that this gateway process has made. `clock` returns CLOCK_BOOTTIME in ns."""
 
     def __init__(self, clock: Callable[[], int]) -> None:
         self._clock = clock

@@ -69,7 +69,7 @@ class Lease:
     ) -> None:
         self.name = name
         self.terms = terms
-        self.session = 0  # number of the present session; 0 without one
+        self.session = 0  # number of the present session; 0 between sessions
         self.until = 0
         self.trouble = ""  # why the session cannot start
         self.began_ms = 0  # start of the session, UTC in ms
@@ -81,7 +81,7 @@ class Lease:
         self._note = note
         self._nonce = uuid.uuid4().hex
         self._watched: list[SeenRevision | None] = [None] * len(buckets)
-        self._newest = 0  # newest session number of this process; none is reused, whatever a record says
+        self._newest = 0  # newest session number of this process; later sessions get higher numbers
         self._ended: set[int] = set()  # paths on which others have ended this session's record
 
     # ---- state ----
@@ -97,12 +97,12 @@ class Lease:
 
     @property
     def best(self) -> int:
-        """Return the number of the path that was renewed last: its server's answers are the newest."""
+        """Return the number of the path that was renewed last: that path's server has the newest records."""
         return max(range(len(self.held)), key=lambda path: held.sent if (held := self.held[path]) else 0)
 
     @property
     def is_over(self) -> bool:
-        """Return True if we hold too few of the session's records to renew it."""
+        """Return True if we hold too few of the session's records to renew the session."""
         return sum(path is not None for path in self.held) < self.terms.needed
 
     @property
@@ -297,12 +297,12 @@ class Lease:
 
 
 def _least_session(record: Record) -> int:
-    """Return a number that is not less than any earlier session's number, even for an invalid record."""
+    """Return a number that no earlier session exceeds: the record's session, or its revision if invalid."""
     return int(record.value["session"]) if record.value else record.revision
 
 
 async def put_end(bucket: Bucket, end: Record) -> None:
-    """Replace our own record by one that ends its session. Raises Conflict and FleetError as `put` does.
+    """Replace our own record by a record that ends its session. Raises the errors of `Bucket.put`.
 
     If a cancelled renewal was stored in the meantime, replace that record too.
     """

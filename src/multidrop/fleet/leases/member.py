@@ -69,7 +69,7 @@ class IncompatibleGateways:
 
     @property
     def trouble(self) -> str:
-        """Return a sentence about the incompatible gateways; "" if there are none."""
+        """Return a sentence about the incompatible gateways; "" if no such gateway is alive."""
         if not self.gateways:
             return ""
         names = ", ".join(sorted(self.gateways))
@@ -79,7 +79,7 @@ class IncompatibleGateways:
 GUARD_LOOK_S = 0.02
 STEP_S = 0.05  # time between steps if no record changes
 LEAST_STEP_S = 0.01  # least time between steps
-TIDY_NS = SECOND // 2  # between checks of all lines of the share when no change was reported
+TIDY_NS = SECOND // 2  # time between checks of the share's lines, if no change was reported
 SETTLE_S = 3.0
 # End other gateways' sessions only with this much left of our own lease. If less is left, the servers may be
 # failing for all gateways.
@@ -96,7 +96,7 @@ class MemberState(StrEnum):
 
 
 class Member:
-    """One gateway of a fleet: its lease, its share of the lines, and what it knows of the other gateways."""
+    """One gateway of a fleet: its lease, its share of the lines, and its knowledge of the other gateways."""
 
     def __init__(
         self,
@@ -326,7 +326,7 @@ class Member:
             self.keeper.reconcile()
 
     def _see(self, present: Mapping[str, Mapping[str, Any]]) -> set[str]:
-        """Return the other gateways that take lines, and note when that set last changed."""
+        """Return the other gateways that take lines, and record when this set changes."""
         self._incompatible.look(present)
         self.keeper.may_claim = not self._incompatible.gateways
         others = {name for name, value in present.items() if not value["draining"]}

@@ -24,7 +24,7 @@ from multidrop.supervisor import end_tasks
 BELIEVING = lease_rules.USUAL._replace(lease=0, guard=0)  # for viewers: every end counts immediately
 
 LOOK_S = 0.1  # pause between reads of a path; a takeover takes up to this much longer
-ENDING_S = 0.1  # time limit for answers when sessions are ended; later outcomes are seen at the next read
+ENDING_S = 0.1  # time limit for answers when ending sessions; the next read shows the other outcomes
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -207,8 +207,8 @@ class Observer:
     async def _end_enough(self, records: Mapping[int, Record]) -> bool:
         """End these records concurrently, and wait for as many answers as needed: a path may have no leader.
 
-        Return True if any record was ended. Another gateway may have ended the others; the next read shows
-        that.
+        Return True if this call has ended a record. Another gateway may have ended the others; the next read
+        shows that.
         """
         ends = [asyncio.create_task(self._end(path, record)) for path, record in records.items()]
         answers: list[bool] = []

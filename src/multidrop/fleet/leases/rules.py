@@ -29,8 +29,8 @@ class Terms(NamedTuple):
 
     lease: int = 2_300_000_000
     guard: int = 700_000_000  # from the end of a session to the first request of the next master
-    needed: int = 2  # paths that the holder must renew
-    ended: int = 2  # paths that a gateway must end to take over
+    needed: int = 2  # number of paths that the holder must renew
+    ended: int = 2  # number of paths that a gateway must end to take over
 
 
 USUAL = Terms()

@@ -24,7 +24,7 @@ _log = logging.getLogger("multidrop.fleet")
 REPORTED_NS = 2_000_000_000  # report a lost port immediately if the newest reply is older
 SILENT_S = 0.5  # close lines this long before the lease expires; the kernel's timer fires guard / 2 after
 TAKE_AGAIN_S = 2.0  # pause between attempts to open a line
-WRITTEN_AT_ONCE = 64  # number of records written together; more would delay renewals of the lease
+WRITTEN_AT_ONCE = 64  # limit of records written together: more would delay renewals of the lease
 LINES_AT_ONCE = 32
 
 
@@ -78,7 +78,7 @@ class LineKeeper:
         self.lines = lines
         self.polled: dict[str, TakenLine] = {}
         self.troubles: dict[str, str] = {}  # why lines could not be opened, by line
-        self.lost: dict[str, str] = {}  # why lines are not polled: their ports failed
+        self.lost: dict[str, str] = {}  # by line: how its port was lost, so the line is not polled
         self.unopened = UnopenedLines(lambda: lease.clock())
         self.releasing: set[str] = set()  # our lines that must be released to other gateways
         self.may_claim = True  # False while a gateway of an incompatible version is alive

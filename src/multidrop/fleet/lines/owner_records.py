@@ -92,7 +92,7 @@ class OwnerRecords:
         return claim_of(self._me, self._records.of(line), is_over, self.doubted(line), self._leaderless())
 
     def _leaderless(self) -> set[str]:
-        """Return the bucket that may have no leader: our lease on the same path is not being renewed."""
+        """Return the bucket, if any, that may have no leader: our lease on its path is not being renewed."""
         sent = [path.sent if path else 0 for path in self._lease.held]
         since = sorted(sent)[1] - LAG_NS
         return {bucket for bucket, moment in zip(names.OWNERS, sent, strict=True) if moment < since}
@@ -100,8 +100,8 @@ class OwnerRecords:
     async def claim(self, claims: Mapping[str, Claim]) -> None:
         """Write the first records of these claims; write the spare ones if a bucket's answer comes late.
 
-        If a claim is refused, it is repeated soon with newer records. So then do not wait for a bucket that
-        may have no leader, nor for other answers that no longer matter.
+        A refused claim is repeated soon with newer records. So after a refusal, do not wait for further
+        answers, such as those of a bucket that may have no leader.
         """
         now_ms, begun = time.time_ns() // 1_000_000, time.monotonic()
         values = {
@@ -137,7 +137,7 @@ class OwnerRecords:
         refused: set[str],
         within_s: float | None = None,
     ) -> set[asyncio.Task[set[str]]]:
-        """Wait until each line is ours or refused. Add to `refused`; return the unanswered writes."""
+        """Wait until each line is ours or refused; fill `refused`, and return the unanswered writes."""
         late = set(writes)
         with suppress(TimeoutError):
             async with asyncio.timeout(within_s):
@@ -147,7 +147,7 @@ class OwnerRecords:
         return late
 
     async def give_away(self, lines: Sequence[str]) -> None:
-        """Release these lines: replace each record that names us by one that names no gateway.
+        """Release these lines: replace each record that names us by a record that names no gateway.
 
         `is_mine` returns False for all of them before the first write is sent, so a late answer to a claim
         cannot make a line ours.
@@ -173,7 +173,7 @@ class OwnerRecords:
         }
 
     async def _write_in(self, bucket: str, records: Sequence[Record]) -> set[str]:
-        """Replace records whose revision is unchanged; return the refused lines, report those now ours."""
+        """Replace records of unchanged revision; return refused lines, and report lines that became ours."""
         follower = self._records.owners[bucket]
         async with self._writing[bucket]:
             if not self._may_write():

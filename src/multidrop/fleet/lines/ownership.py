@@ -23,7 +23,7 @@ NOBODY = ""
 NEEDED = 2  # votes that a master needs
 
 Owner = tuple[str, int]  # a gateway and its session
-LineRecords = Mapping[str, Record | None]  # by bucket, in writing order; None: not read yet
+LineRecords = Mapping[str, Record | None]  # a line's records by bucket, in writing order; None: not read yet
 
 
 class Claim(NamedTuple):
@@ -67,7 +67,7 @@ def votes_of(owner: Owner, records: Iterable[Record | None]) -> int:
 
 
 def owner_by(records: LineRecords) -> Record | None:
-    """Return the newest record of the owner with enough votes; None if no owner has enough.
+    """Return the newest record of the owner with enough votes; None if there is no such owner.
 
     The owner of a free line is NOBODY.
     """

@@ -50,7 +50,7 @@ class FleetRecords:
         self._lines: tuple[str, ...] = ()
         self._on_change = on_change
         self._read: set[str] = set()  # buckets that were read at least once
-        self.is_complete = False  # True once each bucket was read
+        self.is_complete = False  # True once each bucket was read at least once
         self._looks: dict[str, Callable[[], Awaitable[Any]]] = {
             names.PLANT: self._look_at_plant,
             **{name: partial(self.observer.look, at) for at, name in enumerate(names.LEASES)},
@@ -66,7 +66,7 @@ class FleetRecords:
         return self._of.get(line, _UNREAD)
 
     def owner(self, line: str) -> Record | None:
-        """Return a record with enough votes that names the line's master or no gateway; None without one."""
+        """Return the record that names the line's master or NOBODY with enough votes; None without one."""
         return owner_by(self.of(line))
 
     def lines(self) -> tuple[str, ...]:

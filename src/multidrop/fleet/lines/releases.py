@@ -37,11 +37,12 @@ class Releases:
         self._on_change = on_change
         self._clock = clock
         self._has_lines = False
-        # By bucket that has a leader: since when (s) one of the bucket's servers is silent; None if none is.
+        # By bucket that has a leader: the time in s since which one of its servers is silent; None if all
+        # answer.
         self._led: dict[str, float | None] = {}
 
     def due(self, lines: Set[str], wait_s: float = WAIT_S) -> set[str]:
-        """Return those of these lines that may be closed now; the other lines must wait.
+        """Return the lines in `lines` that may be closed now; the other lines must wait.
 
         At least two buckets must be ready. One of them must be the line's first bucket, whose record may have
         two votes. A server that is silent for longer than `wait_s` seconds is ignored.

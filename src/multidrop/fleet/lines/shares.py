@@ -62,7 +62,7 @@ def hand_over(wanted: Mapping[str, str], unopened: Mapping[str, Collection[str]]
 def _words(values: Iterable[int]) -> pa.UInt64Array:
     """Return the values as an array of 64-bit words.
 
-    `pa.array` would import pandas if it is installed, which takes far longer.
+    `pa.array` would take far longer, because it imports pandas if pandas is installed.
     """
     words = array("Q", values)
     return pa.Array.from_buffers(pa.uint64(), len(words), [None, pa.py_buffer(words)])

@@ -13,9 +13,9 @@ from collections.abc import Callable
 
 from multidrop.fleet.leases.rules import SECOND
 
-OPENINGS = 3  # failed attempts to open a line before it is reported
+OPENINGS = 3  # number of failed attempts to open a line before the line is reported
 LOST_NS = 6 * SECOND  # a lost port is reported this long after the last reply
-REPLY_NS = 3 * SECOND  # a reply that is older does not show when the port was lost
+REPLY_NS = 3 * SECOND  # an older reply does not show when the port was lost
 FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND  # first and longest wait before a trial
 TRIAL_NS = 60 * SECOND  # if the line does not come back, its trial ends after this time
 MOST_BYTES = 8_000  # limit of all line names in a lease record
@@ -40,7 +40,7 @@ class UnopenedLines:
         self._tried_since = 0
 
     def failed(self, line: str) -> None:
-        """Count a failed attempt to open the line's port; report the line after OPENINGS of them."""
+        """Count a failed attempt to open the line's port; report the line after OPENINGS failures."""
         self._failures[line] = self._failures.get(line, 0) + 1
         if self._failures[line] >= OPENINGS:
             self._name(line)
@@ -65,7 +65,7 @@ class UnopenedLines:
         if line == self._tried:  # the network is back: try the other reported lines immediately
             self._tried, self._wait_ns, self._trial_at = "", FIRST_WAIT_NS, self._clock()
             for other in self._named.keys() - (self._named.keys() if self.home is None else self.home):
-                del self._named[other]  # assigned to another gateway: a trial would not bring the line back
+                del self._named[other]  # not one of our lines: a trial would not bring it back
 
     def gone(self, line: str) -> None:
         """Forget the line's failures, because it is no longer ours."""

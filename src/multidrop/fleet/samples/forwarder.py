@@ -29,7 +29,7 @@ from multidrop.fleet.samples.spool import Spool, StoredMessage
 from multidrop.fleet.servers.connections import ServerPath
 
 AGAIN_S = 0.25  # pause after a failure
-LOOKING_S = 1.0  # between checks for messages that the spool did not announce
+LOOKING_S = 1.0  # time between checks for messages that the spool did not announce
 SET_BACK = (
     "the servers have message {} of the log {}, and the spool has {}: its folder was copied or set back; "
     "move it away to start a new log"
@@ -105,7 +105,7 @@ class Forwarder:
                 continue
             found = await publish(self._path, self._subject, data, self._headers(stored, data, place))
             end_if_cancelled()
-            if found is None:  # None: refused, because an earlier attempt of ours was stored
+            if found is None:  # refused: our earlier attempt was stored after all
                 return
             place, sequence = found, stored.sequence
             self.sent += 1
@@ -116,7 +116,7 @@ class Forwarder:
         """Return the position and the sequence number of this log's last message in the stream."""
         last = await last_of(self._path, self._subject)
         end_if_cancelled()
-        if last is None or last.sequence == 0:  # none is stored now, or the last one is forged
+        if last is None or last.sequence == 0:  # no message is stored now, or the last message is forged
             sequence = self.last or 0
             self._have(sequence)
             return (last.place if last else 0), sequence

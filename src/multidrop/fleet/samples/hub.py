@@ -34,7 +34,7 @@ class SourceCheck:
         self.alarms = 0
         self.missing = 0  # number of missing messages
         self.doubled = 0  # number of repeated messages, which are ignored
-        self._lost: dict[str, int] = {}  # rows lost by each gateway's spool, as the gateway reports
+        self._lost: dict[str, int] = {}  # by gateway and log: lost rows that the spool has reported
 
     def take(self, message: StreamMessage) -> bool:
         """Return True if the message is new and must be stored."""
@@ -92,7 +92,7 @@ class Commit(NamedTuple):
     """Rows, and the position of their last message, which a sink must store together."""
 
     stream: str  # identity of the stream: when it was created
-    first: int  # position of the first message in the stream
+    first: int  # stream position of the commit's first message
     last: int
     sources: Mapping[str, int]
     tables: Sequence[Any]  # pyarrow.Table of message.ROWS; may be empty
@@ -125,7 +125,7 @@ async def _on_thread(act: Callable[..., T], *arguments: Any) -> T:
 class HubState(NamedTuple):
     """Positions in the stream, counts since the start, and the present problem (None without one)."""
 
-    place: int  # position of the last stored message
+    place: int  # stream position of the last stored message
     behind: int  # messages in the stream that are not stored yet
     rows: int
     alarms: int
@@ -174,7 +174,7 @@ class SampleHub:
         end_if_cancelled()
         kept = await _on_thread(self._sink.begin, found.created)
         self._stream, self._place = found.created, kept.place
-        self._end = found.last if found.first <= found.last else kept.place  # otherwise the stream is empty
+        self._end = found.last if found.first <= found.last else kept.place  # else the stream is empty now
         self._sources.last = dict(kept.sources)
         self._check_end(found)
         if found.first > kept.place + 1 and found.last > kept.place:
@@ -227,7 +227,7 @@ class SampleHub:
         return is_end
 
     def _tables(self, messages: Sequence[StreamMessage]) -> list[Any]:
-        """Return the rows of those messages that are new and valid, one table for each."""
+        """Return a table of rows for each message that is new and valid."""
         found = []
         for message in messages:
             if self._sources.take(message):

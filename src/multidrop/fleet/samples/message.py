@@ -42,7 +42,7 @@ from multidrop.fleet.samples.polled_units import PolledUnits
 from multidrop.polling import BatchColumns
 
 LATEST = 4  # MetadataVersion.V5: older versions mark compressed buffers differently
-MOST_MESSAGES = 100  # Arrow messages in a stream: the schema, dictionaries and rows
+MOST_MESSAGES = 100  # limit of Arrow messages in a stream: the schema, dictionaries and rows
 _DICTIONARY, _RECORD_BATCH = 2, 3  # kinds of messages: MessageHeader in Message.fbs
 _I8, _U16, _I32, _U32, _I64 = (Struct(f"<{kind}") for kind in "bHiIq")
 _BUFFER = Struct("<qq")  # a buffer's offset in the body, and its length
@@ -120,7 +120,7 @@ class _Table:
 
 MOST_BYTES = 900_000  # limit of a message; NATS accepts 1 MiB by default, including headers
 MOST_ROWS = 1 << 16
-MOST_UNPACKED = 4 << 20  # bytes; allows 2.4 MB of rows, and their names
+MOST_UNPACKED = 4 << 20  # limit in bytes; allows 2.4 MB of rows, and their names
 MOST_NAME = 1000  # limit of a name, status or unit in bytes, because PostgreSQL indexes names
 MOST_SAID = 300  # limit of characters of an error's text
 LONGEST_US = (1 << 31) - 1

@@ -35,7 +35,7 @@ from multidrop.fleet.samples.hub import Commit, KeptPlace, NotThisHubs, SinkErro
 from multidrop.fleet.samples.message import ROWS
 from multidrop.recording import FileLock
 
-KEY = "multidrop"  # key under which the files' metadata are stored, as in all recordings
+KEY = "multidrop"  # key of our metadata in the file's metadata, the same in all recordings
 SECOND_NS = 1_000_000_000
 FORM = "%Y%m%dT%H%M%SZ"
 WRITTEN = {  # names are dictionary-encoded in the file; readers get plain texts

@@ -14,7 +14,7 @@ RAW = "raw count"  # same text as in a `History`
 
 
 class Change(NamedTuple):
-    """A change of a series' unit: the code that it had until this monotonic time in ns."""
+    """A change of a series' unit: before `until_ns` (monotonic, in ns) the series had the unit `code`."""
 
     until_ns: int
     series: int
@@ -51,8 +51,8 @@ class PolledUnits:
     def table(self, drives: Sequence[str], registers: Sequence[str]) -> UnitTable:
         """Return the units of the drives' registers. The table is cached until lines or names change.
 
-        A message has nearly as many series as rows, so a lookup for each series would cost more than all
-        other work on a row.
+        A message has nearly as many series as rows, so looking up each series' unit would cost more than
+        all other work on a row.
         """
         with self._lock:
             if self._made is None or self._made[:2] != (drives, registers):
@@ -76,7 +76,7 @@ class PolledUnits:
 
 
 def unit_of(drive: Drive, register: Register[Any]) -> str:
-    """Return a register's unit: "" for a number without one, "names of yd1000" for its named values."""
+    """Return a register's unit: "" for a plain number, "names of yd1000" for a YD1000's named values."""
     if register.values:
         return f"names of {drive.model or type(drive).__name__}"
     return RAW if register.step is None else register.unit

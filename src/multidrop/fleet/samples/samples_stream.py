@@ -100,7 +100,7 @@ async def samples_path(
 
 
 async def create_stream(path: ServerPath, *, replicas: int = 3, most_bytes: int = -1) -> int:
-    """Create the stream if it is missing; return its size limit in bytes, -1 for none.
+    """Create the stream if it is missing; return its size limit in bytes; -1: unlimited.
 
     Above `most_bytes`, the oldest messages are removed. The servers reserve that much space. A stream without
     a limit fills their disks, and then no lease can be renewed. An existing stream stays as it is.
@@ -218,7 +218,7 @@ async def read_after(path: ServerPath, place: int, messages: int, size: int) -> 
     try:
         await path.gather(Request(SUBJECT, json.dumps(wanted).encode()), get, ANSWER_S)
     except FleetError as failure:
-        if get.found or get.has_hole:  # the messages in it are complete; the next call reads the rest
+        if get.found or get.has_hole:  # messages before the hole are complete; the next call reads others
             return get.found
         raise _refused(get.end_line) if get.last.done() else failure from failure
     return get.found

@@ -201,7 +201,7 @@ class SpoolState(NamedTuple):
     newest: int
     acknowledged: int | None  # the stream has all messages up to this one; None: not known yet
     stored: int  # size of all stored messages in bytes
-    trouble: str | None  # the disk's present error; None without one
+    trouble: str | None  # the disk's present error; None if the disk works
 
 
 class Spool:
@@ -239,7 +239,7 @@ class Spool:
         self._undecided: dict[int, int] = {}  # removed rows per message, until `acknowledge` is called
         self._trouble: str | None = None
         self._logged_s: float | None = None
-        self._wanted = 0  # number of rows that `sync` waits for
+        self._wanted = 0  # count of appended rows for which `sync` waits
         self._over = False
         if self._folder.damage:
             _log.error("%s", self._folder.damage)
@@ -294,7 +294,7 @@ class Spool:
     # ---- for the forwarder: any thread ----
 
     def following(self, sequence: int) -> StoredMessage | None:
-        """Return the first stored message with a sequence number above this one; None if there is none."""
+        """Return the stored message with the next higher sequence number; None if there is none."""
         with self._changing:
             messages = self._folder.messages
             first = max(sequence + 1, next(iter(messages), sequence + 1))

@@ -19,7 +19,7 @@ from nats.aio.msg import Msg
 
 STATUS = slice(9, 12)  # position of the status in headers such as "NATS/1.0 404 No Messages"
 PROCESSED = 4  # number of arguments of Client._process_msg after the subscription id
-WHOLE = ("204", "404")  # statuses that end an answer: after its last message, and without any message
+WHOLE = ("204", "404")  # statuses that end an answer: after the last message; without any message
 
 
 class DirectMessage(NamedTuple):

@@ -41,7 +41,7 @@ class Record(NamedTuple):
 class WriteAnswers(NamedTuple):
     """The records that were replaced, with their new revisions, and the keys of the refused records.
 
-    The outcome for any other record is unknown, until it is read.
+    The outcome for any other record is unknown until that record is read.
     """
 
     stored: list[Record]
@@ -100,7 +100,7 @@ def parsed_answer(data: bytes) -> dict[str, Any]:
 
 
 def _revision(said: Mapping[str, Any]) -> int:
-    """Return the sequence number of a stored record. Raises Unsure if the answer has none."""
+    """Return the sequence number of a stored record. Raises Unsure if the answer lacks that number."""
     revision = said.get("seq")
     if type(revision) is not int:
         raise Unsure("the answer of NATS has no sequence number")
@@ -125,7 +125,7 @@ class Bucket:
     def __init__(self, name: str, path: Callable[[], ServerPath]) -> None:
         self.name = name
         self.path = path
-        self._strange: set[str] = set()  # keys whose invalid record was already logged
+        self._strange: set[str] = set()  # keys of invalid records that were already logged
 
     async def put(self, key: str, value: Any, revision: int) -> int:
         """Replace the record if it has exactly this revision, and return its new revision.
@@ -169,7 +169,7 @@ class Bucket:
         )
 
     async def get(self, key: str) -> Record:
-        """Return the record from the bucket's leader; its revision is 0 if there is none."""
+        """Return the record from the bucket's leader; a missing record has revision 0."""
         wanted = {"last_by_subj": self._all_of(key)}
         try:
             said = await ask(self.path(), f"STREAM.MSG.GET.KV_{self.name}", wanted)

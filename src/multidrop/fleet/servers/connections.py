@@ -40,7 +40,7 @@ _log = logging.getLogger("multidrop.fleet")
 
 
 class ServerPath:
-    """One connection: to its home server while that server answers, otherwise to any other server."""
+    """A connection to its home server while that server answers, otherwise to any other server."""
 
     def __init__(
         self, urls: Sequence[str], options: Mapping[str, Any] | None = None, pong_s: float = PONG_S
@@ -92,7 +92,7 @@ class ServerPath:
         raise refusals[0] if refusals else FleetError("; ".join(map(str, failures)))
 
     async def keep(self) -> None:
-        """Check the connection forever: leave a server that does not answer, and return home if possible."""
+        """Check the connection forever: leave a silent server, and return to the home server if possible."""
         while True:
             try:
                 await self.look_after()
@@ -176,7 +176,7 @@ class ServerPath:
             await self.subscribe(subject, called)
             client = self._connected()
             with suppress(NatsError, OSError, TimeoutError):
-                await client.flush()  # this ping may overtake pending data; the next one cannot
+                await client.flush()  # this ping may overtake pending data, but the second ping cannot
                 await client.flush()
 
     async def request(
@@ -205,13 +205,13 @@ class ServerPath:
     async def collect(self, subject: str, data: bytes) -> list[DirectMessage]:
         """Return all messages of a direct get. If this path is slow, repeat the request on the other paths.
 
-        Raises FleetError as `request` does.
+        Raises the errors of `request`.
         """
         ways = [self, *(other for other in self.others if other.is_open)]
         return await first_answer(ways, Request(subject, data), self.spare)
 
     async def gather(self, request: Request, get: DirectGet, silence_s: float = ANSWER_S) -> None:
-        """Collect the messages of a direct get on this path only. Raises FleetError as `request` does."""
+        """Collect the messages of a direct get on this path only. Raises the errors of `request`."""
         client, denials = self._connected(), self._denials
         before = denials.of_request(request.subject)
         try:
@@ -221,7 +221,7 @@ class ServerPath:
             raise Unsure(f"{self.url} gave no whole answer to {request.subject}: {failure}") from None
 
     async def request_all(self, requests: Sequence[Request]) -> list[bytes | None]:
-        """Send all requests together and return the answer to each; None if an outcome is unknown."""
+        """Send all requests together and return the answer to each; None for a request without an answer."""
         try:
             return await self._connected().replies(requests, ANSWER_S)
         except (NatsError, OSError) as failure:

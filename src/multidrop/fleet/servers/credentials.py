@@ -1,8 +1,8 @@
 """Credentials: the identity of a NATS connection, and the servers that it trusts.
 
 A key is an Ed25519 key pair (an "nkey"). The secret key is in a file that only its user has; servers know the
-public key. Answers to a user go to an inbox that is named after its public key, and which no other user may
-read.
+public key. Answers to a user go to an inbox that is named after the user's public key. No other user may read
+the inbox.
 """
 
 from __future__ import annotations

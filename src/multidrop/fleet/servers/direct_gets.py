@@ -24,9 +24,9 @@ from multidrop.fleet.errors import NoRight, Unsure
 from multidrop.fleet.servers.batch_client import DirectGet, DirectMessage, Request
 from multidrop.supervisor import end_tasks
 
-AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)  # silence before each repeat; the read fails after the last
+AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)  # silence before each repeat; the read fails after the last silence
 SLOW = 3.0  # silence before a repeat, as a multiple of an answer's usual time
-MOST_SILENCE_S = 1.0  # limit of that silence, because a path gives up then
+MOST_SILENCE_S = 1.0  # limit of the silence before a repeat, because a path gives up then
 FORGET = 0.97  # decay of the usual time, per answer
 MOST_SPARE = 300.0  # limit of the budget: twice the need of the 3 s until servers notice a dead route
 EARNED = 0.5  # repeats that one timely answer earns
@@ -44,7 +44,7 @@ class Spare:
 
     def __init__(self) -> None:
         self._left = 0.0
-        self._took_s = MOST_SILENCE_S / SLOW  # usual time of an answer; an assumption at first
+        self._took_s = MOST_SILENCE_S / SLOW  # usual time of an answer; at first an assumed value
 
     def note(self, *, is_late: bool) -> None:
         """Update the budget when the first request of a read was answered.
@@ -62,14 +62,14 @@ class Spare:
         return max(least_s, min(SLOW * self._took_s, MOST_SILENCE_S))
 
     def spend(self, ways: Sequence[Way]) -> Sequence[Way]:
-        """Return as many of these paths as the budget allows, and charge it for them."""
+        """Return as many of these paths as the budget allows; charge the budget for these repeats."""
         asked = ways[: int(self._left)]
         self._left -= len(asked)
         return asked
 
 
 async def first_answer(ways: Sequence[Way], request: Request, spare: Spare) -> list[DirectMessage]:
-    """Return the messages of the first complete answer. Raises FleetError if there is none.
+    """Return the messages of the first complete answer. Raises FleetError if no complete answer comes.
 
     Only the first path is asked at first, because it usually answers immediately.
     """

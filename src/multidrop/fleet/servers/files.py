@@ -27,7 +27,7 @@ CLUSTER = "multidrop"
 ROUTE_PORTS = 2000  # a server's port for routes is its client port plus this, such as 6222 for 4222
 MOST_PORTS = 65535
 STORE = Path("/var/lib/nats")
-PINGS = 'ping_interval: "1s", ping_max: 2'  # of routes: a dead one is noticed after 3 s, not 60 to 90 s
+PINGS = 'ping_interval: "1s", ping_max: 2'  # for routes: a dead route is noticed after 3 s
 
 
 class TlsFiles(NamedTuple):
@@ -101,7 +101,7 @@ def _public(path: Path, seed: str) -> str:
 
 
 def _write_secret(path: Path, text: str) -> None:
-    """Write a file that other users can never read, not even for a moment."""
+    """Write a file that other users cannot read, not even while it is written."""
     beside = path.with_name(path.name + ".new")
     beside.unlink(missing_ok=True)
     descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)

@@ -1,4 +1,4 @@
-"""Leaders of buckets: each bucket is led by another server, so that one failed server stops only one path.
+"""Leaders of buckets: each bucket has a different server as leader, so one failed server stops only one path.
 
 A server that is cut off starts an election every 4 to 9 s, each in a newer term of Raft, although the others
 do not hear it. When it returns, a leader with an older term steps down, and its bucket has no leader for 4 to
@@ -23,7 +23,7 @@ from multidrop.fleet.servers.buckets import ask
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.supervisor import end_tasks
 
-SILENT_NS = 2_000_000_000  # time without contact; a follower contacts its leader once a second
+SILENT_NS = 2_000_000_000  # a server is silent after this time; followers contact their leader once a second
 
 
 class Replica(NamedTuple):
@@ -110,7 +110,7 @@ async def have_leaders(path: ServerPath) -> bool:
 
 
 async def led_clusters(path: ServerPath) -> dict[str, Cluster]:
-    """Return the clusters of those lease and master buckets whose leader answers within SOON_S."""
+    """Return, by bucket, the cluster of each lease or master bucket whose leader answers within SOON_S."""
     buckets = (*names.LEASES, *names.OWNERS)
     looks = [asyncio.create_task(known_cluster(path, bucket)) for bucket in buckets]
     try:

@@ -19,7 +19,7 @@ from multidrop.fleet.servers.buckets import Bucket, Follower, Record
 from multidrop.plant import MAY_KEYS, allowed
 from multidrop.toml_check import Key, TomlPlace
 
-AT_ONCE = 64  # concurrent writes of records
+AT_ONCE = 64  # limit of concurrent writes of records
 SOCKETS = ("socket://", "tcp://")
 
 _FLEET = {"may": Key(dict, "[fleet.may], a table")}

@@ -1,4 +1,4 @@
-"""Rights: what each user of a fleet may publish and subscribe to on its NATS servers. Pure.
+"""Rights: what each user of a fleet may publish and subscribe to on its NATS servers.
 
 | user      | may                                                                                          |
 |-----------|----------------------------------------------------------------------------------------------|

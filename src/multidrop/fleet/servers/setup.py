@@ -17,7 +17,7 @@ from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.leaders import bring_leaders_home, cluster_of, led_clusters
 
 CONTEST = "contest"
-ROUNDS = 40  # rounds of `_contest`; nats-server 2.9.10 fails in the first few
+ROUNDS = 40  # tests in `_contest`; nats-server 2.9.10 fails one of the first few
 CLAIMANTS = 6
 MOST_REPLICAS = 3
 WAIT_S = 10.0  # time limit of retries; an election takes 4 to 9 s
@@ -149,7 +149,10 @@ async def _retried(path: ServerPath, attempt: Callable[[], Awaitable[T]]) -> T:
 
 
 async def _contest(paths: Sequence[ServerPath], replicas: int) -> None:
-    """Let several claimants request the same revision, repeatedly. Raises FleetError if two get it."""
+    """Test many times that the servers accept only one of several concurrent writes to one revision.
+
+    Raises FleetError if they accept two.
+    """
     settings = bucket_settings(CONTEST, replicas)
     await _retried(paths[0], partial(_create, paths[0], settings))
     try:

@@ -1,8 +1,8 @@
 """HTTP connections: their number, time limits, and the order of requests.
 
-Slow, silent or greedy clients do not delay others. At MOST_OPEN connections, one of such a client is closed,
-so that a new connection, which may bring a stop, is always accepted. Requests are answered one at a time,
-possible stops first.
+Slow, silent or greedy clients do not delay other clients. If MOST_OPEN connections are open, a connection of
+such a client is closed. So a new connection, which may bring a stop, is always accepted. Requests are
+answered one at a time, possible stops first.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from multidrop.gateway.http.messages import JsonResponse
 
-MOST_OPEN = 256  # a process usually has 1024 descriptors, and lines and files need some
+MOST_OPEN = 256  # limit: a process usually has 1024 descriptors, and lines and files need some
 FIRST_S = 10.0  # time limit for a TLS handshake and the first request
-AGAIN_S = 40.0  # time limit for a later request; the server closes an idle connection after 30 s
+AGAIN_S = 40.0  # time limit between requests; the web server itself closes idle connections after 30 s
 FRESH_S = 1.0  # a new connection should send its first request within this time
-MOST_FRESH = 64  # at most so many fresh connections are protected from being closed
+MOST_FRESH = 64  # limit of fresh connections that are protected from being closed
 STALLED_S = 10.0  # a client that reads none of its answers for this long is closed
 
 ENDS = "the gateway is shutting down: the outcome of this request is unknown"
@@ -84,7 +84,7 @@ class Connections:
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self._open: dict[tuple[str, int], _Open] = {}
-        self.ended = 0  # connections closed here so far
+        self.ended = 0  # number of connections that this object has closed
 
     def add(self, peer: socket.socket, address: Any) -> None:
         """Note a new connection, and close another one if there are too many."""
@@ -113,9 +113,9 @@ class Connections:
             self._open[client].is_busy = True
 
     def is_stop(self, client: tuple[str, int] | None, path: str) -> bool:
-        """Note and return whether a new request may be a stop.
+        """Record and return whether a new request of this client may be a stop.
 
-        A verb does not count as one while its client sends requests without waiting for answers.
+        A verb does not count as a possible stop while its client sends requests without waiting for answers.
         """
         found = self._open.get(client) if client else None
         is_stop = path in STOP_PATHS or (path == VERB_PATH and not (found and found.is_greedy))
@@ -174,7 +174,7 @@ class Turns:
     def __init__(self) -> None:
         self.stops: deque[asyncio.Future[None]] = deque()
         self.others: deque[asyncio.Future[None]] = deque()
-        self._is_taken = False  # a request was started in this round
+        self._is_taken = False  # True: a request was started in this round
 
     async def wait(self, waiting: deque[asyncio.Future[None]]) -> None:
         """Wait until a request in the queue `waiting` may start."""

@@ -1,7 +1,7 @@
 """Exports of the history as CSV or Parquet files.
 
-The number of concurrent exports is limited: each uses a thread while a piece of its file is made, and a
-Parquet file needs space on the disk of the history.
+The number of concurrent exports is limited: each export uses a thread while it makes a piece of its
+file, and a Parquet file needs space on the history's disk.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from multidrop.gateway.http.messages import Denied
 from multidrop.gateway.live.parameter_reads import ParameterRead
 from multidrop.supervisor import supervisor
 
-MOST_EXPORTS = 8  # concurrent exports
+MOST_EXPORTS = 8  # limit of concurrent exports
 PIECE_S = 600.0  # time limit for making one piece; for Parquet, the first piece includes the whole file
 R = TypeVar("R")
-MOST_NAME = 80  # characters of a series' name in a file name
-FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')  # signs that some systems forbid in file names
+MOST_NAME = 80  # limit of characters of a series' name in a file name
+FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')  # characters that some systems forbid in file names
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
 PARAMETER_KINDS = {
     "toml": (params.to_toml, "application/toml; charset=utf-8"),

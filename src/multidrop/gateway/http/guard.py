@@ -31,7 +31,7 @@ PAGE_HEADERS = HEADERS | {
 ANYONE = "anyone"
 WRONG = "the token is wrong"
 SHUT = "too many wrong tokens came from this address: try again in a minute"
-HAS_WRONG_TOKEN = "has_wrong_token"  # key in the scope of a request with a wrong token; stops are sent anyway
+HAS_WRONG_TOKEN = "has_wrong_token"  # scope's key of a wrong token: routes then accept only stops
 MOST_HEAD = 64 * 1024  # limit of a request's head in bytes; browsers send the cookies of all ports of a host
 
 
@@ -52,7 +52,7 @@ class Needed(NamedTuple):
 
 
 class Guard:
-    """Passes an allowed request to `app`, with its caller in the scope's `caller`; refuses any other."""
+    """Passes allowed requests to `app`, with the caller in the scope's `caller`; refuses all others."""
 
     def __init__(
         self,

@@ -21,12 +21,12 @@ from multidrop.supervisor import Hung, supervisor
 
 LEAST_MS, MOST_MS = -62_135_596_800_000, 253_402_300_799_999  # years 1 to 9999, in ms since 1970
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-COMPRESSIBLE = ("text", "json", "javascript", "svg", "toml")  # in the media types of texts
-LEAST_COMPRESSED = 1024  # bytes
+COMPRESSIBLE = ("text", "json", "javascript", "svg", "toml")  # parts of the media types that are compressed
+LEAST_COMPRESSED = 1024  # in bytes; shorter answers are not compressed
 LEVEL = 6
-COMPRESSION_S = 10.0  # time limit
-MOST_BYTES = 64 * 1024  # limit of a body
-BODY_S = 10.0  # time limit for a body
+COMPRESSION_S = 10.0  # time limit for compressing an answer
+MOST_BYTES = 64 * 1024  # limit of a request's body in bytes
+BODY_S = 10.0  # time limit for receiving a body
 STOP_BODY_S = 3.0  # time limit for a stop's body, enough for one or two retransmissions
 _log = logging.getLogger("multidrop.gateway")
 
@@ -53,9 +53,10 @@ def takes_gzip(headers: Mapping[str, str]) -> bool:
 
 
 async def compressed(request: Request, response: Response) -> Response:
-    """Return a text response compressed, if its client accepts that and it is long enough to gain from it.
+    """Return the response compressed if it is a text of some length and its client accepts gzip.
 
-    A thread compresses it, to keep the event loop free for stops. If threads are short, it stays as it is.
+    A thread compresses it, to keep the event loop free for stops. If no thread is free, the response is not
+    compressed.
     """
     kind = response.headers.get("content-type", "")
     if isinstance(response, StreamingResponse) or not any(one in kind for one in COMPRESSIBLE):
@@ -100,7 +101,7 @@ async def body_of(request: Request, seconds: float | None = None) -> dict[str, A
 
 
 async def drives_to_stop(request: Request) -> tuple[list[str] | None, object]:
-    """Return the names of the drives that a stop request names, None for all drives; and the given id.
+    """Return the drives that a stop request names (None: all drives), and the request's id.
 
     A request whose body is missing, late, truncated, too long, empty or invalid stops all drives: stopping
     too many is harmless, stopping none is not.
@@ -122,7 +123,7 @@ async def drives_to_stop(request: Request) -> tuple[list[str] | None, object]:
 
 
 def commander_in(request: Request, body: Mapping[str, Any]) -> Caller:
-    """Return the caller with the id of its command, made here if the body has none."""
+    """Return the caller, with the command's id from the body, or with a new id if the body has no id."""
     try:
         return caller_of(request).commanding(body.get("id"))
     except ValueError as mistake:
@@ -137,7 +138,7 @@ def text_in(body: Mapping[str, Any], key: str) -> str:
 
 
 def frame_in(body: Mapping[str, Any]) -> int:
-    """Return the number of the frame that the sender of a command has seen."""
+    """Return the number of the newest frame that a command's sender has seen. Raises Denied."""
     seen = body.get("seen")
     if isinstance(seen, bool) or not isinstance(seen, int) or not 0 <= seen < 1 << 63:
         raise Denied(400, "seen is missing or not a whole number: give the n of your newest frame")
@@ -152,7 +153,7 @@ def number_in(text: str, key: str) -> int:
 
 
 def moment_in(text: str, key: str) -> int:
-    """Return a time in ms since 1970. The text is ISO 8601, in UTC unless it has an offset, or such ms.
+    """Return a time in ms since 1970, from ISO 8601 text (in UTC unless it has an offset) or digits (ms).
 
     Raises Denied for another text, and for a time outside the years 1 to 9999.
     """

@@ -47,7 +47,7 @@ class Operation(NamedTuple):
     refusals: tuple[int, ...] = ()
     query: Mapping[str, Schema] = {}
     required: tuple[str, ...] = ()  # names in `query` that must be given
-    body: Schema | None = None  # the body of a POST; a route without one is a GET
+    body: Schema | None = None  # the body of a POST; None: the route is a GET
 
     @property
     def method(self) -> str:
@@ -211,7 +211,7 @@ OPERATIONS = (
     Operation(
         "/api/act",
         "act",
-        Right.STOP,  # Commands checks the verb's own right
+        Right.STOP,  # the class Commands checks the right that the verb needs
         "Carry out a verb once.",
         json_of(schemas.COMMANDED),
         (404, *WITH_BODY),
@@ -248,7 +248,7 @@ OPERATIONS = (
 )
 
 NEEDED: Mapping[str, Needed] = {
-    "/api/": Needed("GET", Right.LOOK),  # unknown paths
+    "/api/": Needed("GET", Right.LOOK),  # for unknown paths
     **{one.path.partition("{")[0]: Needed(one.method, one.right) for one in OPERATIONS},
 }
 
@@ -306,7 +306,7 @@ def _content(answer: Mapping[str, Schema]) -> dict[str, Any]:
 
 
 def _of_the_guard(one: Operation) -> set[int]:
-    """Return the statuses of refusals before the handler is called."""
+    """Return the HTTP statuses with which the guard may refuse a request to this route."""
     found = {403, 421, 503}
     if one.right is not None:
         found |= {401}

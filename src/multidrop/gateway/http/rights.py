@@ -1,4 +1,4 @@
-"""Callers, tokens and rights. Pure: works on given texts and times."""
+"""Callers, tokens and rights. Texts and times are arguments: this module does no I/O."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NOT_ALLOWED = "the role does not allow it"
 NEVER_THIS_WAY = "never by this way"
 
 MOST_WRONG, WINDOW_S = 5, 60.0  # wrong tokens allowed to an address within this time
-MOST_ADDRESSES = 10_000  # addresses whose wrong tokens are remembered
+MOST_ADDRESSES = 10_000  # limit of addresses whose wrong tokens are remembered
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
 SCHEMES = ("http", "https")
 COMMAND_ID = re.compile(r"[!-~]{1,64}")
@@ -45,12 +45,12 @@ class Caller(NamedTuple):
 
     @property
     def by(self) -> str:
-        """The caller as named in log lines, with the id of its command."""
+        """The caller's name for log lines: name, interface, address and the command's id."""
         command = f" (command {self.command})" if self.command else ""
         return f"{self.name} by {self.way} from {self.address}{command}"
 
     def commanding(self, given: object = None) -> Caller:
-        """Return the caller of a command with this id, or with a new id without one.
+        """Return the caller with `given` as the command's id; if it is None, with the present or a new id.
 
         Raises ValueError for an invalid id.
         """
@@ -61,7 +61,7 @@ class Caller(NamedTuple):
         return self._replace(command=given)
 
     def stopping(self, given: object = None) -> Caller:
-        """Return what `commanding` does, with a new id instead of an invalid one: a stop is never refused."""
+        """Return the same as `commanding`, but replace an invalid id by a new id: no stop is refused."""
         try:
             return self.commanding(given)
         except ValueError:
@@ -148,7 +148,7 @@ class Tokens:
         return came is not None and len(came) >= MOST_WRONG
 
     def note_wrong(self, address: str, secret: str, now: float) -> bool:
-        """Count a wrong token; return True unless this address has sent the same token recently.
+        """Count a wrong token; return False if this address has sent the same token recently, else True.
 
         If MOST_ADDRESSES are remembered already, the oldest one is forgotten.
         """

@@ -54,11 +54,11 @@ if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
 
 
-MOST_QUERIES = 2  # concurrent queries of the audit log
+MOST_QUERIES = 2  # limit of concurrent queries of the audit log
 AUDIT_S = 20.0  # time limit of one such query
 COOKIE_S = 30 * 24 * 3600
-MOST_RECORDS = 200  # entries of the audit log in one answer
-MOST_NOTE = 500  # characters of an acknowledgement's note
+MOST_RECORDS = 200  # limit of the audit log's entries in one answer
+MOST_NOTE = 500  # limit of characters of an acknowledgement's note
 HEAD_S = 0.5  # the head of a stop's answer is sent after this time; it confirms that the stop was accepted
 UNBUFFERED = {"x-accel-buffering": "no"}  # proxies forward the head immediately
 RIGHTS_RULES = (NOT_ALLOWED, NOT_LISTED, NEVER_THIS_WAY)
@@ -125,7 +125,7 @@ def _fields(result: CommandResult, caller: Caller) -> dict[str, Any]:
 
 
 def _status(result: CommandResult) -> int:
-    """Return 4xx for a command that was refused for its words or for a missing right; else 200."""
+    """Return a 4xx status if the command was invalid or the caller lacks the right; else 200."""
     error = result.error
     if isinstance(error, UnknownDrive):
         return 404
@@ -153,7 +153,7 @@ def _answer_fleet(results: Mapping[str, tuple[bool, str]]) -> Response:
 
 
 def _time_asked(query: Mapping[str, str]) -> str:
-    """Return the parameter `before` of a query as in audit records, "" without one. Raises Denied."""
+    """Return the query's parameter `before` as ISO 8601 text; "" if it is missing. Raises Denied."""
     if "before" not in query or _UTC.fullmatch(query["before"]):
         return query.get("before", "")
     return iso_time(moment_in(query["before"], "before"))

@@ -28,13 +28,13 @@ class AlarmFile:
         self.path = path
         self.past: list[Alarm] | None = None  # alarms of earlier runs; None until they are read
         self._failure = ""
-        self._since = time.monotonic()  # start of the present disk access; inf while idle
+        self._since = time.monotonic()  # start of the present disk access in s; inf while idle
         self._waiting: Queue[Alarm | None] = Queue(MOST_WAITING)
         self._ended = threading.Event()
 
     @property
     def trouble(self) -> str:
-        """Why alarms are not written now; "" if they are."""
+        """The reason why alarms cannot be written now; "" if they can."""
         if time.monotonic() - self._since > SLOW_S:
             return f"alarms are not kept: {self.path} has not been written for {SLOW_S:g} s"
         return f"alarms are not kept: {self._failure}" if self._failure else ""

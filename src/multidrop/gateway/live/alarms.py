@@ -1,4 +1,4 @@
-"""Alarms of drives and lines, each with start and end. Pure."""
+"""Alarms of drives and lines, each with start and end. This module does no I/O."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ STOPPED, PORT, LIMIT = "stopped", "port", "limit"  # kinds of alarms in addition
 KINDS = (FAULT, STOPPED, LIMIT, PORT, SILENT)  # the most serious kind first
 UNCALLED = "the motor stopped, and no stop was called here"
 STANDS_MS = 2000  # a motor must be at rest this long, because a reversing motor passes 0 Hz
-MOST_ENDED = 1000  # ended alarms kept
-MOST_SHOWN = 20  # ended alarms shown
+MOST_ENDED = 1000  # limit of ended alarms that are kept
+MOST_SHOWN = 20  # limit of ended alarms that clients see
 SEPARATOR = "; "  # between the exceeded limits of a drive in the text of its alarm
 LOST = ("port lost", "port refused its settings")  # statuses of a line's rows while its port is lost
 
@@ -47,9 +47,9 @@ class Alarm(NamedTuple):
     ended: int | None
     kind: str
     line: str = ""
-    is_before: bool = False  # it was first seen at `time`, but may have started earlier
+    is_before: bool = False  # True: first seen at `time`, but it may have started earlier
     acknowledged: int | None = None
-    by: str = ""  # the caller who acknowledged it
+    by: str = ""  # the caller who acknowledged the alarm
     note: str = ""
 
     @property
@@ -82,7 +82,7 @@ class Alarms:
         self._lasting: dict[tuple[str, str, str], Alarm] = {}  # active, oldest first; keys: line, drive, kind
         self._ended: deque[Alarm] = deque(maxlen=MOST_ENDED)
         self._known: set[tuple[str, str]] = set()  # lines and drives seen so far
-        self._runs: dict[str, int] = {}  # by drive: its `stops` (see `look`) when a run was first seen
+        self._runs: dict[str, int] = {}  # by drive: the argument `stops` of `look` when a run was first seen
         self._stands: dict[str, int] = {}  # by drive: when a motor that ran was first seen at rest
         self.begun = 0  # number of alarms so far
 
@@ -91,8 +91,8 @@ class Alarms:
     def look(self, time: int, drive: str, shown: Shown, stops: int | None = None) -> None:
         """Note a drive's state. A fault stays active while its drive is silent.
 
-        `stops` is the number of commands so far that can end a run of its motor. With None, a motor at rest
-        raises no alarm.
+        `stops` is the number of commands so far that can end a run of the motor. If it is None, a motor at
+        rest raises no alarm.
         """
         state, words = shown.state, shown.words
         if state == SILENT:
@@ -130,14 +130,17 @@ class Alarms:
         self._stands.pop(drive, None)
 
     def look_at_line(self, time: int, line: str, lost: str | None) -> None:
-        """Note why a line's port is lost; None means that it is present."""
+        """Note why a line's port is lost, or with None that the port works."""
         if lost is None:
             self._end(time, line, "", PORT)
         else:
             self._begin(time, line, "", PORT, lost)
 
     def look_at_limits(self, time: int, drive: str, exceeded: Callable[[str], str]) -> None:
-        """Note a drive's exceeded limits, which `exceeded` returns as a text from the text before."""
+        """Note a drive's exceeded limits.
+
+        `exceeded` takes the text of the active alarm ("" without one), and returns the present text.
+        """
         lasting = self._lasting.get(("", drive, LIMIT))
         text = exceeded(lasting.text if lasting else "")
         if text:
@@ -196,7 +199,7 @@ class Alarms:
         present = self._lasting.get(key)
         is_seen = key[:2] in self._known and present is None
         if present is not None and present.is_before and present.text in (alarm.text, UNNAMED):
-            self._lasting[key] = alarm  # the same alarm
+            self._lasting[key] = alarm  # the present alarm continues the earlier one
         elif present is not None or is_seen or (alarm.drive or alarm.line) not in names:
             self._ended.append(alarm._replace(ended=time))
             self._note(self._ended[-1], Change.ENDED)

@@ -103,7 +103,7 @@ def _register(register: Register[Any]) -> dict[str, Any]:
         "note": register.note,
         "least": least,
         "most": most,
-        "at_least": register.at_least,  # register whose value is the least one allowed
+        "at_least": register.at_least,  # name of the register that holds the least allowed value
         "at_most": register.at_most,
         "step": None if register.is_float else register.step,
     }

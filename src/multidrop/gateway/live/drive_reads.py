@@ -15,12 +15,12 @@ from multidrop.supervisor import supervisor
 PAUSE_S = 0.2  # least pause between two reads on a line, for polling
 SHARE = 20  # the pause is at least this many times the duration of the last read
 LOOKED_S = 3.0  # reading stops this long after the last view of a drive
-MOST_DRIVES = 4  # drives read concurrently
+MOST_DRIVES = 4  # limit of drives that are read concurrently
 READ_S = 30.0  # time limit of one read
 
 UNANSWERED = "no reply"
 
-Found = dict[str, list[Any]]  # by register: value or None, UTC in ms, "ok" or the reason
+Found = dict[str, list[Any]]  # by register: value or None, time (UTC, ms), "ok" or the failure
 ROUND_S = 2.0  # pause between two rounds of identity checks
 ASKED_S = 30.0  # time limit of one identity check
 _log = logging.getLogger("multidrop.gateway")
@@ -89,7 +89,7 @@ class SideReads:
                     async with turn:
                         await self._read_in_turn(line, drive, register)
                     if found.get(register, ["", 0, ""])[2].startswith(UNANSWERED):
-                        registers.remove(register)  # each attempt would cost a timeout
+                        registers.remove(register)  # not read again: each attempt would cost a timeout
         finally:
             if self._tasks.get(drive.name) is asyncio.current_task():
                 del self._tasks[drive.name]

@@ -22,10 +22,10 @@ from multidrop.gateway.live.alarms import LOST, Alarms
 from multidrop.gateway.live.hub import Hub, KeptRow
 from multidrop.gateway.live.recent_statistics import RecentStatistics
 
-LEAST_S = 0.2  # mean time between two frames
+LEAST_S = 0.2  # least mean time between two frames
 EARLY_S = 0.02  # a frame may come this much earlier after a late one
 WAIT_S = 20.0  # longest wait for a frame
-MOST_VIEWERS = 200  # viewers waiting concurrently
+MOST_VIEWERS = 200  # limit of concurrently waiting viewers
 WHOLE = -1  # in a request: the viewer has no frame
 REMEMBERED = 6  # number of newest frames kept; a viewer may be a second behind
 
@@ -104,7 +104,7 @@ def _age_ms(now: Times, asked: Times) -> int:
 
 
 class Places(dict[Times, int]):
-    """The numbers of request times, from 0: all values of one request share a time and its number."""
+    """Numbers the distinct request times of a frame from 0. All values of one request share one number."""
 
     def __missing__(self, time: Times) -> int:
         self[time] = place = len(self)
@@ -131,7 +131,7 @@ def _finite(value: float) -> float | None:
 
 
 def lost_of(hub: Hub, line: str) -> str | None:
-    """Return why a line's port is stalled or lost; None if it works.
+    """Return why a line's port is stalled or lost; None if the port works.
 
     The port is lost if the newest rows of all its registers have that status.
     """
@@ -165,7 +165,7 @@ class Frames:
     """The newest frames and the viewers waiting for the next one.
 
     `clock` returns monotonic seconds. Frame numbers start at `begin`, which is random: a frame of an earlier
-    process is never mistaken for one of this process.
+    process is never mistaken for a frame of this process.
     """
 
     def __init__(
@@ -224,7 +224,7 @@ class Frames:
         turn: asyncio.Future[None] = loop.create_future()
         self._waiting.add(turn)
         self._build_when_due()
-        timer = loop.call_later(WAIT_S, _let_go, turn)  # costs less than asyncio.wait_for
+        timer = loop.call_later(WAIT_S, _let_go, turn)  # cheaper than asyncio.wait_for
         try:
             await turn
         finally:
@@ -243,7 +243,7 @@ class Frames:
             return None
         newest = self._remembered[-1]
         known = next((one for one in self._remembered if one["n"] == n), None)
-        if known is None or known["revision"] != newest["revision"]:  # the plants, and so the keys, differ
+        if known is None or known["revision"] != newest["revision"]:  # after a reload, the keys may differ
             n, known = WHOLE, None
         if n not in self._encoded:
             frame = newest if known is None else {"n": newest["n"], "since": n, **changes(known, newest)}

@@ -1,7 +1,7 @@
 """Hub: the newest row of every register of every drive, and each drive's state from these rows.
 
-Pure: takes rows and times. Rows have times of CLOCK_MONOTONIC, which stops while the computer sleeps: after a
-sleep, all earlier rows are stale.
+Rows and times are arguments: this module does no I/O. Rows have times of CLOCK_MONOTONIC, which stops while
+the computer sleeps: after a sleep, all earlier rows are stale.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from multidrop import Batch, Condition, Plant, PolledDrive, Register
 from multidrop.drive import FAULT_RECORDS, StateReader
 from multidrop.plant import current_for
 
-KeptRow = tuple[int, int, float, int]  # UTC and monotonic ns, value (meaningless in a miss), status code
-Known = tuple[Register[Any], KeptRow | None, KeptRow | None, bool]  # newest row, newest good row, is fresh
+KeptRow = tuple[int, int, float, int]  # UTC ns, monotonic ns, value (undefined in a miss), status code
+Known = tuple[Register[Any], KeptRow | None, KeptRow | None, bool]  # register, newest row, good row, is fresh
 RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
 UNNAMED = "it shows a fault"  # the words for a fault without a text
 NOT_ASKED = "not asked recently"  # the words for state UNKNOWN if no value is fresh
@@ -30,9 +30,9 @@ _STATES = {
     Condition.FAULT: FAULT,
     Condition.UNKNOWN: UNKNOWN,
 }
-LEAST_SLEEP_NS = 100_000_000  # smaller differences arise because two clocks are read in turn
+LEAST_SLEEP_NS = 100_000_000  # a smaller difference is not a sleep: the two clocks are read in turn
 FAULT_REGISTER = "fault"
-RAN_NS = 3_000_000_000  # a motor that turns this long after its fault record changed has no fault
+RAN_NS = 3_000_000_000  # a fault is over if the motor turns this long after the fault record changed
 _ANSWERED = ("exception ", "no valid value")  # prefixes of a miss's status if the drive replied
 
 
@@ -55,7 +55,7 @@ class RegisterRows:
 
 
 class FreshValues(Mapping[str, float]):
-    """The fresh values of one drive's registers, evaluated on access."""
+    """The fresh values of one drive's registers; freshness is checked at each access."""
 
     def __init__(self, cells: Mapping[str, RegisterRows], now_ns: int, woke_ns: int) -> None:
         self._cells = cells
@@ -92,7 +92,7 @@ class Newest(NamedTuple):
     time: int  # when the request was sent, UTC in ns
     monotonic_ns: int
     value: float | None  # None: this row is a miss
-    status: str  # "ok", or the reason
+    status: str  # "ok", or the reason for a miss
     holds_ns: int  # how long a value of this register stays current
 
 
@@ -101,11 +101,11 @@ class Shown(NamedTuple):
 
     state: str
     words: str | None
-    note: str = ""  # other information, or why the state is unknown
+    note: str = ""  # further text for the user, such as why the state is unknown
 
     @property
     def fault(self) -> str | None:
-        """The text of the drive's fault; None without a fault."""
+        """The text of the drive's fault; None if the drive is in another state."""
         return self.words if self.state == FAULT else None
 
     @property
@@ -160,7 +160,8 @@ class Hub:
         """Use another plant, and keep the rows of unchanged drives.
 
         For other drives, rows requested before this call are ignored: a name may mean another drive now. Pass
-        `plant.metadata()["planned"]` as `planned` if you have it: it takes seconds for hundreds of lines.
+        `plant.metadata()["planned"]` as `planned` if it is known: computing it for hundreds of lines takes
+        seconds.
         """
         before = self._watched
         since_ns = self._clock()[0] if before else 0
@@ -362,7 +363,7 @@ class Hub:
 
 
 def _lack(watched: _Watched) -> str:
-    """Return the reason why a drive's state is unknown."""
+    """Return why a drive's state is unknown, as text for the page."""
     reader = watched.reader
     if not reader.has_state:
         return "its family has no register for its state"

@@ -1,4 +1,4 @@
-"""Limits of values, `[[serve.limit]]` of a plant file: which of them are exceeded now. Pure."""
+"""Limits of values (`[[serve.limit]]` of a plant file), and which limits are exceeded now."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Limit(NamedTuple):
     drive: str
     register: str
     unit: str
-    is_above: bool  # values above the bound are beyond it; False: values below it
+    is_above: bool  # True: the bound is an upper limit; False: a lower limit
     bound: float
     lasting_s: float = 0.0
     hysteresis: float = 0.0

@@ -11,10 +11,10 @@ from typing import Any
 from multidrop import BusError, Drive, Plant, params
 from multidrop.supervisor import Hung, supervisor
 
-MOST_READS = 2  # drives whose parameters are read concurrently
+MOST_READS = 2  # limit of drives whose parameters are read concurrently
 READ_S = 3600.0  # time limit of one read
 MOST_PAUSE_S = 1.0
-SHARE = 3  # the pause after a block is this many times the block's duration, for polling
+SHARE = 3  # the pause after a block, for polling, as a multiple of the block's duration
 
 
 @dataclass
@@ -50,7 +50,7 @@ class ParameterReads:
         return read if read is not None and read.drive is drive else None
 
     def begin(self, plant: Plant, name: str) -> ParameterRead:
-        """Start a read, unless one of this drive is in progress. Raises ValueError for an unknown drive."""
+        """Start a read of this drive, unless it is in progress. Raises ValueError for an unknown drive."""
         read = self.of(plant, name)
         if read is not None and read.task is not None and not read.task.done():
             return read

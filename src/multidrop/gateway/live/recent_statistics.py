@@ -1,4 +1,4 @@
-"""Recent statistics of lines and drives, over seconds and over an hour. Pure: takes readings and times."""
+"""Recent statistics of lines and drives, over seconds and over an hour. This module does no I/O."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class RecentStatistics:
             return None, None
         seconds = max(now.seconds - before.seconds, 1e-9)
         used_s = (now.counters.ideal_ns - before.counters.ideal_ns) / 1e9
-        exchanges = now.exchanges - before.exchanges  # less than 0 after a reload that removed a drive
+        exchanges = now.exchanges - before.exchanges  # negative after a reload that removed a drive
         return round(max(0.0, used_s / seconds), 4), round(max(0.0, exchanges / seconds), 1)
 
     def drive_figures(self, name: str) -> dict[str, Any]:
@@ -123,7 +123,7 @@ class RecentStatistics:
 
 
 def misses_of(statistics: Statistics) -> dict[str, int]:
-    """Return the misses by reason, without reasons that have none."""
+    """Return the number of misses by reason; reasons without misses are left out."""
     return {why: n for why, n in statistics.misses.items() if n > 0}
 
 

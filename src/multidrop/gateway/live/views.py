@@ -74,7 +74,7 @@ async def _wear_within(ledger: Ledger, port: str, drive: Drive) -> list[dict[str
             for one in found
         ]
 
-    with contextlib.suppress(OSError):  # Hung is one
+    with contextlib.suppress(OSError):  # Hung is an OSError
         return await supervisor().within("ledger", LEDGER_S, wear)
     return []
 
@@ -128,7 +128,7 @@ def health_of(gateway: Gateway) -> dict[str, Any]:
 
 
 def parts_of(gateway: Gateway) -> dict[str, str]:
-    """Return "ok" or the problem of each part."""
+    """Return by part: "ok", or the part's problem."""
     parts, dead, kept = gateway.parts, supervisor().dead, gateway.alarm_file
     return (
         {name: _health_of_part(feed) for name, feed in parts.feeds.items()}
@@ -146,7 +146,7 @@ def failing_lines_of(gateway: Gateway) -> dict[str, str]:
 
 
 def audit_trouble_of(gateway: Gateway) -> str:
-    """Return why the audit log lacks the newest write of some line; "" if it lacks none."""
+    """Return why a line's newest write is missing in the audit log; "" if no line's is missing."""
     if gateway.unaudited:
         return gateway.unaudited
     poller = gateway.poller

@@ -25,11 +25,11 @@ from multidrop.supervisor import supervisor
 
 SLICE = 64  # most requests of one client in its turn
 SLICE_S = 0.002  # longest turn of a client
-ROUND_S = 0.004  # time of one turn of all busy clients together: a stop waits for that long
-MOST_CLIENTS = 64  # per TCP port
-MOST_BEHIND = 1 << 18  # bytes of pending requests of one client
-MOST_UNTAKEN = 1 << 18  # bytes of answers that a client has not read
-MOST_UNDER_WAY = 16  # requests of one client waiting for lines
+ROUND_S = 0.004  # time of one turn of all busy clients together: the longest wait of a stop
+MOST_CLIENTS = 64  # limit of clients per TCP port
+MOST_BEHIND = 1 << 18  # limit of one client's pending requests in bytes
+MOST_UNTAKEN = 1 << 18  # limit of a client's unread answers in bytes
+MOST_UNDER_WAY = 16  # limit of one client's requests that wait for lines
 IDLE_S = 300.0  # a client that is idle for this long is disconnected
 FORGETTABLE_S = 10.0  # idle time after which a client is disconnected if a new one needs its place
 STALLED_S = 10.0  # a client that reads none of its answers for this long is disconnected
@@ -130,7 +130,7 @@ class ModbusClient(asyncio.Protocol):
         self._close_if_done()
 
     def _look(self) -> bool:
-        """Start received writes and queue other requests; return False if frames are left for later."""
+        """Start received writes and queue other requests; return False if unprocessed frames remain."""
         begun = self._port.clock()
         answers: list[bytes] = []
         is_in_time = True
@@ -282,7 +282,7 @@ class ModbusPort:
         self._server = await loop.create_server(lambda: ModbusClient(self), sock=listener)
 
     def admit(self, client: ModbusClient) -> None:
-        """Accept a new client, or refuse it; if the port is full, close the longest idle client for it."""
+        """Accept a new client, or refuse it; if the port is full, close the client that was idle longest."""
         if not self._may_connect(client.address):
             _log.warning("modbus client %s is refused: its address is not in clients", client.address)
             self.refused += 1

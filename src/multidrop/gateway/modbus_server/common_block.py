@@ -18,7 +18,7 @@ STATE, FAULT, FREQUENCY, CURRENT, SETPOINT, AGE, STOP = 0, 1, 2, 4, 6, 8, 10  # 
 STATES = {"unknown": 0, "stands": 1, "runs": 2, "fault": 3, "silent": 4}
 NO_FAULT, FAULT_WITHOUT_NUMBER, FAULT_UNKNOWN = 0, 0xFFFE, 0xFFFF
 NO_NUMBER = -(1 << 31)  # 8000 0000H: the value is unknown, or out of range
-NEVER, LONGEST_AGE = 0xFFFF_FFFF, 0xFFFF_FFFE  # ages in ms: no value so far; the limit
+NEVER, LONGEST_AGE = 0xFFFF_FFFF, 0xFFFF_FFFE  # ages in ms: of a drive without values so far; the largest age
 
 _PER_UNIT = 100
 
@@ -48,7 +48,7 @@ class CommonBlock:
         return words
 
     def _fresh_value(self, hub: Hub, now_ns: int, woke_ns: int, name: str, unit: str | None) -> float | None:
-        """Return the fresh value of a polled register in this unit (None: its own); None without one."""
+        """Return a polled register's fresh value, if its unit is `unit` (None: any unit); None otherwise."""
         row = hub.newest(self._name, name) if (name, unit) in self._polled else None
         return row.value if row and is_fresh(row, now_ns, woke_ns) else None
 

@@ -15,8 +15,8 @@ from typing import Any
 from multidrop.supervisor import supervisor
 
 SHARE = 0.2  # share of a line's time
-BURST_S = 0.2  # most line time that is saved up during a pause
-MOST_WAITING = 8  # waiting requests per line
+BURST_S = 0.2  # limit of the line time that clients save up during a pause
+MOST_WAITING = 8  # limit of waiting requests per line
 EXPIRY_S = 1.0  # a request that has waited for this long is dropped
 
 
@@ -29,7 +29,7 @@ class _WaitingAsk:
     client: object
     work: Callable[[float], Awaitable[Any]]
     answer: asyncio.Future[Any]
-    expires: float  # time of the loop's clock in s
+    expires: float  # time of the event loop's clock in s
     timer: asyncio.TimerHandle | None = None
 
 
@@ -81,7 +81,7 @@ class LineShare:
             asked.answer.set_exception(PassingBusy(why))
 
     def _forget(self, asked: _WaitingAsk) -> None:
-        """Free the place of a request that is answered or whose client has disconnected."""
+        """Remove a request that is answered, or whose client has disconnected, from the queue."""
         if asked.timer is not None:
             asked.timer.cancel()
         if asked in self._waiting:

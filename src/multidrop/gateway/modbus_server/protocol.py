@@ -1,4 +1,4 @@
-"""Modbus TCP: frames, request data and exception codes. Pure.
+"""Modbus TCP: frames, request data and exception codes.
 
 Sources: MODBUS Messaging on TCP/IP Implementation Guide V1.0b, section 3.1.3 (frames); MODBUS Application
 Protocol Specification V1.1b3, sections 6 (requests) and 7 (exception codes).
@@ -88,7 +88,7 @@ def request_of(frame: bytes) -> MbapRequest:
 
 
 def take_request(buffer: bytearray) -> MbapRequest | None:
-    """Remove the first request from the buffer and return it; None if incomplete. Raises as `take_frame`."""
+    """Remove the first request from the buffer and return it; None if incomplete. Raises Garbage."""
     frame = take_frame(buffer)
     return None if frame is None else request_of(frame)
 

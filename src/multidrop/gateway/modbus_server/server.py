@@ -40,7 +40,7 @@ from multidrop.gateway.parts import Ask, PartContext
 from multidrop.supervisor import supervisor
 
 STOP_WAIT_S = 0.4  # how long a stop's answer waits for the motor: less than the usual timeout of clients
-MOST_STOPS = 8  # concurrent stops of a drive; further requests are only acknowledged
+MOST_STOPS = 8  # limit of concurrent stops of a drive; further requests are only acknowledged
 
 Settings = ModbusSettings
 
@@ -55,7 +55,7 @@ def build(settings: ModbusSettings, context: PartContext) -> ModbusServer:
 
 
 class ModbusServer:
-    """The Modbus TCP server of a plant: one port for all lines, and one for each line with its own.
+    """The Modbus TCP server of a plant: a port for each line in `ports`, one for all others.
 
     `ask` reads words or bits from a drive: drive, function, start, count, expiry in s. Raises ValueError with
     all mistakes if unit ids clash.
@@ -71,7 +71,7 @@ class ModbusServer:
     ) -> None:
         self.settings = settings
         self.answered: Counter[str] = Counter()  # requests by kind of answer
-        self.ports: dict[str, int] = {}  # number of each line's own TCP port; MAIN: port of all others
+        self.ports: dict[str, int] = {}  # a line's own TCP port; MAIN: that of all other lines
         self._hub = hub
         self._commands = commands
         self._ask = ask
@@ -227,7 +227,7 @@ class ModbusServer:
         common, register = self.settings.common_addresses, unit.writable(carrier, address)
         is_one = count == (register.words if register else 1)
         if not is_one and unit.has_stop_in(written, common.start + STOP):
-            with suppress(Declined):  # too many stops are in progress already
+            with suppress(Declined):  # raised if too many stops are in progress already
                 self._begin_stop(unit, client)
             raise Declined(ModbusCode.ILLEGAL_VALUE)  # other registers in the request may start a motor
         if carrier is Carrier.WORD and address in common:

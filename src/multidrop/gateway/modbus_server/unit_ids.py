@@ -1,4 +1,4 @@
-"""Unit ids: the number and TCP port by which Modbus clients address each drive. Pure."""
+"""Unit ids: the number and TCP port by which Modbus clients address each drive."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ _FLOATS = {
     NumberFormat.F64: (">d", ">Q"),
 }
 _OPEN = frozenset({NumberFormat.I8, NumberFormat.U32_EITHER})
-MOST_KNOWN = 8192  # cached values; drives of a family share their registers
+MOST_KNOWN = 8192  # limit of cached values; drives of a family share their registers
 _MOST_EXACT = 1 << 53  # a float64 represents every whole number up to this one
 _FUNCTIONS = {Carrier.BIT: (1, 2), Carrier.WORD: (3, 4)}
 
@@ -86,7 +86,7 @@ def _nearest_count(register: Register[Any], value: float) -> float | None:
         return raw if abs(raw * multiplier) + abs(addend) <= _MOST_EXACT else None
     code, _ = _FLOATS[register.coding.number_format]
     held: float = struct.unpack(code, struct.pack(code, count))[0]
-    return held if held else None  # the sign of a zero is unknown
+    return held if held else None  # None for a float's zero: its sign is unknown
 
 
 def _neighbours(raw: float, number_format: NumberFormat) -> Iterable[float]:

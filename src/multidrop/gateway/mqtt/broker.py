@@ -16,7 +16,7 @@ from multidrop.printable import masked
 from multidrop.supervisor import Hung, supervisor
 
 MOST_UNDER_WAY = 64  # limit of unacknowledged messages: enough for the drives of two lines
-MOST_WAITING = 4096  # limit of pending messages, one per topic; no plant has so many topics
+MOST_WAITING = 4096  # limit of pending messages, one per topic; no plant needs more topics
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 RETRY_S = (1, 30)  # first and longest pause before reconnecting
 KEEP_ALIVE_S = 15
@@ -47,7 +47,7 @@ class Outbox:
         self.dropped = 0  # messages replaced by a newer one, or lost with the connection
 
     def put(self, message: Publication) -> None:
-        """Queue the message, in place of an older one of its topic."""
+        """Queue the message, in place of any older message of the same topic."""
         if message.topic in self._waiting or len(self._waiting) >= MOST_WAITING:
             self.dropped += 1
         if message.topic in self._waiting or len(self._waiting) < MOST_WAITING:
@@ -123,7 +123,7 @@ class Login(NamedTuple):
 
     user: str = ""
     password: str = ""
-    authorities: str | None = None  # file of certificates; None: the system's
+    authorities: str | None = None  # file of trusted certificates; None: those of the system
 
 
 class Speaker(Protocol):
@@ -201,7 +201,7 @@ class Broker:
         self._client = None  # frees the sockets by which paho wakes its thread
 
     def publish(self) -> None:
-        """Let the speaker publish; without a connection, its messages wait, and newer ones replace them.
+        """Let the speaker publish. Without a connection, messages wait, and newer messages replace them.
 
         Raises RuntimeError if paho's thread has ended.
         """
@@ -217,9 +217,9 @@ class Broker:
         self._let(self._speaker.connected)
 
     def _let(self, say: Callable[[], None]) -> None:
-        """Let the speaker publish. If that fails, publish it as offline, but keep receiving commands.
+        """Let the speaker publish. If that fails, publish "offline", but keep receiving commands.
 
-        Without that message, the retained values of its drives would look fresh.
+        Without "offline", the drives' values that the broker retains would look fresh.
         """
         try:
             say()
@@ -234,7 +234,7 @@ class Broker:
 
     @property
     def trouble(self) -> str:
-        """A sentence that there is no connection, with the reason if known."""
+        """The sentence for a missing connection, with the reason if it is known."""
         return f"no connection to {self._address.host}:{self._address.port}" + (
             self._why and f": {self._why}"
         )
@@ -293,7 +293,7 @@ class Broker:
 
     def _on_publish(self, _client: Any, _data: Any, number: int, *_more: Any) -> None:
         self._arrived.append(number)
-        if len(self._arrived) == 1:  # otherwise the loop was woken already: acknowledgements arrive in bursts
+        if len(self._arrived) == 1:  # else the loop was woken already: acknowledgements arrive in bursts
             self._call(self._acknowledge)
 
     def _on_message(self, _client: Any, _data: Any, message: Any) -> None:

@@ -20,7 +20,7 @@ from multidrop.supervisor import supervisor
 
 MOST_AGE_MS = round(MOST_AGE_S * 1e3)  # a broker that was suspended delivers all delayed messages together
 MOST_AHEAD_MS = 2_000  # tolerance for a sender's clock that is ahead
-MOST_UNDER_WAY = 16  # concurrent commands; stops are not counted
+MOST_UNDER_WAY = 16  # limit of concurrent commands; stops are not counted
 REMEMBERED = 1_000  # newest commands, to recognise copies
 
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
@@ -91,11 +91,11 @@ class BrokerCommands:
             self.refuse(drive, what, why, caller.command)
             return False
         self._came.append(command)
-        self._under_way += 1  # here, not in the command's task: a broker may deliver many together
+        self._under_way += 1  # counted here, not in the task: a broker may deliver many commands together
         return True
 
     def _why_not(self, drive: str, command: object, age_ms: int) -> str:
-        """Return why a command of this age is not carried out; "" if it is."""
+        """Return why a command of this age must not be carried out; "" if it may be carried out."""
         if not -MOST_AHEAD_MS <= age_ms <= MOST_AGE_MS:
             clocks = "by the clocks of sender and gateway"
             return f"it was sent {age_ms / 1000:.1f} s ago {clocks}"

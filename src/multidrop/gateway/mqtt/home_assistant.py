@@ -1,4 +1,4 @@
-"""Discovery messages for Home Assistant (homeassistant/device/ID/config), one for each drive. Pure.
+"""Discovery messages for Home Assistant (homeassistant/device/ID/config), one for each drive.
 
 Each component has its own state topic: a state topic of the device would also apply to numbers and buttons.
 """

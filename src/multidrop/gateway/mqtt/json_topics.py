@@ -24,8 +24,8 @@ from multidrop.gateway.parts import PartContext
 from multidrop.plant import drive_meant
 
 ONLINE, OFFLINE = b"online", b"offline"
-MOST_KEPT = 256  # retained messages examined per connection; the next connection examines others
-MOST_DISCOVERY = 1 << 18  # bytes of a discovery message
+MOST_KEPT = 256  # limit of retained messages examined per connection; the next connection examines others
+MOST_DISCOVERY = 1 << 18  # limit of a discovery message in bytes
 EXAMPLES = {
     "set": '{"value": 25.0, "time": UTC in ms}',
     "act": '{"verb": "start", "drive": "pump-1", "time": UTC in ms}',
@@ -55,7 +55,7 @@ class RetainedTopics:
         self.begin()
 
     def begin(self) -> None:
-        """Forget what the previous connection showed; called on a new connection."""
+        """Forget the messages of the previous connection. Called on a new connection."""
         self._is_alone = False  # no other gateway is online with this prefix
         self._found: list[KeptTopic] = []
         self._looked_at = 0
@@ -89,7 +89,7 @@ class RetainedTopics:
         self._looked_at += 1
         drive = self._drive_in(_state_topic(payload))
         if drive is None or drive in there or topic != discovery_topic(self._prefix, drive):
-            return []  # the message is of another gateway, whose prefix starts with ours
+            return []  # from another gateway, whose prefix starts with ours
         return [KeptTopic(drive, topic)]
 
     def _drive_in(self, topic: str) -> str | None:
@@ -133,7 +133,7 @@ class JsonTopics:
 
     @staticmethod
     def _kept(topic: str, payload: bytes) -> Publication:
-        """Return a retained message."""
+        """Return a message that the broker retains."""
         return Publication(topic, lambda: payload, is_retained=True)
 
     # ---- the methods of Speaker ----
@@ -173,7 +173,7 @@ class JsonTopics:
             self._command(levels, payload, is_retained=is_retained)
 
     def _look_back(self, topic: str, payload: bytes) -> None:
-        """Delete the retained messages of a drive that this message shows to be removed."""
+        """If this retained message belongs to a removed drive, delete the drive's retained messages."""
         for left in self._retained_topics.hear(topic, payload, drives_of(self._plant)):
             self.outbox.put(self._kept(left, NOTHING))
 
@@ -209,7 +209,7 @@ class JsonTopics:
         self._commands.refuse(drive, "/".join(what), why, named)
 
     def _to_stop(self, drive: str, given: Mapping[str, Any]) -> list[str]:
-        """Return the topic's drive, and the drive named in the stop if it is another one.
+        """Return the topic's drive, and the drive named in the message if that is a different drive.
 
         Stopping too many drives is harmless, stopping none is not.
         """
@@ -345,7 +345,7 @@ def _read(payload: bytes) -> dict[str, Any]:
 
 
 def _id_in(payload: bytes) -> object:
-    """Return the id in a stop's payload; None if it has none or is invalid."""
+    """Return the id in a stop's payload; None if the payload is invalid or has no id."""
     try:
         return _read(payload).get("id")
     except ValueError:

@@ -31,7 +31,7 @@ class MqttSettings:
     prefix: str = "multidrop"
     every: str = "1 s"  # time between two messages of a drive
     user: str = ""
-    password: str = ""  # path of a file
+    password: str = ""  # path of the file with the password
     authorities: str = ""  # path of a file of certificates that verify a broker of mqtts://
     home_assistant: bool = False
     sparkplug: str = ""  # the group; "": no Sparkplug
@@ -121,7 +121,7 @@ def shown(register: Register[Any], value: float) -> float | str:
 
 
 def fresh_values(hub: Hub, drive: str) -> dict[str, float | str | None]:
-    """Return the values of a drive's polled registers; None for stale, infinite and missing ones."""
+    """Return the values of a drive's polled registers; None for stale, infinite and missing values."""
     return {
         register.name: shown(register, good[2])
         if is_current and good is not None and newest is good and isfinite(good[2])

@@ -1,6 +1,6 @@
 """Sparkplug B: payloads of an edge node and its devices, in Protocol Buffers' wire format.
 
-Source: Eclipse Sparkplug specification 3.0.0, sections 6.4 (payloads) and 5 (birth, death, rebirth). Pure.
+Source: Eclipse Sparkplug specification 3.0.0, sections 6.4 (payloads) and 5 (birth, death, rebirth).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _TYPE, _TEXT = 1, 8
 ENGINEERING_UNIT = "engUnit"  # the property that hosts show as a metric's unit
 
 _VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5  # wire types
-MOST_PAYLOAD = 65_536  # bytes of a command
+MOST_PAYLOAD = 65_536  # limit of a command in bytes
 _MOST_VARINT = 10  # most bytes of a varint
 
 
@@ -43,7 +43,7 @@ class Metric(NamedTuple):
     """One metric: by name and alias in a birth, by alias alone afterwards."""
 
     datatype: DataType
-    value: float | str | None  # None: null
+    value: float | str | None  # None: a null value
     time_ms: int
     name: str = ""
     alias: int | None = None

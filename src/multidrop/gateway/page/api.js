@@ -31,8 +31,8 @@ async function ask(path, options, patience, answered = () => {}) {
 
 export const get = (path, patience = PATIENCE_MS) => ask(path, {}, patience);
 
-// Browsers open at most six connections to a host for all tabs together, and other tabs that wait for frames
-// may occupy these. So a command gets a higher priority than other queued requests. `answered` is called when
+// Browsers open at most six connections to a host for all tabs together, and tabs that wait for frames may
+// occupy all six. So a command gets a higher priority than other queued requests. `answered` is called when
 // the head of the answer has arrived.
 export const post = (path, body, patience = PATIENCE_MS, answered = undefined) =>
   ask(

@@ -3,7 +3,7 @@
 import { post } from "./api.js";
 import { find, fill, make } from "./dom.js";
 
-let answer = null, // function that answers the open question
+let answer = null, // function that resolves the open question's promise
   stopAsked = null; // promise of the answer, if the open question is about a stop
 
 const dialog = () => find("#ask");
@@ -70,8 +70,8 @@ for (const kind of ["keydown", "keyup"])
     true,
   );
 
-// Show the dialog and return the choice, as `show` does. The question of a stop opens at once; other dialogs
-// wait until it is answered.
+// Show the dialog and return the choice, as `show` does. The question about a stop opens immediately; other
+// dialogs wait until that question is answered.
 async function open(title, contents, buttons, { cancel = "Cancel", kind } = {}) {
   if (kind === STOP) return (stopAsked = show(title, contents, buttons, cancel));
   while (stopAsked) await stopAsked;
@@ -171,9 +171,10 @@ export async function askToken(why, yes = "Sign in", kind = DANGER) {
 const IDLE = { sent: () => {}, answered: () => {} };
 const patienceOf = kind => (kind === STOP ? STOP_PATIENCE_MS : undefined);
 
-// Send what the person confirmed, and once more after a sign-in where the right to it was missing: `body`
-// is called at each confirmation, and `kind` is the class of its button. `watch` has `sent` and `answered`,
-// which are called around each request. Return the answer. Raises Refused.
+// Send a confirmed command and return the answer. If the right to it is missing, let the user sign in and
+// confirm again, and repeat the request. `body` makes the request's body at each confirmation, `kind` is the
+// confirming button's class. `watch` has `sent` and `answered`, which are called around each request. Raises
+// Refused.
 export async function send(path, body, { kind = DANGER, patience = patienceOf(kind), watch = IDLE } = {}) {
   dispatchEvent(new Event("command"));
   const sent = async () => {

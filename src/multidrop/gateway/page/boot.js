@@ -3,7 +3,7 @@
 const MOST_TIMES = 3,
   PAUSE_MS = 500;
 
-// Do not reload while a dialog is open: it may be the one for a stop.
+// Do not reload while a dialog is open: the dialog may be for a stop.
 const loadAgain = () => document.querySelector("dialog[open]") || location.reload();
 
 addEventListener(

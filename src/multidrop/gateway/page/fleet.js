@@ -25,7 +25,7 @@ const TABLES = {
 
 let newest = null,
   silent = new Set(), // gateways that do not answer: their lines may be unpolled
-  ordered = [], // lines
+  ordered = [], // the fleet's lines
   cameAt = 0, // when the newest data arrived, by this device's clock
   why = "",
   isAsking = false;

@@ -44,7 +44,7 @@ export async function draw(place, from, to, drives) {
   );
 }
 
-// Return a bar over the time from before the gateway started, of which no alarms are known.
+// Return a bar over the time before the gateway's start, because the alarms of that time are unknown.
 function unknown(since, from, to) {
   const text = "unknown: the gateway started later",
     shown = make("span", { class: "unknown", title: text }, text);

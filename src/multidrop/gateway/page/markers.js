@@ -85,7 +85,7 @@ export function mark(u) {
   }
 }
 
-// Return the value of a column at a time if it is still current then, or null in a gap.
+// Return a column's value at a time, or null if the column has no current value then.
 const at = (u, column, ms, holdMs) => (ms === null ? null : heldAt(u, column, ms / 1000, holdMs));
 
 // Write the table of the values at the markers.

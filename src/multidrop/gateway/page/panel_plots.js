@@ -15,7 +15,7 @@ const RANGES = [
   [3600, "1 h"],
   [86400, "24 h"],
 ];
-const FROM_HISTORY = 600; // s: longer ranges are fetched from the history, shorter ones drawn from frames
+const FROM_HISTORY = 600; // in s: longer ranges are fetched from the history, others drawn from frames
 const ANEW_MS = 5000;
 const POINTS = 400;
 const SYNC = "panel";
@@ -92,7 +92,7 @@ export function begin(drive) {
   const isOneUnit = unitOf(frequency) === unitOf(setpoint);
   const first = isOneUnit ? [[frequency, setpoint]] : [[frequency], [setpoint]];
   const stack = [...first, [current], [third]]
-    .map(names => names.filter(name => numbers.some(r => r.name === name))) // others would have empty plots
+    .map(names => names.filter(name => numbers.some(r => r.name === name))) // others have empty plots
     .filter(names => names.length);
   plots = stack.map((names, i) =>
     one(place, names, i, i === stack.length - 1, names[0] === third ? rest : null),
@@ -187,7 +187,7 @@ function under(u, specs) {
 const until = () => (isLive(now()) ? store.time : now());
 const needsHistory = () => range > FROM_HISTORY;
 
-// Fetch recorded values: of a long range all, of a short range those from before this page's first frame.
+// Fetch recorded values. In a short range, fetch only those from before this page's first frame.
 async function fetchPast() {
   const mine = ++serial,
     to = until(),

@@ -9,7 +9,7 @@ const WHAT =
   "Polling follows the new file. No motor is started or stopped, and motors of removed drives keep their " +
   "state. If the file has a mistake, nothing changes.";
 
-// Return whether this page's user may reload the plant file.
+// Return true if this page's user may reload the plant file.
 export const mayReload = () => store.plant?.file === true && store.plant.may?.role === "write";
 
 // Ask for confirmation, and reload the plant file.

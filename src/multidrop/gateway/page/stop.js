@@ -132,7 +132,7 @@ function failure(error, ends) {
   };
 }
 
-// Return, for the gateway's answer, a dialog's title and contents, and whether all drives have stopped.
+// Return a dialog's title and contents for the gateway's answer, and true if all drives have stopped.
 function outcome(told) {
   const rows = Object.entries(told),
     failed = rows.filter(([, { done }]) => done !== true);

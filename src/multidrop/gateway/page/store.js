@@ -5,7 +5,7 @@ import { Ring } from "./ring.js";
 
 const SAMPLES = 2e6; // limit of samples kept, of all registers together
 const UNPOLLED_S = 5; // how long a value of an unpolled register stays current
-const FAILED_LIMIT_MS = 1000; // how long a value stays current after a failed request
+const FAILED_LIMIT_MS = 1000; // age (ms) from which a value is old if the newest request failed
 const LOOK_MS = 60000; // time in which the gateway reads all registers of a viewed drive
 const UNSEEN_MS = 5000; // if frames are further apart than this, plots have a gap
 export const LIVE_MS = 1500; // a frame is live for this long; a new frame comes each second at least
@@ -52,7 +52,7 @@ function sameDrive(old, { family, address }, { port }) {
   return isSame ? old : null;
 }
 
-// Return whether a register of a drive has the same unit, step and names of values as before.
+// Return true if a register of a drive has the same unit, step and names of values as before.
 function isSame(before, registers, name) {
   const meaning = ({ unit, step, kind, words } = {}) => JSON.stringify([unit, step, kind, words]);
   return meaning(before.registers.get(name)) === meaning(registers.get(name));
@@ -200,7 +200,7 @@ export const alarms = () => store.frame?.alarms ?? [];
 
 export const lasting = () => alarms().filter(alarm => alarm.ended === null);
 
-// Return whether the page's user may write this register or send this verb of a drive.
+// Return true if the page's user may write this register or send this verb of a drive.
 export const mayWrite = (drive, register) =>
   store.plant?.may?.write?.includes(`${drive}.${register}`) ?? false;
 export const mayAct = (drive, verb) => store.plant?.may?.verbs?.includes(`${drive}.${verb}`) ?? false;

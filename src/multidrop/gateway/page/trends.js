@@ -29,7 +29,7 @@ let plots = [],
   waiting = null,
   serial = 0,
   isShown = false,
-  isDragged = false, // the mouse drags over a plot, which must not be rebuilt meanwhile
+  isDragged = false, // true while the mouse drags over a plot: the plot must not be rebuilt
   isDue = false; // the plots must be drawn when the mouse button is released
 
 export function begin() {

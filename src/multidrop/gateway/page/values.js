@@ -70,7 +70,7 @@ export function makeValue() {
   return parts;
 }
 
-// Show a reading (see store.reading) in what `makeValue` made.
+// Show a reading (see store.reading) in the elements that `makeValue` returned.
 export function showValue(parts, reading, register, isDated = true, isNamed = isDated) {
   const isThere = reading !== null && reading.value !== null;
   const isOld = isThere && reading.isOld;
