@@ -100,6 +100,6 @@ def _spelt(given: object) -> str:
     """Return any object, given as a name, as printable text."""
     try:
         text = given if isinstance(given, str) else repr(given)
-    except Exception:  # from the caller's own `__repr__`
+    except Exception:  # raised by the caller's own `__repr__`
         text = type(given).__name__
     return printable(text).strip()[:MOST_CHARACTERS]

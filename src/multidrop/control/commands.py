@@ -31,12 +31,12 @@ from multidrop.supervisor import supervisor
 COMMAND_S = 60.0  # a command that takes longer is reported as hanging (a stop may take 30 s)
 AGAIN_S = 0.2  # s between the turns in which the event loop carries out stops, if no thread can be started
 TURN_S = 0.2  # s; length of such a turn, which blocks the event loop
-STOP_S = 30.0  # how long a stop without a thread is repeated
+STOP_S = 30.0  # s; how long a stop without a thread is repeated
 REPEATED_S = 30.0  # least time in s after a stop's call in which the drive's stops are repeated
 BEGINNING_S = 0.25  # longest time from a stop's call until it is listed as under way
 
 R = TypeVar("R")
-Results = dict[str, CommandResult]  # by drive
+Results = dict[str, CommandResult]  # by drive name
 StopFuture = asyncio.Future[Results]
 StopWork = Callable[[float | None], Results]  # argument: how many seconds to repeat stops (None: the default)
 

@@ -14,7 +14,7 @@ from multidrop.transport.exchange import Exchanges
 STOPPED = "a stop was called"
 REMOVED = "the drive was taken off the bus"
 LEFT = "the bus was left"
-POLL_S = 0.005  # between checks for the end of stops
+POLL_S = 0.005  # s between checks for the end of stops
 
 
 class Latches:

@@ -40,8 +40,8 @@ from multidrop.transport import clock
 from multidrop.transport.aside_log import log_aside
 from multidrop.transport.exchange import WRITE_TIMEOUT, Exchanges
 
-LEAST_S = 30.0  # how long a stop is repeated by default
-PAUSE_S = 0.2  # pause before a repetition
+LEAST_S = 30.0  # s; how long a stop is repeated by default
+PAUSE_S = 0.2  # s; pause before a repetition
 AT_ONCE = 8  # number of steps without a good reply until the line is shared with polling
 SHARE = 1.5  # time left to polling after such a step, as a multiple of the step's duration
 MOST_STEPS = 8  # limit of steps when a stop is sent again after an interruption
@@ -85,7 +85,7 @@ class StopAttempt:
         self.times_sent = 0  # number of stops sent, including those that the drive refused
         self._unanswered = 0  # steps without a good reply
         self.is_over = False
-        self.ended = begun  # when the attempt ended
+        self.ended = begun  # time in s at which the attempt ended
         self.interruption: BaseException | None = None  # raised by the script to end the program
         self.frame: Message | None = None  # the latest request that was sent
         self._times_in_doubt = 0  # number of frames that may or may not have been sent
@@ -512,7 +512,7 @@ def _limit(seconds: float | None) -> float | None:
     if seconds is None:
         return None
     if isinstance(seconds, (Real, Decimal)) and not isinstance(seconds, bool):
-        with suppress(ValueError):  # of Decimal("sNaN")
+        with suppress(ValueError):  # raised for Decimal("sNaN")
             try:
                 limit = float(seconds)
             except OverflowError:

@@ -184,14 +184,14 @@ class Peer:
 
     failures = _number("c.failures")  # number of consecutive exchanges without a reply
     late = _number("c.history.late")  # number of replies recognised after their timeout
-    late_until_ns = _number("c.late_until_ns")  # until when replies to earlier requests may come
+    late_until_ns = _number("c.late_until_ns")  # time until which replies to earlier requests may come
 
     @property
     def owes(self) -> bool:
         """True while replies to earlier requests may still come through a slow gateway or network."""
         return bool(self.c.owed_count)
 
-    answered_ns = _number("c.answered_ns")  # about when the last reply came; 0 before the first
+    answered_ns = _number("c.answered_ns")  # approximate time of the last reply; 0 before the first reply
     pauses = _number("c.history.pauses")  # replies PAUSE_NS or more after the previous reply
     ready_ns = _number("c.ready_ns")  # earliest time of the next request
 

@@ -63,9 +63,9 @@ class Drive(RegisterAccess):
     line_terminals: ClassVar[str] = ""  # the drive's two terminals for the line
     most_devices: ClassVar[int] = 0  # limit of devices on a line with such a drive; 0: not stated
 
-    silence: ClassVar[float] = 0.0  # s, before and after a frame; with RTU at least t3.5
+    silence: ClassVar[float] = 0.0  # s of silence before and after a frame; with RTU at least t3.5
     silence_characters: ClassVar[float] = 0.0  # the same silence, in characters
-    response_delay: float = 0.005  # s, typical, from the request's end to the reply's start
+    response_delay: float = 0.005  # typical s from the request's end to the reply's start
     response_delay_characters: ClassVar[float] = 0.0  # the same delay in characters; the longer delay applies
     response_timeout: ClassVar[float] = 0.3  # s without a reply before an exchange fails
     answering_time: ClassVar[float] = 0.0  # s that the document gives the drive for a reply; 0: not stated

@@ -28,7 +28,7 @@ class DelixiNativeControl(IntEnum):
 
 class DelixiNativeStatus(IntEnum):
     STOPPED = 1
-    FORWARD = 2  # printed "FWD (stopped)", and 3 "REV (stopped)"
+    FORWARD = 2  # the document prints 2 as "FWD (stopped)", 3 as "REV (stopped)"
     REVERSE = 3
     FAULT = 4
     UNDERVOLTAGE = 5

@@ -57,7 +57,7 @@ class DelixiRunSource(IntEnum):
 class DelixiBaudrate(IntEnum):
     B1200 = 0
     B2400 = 1
-    B4800 = 2  # misprinted as 3800
+    B4800 = 2  # misprinted as 3800 in the document
     B9600 = 3
     B19200 = 4
     B38400 = 5

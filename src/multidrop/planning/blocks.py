@@ -163,9 +163,9 @@ class _Neighbours:
 
     carrier: Carrier
     registers: tuple[Register[Any], ...]
-    spans: tuple[tuple[int, int], ...]  # of each register: its first address, and the address after its last
-    joined: tuple[bool, ...]  # of each register: whether addresses up to the next register may be read
-    tied: tuple[bool, ...]  # of each register: whether it must be read together with the next register
+    spans: tuple[tuple[int, int], ...]  # for each register: its first address, and the address after its last
+    joined: tuple[bool, ...]  # for each register: whether addresses up to the next register may be read
+    tied: tuple[bool, ...]  # for each register: whether it must be read together with the next register
     limit: int  # most addresses in a request; a longer register is still read whole
 
     def ending_at(self, end: int) -> Iterator[tuple[int, int]]:

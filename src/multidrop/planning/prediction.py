@@ -102,7 +102,7 @@ def predict(
     turn = [job for job in jobs if job.planned.every is None]
     load = sum(job.cost / job.planned.every for job in jobs if job.planned.every)
     turns = max(TURN_SHARE, 1 - load) / sum(job.cost for job in turn) if turn else 0.0
-    has_rests = any(job.interval_ns for job in jobs)  # then the line may be idle between exchanges
+    has_rests = any(job.interval_ns for job in jobs)  # with intervals, the line may be idle between exchanges
     if has_rests:
         load += sum(job.cost * job.reached for job in turn)
     groups: dict[tuple[Drive, float | None], list[_PredictedJob]] = {}

@@ -33,7 +33,7 @@ class Row(NamedTuple):
     drive: str
     register: str
     value: float | None
-    status: str  # "ok", or the reason
+    status: str  # "ok", or the reason why there is no value
 
     @property
     def time(self) -> datetime:

@@ -197,7 +197,7 @@ def failing_refusals(device: str) -> int:
     return must_take(device) | (NO_DIVISOR if port_identity.has_divisor(device) else 0)
 
 
-TOLERANCE = 0.02  # of a baud rate: the limit of the core and of the kernel
+TOLERANCE = 0.02  # relative deviation of a baud rate: the limit of the core and of the kernel
 CLOSING_S = 0.75  # how long the adapter may still take the driver's bytes when a port is closed
 _UNNOTICED_S = 0.05  # s; time in which a healthy adapter takes all bytes
 BY_PLACE = "/dev/serial/by-path/"  # names of USB sockets, into which any adapter may be plugged

@@ -167,7 +167,7 @@ class PreparedReads:
         self.of = of
         self.newest = NOTHING  # the last plan used: to use it again, no registers are hashed
         self.prepare = prepare
-        self.parts: dict[Block, tuple[Block, ...]] = {}  # of each block that is not answered as a whole
+        self.parts: dict[Block, tuple[Block, ...]] = {}  # parts of blocks not answered as a whole
         self.answered: set[Block] = set()  # blocks that the drive answered, although maybe too long
 
     def ask_first(self, block: Block) -> None:
