@@ -1,4 +1,4 @@
-"""Replay a capture: simulated drives whose registers take the captured values, at the captured times."""
+"""Replay a capture: registers of simulated drives get the captured values, at the captured times."""
 
 from __future__ import annotations
 

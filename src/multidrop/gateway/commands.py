@@ -120,7 +120,7 @@ class Commands:
         self.plant_ns: int | None = None  # when the plant file was last reloaded (CLOCK_BOOTTIME)
 
     def note_reload(self) -> None:
-        """Note the time of a reload: from now on a name may mean another drive."""
+        """Record the time of a reload: from now on, the name of a drive may mean another drive."""
         self.plant_ns = boottime_ns()
 
     def ended_ns(self, drive: str) -> int:
@@ -391,7 +391,7 @@ async def stop_meant(
 
 
 def denied(caller: Caller, role: Right, what: str) -> CommandResult:
-    """Return the result of a command whose caller lacks this role."""
+    """Return the result for a command that is refused because its caller lacks this role."""
     needed = role.name.lower()
     sentence = f"{what} needs the role {needed}, and {caller.name} has {caller.role.name.lower()}"
     return _refused(WriteForbidden(sentence, rule=NOT_ALLOWED))

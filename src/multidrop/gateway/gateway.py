@@ -312,7 +312,7 @@ class Gateway:
             self.note_failure(name)
 
     def note_failure(self, name: str) -> None:
-        """Count the exception being handled, and log it, at most once in LOG_S."""
+        """Count the exception that is being handled, and log it at most once in LOG_S."""
         self.count_failure(name)
         if self.clock() - self._logged.get(name, -LOG_S) >= LOG_S:
             self._logged[name] = self.clock()

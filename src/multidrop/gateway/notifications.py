@@ -37,10 +37,10 @@ MOST_TARGETS = 20
 MOST_BYTES = 65_536  # limit of the file of targets
 MOST_WAITING = 1000  # limit of alarms that wait for a target
 MOST_AN_HOUR = 1000
-SEND_S = 20.0  # how long a webhook may be silent during an attempt
+SEND_S = 20.0  # time limit for a webhook that sends no bytes during an attempt
 RETRY_S, MOST_RETRY_S = 5.0, 300.0  # pause after the first failed attempt, and the longest pause
 CLOSE_S = 2.0
-REFUSED = (400, 413, 422)  # statuses with which a webhook refuses a message for good
+REFUSED = (400, 413, 422)  # HTTP statuses after which a message is not sent again
 SCHEME = re.compile(r"[a-z][a-z0-9+.-]*")
 
 _log = logging.getLogger("multidrop.gateway.notify")
@@ -218,7 +218,7 @@ class AlarmQueue:
         self.left_out = 0
 
     def drop(self, alarm: Alarm) -> None:
-        """Remove an alarm that `next` returned, and that the target refuses for good."""
+        """Remove an alarm that `next` returned, because the target will never accept its message."""
         self._waiting = [one for one in self._waiting if one is not alarm]
         self.left_out += 1
 
@@ -291,7 +291,7 @@ class Sender:
 
     @property
     def problem(self) -> str:
-        """Why the target takes no messages now; "" if it does."""
+        """Why the target accepts no messages now; "" if it accepts them."""
         if self._clock() - self._sending_since_s > 2 * SEND_S:
             return f"{self.name} has not answered for {2 * SEND_S:g} s"
         return self.trouble
@@ -334,7 +334,7 @@ class Sender:
             self._note_failure(failure)
             if isinstance(failure, ValueError) or getattr(failure, "code", 0) in REFUSED:
                 with self._changed:
-                    self._queue.drop(alarm)  # otherwise it would block all later messages
+                    self._queue.drop(alarm)  # otherwise this alarm would block all later messages
             pause_s, self._retry_s = self._retry_s, min(2 * self._retry_s, MOST_RETRY_S)
             return pause_s
         finally:

@@ -237,7 +237,7 @@ class Compactor:
         self._not_before_ns = clock.now_ns() + round(self.PAUSE_S * 1e9)
 
     def end(self) -> None:
-        """Kill the child. This is safe at any moment, because compaction can be interrupted at each step."""
+        """Kill the child process. That is safe, because compaction can be interrupted at each step."""
         if self._child:
             self._child.kill()
             self._child.communicate()

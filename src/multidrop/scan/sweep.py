@@ -55,7 +55,7 @@ class Sweep:
 
     @property
     def each(self) -> float:
-        """Seconds that an address without a drive takes: line silence, request, timeout."""
+        """Seconds that the request to an address without a drive takes: line silence, request, timeout."""
         request = len(build_request(self.framing, self.request.to(1)))
         return self.silence + request * self.settings.character + self.patience
 
@@ -72,7 +72,7 @@ def sweeps(
     baudrates: Collection[int] = (),
     formats: Collection[str] = (),
 ) -> list[Sweep]:
-    """Return sweeps of all settings in these families' documents, the best chance per second first.
+    """Return sweeps of all settings in these families' documents, those with the best chance per second first.
 
     Every setting is swept first with a timeout for usual response delays, then with one for the longest
     delays that the documents allow. `baudrates` and `formats` restrict the settings; empty means all. Raises

@@ -88,7 +88,7 @@ class CommandDesk:
             return CommandAnswer(CommandOutcome.REFUSED, str(mistake), self.gateway)
         return Offered(offer.token, self.subject, offer.prepared.text, self.gateway)
 
-    # ---- carrying it out ----
+    # ---- carrying out an offered command ----
 
     async def do(self, data: bytes) -> CommandAnswer:
         """Carry out an offered command once, and return its result, also for a copy of the message.

@@ -279,7 +279,7 @@ class FleetCommands:
         return self._find(drive)
 
     async def _read_plant(self, otherwise: str) -> None:
-        """Read changes of the plant. If that fails, an older copy is enough: the line's master checks."""
+        """Read changes of the plant. If that fails, use an older copy: masters check each command."""
         try:
             await self._plant.look()
         except FleetError as failure:

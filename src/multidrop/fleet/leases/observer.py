@@ -198,7 +198,7 @@ class Observer:
         return self.ended > before
 
     def _keep_what_is_over(self) -> None:
-        """Remember which sessions are over: they stay over after `restart_waits`."""
+        """Remember which sessions are over, so that they stay over after `restart_waits`."""
         for name in {name for follower in self.paths for name in follower.records}:
             session = max((record.value["session"] for _, record in self._of(name)), default=0)
             if self.is_over(name, session):

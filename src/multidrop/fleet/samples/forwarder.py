@@ -89,7 +89,7 @@ class Forwarder:
             await asyncio.sleep(AGAIN_S)
 
     async def _forward(self) -> None:
-        """Ask for the stream's position, and send the messages after it until one is refused."""
+        """Ask for the stream's position, and send the messages after that position until one is refused."""
         place, sequence = await self._ask()
         while True:
             self._news.clear()

@@ -73,7 +73,7 @@ async def check_buckets(path: ServerPath) -> None:
 
 
 def check_clock(path: ServerPath, server_time: Any) -> None:
-    """Warn if this computer's clock differs from the server's: leases do not depend on clocks, samples do.
+    """Warn if this computer's clock differs from the server's: the times of samples would be wrong.
 
     Raises Unsure if the server's time is invalid.
     """

@@ -98,7 +98,7 @@ def _attachment(name: str) -> dict[str, str]:
 
 
 def _gzipped(pieces: Iterator[bytes]) -> Iterator[bytes]:
-    """Yield the pieces compressed as one gzip stream, in fewer and larger pieces."""
+    """Compress the pieces as one gzip stream; yield it in fewer and larger pieces."""
     stream = zlib.compressobj(wbits=31)
     try:
         for piece in pieces:

@@ -155,7 +155,7 @@ def number_in(text: str, key: str) -> int:
 def moment_in(text: str, key: str) -> int:
     """Return a time in ms since 1970, from ISO 8601 text (in UTC unless it has an offset) or digits (ms).
 
-    Raises Denied for another text, and for a time outside the years 1 to 9999.
+    Raises Denied for any other text, and for a time outside the years 1 to 9999.
     """
     ms = _moment(text, key)
     if not LEAST_MS <= ms <= MOST_MS:

@@ -26,7 +26,7 @@ UNCALLED = "the motor stopped, and no stop was called here"
 STANDS_MS = 2000  # a motor must be at rest this long, because a reversing motor passes 0 Hz
 MOST_ENDED = 1000  # limit of ended alarms that are kept
 MOST_SHOWN = 20  # limit of ended alarms that clients see
-SEPARATOR = "; "  # between the exceeded limits of a drive in the text of its alarm
+SEPARATOR = "; "  # between a drive's exceeded limits in the alarm's text
 LOST = ("port lost", "port refused its settings")  # statuses of a line's rows while its port is lost
 
 
@@ -34,7 +34,7 @@ class Change(Enum):
     """What happened to an alarm."""
 
     BEGAN = "began"
-    CHANGED = "changed"  # it was acknowledged, or has a better text
+    CHANGED = "changed"  # the alarm was acknowledged, or its text has changed
     ENDED = "ended"
 
 

@@ -66,7 +66,7 @@ class RetainedTopics:
         return [*kept, f"{DISCOVERY}/device/+/config"] if self._home_assistant else kept
 
     def hear(self, topic: str, payload: bytes, there: Collection[str]) -> list[str]:
-        """Process a retained message; return the topics to delete now. `there` holds the plant's drives."""
+        """Process a retained message; return the topics to delete now. `there` are the plant's drives."""
         if topic == f"{self._prefix}/gateway":
             self._is_alone = payload == OFFLINE
         elif self._looked_at < MOST_KEPT:
