@@ -139,7 +139,7 @@ class FleetGateway:
         await end_tasks(*waits)
 
     async def _look(self) -> None:
-        """Check repeatedly for ended threads; if polling has failed, report that to the supervisor, and return."""
+        """Check repeatedly for ended threads; report failed polling to the supervisor, and return."""
         while True:
             supervisor().look()
             if failure := self.lines.poller.failure:

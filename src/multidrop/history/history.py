@@ -219,7 +219,7 @@ class History:
         begin: Moment | None = None,
         end: Moment | None = None,
     ) -> Iterator[bytes]:
-        """Yield the rows of `read` as pieces of a .csv file with a column `unit`."""
+        """Yield the rows that `read` returns as pieces of a .csv file with a column `unit`."""
         rows = self.read(series, begin, end)
         units = units_of(rows.metadata)
         lines = (lines_with_units(batch, units) for batch in rows)
@@ -232,7 +232,7 @@ class History:
         begin: Moment | None = None,
         end: Moment | None = None,
     ) -> int:
-        """Write the rows of `read` into a new .csv, .parquet or .arrows file; return the number of rows.
+        """Write the rows that `read` returns into a new .csv, .parquet or .arrows file; return their number.
 
         Parquet is written by duckdb, with rows in any order, or by pyarrow if duckdb is missing. Raises the
         errors of `open_writer`, and then leaves no file.

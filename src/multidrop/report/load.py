@@ -167,7 +167,7 @@ class Recording:
         return found
 
     def of(self, drive: str, register: str = "") -> tuple[Series, ...]:
-        """Return all series of a drive, or only that of `register`."""
+        """Return all series of a drive, or only the series of `register`."""
         of_drive = self._by_drive.get(drive, ())
         return tuple(series for series in of_drive if register in ("", series.register))
 

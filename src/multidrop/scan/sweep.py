@@ -72,7 +72,7 @@ def sweeps(
     baudrates: Collection[int] = (),
     formats: Collection[str] = (),
 ) -> list[Sweep]:
-    """Return sweeps of all settings in these families' documents, those with the best chance per second first.
+    """Return sweeps of all settings in these families' documents, the best chances per second first.
 
     Every setting is swept first with a timeout for usual response delays, then with one for the longest
     delays that the documents allow. `baudrates` and `formats` restrict the settings; empty means all. Raises

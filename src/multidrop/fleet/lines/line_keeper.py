@@ -194,7 +194,7 @@ class LineKeeper:
         self.unopened.gone(line)
 
     async def let_all_go(self) -> None:
-        """Close all lines, whatever is in progress on them. Raises the error if a line could not be closed."""
+        """Close all lines, whatever is in progress on them. Raises the error of a failed closing."""
         self._is_leaving = True
         try:
             while not self.is_silent:

@@ -43,7 +43,7 @@ class Exports:
     async def respond(
         self, part: Any, names: Sequence[str], begin: int, end: int, kind: str, *, is_gzipped: bool = False
     ) -> Response:
-        """Return a file of series from the historian `part`, compressed on its way with `is_gzipped`.
+        """Return a file of series from the historian `part`; with `is_gzipped`, compressed for transfer.
 
         Raises Hung, and Denied for wrong arguments or too many exports.
         """
@@ -135,7 +135,7 @@ def _what(names: Sequence[str]) -> str:
 
 
 def _moment(ms: int) -> str:
-    """Return a UTC time without colons, which some systems forbid in file names."""
+    """Return a UTC time for a file name: without colons, which some systems forbid there."""
     try:
         return datetime.fromtimestamp(ms / 1000, UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
     except (ValueError, OverflowError, OSError):

@@ -191,7 +191,7 @@ class SparkplugNode:
         return {} if known is None else dict(known.registers)
 
     def _register(self, drive: str, name: str) -> Register[Any] | None:
-        """Return the register of a metric; None for "state" and "fault", which every drive has."""
+        """Return the register of a metric; None for the metrics "state" and "fault" of every drive."""
         return None if name in OWN else self._registers(drive)[name.removeprefix(REGISTERS)]
 
     def _alias(self, drive: str, name: str) -> int:
