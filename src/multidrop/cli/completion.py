@@ -31,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _add(
     parser: argparse.ArgumentParser, table: Mapping[str, tuple[str, str]], package: str, file: Any
 ) -> None:
-    """Add the commands of a table, with their arguments; arguments without choices are completed as file names."""
+    """Add the commands of a table, with their arguments; without choices, values are file names."""
     subparsers = parser.add_subparsers()
     for word, (name, text) in table.items():
         module: Any = import_module(f"{package}.{name}" if name else package)
