@@ -243,10 +243,16 @@ static int is_in_window(const struct md_exchange *exchange, int64_t now_ns)
     return 0;
 }
 
+/* Return 1 if no late reply delays the request: a stop must leave, and a broadcast has no reply. */
+static int is_exempt(const struct md_exchange *exchange)
+{
+    return exchange->insists || md_reply_length(exchange->framing, &exchange->request) == 0;
+}
+
 static int is_doubted(const struct md_exchange *exchange)
 {
     const struct md_drive *drive = exchange->drive;
-    return drive->is_doubted && drive->proof_count && !exchange->insists;
+    return drive->is_doubted && drive->proof_count && !is_exempt(exchange);
 }
 
 /* An exception is never in doubt here: it carries no value and settles no request. */
@@ -267,7 +273,7 @@ int md_late_bars(const struct md_exchange *exchange, int64_t now_ns)
     struct md_drive *drive = exchange->drive;
     if (is_first_write(exchange))
         return 1;
-    if (drive->owed_count == 0 || exchange->insists)
+    if (drive->owed_count == 0 || is_exempt(exchange))
         return 0;
     if (is_in_window(exchange, now_ns))
         return 1;
@@ -313,7 +319,7 @@ const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int6
     struct md_drive *drive = exchange->drive;
     if (is_first_write(exchange))
         return last_proof(drive);
-    if (drive->owed_count == 0 || exchange->insists || is_in_window(exchange, now_ns))
+    if (drive->owed_count == 0 || is_exempt(exchange) || is_in_window(exchange, now_ns))
         return NULL;
     forget_settled(drive, now_ns);
     if (!has_mistakable(exchange, 1) || is_sent_alone(exchange))

@@ -34,6 +34,7 @@ from multidrop.errors import (
 from multidrop.families import MODELS, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.families.invt_che import CHEControl
 from multidrop.sim import simulated
+from multidrop.transport.exchange import Exchanges
 
 BROADCASTING = [model for model, family in MODELS.items() if family.broadcasts]
 every_broadcasting = pytest.mark.parametrize("model", BROADCASTING)
@@ -138,6 +139,23 @@ def test_a_stop_broadcasts_only_stop_words(monkeypatch: pytest.MonkeyPatch, conf
         with pytest.raises(WriteForbidden, match="confirmed = 1"):
             line.bus.broadcast(drives[0].frequency, 0.0)
         assert broadcasts(line) == []
+
+
+@every_broadcasting
+def test_a_broadcast_insists_only_if_it_is_a_stop(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+    line, drives, _ = line_of(monkeypatch, model, model)
+    register = drives[0].control
+    insists: list[bool] = []
+
+    def carry_out(*given: Any, **options: Any) -> Completion:
+        insists.append(options["insists"])
+        return Completion()
+
+    monkeypatch.setattr(Exchanges, "carry_out", carry_out)
+    writer, raw = line.bus._writer, register.broadcast[0]
+    writer.broadcast(drives[0], register, raw)
+    writer.broadcast(drives[0], register, raw, line.bus._performer.call(drives[0]))
+    assert insists == [True, False]
 
 
 @pytest.mark.parametrize("is_sent", [False, True])

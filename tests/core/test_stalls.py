@@ -36,6 +36,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="other systems d
 READ = Message(1, 0x03, 0x10, 1)
 START = Message(1, 0x06, 0x20, data=b"\0\1")
 STOP = Message(1, 0x06, 0x20, data=b"\0\0")
+SET_ALL = Message(0, 0x06, 0x21, data=b"\0\1")
 TIMEOUT_S = 0.02
 
 
@@ -55,8 +56,10 @@ def port(ends: tuple[socket.socket, socket.socket]) -> Iterator[Port]:
     made.stop()
 
 
-def exchange(message: Message, *, insists: bool = False, timeout: float = TIMEOUT_S) -> Exchange:
-    peer = Peer(least_timeout=timeout, most_timeout=timeout)
+def exchange(
+    message: Message, *, insists: bool = False, timeout: float = TIMEOUT_S, peer: Peer | None = None
+) -> Exchange:
+    peer = peer or Peer(least_timeout=timeout, most_timeout=timeout)
     settings = {"baudrate": 0, "format": "0\0000"[:3], "character": 1e-5, "silence": 1e-4}
     return Exchange(Framing.RTU, message, peer, insists=insists, **settings)
 
@@ -81,6 +84,26 @@ def test_a_command_is_not_written_behind_held_bytes_but_a_stop_is(
     assert port.carry_out(exchange(STOP, insists=True)).sent_ns > 0
     assert (port.lost, port.called_off) == (False, False)
     assert taken(ends[1]) == [frame(READ), frame(STOP)]
+
+
+def test_a_broadcast_command_is_not_written_behind_held_bytes(port: Port) -> None:
+    assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
+    held = port.carry_out(exchange(SET_ALL))
+    assert (held.result, held.error, held.sent_ns) == (Failure.LINE_LOST, errno.ETIMEDOUT, 0)
+
+
+def test_a_broadcast_command_does_not_wait_for_late_replies(
+    ends: tuple[socket.socket, socket.socket], port: Port
+) -> None:
+    adapter = ends[1]
+    adapter.setblocking(True)
+    reader = threading.Thread(target=adapter.recv, args=(8,))
+    reader.start()
+    peer = Peer(least_timeout=TIMEOUT_S, most_timeout=TIMEOUT_S)
+    assert port.carry_out(exchange(START, peer=peer)).result == Failure.NO_REPLY
+    reader.join()
+    assert port.carry_out(exchange(START, peer=peer)).result == Failure.LATE_ANSWER_DUE
+    assert port.carry_out(exchange(SET_ALL, peer=peer)).sent_ns > 0
 
 
 def test_a_held_command_loses_the_port_at_its_timeout(port: Port) -> None:

@@ -149,7 +149,7 @@ class Writer:
         expires_ns, permit = (call.expires_ns, call.permit) if call else (0, None)
         with self._logged(drive, request, what, self.records.log_later):
             completion = self._exchanges.carry_out(
-                drive, request, expires_ns, insists=True, timeout=0.0, permit=permit
+                drive, request, expires_ns, insists=call is None, timeout=0.0, permit=permit
             )
             if call and completion.result == Failure.EXPIRED:
                 raise call.unsent(what)
