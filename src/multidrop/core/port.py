@@ -173,7 +173,10 @@ class _Engine:
     def set_realtime(self, client: Realtime, wanted: bool) -> None:
         """Run the thread under realtime scheduling while any client wants it. Raises OSError if refused."""
         with self._changing:
+            was_wanted = bool(self._realtime)
             (self._realtime.add if wanted else self._realtime.discard)(client)
+            if was_wanted == bool(self._realtime):
+                return  # a thread that has ended realtime by itself does not start it again
             failure = lib.md_engine_realtime(self.c, bool(self._realtime))
             if failure:
                 self._realtime.discard(client)
