@@ -318,6 +318,18 @@ def test_full_disk_ends_the_application_and_the_next_one_completes_it(
     assert params.apply(drive, values).earlier == []
 
 
+def test_a_journal_that_cannot_be_removed_does_not_lose_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, drive, _ = attached(monkeypatch, ErmanERG220(1), [])
+
+    def refuse(*given: object, **options: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    done = params.apply(drive, {"b.003": 150})
+    assert isinstance(done.failure, PermissionError)
+    assert [change.parameter.code for change in done.written] == ["b.003"]
+
+
 def test_refusal_of_a_ramp_time_suggests_only_existing_ways(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, _ = attached(monkeypatch, YD1000(1), [])
     drive.write("acceleration_time", 20.0)

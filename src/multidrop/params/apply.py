@@ -98,7 +98,10 @@ def _apply(made: ApplyPlan, stops: int, *, commissioning: bool, report: Report |
                 report(number, len(made.writes), change, not_written)
             if result.failure:
                 return result
-    journal.end()
+    try:
+        journal.end()
+    except OSError as failure:
+        result.failure = failure
     return result
 
 
@@ -130,8 +133,11 @@ def _write(change: ParameterChange, call: Call, result: Applied, journal: _Journ
 
 def _refused(change: ParameterChange, why: NotWritten, result: Applied, journal: _Journal) -> NotWritten:
     code = change.parameter.code
-    journal.note(code=code, outcome="not written")
     result.refused[code] = why
+    try:
+        journal.note(code=code, outcome="not written")
+    except OSError as failure:
+        result.failure = failure
     return why
 
 
