@@ -312,7 +312,9 @@ def alarms(handler: Any, gateway: FakeGateway, asked: dict[str, list[str]]) -> N
 
 def as_answer(alarm: dict[str, Any]) -> dict[str, Any]:
     """Return an alarm with its times as ISO text, as the gateway sends it."""
-    return alarm | {key: alarm[key] and iso_time(alarm[key]) for key in ("time", "ended", "acknowledged")}
+    return alarm | {
+        key: alarm[key] and iso_time(alarm[key]) for key in ("time", "ended", "acknowledged") if key in alarm
+    }
 
 
 def audit(handler: Any, gateway: FakeGateway, _: object) -> None:

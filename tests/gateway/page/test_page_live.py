@@ -109,7 +109,7 @@ def test_old_value_is_never_shown_as_new(opened: Opener, gateway: FakeGateway) -
 
 SET_BACK = """([name, register, known]) => import('/page/store.js').then(s => {
   const frame = structuredClone(s.store.frame), [value] = frame.drives[name].values[register];
-  frame.time = String(BigInt(frame.time) - 3600n * 10n ** 9n);
+  frame.time = new Date(Date.parse(frame.time) - 3600e3).toISOString();
   if (!known) frame.drives[name].values[register] = [null, 0, 'not asked yet'];
   s.takeFrame(frame);
   const { age, isOld } = s.reading(name, register, s.store.time);
@@ -284,7 +284,7 @@ def test_no_line_is_drawn_over_missed_time(opened: Opener) -> None:
     page = opened()
     seen = page.evaluate("""() => import('/page/store.js').then(({ store, takeFrame }) => {
         const ring = store.drives.get('pump-1').pasts.get('output_frequency');
-        const later = s => String(BigInt(store.frame.time) + BigInt(s * 1e9));
+        const later = s => new Date(Date.parse(store.frame.time) + s * 1e3).toISOString();
         const taken = [];
         for (const s of [1, 3600, 1]) {
             const before = ring.count;
