@@ -8,12 +8,14 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from lines import until
 
 from multidrop import Plant, Poller
 from multidrop.core import Port, Realtime, wake_lateness
+from multidrop.core import port as core_port
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="other systems show no thread's scheduling")
 
@@ -140,3 +142,20 @@ def test_wake_ups_are_measured() -> None:
     late = wake_lateness(0.02, realtime=False)
     assert len(late) == 10
     assert all(each >= 0 for each in late)
+
+
+def test_only_the_first_and_the_last_client_switch_realtime(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread that has ended realtime by itself must not start it again for a second client."""
+    switched: list[bool] = []
+
+    def switch(engine: object, wanted: bool) -> int:
+        switched.append(wanted)
+        return 0
+
+    monkeypatch.setattr(core_port, "lib", SimpleNamespace(md_engine_realtime=switch))
+    engine, clients = core_port._Engine(), [Realtime(), Realtime()]
+    engine._c = object()
+    for wanted in (True, False):
+        for client in clients:
+            engine.set_realtime(client, wanted)
+    assert switched == [True, False]
