@@ -20,7 +20,7 @@ enum md_line_state {
 
 enum md_line_event {
     MD_BEGUN,         /* an exchange starts */
-    MD_FELL_SILENT,   /* the line was silent for long enough, or never silent until the deadline */
+    MD_FELL_SILENT,   /* the wait for silence is over: the line was silent, or the deadline passed */
     MD_NOTHING_CAME,
     MD_STRAY_BYTES,   /* bytes came before the request, and there is time to wait for silence again */
     MD_PART_LEFT,

@@ -110,7 +110,7 @@ int64_t md_now_ns(void);
  * has one UTC time in all recordings. */
 int64_t md_utc_minus_monotonic_ns(void);
 
-/* ---- stats.c, late.c: a drive's statistics; return a time in ns ---- */
+/* ---- stats.c, late.c: a drive's statistics; times are in ns ---- */
 
 /* Counters of a drive's exchanges; all except longest_ns only grow. `values`: number of values read. */
 struct md_counters {

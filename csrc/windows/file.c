@@ -98,7 +98,7 @@ void md_file_has_written(struct md_file *file, DWORD error)
     tell(file);
 }
 
-/* Start to read the file's byte, unless it has come or a read is in progress. */
+/* Start to read one byte ahead from the file, unless that byte has come or its read is in progress. */
 static void begin(struct md_file *file)
 {
     if (file->is_reading || file->is_held || file->is_ended || file->error)

@@ -304,7 +304,7 @@ def test_a_write_is_unconfirmed_if_the_next_read_reveals_an_echo(monkeypatch: py
     drive.set_frequency(20)
 
     def echo(request: Message) -> bytes | None:
-        line.has_echo |= not is_write(request)  # the core detects the echo when a read's reply follows it
+        line.has_echo |= not is_write(request)  # as the core does when a reply follows the echo
         return build_request(drive.framing, request) if is_write(request) else None
 
     line.answers = echo

@@ -357,7 +357,8 @@ def test_another_client_s_equal_stop_confirms_ours() -> None:
 @patient
 @pytest.mark.parametrize("verb", ["stop", "coast"])
 def test_another_clients_equal_request_is_not_our_echo_for_long(verb: str) -> None:
-    """Our read is lost, and the other client's looks like its echo. A later stop is confirmed anyway."""
+    """Our read is lost, and the other client's equal request looks like the echo of ours. A later stop is
+    confirmed anyway."""
     look = rtu("01 03 10 01 00 01")
     with shared_line("invt-che", seed=3) as (drive, pair, received):
         running(drive, received[0])

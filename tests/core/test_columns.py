@@ -282,7 +282,7 @@ def test_rows_of_a_block_larger_than_a_chunk_are_counted_as_dropped() -> None:
 
 
 def test_more_chunks_than_the_queue_keeps_can_be_given_back() -> None:
-    """There are more chunks than the queue keeps for later."""
+    """A reader returns more chunks of memory than the queue keeps for reuse; the queue frees the others."""
     row_queue = RowQueue(chunk_rows=3, most_chunks=100)
     for turn in (1, 2):
         for due in range(100):

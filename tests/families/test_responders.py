@@ -28,7 +28,7 @@ Word = tuple[int, int]  # address and value
 
 @dataclass(frozen=True)
 class Sheet:
-    """Facts from a family's sources: registers at rest and while running, and the words of each verb."""
+    """Facts from a family's sources: register values at rest and while running, and what each verb writes."""
 
     rest: Mapping[int, int]  # all readable registers, with their values at rest
     shown: Mapping[str, float]  # values on the keypad while the motor turns, by register

@@ -144,7 +144,7 @@ def _side(arguments: argparse.Namespace, words: list[str]) -> tuple[Target | Par
 
 
 def _is_file(words: list[str]) -> bool:
-    """Return True if the first word names a parameter file, or a missing file that cannot be a plant file."""
+    """Return True if the first word names a parameter file, or a .toml or .csv file that does not exist."""
     first = words[0]
     if "://" in first or Path(first).suffix.lower() not in (".toml", ".csv"):
         return False

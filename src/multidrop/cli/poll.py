@@ -203,8 +203,8 @@ def tap_text(summary: Mapping[str, Any]) -> Iterator[str]:
 
 # ---- the live table ----
 #
-# The monitor takes over the terminal and its keys, and can stop motors. This table reads no keys, and stays
-# on the terminal above the summary.
+# The monitor takes over the terminal and its keys, and can stop motors. The table of `poll` reads
+# no keys, and stays on the terminal above the summary.
 
 
 EVERY = 0.5  # pause between two drawings, in s

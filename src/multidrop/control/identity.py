@@ -213,7 +213,7 @@ class IdentityCheck:
         rivals = run_by(register, count)
         suspicion = self._suspicion(drive, rivals) if self._is_in_step(drive) else None
         on, before = self._suspected.pop(drive, (port, None))
-        if suspicion is not None and suspicion.make is not None:  # the drive answered as this make SURE times
+        if suspicion is not None and suspicion.make is not None:  # it answered as this make several times
             raise _withheld(drive, suspicion.why, suspicion.make)
         if suspicion is not None and (before is None or on is not port):
             self._suspected[drive] = port, suspicion

@@ -216,7 +216,7 @@ def test_a_failed_read_without_budget_raises() -> None:
 
 
 def test_slow_answers_delay_repeats() -> None:
-    """Many gateways that start together read the whole plant as well as small records."""
+    """After a slow answer, as when many gateways start together, later reads are repeated later."""
     way, others, spare = LateWay(0.2), [SlowWay("b"), SlowWay("c")], full()
 
     async def main() -> None:

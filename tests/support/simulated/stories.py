@@ -222,7 +222,7 @@ class Path(Story):
 
 
 class PathLine:
-    """A line behind such a path, with the interface that `Bus` uses; time passes only while it waits."""
+    """A line behind a simulated path, with the interface that `Bus` uses; time passes only while it waits."""
 
     def __init__(self, wire: PathWire) -> None:
         self.port = self.identity = wire.where if speaks_tcp(wire.where) else "test line"

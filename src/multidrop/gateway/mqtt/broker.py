@@ -213,7 +213,7 @@ class Broker:
             self.publish_all()
 
     def publish_all(self) -> None:
-        """Let the speaker publish all its messages, as on a new connection."""
+        """Let the speaker (the publishing format) send all its messages, as it does on a new connection."""
         self._let(self._speaker.connected)
 
     def _let(self, say: Callable[[], None]) -> None:
