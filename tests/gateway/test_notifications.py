@@ -17,7 +17,7 @@ from gateways import served
 from lines import until
 from tables import table
 
-from multidrop.gateway.live.alarms import FAULT, PORT, Alarm, Alarms, Change
+from multidrop.gateway.live.alarms import FAULT, PORT, Alarm, AlarmChange, Alarms
 from multidrop.gateway.live.hub import RUNS, Shown
 from multidrop.gateway.notifications import (
     MOST_RETRY_S,
@@ -48,7 +48,7 @@ def flaps(number: int) -> list[Alarm]:
 
 def note(part: Notifications, alarm: Alarm) -> None:
     """Tell the part that an alarm began or ended."""
-    part.note_alarm(alarm, Change.BEGAN if alarm.ended is None else Change.ENDED)
+    part.note_alarm(alarm, AlarmChange.BEGAN if alarm.ended is None else AlarmChange.ENDED)
 
 
 def described(alarm: Alarm, left_out: int) -> dict[str, Any]:

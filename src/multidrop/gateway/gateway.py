@@ -26,7 +26,7 @@ from multidrop.gateway.http.guard import MOST_HEAD
 from multidrop.gateway.http.rights import OwnNames, Tokens
 from multidrop.gateway.http.routes import make_app
 from multidrop.gateway.live.alarm_file import AlarmFile
-from multidrop.gateway.live.alarms import Alarm, Alarms, Change
+from multidrop.gateway.live.alarms import Alarm, AlarmChange, Alarms
 from multidrop.gateway.live.drive_reads import Identities, SideReads
 from multidrop.gateway.live.frames import Frames, SeenFrames, frame_of, lost_of
 from multidrop.gateway.live.hub import SILENT, Hub
@@ -289,7 +289,7 @@ class Gateway:
             self._is_restored = True
         return True
 
-    def _note_alarm(self, alarm: Alarm, change: Change) -> None:
+    def _note_alarm(self, alarm: Alarm, change: AlarmChange) -> None:
         """Log and save an alarm that started, ended or changed."""
         where = alarm.drive or f"line {alarm.line}"
         if alarm.ended is not None:

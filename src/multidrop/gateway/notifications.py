@@ -26,7 +26,7 @@ from urllib.parse import urlsplit
 
 from multidrop import Batch, Plant
 from multidrop.exposition import MetricFamily
-from multidrop.gateway.live.alarms import KINDS, Alarm, Change
+from multidrop.gateway.live.alarms import KINDS, Alarm, AlarmChange
 from multidrop.gateway.metrics import counter
 from multidrop.gateway.parts import PartContext
 from multidrop.gateway.settings import Folders
@@ -364,9 +364,9 @@ class Notifications:
     def take(self, batch: Batch) -> None:
         """Ignore the batch: alarms arrive by `note_alarm`."""
 
-    def note_alarm(self, alarm: Alarm, change: Change) -> None:
+    def note_alarm(self, alarm: Alarm, change: AlarmChange) -> None:
         """Queue a message for an alarm that began or ended, but none for an acknowledgement or a new text."""
-        if alarm.kind in self._kinds and change is not Change.CHANGED:
+        if alarm.kind in self._kinds and change is not AlarmChange.CHANGED:
             for sender in self._senders:
                 sender.put(alarm)
 

@@ -30,7 +30,7 @@ SEPARATOR = "; "  # between a drive's exceeded limits in the alarm's text
 LOST = ("port lost", "port refused its settings")  # statuses of a line's rows while its port is lost
 
 
-class Change(Enum):
+class AlarmChange(Enum):
     """What happened to an alarm."""
 
     BEGAN = "began"
@@ -75,7 +75,7 @@ class Alarms:
     """
 
     def __init__(
-        self, since: int = 0, note: Callable[[Alarm, Change], object] = lambda alarm, change: None
+        self, since: int = 0, note: Callable[[Alarm, AlarmChange], object] = lambda alarm, change: None
     ) -> None:
         self.since = since
         self._note = note
@@ -175,7 +175,7 @@ class Alarms:
             self._lasting[_key(found)] = changed
         else:
             self._ended[self._ended.index(found)] = changed
-        self._note(changed, Change.CHANGED)
+        self._note(changed, AlarmChange.CHANGED)
         if changed.kind == STOPPED and changed.ended is None:
             self._end(time, *_key(changed))
         return changed
@@ -202,7 +202,7 @@ class Alarms:
             self._lasting[key] = alarm  # the present alarm continues the earlier one
         elif present is not None or is_seen or (alarm.drive or alarm.line) not in names:
             self._ended.append(alarm._replace(ended=time))
-            self._note(self._ended[-1], Change.ENDED)
+            self._note(self._ended[-1], AlarmChange.ENDED)
         else:
             self._lasting[key] = alarm
 
@@ -241,12 +241,12 @@ class Alarms:
         if before is not None and (before.text == UNNAMED or kind == PORT or is_less):
             # This is the same alarm, with a better text.
             self._lasting[key] = before._replace(text=text)
-            self._note(self._lasting[key], Change.CHANGED)
+            self._note(self._lasting[key], AlarmChange.CHANGED)
             return
         self._end(time, *key)
         self._lasting[key] = Alarm(time, drive, text, None, kind, line, is_before)
         self.begun += 1
-        self._note(self._lasting[key], Change.BEGAN)
+        self._note(self._lasting[key], AlarmChange.BEGAN)
 
     def _end(self, time: int, line: str, drive: str, kind: str) -> None:
         before = self._lasting.pop((line, drive, kind), None)
@@ -254,7 +254,7 @@ class Alarms:
             if len(self._ended) == MOST_ENDED:
                 self.since = max(self.since, self._ended[0].ended or 0)
             self._ended.append(before._replace(ended=time))
-            self._note(self._ended[-1], Change.ENDED)
+            self._note(self._ended[-1], AlarmChange.ENDED)
 
 
 def _key(alarm: Alarm) -> tuple[str, str, str]:

@@ -9,7 +9,7 @@ from typing import Any
 from multidrop import Batch, Plant
 from multidrop.exposition import MetricFamily
 from multidrop.gateway.clock import utc_ms
-from multidrop.gateway.live.alarms import Alarm, Change
+from multidrop.gateway.live.alarms import Alarm, AlarmChange
 from multidrop.gateway.metrics import counter
 from multidrop.gateway.mqtt.broker import Broker, parse_broker
 from multidrop.gateway.mqtt.json_topics import JsonTopics
@@ -49,7 +49,7 @@ class Mqtt:
     def take(self, batch: Batch) -> None:
         """Ignore the batch: the hub has the newest rows."""
 
-    def note_alarm(self, alarm: Alarm, change: Change) -> None:
+    def note_alarm(self, alarm: Alarm, change: AlarmChange) -> None:
         """Publish the active alarms, because one began, changed or ended."""
         if self._brokers[0].is_connected:
             self._topics.publish_alarms()
