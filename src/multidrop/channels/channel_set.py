@@ -1,0 +1,308 @@
+"""ChannelSet: compute the rows of a plant's channels from the rows of its registers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from math import isfinite
+from typing import Any, NamedTuple
+
+from multidrop.channels.functions import Value
+from multidrop.channels.grammar import ExpressionError
+from multidrop.channels.program import Channel, DriveSeries, Program, SeriesTable
+from multidrop.channels.units import unit_of
+from multidrop.core import Status
+
+MOST_CHANNELS = 1000  # limit of a plant's channels
+MOST_NAME = 100  # limit of the characters in a channel's name, and in its unit
+UNSEEN = -1  # status of a series that has had no row yet
+OLD = -2  # status of a series whose newest value is too old, because no further row has come
+
+
+class Mistake(NamedTuple):
+    """A mistake in a channel, as a sentence."""
+
+    drive: str
+    channel: str
+    sentence: str
+
+    def __str__(self) -> str:
+        return f'drive "{self.drive}", channel "{self.channel}": {self.sentence}'
+
+
+class SlotRow(NamedTuple):
+    """A row of a register or channel, which `slot` identifies.
+
+    Status 0 means that the row has a value; any other status is a miss. A channel's row has the status OLD
+    if an input has had no row for too long.
+    """
+
+    slot: int
+    time_ns: int
+    monotonic_ns: int
+    uncertainty_ns: int
+    value: float
+    status: int
+
+
+class Outage(NamedTuple):
+    """A period that the totals of a channel leave out, because no value was known. It ends at `end_ns`."""
+
+    channel: str  # written as DRIVE.CHANNEL
+    end_ns: int  # UTC
+    seconds: float
+
+    def __str__(self) -> str:
+        seconds = f"{self.seconds:.0f}" if self.seconds >= 100 else f"{self.seconds:.3g}"
+        return f"{self.channel}: {seconds} s without values are not counted"
+
+
+class _Computed(NamedTuple):
+    drive: str
+    channel: Channel
+    program: Program
+    slot: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.drive}.{self.channel.name}"
+
+
+class ChannelSet:
+    """The valid channels of these drives; `mistakes` lists the mistakes of the invalid channels.
+
+    A series is a register or a channel. `slots` maps the drive and name of each series to its slot, an index.
+    Registers have the first slots.
+    """
+
+    def __init__(self, drives: Sequence[DriveSeries]) -> None:
+        self.mistakes: list[Mistake] = []
+        series = SeriesTable(drives)
+        self.slots: Mapping[tuple[str, str], int] = series.slots
+        self.inputs = dict(series.slots)  # the slots of registers only
+        self._computed: list[_Computed] = []
+        self._drive_of = [drive for drive, _ in series.slots]
+        for drive in drives:
+            for channel in drive.channels:
+                self._add(drive, channel, series)
+        size = len(series.units)
+        self._values: list[Value] = [None] * size
+        self._statuses = [UNSEEN] * size
+        self._sent_ns = [0] * size
+        self._known_ns: dict[int, int] = {}  # monotonic time of each slot's newest known value
+        self._gaps: set[int] = set()  # slots of channels with an input whose value is too old
+        self._holds_ns = [round(hold_s * 1e9) for hold_s in series.holds_s]
+        # by slot of a channel whose totals were restored: UTC in ns of the newest value in these totals
+        self._left_off: dict[int, int] = {}
+        # by slot of a channel with totals: UTC in ns of the channel's newest value
+        self._newest_ns: dict[int, int] = {}
+        self.outages: list[Outage] = []  # the caller empties this list
+
+    def _add(self, drive: DriveSeries, channel: Channel, series: SeriesTable) -> None:
+        try:
+            program = self._checked(drive, channel, series)
+        except ExpressionError as mistake:
+            self.mistakes.append(Mistake(drive.name, channel.name, f"value: {mistake}"))
+        except ValueError as mistake:
+            self.mistakes.append(Mistake(drive.name, channel.name, str(mistake)))
+        else:
+            slot = series.add(drive.name, channel.name, unit_of(channel.unit), program.hold_s)
+            self._computed.append(_Computed(drive.name, channel, program, slot))
+
+    def _checked(self, drive: DriveSeries, channel: Channel, series: SeriesTable) -> Program:
+        """Check a channel and return its program. Raises ValueError for a mistake."""
+        if not channel.name.isidentifier():
+            raise ValueError(f"{channel.name!r} is not a valid channel name; use letters, digits and _")
+        if max(len(channel.name), len(channel.unit)) > MOST_NAME:
+            raise ValueError(f"a channel's name and its unit have at most {MOST_NAME} characters each")
+        if channel.name in drive.known or (drive.name, channel.name) in series.slots:
+            raise ValueError(
+                f"{drive.name} already has a register or channel {channel.name!r}; "
+                "give the channel another name"
+            )
+        if len(self._computed) == MOST_CHANNELS:
+            raise ValueError(f"a plant has at most {MOST_CHANNELS} channels")
+        return Program(channel.value, drive.name, series, channel.unit)
+
+    def __bool__(self) -> bool:
+        return bool(self._computed)
+
+    @property
+    def holds_s(self) -> Mapping[tuple[str, str], float]:
+        """The seconds for which each channel's value stays current, by drive and channel name.
+
+        A channel's value stays current for as long as that of its slowest input.
+        """
+        return {(one.drive, one.channel.name): one.program.hold_s for one in self._computed}
+
+    # ---- rows ----
+
+    def compute(self, rows: Iterable[SlotRow]) -> list[SlotRow]:
+        """Compute and return the rows of channels that follow from these rows of registers.
+
+        A channel gets a row for each request that read one of its registers, with the time of that request.
+        If the newest row of a register is a miss, the channel's row is a miss with the same status. A
+        register that has had no row for too long makes the channel's row a miss with the status OLD.
+        """
+        found: list[SlotRow] = []
+        group: dict[int, SlotRow] = {}  # the rows of one request, by slot
+        key: tuple[int, str] | None = None
+        for row in rows:
+            before, key = key, (row.monotonic_ns, self._drive_of[row.slot])
+            if group and (key != before or row.slot in group):
+                found += self._computed_from([*group.values()])
+                group = {}
+            group[row.slot] = row
+        if group:
+            found += self._computed_from([*group.values()])
+        return found
+
+    def _computed_from(self, group: list[SlotRow]) -> Iterator[SlotRow]:
+        """Yield the channels' rows that follow from the rows of one request."""
+        fresh: set[int] = set()
+        uncertainty_ns = max(row.uncertainty_ns for row in group)
+        for row in group:
+            self._note(row, fresh)
+        first = group[0]
+        for computed in self._computed:
+            program = computed.program
+            if program.slots.isdisjoint(fresh):
+                continue
+            self._expire(computed, first.monotonic_ns)
+            value = program.run(self._values, fresh, first.monotonic_ns)
+            self._note_outages(computed, first)
+            status = self._status(program.slots)
+            if status == UNSEEN:
+                continue
+            if status == Status.OK and value is None:
+                status = Status.NO_VALUE
+            row = SlotRow(
+                computed.slot,
+                first.time_ns,
+                first.monotonic_ns,
+                uncertainty_ns,
+                0.0 if value is None else value,
+                status,
+            )
+            self._note(row, fresh)
+            yield row
+
+    def _expire(self, computed: _Computed, now_ns: int) -> None:
+        """Note an outage for each input whose newest value is too old at `now_ns` (monotonic).
+
+        Functions with a memory that need this input do not count the time of the outage. If the input's
+        newest row is not a miss, its value becomes unknown, with the status OLD.
+        """
+        gone = set()
+        for slot in computed.program.slots:
+            if now_ns - self._known_ns.get(slot, now_ns) > self._holds_ns[slot]:
+                gone.add(slot)
+                if self._statuses[slot] == Status.OK:
+                    self._values[slot], self._statuses[slot] = None, OLD
+            elif slot in self._gaps:
+                gone.add(slot)
+        self._gaps.discard(computed.slot)
+        if gone:
+            self._gaps.add(computed.slot)
+            computed.program.interrupt(gone)
+
+    def _note(self, row: SlotRow, fresh: set[int]) -> None:
+        is_good = row.status == Status.OK and isfinite(row.value)
+        self._values[row.slot] = row.value if is_good else None
+        if is_good:
+            self._known_ns[row.slot] = row.monotonic_ns
+        self._statuses[row.slot] = row.status
+        self._sent_ns[row.slot] = row.monotonic_ns
+        fresh.add(row.slot)
+
+    def _status(self, slots: Iterable[int]) -> int:
+        """Return the status of the newest miss among these series.
+
+        Without a miss, return UNSEEN if a series has no row, else OK.
+        """
+        misses = [slot for slot in slots if self._statuses[slot] not in (Status.OK, UNSEEN)]
+        if misses:
+            return self._statuses[max(misses, key=self._sent_ns.__getitem__)]
+        return min(self._statuses[slot] for slot in slots)
+
+    def _note_outages(self, computed: _Computed, row: SlotRow) -> None:
+        """If an outage ended with this row, add it to `outages`. A restart is an outage too."""
+        totals = computed.program.totals
+        if not totals or any(self._values[slot] is None for slot in computed.program.slots):
+            return
+        seconds = max(memory.outage_s for memory in totals)
+        for memory in totals:
+            memory.outage_s = 0.0
+        if (left_off_ns := self._left_off.pop(computed.slot, None)) is not None:
+            seconds = max(seconds, (row.time_ns - left_off_ns) / 1e9)
+        if seconds > 0:
+            self.outages.append(Outage(computed.name, row.time_ns, seconds))
+        self._newest_ns[computed.slot] = row.time_ns
+
+    # ---- totals ----
+
+    def take_over(self, before: ChannelSet) -> None:
+        """Continue the totals of channels that `before` also has, with the same expression and units."""
+        known = {(one.name, one.channel, *one.program.units): one for one in before._computed}
+        for one in self._computed:
+            if same := known.get((one.name, one.channel, *one.program.units)):
+                for memory, old in zip(one.program.memories, same.program.memories, strict=True):
+                    memory.take_over(old)
+                self._left_off.pop(one.slot, None)
+                if same.slot in before._left_off:
+                    self._left_off[one.slot] = before._left_off[same.slot]
+                if same.slot in before._newest_ns:
+                    self._newest_ns[one.slot] = before._newest_ns[same.slot]
+
+    def totals(self) -> dict[str, Any]:
+        """Return the integrals and counts of all kept channels, for `restore`."""
+        return {
+            one.name: {
+                "value": one.channel.value,
+                "units": one.program.units,
+                "totals": [memory.kept for memory in one.program.totals],
+                "time_ns": self._newest_ns.get(one.slot, self._left_off.get(one.slot)),
+            }
+            for one in self._computed
+            if one.channel.is_kept and one.program.totals
+        }
+
+    def restore(self, kept: Mapping[str, Any]) -> list[str]:
+        """Continue with these stored totals. Return the channels that start at 0, because their expression
+        was changed.
+
+        `kept` may come from a damaged file: a channel whose totals are damaged starts at 0, too.
+        """
+        changed = []
+        for one in self._computed:
+            about = kept.get(one.name)
+            totals = one.program.totals
+            if not totals or about is None or not one.channel.is_kept:
+                continue
+            numbers = _numbers(about, one)
+            if numbers is None:
+                changed.append(one.name)
+                continue
+            for memory, own in zip(totals, numbers, strict=True):
+                memory.kept = own
+            time_ns = about.get("time_ns")
+            if isinstance(time_ns, int) and 0 < time_ns < 1 << 63:
+                self._left_off[one.slot] = time_ns
+        return changed
+
+
+def _numbers(about: Any, computed: _Computed) -> list[list[float]] | None:
+    """Return the stored numbers of a channel's totals; None if they are damaged or of another expression."""
+    program = computed.program
+    if not isinstance(about, dict) or about.get("value") != computed.channel.value:
+        return None
+    totals = about.get("totals")
+    if about.get("units") != program.units or not isinstance(totals, list):
+        return None
+    if len(totals) != len(program.totals):
+        return None
+    for numbers in totals:
+        if not isinstance(numbers, list) or not 1 <= len(numbers) <= 2:
+            return None
+        if not all(isinstance(number, float) and isfinite(number) for number in numbers):
+            return None
+    return totals
