@@ -1,0 +1,299 @@
+"""Test files: their steps, their planned times, and a sentence with its line for each mistake."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from simulated_pumps import CHE, write_test
+from tables import table
+
+from multidrop.families.registry import find_model
+from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
+from multidrop.polling.batch import Row
+from multidrop.runs import RunPlan, RunStep, load_test, loader
+from multidrop.runs.bus_time import misfits, silence_of
+from multidrop.runs.model import length, timeline
+from multidrop.runs.watch import LimitWatch
+
+EEPROM = {"model": "delixi-modbus", "framing": "rtu", "poll": ["output_frequency"]}
+
+
+def test_lists_and_repetitions_become_steps_with_planned_times(tmp_path: Path) -> None:
+    text = """
+    [abort]
+    limits = ["fan.output_current >= 30", "pump.fault != 0"]
+    silence = "3 s"
+    [[phase]]
+    name = "cycle"
+    repeat = 2
+    [[phase.step]]
+    frequency = { fan = [10, 20.0], pump = 15 }
+    start = ["fan", "pump"]
+    dwell = "4 s"
+    [[phase.step]]
+    frequency = { fan = 40.0 }
+    rate = 2.0
+    dwell = "1 s"
+    [[phase]]
+    name = "cool"
+    [[phase.step]]
+    stop = ["fan"]
+    until = "fan.output_frequency < 0.5"
+    within = "1 min"
+    [[phase.step]]
+    dwell = "10 s"
+    """
+    plan = load_test(write_test(tmp_path, text, fan=CHE, pump=CHE))
+    planned = timeline(plan.steps)
+    assert [(one.step.name, one.begin, one.seconds, one.is_latest) for one in planned] == [
+        *[("cycle 1", 0, 4, False), ("cycle 2", 4, 4, False), ("cycle 3", 8, 11, False)],
+        *[("cycle 1", 19, 4, False), ("cycle 2", 23, 4, False), ("cycle 3", 27, 11, False)],
+        *[("cool 1", 38, 0, False), ("cool 2", 98, 10, True)],
+    ]
+    assert length(planned) == 108
+    assert [dict(step.frequency) for step in plan.steps[:3]] == [
+        {"fan": 10, "pump": 15},
+        {"fan": 20, "pump": 15},
+        {"fan": 40},
+    ]
+    assert [limit.number for limit in plan.limits.conditions] == [30, 0]
+    assert plan.commanded == ("fan", "pump")
+
+
+STEP = '[[phase]]\nname = "a"\n[[phase.step]]\n'  # these are lines 2 to 4 of the file
+MISTAKES = {  # by text of a test file: the number of the wrong line, and a part of the error's sentence
+    "": (0, "'phase' is missing; add [[phase]], in two brackets"),
+    "abort = 3\n" + STEP + 'dwell = "1 s"': (2, "abort = 3 is not right; write [abort], a table"),
+    '[abort]\nlimits = ["fan.current > 3"]\n' + STEP + 'dwell = "1 s"': (3, "has no register 'current'"),
+    '[abort]\nlimits = ["fan.output_voltage > 3"]\n' + STEP + 'dwell = "1 s"': (
+        3,
+        "is not polled: add it to",
+    ),
+    '[abort]\nlimits = ["fan.output_current is 3"]\n' + STEP + 'dwell = "1 s"': (
+        3,
+        "is not a condition such as",
+    ),
+    '[abort]\nlimits = ["fan.output_current > nan"]\n' + STEP + 'dwell = "1 s"': (
+        3,
+        "'nan' in 'fan.output_current > nan' is not a finite number",
+    ),
+    "[abort]\nlimits = [3]\n" + STEP + 'dwell = "1 s"': (3, "3 is not a text"),
+    '[abort]\nsilence = "soon"\n' + STEP + 'dwell = "1 s"': (3, "silence = 'soon' is not a duration"),
+    STEP: (4, "the step does nothing; add a command, or dwell"),
+    STEP + "dwel = 3": (5, "unknown key 'dwel'; did you mean dwell?"),
+    STEP + 'start = ["fen"]': (5, "has no drive 'fen'; did you mean fan?"),
+    STEP + "start = [1]": (5, "start: 1 is not a text"),
+    STEP + 'start = ["fan"]\ndirection = "left"': (6, "'left' is not a valid Direction"),
+    STEP + 'dwell = "1 s"\ndirection = "forward"': (6, 'direction needs start; add start = ["pump-1"]'),
+    STEP + "frequency = { fan = 51 }": (5, "51"),
+    STEP + 'frequency = { fan = "x" }': (5, "'x' is not a number in Hz"),
+    STEP + "frequency = { fan = [1, 2, 3], pump = [1, 2] }": (5, "must have equally many numbers"),
+    STEP + "frequency = { fan = 20 }\nrate = 1": (6, "a ramp of fan needs a start"),
+    STEP + "frequency = { fan = 20 }\nrate = -1": (6, "rate = -1 is not right"),
+    STEP + "rate = 1": (5, "rate needs frequency; add frequency"),
+    STEP + 'until = "fan.fault == 0"': (5, "until needs within; add within"),
+    STEP + 'dwell = "1 s"\nwithin = "1 s"': (6, "within needs until; add until"),
+    STEP + 'stop = ["fan"]\nfrequency = { fan = 20 }': (5, "fan is stopped and commanded in one step"),
+    STEP + "write = { fan = 3 }": (5, "write of fan: 3 is not right"),
+    STEP + "write = { fan = { setpoint = 101 } }": (5, "setpoint"),
+    STEP + "write = { fan = { control = 'forward' } }": (5, "which only verbs may do: use start()"),
+    STEP + "frequency = { eeprom = 20 }": (5, "may be kept in EEPROM, which steps would wear out"),
+    STEP + "write = { eeprom = { frequency = 20 } }": (5, 'declare ram = ["frequency"]'),
+    STEP.replace('"a"', '"stop"') + 'dwell = "1 s"': (3, 'name "stop" is that of the stops at the end'),
+    STEP + 'dwell = "1 s"\n' + STEP + 'dwell = "1 s"': (6, "another phase already has this name"),
+    STEP.replace("\n[[", "\nrepeat = 0\n[[") + 'dwell = "1 s"': (4, "repeat = 0 is not right"),
+    STEP.replace("\n[[", "\nrepeat = 99999\n[[") + 'dwell = "1 s"\n[[phase.step]]\ndwell = "1 s"': (
+        0,
+        "the phases have",
+    ),
+}
+
+
+@table("text, line, sentence", [(text, *found) for text, found in MISTAKES.items()])
+def test_each_mistake_is_reported_in_one_sentence_that_names_its_line(
+    text: str, line: int, sentence: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("mistake")
+    path = write_test(folder, text, fan=CHE, pump=CHE, eeprom=EEPROM)
+    with pytest.raises(ValueError) as mistake:  # noqa: PT011 (the sentence is compared below)
+        load_test(path)
+    first = str(mistake.value).splitlines()[0]
+    assert first.startswith(f"{path}:{line}: " if line else f"{path}: ")
+    assert sentence in first
+
+
+def test_a_condition_compares_a_computed_channel(tmp_path: Path) -> None:
+    path = write_test(tmp_path, STEP + 'until = "fan.double > 3"\nwithin = "1 s"')
+    with (tmp_path / "plant.toml").open("a") as plant:
+        plant.write('[[line.drive.channel]]\nname = "double"\nvalue = "output_current * 2"\nunit = "A"\n')
+    (step,) = load_test(path).steps
+    assert step.until
+    assert (step.until.register, step.until.number) == ("double", 3.0)
+
+
+def test_a_plant_with_the_drive_test_is_refused(tmp_path: Path) -> None:
+    path = write_test(tmp_path, '[[phase]]\nname = "a"\n[[phase.step]]\ndwell = "1 s"', test=CHE)
+    with pytest.raises(ValueError, match=r'test.toml:1: the plant has a drive "test"'):
+        load_test(path)
+
+
+@table(
+    "line, keys, sentence",
+    [
+        (
+            STEP + 'dwell = "50 ms"\nfrequency = { fan = 1 }',
+            {},
+            "a lasts 50 ms, less than 2 bus cycles of line hall",
+        ),
+        (STEP + "frequency = { fan = 1 }", {}, "it would fit with"),
+        (
+            STEP + 'dwell = "9 s"\nfrequency = { fan = 1 }',
+            {"every": "5 ms"},
+            "line hall does not reach its polling",
+        ),
+        (
+            '[abort]\nsilence = "10 ms"\nlimits = ["fan.fault > 0"]\n' + STEP + 'dwell = "9 s"',
+            {},
+            "silence = 10 ms",
+        ),
+        (
+            '[abort]\nsilence = "3 s"\nlimits = ["fan.fault > 0"]\n' + STEP + 'dwell = "9 s"',
+            {"every": "2 s"},
+            "4 s",
+        ),
+    ],
+)
+def test_error_for_a_test_that_does_not_fit_its_line_says_what_would_fit(
+    line: str, keys: dict[str, str], sentence: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    plan = load_test(write_test(tmp_path_factory.mktemp("misfit"), line, fan=CHE | keys))
+    (found,) = misfits(plan)
+    assert sentence in found
+    assert "would fit with" in found
+
+
+def test_silence_is_longer_than_the_period_of_a_polled_fault_code() -> None:
+    fan = find_model("invt-che")(1, maximum_frequency=50, name="fan")
+    polled = PolledDrive(fan, ["output_frequency", Polled(fan.register("fault"), 2.0)])
+    plant = Plant([PlantLine("hall", "nowhere", drives=[polled])])
+    assert silence_of(RunPlan(plant, [RunStep("a", {"fan": 10.0}, dwell=9.0)])) == 6.0
+
+
+def test_each_write_of_a_step_needs_time(tmp_path: Path) -> None:
+    plan = load_test(write_test(tmp_path, STEP + 'dwell = "400 ms"\nfrequency = { fan = 1 }', fan=CHE))
+    assert misfits(plan) == []
+    many = replace(plan.steps[0], write={"fan": dict.fromkeys(map(str, range(20)), 1)})
+    (found,) = misfits(replace(plan, steps=(many,)))
+    assert found.startswith("a lasts 400 ms, less than ")
+
+
+@table("dwell, within", [(float("nan"), 0.0), (float("inf"), 0.0), (-1.0, 0.0), (0.0, float("nan"))])
+def test_a_step_that_would_never_end_is_refused(dwell: float, within: float) -> None:
+    with pytest.raises(ValueError, match="dwell and within must be 0 s or more, and finite"):
+        RunStep("a", dwell=dwell, within=within)
+
+
+def test_too_many_ramps_at_once_are_refused(tmp_path: Path) -> None:
+    names = [f"fan-{number}" for number in range(12)]
+    zero = ", ".join(f"{name} = 0" for name in names)
+    text = (
+        STEP
+        + f'frequency = {{ {zero} }}\ndwell = "9 s"\n'
+        + f'[[phase.step]]\nfrequency = {{ {zero} }}\nrate = 1\ndwell = "9 s"'
+    )
+    (found,) = misfits(load_test(write_test(tmp_path, text, **dict.fromkeys(names, CHE))))
+    assert found.startswith("a 2 ramps 12 drives of line hall at once: it would fit with ")
+
+
+def test_every_key_of_a_test_file_is_in_the_reference() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "test-file.md").read_text("utf-8")
+    keys = [key for table in (loader._TEST, loader._ABORT, loader._PHASE, loader._STEP) for key in table]
+    assert [key for key in keys if f"\n| `{key}` | " not in page] == []
+
+
+# ---- rows are compared with a run's limits, without a port and on a clock that the test sets ----
+
+
+S = 10**9
+TEXT = """
+[abort]
+limits = ["fan.output_current > 30"]
+[[phase]]
+name = "cool"
+[[phase.step]]
+until = "pump.output_frequency < 5"
+within = "1 min"
+"""
+
+
+@pytest.fixture
+def watch(tmp_path: Path) -> LimitWatch:
+    return LimitWatch(load_test(write_test(tmp_path, TEXT, fan=CHE, pump=CHE, spare=CHE)), 2 * S, 0)
+
+
+def row(drive: str, register: str, value: float | None, seconds: float = 1.0) -> Row:
+    at = round(seconds * S)
+    return Row(
+        at,
+        at,
+        None if value is None else 0,
+        drive,
+        register,
+        value,
+        "ok" if value is not None else "no reply",
+    )
+
+
+def test_one_row_beyond_a_limit_is_reported(watch: LimitWatch) -> None:
+    assert watch.add([row("fan", "output_current", 30.0), row("pump", "output_current", 99.0)]) == ""
+    assert watch.add([row("fan", "output_current", 30.1)]) == "fan.output_current > 30: it is 30.1 A"
+
+
+def test_a_fault_of_the_runs_drives_is_reported_by_name(watch: LimitWatch) -> None:
+    assert watch.add([row("fan", "fault", 0.0), row("spare", "fault", 4.0)]) == ""
+    assert watch.add([row("pump", "fault", 4.0)]).startswith("pump has a fault, ")
+
+
+def test_a_changed_fault_record_is_a_fault_but_an_old_record_is_not(tmp_path: Path) -> None:
+    pump = {"model": "erman-er-g-220", "poll": ["output_frequency", "last_fault"]}
+    watch = LimitWatch(load_test(write_test(tmp_path, TEXT, fan=CHE, pump=pump)), 2 * S, 0)
+    assert watch.add([row("pump", "last_fault", 3.0), row("pump", "last_fault", 3.0)]) == ""
+    assert watch.add([row("pump", "last_fault", None), row("pump", "last_fault", 0.0)]) == ""
+    assert watch.add([row("pump", "last_fault", 4.0)]).startswith("pump had a fault, ")
+
+
+def test_silence_of_a_drive_or_of_a_limited_register_is_reported(watch: LimitWatch) -> None:
+    watch.add([row("fan", "fault", 0.0, 1.9), row("pump", "fault", 0.0, 1.9)])
+    assert watch.silent(2 * S) == ""
+    assert watch.silent(3 * S) == "no value of fan.output_current came for 3.0 s"
+    watch.add([row("fan", "output_current", 1.0, 2.9)])
+    assert watch.silent(3 * S) == ""
+    watch.add([row("pump", "fault", None, 3.9)])  # a miss is not a value
+    assert watch.silent(4 * S) == "no value of pump came for 2.1 s"
+
+
+def test_a_fault_code_without_values_is_silence_of_its_drive(watch: LimitWatch) -> None:
+    for drive in ("fan", "pump"):
+        watch.add([row(drive, "output_current", 1.0, 2.9), row(drive, "fault", 0.0, 2.0)])
+    assert watch.silent(4 * S) == ""
+    watch.add([row("fan", "output_current", 1.0, 4.9), row("pump", "output_current", 1.0, 4.9)])
+    watch.add([row("fan", "fault", 0.0, 4.9), row("pump", "fault", None, 4.9)])
+    assert watch.silent(5 * S) == "no value of pump.fault came for 3.0 s"
+
+
+def test_a_channel_does_not_hide_the_silence_of_its_drive(watch: LimitWatch) -> None:
+    watch.add([row("fan", "output_current", 1.0, 3.0), row("pump", "power_of_all", 1.0, 3.0)])
+    assert watch.silent(3 * S) == "no value of pump came for 3.0 s"
+
+
+def test_a_condition_needs_a_value_that_is_new_enough(watch: LimitWatch, tmp_path: Path) -> None:
+    (condition,) = (step.until for step in load_test(tmp_path / "test.toml").steps)
+    assert condition
+    assert not watch.holds(condition, 0)
+    watch.add([row("pump", "output_frequency", 4.0)])
+    assert watch.holds(condition, S)
+    assert not watch.holds(condition, S + 1)
+    watch.add([row("pump", "output_frequency", None)])
+    assert not watch.holds(condition, S)

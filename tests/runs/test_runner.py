@@ -1,0 +1,454 @@
+"""Runs on simulated lines, judged by the far ends: order and times of writes, aborts, stops."""
+
+from __future__ import annotations
+
+import random
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+from commands import MULTIDROP
+from kills import BoundProcess
+from lines import until
+from simulated_bus import is_write
+from simulated_pumps import CHE, STEPS, far_ends, simulated_test, turning, write_test
+from tables import table
+
+from multidrop.bus import Bus
+from multidrop.control import read_audit
+from multidrop.core import Message, Names
+from multidrop.drive import Drive
+from multidrop.errors import WriteForbidden
+from multidrop.families import MODELS, DelixiModbus, InvtCHE
+from multidrop.families.registry import SHIPPED, find_model
+from multidrop.plant.model import Plant, PlantLine, PolledDrive, planned_on
+from multidrop.polling.added_rows import AddedRow, JoinedColumns
+from multidrop.polling.batch import Batch, Rows
+from multidrop.recording import open_recording
+from multidrop.runs import RunPlan, RunStep, TestRun, load_test, runner
+from multidrop.runs.runner import _Session
+from multidrop.runs.watch import LimitWatch
+from multidrop.sim import MotorDrive, Simulator, Wire, simulated
+from multidrop.sim.memory import MemoryCell
+from multidrop.sim.receiver import Frame
+from multidrop.transport import clock
+
+SPEED = 5.0
+
+
+@pytest.mark.slow
+def test_steps_are_carried_out_in_order_and_recorded_with_their_phases(tmp_path: Path) -> None:
+    out, audit = tmp_path / "run.arrows", tmp_path / "audit.jsonl"
+    with simulated_test(write_test(tmp_path), speed=SPEED) as (plan, (fan,)):
+        result = TestRun(plan, audit=audit, speed=SPEED).run(out)
+        assert (result.ok, result.abort, turning([fan])) == (True, "", [])
+        assert str(result.stopped["fan"]).startswith("fan: stopped after ")
+        setpoints = [write.raw for write in fan.counters.writes if write.name == "setpoint"]
+    assert setpoints == [2000, 4000, 6000]  # 10, 20 and 30 Hz in 0.01 % of 50 Hz
+    found = open_recording(out).to_pandas().sort_values("monotonic_ns", kind="stable")
+    assert [*found["phase"].unique()] in (["", *PHASES], PHASES)
+    assert found[found.phase == "steps 2"].value.max() > 0
+    assert [record["write"] for record in read_audit(audit)][:2] == [
+        "setpoint = 20.00 %",
+        "control = FORWARD",
+    ]
+
+
+PHASES = ["start", "steps 1", "steps 2", "stop"]
+
+
+def never(fan: MotorDrive) -> None:
+    """Change nothing during the run."""
+
+
+# for each kind of abort: lines of the test file, the event that causes it, and the reason in the result
+ABORTS: dict[str, tuple[str, Callable[[MotorDrive], None], str]] = {
+    "limit": (
+        '[abort]\nlimits = ["fan.output_current > 30"]',
+        lambda fan: fan.__setitem__("output_current", 31.0),
+        "fan.output_current > 30: it is 31.0 A",
+    ),
+    "silence": (
+        '[[phase]]\nname = "hold"\n[[phase.step]]\ndwell = "20 s"\n[abort]\nsilence = "1 s"',
+        lambda fan: setattr(fan, "deaf_until", fan.now + 3.0 * SPEED),
+        "no value of fan",
+    ),
+    "fault": ("", lambda fan: fan.trip(4), "fan has a fault, "),
+    "duration": ('[abort]\nduration = "2 s"', never, "the run took longer than its duration, 2 s"),
+    "until": (
+        '[[phase]]\nname = "hot"\n[[phase.step]]\nuntil = "fan.output_frequency > 60"\nwithin = "1 s"',
+        never,
+        "hot: fan.output_frequency > 60 did not hold within 1 s",
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ABORTS)
+def test_an_abort_stops_all_drives_and_says_why(kind: str, tmp_path: Path) -> None:
+    lines, event, reason = ABORTS[kind]
+    is_phase = lines.startswith("[[")
+    text = f"{STEPS}\n{lines}" if is_phase else f"{lines}\n{STEPS}"
+    path = write_test(tmp_path, text, fan=CHE, pump=CHE)
+    with simulated_test(path, speed=SPEED) as (plan, sims):
+        sims[1].motor.target = 20.0
+        sims[1].motor.run()  # the test run does not command this drive of the plant
+        happened: list[bool] = []
+
+        def happen(rows: object) -> None:
+            quiet = {"fault": "steps 1", "silence": "hold"}  # so that no command to the drive fails first
+            is_due = test.phase == quiet.get(kind, test.phase)
+            if sims[0].motor.energised and is_due and not happened:
+                happened.append(True)
+                event(sims[0])
+
+        test = TestRun(plan, speed=SPEED)
+        result = test.run(None, happen)
+        assert result.abort.startswith(reason)
+        assert not result.ok
+        assert {name for name, stopped in result.stopped.items() if stopped.ok} == {"fan", "pump"}
+        assert turning(sims) == []
+
+
+def test_a_test_run_whose_steps_would_wear_eeprom_is_refused() -> None:
+    mixer = PolledDrive(DelixiModbus(1, framing="rtu", name="mixer"), ["output_frequency"])
+    plan = RunPlan(Plant([PlantLine("hall", "nowhere", drives=[mixer])]), [RunStep("a", {"mixer": 10.0})])
+    with pytest.raises(WriteForbidden, match="EEPROM, which steps would wear out"):
+        TestRun(plan).run()
+
+
+@table(
+    "step, sentence",
+    [
+        (RunStep("b", start=("fan",), stop=("fan",)), "b: fan is stopped and commanded in one step"),
+        (RunStep("b", {"fan": 9.0}, rate=1.0, start=("fan",)), "b: fan cannot be started by a ramp"),
+    ],
+)
+def test_a_step_whose_commands_contradict_each_other_is_refused(step: RunStep, sentence: str) -> None:
+    fan = PolledDrive(InvtCHE(1, maximum_frequency=50, name="fan"), ["output_frequency"])
+    plant = Plant([PlantLine("hall", "nowhere", drives=[fan])])
+    with pytest.raises(ValueError, match=sentence):
+        TestRun(RunPlan(plant, [RunStep("a", {"fan": 5.0}), step])).run()
+
+
+class FixedPoller:
+    """A poller without lines; the only row of each batch is a current of this drive."""
+
+    buses: ClassVar[dict[str, Bus]] = {}
+
+    def __init__(self, *currents: float) -> None:
+        now = clock.now_ns()
+        self.waiting = [
+            Batch(
+                JoinedColumns(None, [AddedRow(0, now, 0, 0, 0, 0, current)]),
+                Names(["fan"]),
+                Names(["output_current"]),
+            )
+            for current in currents
+        ]
+
+    def take(self) -> Batch | None:
+        return self.waiting.pop(0) if self.waiting else None
+
+
+def session(folder: Path, limits: str, poller: Any, *takers: Any, writer: Any = None) -> _Session:
+    return _Session(
+        TestRun(load_test(write_test(folder, f"[abort]\n{limits}\n{STEPS}"))), poller, writer, takers
+    )
+
+
+def test_limits_are_compared_although_there_are_always_new_rows(tmp_path: Path) -> None:
+    poller = FixedPoller(1.0, 1.0)
+    found = session(tmp_path, 'duration = "3 s"', poller)
+    found._run._begin_ns = clock.now_ns() - 4 * 10**9
+    with pytest.raises(Exception, match="the run took longer than its duration, 3 s"):
+        found._look([])
+    assert len(poller.waiting) == 1
+
+
+class HangingWriter:
+    """A recording on a disk that hangs until it is released, or for 5 s."""
+
+    path = "run.arrows"
+
+    def __init__(self) -> None:
+        self.released = threading.Event()
+        self.written: list[str] = []
+
+    def write(self, rows: Rows) -> None:
+        self.released.wait(5.0)
+        self.written += [row.register for row in rows]
+
+    def close(self) -> None:
+        self.written.append("closed")
+
+
+LIMIT = 'limits = ["fan.output_current > 30"]'
+
+
+def test_limits_do_not_wait_for_a_disk_that_hangs_and_all_rows_are_written_in_order(tmp_path: Path) -> None:
+    disk, poller = HangingWriter(), FixedPoller(1.0, 31.0)
+    found = session(tmp_path, LIMIT, poller, writer=disk)
+    found._mark("start")
+    found._look([])
+    with pytest.raises(Exception, match=r"fan\.output_current > 30: it is 31\.0 A"):
+        found._look([])
+    assert found._is_stopping
+    assert not disk.written
+    disk.released.set()
+    assert found._end_rows() == []
+    assert disk.written == ["phase", "output_current", "phase", "output_current", "closed"]
+
+
+def test_rows_that_a_hanging_disk_loses_abort_the_run_and_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "MOST_WAITING", 2)
+    monkeypatch.setattr(runner, "ENDING_S", 0.01)
+    disk = HangingWriter()
+    found = session(tmp_path, LIMIT, FixedPoller(*[1.0] * 4), writer=disk)
+    for _ in range(4):  # the thread has taken at most one batch from the queue
+        found.take()
+    with pytest.raises(Exception, match=r"more than 2 batches waited for the recording run\.arrows"):
+        found._look([])
+    assert found._end_rows() == [
+        "4 rows did not reach the recording run.arrows, which did not end within 0.01 s"
+    ]
+    disk.released.set()
+
+
+def test_an_exception_of_a_function_that_takes_rows_ends_the_run(tmp_path: Path) -> None:
+    def fail(rows: Rows) -> None:
+        raise ZeroDivisionError
+
+    found = session(tmp_path, LIMIT, FixedPoller(1.0), fail)
+    assert found._end_rows() == []
+    with pytest.raises(ZeroDivisionError):
+        found._look([])
+
+
+@pytest.mark.slow
+def test_no_step_is_shortened_by_a_delay_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: dict[str, float] = {}
+    original = LimitWatch.add
+
+    def pause(watch: LimitWatch, rows: Rows) -> str:
+        if test.phase not in seen:
+            seen[test.phase] = test.elapsed
+            time.sleep(2.5 * (test.phase == "steps 1"))
+        return original(watch, rows)
+
+    monkeypatch.setattr(LimitWatch, "add", pause)
+    text = STEPS.replace("[20.0, 30.0]", "[20.0, 30.0, 40.0]").replace('"2 s"', '"1 s"')
+    with simulated_test(write_test(tmp_path, text)) as (plan, _):
+        test = TestRun(plan)
+        assert test.run().abort == ""
+    assert seen["steps 3"] - seen["steps 2"] >= 0.8
+
+
+@pytest.mark.slow
+def test_a_run_ends_if_the_computer_has_slept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with simulated_test(write_test(tmp_path, STEPS.replace('"2 s"', '"30 s"'))) as (plan, sims):
+        awake = clock.boottime_ns
+
+        def sleep(rows: object) -> None:
+            if test.phase == "steps 1":
+                monkeypatch.setattr(clock, "boottime_ns", lambda: awake() + 3600 * 10**9)
+
+        test = TestRun(plan)
+        result = test.run(None, sleep)
+        assert result.abort.startswith("no value of fan came for 3600")
+        assert turning(sims) == []
+
+
+@pytest.mark.slow
+def test_a_run_is_not_ok_if_the_stops_of_its_line_raise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = Bus.stop_all
+
+    def stop_all(bus: Bus) -> Any:
+        if bus.drives[0].name == "spare":
+            raise RuntimeError("no stops")
+        return original(bus)
+
+    monkeypatch.setattr(Bus, "stop_all", stop_all)
+    path = write_test(tmp_path, '[[phase]]\nname = "a"\n[[phase.step]]\ndwell = "1 s"')
+    spare = PolledDrive(find_model("invt-che")(1, maximum_frequency=50, name="spare"), ["fault"])
+    other = PlantLine("other", str(tmp_path / "other"), drives=[spare])
+    with simulated_test(path) as (plan, _), Simulator([Wire([simulated(spare.drive)], port=other.port)]):
+        plant = replace(plan.plant, lines=[*plan.plant.lines, other])
+        result = TestRun(plan.with_plant(plant)).run()
+    assert not result.ok
+    assert result.stopped["fan"].ok
+    assert str(result.stopped["spare"]).startswith("spare: sent but unknown")
+
+
+@pytest.mark.slow
+def test_a_refused_run_stops_no_motor_and_a_test_can_run_again(tmp_path: Path) -> None:
+    out = tmp_path / "run.arrows"
+    with simulated_test(write_test(tmp_path, '[abort]\nduration = "8 s"\n' + STEPS)) as (plan, (fan,)):
+        out.touch()
+        fan.motor.run()
+        test = TestRun(plan)
+        with pytest.raises(FileExistsError, match="exists already"):
+            test.run(out)
+        assert fan.motor.energised
+        assert not fan.counters.writes
+        for _ in range(2):
+            assert test.run().abort == ""
+
+
+@pytest.mark.slow
+def test_a_failed_command_aborts_before_any_later_step(tmp_path: Path) -> None:
+    with simulated_test(write_test(tmp_path), speed=SPEED) as (plan, (fan,)):
+        fan.trip(4)
+        result = TestRun(plan, speed=SPEED).run()
+        assert result.abort
+        assert "fan has a fault" in result.abort
+        assert turning([fan]) == []
+        assert not [write for write in fan.counters.writes if write.raw == 6000]
+
+
+WAITING = """
+[abort]
+limits = ["a.%s >= 60"]
+[[phase]]
+name = "wait"
+[[phase.step]]
+dwell = "20 s"
+[[phase.step]]
+start = ["a", "b", "c"]
+"""  # the start is never reached, but before the first step the drives' identities are checked
+OPTIONS = {"maximum_frequency": 50, "confirmed": 1}
+FAMILIES = [model for model in (*MODELS, *SHIPPED) if find_model(model).stop is not Drive.stop]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("model", FAMILIES)
+def test_the_first_stop_frame_of_an_abort_comes_within_two_bus_cycles(model: str, tmp_path: Path) -> None:
+    """Count the requests at the far end, from the read of the high value to the first write, a stop."""
+    family = find_model(model)
+    numbers = [register.name for register in family.readings() if register.values is None and register.step]
+    limited = "output_current" if "output_current" in numbers else "output_frequency"
+    keys: dict[str, Any] = {name: value for name, value in OPTIONS.items() if name in family.options}
+    keys |= {"model": model, "poll": [limited, *(name for name in numbers if name != limited)][:3]}
+    with simulated_test(write_test(tmp_path, WAITING % limited, a=keys, b=keys, c=keys)) as (plan, sims):
+        are_writes: list[bool] = []  # whether each request at the far end is a write
+        reads: list[int] = []  # numbers of requests that have read the high value
+        for sim in sims:
+            _note(sim, are_writes, lambda: sims[0].__setitem__(limited, 0.0))  # the motor is at rest
+        refresh = sims[0].refresh
+
+        def note_read(cell: MemoryCell) -> None:
+            refresh(cell)
+            if cell.name == limited:
+                reads.append(len(are_writes))
+
+        def exceed(rows: object) -> None:
+            if len(are_writes) > 12 and not any(are_writes):
+                sims[0][limited] = 60.0
+                vars(sims[0])["refresh"] = note_read
+
+        result = TestRun(plan).run(None, exceed)
+        cycle = len(planned_on(plan.plant.lines[0]))
+    assert result.abort.startswith(f"a.{limited} >= 60")
+    assert are_writes.index(True) + 1 - reads[0] <= 2 * cycle
+
+
+def _note(sim: MotorDrive, are_writes: list[bool], on_write: Callable[[], object]) -> None:
+    """Add to `are_writes`, for each request that this drive receives, whether it is a write."""
+    receive = sim.receive
+
+    def noting(frame: Frame) -> Message | None:
+        if frame.message is not None and frame.intact:
+            are_writes.append(is_write(frame.message))
+            if are_writes[-1]:
+                on_write()
+        return receive(frame)
+
+    vars(sim)["receive"] = noting
+
+
+# ---- interruptions, and lost ports ----
+
+SHORT = STEPS.replace('"2 s"', '"300 ms"')
+FAST = CHE | {"baudrate": 38400}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(10))
+def test_no_motor_keeps_running_after_ctrl_c_at_a_random_moment(seed: int, tmp_path: Path) -> None:
+    """Each seed interrupts 10 processes in turn, at random moments."""
+    path = write_test(tmp_path, SHORT, fan=FAST)
+    chance = random.Random(seed)
+    outcomes = []
+    for _ in range(10):
+        with (
+            simulated_test(path) as (_plan, sims),
+            BoundProcess(
+                [*MULTIDROP, "run", str(path), "--yes"],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            ) as process,
+        ):
+            until(lambda sims=sims: sims[0].counters.requests > 3)  # type: ignore[misc]
+            time.sleep(chance.uniform(0.0, 2.5))
+            process.send_signal(chance.choice((signal.SIGINT, signal.SIGTERM)))
+            _, errors = process.communicate()
+            outcomes.append(process.returncode)
+            assert turning(sims) == [], errors
+    assert set(outcomes) <= {0, 130, -signal.SIGINT, -signal.SIGTERM}  # 0: the signal came after the run
+    assert 130 in outcomes
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(20))
+def test_no_motor_keeps_running_after_a_port_was_lost(seed: int, tmp_path: Path) -> None:
+    path = write_test(tmp_path, '[abort]\nsilence = "500 ms"\n' + SHORT.replace("300 ms", "2 s"), fan=FAST)
+    plan = load_test(path)
+    sims, chance = far_ends(plan), random.Random(seed)
+    found: list[Any] = []
+    has_ended = threading.Event()
+
+    def lose() -> None:
+        until(
+            lambda: sims[0].motor.energised or has_ended.is_set()
+        )  # on a busy machine, the run may abort before the start
+        time.sleep(chance.uniform(0.0, 1.0))
+        first.__exit__(None, None, None)
+        time.sleep(chance.uniform(0.2, 2.0))
+        found.append(Simulator([Wire(sims, port=plan.plant.lines[0].port)]).__enter__())
+
+    first = Simulator([Wire(sims, port=plan.plant.lines[0].port)])
+    first.__enter__()
+    loser = threading.Thread(target=lose)
+    loser.start()
+    result = TestRun(plan).run()
+    has_ended.set()
+    loser.join()
+    assert turning(sims) == []
+    assert result.stopped["fan"].ok
+    found[0].__exit__(None, None, None)
+
+
+def test_a_simulation_speed_does_not_shorten_the_waits_of_other_threads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Another thread may ramp a real motor."""
+    waits: list[float] = []
+    monkeypatch.setattr(time, "sleep", waits.append)
+    with clock.at_speed(10.0):
+        clock.sleep(5.0)
+        other = threading.Thread(target=clock.sleep, args=[5.0])
+        other.start()
+        other.join()
+    clock.sleep(5.0)
+    assert waits == [0.5, 5.0, 5.0]
