@@ -1,0 +1,193 @@
+"""The part `trigger`: conditions over polled values, and the last moment at which each became true."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, NamedTuple
+
+from multidrop import Batch, Plant
+from multidrop.channels import ChannelSet, DriveSeries
+from multidrop.gateway.clock import iso_time
+from multidrop.gateway.parts import PartContext
+from multidrop.plant import FAULT, POST_S, PRE_S, TriggerSeries, series_of, with_triggers
+from multidrop.polling import slot_rows
+from multidrop.supervisor import supervisor
+from multidrop.toml_check import DURATION, parse_duration
+
+ADOPT_S = 30.0  # time limit for checking the conditions against a new plant
+LONGEST_NAME = 60  # limit of a trigger's name, in characters
+EXAMPLE = 'conditions = { trip = "pump-1.output_current > 30" }'
+TEXTS = {"additionalProperties": {"type": "string", "minLength": 1}, "minProperties": 1}
+
+_log = logging.getLogger("multidrop.gateway")
+
+
+@dataclass(frozen=True)
+class TriggerSettings:
+    """The settings in the table `[serve.trigger]`. Raises ValueError with a line for each mistake."""
+
+    conditions: Mapping[str, str] = field(default_factory=dict, metadata=TEXTS)
+    pre: str = field(default=f"{PRE_S:g} s", metadata=DURATION)
+    post: str = field(default=f"{POST_S:g} s", metadata=DURATION)
+
+    def __post_init__(self) -> None:
+        mistakes = [] if self.conditions else [f"conditions is missing; add {EXAMPLE}"]
+        for key in ("pre", "post"):
+            try:
+                parse_duration(getattr(self, key))
+            except ValueError as mistake:
+                mistakes.append(f"{key} = {mistake}")
+        for name, condition in self.conditions.items():
+            if not 0 < len(name) <= LONGEST_NAME or not name.isprintable():
+                mistakes.append(
+                    f"a trigger's name has 1 to {LONGEST_NAME} printable characters, not {name!r}"
+                )
+            if not isinstance(condition, str) or not condition:
+                mistakes.append(f"{name} = {condition!r} is not a condition; write {EXAMPLE}")
+        if mistakes:
+            raise ValueError("\n".join(mistakes))
+
+    def check(self, plant: Plant) -> list[str]:
+        """Return a sentence for each condition that does not fit the plant."""
+        try:
+            if plant.lines:
+                with_triggers(plant, self.conditions.values())
+        except ValueError as mistake:
+            return str(mistake).splitlines()
+        return []
+
+
+Settings = TriggerSettings
+
+
+def build(settings: TriggerSettings, context: PartContext) -> Triggers:
+    """Return the triggers of a gateway. Call it in a thread: a large plant takes seconds."""
+    return Triggers(settings, context.plant)
+
+
+class Trigger(NamedTuple):
+    """The moment at which a condition became true, UTC in ns, and the registers that it names."""
+
+    name: str
+    condition: str
+    time_ns: int
+    signals: Sequence[TriggerSeries]
+
+
+class Triggers:
+    """The conditions, and in `last` the last trigger by name. Raises ValueError for a wrong condition."""
+
+    def __init__(self, settings: TriggerSettings, plant: Plant) -> None:
+        self._settings = settings
+        self._plant = plant
+        self._is_new = asyncio.Event()  # set if `adopt` has brought another plant
+        self._conditions: _Conditions | None = _Conditions(plant, settings.conditions)
+        self._around_ns = tuple(round(parse_duration(one) * 1e9) for one in (settings.pre, settings.post))
+        self.last: dict[str, Trigger] = {}
+
+    def take(self, batch: Batch) -> None:
+        """Evaluate the conditions over the rows of their registers, within microseconds for each row."""
+        for trigger in self._conditions.triggers(batch) if self._conditions else ():
+            self.last[trigger.name] = trigger
+            _log.info("trigger %s: %s", trigger.name, trigger.condition)
+
+    def adopt(self, plant: Plant) -> None:
+        """Evaluate the conditions over another plant, after `run` has checked them in a thread."""
+        self._plant, self._conditions = plant, None
+        self._is_new.set()
+
+    async def run(self) -> None:
+        """Check the conditions against each plant that is adopted. Raises ValueError if one does not fit."""
+        while True:
+            await self._is_new.wait()
+            self._is_new.clear()
+            plant = self._plant
+            work = partial(_Conditions, plant, self._settings.conditions)
+            found = await supervisor().within("triggers", ADOPT_S, work)
+            if plant is self._plant:
+                self._conditions = found
+
+    async def close(self) -> None:
+        """Do nothing: triggers are only in memory."""
+
+    def as_answer(self) -> list[dict[str, Any]]:
+        """Return the last trigger of each name for clients, the newest first, with the time range to show."""
+        pre_ns, post_ns = self._around_ns
+        return [
+            {
+                "name": one.name,
+                "condition": one.condition,
+                "time": iso_time(one.time_ns // 1_000_000),
+                "from": iso_time((one.time_ns - pre_ns) // 1_000_000),
+                "to": iso_time((one.time_ns + post_ns) // 1_000_000),
+                "signals": [{"drive": drive, "register": register} for drive, register in one.signals],
+            }
+            for one in sorted(self.last.values(), key=lambda one: -one.time_ns)
+        ]
+
+
+class _Conditions:
+    """Conditions that are evaluated over the rows of a plant. Raises ValueError if one does not fit."""
+
+    def __init__(self, plant: Plant, conditions: Mapping[str, str]) -> None:
+        self._names = [*conditions]
+        self._found = found = with_triggers(plant, conditions.values())
+        drives = series_of(found.plant)
+        holds_s = ChannelSet(drives).holds_s
+        self._channels = ChannelSet([_with_triggers_only(drive, found.texts, holds_s) for drive in drives])
+        needed = {
+            series
+            for text, signals in found.signals.items()
+            for series in signals
+            if text in conditions.values() or series[1] == FAULT  # others are only listed in the trigger
+        }
+        self._inputs = {series: slot for series, slot in self._channels.inputs.items() if series in needed}
+        self._by_slot = {slot: name for name, slot in self._channels.slots.items()}
+        self._slots: dict[tuple[int, int], int] = {}  # slots of the inputs, by drive and register code
+        self._sizes = (0, 0)  # how many drive and register names the newest batch has
+        self._was: dict[int, bool] = {}  # by slot: whether the condition was true
+
+    def triggers(self, batch: Batch) -> Iterator[Trigger]:
+        """Yield a trigger for each condition that changes from false to true in this batch."""
+        columns = batch.columns()
+        if self._sizes != (sizes := (len(columns.drives), len(columns.registers))):
+            self._sizes = sizes
+            drives = {name: code for code, name in enumerate(columns.drives)}
+            registers = {name: code for code, name in enumerate(columns.registers)}
+            self._slots = {
+                (drives[drive], registers[register]): slot
+                for (drive, register), slot in self._inputs.items()
+                if drive in drives and register in registers
+            }
+        # A batch has the rows of channels after those of registers. Here all must be in the order of time.
+        rows = sorted(
+            slot_rows(columns, self._slots), key=lambda row: (row.monotonic_ns, self._by_slot[row.slot][0])
+        )
+        for row in self._channels.compute(rows):
+            if row.status != 0:
+                continue
+            was, self._was[row.slot] = self._was.get(row.slot), bool(row.value)
+            if row.value and was is False:
+                series = self._by_slot[row.slot]
+                text = self._found.texts[series]
+                name = self._names[self._found.numbers[series]]
+                yield Trigger(name, text, row.time_ns, self._found.signals[text])
+        self._channels.outages.clear()
+
+
+def _with_triggers_only(
+    drive: DriveSeries, triggers: Container[TriggerSeries], holds_s: Mapping[TriggerSeries, float]
+) -> DriveSeries:
+    """Return a drive's series whose only channels are triggers; the drive's other channels are inputs.
+
+    The values of these inputs come from rows, whose totals continue after a restart. Totals computed here
+    would not.
+    """
+    own = [channel for channel in drive.channels if (drive.name, channel.name) not in triggers]
+    inputs = {channel.name: (channel.unit, holds_s[drive.name, channel.name]) for channel in own}
+    computed = [channel for channel in drive.channels if (drive.name, channel.name) in triggers]
+    return DriveSeries(drive.name, {**drive.polled, **inputs}, drive.known, computed)
