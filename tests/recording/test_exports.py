@@ -1,0 +1,222 @@
+"""Exports as MDF4 and HDF5, read with asammdf and h5py, and compared with the recording's own table."""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pytest
+from batches import SECOND, UTC_0
+from peers import require_installed
+from recordings import ABOUT, record, row
+
+from multidrop.polling.batch import Row
+from multidrop.recording import RecordingError, convert, open_recording
+from multidrop.recording.phases import phase_row, with_phases
+
+require_installed("asammdf")
+require_installed("h5py")
+
+TRIGGER = {"condition": "pump.output_current > 30", "time_ns": UTC_0 + 3 * SECOND}
+METADATA = with_phases({**ABOUT, "multidrop": "0.1.0", "trigger": TRIGGER}, ["start", "stop"])
+STATE = "fault"
+COMMENT = Row(UTC_0 + SECOND // 2, SECOND // 2, None, "event", "comment", None, "подшипник changed")
+
+
+def rows(number: int) -> list[Row]:
+    """Return rows of two drives and a phase at irregular times; a tenth of the values is missed."""
+    chance, found, at = random.Random(number), [*phase_row(0, UTC_0, 0), COMMENT], 0.0
+    for _ in range(number):
+        at += chance.uniform(0.0005, 0.003)
+        for drive, register in (("pump", "output_frequency"), ("pump", STATE), ("fan", "output_current")):
+            value = chance.choice([0.0, 8.0, 77.0]) if register == STATE else chance.gauss(20, 5)
+            is_missed = chance.random() < 0.1
+            status = chance.choice(["no reply", "bad checksum"]) if is_missed else "ok"
+            found.append(row(at, drive, register, None if is_missed else value, status, chance.uniform(1, 9)))
+    middle = round(at / 2 * SECOND)
+    return [*found, *phase_row(1, UTC_0 + middle, middle)]
+
+
+def exported(path: Path, suffix: str, number: int = 400) -> tuple[Path, pa.Table]:
+    """Return an export, and the table of the recording that it was made from."""
+    source, target = record(path / "run.arrows", rows(number), METADATA), path / f"run{suffix}"
+    assert convert(source, target) == 3 * number + 3
+    return target, pa.table(open_recording(source))
+
+
+@pytest.fixture(params=[1 << 18, 100], ids=["one piece", "many pieces"])
+def _pieces(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write the export in one piece, or in many."""
+    monkeypatch.setattr("multidrop.recording.series.PIECE_ROWS", request.param)
+
+
+def of(table: pa.Table, drive: str, register: str) -> dict[str, list[Any]]:
+    """Return the columns of one register, sorted by time; times are in ns."""
+    found = table.set_column(0, "time", table.column("time").cast(pa.int64())).to_pylist()
+    own = [one for one in found if (one["drive"], one["register"]) == (drive, register)]
+    own.sort(key=lambda one: one["time"])
+    return {name: [one[name] for one in own] for name in table.column_names}
+
+
+SERIES = [("pump", "output_frequency"), ("pump", STATE), ("fan", "output_current"), ("test", "phase")]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_pieces")
+def test_mdf4_has_the_rows_of_the_recording(tmp_path: Path) -> None:
+    from asammdf import MDF
+
+    path, table = exported(tmp_path, ".mf4")
+    with MDF(path) as mdf:
+        begin = mdf.header.abs_time
+        assert (begin, mdf.start_time.isoformat()) == (UTC_0, "2026-11-21T09:29:59.123457+00:00")
+        for drive, register in SERIES:
+            name, expected = f"{drive}.{register}", of(table, drive, register)
+            value = mdf.get(name, raw=True, ignore_invalidation_bits=True)
+            assert [begin + round(at * 1e9) for at in value.timestamps.tolist()] == expected["time"]
+            missed = (
+                [False] * len(value) if value.invalidation_bits is None else list(value.invalidation_bits)
+            )
+            assert [
+                None if miss else one for one, miss in zip(value.samples.tolist(), missed, strict=True)
+            ] == (expected["value"])
+            assert value.unit == {"output_frequency": "Hz", "output_current": "raw count"}.get(register, "")
+            statuses = [text.decode() for text in mdf.get(f"{name}.status").samples.tolist()]
+            assert statuses == expected["status"]
+            uncertainty = mdf.get(f"{name}.uncertainty")  # it has no samples for misses
+            known = [one / 1e9 for one in expected["uncertainty_ns"] if one is not None]
+            assert uncertainty.samples.tolist() == pytest.approx(known)
+        texts = {str(one, "utf-8") for one in mdf.get(f"pump.{STATE}").samples.tolist()}
+        assert texts == {"NONE", "OVERHEAT", "unnamed"}  # 77 has no name
+        assert set(mdf.get("test.phase").samples.tolist()) == {b"start", b"stop"}
+        events = {(one.name, one.comment, begin + round(one.value * 1e9)) for one in mdf.events}
+        assert events == {
+            ("comment", COMMENT.status, COMMENT.time_ns),
+            ("trigger", TRIGGER["condition"], TRIGGER["time_ns"]),
+        }
+        assert json.loads(bytes(mdf.extract_attachment(0)[0])) == METADATA
+
+
+@pytest.mark.usefixtures("_pieces")
+def test_hdf5_has_the_rows_of_the_recording(tmp_path: Path) -> None:
+    import h5py
+
+    path, table = exported(tmp_path, ".h5")
+    with h5py.File(path) as file:
+        statuses = [text.decode() for text in file["statuses"][:].tolist()]
+        for drive, register in SERIES:
+            group, expected = file[f"drives/{drive}/{register}"], of(table, drive, register)
+            assert (group.attrs["drive"], group.attrs["register"]) == (drive, register)
+            assert group["time_ns"][:].tolist() == expected["time"]
+            assert group["monotonic_ns"][:].tolist() == expected["monotonic_ns"]
+            valid = group["valid"][:].tolist()
+            for name in ("value", "uncertainty_ns"):
+                found = zip(group[name][:].tolist(), valid, strict=True)
+                assert [one if is_valid else None for one, is_valid in found] == expected[name]
+            assert [statuses[code] for code in group["status"][:].tolist()] == expected["status"]
+        assert file["drives/pump/output_frequency"].attrs["unit"] == "Hz"
+        assert json.loads(file[f"drives/pump/{STATE}"].attrs["values"])["OVERHEAT"] == 8
+        texts = [tuple(text.decode() for text in file["events"][name][:]) for name in ("kind", "text")]
+        assert texts == [("comment", "trigger"), (COMMENT.status, TRIGGER["condition"])]
+        assert file["events/time_ns"][:].tolist() == [COMMENT.time_ns, TRIGGER["time_ns"]]
+        assert json.loads(file["metadata"][()]) == METADATA
+
+
+def test_error_for_another_suffix_names_the_exports(tmp_path: Path) -> None:
+    source = record(tmp_path / "run.arrows", rows(1), METADATA)
+    with pytest.raises(ValueError, match=r"must end in \.arrows, \.csv, \.parquet, \.mf4, \.h5"):
+        convert(source, tmp_path / "run.xls")
+
+
+@pytest.mark.parametrize(
+    ("suffix", "library", "extra"), [(".mf4", "asammdf", "mdf"), (".h5", "h5py", "hdf5")]
+)
+def test_missing_library_is_reported_with_its_extra(
+    suffix: str, library: str, extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = record(tmp_path / "run.arrows", rows(1), METADATA)
+    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.delitem(
+        sys.modules, f"multidrop.recording.{'mdf4' if library == 'asammdf' else 'hdf5'}", False
+    )
+    with pytest.raises(
+        RecordingError, match=rf"{suffix} needs {library}: pip install .*multidrop\[{extra}\]"
+    ):
+        convert(source, tmp_path / f"run{suffix}")
+    assert not (tmp_path / f"run{suffix}").exists()
+
+
+@pytest.mark.parametrize("suffix", [pytest.param(".mf4", marks=pytest.mark.slow), ".h5"])
+@pytest.mark.parametrize("time_ns", [-1, (1 << 63) - 1])
+def test_row_without_a_usable_time_is_reported(time_ns: int, suffix: str, tmp_path: Path) -> None:
+    wrong = rows(1)[-1]._replace(time_ns=time_ns)
+    source, target = record(tmp_path / "run.arrows", [*rows(1), wrong], METADATA), tmp_path / f"run{suffix}"
+    with pytest.raises(ValueError, match=rf"run{suffix}: rows from before 1970 or after 2200 do not fit"):
+        convert(source, target)
+    assert not target.exists()
+
+
+@pytest.mark.parametrize("suffix", [pytest.param(".mf4", marks=pytest.mark.slow), ".h5"])
+def test_existing_file_is_kept_and_an_incomplete_one_is_removed(
+    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, target = record(tmp_path / "run.arrows", rows(1), METADATA), tmp_path / f"run{suffix}"
+    target.write_bytes(b"other")
+    with pytest.raises(FileExistsError):
+        convert(source, target)
+    assert target.read_bytes() == b"other"
+    target.unlink()
+
+    def fail(*_: object) -> Callable[[], None]:
+        raise ValueError("damaged")
+
+    monkeypatch.setattr("multidrop.recording.series.codes_of", fail)
+    with pytest.raises(ValueError, match="damaged"):
+        convert(source, target)
+    assert [path.name for path in tmp_path.iterdir()] == ["run.arrows"]
+
+
+def test_interrupt_during_a_write_of_hdf5_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from multidrop.recording.hdf5 import GuardedFile
+
+    source, calls, write = record(tmp_path / "run.arrows", rows(100), METADATA), count(), GuardedFile.write
+
+    def interrupted_write(file: GuardedFile, piece: Any) -> int:
+        if next(calls) == 20:
+            signal.raise_signal(signal.SIGINT)
+        return write(file, piece)
+
+    monkeypatch.setattr(GuardedFile, "write", interrupted_write)
+    with pytest.raises(KeyboardInterrupt):
+        convert(source, tmp_path / "run.h5")
+    assert [path.name for path in tmp_path.iterdir()] == ["run.arrows"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit for a file's size")
+@pytest.mark.parametrize("suffix", [".mf4", ".h5"])
+def test_full_disk_leaves_no_file(suffix: str, tmp_path: Path) -> None:
+    """Files are limited to 20,000 bytes. A failed write that HDF5 noticed would crash the process."""
+    import resource
+
+    source = record(tmp_path / "run.arrows", rows(2000), METADATA)
+    command = [sys.executable, "-m", "multidrop", "convert", str(source), str(tmp_path / f"run{suffix}")]
+    full = subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)),
+        check=False,
+    )
+    assert (full.returncode, "cannot be written: File too large" in full.stderr) == (1, True), full.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["run.arrows"]
