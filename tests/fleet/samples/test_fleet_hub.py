@@ -15,8 +15,7 @@ import pytest
 from nats_clusters import Cluster
 from peers import require_module
 from postgres_clusters import Postgres, postgres
-from sample_streams import empty_stream
-from spooled import NOON, STEP, exchanges_in, numbered, rows_of
+from spooled import NOON, STEP, empty_stream, exchanges_in, numbered, rows_of
 
 from multidrop import History
 from multidrop.fleet.errors import FleetError
@@ -29,13 +28,12 @@ from multidrop.fleet.samples.hub import (
     NotThisHubs,
     SampleHub,
     SampleSink,
-    SinkError,
 )
-from multidrop.fleet.samples.message import RowBuffer, unpack
 from multidrop.fleet.samples.parquet_sink import ParquetSink
 from multidrop.fleet.samples.postgres_sink import PostgresSink
 from multidrop.fleet.samples.samples_stream import StreamMessage, publish
 from multidrop.fleet.servers.connections import ServerPath
+from multidrop.samples.message import RowBuffer, SinkError, unpack
 
 LOG = "00112233aabbccdd"
 PATIENCE_S = 60.0
@@ -183,7 +181,7 @@ async def test_messages_from_several_answers_are_stored_once(
 async def test_a_commit_ends_at_its_memory_limit(
     running: Cluster, monkeypatch: pytest.MonkeyPatch, is_good: bool
 ) -> None:
-    """Few rows may have long names, and ignored messages were read into memory too."""
+    """Even few rows need much memory if names are long, and ignored messages need memory too."""
     monkeypatch.setattr(hub_module, "MOST_READ", 1)
     monkeypatch.setattr(hub_module, "MOST_BYTES", 1000)
     sink = Memory()
@@ -246,7 +244,10 @@ async def test_a_stream_that_lost_its_end_is_refused(running: Cluster) -> None:
         await say(path, 1, message(0))
         sink = Memory()
         sink.commits.append(Commit("", 1, 5, {}, [], 0))
-        with pytest.raises(NotThisHubs, match="the stream ends at message 1, and 5 are stored: it lost some"):
+        with pytest.raises(
+            NotThisHubs,
+            match="the stream ends at message 1, but 5 are already stored: the stream has lost messages",
+        ):
             await SampleHub(path, sink).run()
 
 
@@ -295,11 +296,11 @@ async def test_hub_files_are_read_by_history_and_duckdb(running: Cluster, tmp_pa
 
 
 async def test_an_unfinished_file_is_not_a_commit(running: Cluster, tmp_path: Path) -> None:
-    """A killed hub leaves an unfinished file, and reads the rows again from the stream."""
+    """A killed hub leaves an unfinished file. The next hub reads its rows again from the stream."""
     async with empty_stream(running) as path:
         await say(path, 1, message(5))
         await kept_in_files(path, tmp_path, 1)
-        part = tmp_path / "rows" / ".00000002-00000003.20261121T120000Z-20261121T120001Z.parquet.writing"
+        part = tmp_path / "rows" / ".00000002-00000003.20261121T120000Z-20261121T120001Z.parquet.tmp"
         part.write_bytes(b"PAR1")
         await say(path, 2, message(10))
         state = await kept_in_files(path, tmp_path, 2)
@@ -317,7 +318,7 @@ def commit_of(
 def test_a_file_is_renamed_after_its_sync(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise a power cut could leave an incomplete file."""
     calls: list[str] = []
-    really_synced, really_renamed = os.fsync, Path.rename
+    really_synced, really_renamed = os.fsync, Path.replace
 
     def fsync(file: int) -> None:
         calls.append(f"fsync {Path(f'/proc/self/fd/{file}').readlink().name[:9]}")
@@ -330,7 +331,7 @@ def test_a_file_is_renamed_after_its_sync(tmp_path: Path, monkeypatch: pytest.Mo
     with closing(ParquetSink(tmp_path)) as sink:
         sink.begin("then")
         monkeypatch.setattr(os, "fsync", fsync)
-        monkeypatch.setattr(Path, "rename", rename)
+        monkeypatch.setattr(Path, "replace", rename)
         sink.write(commit_of())
     assert calls == ["fsync .00000001", "rename .00000001", "fsync rows"]
 
@@ -341,7 +342,7 @@ def test_a_folder_of_another_stream_or_program_is_refused(tmp_path: Path) -> Non
     sink.write(commit_of())
     assert sink.begin("then") == KeptPlace(1, {"a.x": 1})
     with pytest.raises(
-        NotThisHubs, match="of a stream created at then, and this one was created at now: name"
+        NotThisHubs, match="of a stream created at then, but the present stream was created at now: name"
     ):
         sink.begin("now")
     with pytest.raises(NotThisHubs, match=f"another hub writes into {tmp_path}"):
@@ -433,7 +434,7 @@ def test_a_second_hub_of_a_database_waits_until_the_first_ends(empty: Postgres) 
     one.close()
     assert other.begin("then") == KeptPlace(1, {"a.x": 1})
     with pytest.raises(
-        NotThisHubs, match="created at then, and this one was created at now: name another database"
+        NotThisHubs, match="created at then, but the present stream was created at now: name another database"
     ):
         other.begin("now")
     other.close()
@@ -453,7 +454,7 @@ def test_rows_after_a_moved_position_are_refused(empty: Postgres) -> None:
 
 
 @pytest.mark.slow
-def test_a_missing_database_is_one_sentence(empty: Postgres) -> None:
+def test_a_missing_database_is_reported_in_one_sentence(empty: Postgres) -> None:
     sink = PostgresSink(f"{empty.where} connect_timeout=2".replace(f"port={empty.port}", "port=1"))
     with pytest.raises(SinkError, match=r"PostgreSQL: .*Connection refused"):
         sink.begin("then")
@@ -462,7 +463,7 @@ def test_a_missing_database_is_one_sentence(empty: Postgres) -> None:
 
 
 @pytest.mark.long
-def test_insufficient_database_rights_are_one_sentence(empty: Postgres) -> None:
+def test_insufficient_database_rights_are_reported_in_one_sentence(empty: Postgres) -> None:
     empty.ask("drop role if exists reader; create role reader login")
     sink = PostgresSink(empty.where.replace("user=multidrop", "user=reader"))
     with pytest.raises(SinkError, match="PostgreSQL: permission denied for database postgres"):

@@ -1,27 +1,32 @@
-"""The forwarder with real servers: in order, each message once, whatever the network loses."""
+"""The forwarder with real servers: it stores each message once and in order, whatever the network loses."""
 
 from __future__ import annotations
 
 import asyncio
+import importlib
 import logging
 import random
 import re
+from collections import Counter
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager, closing, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from nats_clusters import Cluster, cluster
-from sample_streams import empty_stream
-from spooled import exchanges_in, numbered, rows_of
+from peers import require_module
+from spooled import empty_stream, exchanges_in, numbered, rows_of
+from tables import table
 
+from multidrop import History
 from multidrop.fleet.errors import FleetError, NoRight, Unsure
 from multidrop.fleet.samples import forwarder as forwarder_module
 from multidrop.fleet.samples import samples_stream
 from multidrop.fleet.samples.forwarder import Forwarder
-from multidrop.fleet.samples.message import MOST_BYTES, unpack
+from multidrop.fleet.samples.hub import HubState, SampleHub
+from multidrop.fleet.samples.parquet_sink import ParquetSink
 from multidrop.fleet.samples.samples_stream import (
     StreamMessage,
     about,
@@ -33,8 +38,10 @@ from multidrop.fleet.samples.samples_stream import (
     samples_path,
     subject_of,
 )
-from multidrop.fleet.samples.spool import Spool
 from multidrop.fleet.servers.connections import ServerPath
+from multidrop.samples.message import MOST_BYTES, unpack
+from multidrop.samples.spool import Spool, SpoolState
+from multidrop.supervisor import end_tasks
 
 PATIENCE_S = 30.0
 
@@ -82,6 +89,13 @@ async def store(spool: Spool, first: int) -> None:
     """Append five exchanges to the spool, and wait until they are on the disk as a message."""
     spool.append(numbered(first, 5))
     assert await asyncio.to_thread(spool.sync, PATIENCE_S)
+
+
+@table("name", ["", "a.b", "a b", "*", ">", "ä", "a/b"])
+def test_names_invalid_in_subjects_are_rejected(name: str) -> None:
+    spool: Any = SimpleNamespace(gateway=name, log="00112233aabbccdd")
+    with pytest.raises(ValueError, match="may have only letters, digits, _ and -"):
+        Forwarder(spool, spool)
 
 
 async def test_messages_are_stored_in_the_stream_in_order(running: Cluster, tmp_path: Path) -> None:
@@ -149,13 +163,13 @@ async def test_after_lost_messages_or_answers_each_message_is_stored_once(
     spool = filled(tmp_path / "spool", 6)
     async with empty_stream(running) as path, forwarding(spool, Lossy(path, fates)) as forwarder:
         await until(lambda: forwarder.last == 6)
-        await asyncio.sleep(0.1)  # until late messages were refused
+        await asyncio.sleep(0.1)  # waits until late messages have been refused
         assert [one.sequence for one in await stored(path)] == [1, 2, 3, 4, 5, 6]
     spool.close()
 
 
 async def test_server_answers_within_a_log_are_ignored(running: Cluster, tmp_path: Path) -> None:
-    """Any client may direct a server's answer to this subject. The log's messages are still sent once."""
+    """Any client may direct a server's answer to this subject. Each message of the log is still sent once."""
     spool = filled(tmp_path / "spool", 2)
     subject = subject_of("gateway-1", spool.log)
     answers = [{}, {"Nats-Stream": "KV_own_0", samples_stream.SEQUENCE: "99"}]
@@ -216,7 +230,7 @@ async def test_a_restored_old_folder_is_logged_and_not_forwarded(
         spool.close()
         (tmp_path / "spool" / "000000000002-50.arrows").unlink()
         spool = Spool(tmp_path / "spool", "gateway-1")
-        for number in (100, 200):  # first a log as long as the stream's, then a longer one
+        for number in (100, 200):  # the spool's log is first as long as the stream's, then longer
             async with forwarding(spool, path) as forwarder:
                 await until(lambda forwarder=forwarder: forwarder.trouble)
             await store(spool, number)
@@ -285,7 +299,7 @@ async def test_a_missing_stream_is_reported_and_waited_for(running: Cluster, tmp
 
 
 @pytest.mark.long
-def test_insufficient_rights_are_one_sentence(tmp_path: Path) -> None:
+def test_insufficient_rights_are_reported_in_one_sentence(tmp_path: Path) -> None:
     with cluster(tmp_path, 1) as servers:
         path = tmp_path / "n1.conf"
         servers.nodes[0].kill()
@@ -308,3 +322,112 @@ def test_insufficient_rights_are_one_sentence(tmp_path: Path) -> None:
                     await publish(path, subject_of("gateway-1", "b"), b"", {})
 
         asyncio.run(live())
+
+
+# ---- kills of every process between a poller and the sinks: no reported sample is lost or duplicated ----
+
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def chaos(monkeypatch: pytest.MonkeyPatch) -> Any:
+    require_module("duckdb")
+    monkeypatch.syspath_prepend(str(ROOT))
+    return importlib.import_module("bench.questions.fleet_chaos")
+
+
+def test_lost_and_duplicated_rows_are_found(chaos: Any) -> None:
+    told = {"gateway-1": {0: 4, 1_000_000: 2}, "gateway-2": {0: 3}}
+    whole = {
+        "gateway-1": Counter([0, 1, 2, 3, 4, 5, 1_000_000, 1_000_001]),  # rows 4 and 5 were not reported
+        "gateway-2": Counter([0, 1, 2]),
+    }
+    assert chaos.compare(told, whole) == (9, 0, 0, 0)
+    lost = {**whole, "gateway-2": Counter([0, 1])}
+    assert chaos.compare(told, lost) == (9, 1, 0, 0)
+    hole = {**whole, "gateway-1": Counter([0, 1, 2, 3, 5, 1_000_000, 1_000_001])}
+    assert chaos.compare(told, hole) == (9, 0, 1, 0)
+    doubled = {**whole, "gateway-2": Counter([0, 1, 1, 2])}
+    assert chaos.compare(told, doubled) == (9, 0, 0, 1)
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_no_sample_is_lost_during_random_kills(chaos: Any, tmp_path: Path) -> None:
+    wrong = chaos.run(tmp_path, 12.0, random.Random(2))
+    print(*(f"{path.name}: {path.read_text()[-2000:]}" for path in tmp_path.glob("*.log")), sep="\n")
+    assert wrong == 0
+    assert chaos.alarms(tmp_path) == []
+
+
+# ---- a long outage: the spool keeps as much as its limit allows, and the hub knows which rows are lost ----
+
+
+MESSAGES, EXCHANGES = 40, 5
+LONG_PATIENCE_S = 60.0
+
+
+async def forwarded(spool: Spool, servers: Cluster) -> None:
+    async with samples_path(servers.urls) as path, asyncio.timeout(LONG_PATIENCE_S):
+        forwarder = Forwarder(spool, path)
+        task = asyncio.create_task(forwarder.run())
+        while forwarder.last != spool.state().newest:
+            await asyncio.sleep(0.01)
+        await end_tasks(task)
+
+
+async def kept(folder: Path, servers: Cluster) -> HubState:
+    async with samples_path(servers.urls) as path:
+        with closing(ParquetSink(folder)) as sink:
+            hub = SampleHub(path, sink)
+            await hub.run(once=True)
+        return hub.state()
+
+
+def filled_from(folder: Path, first: int, most: int) -> Spool:
+    spool = Spool(folder, "gateway-1", most=most)
+    for number in range(first, first + MESSAGES):
+        spool.append(numbered(number * EXCHANGES, EXCHANGES))
+        assert spool.sync(LONG_PATIENCE_S)
+    return spool
+
+
+@pytest.fixture
+def most(tmp_path: Path) -> int:
+    """Return a limit of about ten messages, in bytes."""
+    spool = Spool(tmp_path / "one", "gateway-1")
+    spool.append(numbered(0, EXCHANGES))
+    assert spool.sync(LONG_PATIENCE_S)
+    spool.close()
+    return 10 * spool.state().stored
+
+
+def settled(spool: Spool, most: int) -> SpoolState:
+    while spool.state().stored > most:
+        pass
+    return spool.state()
+
+
+@pytest.mark.long
+async def test_after_an_outage_stored_and_lost_rows_add_up(tmp_path: Path, most: int) -> None:
+    """The outage outlasts the spool's limit. Each row is stored, or counted by the spool as lost."""
+    require_module("duckdb")
+    with cluster(tmp_path / "nats", 1) as servers:
+
+        async def live() -> tuple[HubState, SpoolState]:
+            async with samples_path(servers.urls) as path:
+                await create_stream(path, replicas=1)
+            spool = await asyncio.to_thread(filled_from, tmp_path / "spool", 0, most)
+            settled(spool, most)
+            await forwarded(spool, servers)
+            spool.close()
+            return await kept(tmp_path / "hub", servers), spool.state()
+
+        state, spooled = await live()
+    assert 8 <= 40 - state.missing <= 10
+    assert state.rows + spooled.lost == MESSAGES * EXCHANGES * 10
+    assert (state.alarms, state.doubled) == (2, 0)  # one alarm for missing messages, one for lost rows
+    with History(tmp_path / "hub") as history:
+        rows = sorted(tuple(row) for batch in history.read() for row in batch)
+    assert exchanges_in(rows) == list(range(state.missing * EXCHANGES, MESSAGES * EXCHANGES))

@@ -2,27 +2,35 @@
 
 from __future__ import annotations
 
+import asyncio
+import socket
 import time
+from email.parser import BytesParser
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from nats.aio.client import Client
+from nats_clusters import Cluster
 from peers import require_module
-from spooled import NOON, STEP, numbered
+from spooled import NOON, STEP, empty_stream, numbered
 
 import multidrop
 from multidrop import History
 from multidrop.core import Mastership
 from multidrop.fleet.lines.fleet_lines import FleetLines
-from multidrop.fleet.samples import polled_units
 from multidrop.fleet.samples.hub import Commit
-from multidrop.fleet.samples.message import RowBuffer, unpack
 from multidrop.fleet.samples.parquet_sink import ParquetSink
-from multidrop.fleet.samples.polled_units import PolledUnits
+from multidrop.fleet.samples.samples_stream import StreamMessage, read_after
 from multidrop.fleet.servers.buckets import Record
 from multidrop.fleet.servers.plant_store import line_of
 from multidrop.history import compact, quantities
+from multidrop.samples import polled_units
+from multidrop.samples.message import RowBuffer, unpack
+from multidrop.samples.polled_units import PolledUnits
 
 FAMILY = """
 [family]
@@ -70,19 +78,19 @@ def units_in(table: pa.Table, register: str) -> list[tuple[int, str | None]]:
 
 
 def test_rows_keep_the_unit_that_they_were_polled_in(tmp_path: Path) -> None:
-    """Rows that are packed after the change, together with rows of the new unit, keep their old unit too."""
+    """This holds also for rows that are packed after the change, together with rows of the new unit."""
     (table,) = tables(changed(tmp_path))
     assert units_in(table, "value_1") == [(at, "V" if at < 20 else "A") for at in range(0, 40, 4)]
     assert units_in(table, "value_2") == [(at, "names of meter.toml") for at in range(0, 40, 4)]
     assert units_in(table, "value_3") == [(at, "") for at in range(0, 40, 4)]
-    assert units_in(table, "value_4") == [(at, None) for at in range(0, 40, 4)]  # rows without a description
+    assert units_in(table, "value_4") == [(at, None) for at in range(0, 40, 4)]  # the line does not poll it
 
 
 def test_a_gateway_notes_the_units_of_a_claimed_line(tmp_path: Path) -> None:
     units = PolledUnits()
     lines = FleetLines(Mastership(), tmp_path, units)
     lines._take(record('unit = "V"'))
-    with pytest.raises(ValueError, match="line-1"):  # the line is polled already and stays unchanged
+    with pytest.raises(ValueError, match="line-1"):  # refused: the line is polled already
         lines._take(record('unit = "kW"'))
     lines.poller.remove_line("line-1")
     before_ns = time.monotonic_ns()
@@ -95,7 +103,7 @@ def test_a_gateway_notes_the_units_of_a_claimed_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_merged_files_keep_units_beside_rows_without_units(tmp_path: Path) -> None:
+def test_merged_files_keep_the_units_although_other_rows_have_none(tmp_path: Path) -> None:
     require_module("duckdb")
     sink = ParquetSink(tmp_path)
     hour = 3600 * 10**9 // STEP
@@ -178,3 +186,63 @@ def test_rows_of_a_hubs_folder_have_one_column_per_unit(kept: Path, tmp_path: Pa
 def test_opening_a_single_file_of_a_hub_is_refused(kept: Path) -> None:
     with pytest.raises(ValueError, match="a file of `multidrop hub`: read its folder with"):
         multidrop.open_recording(min((kept / "rows").iterdir()))
+
+
+# ---- the gateway and number of a message in the stream are right, whatever headers its writer has set ----
+
+
+OTHERS = "Nats-Subject: samples.victim.{0}\r\nNats-Sequence: {1}\r\nNats-Last-Sequence: {2}\r\n"
+HOSTILE = {
+    "another subject": OTHERS,
+    "a line that is no header": OTHERS + "no header\r\n",
+    "an empty line": OTHERS + "\r\n",
+    "an end of all messages": "Status: 404\r\nno header\r\n",
+    "an empty name": ": \r\n",
+    "a folded line": " Nats-Sequence: 5\r\n\tNats-Subject: samples.victim.x\r\n",
+    "half a line's end": "A: b\nNats-Subject: samples.victim.x\r\n",
+    "a name with a space": "Nats-Sequence : 5\r\n",
+    "no ASCII": "\xff\xfe: 1\r\n",
+}
+
+
+async def _as_mail(self: Client, headers: bytes | None) -> dict[str, str] | None:
+    """Parse headers as nats-py did until 2.14, with Python's e-mail parser."""
+    parsed = BytesParser().parsebytes((headers or b"").partition(b"\r\n")[2])
+    return {name.strip(): str(value).strip() for name, value in parsed.items()} or None
+
+
+def say_with(url: str, subject: str, headers: str) -> None:
+    """Publish a message with headers that no client library would send."""
+    block = b"NATS/1.0\r\n" + headers.encode("latin-1") + b"\r\n"
+    address = urlsplit(url)
+    with socket.create_connection((address.hostname, address.port)) as link, link.makefile("rb") as answers:
+        answers.readline()
+        link.sendall(b'CONNECT {"headers": true, "verbose": false}\r\n')
+        link.sendall(f"HPUB {subject} {len(block)} {len(block) + 1}\r\n".encode() + block + b"x\r\nPING\r\n")
+        assert answers.readline() == b"PONG\r\n"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("parser", [None, _as_mail])
+def test_headers_cannot_forge_the_origin_of_samples(
+    running: Cluster, parser: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    if parser:
+        monkeypatch.setattr(Client, "_process_headers", parser)
+
+    async def live() -> list[StreamMessage]:
+        async with empty_stream(running) as path:
+            for number, headers in enumerate(HOSTILE.values(), 1):
+                text = headers.format(f"log{number}", number, number - 1)
+                say_with(running.urls[0], "samples.evil.log", f"{text}Multidrop-Sequence: {number}\r\n")
+            say_with(running.urls[0], "samples.good.log", "Multidrop-Sequence: 1\r\nMultidrop-Lost: 7\r\n")
+            found: list[StreamMessage] = []
+            while more := await read_after(path, found[-1].place if found else 0, 4, 1 << 20):
+                found += more
+            return found
+
+    found = asyncio.run(live())
+    assert [message.place for message in found] == [*range(1, len(HOSTILE) + 2)]
+    assert {(message.gateway, message.log) for message in found[:-1]} == {("evil", "log")}
+    assert [message.sequence for message in found[:-1]] == [*range(1, len(HOSTILE) + 1)]
+    assert found[-1] == StreamMessage(len(HOSTILE) + 1, "good", "log", 1, 7, b"x")

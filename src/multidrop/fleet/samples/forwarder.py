@@ -1,9 +1,9 @@
 """Forwarder: sends a spool's messages to the stream, in order, each exactly once.
 
-One message is in flight at a time. Each names the stream position of the previous message of its subject, and
-the stream stores it only if that is right. At the start, and after a timeout or refusal, the forwarder asks
-the stream for the last message of the subject, and continues with the next one. So there is no file with an
-offset, and no time after which a duplicate could be stored.
+One message is in flight at a time. Each message states the stream position of the previous message of its
+subject. The stream stores the message only if that position is right. At the start, and after a timeout or
+refusal, the forwarder asks the stream for the last message of the subject, and continues with the next
+one. So the forwarder needs no file with an offset, and the stream refuses a duplicate however late it comes.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ from multidrop.fleet.samples.samples_stream import (
     publish,
     subject_of,
 )
-from multidrop.fleet.samples.spool import Spool, StoredMessage
 from multidrop.fleet.servers.connections import ServerPath
+from multidrop.fleet.servers.names import checked_name
+from multidrop.samples import Spool, StoredMessage
 
 AGAIN_S = 0.25  # pause after a failure
 LOOKING_S = 1.0  # time between checks for messages that the spool did not announce
@@ -39,27 +40,32 @@ _log = logging.getLogger("multidrop.fleet.samples.forwarder")
 
 
 class NotOurLog(Exception):
-    """The stream has another message under a sequence number of this log.
+    """The stream has a message of this log that this spool has never written.
 
     The spool's folder was copied, or restored from an older state.
     """
 
 
 class Forwarder:
-    """Sends the messages of a spool over this path: `await forwarder.run()` runs until it is cancelled."""
+    """Sends the messages of a spool over this path: `await forwarder.run()` runs until it is cancelled.
+
+    Raises ValueError if the gateway's name cannot be part of a subject.
+    """
 
     def __init__(self, spool: Spool, path: ServerPath) -> None:
         self._spool, self._path = spool, path
-        self._subject = subject_of(spool.gateway, spool.log)
+        self._subject = subject_of(checked_name("gateway", spool.gateway), spool.log)
         self._news = asyncio.Event()
         self.sent = 0  # messages sent since the start
-        self.last: int | None = None  # number of the stream's last message of this log; None: unknown so far
+        # sequence number of this log's newest message in the stream; None: not known yet
+        self.last: int | None = None
         self.trouble: str | None = None
 
     def lag_s(self) -> float | None:
         """Return the age (s, by the system's clock) of the oldest message that the stream lacks.
 
-        Return 0 if the stream has all messages; None if that is not known yet, or the message was removed.
+        Return 0 if the stream has all messages. Return None if the stream's position is not known yet,
+        or if the spool has removed the message.
         """
         if self.last is None:
             return None
@@ -84,7 +90,7 @@ class Forwarder:
                 await self._forward()
             except (NotOurLog, OSError) as failure:
                 self._note(str(failure))
-            except Exception as failure:  # an error in this program, or MemoryError
+            except Exception as failure:  # such as MemoryError, or a bug in this program
                 self._note(f"{type(failure).__name__}: {failure}", failure)
             await asyncio.sleep(AGAIN_S)
 

@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 from multidrop.fleet.errors import FleetError
-from multidrop.fleet.samples.message import MessageError, unpack
 from multidrop.fleet.samples.samples_stream import (
     StreamAbout,
     StreamMessage,
@@ -22,6 +21,7 @@ from multidrop.fleet.samples.samples_stream import (
     read_after,
 )
 from multidrop.fleet.servers.connections import ServerPath
+from multidrop.samples import MessageError, SinkError, unpack
 
 _log = logging.getLogger("multidrop.fleet.samples.hub")
 
@@ -65,33 +65,29 @@ class SourceCheck:
 MOST_READ = 64  # limit of messages in one answer
 MOST_READ_BYTES = 8 << 20
 MOST_ROWS = 1_000_000  # limit of rows in one commit: 50 MB
-MOST_BYTES = 256 << 20  # limit of messages and rows in one commit; a single answer may exceed it
+MOST_BYTES = 256 << 20  # limit in bytes of messages and rows in one commit; a single answer may exceed it
 LOOKING_S = 0.2  # pause before the next read if there is no new message
 AGAIN_S = 1.0  # pause after a failure
-BEHIND_S = 5.0  # how long to wait for a server that lacks messages of its leader
+BEHIND_S = 5.0  # how long to wait for a server that has not received the stream's newest messages yet
 
 T = TypeVar("T")
 
 
-class SinkError(OSError):
-    """A sink cannot be written now, or belongs to another hub. The message is one sentence."""
-
-
 class NotThisHubs(SinkError):
-    """The sink belongs to another stream or another hub, so a retry is useless."""
+    """The sink belongs to another stream or another hub, so the hub does not retry."""
 
 
 class KeptPlace(NamedTuple):
-    """The stream position of the last stored message, and the last sequence number of each log."""
+    """The position up to which a sink has stored the stream."""
 
-    place: int
-    sources: Mapping[str, int]
+    place: int  # stream position of the last stored message
+    sources: Mapping[str, int]  # sequence number of the last stored message, by log
 
 
 class Commit(NamedTuple):
     """Rows, and the position of their last message, which a sink must store together."""
 
-    stream: str  # identity of the stream: when it was created
+    stream: str  # identity of the stream, which is the time of its creation
     first: int  # stream position of the commit's first message
     last: int
     sources: Mapping[str, int]
@@ -135,7 +131,7 @@ class HubState(NamedTuple):
 
 
 class SampleHub:
-    """Reads a stream into a sink, with one commit every `every` seconds or million rows."""
+    """Reads a stream into a sink. It commits every `every` seconds, and after a million rows."""
 
     def __init__(self, path: ServerPath, sink: SampleSink, *, every: float = 10.0) -> None:
         self._path, self._sink, self._every = path, sink, every
@@ -151,7 +147,8 @@ class SampleHub:
     async def run(self, *, once: bool = False) -> None:
         """Read until cancelled, or with `once` until all messages that are in the stream now are stored.
 
-        A failure of the stream or the sink is logged and retried each second. Raises NotThisHubs.
+        A failure of the stream or the sink is logged and retried each second. Raises NotThisHubs if the sink
+        belongs to another stream or hub.
         """
         while True:
             try:
@@ -174,7 +171,8 @@ class SampleHub:
         end_if_cancelled()
         kept = await _on_thread(self._sink.begin, found.created)
         self._stream, self._place = found.created, kept.place
-        self._end = found.last if found.first <= found.last else kept.place  # else the stream is empty now
+        # if `first` is above `last`, the stream is empty now
+        self._end = found.last if found.first <= found.last else kept.place
         self._sources.last = dict(kept.sources)
         self._check_end(found)
         if found.first > kept.place + 1 and found.last > kept.place:
@@ -184,8 +182,8 @@ class SampleHub:
     def _check_end(self, found: StreamAbout) -> None:
         if found.last < self._place:
             raise NotThisHubs(
-                f"the stream ends at message {found.last}, and {self._place} are stored: it lost some; "
-                "use a new folder or database"
+                f"the stream ends at message {found.last}, but {self._place} are already stored: the stream "
+                f"has lost messages; use a new folder or database"
             )
 
     async def _commit(self, once: bool) -> bool:

@@ -21,7 +21,6 @@ import os
 import re
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -31,14 +30,15 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from multidrop.extras import install_command
-from multidrop.fleet.samples.hub import Commit, KeptPlace, NotThisHubs, SinkError
-from multidrop.fleet.samples.message import ROWS
+from multidrop.fleet.samples.hub import Commit, KeptPlace, NotThisHubs
 from multidrop.recording import FileLock
+from multidrop.samples import ROWS, SinkError
+from multidrop.whole_file import UNFINISHED, whole_file
 
-KEY = "multidrop"  # key of our metadata in the file's metadata, the same in all recordings
+KEY = "multidrop"  # key of multidrop's part of a Parquet file's metadata, as in all recordings
 SECOND_NS = 1_000_000_000
 FORM = "%Y%m%dT%H%M%SZ"
-WRITTEN = {  # names are dictionary-encoded in the file; readers get plain texts
+WRITTEN = {  # in the file, names are dictionary-encoded; `History` and DuckDB read them as plain texts
     "compression": "zstd",
     "compression_level": 1,
     "store_schema": False,
@@ -79,7 +79,7 @@ class ParquetSink:
     def begin(self, stream: str) -> KeptPlace:
         """Return the position that the newest file contains, and remove unfinished files."""
         try:
-            for part in self._rows.glob(".*.writing"):
+            for part in self._rows.glob(UNFINISHED):
                 part.unlink()
             newest = max(self._files(), default=None)
         except OSError as failure:
@@ -92,8 +92,8 @@ class ParquetSink:
             raise NotThisHubs(f"{path} was not written by a hub: name an empty folder")
         if found.get("stream") != stream:
             raise NotThisHubs(
-                f"{self.folder} holds samples of a stream created at {found.get('stream')}, "
-                f"and this one was created at {stream}: name another folder"
+                f"{self.folder} holds samples of a stream created at {found.get('stream')}, but the present "
+                f"stream was created at {stream}: name another folder"
             )
         return KeptPlace(last, {str(name): int(number) for name, number in found["sources"].items()})
 
@@ -105,19 +105,11 @@ class ParquetSink:
         """Write the rows into a temporary file, sync it to the disk, and rename it."""
         table = _joined(commit)
         path = self._rows / _name(commit, table)
-        part = path.with_name(f".{path.name}.writing")
         try:
-            with part.open("xb") as file:
-                with pq.ParquetWriter(file, table.schema, **WRITTEN) as writer:
-                    writer.add_key_value_metadata({KEY: json.dumps(_about(commit))})
-                    writer.write_table(table)
-                file.flush()
-                os.fsync(file.fileno())
-            part.rename(path)
-            _sync(self._rows)
+            with whole_file(path) as part, pq.ParquetWriter(part, table.schema, **WRITTEN) as writer:
+                writer.add_key_value_metadata({KEY: json.dumps(_about(commit))})
+                writer.write_table(table)
         except OSError as failure:
-            with suppress(OSError):
-                part.unlink()
             raise SinkError(f"{path} cannot be written: {failure.strerror or failure}") from failure
 
 
@@ -129,7 +121,8 @@ def _joined(commit: Commit) -> Any:
     drives = table.column("drive").chunk(0)
     ranks = pc.rank(drives.dictionary).cast(pa.int32()).take(drives.indices)
     by_time = pc.array_sort_indices(table.column("time").chunk(0).cast(pa.int64()))
-    return table.take(by_time.take(pc.array_sort_indices(ranks.take(by_time))))  # a stable sort
+    # sorted by drive and time, because the second sort is stable
+    return table.take(by_time.take(pc.array_sort_indices(ranks.take(by_time))))
 
 
 def _about(commit: Commit) -> dict[str, Any]:
@@ -154,14 +147,6 @@ def _metadata(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _sync(folder: Path) -> None:
-    file = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(file)
-    finally:
-        os.close(file)
-
-
 EVERY_S = 300.0
 
 _log = logging.getLogger("multidrop.fleet.samples.hub")
@@ -170,7 +155,7 @@ _log = logging.getLogger("multidrop.fleet.samples.hub")
 async def compact_for_ever(folder: Path, every: float = EVERY_S) -> None:
     """Merge the files of past hours and create the files in `tens` for plots, until cancelled; needs duckdb.
 
-    The work is done by a child process of low priority, which may be killed at any time.
+    A child process of low priority does the work. It may be killed at any time.
     """
     if importlib.util.find_spec("duckdb") is None:
         _log.warning("files are not merged: that needs duckdb: %s", install_command("history"))

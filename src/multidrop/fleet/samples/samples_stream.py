@@ -1,7 +1,8 @@
 """The stream of all gateways' samples, through JetStream's own API (direct gets: ADR-31).
 
-A message has the subject `samples.<gateway>.<log id>`. Its headers contain its number in that log
-(`Multidrop-Sequence`) and a digest of its bytes. This module keeps no state: it always asks the stream.
+A message has the subject `samples.<gateway>.<log id>`. The message's headers contain its number in that
+log (`Multidrop-Sequence`) and a digest of its bytes. This module keeps no state: it always asks the
+stream.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from multidrop.supervisor import end_tasks, supervisor
 
 STREAM = "samples"
 SEQUENCE, DIGEST, LOST = "Multidrop-Sequence", "Multidrop-Digest", "Multidrop-Lost"
-BY_SERVER = "Nats-Stream"  # header of each message that a server returns from a stream
+BY_SERVER = "Nats-Stream"  # a server adds this header to each stored message that it returns
 EXPECTED = "Nats-Expected-Last-Subject-Sequence"
 ANSWER_S = 5.0  # time limit of an answer; an election takes 4 to 9 s, so requests are retried
 NO_MESSAGE, NO_STREAM, WRONG_SEQUENCE = 10037, 10059, 10071  # error codes of JetStream
@@ -100,10 +101,11 @@ async def samples_path(
 
 
 async def create_stream(path: ServerPath, *, replicas: int = 3, most_bytes: int = -1) -> int:
-    """Create the stream if it is missing; return its size limit in bytes; -1: unlimited.
+    """Create the stream if it is missing. Return the stream's size limit in bytes, or -1 if it is unlimited.
 
-    Above `most_bytes`, the oldest messages are removed. The servers reserve that much space. A stream without
-    a limit fills their disks, and then no lease can be renewed. An existing stream stays as it is.
+    Above `most_bytes`, the oldest messages are removed. The servers reserve that much space. A stream
+    without a limit fills their disks, and then no lease can be renewed. An existing stream stays as it
+    is.
     """
     config = {
         "name": STREAM,
@@ -194,10 +196,11 @@ SUBJECT = f"$JS.API.DIRECT.GET.{STREAM}"
 
 
 class StreamMessage(NamedTuple):
-    """A message as the hub reads it. `sequence` is 0 if the header is missing or invalid.
+    """A message as the hub reads it. `sequence` is 0 if the message cannot be from a gateway.
 
-    `sequence` is also 0 if a server has returned this message from a stream. A client that may read stored
-    messages can direct such an answer to any subject, and so into the stream in another gateway's name.
+    This is so if its header is missing or invalid, or if the message is a server's answer to a read. A client
+    that may read stored messages can direct such answers to any subject, and so into the samples of another
+    gateway.
     """
 
     place: int
@@ -209,7 +212,7 @@ class StreamMessage(NamedTuple):
 
 
 async def read_after(path: ServerPath, place: int, messages: int, size: int) -> list[StreamMessage]:
-    """Return the next messages after this position, without a gap: at most `messages`, and `size` bytes.
+    """Return the next messages after this position, leaving none out: at most `messages`, and `size` bytes.
 
     An empty list means that there are none now. Any replica may answer. Raises FleetError.
     """
@@ -218,7 +221,8 @@ async def read_after(path: ServerPath, place: int, messages: int, size: int) -> 
     try:
         await path.gather(Request(SUBJECT, json.dumps(wanted).encode()), get, ANSWER_S)
     except FleetError as failure:
-        if get.found or get.has_hole:  # messages before the hole are complete; the next call reads others
+        # no message before the lost one is missing; the next call reads the rest
+        if get.found or get.has_hole:
             return get.found
         raise _refused(get.end_line) if get.last.done() else failure from failure
     return get.found
@@ -228,13 +232,14 @@ class SampleGet(DirectGet):
     """The messages that one direct get returns, parsed from raw headers.
 
     A sender may write any headers into a message, and the server appends its own headers. A parser that stops
-    at an invalid header would trust the sender about the message's origin.
+    at an invalid header would miss the server's headers, and take the sender's claim for the message's
+    origin.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.found: list[StreamMessage] = []
-        self.has_hole = False  # a message of the answer was lost on the way
+        self.has_hole = False  # True if a message of the answer was lost on the way
         self.end_line = ""
 
     def take(self, headers: bytes, data: bytes) -> None:

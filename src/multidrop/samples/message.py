@@ -1,30 +1,33 @@
 """Messages: many rows as one Arrow IPC stream that any Arrow reader opens, two to three bytes a row.
 
-| column           | type                            | meaning                                               |
-|------------------|---------------------------------|-------------------------------------------------------|
-| `time`           | timestamp[ns, UTC]              | when the request was sent                             |
-| `clock_ns`       | int64                           | time - monotonic_ns: nearly the same in all rows      |
-| `uncertainty_us` | int32, null for a miss          | the value was taken between time and this much later  |
-| `drive`          | dictionary of utf8              | the drive's name                                      |
-| `register`       | dictionary of utf8              | the register's name                                   |
-| `value`          | float64, null for a miss        | in `unit`                                             |
-| `status`         | dictionary of utf8              | `ok`, or why there is no value                        |
-| `unit`           | dictionary of utf8, or null     | see below; null if unknown                            |
+| column           | type                        | meaning                                              |
+|------------------|-----------------------------|------------------------------------------------------|
+| `time`           | timestamp[ns, UTC]          | when the request was sent                            |
+| `clock_ns`       | int64                       | time - monotonic_ns: nearly the same in all rows     |
+| `uncertainty_us` | int32, null for a miss      | the value was taken between time and this much later |
+| `drive`          | dictionary of utf8          | the drive's name                                     |
+| `register`       | dictionary of utf8          | the register's name                                  |
+| `value`          | float64, null for a miss    | in `unit`                                            |
+| `status`         | dictionary of utf8          | `ok`, or why there is no value                       |
+| `unit`           | dictionary of utf8, or null | see below; null if unknown                           |
 
-Rows are ordered by register, and by time within a register. So similar values are adjacent, and a time that
-ten registers share costs little more than one. Buffers are compressed with zstd-1; dictionaries hold only the
-names in these rows. An uncertainty is rounded up to whole microseconds: the bound stays true, and its last
-ten bits are noise.
+Rows are ordered by register, and by time within a register. So similar values are adjacent, and a time
+that ten registers share costs little more than one. Buffers are compressed with zstd-1; dictionaries
+hold only the names in these rows. An uncertainty is rounded up to whole microseconds, so it stays an
+upper bound; the ten bits that rounding drops are noise.
 
-The unit comes from the description under which the row was polled: "" for a number without a unit, "raw
-count" if the step is unknown, "names of yd1000" if numbers stand for this family's names.
+The unit comes from the register's description at the time of the poll: "" for a number without a unit, "raw
+count" if the step is unknown, and, for instance, "names of yd1000" if numbers stand for named values of this
+drive family.
 
-Any holder of a gateway's key may send other bytes as a message. A message that declares an unpacked size
-above 4 MiB is rejected before it is unpacked, and so are columns of other types, which may grow in a cast.
+Any holder of a gateway's key may send other bytes as a message. A message that declares an unpacked
+size above 4 MiB is rejected before it is unpacked, and so are columns of other types, which may grow in
+a cast.
 
-A compressed buffer starts with its unpacked size, and pyarrow allocates that much before it checks the rest.
-So the sizes are read first, from the flatbuffers described in Message.fbs of Arrow's format. A table there
-starts with the distance back to a list of its fields' offsets; 0 is a missing field.
+A compressed buffer starts with its unpacked size, and pyarrow allocates that much memory before it checks the
+rest. So the sizes are read first, from the flatbuffers described in Message.fbs of Arrow's format. A
+flatbuffer's table starts with the distance back to a list of its fields' offsets; the offset of a missing
+field is 0.
 """
 
 from __future__ import annotations
@@ -38,15 +41,16 @@ from typing import Any, NamedTuple
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from multidrop.fleet.samples.polled_units import PolledUnits
 from multidrop.polling import BatchColumns
+from multidrop.samples.polled_units import PolledUnits
 
 LATEST = 4  # MetadataVersion.V5: older versions mark compressed buffers differently
 MOST_MESSAGES = 100  # limit of Arrow messages in a stream: the schema, dictionaries and rows
 _DICTIONARY, _RECORD_BATCH = 2, 3  # kinds of messages: MessageHeader in Message.fbs
 _I8, _U16, _I32, _U32, _I64 = (Struct(f"<{kind}") for kind in "bHiIq")
 _BUFFER = Struct("<qq")  # a buffer's offset in the body, and its length
-_NOT_COMPRESSED = -1  # marks a buffer that compression would not shrink
+# stands in place of the unpacked size if a buffer is not compressed, because compression would not shrink it
+_NOT_COMPRESSED = -1
 
 
 def unpacked_size(data: bytes | memoryview) -> int:
@@ -76,7 +80,7 @@ def _size(metadata: memoryview, body: memoryview) -> int:
     size = 0
     for place, length in rows.pairs(2):
         if place < 0 or length < 0 or place + length > len(body):
-            raise ValueError("a buffer lies beyond its end")
+            raise ValueError("a buffer extends beyond the end of the message")
         declared = _I64.unpack_from(body, place)[0] if is_compressed and length else _NOT_COMPRESSED
         if declared < _NOT_COMPRESSED:
             raise ValueError("a buffer has a size below 0")
@@ -120,12 +124,13 @@ class _Table:
 
 MOST_BYTES = 900_000  # limit of a message; NATS accepts 1 MiB by default, including headers
 MOST_ROWS = 1 << 16
-MOST_UNPACKED = 4 << 20  # limit in bytes; allows 2.4 MB of rows, and their names
+MOST_UNPACKED = 4 << 20  # limit of the unpacked size in bytes; enough for 2.4 MB of rows and their names
 MOST_NAME = 1000  # limit of a name, status or unit in bytes, because PostgreSQL indexes names
 MOST_SAID = 300  # limit of characters of an error's text
 LONGEST_US = (1 << 31) - 1
 COMPRESSED = pa.ipc.IpcWriteOptions(compression=pa.Codec("zstd", 1))
-NAMED = pa.dictionary(pa.int32(), pa.utf8())  # codes wide enough for the names of many messages in one table
+# type of names; its codes are wide enough for tables that join many messages
+NAMED = pa.dictionary(pa.int32(), pa.utf8())
 TIMES = pa.timestamp("ns", "UTC")
 ROWS = pa.schema(  # columns that `unpack` returns, the same as in recordings
     [
@@ -139,7 +144,7 @@ ROWS = pa.schema(  # columns that `unpack` returns, the same as in recordings
         pa.field("unit", NAMED),
     ]
 )
-_TYPES: Mapping[str, Sequence[Any]] = {  # types of a message's columns; names are dictionaries of utf8
+_TYPES: Mapping[str, Sequence[Any]] = {  # allowed types of a message's columns, except dictionaries
     "time": [TIMES],
     "clock_ns": [pa.int64()],
     "uncertainty_us": [pa.int32(), pa.int64()],
@@ -153,6 +158,10 @@ class MessageError(ValueError):
     """These bytes are not a valid message."""
 
 
+class SinkError(OSError):
+    """A store of rows cannot be written now. The message is one sentence."""
+
+
 class Packed(NamedTuple):
     """A message, and the number of its rows."""
 
@@ -161,7 +170,7 @@ class Packed(NamedTuple):
 
 
 class RowBuffer:
-    """Copies the rows of many batches of one poller, so that the batches' memory can be reused."""
+    """Holds copies of the rows of many batches of one poller, so that the batches' memory can be reused."""
 
     def __init__(self) -> None:
         self.rows = 0
@@ -267,7 +276,7 @@ def _is_ours(field: Any) -> bool:
 
 
 def _check(rows: Any) -> None:
-    """Raise ValueError for rows that no sink accepts, because such a message would block all later ones."""
+    """Raise ValueError for rows that no sink accepts: the hub could never store them, nor later messages."""
     for field, column in zip(rows.schema, rows.columns, strict=True):
         if not field.nullable and column.null_count:
             raise ValueError(f"its {field.name} is missing in some rows")

@@ -1,15 +1,15 @@
-"""Spool: a poller's rows on a gateway's disk until the servers have them, one file per message.
+"""Spool: a poller's rows on a gateway's disk until a receiver has them, one file per message.
 
-| in the folder        | content                                                                |
-|----------------------|------------------------------------------------------------------------|
-| `spool.json`         | gateway, and the id of the log whose messages are numbered here        |
-| `NUMBER-ROWS.arrows` | a message: its sequence in the log, and its rows                       |
-| `NUMBER-ROWS.damaged`| a message that was the newest, and that the disk stored only in part   |
-| `.spool.lock`        | locked by the process that writes here                                 |
+| in the folder         | content                                                              |
+|-----------------------|----------------------------------------------------------------------|
+| `spool.json`          | gateway, and the id of the log whose messages are numbered here      |
+| `NUMBER-ROWS.arrows`  | a message: its sequence in the log, and its rows                     |
+| `NUMBER-ROWS.damaged` | a message that was the newest, and that the disk stored only in part |
+| `.spool.lock`         | locked by the process that writes here                               |
 
-A file is synced to the disk under a temporary name, and renamed then. The newest message is never removed,
-because the next number is one above its own. A log's id is created with its folder: a new disk starts a new
-log.
+A file is synced to the disk under a temporary name and then renamed. The newest message is never
+removed, because the next message's number is one above the number of the newest. A log's id is created
+with its folder: a new disk starts a new log.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ import secrets
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from multidrop import Batch
-from multidrop.fleet.samples.message import MessageError, Packed, RowBuffer, unpack
-from multidrop.fleet.samples.polled_units import PolledUnits
-from multidrop.fleet.servers.names import checked_name
+from multidrop.polling.batch import Batch
 from multidrop.recording import FileLock
+from multidrop.samples.message import MessageError, Packed, RowBuffer, unpack
+from multidrop.samples.polled_units import PolledUnits
+from multidrop.whole_file import sync_to_disk, whole_file
 
 FORMAT = "multidrop spool 1"
 HEAD = "spool.json"
@@ -61,7 +61,8 @@ class SpoolFolder:
 
     def __init__(self, path: Path, gateway: str) -> None:
         self.path = path
-        self.damage: str | None = None  # sentence about a newest message that the disk stored only in part
+        # sentence about the newest message if the disk stored only a part of it
+        self.damage: str | None = None
         with ExitStack() as stack:
             try:
                 path.mkdir(parents=True, exist_ok=True)
@@ -86,11 +87,12 @@ class SpoolFolder:
                     f"{self.path} is not a spool: it holds {others[0]!r} and no {HEAD}; name an empty folder"
                 )
             log = secrets.token_hex(8)
-            self._store(path, json.dumps({**wanted, "log": log}).encode())
+            with whole_file(path) as part:
+                part.write_text(json.dumps({**wanted, "log": log}), "utf-8")
             return log
         found = _parsed(path)
         if found.get("format") != FORMAT or not re.fullmatch(r"[0-9a-f]{16}", str(found.get("log"))):
-            raise SpoolError(f"{path} is not the head of a spool of this version ({FORMAT!r})")
+            raise SpoolError(f"{path} is not the head file of a spool of this version ({FORMAT!r})")
         if found.get("gateway") != wanted["gateway"]:
             raise SpoolError(
                 f"{self.path} is the spool of gateway {found.get('gateway')!r}, not of {wanted['gateway']!r}"
@@ -98,7 +100,7 @@ class SpoolFolder:
         return str(found["log"])
 
     def _listed(self) -> dict[int, StoredMessage]:
-        """Return the messages by sequence number, and remove files that a killed process left unfinished."""
+        """Return the messages by sequence number. Remove unfinished files of a killed process."""
         found = {}
         self.newest = 0
         for path in self.path.iterdir():
@@ -106,7 +108,8 @@ class SpoolFolder:
                 path.unlink()
             elif match := _NAME.fullmatch(path.name):
                 number = int(match[1])
-                self.newest = max(self.newest, number)  # the number of a damaged message is not reused either
+                # this counts damaged messages too, so that their numbers are not reused
+                self.newest = max(self.newest, number)
                 if match[3] == "arrows":
                     found[number] = StoredMessage(number, int(match[2]), path.stat().st_size, path)
         return dict(sorted(found.items()))
@@ -117,51 +120,21 @@ class SpoolFolder:
         if newest and (mistake := _mistake(newest)):
             del self.messages[self.newest]
             newest.path.rename(newest.path.with_suffix(".damaged"))
-            self._sync_folder()
+            sync_to_disk(self.path)
             self.damage = f"{newest.path} is damaged, and was put aside with {newest.rows} rows: {mistake}"
 
     def write(self, data: bytes, rows: int) -> StoredMessage:
         """Write the next message and sync it to the disk. After an OSError the call may be repeated."""
         number = self.newest + 1
         path = self.path / f"{number:012d}-{rows}.arrows"
-        self._store(path, data)
+        with whole_file(path) as part:
+            part.write_bytes(data)
         return StoredMessage(number, rows, len(data), path)
 
     def add(self, stored: StoredMessage) -> None:
         """Add a message that `write` has written to `messages`."""
         self.messages[stored.sequence] = stored
         self.newest = stored.sequence
-
-    def remove(self, message: StoredMessage) -> None:
-        """Remove the file of a message other than the newest. Raises OSError."""
-        message.path.unlink(missing_ok=True)
-        del self.messages[message.sequence]
-
-    def _store(self, path: Path, data: bytes) -> None:
-        """Write and sync a temporary file, then rename it to `path`. Remove it if that fails."""
-        part = path.with_name(f".{path.name}.tmp")
-        try:
-            file = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
-            try:
-                left = memoryview(data)
-                while left:
-                    left = left[os.write(file, left) :]
-                os.fsync(file)
-            finally:
-                os.close(file)
-            part.rename(path)
-        except BaseException:
-            with suppress(OSError):
-                part.unlink()
-            raise
-        self._sync_folder()
-
-    def _sync_folder(self) -> None:
-        folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
 
 
 def _mistake(message: StoredMessage) -> str | None:
@@ -184,14 +157,14 @@ ENOUGH_ROWS = 1 << 14  # number of waiting rows at which a message is written
 ENOUGH_S = 1.0  # age of the oldest waiting row at which a message is written
 MOST_WAITING = 1_000_000  # limit of rows that wait in memory while the disk is slow or full: 38 MB
 AGAIN_S = 1.0  # pause after a disk error
-TELLING_S = 60.0  # time between log lines about lost rows
+LOG_S = 60.0  # time between log lines about lost rows
 ENDING_S = 10.0  # time limit of `close` for the disk
 
-_log = logging.getLogger("multidrop.fleet.samples.spool")
+_log = logging.getLogger("multidrop.samples.spool")
 
 
 class SpoolState(NamedTuple):
-    """The state of a spool. Rows are counted from the opening of the spool."""
+    """The state of a spool. Counts of rows start when the spool is opened."""
 
     log: str  # id of the log, from `spool.json`
     written: int  # rows that reached the disk
@@ -199,7 +172,7 @@ class SpoolState(NamedTuple):
     waiting: int  # rows that wait in memory
     oldest: int  # sequence number of the oldest message; 0 without one
     newest: int
-    acknowledged: int | None  # the stream has all messages up to this one; None: not known yet
+    acknowledged: int | None  # the receiver has all messages up to this one; None: not known yet
     stored: int  # size of all stored messages in bytes
     trouble: str | None  # the disk's present error; None if the disk works
 
@@ -207,12 +180,13 @@ class SpoolState(NamedTuple):
 class Spool:
     """Keeps rows in a folder: `poller.on_batch(spool.append)`.
 
-    The waiting rows are written as one message, in its own file, when there are 16384 or the oldest is a
+    The waiting rows are written as one message, in its own file, when 16384 rows wait or the oldest is a
     second old. If all files together exceed `most` bytes, the oldest are removed; rows that were not sent are
-    counted as lost and logged. A full or slow disk does not delay the poller: up to a million rows wait in
-    memory, further rows are lost and counted, and writing is retried each second.
+    counted as lost and logged. If `keep_sent` is False, each new message also removes the oldest messages
+    that were sent. A full or slow disk does not delay the poller: up to a million rows wait in memory,
+    further rows are lost and counted, and writing is retried each second.
 
-    Raises SpoolError as `SpoolFolder` does, and ValueError for an invalid name of the gateway.
+    Raises SpoolError as `SpoolFolder` does.
     """
 
     def __init__(
@@ -222,13 +196,15 @@ class Spool:
         *,
         most: int = 10_000_000_000,
         units: PolledUnits | None = None,
+        keep_sent: bool = True,
     ) -> None:
-        self.gateway = checked_name("gateway", gateway)
+        self.gateway = gateway
         self._folder = SpoolFolder(Path(folder), gateway)
         self.log = self._folder.log
         self.on_message: Callable[[], object] = lambda: None  # called in the spool's thread, per message
         self._most = most
         self._units = units or PolledUnits()
+        self._keep_sent = keep_sent
         self._stored = sum(message.size for message in self._folder.messages.values())
         self._changing = threading.Condition()
         self._waiting: deque[RowBuffer] = deque()
@@ -236,10 +212,12 @@ class Spool:
         self._first_s: float | None = None  # when the oldest waiting row arrived
         self._taken = self._written = self._lost = 0
         self._acknowledged: int | None = None
-        self._undecided: dict[int, int] = {}  # removed rows per message, until `acknowledge` is called
+        self._missing: Sequence[tuple[int, int]] = ()
+        # by removed message: the number of its rows. `acknowledge` shows whether these rows are lost.
+        self._undecided: dict[int, int] = {}
         self._trouble: str | None = None
         self._logged_s: float | None = None
-        self._wanted = 0  # count of appended rows for which `sync` waits
+        self._wanted = 0  # `sync` waits until this many appended rows are on the disk
         self._over = False
         if self._folder.damage:
             _log.error("%s", self._folder.damage)
@@ -307,14 +285,24 @@ class Spool:
         with self._changing:
             return self._folder.messages.get(sequence)
 
-    def acknowledge(self, sequence: int) -> None:
-        """Note that the stream has all messages up to this sequence number. Removing these loses no rows."""
+    def acknowledge(self, sequence: int, missing: Sequence[tuple[int, int]] = ()) -> None:
+        """Note that the receiver has all messages up to this sequence number, so that their removal loses
+        no rows.
+
+        `missing` are exceptions, as pairs of the first and the last sequence number.
+        """
         with self._changing:
-            self._acknowledged = sequence
+            self._acknowledged, self._missing = sequence, missing
             for removed, rows in self._undecided.items():
-                if removed > sequence:
+                if not self._is_sent(removed):
                     self._lose(rows, f"the spool is full at {self._most} bytes")
             self._undecided.clear()
+
+    def _is_sent(self, sequence: int) -> bool:
+        with self._changing:
+            if self._acknowledged is None or sequence > self._acknowledged:
+                return False
+            return not any(first <= sequence <= last for first, last in self._missing)
 
     # ---- for the spool's own thread ----
 
@@ -322,12 +310,12 @@ class Spool:
         is_over = False
         while not is_over:
             try:
-                is_over = self._write_what_is_due()
+                is_over = self._write_due_rows()
             except Exception as failure:  # such as MemoryError: continue with the waiting rows
                 _log.error("writing the spool %s failed; retrying", self._folder.path, exc_info=failure)
                 time.sleep(AGAIN_S)
 
-    def _write_what_is_due(self) -> bool:
+    def _write_due_rows(self) -> bool:
         """Wait until rows are due, and write them; return True if the thread must end."""
         with self._changing:
             if not self._is_due():
@@ -401,35 +389,41 @@ class Spool:
             self._remove_acknowledged()
 
     def _remove_acknowledged(self) -> None:
-        """Remove the oldest message if the stream has it: the disk may be full."""
+        """Remove the oldest message if the receiver has it: the disk may be full."""
         oldest = self.following(0)
-        if oldest and oldest.sequence <= (self._acknowledged or 0) and oldest.sequence < self._folder.newest:
+        if oldest and self._is_sent(oldest.sequence) and oldest.sequence < self._folder.newest:
             self._remove(oldest)
 
     def _make_room(self) -> None:
-        while self._stored > self._most and len(self._folder.messages) > 1:
+        while len(self._folder.messages) > 1:
             oldest = self.following(0)
-            if oldest is None or not self._remove(oldest):
+            is_excess = self._stored > self._most
+            if oldest is None or not (is_excess or self._is_done(oldest)) or not self._remove(oldest):
                 return
 
+    def _is_done(self, message: StoredMessage) -> bool:
+        return not self._keep_sent and self._is_sent(message.sequence)
+
     def _remove(self, message: StoredMessage) -> bool:
+        try:
+            # called without the lock, because a disk that hangs must not delay `append`
+            message.path.unlink(missing_ok=True)
+        except OSError as failure:
+            _log.error("the spool cannot remove %s: %s", message.path, failure.strerror)
+            return False
         with self._changing:
-            try:
-                self._folder.remove(message)
-            except OSError as failure:
-                _log.error("the spool cannot remove %s: %s", message.path, failure.strerror)
-                return False
+            del self._folder.messages[message.sequence]
             self._stored -= message.size
             if self._acknowledged is None:
                 self._undecided[message.sequence] = message.rows
-            elif message.sequence > self._acknowledged:
+            elif not self._is_sent(message.sequence):
                 self._lose(message.rows, f"the spool is full at {self._most} bytes")
-            return True
+        return True
 
     def _lose(self, rows: int, reason: str) -> None:
         self._lost += rows
         now = time.monotonic()
-        if rows and (self._logged_s is None or now - self._logged_s >= TELLING_S):
+        if rows and (self._logged_s is None or now - self._logged_s >= LOG_S):
             _log.error("%s: %d rows of the spool %s were lost so far", reason, self._lost, self._folder.path)
             self._logged_s = now
 

@@ -10,14 +10,13 @@ from typing import Any
 
 import pyarrow as pa
 import pytest
-from batches import DRIVES, EXAMPLE, REGISTERS, SECOND, UTC_0, block, completion, example
-from completions import add_rows
+from batches import DRIVES, EXAMPLE, REGISTERS, SECOND, UTC_0, add_rows, block, completion, example
 from spooled import numbered, rows_of
 from tables import table
 
 from multidrop import Batch
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
-from multidrop.fleet.samples.message import MOST_ROWS, MessageError, Packed, RowBuffer, unpack, unpacked_size
+from multidrop.samples.message import MOST_ROWS, MessageError, Packed, RowBuffer, unpack, unpacked_size
 
 
 def packed(*batches: Batch, most: int = 900_000) -> list[Packed]:
@@ -78,7 +77,7 @@ def test_values_are_stored_bit_for_bit() -> None:
 
 @table(("ns", "told"), [(1, 1000), (1000, 1000), (1001, 2000), (3 * 10**12, (2**31 - 1) * 1000)])
 def test_an_uncertainty_is_rounded_up(ns: int, told: int) -> None:
-    """Fifty minutes exceed 32 bits of microseconds, and any request's duration."""
+    """The last uncertainty, 50 minutes, exceeds 32 bits and is capped. No request takes that long."""
     columns = Columns(1)
     assert add_rows(columns, block(0, 0), completion(SECOND, first_ns=SECOND + ns, words=(1,)), UTC_0)
     (message,) = packed(Batch(columns, DRIVES, REGISTERS))
@@ -218,8 +217,7 @@ OF_ONE_TEXT = {  # columns of this many rows: small in the message and in memory
     "clock_ns": lambda rows: pa.RunEndEncodedArray.from_arrays([rows], pa.array([5])),
 }
 
-
-POOLS: list[pa.MemoryPool] = []  # kept alive, because a test's memory may outlive it
+POOLS: list[pa.MemoryPool] = []  # pools are kept alive, because memory of a test may be freed after the test
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""PolledUnits: the units of a gateway's rows, from the description under which each row was polled."""
+"""PolledUnits: the unit of each row, from the register's description at the time of the poll."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from typing import Any, NamedTuple
 
 import pyarrow as pa
 
-from multidrop import Drive, PlantLine, Register
+from multidrop.drive import Drive
+from multidrop.drive.register import Register
+from multidrop.plant.model import PlantLine
 
-RAW = "raw count"  # same text as in a `History`
+RAW = "raw count"  # unit of values without a known scale, as in a `History`
 
 
 class Change(NamedTuple):
-    """A change of a series' unit: before `until_ns` (monotonic, in ns) the series had the unit `code`."""
+    """A change of unit: before `until_ns` (monotonic, in ns), the series had the unit `code`."""
 
     until_ns: int
     series: int
@@ -22,9 +24,12 @@ class Change(NamedTuple):
 
 
 class UnitTable(NamedTuple):
-    """Unit codes by series: the series of a drive's register is drive * len(registers) + register."""
+    """Unit codes by series. A series is the values of one register of one drive.
 
-    newest: Any  # pa.Array of the present unit codes; null if unknown
+    Its number is drive * len(registers) + register, with the codes of the two names.
+    """
+
+    newest: Any  # pa.Array of the present unit code of each series; null if unknown
     changes: Sequence[Change]  # newest change first
     texts: Sequence[str]  # unit texts by code
 
@@ -41,7 +46,7 @@ class PolledUnits:
         """Note the units of this line for rows that are requested from `since_ns` (monotonic) on."""
         with self._lock:
             for polled in line.drives:
-                for poll in polled.polls:
+                for poll in polled.series:
                     known = self._since.setdefault((polled.drive.name, poll.register.name), [])
                     unit = unit_of(polled.drive, poll.register)
                     if not known or known[-1][1] != unit:
@@ -76,7 +81,7 @@ class PolledUnits:
 
 
 def unit_of(drive: Drive, register: Register[Any]) -> str:
-    """Return a register's unit: "" for a plain number, "names of yd1000" for a YD1000's named values."""
+    """Return a register's unit: "" for a plain number, "names of yd1000" for named values of a YD1000."""
     if register.values:
         return f"names of {drive.model or type(drive).__name__}"
     return RAW if register.step is None else register.unit
