@@ -1,0 +1,79 @@
+"""The part `influx`: all rows as InfluxDB's line protocol, to a server over HTTP or to standard output."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import sys
+from dataclasses import dataclass, field
+from urllib.parse import parse_qs, urlsplit
+
+from multidrop import Plant
+from multidrop.gateway.forward.formats import line_protocol, pieces
+from multidrop.gateway.forward.forwarder import Outgoing, RepeatingReceiver
+from multidrop.gateway.forward.part import Forwarding
+from multidrop.gateway.forward.settings import (
+    host_of,
+    secret_in,
+    secret_mistakes,
+    spool_mistakes,
+    url_mistakes,
+)
+from multidrop.gateway.http_post import post
+from multidrop.gateway.parts import PartContext
+from multidrop.toml_check import SIZE
+
+STDOUT = "stdout"
+NANOSECONDS = ("ns", "n", "nanosecond")  # what InfluxDB 1, 2 and 3 call the precision of nanoseconds
+
+
+@dataclass(frozen=True)
+class InfluxSettings:
+    """The settings in the table `[serve.influx]`. Raises ValueError with a line for each mistake."""
+
+    url: str = "http://localhost:8086/write?db=multidrop"  # or "stdout", which means standard output
+    token: str = ""  # path of the file with the token
+    measurement: str = "multidrop"
+    spool: str = "spool/influx"
+    most: str = field(default="1 GB", metadata=SIZE)
+
+    def __post_init__(self) -> None:
+        wrong = [] if self.url == STDOUT else [*url_mistakes(self.url, InfluxSettings.url)]
+        if not wrong and set(parse_qs(urlsplit(self.url).query).get("precision", ())) - {*NANOSECONDS}:
+            wrong.append("url names another precision; times are in ns: write precision=ns, or none")
+        if not self.measurement.strip() or self.measurement.startswith("#"):
+            wrong.append(f'measurement = "{self.measurement}" is not a name; write measurement = "multidrop"')
+        wrong += spool_mistakes(self.most)
+        if wrong:
+            raise ValueError("\n".join(wrong))
+
+    def check(self, plant: Plant) -> list[str]:
+        """Return a sentence if the file with the token cannot be read."""
+        return [*secret_mistakes("token", self.token, plant)]
+
+
+Settings = InfluxSettings
+
+
+def build(settings: InfluxSettings, context: PartContext) -> Forwarding:
+    """Return the part. Raises OSError if the token cannot be read."""
+    token = secret_in(settings.token, context.plant)
+    headers = {"content-type": "text/plain; charset=utf-8", "content-encoding": "gzip"}
+    if token:
+        headers["authorization"] = f"Token {token}"
+
+    def deliver(message: Outgoing) -> None:
+        for rows in pieces(message.rows):
+            lines = line_protocol(rows, settings.measurement)
+            if settings.url == STDOUT:
+                left = memoryview(lines)
+                while left:  # bypass Python's buffer, which stays locked while the reader hangs
+                    left = left[os.write(sys.stdout.fileno(), left) :]
+            else:
+                post(settings.url, gzip.compress(lines, 1), headers)
+
+    receiver = STDOUT if settings.url == STDOUT else host_of(settings.url)
+    folder = context.folder / settings.spool
+    return Forwarding(
+        "influx", receiver, folder, settings.most, context.plant, lambda at: RepeatingReceiver(at, deliver)
+    )

@@ -1,0 +1,101 @@
+"""The part `postgres`: all rows into PostgreSQL, each once.
+
+The table `multidrop.spools` has a row for each spool: its position, which says which messages the
+database has. Rows and position are stored in one transaction.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+
+import psycopg
+from psycopg.conninfo import conninfo_to_dict
+
+from multidrop import Plant
+from multidrop.gateway.forward.forwarder import Outgoing, SpoolPosition
+from multidrop.gateway.forward.part import Forwarding
+from multidrop.gateway.forward.settings import secret_in, secret_mistakes, spool_mistakes
+from multidrop.gateway.parts import PartContext
+from multidrop.samples import SinkError
+from multidrop.samples.sample_tables import SampleTables, sentences
+from multidrop.toml_check import SIZE
+
+PASSWORDS = {"password", "sslpassword"}  # keys of a connection string that hold secrets
+SPOOLS = "multidrop.spools"
+COLUMNS = "log text primary key, newest bigint not null, gaps jsonb not null"
+FIRST = "insert into multidrop.spools (log, newest, gaps) values (%s, 0, '[]') on conflict do nothing"
+FIND = "select newest, gaps from multidrop.spools where log = %s"
+MOVE = "update multidrop.spools set newest = %s, gaps = %s where log = %s and newest = %s and gaps = %s"
+
+
+@dataclass(frozen=True)
+class PostgresSettings:
+    """The settings in the table `[serve.postgres]`. Raises ValueError with a line for each mistake."""
+
+    database: str = "dbname=multidrop"  # connection string of libpq
+    password: str = ""  # path of the file with the password
+    spool: str = "spool/postgres"
+    most: str = field(default="1 GB", metadata=SIZE)
+
+    def __post_init__(self) -> None:
+        wrong = [*spool_mistakes(self.most)]
+        try:
+            if PASSWORDS & conninfo_to_dict(self.database).keys():
+                wrong.append('database has a password in it; write password = "FILE" instead')
+        except psycopg.Error:  # the library's own message may quote a password
+            wrong.append('database is not a connection string; write database = "host=db dbname=plant"')
+        if wrong:
+            raise ValueError("\n".join(wrong))
+
+    def check(self, plant: Plant) -> list[str]:
+        """Return a sentence if the file with the password cannot be read."""
+        return [*secret_mistakes("password", self.password, plant)]
+
+
+Settings = PostgresSettings
+
+
+def build(settings: PostgresSettings, context: PartContext) -> Forwarding:
+    """Return the part. Raises OSError if the password cannot be read."""
+    password = secret_in(settings.password, context.plant)
+    login = {"password": password} if password else {}
+    tables = SampleTables(settings.database, "multidrop serve", **login)
+    folder = context.folder / settings.spool
+    return Forwarding(
+        "postgres", "the database", folder, settings.most, context.plant, lambda _: PostgresReceiver(tables)
+    )
+
+
+class PostgresReceiver:
+    """Stores each message as one transaction."""
+
+    def __init__(self, tables: SampleTables) -> None:
+        self._tables = tables
+        self._log = ""
+        self._kept = SpoolPosition()  # the spool's position that is stored in the database
+
+    def begin(self, log: str) -> SpoolPosition:
+        """Connect again, create missing tables, and return the spool's position."""
+        self._log = log
+        with sentences(), self._tables.open().transaction():
+            self._tables.prepare(SPOOLS, COLUMNS)
+            self._tables.connection.execute(FIRST, (log,))
+            found = self._tables.connection.execute(FIND, (log,)).fetchone()
+            assert found is not None
+            self._kept = SpoolPosition(found[0], tuple((first, last) for first, last in found[1]))
+        return self._kept
+
+    def write(self, message: Outgoing, after: SpoolPosition) -> None:
+        """Store the message's rows, and the position after this message."""
+        positions = [(one.newest, json.dumps(one.gaps)) for one in (after, self._kept)]
+        with sentences(), self._tables.connection.transaction():
+            values = (*positions[0], self._log, *positions[1])
+            if self._tables.connection.execute(MOVE, values).rowcount != 1:
+                raise SinkError(f"the position of the spool {self._log} in the database was changed")
+            self._tables.insert([message.rows])
+        self._kept = after
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._tables.close()

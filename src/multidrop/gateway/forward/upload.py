@@ -1,0 +1,65 @@
+"""The part `upload`: all rows as JSON, in batches by POST to a URL."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+
+from multidrop import Plant
+from multidrop.gateway.forward.formats import pieces, row_objects
+from multidrop.gateway.forward.forwarder import Outgoing, RepeatingReceiver
+from multidrop.gateway.forward.part import Forwarding
+from multidrop.gateway.forward.settings import (
+    host_of,
+    secret_in,
+    secret_mistakes,
+    spool_mistakes,
+    url_mistakes,
+)
+from multidrop.gateway.http_post import post
+from multidrop.gateway.parts import PartContext
+from multidrop.toml_check import SIZE
+
+
+@dataclass(frozen=True)
+class UploadSettings:
+    """The settings in the table `[serve.upload]`. Raises ValueError with a line for each mistake."""
+
+    url: str = "http://localhost:1880/rows"
+    token: str = ""  # path of the file with a bearer token
+    spool: str = "spool/upload"
+    most: str = field(default="1 GB", metadata=SIZE)
+
+    def __post_init__(self) -> None:
+        wrong = [*url_mistakes(self.url, "https://plant.example/rows"), *spool_mistakes(self.most)]
+        if wrong:
+            raise ValueError("\n".join(wrong))
+
+    def check(self, plant: Plant) -> list[str]:
+        """Return a sentence if the file with the token cannot be read."""
+        return [*secret_mistakes("token", self.token, plant)]
+
+
+Settings = UploadSettings
+
+
+def build(settings: UploadSettings, context: PartContext) -> Forwarding:
+    """Return the part. Raises OSError if the token cannot be read."""
+    token = secret_in(settings.token, context.plant)
+    headers = {"content-type": "application/json"} | ({"authorization": f"Bearer {token}"} if token else {})
+
+    def deliver(message: Outgoing) -> None:
+        for number, rows in enumerate(pieces(message.rows)):
+            name = f"{message.id}-{number}"
+            batch = {
+                "id": name,
+                "plant": context.plant.path.stem,
+                "historical": message.is_historical,
+                "rows": row_objects(rows),
+            }
+            post(settings.url, json.dumps(batch).encode(), {**headers, "idempotency-key": name})
+
+    folder, receiver = context.folder / settings.spool, host_of(settings.url)
+    return Forwarding(
+        "upload", receiver, folder, settings.most, context.plant, lambda at: RepeatingReceiver(at, deliver)
+    )

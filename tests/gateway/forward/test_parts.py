@@ -1,0 +1,352 @@
+"""The parts `postgres`, `influx` and `upload`: settings, units, health, and receivers that hang."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import sys
+import threading
+import time
+from collections import Counter
+from math import inf, nan
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from batches import add_rows, new_completion
+from brokers import PUMP
+from forwarded import forwarding, keys_in, rows_at_noon, store, web_server
+from gateways import served, written
+from lines import PATIENCE, until
+from spooled import NOON, numbered
+from tables import table
+
+from multidrop import Plant, PlantError, PlantLine, Polled, PolledDrive
+from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
+from multidrop.drive.register import reading
+from multidrop.gateway.forward import part as part_module
+from multidrop.gateway.forward.formats import MOST_ROWS, line_protocol, pieces, row_objects
+from multidrop.gateway.forward.part import Forwarding
+from multidrop.gateway.http.rights import Right
+from multidrop.gateway.parts import missing_library
+from multidrop.gateway.settings import read_settings
+from multidrop.polling.batch import Batch
+from multidrop.samples import SpoolState, unpack
+
+
+@table(
+    ("serve", "mistake"),
+    [
+        (
+            '[serve.influx]\nurl = "influx:8086"',
+            '[serve.influx]: url = "influx:8086" is not a URL; '
+            'write url = "http://localhost:8086/write?db=multidrop"',
+        ),
+        (
+            '[serve.influx]\nurl = "http://anna:T0K3N@influx/write"',
+            '[serve.influx]: url has a login in it; write token = "FILE" instead',
+        ),
+        (
+            '[serve.influx]\nurl = "http://influx/write?db=a&p=T0K3N"',
+            '[serve.influx]: url has a login in it; write token = "FILE" instead',
+        ),
+        (
+            '[serve.upload]\nurl = "http://[T0K3N/"',
+            '[serve.upload]: url = "http://[T0K3N/" is not a URL; write url = "https://plant.example/rows"',
+        ),
+        (
+            '[serve.upload]\nurl = "http://anna:T0K3N@[db/"',
+            '[serve.upload]: url = "http://[db/" is not a URL; write url = "https://plant.example/rows"',
+        ),
+        ('[serve.upload]\nurl = "http://db:port/"', '[serve.upload]: url = "http://db:port/" is not a URL'),
+        ('[serve.upload]\nurl = "http://db/a b"', '[serve.upload]: url = "http://db/a b" is not a URL'),
+        (
+            '[serve.influx]\nurl = "http://influx/write?db=a&precision=ms"',
+            "[serve.influx]: url names another precision; times are in ns: write precision=ns, or none",
+        ),
+        (
+            '[serve.influx]\nmeasurement = "#m"',
+            '[serve.influx]: measurement = "#m" is not a name; write measurement = "multidrop"',
+        ),
+        (
+            '[serve.influx]\ntoken = "plant.toml"',
+            '[serve.influx]: token = "plant.toml": {folder}/plant.toml has ',
+        ),
+        (
+            '[serve.postgres]\ndatabase = "plant"',
+            '[serve.postgres]: database is not a connection string; write database = "host=db dbname=plant"',
+        ),
+        (
+            '[serve.upload]\nmost = "much"',
+            '[serve.upload]: most = invalid size \'much\': write 1 kB or more, such as "500 MB" or "20 GB"',
+        ),
+        ('[serve.upload]\nulr = "http://a/"', "[serve.upload]: unknown key 'ulr'; did you mean url?"),
+        (
+            '[serve.postgres]\ndatabase = "dbname=a password=T0K3N"',
+            '[serve.postgres]: database has a password in it; write password = "FILE" instead',
+        ),
+        (
+            '[serve.postgres]\ndatabase = "postgresql://anna:T0K3N@db/a"',
+            '[serve.postgres]: database has a password in it; write password = "FILE" instead',
+        ),
+        (
+            '[serve.postgres]\npassword = "none"',
+            '[serve.postgres]: password = "none": {folder}/none cannot be read: No such file or directory',
+        ),
+        ('[serve.mqtt]\nrows = true\nmost = "1"', "[serve.mqtt]: most = invalid size '1': write 1 kB or"),
+    ],
+)
+def test_mistake_in_the_settings_is_reported_in_one_sentence(
+    tmp_path: Path, serve: str, mistake: str
+) -> None:
+    with pytest.raises(PlantError) as wrong:
+        read_settings(written(tmp_path, serve), {})
+    [found] = wrong.value.mistakes
+    assert mistake.format(folder=tmp_path) in found
+
+
+def test_missing_library_is_reported_in_one_sentence() -> None:
+    missing = ImportError("No module named 'pyarrow'", name="pyarrow")
+    assert missing_library("influx", missing).startswith(
+        "it needs pyarrow, which is not installed: pip install 'pyarrow"
+    )
+    missing = ImportError("No module named 'psycopg'", name="psycopg")
+    assert "# multidrop[postgres]" in missing_library("postgres", missing)
+
+
+def test_a_folder_that_is_not_a_spool_is_reported_in_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "spool" / "upload").mkdir(parents=True)
+    (tmp_path / "spool" / "upload" / "rows.csv").touch()
+    with pytest.raises(ValueError, match=r"is not a spool: it holds 'rows.csv'"):
+        forwarding("upload", "http://localhost/", tmp_path)
+
+
+@pytest.mark.slow
+def test_gateway_sends_all_rows_with_units_and_shows_no_secret(tmp_path: Path) -> None:
+    with web_server() as posted:
+        (tmp_path / "token").write_text("T0K3N\n")
+        serve = f'[serve.upload]\nurl = "{posted.url}"\ntoken = "token"\n'
+        with served(tmp_path, serve) as gateway:
+            until(lambda: len(posted.batches) >= 2)
+            posted.status = 500
+            until(lambda: "500" in gateway.get("/health").json["parts"]["upload"])
+            shown = gateway.get("/health").body + gateway.get("/metrics").body
+            assert b"secret-path" not in shown
+            assert b"T0K3N" not in shown
+            assert b"multidrop_upload_rows_lost_total 0.0" in shown
+            posted.status = 200
+        rows = [row for one in posted.batches for row in one["rows"]]
+        assert posted.headers[0]["authorization"] == "Bearer T0K3N"
+        assert posted.headers[0]["idempotency-key"] == posted.batches[0]["id"]
+    units = {(row["register"], row["unit"]) for row in rows}
+    assert {("output_frequency", "Hz"), ("output_current", "A"), ("status", "names of invt-che")} <= units
+    for one in posted.batches:  # on a busy machine, several misses may have the same time
+        one["rows"] = [row for row in one["rows"] if row["value"] is not None]
+    assert set(Counter(keys_in(posted.batches)).values()) == {1}
+
+
+@pytest.mark.slow
+def test_a_receiver_that_hangs_delays_neither_polls_nor_stops_nor_the_shutdown(tmp_path: Path) -> None:
+    with web_server() as posted:
+        posted.hang.clear()
+        with served(tmp_path, f'[serve.upload]\nurl = "{posted.url}"\n') as gateway:
+            part: Any = gateway.gateway.feeds["upload"]
+            until(lambda: part._forwarder._sending_since_s < float("inf"))
+            before = part._spool.state().written
+            until(lambda: part._spool.state().written > before + 50)
+            stopped = gateway.post("/api/stop", {"drives": None}, authorization=gateway.bearer(Right.STOP))
+            assert stopped.status == 200
+            begun = time.monotonic()
+        assert time.monotonic() - begun < PATIENCE
+        assert posted.batches == []
+
+
+@pytest.mark.slow
+def test_a_disk_that_hangs_while_a_file_is_removed_does_not_delay_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    part = forwarding("upload", "http://localhost:9/", tmp_path)
+    store(part._spool, 0, 5)
+    part._spool.acknowledge(1)
+    hangs, goes_on = threading.Event(), threading.Event()
+
+    def hang(path: Path, missing_ok: bool = False) -> None:
+        hangs.set()
+        goes_on.wait()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", hang)
+        part.take(numbered(5, 5))
+        assert hangs.wait(PATIENCE)
+        taking = threading.Thread(target=part.take, args=[numbered(10, 5)])
+        taking.start()
+        taking.join(5.0)
+        was_delayed = taking.is_alive()
+        goes_on.set()
+    taking.join()
+    part._spool.close()
+    assert not was_delayed
+
+
+def state_with(**counts: Any) -> SpoolState:
+    return SpoolState("log", 0, 0, 0, 0, 0, 0, 0, None)._replace(**counts)
+
+
+def test_health_reports_lost_rows_until_the_backlog_is_sent(tmp_path: Path) -> None:
+    part: Any = forwarding("upload", "http://localhost:9/", tmp_path)
+    spool = part._spool
+    part._spool = SimpleNamespace(state=lambda: state_with(lost=120))
+    assert part.health() == "120 rows were lost, because the spool or the disk is full"
+    part._lost_before = 120
+    assert part.health() == ""
+    part._spool = SimpleNamespace(state=lambda: state_with(trouble="No space left on device"))
+    part._lost_before = 0
+    assert part.health() == "rows are not stored: No space left on device"
+    assert {one.name for one in part.figures()} == {
+        f"multidrop_upload_{name}"
+        for name in ("rows_sent", "rows_lost", "rows_refused", "backlog_messages", "spool_bytes")
+    }
+    spool.close()
+
+
+def test_stdout_gets_line_protocol(tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes]) -> None:
+    part = forwarding("influx", "stdout", tmp_path)
+    store(part._spool, 0, 1)
+    part._forwarder.step()
+    part._spool.close()
+    lines = capfdbinary.readouterr().out.decode().splitlines()
+    assert lines[0] == "multidrop,drive=pump-1,register=value_1 value=0.0 1795262400000000000"
+    assert len(lines) == 10
+
+
+def test_flush_of_stdout_does_not_wait_for_a_reader_that_hangs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    part = forwarding("influx", "stdout", tmp_path)
+    store(part._spool, 0, 150)  # more than a pipe holds
+    reading, writing = os.pipe()
+    with os.fdopen(writing, "w", encoding="utf-8") as output:
+        monkeypatch.setattr(sys, "stdout", output)
+        threads = [
+            threading.Thread(target=work, daemon=True) for work in (part._forwarder.step, output.flush)
+        ]
+        threads[0].start()
+        select.select([reading], [], [], PATIENCE)
+        threads[1].start()
+        threads[1].join(5.0)
+        was_blocked, was_sent = threads[1].is_alive(), not threads[0].is_alive()
+        while threads[0].is_alive():
+            if select.select([reading], [], [], 0.01)[0]:
+                os.read(reading, 1 << 16)
+    os.close(reading)
+    part._spool.close()
+    assert not was_sent
+    assert not was_blocked
+
+
+# ---- a plant that changes ----
+
+
+def plant_with(unit: str, folder: Path) -> Plant:
+    """Return a plant whose drive has a register `load` in this unit."""
+    drive = type("Meter", (type(PUMP),), {"load": reading(0x9000, unit, step=0.1)})(1, name="pump-1")
+    polled = PolledDrive(drive, (Polled(drive.load, 1.0),))
+    return Plant((PlantLine("hall", "/dev/null", None, None, (polled,)),), folder / "plant.toml")
+
+
+def batch_at(time_ns: int) -> Any:
+    """Return a batch with one row of pump-1's `load`, requested at this monotonic time."""
+    columns = Columns(1)
+    found = new_completion(result=7, sent_ns=time_ns, first_ns=time_ns + 1)
+    found.reply.data_len = 2
+    layout = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1.0, 1.0)])
+    assert add_rows(columns, layout, found, 0)
+    return Batch(columns, Names(["pump-1"]), Names(["load"]))
+
+
+def test_units_follow_the_present_plant_and_rows_of_unknown_units_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent: list[Any] = []
+    monkeypatch.setattr(part_module, "monotonic_ns", lambda: 1000)
+    made: Any = Forwarding(  # type: ignore[arg-type]
+        "upload",
+        "it",
+        tmp_path / "spool",
+        "1 GB",
+        plant_with("A", tmp_path),
+        lambda _: sent,  # type: ignore[return-value]
+    )
+    made.take(batch_at(900))
+    made.adopt(plant_with("%", tmp_path))
+    made.take(batch_at(999))  # requested before the new plant was adopted, so its unit is unknown
+    made.take(batch_at(1000))
+    made._spool.close()
+    [stored] = made._spool._folder.messages.values()
+    rows = unpack(stored.path.read_bytes())
+    assert sorted(zip(rows["monotonic_ns"].to_pylist(), rows["unit"].to_pylist(), strict=True)) == [
+        (900, "A"),
+        (1000, "%"),
+    ]
+
+
+# ---- rows as JSON and in line protocol; InfluxDB itself reads them in `test_receivers.py` ----
+
+
+def test_rows_are_sent_as_json_objects() -> None:
+    found = row_objects(
+        rows_at_noon(
+            ("pump-1", "output_frequency", 49.5, "ok", "Hz"),
+            ("pump-1", "fault", None, "no reply", None),
+            ("насос", "ratio", nan, "ok", ""),
+        )
+    )
+    assert json.loads(json.dumps(found, allow_nan=False)) == [
+        {
+            "time": "2026-11-21T12:00:00.000000000Z",
+            "drive": "pump-1",
+            "register": "output_frequency",
+            "value": 49.5,
+            "status": "ok",
+            "unit": "Hz",
+        },
+        {
+            "time": "2026-11-21T12:00:00.000000001Z",
+            "drive": "pump-1",
+            "register": "fault",
+            "value": None,
+            "status": "no reply",
+            "unit": None,
+        },
+        {
+            "time": "2026-11-21T12:00:00.000000002Z",
+            "drive": "насос",
+            "register": "ratio",
+            "value": None,
+            "status": "not a finite number",
+            "unit": "",
+        },
+    ]
+
+
+@table(
+    ("row", "line"),
+    [
+        (("pump-1", "hz", 49.5, "ok", "Hz"), "m,drive=pump-1,register=hz,unit=Hz value=49.5"),
+        (("pump-1", "n", 1e-7, "ok", ""), "m,drive=pump-1,register=n value=1e-07"),
+        (("a b,c=d", "n", 1.0, "ok", None), "m,drive=a\\ b\\,c\\=d,register=n value=1.0"),
+        (("a\\", "n", 1.0, "ok", None), "m,drive=a/,register=n value=1.0"),
+        (("a", "n", None, 'a "b" \\', "%"), 'm,drive=a,register=n,unit=% miss="a \\"b\\" \\\\"'),
+        (("a", "n", inf, "ok", "%"), 'm,drive=a,register=n,unit=% miss="not a finite number"'),
+    ],
+)
+def test_row_is_written_in_line_protocol(row: Any, line: str) -> None:
+    assert line_protocol(rows_at_noon(row), "m").decode() == f"{line} {NOON}\n"
+
+
+def test_many_rows_are_sent_in_pieces() -> None:
+    table = rows_at_noon(*[("a", "n", float(number), "ok", None) for number in range(2 * MOST_ROWS + 1)])
+    assert [len(one) for one in pieces(table)] == [MOST_ROWS, MOST_ROWS, 1]
+    assert [row["value"] for one in pieces(table) for row in row_objects(one)] == table["value"].to_pylist()
