@@ -1,0 +1,385 @@
+"""The nodes of a plant in the address space of an OPC UA server."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import logging
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from functools import cache, lru_cache
+from typing import Any, NamedTuple
+
+from asyncua import ua
+from asyncua.server.address_space import AttributeValue
+from asyncua.server.internal_server import InternalServer
+
+from multidrop import Plant, PolledDrive, Register
+from multidrop.gateway.live import hub
+from multidrop.gateway.opcua.settings import FAULT, STATE, STOP
+
+INDEX = 2  # index of the namespace of all nodes below
+PLANT, PLANT_STOP = ua.NodeId(1, INDEX), ua.NodeId(2, INDEX)
+SOME = 64  # number of values written before waiting requests are served
+MOST_REMOVED = 500  # once reloads have removed more drives, their memory is freed: 10 kB each
+UNITS_OF = "http://www.opcfoundation.org/UA/units/un/cefact"
+# Common codes of UNECE Recommendation 20 by unit. A unit id is the bytes of such a code (OPC 10000-8, 5.6.3).
+UNITS = {
+    "Hz": "HTZ",
+    "kHz": "KHZ",
+    "V": "VLT",
+    "A": "AMP",
+    "mA": "4K",
+    "W": "WTT",
+    "kW": "KWT",
+    "kWh": "KWH",
+    "%": "P1",
+    "rpm": "RPM",
+    "°C": "CEL",
+    "ms": "C26",
+    "s": "SEC",
+    "min": "MIN",
+    "h": "HUR",
+    "Nm": "NU",
+    "bar": "BAR",
+    "atm": "ATM",
+    "kPa": "KPA",
+    "MPa": "MPA",
+    "kgf/cm²": "E42",
+}
+_Codes = ua.StatusCodes
+GOOD, WAITING = _Codes.Good, _Codes.BadWaitingForInitialData
+STALE, HELD = _Codes.UncertainLastUsableValue, _Codes.UncertainNoCommunicationLastUsableValue
+SILENT = _Codes.BadNoCommunication
+REMOVED = _Codes.BadNodeIdUnknown
+DAMAGED = (
+    *("reply cut short", "bad checksum", "bad character", "no frame in what was received"),
+    *("reply from another address", "reply to another function", "reply of another length"),
+    "maybe the adapter's echo",
+)
+# OPC UA's status code by the status of a miss. Misses with another status mean an unreachable drive.
+CODES = {"no valid value": _Codes.BadSensorFailure} | dict.fromkeys(DAMAGED, _Codes.BadCommunicationError)
+REFUSED = "exception "
+NOTHING = ua.Variant(None, ua.VariantType.Null)
+
+_log = logging.getLogger("multidrop.gateway")
+
+
+@contextmanager
+def lasting() -> Iterator[None]:
+    """Exclude the objects made in the `with` block from garbage collection, because they last.
+
+    A garbage collection stops all threads: with the 400,000 objects of the address space, for 0.2 s. An
+    excluded object is still freed when its last reference ends. But objects in a reference cycle, such as the
+    drives of an old plant, are freed only by `free_excluded`.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        if was_enabled:
+            gc.enable()
+
+
+def free_excluded() -> None:
+    """Collect garbage, also among the objects that `lasting` has excluded. Stops all threads for 0.2 s."""
+    gc.unfreeze()
+    gc.collect()
+
+
+class VariableState(NamedTuple):
+    """The state of a variable: its value, status code and time. If the code is bad, the value is None."""
+
+    drive: str
+    name: str  # a register's name, STATE or FAULT
+    code: int  # OPC UA's status code
+    value: float | str | None
+    time_ns: int  # when the value was requested, UTC in ns
+
+
+def state_of(
+    drive: str, name: str, newest: hub.KeptRow | None, good: hub.KeptRow | None, is_current: bool, reason: str
+) -> VariableState:
+    """Return the state of a register's variable from its newest row.
+
+    `good` is the newest row with a value; if `newest` is another row, it is a miss. If `is_current`, the
+    value of `good` is still current, and the variable keeps it even if newer rows are misses. `reason` is the
+    status of `newest`.
+    """
+    if newest is None:
+        return VariableState(drive, name, WAITING, None, 0)
+    if good is not None and (newest is good or is_current):
+        code = (GOOD if is_current else STALE) if newest is good else HELD
+        return VariableState(drive, name, code, good[2], good[0])
+    code = _Codes.BadDeviceFailure if reason.startswith(REFUSED) else CODES.get(reason, SILENT)
+    return VariableState(drive, name, code, None, newest[0])
+
+
+def fault_of(shown: hub.Shown) -> tuple[int, str | None]:
+    """Return status code and text of a drive's fault.
+
+    The text is "" without a fault, and None if it is unknown.
+    """
+    if shown.words is None or shown.state == hub.FAULT:
+        return GOOD, shown.words or ""
+    return SILENT if shown.state == hub.SILENT else _Codes.Bad, None
+
+
+class _Variant(ua.Variant):
+    """A number or a text with its type. The type is known to be right, so asyncua's check is skipped."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None: ...
+
+
+class _Value(ua.DataValue):
+    """A value that never changes. So asyncua need not copy it, which would take 50 us for each subscriber."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None: ...
+
+    def __deepcopy__(self, memo: object) -> _Value:
+        return self
+
+
+class _Variable:
+    """A variable and its newest state.
+
+    The value for clients is made on request, because few variables have subscribers.
+    """
+
+    def __init__(self, state: VariableState, register: Register[Any] | None) -> None:
+        self.state = state
+        self._register = register
+
+    def value(self, *node: object) -> _Value:
+        """Return the value for clients, made from the newest state."""
+        _, _, code, value, time_ns = self.state
+        if isinstance(value, float) and self._register is not None:
+            value = hub.published_value(self._register, value)
+        kind = ua.VariantType.Double if isinstance(value, float) else ua.VariantType.String
+        variant = NOTHING if value is None else _Variant(value, kind, None, False)
+        return _Value(variant, _status(code), _time(time_ns))
+
+
+@lru_cache(maxsize=64)  # cached, because the registers of one request have the same time
+def _time(ns: int) -> datetime | None:
+    return datetime.fromtimestamp(ns / 1e9, UTC) if ns else None
+
+
+class _Drive(NamedTuple):
+    polled: PolledDrive
+    nodes: list[ua.NodeId]  # all nodes of the drive
+    variables: dict[str, tuple[_Variable, AttributeValue]]
+
+
+class PlantNodes:
+    """The object of the plant, and in it an object for each drive, with a variable for each polled register.
+
+    All methods must be called in the server's loop.
+    """
+
+    def __init__(self, server: InternalServer) -> None:
+        # by id of a stop method: the drive that it stops; None: all drives
+        self.stops: dict[ua.NodeId, str | None] = {PLANT_STOP: None}
+        self._session = server.isession
+        self._space = server.aspace
+        self._drives: dict[str, _Drive] = {}
+        self._removed = 0  # number of drives removed since the last call of `free_excluded`
+
+    async def make(self) -> None:
+        """Add the object of the plant, which has no drives yet."""
+        await self._add(
+            _object(ua.NodeId(ua.ObjectIds.ObjectsFolder), PLANT, "Plant", "all drives"),
+            *_method(PLANT, PLANT_STOP, ua.NodeId(3, INDEX), "Stop all drives of the plant."),
+        )
+
+    async def _add(self, *items: ua.AddNodesItem) -> list[ua.NodeId]:
+        for result in await self._session.add_nodes([*items]):
+            result.StatusCode.check()
+        return [item.RequestedNewNodeId for item in items]
+
+    async def adopt(self, plant: Plant) -> None:
+        """Remove the nodes of drives that changed or are gone, and add those of new drives."""
+        wanted = {polled.drive.name: polled for line in plant.lines for polled in line.drives}
+        for name in [name for name, known in self._drives.items() if wanted.get(name) != known.polled]:
+            await self._remove(name)
+            self._removed += 1
+        if self._removed > MOST_REMOVED:
+            self._removed = 0
+            free_excluded()
+        with lasting():
+            for name, polled in wanted.items():
+                if name not in self._drives:
+                    await self._add_drive(name, polled)
+                    await asyncio.sleep(0)
+
+    async def _add_drive(self, name: str, polled: PolledDrive) -> None:
+        drive, stop = polled.drive, _id(name, STOP)
+        registers = {poll.register.name: poll.register for poll in polled.series}
+        variables = {member: _id(name, member) for member in (*registers, STATE, FAULT)}
+        items = [
+            _object(PLANT, _id(name), name, drive.title),
+            *_method(_id(name), stop, _id(name, STOP, "OutputArguments"), "Stop this drive."),
+            _variable(_id(name), variables[STATE], STATE, "runs, stands, fault, silent or unknown", str),
+            _variable(_id(name), variables[FAULT], FAULT, "what the drive shows as its fault", str),
+        ]
+        for member, register in registers.items():
+            kind, unit = str if register.values is not None else float, register.value_unit
+            type_of = "AnalogUnitType" if unit and kind is float else "BaseDataVariableType"
+            text = register.note or member
+            items.append(_variable(_id(name), variables[member], member, text, kind, type_of))
+            if unit and kind is float:
+                items.append(_unit(variables[member], _id(name, member, "EngineeringUnits"), unit))
+        nodes = await self._add(*items)
+        found = {}
+        for member, node in variables.items():
+            variable = _Variable(VariableState(name, member, WAITING, None, 0), registers.get(member))
+            self._space.set_attribute_value_callback(node, ua.AttributeIds.Value, variable.value)
+            found[member] = variable, self._space[node].attributes[ua.AttributeIds.Value]
+        self.stops[stop] = name
+        self._drives[name] = _Drive(polled, nodes, found)
+
+    async def _remove(self, name: str) -> None:
+        """Remove a drive's nodes.
+
+        Subscribers of the drive's values get a bad status as their last notification.
+        """
+        drive, space = self._drives.pop(name), self._space
+        del self.stops[_id(name, STOP)]
+        for member, (variable, attribute) in drive.variables.items():
+            variable.state = VariableState(name, member, REMOVED, None, 0)
+            await _notify(variable, attribute)
+            for handle in [*attribute.datachange_callbacks]:
+                space.delete_datachange_callback(handle)
+        of_plant = space[PLANT].references
+        of_plant[:] = [one for one in of_plant if one.NodeId != _id(name)]
+        for node in drive.nodes:
+            del space[node]
+
+    async def write(self, states: Iterable[VariableState]) -> None:
+        """Write these states. After every SOME states, let the loop serve clients, who may send stops."""
+        for count, state in enumerate(states, 1):
+            drive = self._drives.get(state.drive)
+            if drive is not None and state.name in drive.variables:
+                variable, attribute = drive.variables[state.name]
+                variable.state = state
+                await _notify(variable, attribute)
+            if count % SOME == 0:
+                await asyncio.sleep(0)
+
+
+async def _notify(variable: _Variable, attribute: AttributeValue) -> None:
+    """Send a variable's value to its subscribers."""
+    if not attribute.datachange_callbacks:
+        return
+    value = variable.value()
+    for handle, callback in [*attribute.datachange_callbacks.items()]:
+        try:
+            await callback(handle, value)
+        except Exception:  # for example if a client demands a deadband for a text
+            drive, name, *_ = variable.state
+            _log.debug("a subscriber of %s.%s failed", drive, name, exc_info=True)
+
+
+def _id(*names: str) -> ua.NodeId:
+    """Return the id of a drive's object, or of a node in it."""
+    return ua.NodeId(".".join(names), INDEX)
+
+
+@cache
+def _status(code: int) -> ua.StatusCode:
+    return ua.StatusCode(code)
+
+
+def _item(parent: ua.NodeId, node: ua.NodeId, name: str, attributes: Any, reference: str) -> ua.AddNodesItem:
+    """Return the request to add a node with this display name.
+
+    `attributes` has the other attributes of the node.
+    """
+    attributes.DisplayName = ua.LocalizedText(name)
+    attributes.WriteMask = attributes.UserWriteMask = 0
+    item = ua.AddNodesItem()
+    item.ParentNodeId, item.RequestedNewNodeId = parent, node
+    item.ReferenceTypeId = ua.NodeId(getattr(ua.ObjectIds, reference))
+    item.NodeAttributes = attributes
+    return item
+
+
+def _object(parent: ua.NodeId, node: ua.NodeId, name: str, description: str) -> ua.AddNodesItem:
+    attributes = ua.ObjectAttributes()
+    attributes.Description, attributes.EventNotifier = ua.LocalizedText(description), 0
+    item = _item(parent, node, name, attributes, "Organizes" if node == PLANT else "HasComponent")
+    item.NodeClass, item.BrowseName = ua.NodeClass.Object, ua.QualifiedName(name, INDEX)
+    item.TypeDefinition = ua.NodeId(ua.ObjectIds.BaseObjectType)
+    return item
+
+
+def _variable(
+    parent: ua.NodeId,
+    node: ua.NodeId,
+    name: str,
+    description: str,
+    kind: type,
+    type_of: str = "BaseDataVariableType",
+) -> ua.AddNodesItem:
+    """Return a variable of numbers or texts, which clients may only read."""
+    value = ua.Variant(0.0, ua.VariantType.Double) if kind is float else ua.Variant("", ua.VariantType.String)
+    item = _item(parent, node, name, _values(value, value.VariantType.value, description), "HasComponent")
+    item.NodeClass, item.BrowseName = ua.NodeClass.Variable, ua.QualifiedName(name, INDEX)
+    item.TypeDefinition = ua.NodeId(getattr(ua.ObjectIds, type_of))
+    return item
+
+
+def _property(parent: ua.NodeId, node: ua.NodeId, name: str, value: Any, data_type: int) -> ua.AddNodesItem:
+    item = _item(parent, node, name, _values(value, data_type, name), "HasProperty")
+    item.NodeClass, item.BrowseName = ua.NodeClass.Variable, ua.QualifiedName(name, 0)
+    item.TypeDefinition = ua.NodeId(ua.ObjectIds.PropertyType)
+    return item
+
+
+def _values(value: ua.Variant, data_type: int, description: str) -> ua.VariableAttributes:
+    attributes = ua.VariableAttributes()
+    attributes.Value, attributes.DataType = value, ua.NodeId(data_type)
+    attributes.Description = ua.LocalizedText(description)
+    attributes.ValueRank = ua.ValueRank.OneDimension if value.is_array else ua.ValueRank.Scalar
+    attributes.ArrayDimensions = [0] if value.is_array else None
+    attributes.Historizing = False
+    attributes.AccessLevel = attributes.UserAccessLevel = ua.AccessLevel.CurrentRead.mask
+    return attributes
+
+
+def unit_of(unit: str) -> ua.EUInformation:
+    """Return the description of a unit; its id is -1 if UNECE has no code for it."""
+    code = UNITS.get(unit, "")
+    number = int.from_bytes(code.encode(), "big") if code else -1
+    return ua.EUInformation(UNITS_OF, number, ua.LocalizedText(unit), ua.LocalizedText(unit))
+
+
+def _unit(parent: ua.NodeId, node: ua.NodeId, unit: str) -> ua.AddNodesItem:
+    value = ua.Variant(unit_of(unit), ua.VariantType.ExtensionObject)
+    return _property(parent, node, "EngineeringUnits", value, ua.ObjectIds.EUInformation)
+
+
+def _method(
+    parent: ua.NodeId, node: ua.NodeId, results: ua.NodeId, description: str
+) -> Iterator[ua.AddNodesItem]:
+    """Yield the requests to add two nodes: a method without arguments that returns a text, and the
+    description of this text.
+    """
+    attributes = ua.MethodAttributes()
+    attributes.Description = ua.LocalizedText(description)
+    attributes.Executable = attributes.UserExecutable = True
+    item = _item(parent, node, STOP, attributes, "HasComponent")
+    item.NodeClass, item.BrowseName = ua.NodeClass.Method, ua.QualifiedName(STOP, INDEX)
+    yield item
+    text = ua.Argument(
+        "Text", ua.NodeId(ua.ObjectIds.String), ua.ValueRank.Scalar, [], ua.LocalizedText("the outcome")
+    )
+    arguments = ua.Variant([text], ua.VariantType.ExtensionObject)
+    yield _property(node, results, "OutputArguments", arguments, ua.ObjectIds.Argument)

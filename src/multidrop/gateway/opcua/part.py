@@ -1,0 +1,253 @@
+"""The part `opcua`: serves the plant to OPC UA clients, which may read values and stop drives.
+
+The server has its own thread with its own event loop. So requests of its clients delay neither polling
+nor stops over other interfaces.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import logging
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
+from importlib import import_module
+from math import inf
+from typing import TYPE_CHECKING, Any
+
+from multidrop import Batch, NoReply, Plant
+from multidrop.control import CommandResult
+from multidrop.gateway.commands import MOST_STOPS
+from multidrop.gateway.http.connections import listen
+from multidrop.gateway.http.rights import Caller, Right, Tokens, caller_with, is_loopback
+from multidrop.gateway.opcua.settings import FAULT, STATE, OpcUaSettings
+from multidrop.gateway.parts import PartContext
+from multidrop.supervisor import supervisor
+
+if TYPE_CHECKING:
+    from multidrop.gateway.opcua.nodes import PlantNodes, VariableState
+    from multidrop.gateway.opcua.server import Identity, Visitor
+
+EVERY_S = 0.1  # interval of passing new values to the server
+SWITCH_S = 0.0005  # how long a thread may run, in s, while other threads wait for their turn
+USUAL_SWITCH_S = sys.getswitchinterval()  # the interpreter's default, used without an OPC UA server: 5 ms
+STATE_TURNS = 10  # a drive's state is passed on once in this many intervals: computing it takes 50 us
+STOP_WAIT_S = 0.4  # how long a stop's answer waits for the motor; the client's other requests wait as long
+
+Settings = OpcUaSettings
+
+_unended: set[OpcUa] = set()  # all parts in this process whose server has not ended
+_log = logging.getLogger("multidrop.gateway")
+
+
+def build(settings: OpcUaSettings, context: PartContext) -> OpcUa:
+    """Return the listening part. Raises ImportError without asyncua, OSError if the port cannot be opened.
+
+    Raises ValueError for an unsuitable certificate or key.
+    """
+    server, folder = import_module("multidrop.gateway.opcua.server"), context.plant.path.parent
+    files = [folder / name for name in (settings.certificate, settings.key) if name]
+    return OpcUa(settings, context, server.read_identity(*files) if files else None)
+
+
+class OpcUa:
+    """The OPC UA server of a plant."""
+
+    def __init__(self, settings: OpcUaSettings, context: PartContext, identity: Identity | None) -> None:
+        self._identity = identity
+        self._context = context
+        self._listener = listen(*settings.address)
+        self.port: int = self._listener.getsockname()[1]
+        self._plant = context.plant
+        self._adopted: Plant | None = None  # the plant whose nodes the server has
+        self._turn = 0  # number of intervals so far
+        self._seen: dict[str, dict[str, Any]] = {}  # states that the server has, by drive and name
+        self._wrong = Tokens()  # wrong tokens, to limit their log lines; used in the server's thread only
+        self._stopping: Counter[str | None] = Counter()  # stops in progress by drive; None: of all drives
+        self._loop: asyncio.AbstractEventLoop | None = None  # event loop of the gateway
+        self._serving: asyncio.Future[None] | None = None  # done when the server's thread has ended
+        self._opened: tuple[asyncio.AbstractEventLoop, asyncio.Event, PlantNodes] | None = None
+        self._is_over = False  # True: the server must end now, or as soon as it is open
+        self._writing: Future[None] | None = None  # pending while the server takes over values
+
+    # ---- in the gateway's loop ----
+
+    def take(self, batch: Batch) -> None:
+        """Ignore the batch: the hub has the rows."""
+
+    def adopt(self, plant: Plant) -> None:
+        """Use another plant; the server gets it before the next values."""
+        self._plant = plant
+
+    async def run(self) -> None:
+        """Serve until cancelled. Raises the exception that ends the server's thread."""
+        self._loop = asyncio.get_running_loop()
+        self._serving = supervisor().thread("opcua server", inf, lambda: asyncio.run(self._serve()))
+        due = self._loop.time()
+        try:
+            while not self._serving.done():
+                self._hand_over()
+                due = max(due + EVERY_S, self._loop.time())
+                await asyncio.wait([self._serving], timeout=due - self._loop.time())
+            self._serving.result()
+        finally:
+            self._end_server()  # otherwise clients would still read the last values as current ones
+
+    async def close(self) -> None:
+        """Disconnect all clients; stops in progress continue."""
+        while self._serving is not None and not self._serving.done():
+            self._end_server()
+            await asyncio.wait([self._serving], timeout=EVERY_S)
+        self._listener.close()
+
+    @property
+    def is_ready(self) -> bool:
+        """True as soon as clients see the plant's drives."""
+        return self._writing is not None and self._writing.done()
+
+    def _end_server(self) -> None:
+        self._is_over = True
+        if self._opened is not None:
+            loop, ended, _ = self._opened
+            with suppress(RuntimeError):  # the server's loop is closed already
+                loop.call_soon_threadsafe(ended.set)
+
+    def _hand_over(self) -> None:
+        """Pass changed states to the server, unless the server is still taking over earlier ones."""
+        if self._opened is None or (self._writing is not None and not self._writing.done()):
+            return
+        loop, _, nodes = self._opened
+        if self._writing is not None:
+            self._writing.result()
+        if self._adopted is not self._plant:
+            self._adopted, self._seen = self._plant, {}
+            self._writing = asyncio.run_coroutine_threadsafe(nodes.adopt(self._plant), loop)
+        elif states := self._changes():
+            self._writing = asyncio.run_coroutine_threadsafe(nodes.write(states), loop)
+
+    def _changes(self) -> list[VariableState]:
+        """Return the states of all variables that changed since the last call."""
+        from multidrop.gateway.opcua.nodes import GOOD, VariableState, fault_of, state_of
+
+        hub, seen, states = self._context.hub, self._seen, []
+        self._turn += 1
+        for number, drive in enumerate(hub.drives):
+            given = seen.setdefault(drive, {})
+            for register, newest, good, is_current in hub.known(drive):
+                before = given.get(register.name)
+                if before is None or before[0] is not newest or before[1] is not is_current:
+                    given[register.name] = newest, is_current
+                    reason = "" if newest is None or newest is good else hub.status(newest[3])
+                    states.append(state_of(drive, register.name, newest, good, is_current, reason))
+            if number % STATE_TURNS != self._turn % STATE_TURNS:
+                continue
+            shown = hub.seen(drive)
+            for name, code, text in (STATE, GOOD, shown.state), (FAULT, *fault_of(shown)):
+                if given.get(name) != (code, text):
+                    given[name] = code, text
+                    states.append(VariableState(drive, name, code, text, time.time_ns()))
+        return states
+
+    async def _stop(self, drive: str | None, caller: Caller) -> CommandResult:
+        """Stop a drive, or with None all drives.
+
+        Return the drive's result, or for all drives the first failure.
+        """
+        try:
+            results = await self._context.commands.stop(None if drive is None else [drive], caller)
+        except Exception:
+            _log.exception("stop of %s by an OPC UA client", drive or "all drives")
+            raise
+        return next((one for one in results.values() if not one.ok), next(iter(results.values())))
+
+    # ---- in the server's thread ----
+
+    async def _serve(self) -> None:
+        from multidrop.gateway.opcua.nodes import PlantNodes, lasting
+        from multidrop.gateway.opcua.server import PlantServer
+
+        server = PlantServer(self._listener, lambda visitor: self._caller(visitor) is not None, self._call)
+        with self._quick_process():
+            with lasting():
+                await server.open(self._context.version, self._identity)
+                nodes, ended = PlantNodes(server.internal), asyncio.Event()
+                await nodes.make()
+                await server.start()
+            try:
+                self._opened = asyncio.get_running_loop(), ended, nodes
+                if not self._is_over:
+                    await ended.wait()
+            finally:
+                await server.stop()
+
+    @contextmanager
+    def _quick_process(self) -> Iterator[None]:
+        """Make threads take turns quickly while a server runs. After the last server, undo `lasting` too.
+
+        There may be two servers: during a reload, the next one may start before this one has ended.
+        """
+        _unended.add(self)
+        sys.setswitchinterval(SWITCH_S)
+        try:
+            yield
+        finally:
+            _unended.discard(self)
+            if not _unended:
+                sys.setswitchinterval(USUAL_SWITCH_S)
+                gc.unfreeze()
+
+    def _caller(self, visitor: Visitor) -> Caller | None:
+        """Return a session's user as a caller with its present rights; None if the user may not read."""
+        tokens, may, address = self._context.tokens, self._context.commands.may, visitor.address
+        token = None
+        if visitor.secret and tokens:  # without tokens of its own, the gateway ignores any token
+            token = tokens.find(visitor.secret)
+            if token is None:
+                self._note_wrong(visitor)
+                return None
+        return caller_with(token, may.without_token(is_loopback=is_loopback(address)), "opcua", address)
+
+    def _note_wrong(self, visitor: Visitor) -> None:
+        now, address = time.monotonic(), visitor.address
+        if not self._wrong.is_shut(address, now) and self._wrong.note_wrong(address, visitor.secret, now):
+            _log.warning("wrong token by opcua from %s", address)
+
+    async def _call(self, method: Any, visitor: Visitor) -> Any:
+        """Carry out a method, which is always a stop. Answer within STOP_WAIT_S, even if it takes longer."""
+        from asyncua import ua
+
+        assert self._opened is not None
+        assert self._loop is not None
+        stops = self._opened[2].stops
+        if method not in stops:
+            return ua.CallMethodResult(ua.StatusCode(ua.StatusCodes.BadMethodInvalid))
+        drive, caller = stops[method], self._caller(visitor)
+        if caller is None or caller.role < Right.STOP:
+            return ua.CallMethodResult(ua.StatusCode(ua.StatusCodes.BadUserAccessDenied))
+        if self._stopping[drive] >= MOST_STOPS:
+            return _answer(ua.StatusCodes.GoodCompletesAsynchronously, "a stop is in progress")
+        stopping = asyncio.wrap_future(
+            asyncio.run_coroutine_threadsafe(self._stop(drive, caller), self._loop)
+        )
+        self._stopping[drive] += 1
+        stopping.add_done_callback(lambda _: self._stopping.subtract([drive]))
+        await asyncio.wait([stopping], timeout=STOP_WAIT_S)
+        if not stopping.done():
+            return _answer(ua.StatusCodes.GoodCompletesAsynchronously, "the stop is in progress")
+        result = stopping.result()
+        if result.ok:
+            return _answer(ua.StatusCodes.Good, result.text)
+        is_silent = isinstance(result.error, NoReply)
+        return _answer(
+            ua.StatusCodes.BadNoCommunication if is_silent else ua.StatusCodes.BadUnexpectedError, result.text
+        )
+
+
+def _answer(code: int, text: str) -> Any:
+    from asyncua import ua
+
+    return ua.CallMethodResult(ua.StatusCode(code), OutputArguments=[ua.Variant(text, ua.VariantType.String)])

@@ -1,0 +1,249 @@
+"""An OPC UA server whose clients are hostile, greedy or read no answers, and its encryption."""
+
+from __future__ import annotations
+
+import os
+import random
+import socket
+import struct
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pytest
+from gateways import Served, served
+from lines import PATIENCE, until
+
+from multidrop.gateway.http.rights import Right
+
+try:
+    from asyncua import Client as AsyncClient
+    from asyncua import ua
+    from asyncua.sync import Client
+
+    from multidrop.gateway.opcua import server
+except ImportError:
+    if os.environ.get("CI"):
+        raise
+    pytest.skip("asyncua, the client, is not installed", allow_module_level=True)
+
+pytestmark = pytest.mark.slow  # asyncua takes a second to start
+
+SERVE = '[serve.opcua]\nlisten = "127.0.0.1:0"\n[serve.may]\nlook = "anyone"\nstop = "anyone"\n'
+PLANT, PLANT_STOP = "ns=2;i=1", "ns=2;i=2"
+
+
+@pytest.fixture(scope="module")
+def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with pytest.MonkeyPatch.context() as patch, served(tmp_path_factory.mktemp("opcua"), SERVE) as gateway:
+        patch.setattr(server, "MOST_WAITING", 1 << 20)  # so that only MOST_UNREAD limits clients
+        part: Any = gateway.gateway.feeds["opcua"]
+        until(lambda: part.is_ready)
+        yield gateway
+
+
+def port_of(gateway: Served) -> int:
+    part: Any = gateway.gateway.feeds["opcua"]
+    return int(part.port)
+
+
+def stop_all(url: str) -> None:
+    """Stop all drives by OPC UA, with a new client."""
+    with Client(url, timeout=PATIENCE) as client:
+        assert "stop" in client.get_node(PLANT).call_method(client.get_node(PLANT_STOP).nodeid)
+
+
+def connected(gateway: Served) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", port_of(gateway)), timeout=PATIENCE)
+
+
+@contextmanager
+def recorded(port: int) -> Iterator[tuple[str, bytearray]]:
+    """Yield the URL of a proxy for one client, and the bytes that the client sends."""
+    sent = bytearray()
+
+    def passed(source: socket.socket, target: socket.socket, note: bytearray) -> None:
+        with suppress(OSError):
+            while data := source.recv(65536):
+                note += data
+                target.sendall(data)
+            target.shutdown(socket.SHUT_WR)
+
+    with closing(socket.create_server(("127.0.0.1", 0))) as listener:
+
+        def serve() -> None:
+            listener.settimeout(PATIENCE)
+            peer, _ = listener.accept()
+            with closing(peer), closing(socket.create_connection(("127.0.0.1", port))) as far:
+                back = threading.Thread(target=passed, args=(far, peer, bytearray()))
+                back.start()
+                passed(peer, far, sent)
+                back.join()
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield f"opc.tcp://127.0.0.1:{listener.getsockname()[1]}/", sent
+        thread.join()
+
+
+def chunks_of(data: bytes) -> list[bytes]:
+    """Return the chunks of OPC UA's binary protocol (OPC 10000-6, 7.1.2) in these bytes."""
+    found = []
+    while data:
+        (size,) = struct.unpack_from("<I", data, 4)
+        found.append(data[:size])
+        data = data[size:]
+    return found
+
+
+def read_chunk(peer: socket.socket) -> bytes:
+    data = b""
+    while len(data) < 8 or len(data) < struct.unpack_from("<I", data, 4)[0]:
+        more = peer.recv(65536)
+        assert more
+        data += more
+    return data
+
+
+def test_the_server_survives_damaged_conversations(gateway: Served) -> None:
+    """A recorded conversation is replayed on a new channel, with random bytes changed in one message."""
+    with recorded(port_of(gateway)) as (url, sent), Client(url, timeout=PATIENCE) as client:
+        plant = client.get_node(PLANT)
+        plant.get_children()
+        client.get_node("ns=2;s=pump-1.status").read_data_value(raise_on_bad_status=False)
+        subscription = client.create_subscription(100, None)
+        subscription.subscribe_data_change(client.get_node("ns=2;s=pump-1.State"))
+        plant.call_method(client.get_node(PLANT_STOP).nodeid)
+    hello, opening, *messages = chunks_of(bytes(sent))
+    rng = random.Random(43)
+    for _ in range(60):
+        with closing(connected(gateway)) as peer:
+            peer.sendall(hello)
+            read_chunk(peer)
+            peer.sendall(opening)
+            channel = read_chunk(peer)[8:12]
+            damaged = rng.randrange(len(messages))
+            for at, message in enumerate(messages):
+                data = bytearray(message[:8] + channel + message[12:])
+                if at == damaged:
+                    for place in rng.sample(range(len(data)), 3):
+                        data[place] = rng.randrange(256)
+                with suppress(OSError):
+                    peer.sendall(data)
+    for _ in range(60):
+        with closing(connected(gateway)) as peer, suppress(OSError):
+            peer.sendall(rng.randbytes(rng.randrange(1, 2000)))
+    part: Any = gateway.gateway.feeds["opcua"]
+    until(lambda: not part._stopping["pump-1"])
+    stop_all(f"opc.tcp://127.0.0.1:{port_of(gateway)}/")
+    assert gateway.get("/health").json["parts"]["opcua"] == "ok"
+
+
+def test_a_client_that_sends_an_endless_message_is_disconnected(gateway: Served) -> None:
+    with closing(connected(gateway)) as peer:
+        peer.sendall(b"HELF" + struct.pack("<I", 0xFFFF_FFFF))
+        with pytest.raises(ConnectionError):
+            peer.sendall(bytes(1 << 26))
+
+
+def test_client_that_leaves_answers_unread_is_disconnected(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "MOST_UNREAD", 1 << 16)
+    with recorded(port_of(gateway)) as (url, sent), Client(url, timeout=PATIENCE) as client:
+        client.read_values([client.get_node("ns=2;s=pump-1.State")] * 500)
+    hello, opening, *messages = chunks_of(bytes(sent))
+    with closing(connected(gateway)) as peer:
+        peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        peer.sendall(hello)
+        read_chunk(peer)
+        peer.sendall(opening)
+        channel = read_chunk(peer)[8:12]
+        create, activate, *others = [message[:8] + channel + message[12:] for message in messages]
+        peer.sendall(create + activate)
+        read, (number,) = max(others, key=len), struct.unpack_from("<I", activate, 16)
+        numbers = count(number + 1)
+
+        def is_cut() -> bool:
+            try:
+                for _ in range(20):
+                    peer.sendall(read[:16] + struct.pack("<I", next(numbers)) + read[20:])
+            except ConnectionError:
+                return True
+            return False
+
+        until(is_cut)
+
+
+@pytest.mark.parametrize("interval", [0.0, -1.0, 1e-9, 1e300, float("nan")])
+def test_interval_of_a_subscription_is_limited(gateway: Served, interval: float) -> None:
+    with Client(f"opc.tcp://127.0.0.1:{port_of(gateway)}/", timeout=PATIENCE) as client:
+        parameters = ua.CreateSubscriptionParameters(RequestedPublishingInterval=interval)
+        found = client.tloop.post(client.aio_obj.uaclient.create_subscription(parameters, callback=None))
+        assert server.LEAST_INTERVAL_MS <= found.RevisedPublishingInterval <= server.MOST_INTERVAL_MS
+
+
+def test_request_for_too_many_nodes_is_refused(gateway: Served) -> None:
+    with Client(f"opc.tcp://127.0.0.1:{port_of(gateway)}/", timeout=PATIENCE) as client:
+        state = client.get_node("ns=2;s=pump-1.State")
+        limit = client.get_node(ua.ObjectIds.Server_ServerCapabilities_OperationLimits_MaxNodesPerRead)
+        assert limit.read_value() == server.MOST_OPERATIONS
+        with pytest.raises(ua.UaStatusCodeError, match="BadTooManyOperations"):
+            client.read_values([state] * (server.MOST_OPERATIONS + 1))
+
+
+# ---- encryption ----
+
+
+def make_certificate(folder: Path, name: str) -> None:
+    subprocess.run(
+        [
+            *("openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2"),
+            *("-subj", f"/CN={name}"),
+            *("-addext", f"subjectAltName=URI:urn:{name}:multidrop,DNS:localhost"),
+            *("-keyout", f"{folder}/{name}-key.pem", "-out", f"{folder}/{name}.pem"),
+        ],
+        check=True,
+        capture_output=True,
+    )
+
+
+def test_with_a_certificate_only_encrypted_sessions_are_accepted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("plant", "client"):
+        make_certificate(tmp_path, name)
+    files = 'certificate = "plant.pem"\nkey = "plant-key.pem"\n'
+    with served(tmp_path, SERVE.replace("[serve.may]", f"{files}[serve.may]")) as gateway:
+        part: Any = gateway.gateway.feeds["opcua"]
+        until(lambda: part.is_ready)
+        url = f"opc.tcp://127.0.0.1:{port_of(gateway)}/"
+        plain = Client(url, timeout=PATIENCE)
+        with monkeypatch.context() as patch:  # else the client gives up before it connects
+            patch.setattr(AsyncClient, "find_endpoint", staticmethod(lambda endpoints, *rest: endpoints[0]))
+            with pytest.raises(ua.UaStatusCodeError, match="BadSecurityModeRejected"):
+                plain.connect()
+        plain.disconnect()
+        secured = Client(url, timeout=PATIENCE)
+        secured.application_uri = "urn:client:multidrop"
+        keys = f"{tmp_path}/client.pem,{tmp_path}/client-key.pem"
+        secured.set_security_string(f"Basic256Sha256,SignAndEncrypt,{keys}")
+        secured.set_user("stopper")
+        secured.set_password(gateway.secrets[Right.STOP])
+        with secured:
+            assert "stop" in secured.get_node(PLANT).call_method(secured.get_node(PLANT_STOP).nodeid)
+
+
+def test_a_key_of_another_certificate_is_reported_in_one_sentence(tmp_path: Path) -> None:
+    for name in ("plant", "other"):
+        make_certificate(tmp_path, name)
+    files = 'certificate = "plant.pem"\nkey = "other-key.pem"\n'
+    with (
+        pytest.raises(ValueError, match=r"must be an RSA certificate and its key, in PEM"),
+        served(tmp_path, SERVE.replace("[serve.may]", f"{files}[serve.may]")),
+    ):
+        pass

@@ -1,0 +1,503 @@
+"""The OPC UA server of a gateway, with asyncua's client."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import cycle
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from gateways import Served, served, written
+from kills import BoundProcess
+from lines import PATIENCE, until
+
+from multidrop import Plant, PlantError, PolledDrive
+from multidrop.families import MODELS
+from multidrop.families.registry import SHIPPED, find_model
+from multidrop.gateway.http.rights import Right
+from multidrop.gateway.live import hub
+from multidrop.gateway.opcua.part import SWITCH_S, USUAL_SWITCH_S, OpcUa
+from multidrop.gateway.opcua.settings import OpcUaSettings
+from multidrop.gateway.settings import read_settings
+
+try:
+    from asyncua import ua
+    from asyncua.sync import Client
+
+    from multidrop.gateway.opcua.nodes import PlantNodes, fault_of, lasting, state_of, unit_of
+except ImportError:
+    if os.environ.get("CI"):
+        raise
+    pytest.skip("asyncua, the client, is not installed", allow_module_level=True)
+
+
+SERVE = """[[line.drive.channel]]
+name = "half"
+value = "output_frequency / 2"
+unit = "Hz"
+[serve.opcua]
+listen = "127.0.0.1:0"
+[serve.may]
+look = "anyone"
+stop = "{stop}"
+write = ["pump-1.setpoint", "pump-2.setpoint"]
+verbs = ["pump-1.start", "pump-2.start"]
+"""
+SUBSCRIBER = Path(__file__).parents[2] / "support" / "programs" / "opcua_subscriber.py"
+PLANT, PLANT_STOP = "ns=2;i=1", "ns=2;i=2"
+
+
+@pytest.fixture(scope="module")
+def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with served(tmp_path_factory.mktemp("opcua"), SERVE.format(stop="anyone")) as gateway:
+        yield gateway
+
+
+@pytest.fixture
+def client(gateway: Served) -> Iterator[Any]:
+    with Client(url_of(gateway), timeout=PATIENCE) as client:
+        yield client
+
+
+def url_of(gateway: Served) -> str:
+    part: Any = gateway.gateway.feeds["opcua"]
+    until(lambda: part.is_ready)
+    return f"opc.tcp://127.0.0.1:{part.port}/"
+
+
+@contextmanager
+def logged_in(gateway: Served, right: Right) -> Iterator[Any]:
+    client = Client(url_of(gateway), timeout=PATIENCE)
+    client.set_user(next(one.name for one in gateway.gateway.settings.tokens if one.right is right))
+    client.set_password(gateway.secrets[right])
+    with client:
+        yield client
+
+
+def read(client: Any, node: str) -> Any:
+    """Return the data value of a node, whose status may be bad."""
+    return client.get_node(f"ns=2;s={node}").read_data_value(raise_on_bad_status=False)
+
+
+def code(client: Any, node: str) -> str:
+    return str(read(client, node).StatusCode.name)
+
+
+def names_of(nodes: Any) -> list[str]:
+    return [node.read_browse_name().Name for node in nodes]
+
+
+def start(gateway: Served, *drives: str) -> None:
+    writer = {"authorization": gateway.bearer(Right.WRITE)}
+    for drive in drives:
+        value = {"drive": drive, "register": "setpoint", "value": 50.0}
+        verb = {"drive": drive, "verb": "start", "options": {}}
+        for path, body in (("/api/write", value), ("/api/act", verb)):
+            assert gateway.command(path, body, **writer).json["done"] is True
+        assert not stands(gateway, drive)
+
+
+def stands(gateway: Served, drive: str) -> bool:
+    return not gateway.sims[drive].motor.goal  # type: ignore[attr-defined]
+
+
+def stop(client: Any, drive: str = "") -> str:
+    """Stop a drive, or all drives; return the answer's text."""
+    place, method = (f"ns=2;s={drive}", f"ns=2;s={drive}.Stop") if drive else (PLANT, PLANT_STOP)
+    return str(client.get_node(place).call_method(client.get_node(method).nodeid))
+
+
+# ---- closing ----
+
+
+@pytest.mark.slow
+async def test_a_server_that_was_closed_during_its_start_accepts_no_client(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A reload waits at most 3 s for the end of the old server, which may then still be starting."""
+    from multidrop.gateway.opcua.server import PlantServer
+
+    begun, may_start, start = threading.Event(), threading.Event(), PlantServer.start
+
+    async def slow_start(server: PlantServer) -> None:
+        begun.set()
+        may_start.wait(PATIENCE)
+        await start(server)
+
+    monkeypatch.setattr(PlantServer, "start", slow_start)
+    context: Any = SimpleNamespace(plant=Plant(()), version="1")
+    part = OpcUa(OpcUaSettings("127.0.0.1:0"), context, None)
+    running = asyncio.create_task(part.run())
+    await asyncio.to_thread(begun.wait, PATIENCE)
+    running.cancel()
+    with pytest.raises(TimeoutError):
+        await asyncio.wait_for(part.close(), 0.1)
+    may_start.set()
+    assert part._serving is not None
+    try:
+        await asyncio.wait_for(asyncio.shield(part._serving), PATIENCE)
+    finally:
+        part._end_server()  # a thread that still serves would keep the tests from ending
+
+
+@pytest.mark.slow
+async def test_end_of_the_last_server_frees_its_nodes_and_restores_the_process(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nodes are freed without a garbage collection. At first, `serving` also has a fake server."""
+    serving, switch_s = {object()}, sys.getswitchinterval()
+    monkeypatch.setattr("multidrop.gateway.opcua.part._unended", serving)
+    context: Any = SimpleNamespace(plant=Plant(()), version="1", hub=SimpleNamespace(drives=[]))
+
+    async def serve() -> None:
+        part = OpcUa(OpcUaSettings("127.0.0.1:0"), context, None)
+        running = asyncio.create_task(part.run())
+        while not part.is_ready:
+            await asyncio.sleep(0.05)
+        running.cancel()
+        await part.close()
+
+    gc.unfreeze()
+    gc.disable()
+    try:
+        await serve()
+        assert gc.get_freeze_count() > 10_000
+        assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
+        serving.clear()
+        before = gc.get_freeze_count()
+        await serve()
+        assert gc.get_freeze_count() == 0
+        assert sys.getswitchinterval() == pytest.approx(USUAL_SWITCH_S)
+        assert len(gc.get_objects()) < before + 50_000
+    finally:
+        gc.enable()
+        gc.freeze()
+        sys.setswitchinterval(switch_s)
+
+
+@pytest.mark.slow
+def test_the_address_space_is_excluded_from_garbage_collection(gateway: Served) -> None:
+    """A garbage collection stops all threads. With the address space, each full one would take 0.2 s."""
+    url_of(gateway)  # waits until the drives' nodes exist
+    assert gc.isenabled()
+    assert gc.get_freeze_count() > 400_000
+    assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
+
+
+# ---- reading ----
+
+
+@pytest.mark.slow
+def test_each_drive_is_an_object_with_typed_values(client: Any) -> None:
+    assert client.get_namespace_array()[2:] == ["urn:multidrop:plant"]
+    plant = client.get_node("i=85").get_child("2:Plant")
+    assert plant.nodeid.to_string() == PLANT
+    assert names_of(plant.get_children()) == ["Stop", "pump-1", "pump-2"]
+    pump = plant.get_child("2:pump-1")
+    polled = ["status", "output_frequency", "output_current", "fault"]
+    assert sorted(names_of(pump.get_children())) == sorted(["Stop", "State", "Fault", *polled])
+    current = pump.get_child("2:output_current")
+    assert current.read_type_definition().Identifier == ua.ObjectIds.AnalogUnitType
+    assert current.read_data_type_as_variant_type() is ua.VariantType.Double
+    unit = current.get_child("0:EngineeringUnits").read_value()
+    assert (unit.DisplayName.Text, unit.UnitId) == ("A", 4279632)
+    assert pump.get_child("2:status").read_data_type_as_variant_type() is ua.VariantType.String
+    until(lambda: code(client, "pump-2.half") == "Good")  # a computed channel
+
+
+@pytest.mark.slow
+def test_values_have_the_time_of_their_request(gateway: Served, client: Any) -> None:
+    until(lambda: code(client, "pump-1.output_frequency") == "Good")
+    first = read(client, "pump-1.output_frequency")
+    assert abs(first.SourceTimestamp.timestamp() - time.time()) < PATIENCE
+    until(lambda: read(client, "pump-1.output_frequency").SourceTimestamp > first.SourceTimestamp)
+    newest = gateway.gateway.hub.newest("pump-1", "output_frequency")
+    assert newest is not None
+    assert first.Value.Value == newest.value == 0.0
+    until(lambda: read(client, "pump-1.State").Value.Value == "stands")
+
+
+@pytest.mark.slow
+def test_values_have_the_status_bad_no_communication_while_their_drive_is_silent(
+    gateway: Served, client: Any
+) -> None:
+    gateway.sims["pump-2"].deaf_until = float("inf")
+    try:
+        until(lambda: code(client, "pump-2.output_frequency") == "BadNoCommunication")
+        until(lambda: read(client, "pump-2.State").Value.Value == "silent")
+        assert read(client, "pump-2.output_frequency").Value.Value is None
+        until(lambda: code(client, "pump-2.Fault") == "BadNoCommunication")
+        until(lambda: code(client, "pump-1.output_frequency") == "Good")
+    finally:
+        gateway.sims["pump-2"].deaf_until = 0.0
+    until(lambda: code(client, "pump-2.output_frequency") == "Good")
+    until(lambda: code(client, "pump-2.Fault") == "Good")
+
+
+@pytest.mark.slow
+def test_opc_ua_clients_can_write_no_value(client: Any) -> None:
+    frequency = client.get_node("ns=2;s=pump-1.output_frequency")
+    with pytest.raises(ua.UaStatusCodeError, match="BadUserAccessDenied"):
+        frequency.write_value(25.0)
+    with pytest.raises(ua.UaStatusCodeError, match="BadUserAccessDenied"):
+        client.get_node(PLANT).add_object(2, "intruder")
+
+
+# ---- stops ----
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("drive", "drives"), [("pump-1", ["pump-1"]), ("", ["pump-1", "pump-2"])])
+def test_opc_ua_stop_stops_the_motors(gateway: Served, client: Any, drive: str, drives: list[str]) -> None:
+    start(gateway, *drives)
+    assert "stop" in stop(client, drive)
+    until(lambda: all(stands(gateway, one) for one in drives))
+    until(lambda: all(read(client, f"{one}.State").Value.Value == "stands" for one in drives))
+
+
+@pytest.mark.slow
+def test_stops_of_one_request_do_not_wait_for_each_other(gateway: Served, client: Any) -> None:
+    start(gateway, "pump-1")
+    gateway.sims["pump-2"].deaf_until = float("inf")
+    try:
+        calls = [
+            ua.CallMethodRequest(*(client.get_node(f"ns=2;s={name}").nodeid for name in (one, f"{one}.Stop")))
+            for one in ("pump-2", "pump-1")
+        ]
+        session = client.aio_obj.uaclient
+        found = client.tloop.post(session.call(calls))
+        assert found[0].StatusCode.name == "GoodCompletesAsynchronously"
+        assert found[0].OutputArguments[0].Value == "the stop is in progress"
+        assert stands(gateway, "pump-1")
+    finally:
+        gateway.sims["pump-2"].deaf_until = 0.0
+    until(lambda: not gateway.gateway.bus("hall").stops_under_way())
+
+
+@pytest.mark.slow
+def test_client_that_reads_nothing_delays_no_poll_and_no_stop(gateway: Served, client: Any) -> None:
+    words = [sys.executable, str(SUBSCRIBER), url_of(gateway), "50"]
+    start(gateway, "pump-1", "pump-2")
+    with BoundProcess(words, stdout=subprocess.PIPE, text=True) as subscriber:
+        try:
+            assert subscriber.stdout is not None
+            assert subscriber.stdout.readline()
+            subscriber.send_signal(signal.SIGSTOP)
+            rows = gateway.gateway.hub.taken
+            until(lambda: gateway.gateway.hub.taken > rows + 20)
+            assert "stop" in stop(client, "pump-1")
+            until(lambda: stands(gateway, "pump-1"))
+            assert gateway.post("/api/stop").json["pump-2"]["done"] is True
+        finally:
+            subscriber.kill()
+
+
+# ---- rights ----
+
+
+@pytest.mark.slow
+def test_opc_ua_clients_have_the_rights_of_their_tokens(tmp_path: Path) -> None:
+    with served(tmp_path, SERVE.format(stop="token")) as gateway:
+        with Client(url_of(gateway), timeout=PATIENCE) as anyone, logged_in(gateway, Right.LOOK) as viewer:
+            for client in (anyone, viewer):
+                with pytest.raises(ua.UaStatusCodeError, match="BadUserAccessDenied"):
+                    stop(client)
+        wrong = Client(url_of(gateway), timeout=PATIENCE)
+        wrong.set_user("anna")
+        wrong.set_password("wrong")
+        with pytest.raises(ua.UaStatusCodeError, match="BadUserAccessDenied"):
+            wrong.connect()
+        wrong.disconnect()
+        with logged_in(gateway, Right.STOP) as stopper:
+            assert "stop" in stop(stopper)
+            gateway.gateway.tokens.replace([])  # as a reload does
+            gateway.gateway.commands.may = gateway.gateway.commands.may._replace(look="token")
+            with pytest.raises(ua.UaStatusCodeError, match="BadUserAccessDenied"):
+                read(stopper, "pump-1.State")
+
+
+# ---- reload ----
+
+
+@pytest.mark.slow
+def test_reload_removes_and_adds_drives(tmp_path: Path) -> None:
+    class Notes:
+        codes: list[str] = []
+
+        def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
+            self.codes.append(data.monitored_item.Value.StatusCode.name)
+
+    with (
+        served(tmp_path, SERVE.format(stop="anyone")) as gateway,
+        Client(url_of(gateway), timeout=PATIENCE) as client,
+    ):
+        until(lambda: code(client, "pump-2.output_frequency") == "Good")
+        subscription = client.create_subscription(50, Notes())
+        subscription.subscribe_data_change(client.get_node("ns=2;s=pump-2.output_frequency"))
+        path = tmp_path / "plant.toml"
+        path.write_text(path.read_text().replace('"pump-2', '"fan'))
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+        assert gateway.post("/api/reload", {"confirm": True}, **writer).json["done"] is True
+        until(lambda: code(client, "fan.output_frequency") == "Good")
+        assert code(client, "pump-2.output_frequency") == "BadNodeIdUnknown"
+        until(lambda: Notes.codes[-1:] == ["BadNodeIdUnknown"])
+        assert names_of(client.get_node(PLANT).get_children()) == ["Stop", "pump-1", "fan"]
+
+
+class Cyclic:
+    """An object that refers to itself, like each drive of a plant."""
+
+    def __init__(self) -> None:
+        self.own = self
+
+
+async def test_excluded_cycles_are_freed_once_many_drives_were_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def remove(nodes: PlantNodes, name: str) -> None:
+        del nodes._drives[name]
+
+    async def add(nodes: PlantNodes, name: str, polled: PolledDrive) -> None:
+        nodes._drives[name] = SimpleNamespace(polled=polled)  # type: ignore[assignment]
+
+    monkeypatch.setattr(PlantNodes, "_remove", remove)
+    monkeypatch.setattr(PlantNodes, "_add_drive", add)
+    monkeypatch.setattr("multidrop.gateway.opcua.nodes.MOST_REMOVED", 2)
+    server: Any = SimpleNamespace(isession=None, aspace=None)
+    nodes, plants = PlantNodes(server), cycle(("pump", "fan"))
+    with lasting():
+        left = weakref.ref(Cyclic())
+    freed = []
+    for _ in range(4):
+        await nodes.adopt(written(tmp_path, "", next(plants)))
+        gc.collect()
+        freed.append(left() is None)
+    assert freed == [False, False, False, True]
+
+
+# ---- the table `[serve.opcua]`: addresses, protection of connections from other machines, names ----
+
+
+OPEN = "is open to other machines: that needs certificate and key here and tokens in [serve]"
+
+CHANNEL = '[[line.drive.channel]]\nname = "{}"\nvalue = "output_frequency / 2"\nunit = "Hz"'
+
+
+@pytest.mark.parametrize(
+    ("serve", "drives", "sentence"),
+    [
+        (
+            'listen = "4840"',
+            (),
+            'not an address and port; write listen = "127.0.0.1:4840"',
+        ),
+        ('listen = "0.0.0.0:4840"', (), OPEN),
+        ('listen = "0.0.0.0:4840"\ncertificate = "plant.toml"\nkey = "plant.toml"', (), OPEN),
+        ('certificate = "cert.pem"', (), "certificate and key belong together: give both, or none"),
+        ('certificate = "cert.pem"\nkey = "plant.toml"', (), 'certificate = "cert.pem": there is no file'),
+        ("port = 4840", (), "unknown key 'port'"),
+        ("", ("a", "a.status"), 'drive "a.status" has the node id of a value of "a": choose another name'),
+        (CHANNEL.format("State"), ("a",), 'channel "State" of "a" has the node id of another value'),
+        (CHANNEL.format("half"), ("a.half", "a"), 'drive "a.half" has the node id of a value of "a"'),
+    ],
+)
+def test_mistakes_in_the_opc_ua_table_are_reported(
+    tmp_path: Path, serve: str, drives: tuple[str, ...], sentence: str
+) -> None:
+    with pytest.raises(PlantError) as mistakes:
+        read_settings(written(tmp_path, f"[serve.opcua]\n{serve}\n", *drives), {})
+    assert sentence in str(mistakes.value)
+
+
+def test_opc_ua_accepts_only_this_computer_by_default(tmp_path: Path) -> None:
+    settings = read_settings(written(tmp_path, "[serve.opcua]\n"), {})
+    assert settings.parts["opcua"] == OpcUaSettings("127.0.0.1:4840")
+
+
+# ---- status codes and units of OPC UA ----
+
+
+GOOD_ROW, MISS = (5, 50, 24.5, 0), (7, 70, 0.0, 1)
+NAMES = {  # names of status codes, from OPC 10000-6, A.2 (StatusCode.csv)
+    0x00000000: "Good",
+    0x40900000: "Uncertain_LastUsableValue",
+    0x408F0000: "Uncertain_NoCommunicationLastUsableValue",
+    0x80000000: "Bad",
+    0x80310000: "Bad_NoCommunication",
+    0x80050000: "Bad_CommunicationError",
+    0x808B0000: "Bad_DeviceFailure",
+    0x808C0000: "Bad_SensorFailure",
+    0x80320000: "Bad_WaitingForInitialData",
+}
+
+
+@pytest.mark.parametrize(
+    ("newest", "good", "is_current", "reason", "expected"),
+    [
+        (None, None, False, "", ("Bad_WaitingForInitialData", None, 0)),
+        (GOOD_ROW, GOOD_ROW, True, "ok", ("Good", 24.5, 5)),
+        (GOOD_ROW, GOOD_ROW, False, "ok", ("Uncertain_LastUsableValue", 24.5, 5)),
+        (MISS, GOOD_ROW, True, "no reply", ("Uncertain_NoCommunicationLastUsableValue", 24.5, 5)),
+        (MISS, GOOD_ROW, False, "no reply", ("Bad_NoCommunication", None, 7)),
+        (MISS, None, False, "not asked: drive is silent", ("Bad_NoCommunication", None, 7)),
+        (MISS, None, False, "port lost", ("Bad_NoCommunication", None, 7)),
+        (MISS, None, False, "bad checksum", ("Bad_CommunicationError", None, 7)),
+        (MISS, None, False, "exception 02", ("Bad_DeviceFailure", None, 7)),
+        (MISS, None, False, "no valid value", ("Bad_SensorFailure", None, 7)),
+    ],
+)
+def test_each_row_has_the_expected_opc_ua_status_code(
+    newest: tuple[int, int, float, int] | None,
+    good: tuple[int, int, float, int] | None,
+    is_current: bool,
+    reason: str,
+    expected: tuple[str, float | None, int],
+) -> None:
+    state = state_of("pump-1", "load", newest, good, is_current, reason)
+    assert (NAMES[state.code], state.value, state.time_ns) == expected
+
+
+@pytest.mark.parametrize(
+    ("shown", "expected"),
+    [
+        (hub.Shown(hub.FAULT, "overcurrent"), ("Good", "overcurrent")),
+        (hub.Shown(hub.RUNS, None), ("Good", "")),
+        (hub.Shown(hub.UNKNOWN, None), ("Good", "")),
+        (hub.Shown(hub.UNKNOWN, hub.INCOMPLETE), ("Bad", None)),
+        (hub.Shown(hub.UNKNOWN, hub.NOT_ASKED), ("Bad", None)),
+        (hub.Shown(hub.SILENT, "no reply"), ("Bad_NoCommunication", None)),
+    ],
+)
+def test_a_drive_counts_as_free_of_faults_only_if_its_values_show_it(
+    shown: hub.Shown, expected: tuple[str, str | None]
+) -> None:
+    code, text = fault_of(shown)
+    assert (NAMES[code], text) == expected
+
+
+@pytest.mark.parametrize(  # ids of the OPC Foundation's list UNECE_to_OPCUA.csv
+    ("unit", "number"),
+    [("Hz", 4740186), ("V", 5655636), ("A", 4279632), ("%", 20529), ("kW", 4937556), ("°C", 4408652)],
+)
+def test_unit_has_the_id_of_unece(unit: str, number: int) -> None:
+    found = unit_of(unit)
+    assert (found.UnitId, found.DisplayName.Text) == (number, unit)
+
+
+def test_every_unit_of_a_family_has_an_id() -> None:
+    families = map(find_model, (*MODELS, *SHIPPED))
+    units = {register.unit for family in families for register in family.registers.values() if register.unit}
+    assert len(units) > 10
+    assert {unit for unit in units if unit_of(unit).UnitId == -1} == set()
