@@ -1,0 +1,152 @@
+"""Ends: the gateway's side of a tool's connection, which is a pseudo-terminal or a TCP connection."""
+
+from __future__ import annotations
+
+import os
+import socket
+from contextlib import suppress
+from pathlib import Path
+from typing import Protocol
+
+from multidrop.recording import FileLock
+
+MOST_READ = 256  # bytes of one read
+_DEVICES = "/dev/pts/"
+# The target of each link that a gateway makes starts with this text, so that gateways recognise their links
+# and replace no others. Links are made and read with `os`, because a Path would drop the ".".
+_OURS = "/dev/pts/./"
+
+
+class End(Protocol):
+    """The gateway's side of a tool's connection."""
+
+    @property
+    def address(self) -> str:
+        """The tool's address in logs: a path or an IP address."""
+
+    def fileno(self) -> int: ...
+    def read(self) -> bytes | None:
+        """Return received bytes; None if there are none, b"" if the tool has disconnected."""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; drop them if the tool does not read fast enough."""
+
+    def discard(self) -> None:
+        """Drop sent bytes that the tool has not read, if that is possible."""
+
+    def close(self) -> None: ...
+
+
+class Terminal:
+    """A pseudo-terminal that tools open through a symbolic link.
+
+    This object keeps the tool's side open, so that the pseudo-terminal still exists after a tool has closed
+    it. The baud rate and format that a tool sets have no effect. A lock on a file beside the link shows that
+    its gateway is alive. An existing link is replaced only if its gateway was killed. Raises OSError if the
+    link cannot be made, or if its path is in use.
+    """
+
+    def __init__(self, link: Path) -> None:
+        if not hasattr(os, "openpty"):
+            raise OSError("pty: this system has no pseudo-terminals; use rtu")
+        self.address = str(link)
+        self._target = ""
+        self._is_open = True
+        self._lock: FileLock | None = None
+        self._master, self._slave = os.openpty()
+        try:
+            self._lock = FileLock(link.with_name(f".{link.name}.lock"))
+            os.set_blocking(self._master, False)
+            self._make_raw()
+            self._target = _OURS + os.ttyname(self._slave).removeprefix(_DEVICES)
+            if is_ours(link):
+                link.unlink()
+            os.symlink(self._target, link)  # noqa: PTH211
+        except OSError as failure:
+            self._close_descriptors()
+            why = {
+                FileExistsError: "it exists, and no gateway made it",
+                BlockingIOError: "another gateway uses it",
+            }.get(type(failure), failure.strerror)
+            raise OSError(f"pty: the link {link} cannot be made: {why}") from failure
+
+    def fileno(self) -> int:
+        return self._master
+
+    def read(self) -> bytes | None:
+        try:
+            return os.read(self._master, MOST_READ)
+        except BlockingIOError:
+            return None
+
+    def write(self, data: bytes) -> None:
+        self._make_raw()
+        with suppress(BlockingIOError):
+            os.write(self._master, data)
+
+    def discard(self) -> None:
+        import termios
+
+        termios.tcflush(self._slave, termios.TCIFLUSH)
+
+    def _make_raw(self) -> None:
+        """Turn echo and translation off. An echo of the reply to a write would look like a second write."""
+        import termios
+        import tty
+
+        input_flags, output_flags, _, local_flags, *_ = termios.tcgetattr(self._slave)
+        translates = input_flags & (termios.ICRNL | termios.IXON | termios.ISTRIP | termios.INLCR)
+        if translates or output_flags & termios.OPOST or local_flags & (termios.ECHO | termios.ICANON):
+            tty.setraw(self._slave, termios.TCSANOW)
+
+    def close(self) -> None:
+        """Close the pseudo-terminal, and remove the link if it still leads to this pseudo-terminal."""
+        if not self._is_open:
+            return
+        self._is_open = False
+        with suppress(OSError):
+            if os.readlink(self.address) == self._target:  # noqa: PTH115
+                Path(self.address).unlink()
+        self._close_descriptors()
+
+    def _close_descriptors(self) -> None:
+        os.close(self._master)
+        os.close(self._slave)
+        if self._lock is not None:
+            self._lock.close()
+
+
+def is_ours(link: Path) -> bool:
+    """Return True if a gateway made this link."""
+    return link.is_symlink() and os.readlink(link).startswith(_OURS)  # noqa: PTH115
+
+
+class Connection:
+    """A tool's TCP connection."""
+
+    def __init__(self, peer: socket.socket, address: str) -> None:
+        self.address = address
+        self._peer = peer
+        peer.setblocking(False)
+        peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def fileno(self) -> int:
+        return self._peer.fileno()
+
+    def read(self) -> bytes | None:
+        try:
+            return self._peer.recv(MOST_READ)
+        except BlockingIOError:
+            return None
+        except OSError:
+            return b""
+
+    def write(self, data: bytes) -> None:
+        with suppress(OSError):  # the tool has disconnected, which `read` reports
+            self._peer.send(data)
+
+    def discard(self) -> None:
+        """Leave sent bytes as they are: TCP cannot take them back."""
+
+    def close(self) -> None:
+        self._peer.close()

@@ -1,0 +1,434 @@
+"""Tool ports: pass the requests of vendors' tools on to the drives of a line, in the line's spare time.
+
+A tool port behaves like the line itself: a request to another address, or to a silent drive, gets no
+reply. Reads go to the drive one at a time. Writes obey the same rules as those of Modbus TCP clients.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from functools import partial
+from math import inf
+from pathlib import Path
+
+from multidrop import Batch, BusError, Plant, PlantLine
+from multidrop.core import Framing
+from multidrop.drive import DEVICE_ID, MEI_DEVICE_ID, SERVER_ID, STATUS
+from multidrop.gateway.commands import Commands
+from multidrop.gateway.http.connections import listen
+from multidrop.gateway.http.rights import Right
+from multidrop.gateway.live.hub import SILENT, Hub
+from multidrop.gateway.modbus_server.line_share import LineShare, PassingBusy
+from multidrop.gateway.modbus_server.protocol import (
+    WRITES,
+    Declined,
+    MbapRequest,
+    ModbusCode,
+    code_of,
+    read_range,
+    reply_data,
+)
+from multidrop.gateway.modbus_server.unit_ids import Unit
+from multidrop.gateway.modbus_server.writes import ClientWrites
+from multidrop.gateway.parts import Ask, PartContext
+from multidrop.gateway.tool_ports.ends import Connection, End, Terminal
+from multidrop.gateway.tool_ports.requests import EXCEPTION, RequestCutter, rtu_reply, rtu_text
+from multidrop.gateway.tool_ports.settings import RTU_EXAMPLE, ToolSettings
+from multidrop.supervisor import supervisor
+from multidrop.toml_check import parse_address
+
+WAY = "tool"
+# the tools' share of a line's time: on a line that polling fully uses, and on an idle line
+LEAST_SHARE, MOST_SHARE = 0.1, 0.5
+MOST_TOOLS = 8  # limit of TCP connections per line
+PAUSE_S = 0.005  # pause between two reads of MOST_READ bytes, so that a tool cannot keep the loop busy
+REST_S = 0.2  # an incomplete request is dropped after this time in s without further bytes
+PLAN_S = 60.0  # time limit for computing a line's planned utilisation
+IDLE_S = 300.0  # a TCP connection is closed after this time without a request
+SWEEP_S = 1.0  # interval of checking for idle connections
+# a stop's answer waits for the motor, and a read waits for the line, for this share of `timeout`
+WAIT_SHARE = 0.75
+REFUSAL_S = 1.0  # least time between two audit records of a line's refused writes
+
+# Codes of failures after which a tool on a real line would get no reply.
+_SILENT = (ModbusCode.NO_PATH, ModbusCode.NO_RESPONSE)
+
+Settings = ToolSettings
+
+_log = logging.getLogger("multidrop.gateway")
+
+
+def build(settings: ToolSettings, context: PartContext) -> ToolPorts:
+    """Open the tool ports and return them. Raises OSError if one cannot be opened."""
+    plant, hub, commands, folder = context.plant, context.hub, context.commands, context.folder
+    ports = ToolPorts(plant, hub, commands, settings, context.ask, folder)
+    ports.listen()
+    return ports
+
+
+# Starts a request. Returns None if the request gets no answer; else an awaitable of the answer's frame, or of
+# None if no answer is sent after all.
+Serve = Callable[[MbapRequest, "Tool"], Awaitable["bytes | None"] | None]
+
+
+class Tool:
+    """A connected tool. Only the tool's newest request is answered, because a tool sends a request only
+    after it has given up the earlier ones.
+
+    A reply later than `timeout` s after its request is dropped: the tool could take it for the reply to
+    its next request.
+    """
+
+    is_full = False  # a single tool has no limit of writes: that of the line is enough
+
+    def __init__(self, end: End, serve: Serve, timeout: float) -> None:
+        self.address = end.address
+        self.is_open = True
+        self._end = end
+        self._serve = serve
+        self._timeout = timeout
+        self._cutter = RequestCutter()
+        self._newest: MbapRequest | None = None
+        self._answering: asyncio.Task[None] | None = None
+        self._rest: asyncio.TimerHandle | None = None  # timer that drops an incomplete request
+        self._loop = asyncio.get_running_loop()
+        self.last_request = self._loop.time()
+        self._listen()
+
+    def _listen(self) -> None:
+        if self.is_open:
+            self._loop.add_reader(self._end.fileno(), self._receive)
+
+    def _receive(self) -> None:
+        self._loop.remove_reader(self._end.fileno())
+        if self._take_in():
+            self._loop.call_later(PAUSE_S, self._listen)
+
+    def _take_in(self) -> bool:
+        """Read bytes and start their requests; return False if the tool has disconnected."""
+        try:
+            data = self._end.read()
+        except OSError as failure:
+            _log.warning("tool port %s is closed: %s", self.address, failure)
+            data = b""
+        if data == b"":
+            self.close()
+            return False
+        if data:
+            self._cutter.add(data)
+            self._begin_all()
+            self._stop_waiting()
+            if self._cutter.has_rest:
+                self._rest = self._loop.call_later(REST_S, self._drop_rest)
+        return True
+
+    def _begin_all(self) -> None:
+        while (request := self._cutter.take()) is not None:
+            try:
+                self._begin(request)
+            except Exception:  # later requests are still served: one may be a stop
+                _log.exception("a request of tool %s failed", self.address)
+
+    def _drop_rest(self) -> None:
+        """Drop an incomplete request, unless the rest of it has come while the event loop was busy.
+
+        Requests after the dropped bytes are served, because one may be a stop.
+        """
+        self._rest = None
+        if self._take_in() and self._rest is None:
+            while self._cutter.skip():
+                self._begin_all()
+
+    def _stop_waiting(self) -> None:
+        if self._rest is not None:
+            self._rest.cancel()
+            self._rest = None
+
+    def _begin(self, request: MbapRequest) -> None:
+        """Start a request. A pending answer to the previous request will not be sent."""
+        self._give_up()
+        self._end.discard()
+        self.last_request = self._loop.time()
+        self._newest = request
+        answer = self._serve(request, self)
+        if answer is not None:
+            self._answering = supervisor().start("tool answer", self._answer(request, answer))
+
+    def _give_up(self) -> None:
+        if self._answering is not None and not self._answering.done():
+            self._loop.call_soon(self._answering.cancel)  # later: by then, the task has started
+        self._answering = None
+
+    async def _answer(self, request: MbapRequest, answer: Awaitable[bytes | None]) -> None:
+        until = self._loop.time() + self._timeout
+        try:
+            async with asyncio.timeout_at(until):
+                frame = await answer
+        except TimeoutError:
+            return
+        if frame is None or not self.is_open or request is not self._newest:
+            return
+        self._end.write(rtu_reply(frame))
+        await asyncio.sleep(max(0.0, until - self._loop.time()))
+        if self.is_open:
+            self._end.discard()
+
+    def close(self) -> None:
+        """Close the connection without its pending answer; writes in progress continue."""
+        if not self.is_open:
+            return
+        self.is_open = False
+        self._give_up()
+        self._stop_waiting()
+        self._loop.remove_reader(self._end.fileno())
+        self._end.close()
+
+
+class ToolLine:
+    """The drives of a line by address, as its tools see them."""
+
+    def __init__(
+        self, line: PlantLine, hub: Hub, commands: Commands, settings: ToolSettings, ask: Ask
+    ) -> None:
+        self.share = LineShare(LEAST_SHARE)
+        self._name = line.name
+        self._units = {polled.drive.address: Unit(line.name, polled) for polled in line.drives}
+        self._hub = hub
+        self._commands = commands
+        self._ask = ask
+        self._timeout = settings.timeout
+        role = Right[settings.may.upper()]
+        self._writes = ClientWrites(commands, role, WAY, None, self._record)
+        self._recorded = -inf  # time of the newest record of a refused write
+
+    def serve(self, request: MbapRequest, tool: Tool) -> Awaitable[bytes | None] | None:
+        """Start a request; return an awaitable of the answer's frame, or None if it gets no answer."""
+        unit, is_write = self._units.get(request.unit), request.function in WRITES
+        if request.unit == 0 and is_write:
+            self._record(request, "all", "a broadcast is never passed on", tool)
+        if unit is None:
+            return None
+        try:
+            return self._written(unit, request, tool) if is_write else self._read(unit, request, tool)
+        except Declined as declined:
+            if is_write and declined.code != ModbusCode.ACKNOWLEDGE:
+                self._record(request, unit.drive.name, f"refused with exception {declined.code:02X}H", tool)
+            return _at_once(_exception(request, declined.code))
+
+    def _written(self, unit: Unit, request: MbapRequest, tool: Tool) -> Awaitable[bytes | None]:
+        answer = self._writes.begin(unit, request, tool, WAIT_SHARE * self._timeout)
+
+        async def finish() -> bytes | None:
+            frame = await answer
+            return None if frame[7] & EXCEPTION and frame[8] in _SILENT else frame
+
+        return finish()
+
+    def _record(self, request: MbapRequest, drive: str, why: str, tool: Tool) -> None:
+        """Record a refused write in the audit log, at most once in REFUSAL_S."""
+        now = asyncio.get_running_loop().time()
+        if now - self._recorded >= REFUSAL_S:
+            self._recorded = now
+            what = f"request {rtu_text(request)}"
+            self._commands.note_refused(self._name, drive, what, why, self._writes.caller(tool))
+
+    # ---- reading ----
+
+    def _read(self, unit: Unit, request: MbapRequest, tool: Tool) -> Awaitable[bytes | None]:
+        start, count = _asked(request)
+        if unit.drive.framing is Framing.DELIXI:
+            raise Declined(ModbusCode.ILLEGAL_FUNCTION)  # the drive's protocol has no Modbus functions
+        if self._hub.state(unit.drive.name) == SILENT:
+            # not sent, and not answered: polling notices when the drive answers again
+            raise Declined(ModbusCode.NO_RESPONSE)
+        return self._passed(unit, request, start, count, tool)
+
+    async def _passed(
+        self, unit: Unit, request: MbapRequest, start: int, count: int, tool: Tool
+    ) -> bytes | None:
+        """Read from the drive once the line has time for tools. Answer "busy" if the read has not started
+        after WAIT_SHARE of the timeout.
+        """
+        is_begun = False
+        until = asyncio.get_running_loop().time() + self._timeout
+
+        async def read(seconds: float) -> list[int]:
+            nonlocal is_begun
+            is_begun = True
+            left = max(until - asyncio.get_running_loop().time(), 0.001)
+            name, function = unit.drive.name, request.function
+            return await self._ask(name, function, start, count, min(seconds, left))
+
+        asked: asyncio.Future[list[int]] | None = None
+        try:
+            asked = self.share.ask(tool, read)
+            await asyncio.wait([asked], timeout=WAIT_SHARE * self._timeout)
+            if not is_begun and not asked.done():
+                return _exception(request, ModbusCode.BUSY)
+            found = await asked
+        except (BusError, ValueError, PassingBusy) as failure:
+            return _exception(request, code_of(failure))
+        finally:
+            if asked is not None:
+                asked.cancel()  # cancels the read only if it still waits for the line
+        if count:
+            return request.reply(reply_data(request.function, found))
+        length = bytes([len(found)]) if request.function == SERVER_ID else b""
+        return request.reply(length + bytes(found))
+
+
+def _exception(request: MbapRequest, code: int) -> bytes | None:
+    """Return the frame of an exception, or None if a tool on a real line would get no reply."""
+    return None if code in _SILENT else request.exception(code)
+
+
+async def _at_once(frame: bytes | None) -> bytes | None:
+    return frame
+
+
+def _asked(request: MbapRequest) -> tuple[int, int]:
+    """Return first address and count of a read. Raises Declined for an invalid or unknown request."""
+    function, data = request.function, request.data
+    if function in (STATUS, SERVER_ID) and not data:
+        return 0, 0
+    if function == DEVICE_ID and len(data) == 3 and data[0] == MEI_DEVICE_ID:
+        return int.from_bytes(data[1:]), 0
+    addresses = read_range(request)
+    return addresses.start, len(addresses)
+
+
+class ToolPorts:
+    """The tool ports of a plant: for each line a pseudo-terminal, a TCP port, or both.
+
+    `folder` is the base of relative paths of pseudo-terminals.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        hub: Hub,
+        commands: Commands,
+        settings: ToolSettings,
+        ask: Ask,
+        folder: Path,
+    ) -> None:
+        self.settings = settings
+        self.lines: dict[str, ToolLine] = {}
+        self.ports: dict[str, int] = {}  # TCP ports by line
+        self._plant = plant
+        self._folder = folder
+        self._make = partial(ToolLine, hub=hub, commands=commands, settings=settings, ask=ask)
+        self._terminals: dict[str, Terminal] = {}
+        self._listeners: dict[str, socket.socket] = {}
+        self._at_terminals: list[Tool] = []
+        self._tools: dict[str, list[Tool]] = {}  # TCP connections by line
+
+    def listen(self) -> None:
+        """Open all ports, or none. Raises OSError for the first port that cannot be opened."""
+        try:
+            for line, link in self.settings.pty.items():
+                self._terminals[line] = Terminal(self._folder / link)
+            for line, where in self.settings.rtu.items():
+                self._listeners[line] = listen(*parse_address(where, RTU_EXAMPLE))
+                self.ports[line] = self._listeners[line].getsockname()[1]
+        except OSError:
+            self._close_ends()
+            raise
+
+    async def run(self) -> None:
+        """Serve tools until cancelled."""
+        loop = asyncio.get_running_loop()
+        self.adopt(self._plant)
+        self._at_terminals = [self._tool(line, terminal) for line, terminal in self._terminals.items()]
+        for line in self._listeners:
+            self._accept_on(line)
+        while True:
+            await asyncio.sleep(SWEEP_S)
+            for tools in self._tools.values():
+                self._sweep(tools, loop.time())
+
+    def take(self, batch: Batch) -> None:
+        """Ignore the batch: tools read from the drives."""
+
+    def adopt(self, plant: Plant) -> None:
+        """Use another plant; connections stay open."""
+        self._plant = plant
+        before, self.lines = self.lines, {}
+        for tools in before.values():
+            tools.share.close()
+        for line in plant.lines:
+            if line.name in self.settings.lines:
+                self.lines[line.name] = self._make(line)
+                supervisor().start("tool share", self._learn_share(self.lines[line.name], line))
+
+    async def _learn_share(self, tools: ToolLine, line: PlantLine) -> None:
+        """Set the share of the line's time for tools: half of the share that polling leaves."""
+        used = await supervisor().within("tool share", PLAN_S, partial(utilisation_of, self._plant, line))
+        tools.share.share = min(MOST_SHARE, max(LEAST_SHARE, (1 - used) / 2))
+
+    def _serve(self, line: str, request: MbapRequest, tool: Tool) -> Awaitable[bytes | None] | None:
+        found = self.lines.get(line)
+        return None if found is None else found.serve(request, tool)
+
+    def _accept_on(self, line: str) -> None:
+        listener = self._listeners.get(line)
+        if listener is not None:
+            asyncio.get_running_loop().add_reader(listener.fileno(), self._accept, line, listener)
+
+    def _accept(self, line: str, listener: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        try:
+            peer, (host, *_) = listener.accept()
+        except OSError as failure:  # such as too many open files
+            _log.warning("a tool could not connect to line %s: %s", line, failure)
+            loop.remove_reader(listener.fileno())
+            loop.call_later(SWEEP_S, self._accept_on, line)
+            return
+        tools = self._tools.setdefault(line, [])
+        self._sweep(tools, loop.time())
+        if not self.settings.may_connect(host):
+            _log.warning("tool %s is refused: its address is not in clients", host)
+        elif len(tools) >= MOST_TOOLS:
+            _log.warning("tool %s is refused: %d are connected to line %s", host, MOST_TOOLS, line)
+        else:
+            _log.info("tool %s is connected to line %s", host, line)
+            tools.append(self._tool(line, Connection(peer, host)))
+            return
+        peer.close()
+
+    def _tool(self, line: str, end: End) -> Tool:
+        return Tool(end, partial(self._serve, line), self.settings.timeout)
+
+    def _sweep(self, tools: list[Tool], now: float) -> None:
+        for tool in tools:
+            if now - tool.last_request >= IDLE_S:
+                tool.close()
+        tools[:] = [tool for tool in tools if tool.is_open]
+
+    async def close(self) -> None:
+        """Close all ports and connections; writes and stops in progress continue."""
+        loop = asyncio.get_running_loop()
+        for listener in self._listeners.values():
+            loop.remove_reader(listener.fileno())
+        for tools in (self._at_terminals, *self._tools.values()):
+            for tool in tools:
+                tool.close()
+        for line in self.lines.values():
+            line.share.close()
+        self._close_ends()
+
+    def _close_ends(self) -> None:
+        for terminal in self._terminals.values():
+            terminal.close()
+        for listener in self._listeners.values():
+            listener.close()
+        self._terminals, self._listeners, self.ports = {}, {}, {}
+
+
+def utilisation_of(plant: Plant, line: PlantLine) -> float:
+    """Return the planned share of the line's time that polling takes."""
+    return float(replace(plant, lines=(line,)).metadata()["planned"][line.name]["utilisation"])
