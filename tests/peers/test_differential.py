@@ -9,19 +9,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
-from damage import (
+from judges import (
     BITS,
     COIL_VALUES,
     ECHOES,
     FUNCTIONS,
     MOST,
     READS,
+    UNKNOWN_CODE,
+    Libmodbus,
+    Pymodbus,
     SampleFrame,
+    Understood,
+    Verdict,
     data_bytes,
+    expected,
     frames,
     request_body,
 )
-from judges import UNKNOWN_CODE, Libmodbus, Pymodbus, Understood, Verdict, expected
 
 from multidrop.core import (
     FrameFault,

@@ -1,7 +1,8 @@
-"""Servers by other authors, on serial lines and Modbus TCP, and a client that reads our simulated drives."""
+"""The library reads other authors' servers on serial lines and Modbus TCP; mbpoll reads simulated drives."""
 
 from __future__ import annotations
 
+import json
 import struct
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from urllib.parse import urlsplit
 import pytest
 from kills import BoundProcess
 from lines import HOST_LATE, patient, rows_of, until
+from own_drives import ADDRESSES
 from peers import build_with_libmodbus, require_module, require_program
 from ptys import linked_ptys
 
@@ -21,16 +23,17 @@ from multidrop.bus import Bus
 from multidrop.cli import main
 from multidrop.errors import DriveException, NoReply
 from multidrop.families import InnovertIBD, InvtCHE
+from multidrop.families.files.loader import load_family
 from multidrop.families.registry import find_model
 from multidrop.plant.loader import load_plant
 from multidrop.poller import Poller
+from multidrop.polling.batch import Row
 from multidrop.sim import Simulator, Wire, simulated
 
 SERVERS = Path(__file__).parents[1] / "support" / "servers"
 DEVICE = f"{Path(__file__).parents[1] / 'support' / 'drives' / 'own_drives.py'}:Device"
 Device = find_model(DEVICE)
 ADDRESS = 7
-
 
 HELD = {
     "current": 101.0,  # input register 10 holds 1010
@@ -60,20 +63,20 @@ class Server(NamedTuple):
         return [self.port, DEVICE, str(ADDRESS), *framing]
 
 
-def libmodbus(built: Path, name: str, *words: str) -> list[str]:
-    return [str(build_with_libmodbus(SERVERS / f"{name}.c", built)), *words]
+def libmodbus(built: Path, *words: str) -> list[str]:
+    return [str(build_with_libmodbus(SERVERS / "libmodbus_server.c", built)), *words]
 
 
-def pymodbus(*words: str) -> list[str]:
+def pymodbus(*words: str, address: int = ADDRESS) -> list[str]:
     require_module("pymodbus")
-    return [sys.executable, str(SERVERS / "pymodbus_server.py"), str(ADDRESS), *words]
+    return [sys.executable, str(SERVERS / "pymodbus_server.py"), str(address), *words]
 
 
 COMMANDS: dict[str, Callable[[Path], list[str]]] = {
-    "libmodbus rtu": lambda built: libmodbus(built, "libmodbus_server", "PORT", str(ADDRESS)),
+    "libmodbus rtu": lambda built: libmodbus(built, "PORT", str(ADDRESS)),
     "pymodbus rtu": lambda _: pymodbus("rtu", "PORT"),
     "pymodbus ascii": lambda _: pymodbus("ascii", "PORT"),
-    "libmodbus tcp": lambda built: libmodbus(built, "libmodbus_tcp_server"),
+    "libmodbus tcp": lambda built: libmodbus(built),
     "pymodbus tcp": lambda _: pymodbus("tcp"),
 }
 
@@ -120,6 +123,20 @@ def test_undeclared_addresses_can_be_read(server: Server) -> None:
         with pytest.raises(DriveException) as refusal:
             device.read_raw(3, 40000, 1)
         assert refusal.value.code == 2
+
+
+@pytest.mark.slow
+@patient
+def test_the_identity_of_a_server_can_be_read(server: Server) -> None:
+    """pymodbus reports its name by functions 11H and 2BH; libmodbus answers 11H only."""
+    with Bus(server.port) as bus:
+        device = server.attach(bus)
+        name = device.read_raw(0x11, 0, 0)
+        assert len(name) > 2
+        if b"LMB" not in name:  # libmodbus does not answer function 2BH
+            identity = device.read_raw(0x2B, 0x0100, 0)
+            assert identity[:2] == b"\x0e\x01"
+            assert b"pymodbus" in identity
 
 
 @pytest.mark.slow
@@ -204,3 +221,96 @@ def test_mbpoll_reads_and_writes_a_simulated_family_over_tcp() -> None:
         assert "Illegal data address" in refused.stderr
         assert mbpoll(port, 1, "-r 107 -t 4", 200).returncode == 0
     assert pump["acceleration_time"] == 20
+
+
+# ---- poll a meter of 40 values, simulated by pymodbus, through its family file ----
+
+
+FAMILY = Path(__file__).parents[1] / "data" / "families" / "sdm630.toml"
+PAGE = Path(__file__).parents[2] / "docs" / "howto" / "family-file.md"
+STATED = ("together", "gaps")
+UNIT = 5
+SERIAL_NUMBER = 0x01020304
+FLOATS = {name: (-1) ** at * (at * 37.11 + 0.25) for at, name in enumerate(ADDRESSES)}
+METER_HOLDS = {
+    **{name: struct.unpack(">f", struct.pack(">f", value))[0] for name, value in FLOATS.items()},
+    "serial_number": SERIAL_NUMBER,
+}
+
+
+def family_file(folder: Path, *, stated: bool) -> Path:
+    """Write the meter's family file, with or without its read limits and gaps."""
+    lines = FAMILY.read_text("utf-8").splitlines(keepends=True)
+    path = folder / ("meter.toml" if stated else "unstated.toml")
+    path.write_text("".join(line for line in lines if stated or not line.startswith(STATED)), "utf-8")
+    return path
+
+
+@contextmanager
+def served(folder: Path, *options: str) -> Iterator[str]:
+    """Yield the port of a meter that pymodbus simulates."""
+    values = folder / "values.json"
+    floats = {ADDRESSES[name]: value for name, value in FLOATS.items()}
+    values.write_text(json.dumps({"floats": floats, "serial_number": SERIAL_NUMBER}))
+    with linked_ptys() as (theirs, ours):
+        command = pymodbus("meter", theirs, str(values), *options, address=UNIT)
+        with BoundProcess(command, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "ready\n"
+            yield ours
+            process.kill()
+
+
+def plant_file(folder: Path, port: str, family: Path, *polled: str) -> Path:
+    path = folder / "plant.toml"
+    path.write_text(
+        f'[[line]]\nname = "house"\nport = "{port}"\n'
+        f'[[line.drive]]\nname = "meter"\nmodel = "{family.name}"\naddress = {UNIT}\n'
+        + (f"poll = {list(polled)}\n" if polled else "")
+    )
+    return path
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("stated", [True, False], ids=["gaps stated", "nothing stated"])
+def test_poll_reads_all_40_values_of_the_server(tmp_path: Path, stated: bool) -> None:
+    """Check all values; the server rejects undeclared registers."""
+    assert len(METER_HOLDS) == 40
+    family = family_file(tmp_path, stated=stated)
+    rows: list[Row] = []
+    with served(tmp_path, *([] if stated else ["refusing"])) as port:
+        plant = load_plant(plant_file(tmp_path, port, family))
+        with Poller(plant) as poller:
+            until(lambda: rows.extend(rows_of(poller)) or len(rows) > 400)
+    assert {row.status for row in rows} <= {"ok"} | HOST_LATE
+    assert {(row.register, row.value) for row in rows if row.value is not None} == set(METER_HOLDS.items())
+
+
+@pytest.mark.slow
+def test_read_many_reads_all_40_values_of_the_server(tmp_path: Path) -> None:
+    meter = load_family(FAMILY)
+    with served(tmp_path) as port, Bus(port) as bus:
+        assert bus.attach(meter, UNIT).read_many(meter.registers.values()) == METER_HOLDS
+
+
+@pytest.mark.parametrize(("stated", "requests"), [(True, 4), (False, 8)])
+def test_plan_of_39_floats_at_9600_baud_prints_the_documented_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], stated: bool, requests: int
+) -> None:
+    """Check the plan in the documentation; 5 ms is the default response delay."""
+    family = family_file(tmp_path, stated=stated)
+    assert load_family(family).response_delay == 0.005
+    assert main(["plan", str(plant_file(tmp_path, "/dev/null", family, *ADDRESSES))]) == 0
+    shown = capsys.readouterr().out
+    assert shown.splitlines()[2].split()[:3] == ["meter", str(requests), "39"]
+    assert shown in PAGE.read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("stated", "most"), [(True, "at most 80"), (False, "at most 125, the standard's limit")]
+)
+def test_models_prints_the_read_limit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], stated: bool, most: str
+) -> None:
+    assert main(["models", str(family_file(tmp_path, stated=stated))]) == 0
+    assert f"input registers (read 04H, {most}" in capsys.readouterr().out
