@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, TypeVar
 
-from multidrop.printable import masked, printable
+from multidrop.printable import did_you_mean, is_number, masked, nearest_names, printable
 
 T = TypeVar("T")
 
@@ -19,14 +19,14 @@ MOST_PARTS = 100  # limit of parts in a dotted key
 
 
 def read_document(path: Path, what: str) -> dict[str, Any]:
-    """Return the tables of a TOML file. Raises ValueError, whose text lacks the path, if it cannot be read.
+    """Return the tables of a TOML file. If that fails, raises ValueError; its text does not name the path.
 
     A byte order mark before the text is skipped, because some editors write one. A device is refused: reading
     a serial port would block forever, and would take bytes from its drives.
     """
     try:
         if path.is_char_device():
-            raise ValueError(f"is a device, and no {what}")
+            raise ValueError(f"is a device, not a {what}")
         data = path.read_bytes()
     except OSError as failure:
         raise ValueError(f"the {what} cannot be read: {failure.strerror}") from failure
@@ -34,7 +34,7 @@ def read_document(path: Path, what: str) -> dict[str, Any]:
 
 
 def read_bounded(path: Path, most: int, what: str) -> bytes:
-    """Return a file's bytes, at most `most`. Raises ValueError, whose text lacks the path, if that fails."""
+    """Return a file's bytes, at most `most`. If that fails, raises ValueError; its text lacks the path."""
     try:
         with path.open("rb") as file:
             data = file.read(most + 1)
@@ -46,7 +46,7 @@ def read_bounded(path: Path, most: int, what: str) -> bytes:
 
 
 def parse_document(data: bytes) -> dict[str, Any]:
-    """Return the tables of a TOML file's bytes. Raises ValueError if they are not valid TOML."""
+    """Return the tables of a TOML file's bytes. Raises ValueError if the bytes are not valid TOML."""
     try:
         text = data.decode("utf-8-sig")
         _check_keys(text)
@@ -55,7 +55,7 @@ def parse_document(data: bytes) -> dict[str, Any]:
     except UnicodeDecodeError as failure:
         raise ValueError(f"is not text in UTF-8, from byte {failure.start} on") from failure
     except RecursionError as failure:
-        raise ValueError("is not TOML of ours: it is nested too deeply") from failure
+        raise ValueError("is nested too deeply") from failure
     except ValueError as failure:
         raise ValueError(f"is not TOML: {failure}") from failure
     if not fits:
@@ -68,7 +68,7 @@ def _check_keys(text: str) -> None:
     if text.count(".") > MOST_PARTS:
         pieces = re.split(r"[=,{}\[\]\n]+", text)
         if any(piece.count(".") > MOST_PARTS for piece in pieces):
-            raise ValueError(f"a key or a text has more than {MOST_PARTS} points")
+            raise ValueError(f"a key or a text has more than {MOST_PARTS} dots")
 
 
 def _fits(value: Any) -> bool:
@@ -82,7 +82,10 @@ def _fits(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Key:
-    """A key that a table may have: the type of its value, an example, and keywords for its JSON Schema."""
+    """A key that a table may have: the type of its value, an example, and keywords for its JSON Schema.
+
+    `keywords` of a table may be the result of `json_schema`.
+    """
 
     kind: type | tuple[type, ...]
     example: str
@@ -106,13 +109,17 @@ _TYPES: Mapping[type, Mapping[str, Any]] = {
 }
 
 
-def json_schema(keys: Mapping[str, Key]) -> dict[str, Any]:
-    """Return the JSON Schema of a table with these keys, for editors."""
+DRAFT = "http://json-schema.org/draft-07/schema#"  # the version of JSON Schema
+
+
+def json_schema(keys: Mapping[str, Key], **more: Any) -> dict[str, Any]:
+    """Return the JSON Schema (draft 7) of a table with these keys, for editors; `more` are more keywords."""
     return {
         "type": "object",
         "properties": {name: _key_schema(key) for name, key in keys.items()},
         "required": [name for name, key in keys.items() if key.needed],
         "additionalProperties": False,
+        **more,
     }
 
 
@@ -122,18 +129,19 @@ def _key_schema(key: Key) -> dict[str, Any]:
     return {**alternatives, **key.keywords, "description": key.example}
 
 
-Steps = tuple[tuple[str, int], ...]  # a table's path: for each level, the array's name and the table's number
+# a table's path: for each level, the name of the array, and the table's number in it
+Steps = tuple[tuple[str, int], ...]
 
 
 class ConfigError(str):
-    """An error with its place at the start; `sentence` is the rest, `line` the file's line or 0."""
+    """An error as text, with its place first; `sentence` lacks the place, `line` is the file's line or 0."""
 
     sentence: str
     line: int
 
 
 def line_numbers(path: Path) -> dict[tuple[Steps, str], int]:
-    """Return the line number of each key by its table's path and its name; "" means the table's header."""
+    """Return the line numbers of keys, by their table's path and their name; "" is the table's header."""
     if not path.is_file():  # reading a serial port would block
         return {}
     found: dict[tuple[Steps, str], int] = {}
@@ -156,8 +164,10 @@ _ENTRY = re.compile(r"\s*([\w-]+)\s*=")
 
 
 def grouped(errors: Sequence[str]) -> tuple[str, ...]:
-    """Return the errors; of more than SHOWN_ALIKE with the same sentence, only one, with their number."""
+    """Return the errors, but merge those with the same sentence if there are more than SHOWN_ALIKE.
 
+    The merged error states their number.
+    """
     alike = Counter(getattr(error, "sentence", error) for error in errors)
     found: dict[str, str] = {}
     for error in errors:
@@ -169,7 +179,7 @@ def grouped(errors: Sequence[str]) -> tuple[str, ...]:
     return tuple(found.values())
 
 
-SHOWN_ALIKE = 3  # limit of errors with the same sentence that are shown separately
+SHOWN_ALIKE = 3  # limit up to which errors with the same sentence are shown separately
 
 
 @dataclass(frozen=True)
@@ -191,7 +201,7 @@ class TomlPlace:
             yield table, replace(self, labels=(*self.labels, label), steps=(*self.steps, (kind, number)))
 
     def within(self, *labels: str) -> TomlPlace:
-        """Return a place inside this one."""
+        """Return a place inside this place, with these labels appended."""
         return replace(self, labels=(*self.labels, *labels))
 
     def of_file(self, path: Path, *labels: str) -> TomlPlace:
@@ -219,7 +229,10 @@ class TomlPlace:
         return next((lines[place] for place in places if place in lines), 0)
 
     def once(self, *what: object, sentence: str) -> None:
-        """Add an error if `what` was seen before; `{first}` in the sentence becomes the first place."""
+        """Add the error `sentence` if `what` was seen before.
+
+        `{first}` in the sentence becomes the first place of `what`.
+        """
         if what in self.seen:
             self.wrong(sentence.format(first=self.seen[what]))
         self.seen.setdefault(what, ", ".join(self.labels))
@@ -227,7 +240,7 @@ class TomlPlace:
     def attempt(self, make: Callable[..., T], *arguments: Any, hint: str = "", key: str = "") -> T | None:
         """Return make(*arguments). If that raises ValueError or TypeError, add the error and return None.
 
-        `hint` is appended to the error's text; `key` is the key with the error.
+        `hint` is appended to the error's text; `key` is the key whose value is wrong.
         """
         try:
             return make(*arguments)
@@ -259,19 +272,77 @@ class TomlPlace:
         """Add an error for each unknown key; return the known keys that were probably meant."""
         meant: set[str] = set()
         for name in [name for name in table if name not in keys]:
-            near = difflib.get_close_matches(name, keys, n=1)
-            meant.update(near)
-            hint = f"did you mean {near[0]!r}?" if near else f"the keys here are {', '.join(keys)}"
+            hint = did_you_mean(name, keys, f"the keys here are {', '.join(keys)}", 1)
+            meant.update(nearest_names(name, keys, 1))
             self.wrong(f"unknown key {name!r}; {hint}", name)
         return meant
 
 
+_SHORTEST, _LONGEST = 100e-6, 86400.0  # limits of a duration in s
 _DURATION = r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|h)"
-DURATION: Mapping[str, Any] = {"pattern": rf"^\s*(?=.*[1-9]){_DURATION}\s*$"}  # JSON Schema
+_TOO_SHORT = r"0*\d{0,2}(\.\d+)?\s*us"
+_TOO_LONG = r"0*(2[5-9]|[3-9]\d|[1-9]\d{2,})(\.\d+)?\s*h"
+
+# JSON Schema keywords for `Key.keywords`. Several keys share each of these.
+DURATION: Mapping[str, Any] = {
+    "pattern": rf"^\s*(?=[^a-z]*[1-9])(?!{_TOO_SHORT})(?!{_TOO_LONG}){_DURATION}\s*$"
+}
+SIZE: Mapping[str, Any] = {"pattern": r"^\s*\d+(\.\d+)?\s*(kB|MB|GB|TB)\s*$"}
+ASCENDING: Mapping[str, Any] = {"allOf": [{"$ref": "#/definitions/ascending"}]}  # see `ascending`
+PORT_NUMBER = r"([0-9]{1,4}|[1-5][0-9]{4}|6[0-4][0-9]{3}|65[0-4][0-9]{2}|655[0-2][0-9]|6553[0-5])"
+_IPV6 = r"\[?[0-9A-Fa-f.]*:[0-9A-Fa-f:.]*(%[^\s\]]+)?\]?"
+_HOST_NAME = r"([A-Za-z0-9_-]+\.)*[0-9]*[A-Za-z_-][A-Za-z0-9_-]*\.?"  # its last label is not only digits
+_IPV4 = r"[0-9]{1,3}(\.[0-9]{1,3}){3}"
+ADDRESS: Mapping[str, Any] = {"pattern": f"^({_IPV6}|{_HOST_NAME}|{_IPV4}):{PORT_NUMBER}$"}
+
+
+def ascending() -> dict[str, Any]:
+    """Return the JSON Schema of two numbers in ascending order.
+
+    A JSON Schema cannot compare two numbers. It can only compare both with some limits: if the first number
+    is at least a limit, so is the second.
+    """
+    powers = [sign * digit * 10**power for power in range(7) for digit in (1, 2, 5) for sign in (-1, 1)]
+    limits = sorted({0, *powers, *(power / 1000 for power in powers)})
+    return {
+        "allOf": [
+            {
+                "if": {"items": [{"type": "number", "minimum": limit}]},
+                "then": {"items": [{}, {"minimum": limit}]},
+            }
+            for limit in limits
+        ]
+    }
+
+
+def parse_address(text: str, example: str) -> tuple[str, int]:
+    """Return host and port of a text such as "127.0.0.1:8750" or "[::1]:8750".
+
+    Raises ValueError for any other text; `example` is a valid setting, such as 'listen = "127.0.0.1:8750"'.
+    """
+    host, _, port = text.rpartition(":")
+    host = host[1:-1] if host.startswith("[") and host.endswith("]") else host
+    if not _is_host(host) or not re.fullmatch(r"[0-9]{1,5}", port) or int(port) > 65535:
+        raise ValueError(f'"{text}" is not an address and port; write {example}')
+    return host, int(port)
+
+
+def _is_host(text: str) -> bool:
+    try:
+        return bool(re.fullmatch(_HOST_NAME, text) or ip_address(text))
+    except ValueError:
+        return False
+
+
+def duration_up_to(digits: int) -> dict[str, Any]:
+    """Return the JSON Schema keywords of a duration of at most 10 to the power of `digits` seconds."""
+    more = rf"[1-9]\d{{{digits + 1},}}|[2-9]\d{{{digits}}}|1(?!0{{{digits}}})\d{{{digits}}}"
+    longer = rf"^\s*(0*({more})(\.\d+)?\s*s|\d*[1-9]\d*(\.\d+)?\s*(min|h))\s*$"
+    return {**DURATION, "not": {"pattern": longer}}
 
 
 def parse_duration(text: str) -> float:
-    """Return the seconds of a duration such as "50 ms". Raises ValueError if it is not a valid one."""
+    """Return the seconds of a duration such as "50 ms". Raises ValueError if the duration is invalid."""
     match = re.fullmatch(_DURATION, str(text).strip(), re.ASCII)
     units = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
     seconds = float(match[1]) * units[match[2]] if match else 0
@@ -282,14 +353,12 @@ def parse_duration(text: str) -> float:
 
 def check_period(seconds: float) -> None:
     """Raise ValueError unless this is a valid period in s for a plant file."""
-    is_number = isinstance(seconds, (int, float)) and not isinstance(seconds, bool)
-    if not is_number or not _SHORTEST <= seconds <= _LONGEST:
+    if not is_number(seconds) or not _SHORTEST <= seconds <= _LONGEST:
         raise ValueError(f"every = {seconds!r} is not a number of seconds from 0.0001 to 86400, or None")
 
 
 def duration_of(given: Mapping[str, Any], key: str, place: TomlPlace) -> float | None:
     """Return the duration under this key in s; None if it is missing or invalid. Add an error if invalid."""
-
     return place.attempt(_duration_under, key, given[key], key=key) if key in given else None
 
 
@@ -298,6 +367,3 @@ def _duration_under(key: str, text: str) -> float:
         return parse_duration(text)
     except ValueError as mistake:
         raise ValueError(f"{key} = {mistake}") from mistake
-
-
-_SHORTEST, _LONGEST = 100e-6, 86400.0  # s
