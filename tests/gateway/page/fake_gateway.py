@@ -1,4 +1,4 @@
-"""A small gateway for tests of the page: its routes, with answers that a test may set. It can be killed."""
+"""A small gateway for tests of the page. A test may set its answers, and may kill it."""
 
 from __future__ import annotations
 
@@ -9,22 +9,16 @@ import socket
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from importlib.resources import files
 from typing import Any
 from urllib.parse import parse_qs, unquote, urlsplit
 
 import fake_plant
 
 from multidrop.gateway.clock import iso_time
+from multidrop.gateway.http.page_files import PAGE, read_files
 from multidrop.gateway.live.frames import changes
 
-PAGE = files("multidrop.gateway") / "page"
-TYPES = {
-    "html": "text/html; charset=utf-8",
-    "js": "text/javascript",
-    "css": "text/css",
-    "svg": "image/svg+xml",
-}
+FILES = read_files(PAGE)
 HEADERS = {
     "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
@@ -46,14 +40,15 @@ class FakeGateway:
         self.changes: dict[str, Any] = {}  # replaced keys of the frame
         self.drive_changes: dict[str, dict[str, Any]] = {}  # by drive: replaced keys in the frame
         self.posts: list[tuple[str, Any]] = []  # path and body of each POST request
-        self.seen: list[int] = []  # numbers of the frames that commands named
+        self.seen: list[int] = []  # for each command: number of the newest frame on the page
         self.stops: dict[str, int] = {}  # by drive: number of stops called
         self.is_held: threading.Event | None = None  # answers to stops wait for this event
-        self.confirms = False  # True: the head of a waiting answer is sent immediately
+        self.confirms = False  # True: the HTTP head of a waiting answer is sent immediately
         self.token: str | None = None  # token that POST requests need; None: no token
         self.has_history = True
         self.recorded: dict[str, dict[str, object]] = {}  # by series: additional keys of its history
-        self.knows_since = 0  # time from which alarms are known, UTC in ms
+        self.triggers: list[dict[str, Any]] = []  # the last triggers, newest first
+        self.knows_since = 0  # since when the gateway knows all alarms, UTC in ms
         self.maximum_hz = 50.0  # value of the maximum frequency of drives
         self.has_changed = False  # True: acknowledging any alarm fails with "unknown"
         self.parameters: list[dict[str, Any]] = []  # successive answers; the last one is repeated
@@ -91,7 +86,7 @@ class FakeGateway:
         return 1 if self.stands_still else int((time.time() - self.began) * FRAMES_A_SECOND) + 1
 
     def encoded(self, after: int) -> bytes:
-        """Return the newest frame, or its changes since frame `after` if that is still remembered."""
+        """Return the newest frame, or only its changes since frame `after` if that frame is still kept."""
         with self._lock:
             number = self.number()
             if number not in self._made:
@@ -175,11 +170,10 @@ def _handler(gateway: FakeGateway) -> type[BaseHTTPRequestHandler]:
 
         def file(self, path: str) -> None:
             name = "index.html" if path == "/" else path.removeprefix("/page/")
-            file = PAGE.joinpath(*name.split("/"))
-            if ".." in name or not file.is_file():
-                self.tell({"error": f"There is no file {name}."}, 404)
+            if file := FILES.get(name):
+                self.answer(200, file.body, file.media_type, **{"Cache-Control": "max-age=3600"})
             else:
-                self.answer(200, file.read_bytes(), TYPES[name.rpartition(".")[2]])
+                self.tell({"error": f"There is no file {name}."}, 404)
 
         def frame(self, after: int) -> None:
             end = time.monotonic() + HOLD_S
@@ -241,7 +235,8 @@ def drive(name: str, gateway: FakeGateway) -> dict[str, Any]:
 
 
 def plant(handler: Any, gateway: FakeGateway, _: object) -> None:
-    handler.tell(fake_plant.plant(gateway.renamed) | gateway.plant_changes)
+    history = {"history": gateway.has_history}
+    handler.tell(fake_plant.plant(gateway.renamed) | history | gateway.plant_changes)
 
 
 def lines(handler: Any, gateway: FakeGateway, _: object) -> None:
@@ -276,9 +271,6 @@ def fleet(handler: Any, gateway: FakeGateway, _: object) -> None:
 
 
 def history(handler: Any, gateway: FakeGateway, asked: dict[str, list[str]]) -> None:
-    if not gateway.has_history:
-        handler.tell({"error": "No history is kept: the plant file has no [serve.history]."}, 404)
-        return
     start, end, points = (float(asked[key][0]) for key in ("from", "to", "points"))
     step = max(100.0, (end - start) / points)
     names = " ".join(fake_plant.NAMES).split()
@@ -341,7 +333,12 @@ def export(handler: Any, _: object, asked: dict[str, list[str]]) -> None:
         "Content-Disposition": f'attachment; filename="history.{asked["format"][0]}"'})  # fmt: skip
 
 
+def triggers(handler: Any, gateway: FakeGateway, _: object) -> None:
+    handler.tell({"triggers": gateway.triggers})
+
+
 ANSWERS = {
     "/api/plant": plant, "/api/lines": lines, "/api/history": history, "/api/alarms": alarms,
     "/api/audit": audit, "/api/export": export, "/api/fleet": fleet,
+    "/api/triggers": triggers,
 }  # fmt: skip

@@ -22,7 +22,6 @@ SILENT = {"labeller": 42}
 KINDS = ("fault", "stopped", "port", "silent")  # kinds of alarms, the gravest first
 SPEEDS = ("38400 8N1", "9600 8N1", "38400 8N1")
 
-
 UNPOLLED: dict[str, Any] = {"period_s": None, "holds_s": None}
 
 
@@ -163,7 +162,7 @@ def ms(seconds: float) -> int:
 
 
 def frame(n: int, began: float, renamed: dict[str, str], stuck: dict[str, float]) -> dict[str, Any]:
-    """Return a frame. A drive in `stuck` has its newest values from that time (s), without later misses."""
+    """Return a frame. A drive in `stuck` was last polled at the time given there (s)."""
     now = time.time()
     drives = {}
     for number, name in enumerate(" ".join(NAMES).split()):

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
-from typing import Any
-
 import fake_plant
 import pytest
 from fake_gateway import FakeGateway
-from watching import Opener, missing, press_enter, until, until_still
+from watching import Opener, press_enter, until, until_settled, violations
 
-pytestmark = pytest.mark.long  # Chromium is started for each file
+pytestmark = pytest.mark.long  # each file starts Chromium, which takes time
 
 VIEWS = (
     "#/drives",
@@ -25,36 +22,19 @@ VIEWS = (
     "reload",
 )
 LOOKS = [("desk", "light"), ("tablet", "light"), ("phone", "dark")]
-TAGS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
-# Report violations only: other results would list all elements of the page.
-RUN = """tags => axe.run(document, { runOnly: tags, resultTypes: ["violations"] })
-  .then(found => found.violations)"""
-
-
-@pytest.fixture(scope="module")
-def axe() -> str:
-    try:
-        return (files("axe_playwright_python") / "axe.min.js").read_text("utf-8")
-    except ImportError:
-        missing("axe-playwright-python is not installed")
-
-
-def violations(page: Any) -> list[str]:
-    found = page.evaluate(RUN, TAGS)
-    return [f"{v['id']}: {node['target']} {node['failureSummary']}" for v in found for node in v["nodes"]]
 
 
 @pytest.mark.parametrize(("size", "theme"), LOOKS)
 def test_axe_finds_no_violation(
     opened: Opener, gateway: FakeGateway, axe: str, size: str, theme: str, request: pytest.FixtureRequest
 ) -> None:
-    if size == "tablet":  # other sizes check the long list of drives
+    if size == "tablet":  # the other sizes check all drives
         request.getfixturevalue("few_drives")
     gateway.reloaded |= {"done": False, "mistakes": ["plant.toml: a mistake"] * 40}
     page = opened(size=size, color_scheme=theme)
     page.evaluate(axe)
     found = {}
-    for view in VIEWS if size == "phone" else VIEWS[:-1]:  # long lists scroll on a small screen
+    for view in VIEWS if size == "phone" else VIEWS[:-1]:  # only a phone has to scroll the last view
         if view == "settings":
             page.get_by_role("button", name="Settings").click()
         elif view == "stop":
@@ -68,8 +48,7 @@ def test_axe_finds_no_violation(
             page.get_by_role("heading", name="The file has 40 mistakes").wait_for()
         else:
             page.evaluate("view => { location.hash = view }", view)
-        page.wait_for_timeout(700)
-        until_still(page)
+        until_settled(page)
         found[view] = violations(page)
     assert {view: some for view, some in found.items() if some} == {}
 
@@ -85,8 +64,7 @@ def test_axe_finds_no_violation_in_rare_states(
     found = {}
 
     def look(state: str) -> None:
-        page.wait_for_timeout(300)
-        until_still(page)
+        until_settled(page)
         found[state] = violations(page)
 
     page.get_by_role("button", name="start", exact=True).click()

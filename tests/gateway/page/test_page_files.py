@@ -7,7 +7,9 @@ from pathlib import Path
 
 from fake_gateway import PAGE
 
-FILES = sorted(path for path in Path(str(PAGE)).iterdir() if path.is_file())
+from multidrop.gateway.live.alarms import KINDS
+
+FILES = sorted(path for path in PAGE.iterdir() if path.is_file())
 OURS = [path for path in FILES if path.suffix in (".js", ".css", ".html")]
 SCRIPTS = [path for path in OURS if path.suffix == ".js"]
 MARKUP = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|createContextualFragment|DOMParser|srcdoc"
@@ -37,8 +39,22 @@ def test_page_refers_to_all_its_files_and_to_no_others() -> None:
     named = set(re.findall(r'(?:from "\./|"page/)([\w./-]+)"', text))
     there = {path.relative_to(str(PAGE)).as_posix() for path in Path(str(PAGE)).rglob("*") if path.is_file()}
     served = {"prometheus/alerts.yml", "prometheus/dashboard.json"}  # for users of Prometheus and Grafana
-    assert there - named == {"index.html", "vendor/uPlot-LICENSE", *served}
+    assert there - named == {"index.html", "texts.toml", "vendor/uPlot-LICENSE", *served}
     assert named - there == set()
+
+
+def test_each_kind_of_alarm_has_a_shape_a_colour_a_word_and_a_bar() -> None:
+    index, strip, lanes, table, bars, words = (
+        Path(str(PAGE / name)).read_text("utf-8")
+        for name in ("index.html", "top.css", "plots.css", "views.css", "lane.js", "values.js")
+    )
+    for kind in KINDS:
+        assert f'id="glyph-{kind}"' in index
+        assert f".strip .{kind}" in strip
+        assert f".lane .{kind}" in lanes
+        assert f".faults tr.{kind} .kind" in table
+        assert f'"{kind}"' in bars
+        assert f"\n  {kind}: " in words[words.index("ALARMS") :]
 
 
 def test_vendored_plot_library_has_its_licence() -> None:

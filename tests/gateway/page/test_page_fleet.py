@@ -9,7 +9,7 @@ from fake_gateway import FakeGateway
 from watching import Opener, until, until_met
 
 NONE = "\u2013"  # a dash
-pytestmark = pytest.mark.long  # Chromium is started for each file
+pytestmark = pytest.mark.long  # each file starts Chromium, which takes time
 
 
 def cells(page: Any, table: str) -> list[list[str]]:
@@ -53,7 +53,7 @@ def test_fleet_tables_fit_a_small_screen(opened: Opener) -> None:
         page.set_viewport_size({"width": width, "height": 844})
         until_met(page, lambda: tables.count() == 3)
         until_met(page, lambda: max(tables.evaluate_all(wide)) <= 0)
-        until(page, f"{lag} === '\"Lag \"'")  # each cell shows its column's head
+        until(page, f"{lag} === '\"Lag \"'")  # each cell starts with its column's title
 
 
 def test_old_fleet_values_show_their_age_and_the_reason(opened: Opener, gateway: FakeGateway) -> None:
@@ -158,7 +158,7 @@ def test_stop_all_stops_the_fleet_with_a_commanders_key(opened: Opener, gateway:
     assert sorted(gateway.posts) == [("/api/fleet/stop", {}), ("/api/stop", {"drives": None})]
 
 
-def test_failed_stop_of_the_fleet_is_reported_besides_own_drives(
+def test_a_failed_stop_of_the_fleet_is_reported_in_addition_to_the_own_drives(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     """The fleet's servers do not answer, but the gateway's own drives are stopped."""

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fake_gateway import FakeGateway
 from gateways import Served, served
 from lines import until as until_here
-from watching import LIVE, until
+from watching import AT_ITS_PLACE, LIVE, SIZES, VIEWS, Opener, until, until_settled
 
-pytestmark = pytest.mark.long  # Chromium is started for each file
+pytestmark = pytest.mark.long  # each file starts Chromium, which takes time
 
 MAY = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
 # Try all ways in which a page could send or read data without permission; return [way, outcome] for each.
@@ -93,7 +94,7 @@ def written(gateway: Served) -> list[Any]:
 
 
 def sent_by_form(page: Any, gateway: str) -> int:
-    """Submit the form, and return the HTTP status of the answer."""
+    """Submit FORM, and return the HTTP status of the answer."""
     with page.expect_response("**/api/stop") as answer:
         page.evaluate(FORM, gateway)
     page.wait_for_url("**/api/stop")
@@ -106,13 +107,14 @@ def test_only_the_gateways_page_can_read_or_send(strange: Any, elsewhere: int, t
         port = gateway.gateway.port
         refused = dict.fromkeys(("read", "read blindly", "post", "post a text", "start"), "TypeError")
         refused |= {"post a text blindly": "TypeError", "script": "error", "image": "error"}
-        # A page of another site, and a page of another port of the gateway's own host.
+        # First a page of another site, then a page of the gateway's host on another port.
         for host, ours in (("evil.example", "127.0.0.1"), ("localhost", "localhost")):
             strange.goto(f"http://{host}:{elsewhere}/")
             own = f"http://{ours}:{port}/"
             assert dict(strange.evaluate(ATTACK, own)) == refused, host
             assert sent_by_form(strange, own) == 403
-        # DNS rebinding: another site's name leads to this machine; to the browser it is the gateway's page.
+        # DNS rebinding: another site's name resolves to this machine, so the browser takes the gateway's
+        # answers for that site's.
         rebound = f"http://evil.example:{port}/"
         assert strange.goto(rebound).status == 421
         came = dict(strange.evaluate(ATTACK, rebound))
@@ -130,7 +132,58 @@ def test_only_the_gateways_page_can_read_or_send(strange: Any, elsewhere: int, t
         assert strange.evaluate(send, ["api/act", start]) == 403  # the token has only the right to stop
         assert strange.evaluate(send, ["api/reload", {"confirm": True}]) == 401
         assert written(gateway) == []
-        assert (
-            strange.evaluate(send, ["api/stop", {"drives": None}]) == 200
-        )  # the same request from our own page is accepted
+        # the same request from our own page is accepted
+        assert strange.evaluate(send, ["api/stop", {"drives": None}]) == 200
         until_here(lambda: written(gateway))
+
+
+# ---- names from a plant file are text: they run no code, and move or cover no element ----
+
+
+MARKUP = '<img src=x onerror="window.hit=1"><script>window.hit=1</script>&amp;'
+RIGHT_TO_LEFT = "\u202epots\u202c \u05d0\u05d1\u05d2 \u0645\u0636\u062e\u0629"
+LONG = "w" * 300
+CYRILLIC = "\u041d\u0430\u0441\u043e\u0441 \u2116 7/\u0430?#%41"
+HOSTILE = {"pump-1": MARKUP, "conveyor-2": RIGHT_TO_LEFT, "labeller": LONG, "filler-1": CYRILLIC}
+
+
+@pytest.fixture
+def hostile(gateway: FakeGateway) -> FakeGateway:
+    gateway.renamed = HOSTILE
+    return gateway
+
+
+def elements(page: Any) -> list[int]:
+    return list(page.evaluate("[document.images.length, document.scripts.length, window.hit ?? 0]"))
+
+
+@pytest.mark.usefixtures("hostile")
+def test_hostile_names_are_shown_as_text_and_break_no_layout(opened: Opener) -> None:
+    page = opened()
+    shown = page.locator("td.name").all_text_contents()
+    assert set(HOSTILE.values()) <= set(shown)
+    for width, height in SIZES.values():
+        page.set_viewport_size({"width": width, "height": height})
+        for view in VIEWS:
+            page.evaluate("view => { location.hash = view }", view)
+            until_settled(page)
+            assert elements(page) == [1, 4, 0], (width, view)
+            assert page.evaluate("document.documentElement.scrollWidth") <= width, view
+            assert page.evaluate("document.querySelector('main').scrollWidth") <= width, view
+            assert page.evaluate(AT_ITS_PLACE)[0], (width, view)
+
+
+def test_drive_with_a_hostile_name_is_stopped(opened: Opener, hostile: FakeGateway) -> None:
+    page = opened()
+    for name in HOSTILE.values():
+        page.evaluate("name => { location.hash = `#/drives/${encodeURIComponent(name)}` }", name)
+        page.locator("#panel h2", has_text=name[:3]).wait_for()
+        assert page.locator("#panel h2").text_content() == name
+        page.locator("#panel .danger").click()
+        assert page.locator("#ask-title").text_content() == f"Stop {name}?"
+        assert page.locator("#ask-title bdi").evaluate("e => getComputedStyle(e).unicodeBidi") == "isolate"
+        page.locator("#ask .danger").click()
+        page.get_by_role("heading", name="The drive is stopped").wait_for()
+        page.keyboard.press("Escape")
+    assert hostile.posts == [("/api/stop", {"drives": [name]}) for name in HOSTILE.values()]
+    assert elements(page)[2] == 0

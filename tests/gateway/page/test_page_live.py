@@ -11,9 +11,9 @@ import fake_gateway
 import fake_plant
 import pytest
 from fake_gateway import FakeGateway
-from watching import LIVE, STALE, Opener, cell, link, until, until_met
+from watching import LIVE, STALE, Opener, aborting, cell, link, until, until_met
 
-pytestmark = pytest.mark.long  # Chromium is started for each file
+pytestmark = pytest.mark.long  # each file starts Chromium, which takes time
 
 DASH = "\u2013"
 BUSY_S = 20.0  # for busy machines; a benchmark checks the promised 0.5 s
@@ -64,7 +64,7 @@ def test_hanging_gateway_is_reported_and_values_become_old(opened: Opener, gatew
 def test_old_values_stay_old_when_the_viewers_clock_is_set_back(
     opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fake_gateway, "HOLD_S", 120)  # so that no answer shows the gateway's clock
+    monkeypatch.setattr(fake_gateway, "HOLD_S", 120)  # no answer arrives that would show the gateway's clock
     page = opened()
     gateway.is_silent = True
     page.evaluate("(now => { Date.now = () => now() - 3600e3; })(Date.now)")
@@ -137,7 +137,7 @@ def test_values_stay_old_when_the_gateways_clock_is_set_back(opened: Opener) -> 
 def test_values_of_a_slow_line_stay_fresh_for_seconds(
     opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The polling period comes from the plant file; the gateway knows how long a value is current."""
+    """The gateway reports how long each register's values stay current: here for ten minutes."""
     held = [one | {"holds_s": one["holds_s"] and 600.0} for one in fake_plant.REGISTERS]
     monkeypatch.setattr(fake_plant, "REGISTERS", held)
     gateway.stuck = {"pump-2": time.time() - 20}
@@ -159,7 +159,7 @@ def test_problems_other_than_lost_lines_are_shown(opened: Opener, gateway: FakeG
 
 def test_a_silent_drive_keeps_its_last_value_with_its_age(opened: Opener) -> None:
     page = opened("#/drives/labeller")
-    state = cell(page, "labeller", "state")  # "last: silent for" while the page itself waits for news
+    state = cell(page, "labeller", "state")  # may be "last: silent for ..." if the machine is busy
     until_met(page, lambda: state.inner_text().strip().startswith("silent for "))
     assert re.search(r"Hz\d\d s old", cell(page, "labeller", "frequency").inner_text().replace("\n", ""))
     assert "since then: no reply" in cell(page, "labeller", "frequency").locator(".value").get_attribute(
@@ -189,10 +189,8 @@ def test_unknown_values_are_shown_as_a_dash_and_never_as_zero(opened: Opener, ga
 
 @pytest.mark.parametrize("off_s", [-90, 90])
 def test_viewers_wrong_clock_is_shown_and_ages_stay_right(opened: Opener, off_s: int) -> None:
-    page = opened(live=False)
-    page.add_init_script(f"const now = Date.now; Date.now = () => now() + {off_s * 1000}")
-    page.reload()
-    until(page, LIVE)
+    wrong = f"const now = Date.now; Date.now = () => now() + {off_s * 1000}"
+    page = opened(prepare=lambda page: page.add_init_script(wrong))
     notice = page.locator("#notice")
     notice.wait_for()
     assert re.search(r"clock is (8\d|9\d) s (slow|fast); times", notice.inner_text())
@@ -226,7 +224,7 @@ def test_times_have_24_hours_in_utc_or_local_time_as_chosen(opened: Opener) -> N
 @pytest.mark.long
 @pytest.mark.usefixtures("few_drives")
 def test_nine_tabs_are_live_together(browser: Any, gateway: FakeGateway) -> None:
-    """Browsers open six connections to a host for all tabs together."""
+    """All tabs of a browser share at most six connections to a host."""
     gateway.clocked = "pump-1"
     context = browser.new_context(viewport={"width": 1440, "height": 900})
     pages = [context.new_page() for _ in range(9)]
@@ -252,8 +250,7 @@ FORBIDDEN = """for (const name of ['sessionStorage', 'localStorage'])
 
 def test_page_reloads_itself_if_a_network_change_aborts_its_scripts(opened: Opener) -> None:
     """Chromium aborts all requests when the network changes. Here the browser also forbids storage."""
-    page, broken = opened(live=False), []
-    page.add_init_script(FORBIDDEN)
+    broken = []
 
     def break_two_off(route: Any) -> None:
         if len(broken) < 2:
@@ -262,8 +259,11 @@ def test_page_reloads_itself_if_a_network_change_aborts_its_scripts(opened: Open
         else:
             route.continue_()
 
-    page.route("**/page/api.js", break_two_off)
-    page.reload()
+    def prepare(page: Any) -> None:
+        page.add_init_script(FORBIDDEN)
+        page.route("**/page/api.js", break_two_off)
+
+    page = opened(live=False, prepare=prepare)
     page.locator("#link").get_by_text("live", exact=True).wait_for()
     assert len(broken) == 2
     assert page.evaluate("history.state") is None
@@ -271,9 +271,7 @@ def test_page_reloads_itself_if_a_network_change_aborts_its_scripts(opened: Open
 
 
 def test_page_without_scripts_says_that_stop_all_does_not_work(opened: Opener) -> None:
-    page = opened(live=False)
-    page.route("**/page/api.js", lambda route: route.abort())
-    page.reload()
+    page = opened(live=False, prepare=aborting("**/page/api.js"))
     page.locator("#notice").get_by_text("Stop all does not work").wait_for()
     assert page.locator("#link.stale").inner_text() == "connecting"
     assert page.locator("#stopall").is_disabled()
@@ -297,7 +295,8 @@ def test_no_line_is_drawn_over_missed_time(opened: Opener) -> None:
 
 
 TAKEN_ANEW = """change => import('/page/store.js').then(({ store, takePlant }) => {
-  const plant = structuredClone(store.plant);
+  window.original ??= store.plant;
+  const plant = structuredClone(window.original);
   const drive = plant.lines[0].drives.find(one => one.name === 'pump-1');
   Object.assign(drive, change.drive);
   for (const register of drive.registers) Object.assign(register, change.registers?.[register.name]);
@@ -305,23 +304,25 @@ TAKEN_ANEW = """change => import('/page/store.js').then(({ store, takePlant }) =
   const { good, pasts } = store.drives.get('pump-1');
   return ['output_frequency', 'output_current'].map(name => good.has(name) && pasts.has(name));
 })"""
+KEPT = """import('/page/store.js').then(({ store }) => {
+  const { good, pasts } = store.drives.get('pump-1');
+  return ['output_frequency', 'output_current'].map(name => good.has(name) && pasts.has(name));
+})"""
 
 
-@pytest.mark.parametrize(
-    ("change", "kept"),
-    [
+def test_values_are_dropped_if_a_name_means_another_drive_or_unit(opened: Opener) -> None:
+    page = opened("#/drives/pump-1")
+    changes: list[tuple[dict[str, Any], list[bool]]] = [
         ({}, [True, True]),
         ({"drive": {"family": "delixi-modbus"}}, [False, False]),
         ({"drive": {"address": 99}}, [False, False]),
         ({"registers": {"output_frequency": {"step": 0.5}}}, [False, True]),
         ({"registers": {"output_current": {"unit": "%"}}}, [True, False]),
-    ],
-)
-def test_values_are_dropped_if_a_name_means_another_drive_or_unit(
-    opened: Opener, change: dict[str, Any], kept: list[bool]
-) -> None:
-    page = opened("#/drives/pump-1")
-    assert page.evaluate(TAKEN_ANEW, change) == kept
+    ]
+    for change, kept in changes:
+        page.evaluate(TAKEN_ANEW, {})
+        until_met(page, lambda: page.evaluate(KEPT) == [True, True])
+        assert page.evaluate(TAKEN_ANEW, change) == kept, change
 
 
 def test_phone_shows_ages_and_misses_of_each_drive(opened: Opener, gateway: FakeGateway) -> None:

@@ -1,4 +1,4 @@
-"""Stop all: always at the same place, one question, sent immediately, with its result."""
+"""The button Stop all: it never moves, asks one question, sends immediately, and shows the result."""
 
 from __future__ import annotations
 
@@ -9,11 +9,22 @@ from typing import Any
 import fake_gateway
 import pytest
 from fake_gateway import FakeGateway
-from watching import AT_ITS_PLACE, LIVE, SIZES, VIEWS, Opener, press_enter, until, until_met
+from watching import (
+    AT_ITS_PLACE,
+    LIVE,
+    SIZES,
+    VIEWS,
+    Opener,
+    aborting,
+    press_enter,
+    until,
+    until_met,
+    until_settled,
+)
 
 from multidrop.control.stops import LEAST_S
 
-pytestmark = pytest.mark.long  # Chromium is started for each file
+pytestmark = pytest.mark.long  # each file starts Chromium, which takes time
 
 
 def title(page: Any) -> Any:
@@ -25,21 +36,22 @@ def told(page: Any, title: str) -> None:
     page.get_by_role("heading", name=title, exact=True).wait_for()
 
 
-@pytest.mark.parametrize("size", SIZES)
-def test_stop_all_is_at_the_same_place_and_never_covered(opened: Opener, size: str) -> None:
-    page = opened(size=size)
-    places = set()
-    for view in VIEWS:
-        page.evaluate("view => { location.hash = view }", view)
-        page.wait_for_timeout(300)  # until the panel has slid in
-        seen, *place = page.evaluate(AT_ITS_PLACE)
-        assert seen, view
-        places.add(tuple(place))
-    assert len(places) == 1
-    x, y, width, height = places.pop()
-    assert min(width, height) >= (30 if size == "desk" else 40)
-    assert 0 <= x <= x + width <= SIZES[size][0]
-    assert 0 <= y <= y + height <= SIZES[size][1]
+def test_stop_all_is_at_the_same_place_and_never_covered(opened: Opener) -> None:
+    page = opened()
+    for size, (wide, high) in SIZES.items():
+        page.set_viewport_size({"width": wide, "height": high})
+        places = set()
+        for view in VIEWS:
+            page.evaluate("view => { location.hash = view }", view)
+            until_settled(page)
+            seen, *place = page.evaluate(AT_ITS_PLACE)
+            assert seen, (size, view)
+            places.add(tuple(place))
+        assert len(places) == 1
+        x, y, width, height = places.pop()
+        assert min(width, height) >= (30 if size == "desk" else 40)
+        assert 0 <= x <= x + width <= wide
+        assert 0 <= y <= y + height <= high
 
 
 def test_stop_all_works_with_an_open_panel_on_a_phone(opened: Opener, gateway: FakeGateway) -> None:
@@ -109,7 +121,7 @@ def test_stop_all_accepts_a_click_right_after_a_dialog_closed(opened: Opener, ga
             position: 'fixed', left: `${x - 20}px`, top: `${y - 20}px`, width: '40px', height: '40px' })""",
         [x, y],
     )
-    page.mouse.dblclick(x, y)  # first click: Cancel; second click: the button behind it
+    page.mouse.dblclick(x, y)  # the first click hits Cancel, the second the button behind the dialog
     assert title(page).inner_text() == "Stop all 31 drives?"
     assert gateway.posts == []
 
@@ -128,7 +140,7 @@ def test_stop_all_works_while_a_dialog_is_open(opened: Opener, gateway: FakeGate
 def test_outcome_of_a_stop_waits_until_the_open_question_is_answered(
     opened: Opener, gateway: FakeGateway
 ) -> None:
-    """The outcome of one drive's stop arrives while Stop all asks, and must not replace that question."""
+    """The outcome of one drive's stop arrives while the question of Stop all is open."""
     page = opened("#/drives/pump-1")
     gateway.is_held = threading.Event()
     page.get_by_role("button", name="Stop pump-1").click()
@@ -147,11 +159,7 @@ def test_outcome_of_a_stop_waits_until_the_open_question_is_answered(
 
 def test_stop_works_if_other_parts_of_the_page_fail_to_load(opened: Opener, gateway: FakeGateway) -> None:
     """If one view cannot be loaded, all views fail, but stops work."""
-    page = opened(live=False)
-    page.route("**/page/table.js", lambda route: route.abort())
-    page.route("**/page/vendor/*", lambda route: route.abort())
-    page.route("**/api/frame*", lambda route: route.abort())
-    page.reload()
+    page = opened(live=False, prepare=aborting("**/page/table.js", "**/page/vendor/*", "**/api/frame*"))
     page.locator("#notice").get_by_text("was not fully loaded").wait_for()
     page.locator("#stopall").click()
     assert title(page).inner_text() == "Stop all drives?"
@@ -161,11 +169,7 @@ def test_stop_works_if_other_parts_of_the_page_fail_to_load(opened: Opener, gate
 
 
 def test_the_page_works_without_its_plot_library(opened: Opener) -> None:
-    page = opened(live=False)
-    page.route("**/page/vendor/*.js", lambda route: route.abort())
-    page.goto(page.url.partition("#")[0] + "#/drives/pump-1")
-    page.reload()
-    until(page, LIVE)
+    page = opened("#/drives/pump-1", prepare=aborting("**/page/vendor/*.js"))
     page.get_by_text("Plots could not be loaded.").wait_for()
     assert page.locator(".registers tbody tr").count() == 12
 
@@ -194,6 +198,11 @@ def test_stop_with_a_lost_answer_is_shown_as_unknown(opened: Opener, gateway: Fa
 
 
 UNTAKEN = "The gateway has not accepted the stop"
+# Close the next dialog with the button "Close" as soon as it is drawn.
+CLOSED = """() => new MutationObserver((_, observer) => {
+  const close = [...document.querySelectorAll('#ask button')].find(one => one.textContent === 'Close');
+  if (close) { observer.disconnect(); close.click(); window.wasClosed = true; }
+}).observe(document.querySelector('#ask'), { childList: true, subtree: true })"""
 
 
 @pytest.mark.parametrize("is_closed", [False, True])
@@ -203,11 +212,12 @@ def test_stop_at_a_frozen_gateway_shows_a_warning_within_two_seconds(
     gateway.is_held = threading.Event()
     page = opened()
     page.locator("#stopall").click()
+    if is_closed:
+        page.evaluate(CLOSED)
     page.get_by_role("button", name="Stop all 31 drives").click()
     until_met(page, lambda: gateway.posts)
-    if is_closed:
-        page.get_by_role("button", name="Close").click()
     told(page, UNTAKEN)
+    assert page.evaluate("window.wasClosed === true") is is_closed
     assert "Use the hard-wired stop at the machine now." in page.locator("#ask p.bad").inner_text()
     gateway.is_held.set()
     told(page, "All 31 drives are stopped")
@@ -370,7 +380,7 @@ def test_no_later_dialog_replaces_the_question_of_a_stop(
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
-KEYS = {  # (key, its place on the keyboard, is Shift held): the dialog's question
+KEYS = {  # by key, its place on the keyboard, and whether Shift is held: the question that is asked
     ("S", "KeyS", True): "Stop all 31 drives?",
     ("s", "KeyS", False): "Stop pump-1?",
     ("s", "KeyS", True): "Stop all 31 drives?",  # with caps lock on

@@ -10,12 +10,14 @@ from typing import Any
 import fake_plant
 import pytest
 from fake_gateway import FakeGateway
-from watching import SIZES, Opener, until, until_met
+from fake_plant import alarm, lines, ms
+from watching import SIZES, Opener, cell, until, until_met, until_settled
 
-pytestmark = pytest.mark.long  # Chromium is started for each file
+pytestmark = pytest.mark.long  # each file starts Chromium, which takes time
 
 MINUTE_MS = 60_000
-# Draw a plot of a minute whose last tick is at its end; return how dark the canvas is at its right edge.
+# Draw a plot of one minute, with a tick at the minute's end. Return True if anything is drawn at the right
+# edge of the canvas.
 EDGE = """async () => {
   const { makePlot, line } = await import("/page/plots.js");
   const place = document.querySelector("#lines");
@@ -28,14 +30,13 @@ EDGE = """async () => {
   return [...ctx.getImageData(width - 1, height - 24, 1, 24).data].some(value => value > 0);
 }"""
 
-
 TELL_NUMBERS = """async numbers => {
   const { text } = await import("/page/values.js");
   return numbers.map(([value, digits]) => text(value, { kind: "number", digits }));
 }"""
 
 
-def test_numbers_have_their_registers_digits_and_floats_all_they_need(opened: Opener) -> None:
+def test_numbers_have_the_digits_of_their_register_and_floats_all_digits(opened: Opener) -> None:
     single = struct.unpack(">f", struct.pack(">f", 0.1))[0]  # as the core delivers it: 0.10000000149011612
     told = {
         (12.5, 1): "12.5",
@@ -105,7 +106,7 @@ def test_durations_freeze_when_the_gateway_is_lost(opened: Opener, gateway: Fake
     until(page, "document.body.classList.contains('dead')")
     told = []
     for _ in range(2):
-        page.wait_for_timeout(5100)  # the list is redrawn after 5 s
+        page.evaluate("(now => { Date.now = () => now() + 5100 })(Date.now)")  # redrawn after 5 s
         page.evaluate("import('/page/faults.js').then(m => m.show())")
         told.append(lasted.inner_text())
     assert told[0] == told[1]
@@ -129,7 +130,9 @@ def test_single_drive_is_named_in_the_singular(opened: Opener, gateway: FakeGate
     page.get_by_text(re.compile("· 1 drive$")).wait_for()
 
 
-def test_fault_that_does_not_fit_still_colours_the_strip(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_strip_has_the_colour_of_a_fault_whose_text_does_not_fit(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     now = fake_plant.ms(time.time())
     silent, fault = ({"text": "no reply", "kind": "silent"}, {"text": "undervoltage", "kind": "fault"})
     kinds = zip(("labeller", "screw", "booster-1"), (silent, silent, fault), strict=True)
@@ -164,19 +167,15 @@ def test_newest_minute_is_at_the_right_end_of_the_hour(opened: Opener, gateway: 
     assert "No full minute counted yet." in begun.inner_text()
 
 
-@pytest.mark.parametrize("size", SIZES)
-def test_names_that_differ_at_their_ends_look_different(
-    opened: Opener, gateway: FakeGateway, size: str
-) -> None:
+def test_names_that_differ_at_their_ends_look_different(opened: Opener, gateway: FakeGateway) -> None:
     names = [f"conveyor-of-the-bottling-hall-south-no-{n:02}" for n in (1, 2)]
     gateway.renamed = dict(zip(("pump-1", "pump-2"), names, strict=True))
-    page = opened(size=size)
-    for name in names:
-        link = page.locator("td.name a", has_text=name)
-        assert link.evaluate("a => [a.scrollWidth <= a.clientWidth, a.scrollHeight <= a.clientHeight]") == [
-            True,
-            True,
-        ]
+    page = opened()
+    is_whole = "a => a.scrollWidth <= a.clientWidth && a.scrollHeight <= a.clientHeight"
+    for width, height in SIZES.values():
+        page.set_viewport_size({"width": width, "height": height})
+        until_settled(page)
+        assert all(page.locator("td.name a", has_text=name).evaluate(is_whole) for name in names)
 
 
 def test_time_label_at_the_end_of_a_plot_is_not_cut_off(opened: Opener) -> None:
@@ -214,3 +213,89 @@ def test_fault_text_that_is_cut_off_in_its_lane_ends_with_an_ellipsis(opened: Op
         True,
         "ellipsis",
     ]
+
+
+# ---- alarms on the page: order, one alarm per lost port, and acknowledgements with their senders ----
+
+
+NOW = time.time()
+SEEN = {"acknowledged": ms(NOW), "by": "anna", "note": "fuse"}
+ALARMS = [
+    alarm(ms(NOW - 240), "conveyor-2", "overcurrent while accelerating", None, "fault"),
+    alarm(ms(NOW - 90), "pump-4", "the motor stopped, and no stop was called here", None, "stopped"),
+    alarm(ms(NOW - 20), "", "there is no such port", None, "port", "hall-4"),
+    alarm(ms(NOW - 10), "labeller", "no reply", None, "silent", is_before=True),
+    alarm(
+        ms(NOW - 9), "booster-1", "undervoltage", None, "fault", acknowledged=ms(NOW), by="anna", note="fuse"
+    ),
+]
+
+
+@pytest.fixture
+def alarmed(gateway: FakeGateway) -> FakeGateway:
+    gateway.changes = {"alarms": ALARMS}
+    return gateway
+
+
+def strip(page: Any) -> list[str]:
+    page.locator("#strip a").nth(4).wait_for()
+    found: list[str] = page.locator("#strip a").all_inner_texts()
+    return [text.split(":")[0] for text in found]
+
+
+def test_gravest_alarm_is_listed_first(opened: Opener, alarmed: FakeGateway) -> None:
+    page = opened("#/faults")
+    wanted = ["conveyor-2", "pump-4", "line hall-4", "labeller", "booster-1"]
+    assert strip(page) == wanted
+    rows = page.locator("#fault-list section").first.locator("tbody tr")
+    until_met(page, lambda: rows.count() == 5)
+    assert rows.locator(".who").all_inner_texts() == wanted
+    kinds = ["fault", "stopped by itself", "line lost", "silent", "fault"]
+    assert [kind.strip() for kind in rows.locator(".kind").all_inner_texts()] == kinds
+    assert page.locator("#count").inner_text() == "4"  # number of unacknowledged alarms
+    assert "acknowledged" in rows.last.inner_text()
+    assert "by anna: fuse" in rows.last.inner_text()
+    assert rows.last.get_by_role("button").count() == 0
+    assert "before" in rows.nth(3).inner_text()
+    assert "since before" in page.locator("#strip").inner_text()
+
+
+def test_an_alarm_is_acknowledged_with_a_note(opened: Opener, alarmed: FakeGateway) -> None:
+    page = opened("#/faults")
+    page.get_by_role("button", name="Acknowledge").first.click()
+    assert "conveyor-2: overcurrent while accelerating" in page.locator("#ask").inner_text()
+    page.get_by_label("Note (optional)").fill(" belt stuck ")
+    page.get_by_role("button", name="Acknowledge").last.click()
+    until_met(page, lambda: alarmed.posts)
+    assert alarmed.posts == [("/api/acknowledge", {"alarm": ALARMS[0]["id"], "note": "belt stuck"})]
+    alarmed.has_changed = True
+    page.get_by_role("button", name="Acknowledge").first.click()
+    page.get_by_role("button", name="Acknowledge").last.click()
+    page.get_by_role("heading", name="The alarm was not acknowledged").wait_for()
+    assert "there is no such alarm" in page.locator("#ask").inner_text()
+
+
+def test_many_misses_show_a_warning_and_one_does_not(opened: Opener, gateway: FakeGateway) -> None:
+    gateway.drive_changes = {"pump-1": {"missed": 0.0003}, "pump-2": {"missed": 0.05}}
+    gateway.changes = {"lines": {name: line | {"misses": 1} for name, line in lines().items()}}
+    page = opened()
+    until_met(page, lambda: cell(page, "pump-1", "missed").inner_text() == "< 0.1 %")
+    assert "warn" not in (cell(page, "pump-1", "missed").get_attribute("class") or "")
+    assert "warn" in (cell(page, "pump-2", "missed").get_attribute("class") or "")
+    assert page.locator(".linehead").first.inner_text().endswith("1 missed in the last minute")
+    assert page.locator(".linehead .warn").count() == 0
+    gateway.changes = {"lines": {name: line | {"misses": 600} for name, line in lines().items()}}
+    page.locator(".linehead .warn").first.wait_for()
+
+
+def test_drive_at_rest_with_unknown_state_is_not_shown_as_fault(opened: Opener, gateway: FakeGateway) -> None:
+    why = "the outputs are not programmed"
+    gateway.drive_changes = {name: {"state": "unknown", "note": why} for name in ("pump-4", "pump-1")}
+    page = opened("#/drives/pump-4")
+    until_met(page, lambda: cell(page, "pump-4", "state").inner_text().strip() == "at rest: 0 Hz")
+    until_met(page, lambda: cell(page, "pump-1", "state").inner_text().strip() == "unknown")
+    assert why in page.locator("#panel").inner_text()
+    assert page.locator("button[data-show=bad] b").inner_text() == "4"
+    page.locator("button[data-show=stands]").click()
+    assert cell(page, "pump-4", "state").is_visible()
+    assert not cell(page, "pump-1", "state").is_visible()

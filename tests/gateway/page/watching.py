@@ -1,4 +1,4 @@
-"""Functions that wait for a state of a page by polling it, because its CSP forbids evaluated code."""
+"""Functions that wait for a state of a page. They poll it, because its CSP forbids evaluated code."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable
 from typing import Any, NoReturn
+from weakref import WeakKeyDictionary
 
 import pytest
 
@@ -32,6 +33,12 @@ AT_ITS_PLACE = """() => {
     document.elementFromPoint(box.x + box.width * x, box.y + box.height * y)?.id === 'stopall');
   return [seen, box.x, box.y, box.width, box.height];
 }"""
+
+
+AXE_TAGS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
+# Report violations only: other results would list all elements of the page.
+RUN_AXE = """tags => axe.run(document, { runOnly: tags, resultTypes: ["violations"] })
+  .then(found => found.violations)"""
 
 
 def until(page: Any, expression: str) -> None:
@@ -71,8 +78,36 @@ def until_still(page: Any) -> None:
     )
 
 
+PENDING: WeakKeyDictionary[Any, set[Any]] = WeakKeyDictionary()
+
+
+def note_requests(page: Any) -> None:
+    """Note the page's pending requests, except requests for frames, for `until_settled`."""
+    pending = PENDING[page] = set[Any]()
+    page.on("request", lambda request: "/api/frame" in request.url or pending.add(request))
+    for event in ("requestfinished", "requestfailed"):
+        page.on(event, lambda request: pending.discard(request))
+
+
+def until_settled(page: Any) -> None:
+    """Wait until the page has all answers except the next frame, and all animations have ended."""
+    page.wait_for_timeout(200)  # views fetch up to 150 ms after they are opened
+    until_met(page, lambda: not PENDING[page], "pending requests")
+    until_still(page)
+
+
+def aborting(*urls: str) -> Callable[[Any], None]:
+    """Return a function for `opened` that makes the page's requests for these URLs fail."""
+
+    def prepare(page: Any) -> None:
+        for url in urls:
+            page.route(url, lambda route: route.abort())
+
+    return prepare
+
+
 def press_enter(page: Any) -> None:
-    """Press Enter when the opened or closed dialog is drawn: until then the page ignores the key."""
+    """Press Enter after the page has drawn an opened or closed dialog: the page ignores earlier keys."""
     page.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
     page.keyboard.press("Enter")
 
@@ -94,3 +129,9 @@ def cell(page: Any, drive: str, part: str) -> Any:
 def link(page: Any) -> str:
     """Return the text about the connection in the page's head."""
     return str(page.locator("#link").inner_text().strip())
+
+
+def violations(page: Any) -> list[str]:
+    """Return the violations that axe-core finds in the present view; the page must have loaded axe-core."""
+    found = page.evaluate(RUN_AXE, AXE_TAGS)
+    return [f"{v['id']}: {node['target']} {node['failureSummary']}" for v in found for node in v["nodes"]]

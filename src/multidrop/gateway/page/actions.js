@@ -8,7 +8,8 @@ import { fill, find, glyph, make, named, say } from "./dom.js";
 import { now } from "./link.js";
 import { watchStop } from "./stop.js";
 import { key, known, mayAct, stops, store } from "./store.js";
-import { text, unit, withUnit, words } from "./values.js";
+import { pieces, said, t } from "./texts.js";
+import { registerName, text, unit, unitName, withUnit, words } from "./values.js";
 
 const MOST = 20; // outcomes kept on the page; the audit log has all
 const outcomes = [];
@@ -21,13 +22,13 @@ export function build(spec) {
   const verbs = (spec.verbs ?? []).filter(verb => verb !== "stop" && mayAct(spec.name, verb));
   const box = make(
     "section",
-    { class: "actions", "aria-label": "Commands" },
+    { class: "actions", "aria-label": t("Commands") },
     verbs.length
       ? make(
           "div",
           { class: "verbs" },
           verbs.map(verb =>
-            make("button", { type: "button", onclick: () => act(spec.name, verb) }, words(verb)),
+            make("button", { type: "button", onclick: () => act(spec.name, verb) }, said(words(verb))),
           ),
         )
       : null,
@@ -72,9 +73,9 @@ function seen(drive) {
   const stopped = stops(drive),
     { revision } = store.plant;
   return body => () => {
-    if (stops(drive) !== stopped) throw new Refused(409, "The drive was stopped in the meantime.");
+    if (stops(drive) !== stopped) throw new Refused(409, t("The drive was stopped in the meantime."));
     if (store.frame?.revision !== revision)
-      throw new Refused(409, "The plant file was reloaded in the meantime.");
+      throw new Refused(409, t("The plant file was reloaded in the meantime."));
     return { ...body, seen: store.frame.n };
   };
 }
@@ -83,7 +84,7 @@ async function deliver(drive, what, path, confirmed, kind = DANGER) {
   try {
     const watch = kind === STOP ? { watch: watchStop(drive) } : {};
     const { done, text: told } = await send(path, confirmed, { kind, ...watch });
-    note(drive, what, done === true, told);
+    note(drive, what, done === true, said(told));
   } catch (error) {
     const isRefused = error.status >= 400 && error.status < 500;
     note(
@@ -91,29 +92,30 @@ async function deliver(drive, what, path, confirmed, kind = DANGER) {
       what,
       false,
       isRefused
-        ? `not sent. ${error.message}`
-        : `${error.message} The outcome is unknown.`,
+        ? t("not sent. {why}", { why: error.message })
+        : t("{why} The outcome is unknown.", { why: error.message }),
     );
   }
 }
 
 // Ask for confirmation and send a verb, with a frequency if the verb takes one.
-export async function act(drive, verb) {
+async function act(drive, verb) {
   const turns = TURNS.some(word => verb.includes(word)),
     asked = WITH_HZ.has(verb) ? hertz(drive) : null,
     withSeen = seen(drive),
     isStop = STOPS.has(verb),
     kind = isStop ? STOP : DANGER;
   const warning = turns
-    ? "The motor will turn. Make sure that nobody is near the machine."
-    : "The command is sent once.";
+    ? t("The motor will turn. Make sure that nobody is near the machine.")
+    : t("The command is sent once.");
   const contents = [make("p", { class: turns ? "bad" : "" }, warning), ...(asked?.contents ?? [])];
   const asks = asked ? confirmForm : confirm;
-  const title = [`${words(verb)}: `, named(drive), "?"],
-    yes = [`${words(verb)} `, named(drive)];
+  const verbName = said(words(verb)),
+    title = [`${verbName}: `, named(drive), "?"],
+    yes = [`${verbName} `, named(drive)];
   if (!(await asks(title, contents, yes, kind))) return;
   const options = asked ? { hz: Number(asked.field.value) } : {};
-  const what = asked ? `${words(verb)} ${options.hz} Hz` : words(verb);
+  const what = asked ? `${verbName} ${options.hz} ${said("Hz")}` : verbName;
   const body = { drive, verb, options };
   await deliver(drive, what, "api/act", isStop ? () => body : withSeen(body), kind);
 }
@@ -125,15 +127,13 @@ function hertz(drive) {
   const setpoint = registers.get(key(drive, "setpoint"));
   const isHertz = setpoint && unit(setpoint) === "Hz";
   const maximum = registers.get("maximum_frequency");
-  const [least, most] = isHertz
-    ? limits(drive, setpoint)
-    : [0, maximum ? held(drive, maximum.name) : null];
+  const [least, most] = isHertz ? limits(drive, setpoint) : [0, maximum ? held(drive, maximum.name) : null];
   const field = make("input", { ...FIELD, type: "number", min: least ?? 0, max: most, step: "any" });
   return {
     field,
     contents: [
-      make("p", {}, setpoint ? `${present(drive, setpoint)} ${span([least ?? 0, most], "Hz")}` : ""),
-      make("label", { class: "field", for: field.id }, "Frequency, Hz", field),
+      make("p", {}, setpoint ? `${present(drive, setpoint)} ${span([least ?? 0, most], said("Hz"))}` : ""),
+      make("label", { class: "field", for: field.id }, t("Frequency, Hz"), field),
     ],
   };
 }
@@ -156,45 +156,50 @@ function limits(drive, { least, most, at_least: atLeast, at_most: atMost }) {
 
 // Return a sentence with a register's present value.
 function present(drive, register) {
-  const current = known(drive, register.name, now());
-  if (!current || current.value === null) return `The value of ${words(register.name)} is unknown.`;
+  const current = known(drive, register.name, now()),
+    name = registerName(register);
+  if (!current || current.value === null)
+    return t("The value of {register} is unknown.", { register: name });
   const shown = withUnit(text(current.value, register), register);
-  const past = current.isOld ? `unknown now; ${clock.lasting(current.age)} ago it was ` : "";
-  return `${words(register.name)} is ${past}${shown}.`;
+  return current.isOld
+    ? t("{register} is unknown now; {age} ago it was {value}.", {
+        register: name,
+        age: clock.lasting(current.age),
+        value: shown,
+      })
+    : t("{register} is {value}.", { register: name, value: shown });
 }
 
 // Return a sentence with the allowed values.
 function span([least, most], of) {
-  const bounds = [
-    ["from", least],
-    ["to", most],
-  ].flatMap(([word, end]) => (end === null ? [] : [`${word} ${end}`]));
-  return bounds.length ? `Allowed: ${`${bounds.join(" ")} ${of}`.trim()}.` : "No limits known.";
+  const [from, to] = [least, most].map(end => end !== null && `${end} ${of}`.trim());
+  if (least !== null && most !== null) return t("Allowed: from {from} to {to}.", { from: least, to });
+  if (least !== null) return t("Allowed: from {from}.", { from });
+  return most !== null ? t("Allowed: to {to}.", { to }) : t("No limits known.");
 }
 
 // Ask for a value in a dialog, and write it to a register.
 export async function change(drive, register) {
-  const name = words(register.name),
+  const name = registerName(register),
     withSeen = seen(drive),
     ends = limits(drive, register);
   const field = editor(register, ends);
   const isNumber = register.kind === "number";
   const contents = [
-    make("p", {}, `${present(drive, register)}${isNumber ? ` ${span(ends, unit(register))}` : ""}`),
+    make("p", {}, `${present(drive, register)}${isNumber ? ` ${span(ends, unitName(register))}` : ""}`),
     make(
       "label",
       { class: "field", for: "new-value" },
-      `New value${unit(register) ? `, ${unit(register)}` : ""}`,
+      [t("New value"), unitName(register)].filter(Boolean).join(", "),
       field,
     ),
   ];
-  if (
-    !(await confirmForm([`Change ${name} of `, named(drive), "?"], contents, ["Write to ", named(drive)]))
-  )
-    return;
+  const title = pieces("Change {register} of {drive}?", { register: name, drive: named(drive) }),
+    yes = pieces("Write to {drive}", { drive: named(drive) });
+  if (!(await confirmForm(title, contents, yes))) return;
   const value = Number(field.value);
   if (field.value === "" || !Number.isFinite(value)) return;
-  const what = `${name} = ${text(value, register)} ${unit(register)}`.trim();
+  const what = `${name} = ${withUnit(text(value, register), register)}`;
   await deliver(drive, what, "api/write", withSeen({ drive, register: register.name, value }));
 }
 
@@ -206,9 +211,9 @@ function editor(register, [least, most]) {
     return make(
       "select",
       FIELD,
-      make("option", { value: "" }, "choose"),
+      make("option", { value: "" }, t("choose")),
       Object.entries(register.words).map(([value, word]) =>
-        make("option", { value }, `${word} (${value})`),
+        make("option", { value }, `${said(word)} (${value})`),
       ),
     );
   }

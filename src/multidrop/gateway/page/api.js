@@ -1,5 +1,7 @@
 // Requests to the gateway. Failures are Errors whose message is a sentence for the user.
 
+import { said, t } from "./texts.js";
+
 export class Refused extends Error {
   constructor(status, message) {
     super(message);
@@ -9,6 +11,10 @@ export class Refused extends Error {
 
 const PATIENCE_MS = 15000;
 
+// Return the sentence about a failure in an answer.
+export const errorOf = ({ status }, body) =>
+  body?.error ? said(body.error) : t("The gateway answered with status {n}.", { n: status });
+
 async function ask(path, options, patience, answered = () => {}) {
   let response;
   try {
@@ -17,15 +23,14 @@ async function ask(path, options, patience, answered = () => {}) {
     throw new Refused(
       0,
       error.name === "TimeoutError"
-        ? `No answer from the gateway for ${Math.round(patience / 1000)} s.`
-        : "The gateway cannot be reached.",
+        ? t("No answer from the gateway for {n} s.", { n: Math.round(patience / 1000) })
+        : t("The gateway cannot be reached."),
     );
   }
   answered();
   const body = await response.json().catch(() => null);
-  if (!response.ok)
-    throw new Refused(response.status, body?.error ?? `The gateway answered with status ${response.status}.`);
-  if (body === null) throw new Refused(0, "The gateway's answer was cut off.");
+  if (!response.ok) throw new Refused(response.status, errorOf(response, body));
+  if (body === null) throw new Refused(0, t("The gateway's answer was cut off."));
   return body;
 }
 

@@ -17,6 +17,7 @@ import * as settings from "./settings.js";
 import { stopKey, stopOne } from "./stop.js";
 import { onPlant, store, takePlant } from "./store.js";
 import * as table from "./table.js";
+import { plantPath, t } from "./texts.js";
 import { drawTop, showPlant } from "./top.js";
 import * as trends from "./trends.js";
 
@@ -144,11 +145,11 @@ addEventListener("theme", redraw);
 addEventListener("timezone", redraw);
 addEventListener(
   "stranger",
-  () => find("#ask").open || askToken("This gateway shows its values only with a token."),
+  () => find("#ask").open || askToken(t("This gateway shows its values only with a token.")),
 );
 addEventListener("written", () => drive.refresh());
 for (const changed of ["signed", "reloaded"])
-  addEventListener(changed, () => get("api/plant").then(takePlant, () => {}));
+  addEventListener(changed, () => get(plantPath).then(takePlant, () => {}));
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 find(".skip").addEventListener("click", event => {
   event.preventDefault();

@@ -2,6 +2,7 @@
 
 import { post } from "./api.js";
 import { find, fill, make } from "./dom.js";
+import { t } from "./texts.js";
 
 let answer = null, // function that resolves the open question's promise
   stopAsked = null; // promise of the answer, if the open question is about a stop
@@ -72,7 +73,7 @@ for (const kind of ["keydown", "keyup"])
 
 // Show the dialog and return the choice, as `show` does. The question about a stop opens immediately; other
 // dialogs wait until that question is answered.
-async function open(title, contents, buttons, { cancel = "Cancel", kind } = {}) {
+async function open(title, contents, buttons, { cancel = t("Cancel"), kind } = {}) {
   if (kind === STOP) return (stopAsked = show(title, contents, buttons, cancel));
   while (stopAsked) await stopAsked;
   return show(title, contents, buttons, cancel);
@@ -138,10 +139,11 @@ export const confirmForm = async (title, contents, yes, kind = DANGER) =>
   (await open(title, contents, [["submit", yes, kind]], { kind })) === "submit";
 
 // Show a message until it is closed. Return the name of another button if that was pressed.
-export const tell = (title, contents, buttons = []) => open(title, contents, buttons, { cancel: "Close" });
+export const tell = (title, contents, buttons = []) =>
+  open(title, contents, buttons, { cancel: t("Close") });
 
 // Ask for a token until one is right. Return true if the gateway accepted it.
-export async function askToken(why, yes = "Sign in", kind = DANGER) {
+export async function askToken(why, yes = t("Sign in"), kind = DANGER) {
   let wrong = null;
   for (;;) {
     const field = make("input", {
@@ -154,10 +156,10 @@ export async function askToken(why, yes = "Sign in", kind = DANGER) {
     });
     const contents = [
       make("p", {}, why),
-      make("label", { for: "token", class: "field" }, "Token", field),
+      make("label", { for: "token", class: "field" }, t("Token"), field),
       wrong && make("p", { id: "token-wrong", class: "bad" }, wrong),
     ];
-    if (!(await confirmForm("Sign in", contents, yes, kind))) return false;
+    if (!(await confirmForm(t("Sign in"), contents, yes, kind))) return false;
     try {
       await post("api/token", { token: field.value, ...(kind === STOP ? { to: "stop" } : {}) });
       dispatchEvent(new Event("signed"));
@@ -189,9 +191,9 @@ export async function send(path, body, { kind = DANGER, patience = patienceOf(ki
     return await sent();
   } catch (error) {
     if (error.status !== 401 && error.status !== 403) throw error;
-    const reason = error.message.replace(/\.$/, "");
-    const why = `The gateway refused this: ${reason}. Enter a token with that right.`;
-    if (!(await askToken(why, "Sign in and send", kind))) throw error;
+    const reason = error.message.replace(/[.。]$/, "");
+    const why = t("The gateway refused this: {reason}. Enter a token with that right.", { reason });
+    if (!(await askToken(why, t("Sign in and send"), kind))) throw error;
     return await sent();
   }
 }

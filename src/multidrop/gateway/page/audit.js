@@ -3,6 +3,7 @@
 import { get, query } from "./api.js";
 import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, tableHead } from "./dom.js";
+import { said, t } from "./texts.js";
 
 const COUNT = 100;
 const DONE = /^(ok|confirmed|done|written|unchanged|stopped|called)/i;
@@ -16,10 +17,10 @@ export function begin() {
     make(
       "div",
       { class: "card" },
-      make("h2", {}, "Audit log"),
-      make("p", { class: "note" }, "All writes sent, newest first."),
+      make("h2", {}, t("Audit log")),
+      make("p", { class: "note" }, t("All writes sent, newest first.")),
       make("div", { id: "log-list", class: "scroll" }),
-      make("button", { type: "button", id: "older", hidden: true, onclick: older }, "Older"),
+      make("button", { type: "button", id: "older", hidden: true, onclick: older }, t("Older")),
     ),
   );
 }
@@ -40,7 +41,7 @@ async function fetchMore(before) {
     more = Boolean(told.more);
     fill(
       list,
-      entries.length ? auditRows(entries, true) : make("p", { class: "note" }, "No writes yet."),
+      entries.length ? auditRows(entries, true) : make("p", { class: "note" }, t("No writes yet.")),
     );
   } catch (error) {
     fill(list, make("p", { class: "note bad" }, error.message));
@@ -54,12 +55,12 @@ export const redraw = () => entries.length && fill(find("#log-list"), auditRows(
 // Return a table of at most `most` entries; with `isWhole` also columns for the drive and the Modbus frame.
 export function auditRows(list, isWhole, most = Infinity) {
   const heads = [
-    `Time, ${clock.zoneName()}`,
-    isWhole && "Drive",
-    "Write",
-    "Result",
-    "By",
-    isWhole && "Sent",
+    t("Time, {zone}", { zone: clock.zoneName() }),
+    isWhole && t("Drive"),
+    t("Write"),
+    t("Result"),
+    t("By"),
+    isWhole && t("Sent"),
   ].filter(Boolean);
   return make(
     "table",
@@ -98,17 +99,18 @@ function repeats(list) {
 
 const at = time => clock.when(Date.parse(time));
 
-const repeated = (times, since) => make("p", { class: "note" }, `${times} times since ${at(since)}`);
+const repeated = (times, since) =>
+  make("p", { class: "note" }, t("{n} times since {time}", { n: times, time: at(since) }));
 
 function row(entry, isWhole) {
   const { time, drive, address, model, write, sent, frames, outcome, held, why, by, way, times, since } =
     entry;
   const isDone = DONE.test(outcome ?? ""),
     result = [
-      outcome ?? "unknown",
-      held !== undefined && held !== null && `the drive holds ${held}`,
-      frames > 1 && `${frames} frames`,
-      why,
+      said(outcome ?? "unknown"),
+      held !== undefined && held !== null && t("the drive holds {value}", { value: held }),
+      frames > 1 && t("{n} frames", { n: frames }),
+      why && said(why),
     ]
       .filter(Boolean)
       .join("; ");

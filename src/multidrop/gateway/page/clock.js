@@ -1,6 +1,9 @@
 // Times as texts: in UTC or local time, as the user chooses, and always with 24 hours.
 
+import { language, t } from "./texts.js";
+
 const KEY = "multidrop-times";
+const LOCALE = language === "en" ? "en-GB" : language;
 let zone = kept() === "local" ? "local" : "UTC";
 let formats = {};
 
@@ -27,7 +30,7 @@ export function switchZone() {
 }
 
 function formatted(ms, name, options) {
-  formats[name] ??= new Intl.DateTimeFormat("en-GB", {
+  formats[name] ??= new Intl.DateTimeFormat(LOCALE, {
     hourCycle: "h23",
     timeZone: isUtc() ? "UTC" : undefined,
     ...options,
@@ -53,7 +56,7 @@ export function moment(ms) {
 // Return the time alone if it is of today, else date and time.
 export const when = ms => (day(ms) === day(Date.now()) ? time(ms) : moment(ms));
 
-export const zoneName = () => (isUtc() ? "UTC" : "local");
+export const zoneName = () => (isUtc() ? "UTC" : t("local"));
 
 // Convert a time (ms) to the text of an input field of type datetime-local, and such a text to a time.
 export function field(ms) {
@@ -65,16 +68,16 @@ export const parsed = text => Date.parse(isUtc() ? `${text}Z` : text);
 // Return a duration in its largest whole unit: "0.4 s", "42 s", "7 min", "3.5 h", "12 days".
 export function lasting(ms) {
   const s = Math.max(0, ms) / 1000;
-  if (s < 10) return `${s.toFixed(1)} s`;
-  if (s < 120) return `${Math.round(s)} s`;
-  if (s < 7200) return `${Math.round(s / 60)} min`;
-  if (s < 48 * 3600) return `${(s / 3600).toFixed(1)} h`;
-  return `${Math.round(s / 86400)} days`;
+  if (s < 10) return t("{n} s", { n: s.toFixed(1) });
+  if (s < 120) return t("{n} s", { n: Math.round(s) });
+  if (s < 7200) return t("{n} min", { n: Math.round(s / 60) });
+  if (s < 48 * 3600) return t("{n} h", { n: (s / 3600).toFixed(1) });
+  return t("{n} days", { n: Math.round(s / 86400) });
 }
 
 // Return for how long an alarm has lasted; an alarm present at the gateway's start may have begun before.
-export const since = ({ time: begin, is_before: isBefore }, t) =>
-  isBefore ? `since before ${when(begin).slice(0, -3)}` : lasting(t - begin);
+export const since = ({ time: begin, is_before: isBefore }, now) =>
+  isBefore ? t("since before {time}", { time: when(begin).slice(0, -3) }) : lasting(now - begin);
 
 // Return texts for a plot's time axis, as precise as the distance of its ticks needs. uPlot's times are in s.
 export function ticks(splits, step) {

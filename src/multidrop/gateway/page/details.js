@@ -4,6 +4,7 @@ import { get } from "./api.js";
 import { auditRows } from "./audit.js";
 import { fill, find, make, tableHead } from "./dom.js";
 import { takeOthers } from "./store.js";
+import { said, t } from "./texts.js";
 import { UNKNOWN, milliseconds, share, words } from "./values.js";
 
 let name = null;
@@ -14,8 +15,8 @@ export function build(spec) {
   return make(
     "div",
     {},
-    make("section", { id: "delays", "aria-label": "Delays and misses" }),
-    make("section", { id: "writes", "aria-label": "Writes" }),
+    make("section", { id: "delays", "aria-label": t("Delays and misses") }),
+    make("section", { id: "writes", "aria-label": t("Writes") }),
   );
 }
 
@@ -30,12 +31,12 @@ export async function refresh() {
   if (told.status === "fulfilled") takeOthers(asked, told.value.values);
   fill(
     find("#delays"),
-    make("h3", {}, "Delays and misses"),
+    make("h3", {}, t("Delays and misses")),
     told.status === "fulfilled" ? delays(told.value) : make("p", { class: "note" }, told.reason.message),
   );
   fill(
     find("#writes"),
-    make("h3", {}, "Writes to this drive"),
+    make("h3", {}, t("Writes to this drive")),
     log.status === "fulfilled"
       ? writes(log.value, asked)
       : make("p", { class: "note" }, log.reason.message),
@@ -48,24 +49,29 @@ function delays({ delays, misses, asked, ledger }) {
     make(
       "p",
       { class: "note" },
-      `Response delay: 50 % within ${milliseconds(delays?.p50)}, 99 % within ${milliseconds(delays?.p99)}.`,
+      t("Response delay: 50 % within {half}, 99 % within {most}.", {
+        half: milliseconds(delays?.p50),
+        most: milliseconds(delays?.p99),
+      }),
     ),
     delays?.counts?.length ? histogram(delays.counts) : null,
     make(
       "p",
       { class: "note" },
-      asked ? `Missed ${total} of ${asked} values, ${share(total / asked)}.` : "No values requested yet.",
+      asked
+        ? t("Missed {n} of {all} values, {share}.", { n: total, all: asked, share: share(total / asked) })
+        : t("No values requested yet."),
     ),
     total
       ? make(
           "table",
           { class: "plain" },
-          tableHead(["Reason", "Missed"]),
+          tableHead([t("Reason"), t("Missed")]),
           make(
             "tbody",
             {},
             Object.entries(misses).map(([reason, n]) =>
-              make("tr", {}, make("th", { scope: "row" }, reason), make("td", {}, String(n))),
+              make("tr", {}, make("th", { scope: "row" }, said(reason)), make("td", {}, String(n))),
             ),
           ),
         )
@@ -74,20 +80,27 @@ function delays({ delays, misses, asked, ledger }) {
       ? make(
           "p",
           { class: "note" },
-          "EEPROM writes in the last year: " +
-            ledger.map(l => `${words(l.register)} ${l.year} of ${l.budget ?? UNKNOWN}`).join(", "),
+          t("EEPROM writes in the last year: {writes}", { writes: ledger.map(yearly).join(", ") }),
         )
       : null,
   ].filter(Boolean);
 }
+
+const yearly = ({ register, year, budget }) =>
+  t("{register} {n} of {all}", {
+    register: words(register),
+    n: year,
+    all: budget ?? UNKNOWN,
+  });
 
 // Draw a histogram of response delays: a bar for each range of delays, with the range and the number as text.
 function histogram(counts) {
   const most = Math.max(...counts.map(([, n]) => n)),
     last = counts[counts.length - 1][0];
   const bars = counts.map(([from, n], i) => {
-    const end = i + 1 < counts.length ? `to ${milliseconds(counts[i + 1][0])}` : "and more";
-    const bar = make("i", { title: `${milliseconds(from)} ${end}: ${n}` });
+    const [low, high] = [from, counts[i + 1]?.[0]].map(milliseconds),
+      range = i + 1 < counts.length ? t("{low} to {high}", { low, high }) : t("{low} and more", { low });
+    const bar = make("i", { title: `${range}: ${n}` });
     bar.style.height = `${most ? Math.max(n ? 4 : 0, (n / most) * 100) : 0}%`;
     return bar;
   });
@@ -96,7 +109,10 @@ function histogram(counts) {
     {
       class: "histogram",
       role: "img",
-      "aria-label": `Replies by response delay, ${milliseconds(counts[0][0])} to ${milliseconds(last)}`,
+      "aria-label": t("Replies by response delay, {low} to {high}", {
+        low: milliseconds(counts[0][0]),
+        high: milliseconds(last),
+      }),
     },
     make("div", { class: "bars" }, bars),
     make(
@@ -112,5 +128,5 @@ function writes({ entries }, drive) {
   const own = (entries ?? []).filter(entry => entry.drive === drive);
   return own.length
     ? auditRows(own, false, 20)
-    : make("p", { class: "note" }, "None among the newest 200 writes.");
+    : make("p", { class: "note" }, t("None among the newest 200 writes."));
 }

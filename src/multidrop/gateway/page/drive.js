@@ -10,14 +10,15 @@ import * as parameters from "./parameters.js";
 import * as registers from "./registers.js";
 import { driveAge, isLive, known, noteOf, onPlant, state, store } from "./store.js";
 import { stopOne } from "./stop.js";
+import { pieces, said, t } from "./texts.js";
 import { STATES, makeValue, showValue } from "./values.js";
 
 const KEYS = [
-  ["frequency", "Frequency"],
-  ["setpoint", "Setpoint"],
-  ["current", "Current"],
+  ["frequency", t("Frequency")],
+  ["setpoint", t("Setpoint")],
+  ["current", t("Current")],
 ];
-const TITLES = { motor_speed: "Motor speed" }; // label of a register shown in place of the frequency
+const TITLES = { motor_speed: t("Motor speed") }; // label of a register shown in place of the frequency
 
 let chosen = null,
   parts = null;
@@ -42,8 +43,8 @@ export function show(name, isOpen) {
         "p",
         { class: "empty" },
         name === null || !store.plant
-          ? "Select a drive to see its plots and registers."
-          : ["There is no drive ", named(name), " in this plant."],
+          ? t("Select a drive to see its plots and registers.")
+          : pieces("There is no drive {drive} in this plant.", { drive: named(name) }),
       ),
     );
     return;
@@ -57,11 +58,12 @@ function build({ spec, line }) {
   parts = { shape: make("span"), word: make("span"), age: make("span"), note: make("p"), keys: [] };
   parts.note.className = "note";
   parts.says = make("span", {}, parts.shape, " ", parts.word);
-  const where = [
-    `${spec.family} · address ${spec.address} on `,
-    named(line.name),
-    ` · ${spec.speed}`,
-  ];
+  const where = pieces("{model} · address {address} on {line} · {speed}", {
+    model: spec.family,
+    address: String(spec.address),
+    line: named(line.name),
+    speed: spec.speed,
+  });
   const keys = KEYS.filter(([part]) => spec.key?.[part]).map(([part, title]) => {
     const value = makeValue();
     parts.keys.push([spec.key[part], value]);
@@ -86,11 +88,11 @@ function build({ spec, line }) {
             type: "button",
             class: "danger stop",
             onclick: () => stopOne(spec.name),
-            "aria-label": `Stop ${spec.name}`,
+            "aria-label": t("Stop {what}", { what: spec.name }),
           },
-          "Stop",
+          t("Stop"),
         ),
-        make("a", { class: "button close", href: "#/drives", "aria-label": "Close" }, "✕"),
+        make("a", { class: "button close", href: "#/drives", "aria-label": t("Close") }, "✕"),
       ),
     ),
     keys.length ? make("dl", { class: "keys" }, keys) : null,
@@ -106,22 +108,27 @@ function build({ spec, line }) {
 // Update the texts, a few times a second.
 export function draw() {
   if (!parts) return;
-  const t = now(),
+  const at = now(),
     drive = store.drives.get(chosen),
     is = state(chosen),
-    age = driveAge(chosen, t);
+    age = driveAge(chosen, at);
   for (const [register, value] of parts.keys)
-    showValue(value, known(chosen, register, t), drive.registers.get(register));
+    showValue(value, known(chosen, register, at), drive.registers.get(register));
   if (parts.state !== is) fill(parts.shape, glyph(STATES[is] ? is : "unknown"));
   parts.state = is;
   const words_ =
-    is === "fault" ? `fault: ${store.frame.drives[chosen].fault ?? "unknown"}` : (STATES[is] ?? is);
-  put(parts.word, isLive(t) || !store.frame ? words_ : `last: ${words_}`);
+    is === "fault"
+      ? t("fault: {what}", { what: said(store.frame.drives[chosen].fault ?? "unknown") })
+      : (STATES[is] ?? is);
+  put(parts.word, isLive(at) || !store.frame ? words_ : t("last: {word}", { word: words_ }));
   parts.says.className = `stateword ${is}`;
-  put(parts.age, age === null ? "never answered" : `last reply ${clock.lasting(age)} ago`);
-  put(parts.note, noteOf(chosen));
+  put(
+    parts.age,
+    age === null ? t("never answered") : t("last reply {age} ago", { age: clock.lasting(age) }),
+  );
+  put(parts.note, said(noteOf(chosen)));
   parts.note.hidden = !noteOf(chosen);
-  registers.draw(t);
+  registers.draw(at);
 }
 
 export const drawPlots = () => parts && plots.draw();

@@ -6,6 +6,7 @@ import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, tableHead } from "./dom.js";
 import { now } from "./link.js";
 import { alarms, isLive, store, withMs } from "./store.js";
+import { pieces, said, t } from "./texts.js";
 import { ALARMS } from "./values.js";
 
 const SPAN_MS = 30 * 86400e3;
@@ -33,11 +34,11 @@ export function begin() {
     make(
       "div",
       { class: "card" },
-      make("h2", {}, "Alarms"),
+      make("h2", {}, t("Alarms")),
       make(
         "p",
         { class: "note" },
-        "Active alarms, most serious first, and alarms that ended in the last 30 days.",
+        t("Active alarms, most serious first, and alarms that ended in the last 30 days."),
       ),
       make("div", { id: "fault-list", class: "scroll" }),
     ),
@@ -57,37 +58,38 @@ export async function show() {
       .filter(alarm => alarm.ended === null)
       .sort((a, b) => rank(a).localeCompare(rank(b)) || b.time - a.time),
     ended = found.filter(alarm => alarm.ended !== null);
-  fill(list, part(`Active: ${lasting.length}`, lasting), part(`Ended: ${ended.length}`, ended));
+  fill(
+    list,
+    part(t("Active: {n}", { n: lasting.length }), lasting),
+    part(t("Ended: {n}", { n: ended.length }), ended),
+  );
 }
 
 function part(title, alarms) {
-  const heads = [`Since, ${clock.zoneName()}`, "Drive", "Kind", "Message", "Duration", ""];
+  const since = t("Since, {zone}", { zone: clock.zoneName() }),
+    heads = [since, t("Drive"), t("Kind"), t("Message"), t("Duration"), ""];
   return make(
     "section",
     {},
     make("h3", {}, title),
     alarms.length
-      ? make(
-          "table",
-          { class: "plain faults" },
-          tableHead(heads),
-          make("tbody", {}, alarms.map(row)),
-        )
-      : make("p", { class: "note" }, "None."),
+      ? make("table", { class: "plain faults" }, tableHead(heads), make("tbody", {}, alarms.map(row)))
+      : make("p", { class: "note" }, t("None.")),
   );
 }
 
 function row(alarm) {
   const { kind, drive, line, acknowledged } = alarm,
-    isLasting = alarm.ended === null;
+    isLasting = alarm.ended === null,
+    began = clock.when(alarm.time);
   const where = drive ? `#/drives/${encodeURIComponent(drive)}` : "#/lines";
   return make(
     "tr",
     { class: isLasting && !acknowledged ? kind : "" },
-    make("td", {}, `${alarm.is_before ? "before " : ""}${clock.when(alarm.time)}`),
-    make("td", { class: "who" }, make("a", { href: where }, named(drive || `line ${line}`))),
+    make("td", {}, alarm.is_before ? t("before {time}", { time: began }) : began),
+    make("td", { class: "who" }, make("a", { href: where }, named(drive || t("line {line}", { line })))),
     make("td", { class: "kind" }, glyph(kind), ` ${ALARMS[kind] ?? kind}`),
-    make("td", { class: "words" }, make("bdi", {}, alarm.text), acknowledgement(alarm)),
+    make("td", { class: "words" }, make("bdi", {}, said(alarm.text)), acknowledgement(alarm)),
     make("td", {}, lasted(alarm)),
     make("td", { class: "acts" }, acknowledged ? null : acknowledgeButton(alarm), trendLink(alarm)),
   );
@@ -95,10 +97,11 @@ function row(alarm) {
 
 // Return an alarm's duration; it is frozen when the gateway is lost.
 function lasted({ time, ended, is_before: isBefore }) {
-  const t = now(),
-    isNew = isLive(t) || store.frame === null, // before the first frame the fetched list counts as fresh
-    seen = ended ?? (isNew ? t : store.time);
-  return `${isBefore ? "over " : ""}${clock.lasting(seen - time)}${ended === null ? " so far" : ""}`;
+  const at = now(),
+    isNew = isLive(at) || store.frame === null, // before the first frame the fetched list counts as fresh
+    seen = ended ?? (isNew ? at : store.time),
+    age = isBefore ? t("over {age}", { age: clock.lasting(seen - time) }) : clock.lasting(seen - time);
+  return ended === null ? t("{age} so far", { age }) : age;
 }
 
 function acknowledgement({ acknowledged, by, note }) {
@@ -107,33 +110,36 @@ function acknowledgement({ acknowledged, by, note }) {
   return make(
     "p",
     { class: "note" },
-    `acknowledged ${clock.when(acknowledged)} by `,
-    named(by),
+    pieces("acknowledged {time} by {user}", { time: clock.when(acknowledged), user: named(by) }),
     make("bdi", {}, words),
   );
 }
 
 const acknowledgeButton = alarm =>
-  make("button", { type: "button", onclick: () => acknowledge(alarm) }, "Acknowledge");
+  make("button", { type: "button", onclick: () => acknowledge(alarm) }, t("Acknowledge"));
 
 function trendLink({ drive, time, ended }) {
   if (!drive) return null;
   const [from, to] = [Math.floor(time - AROUND_MS), Math.ceil((ended ?? now()) + AROUND_MS)];
-  return make("a", { href: `#/trends?drive=${encodeURIComponent(drive)}&from=${from}&to=${to}` }, "Trend");
+  return make(
+    "a",
+    { href: `#/trends?drive=${encodeURIComponent(drive)}&from=${from}&to=${to}` },
+    t("Trend"),
+  );
 }
 
 // Ask the user for a note, and acknowledge an alarm.
 async function acknowledge({ id, drive, line, text }) {
   const field = make("input", { id: "ack-note", maxlength: MOST_NOTE, "data-first": true });
   const contents = [
-    make("p", {}, named(drive || `line ${line}`), ": ", named(text)),
-    make("label", { class: "field", for: "ack-note" }, "Note (optional)", field),
+    make("p", {}, named(drive || t("line {line}", { line })), ": ", named(said(text))),
+    make("label", { class: "field", for: "ack-note" }, t("Note (optional)"), field),
   ];
-  if (!(await confirmForm("Acknowledge this alarm?", contents, "Acknowledge"))) return;
+  if (!(await confirmForm(t("Acknowledge this alarm?"), contents, t("Acknowledge")))) return;
   try {
     await send("api/acknowledge", () => ({ alarm: id, note: field.value.trim() }));
   } catch (error) {
-    await tell("The alarm was not acknowledged", [make("p", { class: "bad" }, error.message)]);
+    await tell(t("The alarm was not acknowledged"), [make("p", { class: "bad" }, error.message)]);
   }
   await show();
 }

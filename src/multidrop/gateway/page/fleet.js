@@ -5,6 +5,7 @@ import { get } from "./api.js";
 import * as clock from "./clock.js";
 import { fill, find, glyph, make, named, put, setClass, tableHead } from "./dom.js";
 import { onPlant, store } from "./store.js";
+import { pieces, said, sentence, t } from "./texts.js";
 import { UNKNOWN } from "./values.js";
 
 const OLD_S = 3;
@@ -13,14 +14,23 @@ const NAMES = new Intl.Collator("en", { numeric: true }); // line-2 before line-
 const UNITS = ["B", "kB", "MB", "GB", "TB"];
 const TABLES = {
   gateways: [
-    "Gateways",
+    t("Gateways"),
     [
-      ...["Gateway", "Host", "State", "Lines", "Lease left", "Spool", "Unsent", "Lag", "Rows lost"],
-      ...["Session", "Since"],
+      ...[
+        t("Gateway"),
+        t("Host"),
+        t("State"),
+        t("Lines"),
+        t("Lease left"),
+        t("Spool"),
+        t("Unsent"),
+        t("Lag"),
+      ],
+      ...[t("Rows lost"), t("Session"), t("Since")],
     ],
   ],
-  lines: ["Lines", ["Line", "Port", "Master", "Since"]],
-  moves: ["Latest moves", ["Line", "Time", "From", "To"]],
+  lines: [t("Lines"), [t("Line"), t("Port"), t("Master"), t("Since")]],
+  moves: [t("Latest moves"), [t("Line"), t("Time"), t("From"), t("To")]],
 };
 
 let newest = null,
@@ -50,13 +60,8 @@ function card(id, title, heads) {
     make("p", { class: "note", id: `fleet-${id}-note` }),
     make(
       "div",
-      { class: "scroll", tabindex: "0", role: "group", "aria-label": `${title}, table` },
-      make(
-        "table",
-        { class: "plain" },
-        tableHead(heads),
-        make("tbody", { id: `fleet-${id}` }),
-      ),
+      { class: "scroll", tabindex: "0", role: "group", "aria-label": t("{title}, table", { title }) },
+      make("table", { class: "plain" }, tableHead(heads), make("tbody", { id: `fleet-${id}` })),
     ),
   );
 }
@@ -93,11 +98,13 @@ function draw() {
   const members = Object.entries(gateways),
     free = ordered.filter(([, { master }]) => master === null).length,
     unsure = ordered.filter(([, { master }]) => silent.has(master)).length,
-    others = unsure ? `, ${unsure} with a master that does not answer` : "",
-    more = ordered.length > MOST_LINES ? `; the first ${MOST_LINES} are shown` : "";
+    counts = t("{n} lines, {free} without a master", { n: ordered.length, free }),
+    others = unsure ? t("{n} with a master that does not answer", { n: unsure }) : "",
+    more = ordered.length > MOST_LINES ? t("the first {n} are shown", { n: MOST_LINES }) : "";
   note("gateways", members.flatMap(troubles).join("; "), true);
-  note("lines", `${ordered.length} lines, ${free} without a master${others}${more}`, free + unsure > 0);
-  note("moves", "A dash means that no master was seen.", false);
+  const known = [counts, others].filter(Boolean).join(", ");
+  note("lines", [known, more].filter(Boolean).join("; "), free + unsure > 0);
+  note("moves", t("A dash means that no master was seen."), false);
   drawTable("gateways", members.map(gateway));
   drawTable("lines", ordered.slice(0, MOST_LINES).map(line));
   drawTable("moves", moves.map(move));
@@ -111,16 +118,26 @@ function note(id, text, isBad) {
 }
 
 function troubles([name, { says }]) {
-  const lines = Object.entries(says?.troubles ?? {}).map(([line, why]) => `${name}: line ${line}: ${why}`);
-  return [...lines, ...[says?.trouble, says?.spool?.trouble].filter(Boolean).map(one => `${name}: ${one}`)];
+  const lines = Object.entries(says?.troubles ?? {}).map(
+    ([line, why]) => `${name}: ${t("line {line}", { line })}: ${said(why)}`,
+  );
+  return [
+    ...lines,
+    ...[says?.trouble, says?.spool?.trouble].filter(Boolean).map(one => `${name}: ${said(one)}`),
+  ];
 }
 
 function drawAge(age, isOld) {
-  const seen = age === null ? "The fleet has not been seen yet" : `Seen ${clock.lasting(age * 1000)} ago`,
+  const seen =
+      age === null
+        ? t("The fleet has not been seen yet")
+        : t("Seen {age} ago", { age: clock.lasting(age * 1000) }),
     reason = why || newest?.trouble,
     place = find("#fleet-age");
-  const said = isOld ? `${seen}${reason ? `: ${reason}` : ""}` : "Updated once a second.";
-  put(place, `${said}${said.endsWith(".") ? "" : "."} Times are ${clock.zoneName()}.`);
+  const status = isOld
+    ? [seen, reason && said(reason)].filter(Boolean).join(": ")
+    : t("Updated once a second.");
+  put(place, `${sentence(status)} ${t("Times are {zone}.", { zone: clock.zoneName() })}`);
   setClass(place, "bad", isOld);
   setClass(find("#fleet"), "stale", isOld);
 }
@@ -147,7 +164,7 @@ function gateway([name, { host, session, began_ms: began, lines, says }]) {
   return [
     named(name),
     named(host),
-    says ? named(says.state) : wrong("silent", "no answer"),
+    says ? named(said(says.state)) : wrong("silent", t("no answer")),
     String(lines),
     says ? seconds(says.margin_s) : UNKNOWN,
     spool ? bytes(spool.bytes) : UNKNOWN,
@@ -163,9 +180,15 @@ const line = ([name, { port, master, since_ms: from }]) => [
   named(name),
   named(port),
   master === null
-    ? wrong("port", "none")
+    ? wrong("port", t("none"))
     : silent.has(master)
-      ? make("span", { class: "bad" }, glyph("silent"), " ", named(master), ", no answer")
+      ? make(
+          "span",
+          { class: "bad" },
+          glyph("silent"),
+          " ",
+          pieces("{master}, no answer", { master: named(master) }),
+        )
       : named(master),
   from === null ? UNKNOWN : clock.when(from),
 ];
@@ -173,12 +196,12 @@ const line = ([name, { port, master, since_ms: from }]) => [
 const move = ({ line: name, at_ms: at, from, to }) => [
   named(name),
   clock.when(at),
-  from === null ? UNKNOWN : named(from || "nobody"),
-  named(to || "nobody"),
+  from === null ? UNKNOWN : named(from || t("nobody")),
+  named(to || t("nobody")),
 ];
 
 const wrong = (shape, text) => make("span", { class: "bad" }, glyph(shape), ` ${text}`);
-const seconds = s => `${s.toFixed(1)} s`;
+const seconds = s => t("{n} s", { n: s.toFixed(1) });
 
 function bytes(number) {
   const power = Math.min(UNITS.length - 1, Math.floor(Math.log10(Math.max(1, number)) / 3)),

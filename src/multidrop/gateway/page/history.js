@@ -1,7 +1,8 @@
 // The recorded history: series of a time range, and links to download them.
 
-import { get, query } from "./api.js";
-import { holdsFor } from "./store.js";
+import { Refused, get, query } from "./api.js";
+import { holdsFor, store } from "./store.js";
+import { said, t } from "./texts.js";
 import { unit } from "./values.js";
 
 export const label = (drive, register) => `${drive}.${register}`;
@@ -11,6 +12,8 @@ const COLUMNS = ["time", "least", "mean", "most", "missed"];
 // Return {series: {label: {time, least, mean, most}}, step_ms}. A null is a gap: a value was missed, or the
 // register was not polled for longer than a value stays current. Throws Refused if no history is kept.
 export async function read(labels, from, to, points) {
+  if (!store.plant.history)
+    throw new Refused(0, t("No history is kept: the plant file has no [serve.history]."));
   const told = await get(
     `api/history?${query([
       ...labels.map(name => ["series", name]),
@@ -54,14 +57,18 @@ export const unitOf = (told, spec) => told.unit ?? unit(spec);
 // Return true if a series has the present unit of its register.
 export const isPresent = (told, spec) => unitOf(told, spec) === unit(spec);
 
-// Return a sentence for each series that has a part in another unit; such parts are not drawn.
-export const leftOut = series =>
-  Object.entries(series)
-    .filter(([, told]) => told.left_out?.length)
-    .map(([name, told]) => {
-      const others = told.left_out.map(other => other || "no unit").join(", ");
-      return `${name} was also recorded in ${others}; that is not drawn.`;
-    });
+// Return a sentence for each series that has a part in another unit, which is not drawn. If there is no such
+// part and no value at all, return a sentence that says so.
+export function notes(series) {
+  const found = Object.entries(series),
+    mixed = found.filter(([, told]) => told.left_out?.length);
+  if (found.length && !mixed.length && found.every(([, { mean }]) => mean.every(value => value === null)))
+    return [t("The history has no values in this time range.")];
+  return mixed.map(([name, told]) => {
+    const others = told.left_out.map(other => said(other) || t("no unit")).join(", ");
+    return t("{series} was also recorded in {units}; that is not drawn.", { series: name, units: others });
+  });
+}
 
 export const exportLink = (labels, from, to, format) =>
   `api/export?${query([

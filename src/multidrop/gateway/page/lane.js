@@ -1,13 +1,14 @@
-// Faults and silences as bars over the time axis of the trends.
+// Alarms as bars over the time axis of the trends.
 
 import { fill, glyph, make, named } from "./dom.js";
 import { read } from "./faults.js";
 import { now } from "./link.js";
 import { store } from "./store.js";
+import { said, t } from "./texts.js";
 
 const LANES = [
-  ["faults", ["fault", "stopped"]],
-  ["silent", ["silent", "port"]],
+  [t("faults"), ["fault", "stopped", "limit"]],
+  [t("silent"), ["silent", "port"]],
 ];
 let serial = 0;
 
@@ -37,7 +38,7 @@ export async function draw(place, from, to, drives) {
           { class: "bars" },
           since > from ? unknown(since, from, to) : null,
           there.map(alarm => bar(alarm, from, to)),
-          there.length || since > from ? null : make("span", { class: "none" }, "none"),
+          there.length || since > from ? null : make("span", { class: "none" }, t("none")),
         ),
       );
     }),
@@ -46,7 +47,7 @@ export async function draw(place, from, to, drives) {
 
 // Return a bar over the time before the gateway's start, because the alarms of that time are unknown.
 function unknown(since, from, to) {
-  const text = "unknown: the gateway started later",
+  const text = t("unknown: the gateway started later"),
     shown = make("span", { class: "unknown", title: text }, text);
   shown.style.left = 0;
   shown.style.width = `${Math.min(1, (since - from) / (to - from)) * 100}%`;
@@ -54,14 +55,14 @@ function unknown(since, from, to) {
 }
 
 function bar(alarm, from, to) {
-  const who = alarm.drive || `line ${alarm.line}`,
-    text = `${who}: ${alarm.text}`;
+  const who = alarm.drive || t("line {line}", { line: alarm.line }),
+    what = said(alarm.text);
   const shown = make(
     "span",
-    { class: alarm.kind, title: text },
+    { class: alarm.kind, title: `${who}: ${what}` },
     glyph(alarm.kind),
     named(who),
-    `: ${alarm.text}`,
+    `: ${what}`,
   );
   const start = Math.max(0, (alarm.time - from) / (to - from)),
     end = Math.min(1, ((alarm.ended ?? now()) - from) / (to - from));

@@ -6,7 +6,8 @@ import { fill, find, glyph, make, named, tableHead } from "./dom.js";
 import { misses } from "./misses.js";
 import { isLive, store } from "./store.js";
 import { now } from "./link.js";
-import { count, milliseconds, share, UNKNOWN } from "./values.js";
+import { said, t } from "./texts.js";
+import { drives, milliseconds, share, UNKNOWN } from "./values.js";
 
 let shown = "";
 
@@ -39,9 +40,16 @@ function card(line, told) {
     make(
       "p",
       { class: "note" },
-      `${line.port}${line.speed ? ` · ${line.speed}` : ""} · ${count(line.drives.length, "drive")}`,
+      [line.port, line.speed, drives(line.drives.length)].filter(Boolean).join(" · "),
     ),
-    frame.lost ? make("p", { class: "warn" }, glyph("port"), ` The port is lost: ${frame.lost}`) : null,
+    frame.lost
+      ? make(
+          "p",
+          { class: "warn" },
+          glyph("port"),
+          ` ${t("The line is lost: {why}", { why: said(frame.lost) })}`,
+        )
+      : null,
     figures(frame),
     told ? misses(told.minutes) : null,
     delays(line, told?.drives ?? {}),
@@ -53,7 +61,7 @@ function figures({ used = null, planned = null, rate = null, p99 = null, misses:
   const bar = make("span", {
     class: "use",
     role: "img",
-    "aria-label": `${share(used)} used, ${share(planned)} planned`,
+    "aria-label": t("{used} used, {planned} planned", { used: share(used), planned: share(planned) }),
   });
   const [part, mark] = [make("i"), make("u")];
   part.style.width = `${Math.min(1, used ?? 0) * 100}%`;
@@ -61,15 +69,15 @@ function figures({ used = null, planned = null, rate = null, p99 = null, misses:
   mark.hidden = planned === null;
   bar.append(part, mark);
   const pairs = [
-    ["Line time used", [share(used), bar]],
+    [t("Line time used"), [share(used), bar]],
     [
-      "Planned",
-      [share(planned), isOver ? make("small", { class: "warn" }, " more than planned") : null],
+      t("Planned"),
+      [share(planned), isOver ? make("small", { class: "warn" }, ` ${t("more than planned")}`) : null],
     ],
-    ["Exchanges", [rate === null ? UNKNOWN : `${rate.toFixed(1)} /s`]],
-    ["Delay, 99 % within", [milliseconds(p99)]],
+    [t("Exchanges"), [rate === null ? UNKNOWN : t("{n} /s", { n: rate.toFixed(1) })]],
+    [t("Delay, 99 % within"), [milliseconds(p99)]],
     [
-      "Missed in the last minute",
+      t("Missed in the last minute"),
       [make("span", { class: missed > 0 ? "warn" : "" }, missed === null ? UNKNOWN : String(missed))],
     ],
   ];
@@ -85,14 +93,14 @@ function delays(line, told) {
   return make(
     "section",
     {},
-    make("h3", {}, "Response delay of each drive"),
+    make("h3", {}, t("Response delay of each drive")),
     make(
       "div",
       { class: "scroll" },
       make(
         "table",
         { class: "plain delays" },
-        tableHead(["Drive", "50 % within", "99 % within", "", "Missed"]),
+        tableHead([t("Drive"), t("50 % within"), t("99 % within"), "", t("Missed")]),
         make(
           "tbody",
           {},
@@ -118,7 +126,13 @@ function delays(line, told) {
               make(
                 "td",
                 { class: d.missed ? "warn" : "" },
-                d.asked ? `${d.missed} of ${d.asked}, ${share(d.missed / d.asked)}` : UNKNOWN,
+                d.asked
+                  ? t("{n} of {all}, {share}", {
+                      n: d.missed,
+                      all: d.asked,
+                      share: share(d.missed / d.asked),
+                    })
+                  : UNKNOWN,
               ),
             );
           }),

@@ -1,7 +1,8 @@
 // The connection to the gateway: one pending request for a frame, and the frame's age.
 
-import { get } from "./api.js";
+import { errorOf, get } from "./api.js";
 import { store, takeFrame, takeMinute, takePlant } from "./store.js";
+import { plantPath, t } from "./texts.js";
 
 const PATIENCE_MS = 25000; // request timeout; the gateway answers after 20 s even without news
 const AGAIN_MS = 500;
@@ -29,8 +30,7 @@ function learnSkew(date, sent, received) {
 export const correction = () => (skew.least > 0 ? skew.least : skew.most < 0 ? skew.most : 0);
 
 // Return the gateway's time in ms: the later one by two clocks, because this device's clock may be set back.
-export const now = () =>
-  Math.max(Date.now() + correction(), store.time + performance.now() - store.came);
+export const now = () => Math.max(Date.now() + correction(), store.time + performance.now() - store.came);
 
 const pause = ms => new Promise(done => setTimeout(done, ms));
 
@@ -57,7 +57,7 @@ export async function run() {
       if (restMs) await pause(restMs);
       restMs = 0;
       if (!isKnown) {
-        takePlant(await get("api/plant"));
+        takePlant(await get(plantPath));
         takeMinute(await get("api/minute").catch(() => ({})));
         [n, isKnown] = [NONE, true];
       }
@@ -93,9 +93,11 @@ async function newer(n) {
   } catch (error) {
     if (error.name === "AbortError") throw error;
     throw new Error(
-      error.name === "TimeoutError" ? "The gateway does not answer." : "The gateway cannot be reached.",
+      error.name === "TimeoutError"
+        ? t("The gateway does not answer.")
+        : t("The gateway cannot be reached."),
     );
   }
   const body = await response.json().catch(() => null);
-  throw new Error(body?.error ?? `The gateway answered with status ${response.status}.`);
+  throw new Error(errorOf(response, body));
 }

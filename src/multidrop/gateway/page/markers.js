@@ -1,12 +1,15 @@
-// Two markers in trends, A and B: the values at each marker, and the time and differences between them.
+// Two markers in trends, A and B: the values at each marker, and the time and differences between them. A
+// third marker is at the moment of a trigger.
 
 import * as clock from "./clock.js";
 import { colour, fill, find, make, named, tableHead } from "./dom.js";
 import { label } from "./history.js";
 import { heldAt } from "./plots.js";
+import { said, t } from "./texts.js";
 import { number } from "./values.js";
 
-const marks = { A: null, B: null }; // time of each marker in ms
+const TRIGGER = t("trigger");
+const marks = { A: null, B: null, [TRIGGER]: null }; // time of each marker in ms
 let plots = () => [],
   view = () => ({ from: 0, to: 0 });
 
@@ -23,8 +26,8 @@ export const buttons = () =>
       "button",
       {
         type: "button",
-        title: `Marker ${name}: at the cursor; arrow keys move it; Delete removes it`,
-        "aria-label": `Marker ${name}`,
+        title: t("Marker {name}: at the cursor; arrow keys move it; Delete removes it", { name }),
+        "aria-label": t("Marker {name}", { name }),
         id: `mark-${name}`,
         onclick: () => place(name),
         onkeydown: event => move(event, name),
@@ -63,6 +66,9 @@ function set(name, ms) {
   for (const { plot } of plots()) plot.redraw(false);
   draw();
 }
+
+// Put the third marker at the moment of a trigger; the next drawing of the plots shows it.
+export const setTrigger = ms => (marks[TRIGGER] = ms);
 
 // Draw the markers into a plot. uPlot calls this after it has drawn the plot.
 export function mark(u) {
@@ -106,7 +112,7 @@ export function draw() {
         make("td", {}, write(a)),
         make("td", {}, write(b)),
         make("td", {}, a === null || b === null ? "–" : write(b - a)),
-        make("td", {}, unit),
+        make("td", {}, said(unit)),
       );
     }),
   );
@@ -117,8 +123,8 @@ export function draw() {
     make(
       "table",
       { class: "plain" },
-      make("caption", { class: "hidden" }, "Values at the markers"),
-      tableHead(["", `A ${told(marks.A)}`, `B ${told(marks.B)}`, `B − A, ${between}`, "unit"]),
+      make("caption", { class: "hidden" }, t("Values at the markers")),
+      tableHead(["", `A ${told(marks.A)}`, `B ${told(marks.B)}`, `B − A, ${between}`, t("unit")]),
       make("tbody", {}, rows),
     ),
   );

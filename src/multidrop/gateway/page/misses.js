@@ -2,6 +2,7 @@
 
 import * as clock from "./clock.js";
 import { colour, make, tableHead } from "./dom.js";
+import { said, t } from "./texts.js";
 import { share } from "./values.js";
 
 const HOUR = 60; // minutes
@@ -17,8 +18,8 @@ export function misses(minutes) {
   }
   const reasons = [...sums.keys()].sort((a, b) => sums.get(b) - sums.get(a)),
     total = [...sums.values()].reduce((a, b) => a + b, 0);
-  if (!minutes.length) return make("p", { class: "note" }, "No full minute counted yet.");
-  const head = make("h3", {}, `Missed in the last hour: ${total} of ${asked}`);
+  if (!minutes.length) return make("p", { class: "note" }, t("No full minute counted yet."));
+  const head = make("h3", {}, t("Missed in the last hour: {n} of {all}", { n: total, all: asked }));
   if (!total) return make("section", {}, head);
   const most = Math.max(...minutes.map(m => Object.values(m.misses).reduce((a, b) => a + b, 0)));
   const newest = minutes[minutes.length - 1].time,
@@ -29,7 +30,7 @@ export function misses(minutes) {
     head,
     make(
       "div",
-      { class: "minutes", role: "img", "aria-label": `Missed each minute, at most ${most}` },
+      { class: "minutes", role: "img", "aria-label": t("Missed each minute, at most {n}", { n: most }) },
       Array.from({ length: HOUR - minutes.length }, () => make("div")),
       minutes.map(minute => column(minute, reasons, most)),
     ),
@@ -37,13 +38,13 @@ export function misses(minutes) {
       "div",
       { class: "ends" },
       make("span", {}, `${clock.minute(began)} ${clock.zoneName()}`),
-      make("span", {}, `at most ${most} a minute`),
+      make("span", {}, t("at most {n} a minute", { n: most })),
       make("span", {}, clock.minute(newest)),
     ),
     make(
       "table",
       { class: "plain" },
-      tableHead(["Reason", "Missed", "Share"]),
+      tableHead([t("Reason"), t("Missed"), t("Share")]),
       make(
         "tbody",
         {},
@@ -51,7 +52,7 @@ export function misses(minutes) {
           make(
             "tr",
             {},
-            make("th", { scope: "row" }, swatch(i), reason),
+            make("th", { scope: "row" }, swatch(i), said(reason)),
             make("td", {}, String(sums.get(reason))),
             make("td", {}, share(asked ? sums.get(reason) / asked : null)),
           ),
@@ -71,8 +72,8 @@ function column(minute, reasons, most) {
   const words =
     reasons
       .filter(r => minute.misses[r])
-      .map(r => `${r} ${minute.misses[r]}`)
-      .join(", ") || "none";
+      .map(r => `${said(r)} ${minute.misses[r]}`)
+      .join(", ") || t("none");
   return make("div", { title: `${clock.minute(minute.time)}: ${words}` }, parts);
 }
 

@@ -2,18 +2,19 @@
 
 import * as clock from "./clock.js";
 import { colour, fill, find, make, put } from "./dom.js";
-import { exportLink, isPresent, label, leftOut, read } from "./history.js";
+import { exportLink, isPresent, label, notes, read } from "./history.js";
 import { now } from "./link.js";
 import { COLOURS, heldAt, isThere, join, line, makePlot, summary, wide } from "./plots.js";
 import { holdsFor, isLive, store } from "./store.js";
-import { text, unit, words } from "./values.js";
+import { t } from "./texts.js";
+import { registerName, text, title, unitName } from "./values.js";
 
 const RANGES = [
-  [10, "10 s"],
-  [60, "1 min"],
-  [600, "10 min"],
-  [3600, "1 h"],
-  [86400, "24 h"],
+  [10, t("{n} s", { n: 10 })],
+  [60, t("{n} min", { n: 1 })],
+  [600, t("{n} min", { n: 10 })],
+  [3600, t("{n} h", { n: 1 })],
+  [86400, t("{n} h", { n: 24 })],
 ];
 const FROM_HISTORY = 600; // in s: longer ranges are fetched from the history, others drawn from frames
 const ANEW_MS = 5000;
@@ -38,7 +39,7 @@ export function clear() {
 export function build(drive) {
   const ranges = make(
     "div",
-    { class: "ranges", role: "group", "aria-label": "Time range" },
+    { class: "ranges", role: "group", "aria-label": t("Time range") },
     RANGES.map(([seconds, name]) =>
       make(
         "button",
@@ -52,11 +53,11 @@ export function build(drive) {
       ),
     ),
     make("a", { id: "panel-csv", download: true }, "CSV"),
-    make("a", { href: `#/trends?drive=${encodeURIComponent(drive.name)}` }, "Trends"),
+    make("a", { href: `#/trends?drive=${encodeURIComponent(drive.name)}` }, t("Trends")),
   );
   return make(
     "section",
-    { "aria-label": "Plots" },
+    { "aria-label": t("Plots") },
     ranges,
     make("p", { class: "note", id: "past-note", hidden: true }),
     make("div", { id: "plots" }),
@@ -80,7 +81,7 @@ export function begin(drive) {
   const place = find("#plots");
   if (!place) return;
   if (!isThere()) {
-    fill(place, make("p", { class: "note" }, "Plots could not be loaded."));
+    fill(place, make("p", { class: "note" }, t("Plots could not be loaded.")));
     return;
   }
   fill(place);
@@ -111,12 +112,7 @@ function one(place, names, index, isLast, choices) {
   const heads = specs.map((register, i) =>
     choices
       ? picker(choices)
-      : make(
-          "span",
-          { class: "legend" },
-          swatch(i ? null : index),
-          `${words(register.name)}${unit(register) ? `, ${unit(register)}` : ""}`,
-        ),
+      : make("span", { class: "legend" }, swatch(i ? null : index), title(register)),
   );
   place.append(
     make(
@@ -162,13 +158,13 @@ function picker(choices) {
   const select = make(
     "select",
     {
-      "aria-label": "Third plot",
+      "aria-label": t("Third plot"),
       onchange: event => {
         third = event.target.value;
         begin(spec);
       },
     },
-    choices.map(r => make("option", { value: r.name }, `${words(r.name)}${unit(r) ? `, ${unit(r)}` : ""}`)),
+    choices.map(r => make("option", { value: r.name }, title(r))),
   );
   select.value = third;
   return select;
@@ -199,7 +195,7 @@ async function fetchPast() {
   try {
     const told = await read(labels, from, to, POINTS);
     if (mine === serial) past = { series: told.series, until: to };
-    if (needsHistory()) note = leftOut(told.series).join(" ");
+    if (needsHistory()) note = notes(told.series).join(" ");
   } catch (error) {
     if (needsHistory()) note = error.message;
   }
@@ -224,10 +220,10 @@ export function draw() {
   for (const { plot, specs, box } of plots) {
     const tables = specs.map(r => samples(r));
     const joined = join(
-      tables.map(t => t.slice(0, 2)).concat([[tables[0][0], tables[0][2], tables[0][3]]]),
+      tables.map(one => one.slice(0, 2)).concat([[tables[0][0], tables[0][2], tables[0][3]]]),
     );
     plot.setData(joined);
-    const words_ = summary(words(specs[0].name), tables[0][1], unit(specs[0]), specs[0].digits);
+    const words_ = summary(registerName(specs[0]), tables[0][1], unitName(specs[0]), specs[0].digits);
     if (box.getAttribute("aria-label") !== words_) box.setAttribute("aria-label", words_);
   }
 }

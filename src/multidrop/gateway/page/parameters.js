@@ -2,15 +2,17 @@
 
 import { get, query } from "./api.js";
 import { fill, find, make, tableHead } from "./dom.js";
+import { said, t } from "./texts.js";
 import { words } from "./values.js";
 
+const FORMATS = ["toml", "csv"];
 const AGAIN_MS = 1000; // interval of requests while the gateway reads the parameters
 
 let name = null;
 
 export function build(spec) {
   name = spec.name;
-  const section = make("section", { id: "parameters", "aria-label": "Parameters" });
+  const section = make("section", { id: "parameters", "aria-label": t("Parameters") });
   ask(spec.name, {});
   return section;
 }
@@ -22,27 +24,33 @@ const path = (drive, pairs) => `api/parameters/${encodeURIComponent(drive)}?${qu
 async function ask(drive, pairs) {
   const found = await get(path(drive, pairs)).catch(error => ({ state: "failed", error: error.message }));
   if (drive !== name || !find("#parameters")) return;
-  fill(find("#parameters"), make("h3", {}, "Parameters"), ...shown(drive, found));
+  fill(find("#parameters"), make("h3", {}, t("Parameters")), ...shown(drive, found));
   if (found.state === "reading") setTimeout(() => drive === name && ask(drive, {}), AGAIN_MS);
 }
 
 function shown(drive, found) {
   if (found.state === "reading")
-    return [note(found.total ? `Read ${found.done} of ${found.total} addresses.` : "Reading starts.")];
+    return [
+      note(
+        found.total
+          ? t("Read {n} of {all} addresses.", { n: found.done, all: found.total })
+          : t("Reading starts."),
+      ),
+    ];
   const button = make(
     "button",
     { type: "button", onclick: () => ask(drive, { read: 1 }) },
-    found.state === "read" ? "Read again" : "Read all parameters",
+    found.state === "read" ? t("Read again") : t("Read all parameters"),
   );
-  if (found.state === "failed") return [note(found.error), button];
+  if (found.state === "failed") return [note(said(found.error)), button];
   if (found.state !== "read") return [button];
   return [
-    note(`${found.parameters.length} parameters, read at ${found.saved}.`),
-    make("div", { class: "acts" }, button, ...["toml", "csv"].map(format => file(drive, format))),
+    note(t("{n} parameters, read at {time}.", { n: found.parameters.length, time: found.saved })),
+    make("div", { class: "acts" }, button, ...FORMATS.map(format => file(drive, format))),
     make(
       "table",
       { class: "plain" },
-      tableHead(["Parameter", "Value", "Factory"]),
+      tableHead([t("Parameter"), t("Value"), t("Factory")]),
       make("tbody", {}, found.parameters.map(row)),
     ),
   ];
@@ -54,7 +62,7 @@ const file = (drive, format) =>
   make(
     "a",
     { class: "button", href: path(drive, { format }), download: "" },
-    `Save as ${format.toUpperCase()}`,
+    t("Save as {format}", { format: format.toUpperCase() }),
   );
 
 function row({ code, name: register, value, factory }) {

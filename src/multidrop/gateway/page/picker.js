@@ -3,13 +3,15 @@
 import { fill, find, make, named } from "./dom.js";
 import { COLOURS, DASHES, swatch } from "./plots.js";
 import { key, state, store } from "./store.js";
-import { unit, words } from "./values.js";
+import { t } from "./texts.js";
+import { title } from "./values.js";
 
 const MOST_DRIVES = COLOURS.length * DASHES.length;
-
-const NOTE =
+const MOST_SIGNALS = 4; // limit of a trigger's quantities, so that their plots fit on a screen
+const NOTE = t(
   "The band shows the smallest and largest value at each point, the line the mean. A gap has no values. " +
-  "Drag to zoom in.";
+    "Drag to zoom in.",
+);
 
 let chosen = [],
   registers = [],
@@ -33,7 +35,10 @@ export function takePlant() {
   if (!chosen.length) chosen = [...all.filter(name => state(name) === "runs"), ...all].slice(0, 1);
   if (!quantities().length)
     registers = [...new Set(chosen.flatMap(name => [key(name, "frequency"), key(name, "current")]))];
-  if (!quantities().length) registers = numbers().map(({ name }) => name).slice(0, 1);
+  if (!quantities().length)
+    registers = numbers()
+      .map(({ name }) => name)
+      .slice(0, 1);
   draw();
 }
 
@@ -46,11 +51,25 @@ export function choose(name) {
   draw();
 }
 
+// Select the drives of these signals, and the signals that are numbers, at most MOST_SIGNALS of them.
+export function chooseSignals(signals) {
+  chosen = [...new Set(signals.map(({ drive }) => drive))].filter(name => store.drives.has(name));
+  const there = numbers().map(({ name }) => name);
+  registers = [...new Set(signals.map(({ register }) => register))]
+    .filter(name => there.includes(name))
+    .slice(0, MOST_SIGNALS);
+  takePlant();
+}
+
 export const drives = () => chosen;
 // Return the selected registers that a selected drive polls. Others have no checkbox to deselect them.
 export const quantities = () => {
   const there = numbers().map(({ name }) => name);
   return registers.filter(name => there.includes(name));
+};
+export const isPolled = (name, register) => {
+  const period = store.drives.get(name).registers.get(register)?.period_s;
+  return period !== undefined && period !== null;
 };
 export const showsFaults = () => faults;
 export const index = name => chosen.indexOf(name);
@@ -67,8 +86,8 @@ export function draw() {
   const isOpen = find("details", place)?.open ?? innerWidth > 1000;
   const filter = make("input", {
     type: "search",
-    placeholder: "Find a drive",
-    "aria-label": "Find a drive",
+    placeholder: t("Find a drive"),
+    "aria-label": t("Find a drive"),
     autocomplete: "off",
     oninput: event => {
       query = event.target.value.toLowerCase();
@@ -77,7 +96,11 @@ export function draw() {
   });
   filter.value = query;
   const names = [...store.drives.keys()];
-  const list = make("div", { class: "choices", role: "group", "aria-label": "Drives" }, names.map(choice));
+  const list = make(
+    "div",
+    { class: "choices", role: "group", "aria-label": t("Drives") },
+    names.map(choice),
+  );
   const show = () => {
     for (const label of list.children) label.hidden = !label.textContent.toLowerCase().includes(query);
   };
@@ -86,21 +109,21 @@ export function draw() {
     make(
       "details",
       { open: isOpen },
-      make("summary", {}, "Drives and quantities"),
-      make("h2", {}, "Drives"),
+      make("summary", {}, t("Drives and quantities")),
+      make("h2", {}, t("Drives")),
       names.length > 8 ? filter : null,
       list,
-      make("h2", {}, "Quantities"),
+      make("h2", {}, t("Quantities")),
       make(
         "div",
-        { class: "choices", role: "group", "aria-label": "Quantities" },
+        { class: "choices", role: "group", "aria-label": t("Quantities") },
         numbers().map(r =>
-          check(`${words(r.name)}${unit(r) ? `, ${unit(r)}` : ""}`, registers.includes(r.name), is => {
+          check(title(r), registers.includes(r.name), is => {
             registers = toggled(registers, r.name, is);
             changed();
           }),
         ),
-        check("faults and silence", faults, is => {
+        check(t("faults and silence"), faults, is => {
           faults = is;
           changed();
         }),
@@ -129,12 +152,12 @@ function choice(name) {
   );
 }
 
-function check(title, is, what, name = null, at = -1) {
+function check(label, is, what, name = null, at = -1) {
   const box = make("input", {
     type: "checkbox",
     "data-name": name,
     onchange: event => what(event.target.checked),
   });
   box.checked = is;
-  return make("label", {}, box, at >= 0 ? swatch(at) : null, make("span", {}, title));
+  return make("label", {}, box, at >= 0 ? swatch(at) : null, make("span", {}, label));
 }

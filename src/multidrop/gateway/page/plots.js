@@ -2,6 +2,7 @@
 
 import * as clock from "./clock.js";
 import { colour, make } from "./dom.js";
+import { t } from "./texts.js";
 import { number } from "./values.js";
 
 export const COLOURS = ["c1", "c2", "c3", "c4", "c5", "c6"];
@@ -110,9 +111,9 @@ export function join(tables) {
 // Return a sentence about a series for screen readers.
 export function summary(what, values, unit, digits) {
   const there = values.filter(value => value !== null && value !== undefined);
-  if (!there.length) return `${what}: no values`;
+  if (!there.length) return t("{what}: no values", { what });
   const low = there.reduce((a, b) => Math.min(a, b)),
     high = there.reduce((a, b) => Math.max(a, b));
   const [from, to, last] = [low, high, there[there.length - 1]].map(value => number(value, digits));
-  return `${what}: ${from} to ${to} ${unit}, last ${last} ${unit}`;
+  return t("{what}: {from} to {to} {unit}, last {last} {unit}", { what, from, to, last, unit });
 }

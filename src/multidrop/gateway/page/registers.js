@@ -5,7 +5,8 @@ import { change } from "./actions.js";
 import * as clock from "./clock.js";
 import { make, put, tableHead } from "./dom.js";
 import { key, known, mayWrite, store } from "./store.js";
-import { UNKNOWN, makeValue, showValue, withUnit, words } from "./values.js";
+import { said, t } from "./texts.js";
+import { UNKNOWN, makeValue, registerName, showValue, withUnit } from "./values.js";
 
 let name = null,
   rows = [];
@@ -22,12 +23,12 @@ export function build(spec) {
   }));
   return make(
     "section",
-    { "aria-label": "Registers" },
-    make("h3", {}, "Registers"),
+    { "aria-label": t("Registers") },
+    make("h3", {}, t("Registers")),
     make(
       "table",
       { class: "registers" },
-      tableHead(["Register", "Value", "Age"]),
+      tableHead([t("Register"), t("Value"), t("Age")]),
       make("tbody", {}, rows.map(row)),
     ),
   );
@@ -37,7 +38,7 @@ function row({ register, value, age }) {
   return make(
     "tr",
     {},
-    make("th", { scope: "row" }, words(register.name), make("small", {}, about(register))),
+    make("th", { scope: "row" }, registerName(register), make("small", {}, about(register))),
     make(
       "td",
       {},
@@ -48,10 +49,10 @@ function row({ register, value, age }) {
             {
               type: "button",
               class: "change",
-              "aria-label": `Change ${words(register.name)}`,
+              "aria-label": t("Change {register}", { register: registerName(register) }),
               onclick: () => change(name, register),
             },
-            "Change",
+            t("Change"),
           )
         : null,
     ),
@@ -68,22 +69,26 @@ function about({ place, access, least, most, step, period_s: period, ...register
   const isLimited = typeof least === "number" && typeof most === "number";
   return [
     place,
-    access === "reading" ? null : access,
-    isLimited ? withUnit(`${least} to ${most}`, register) + (step ? ` by ${step}` : "") : null,
-    period ? `every ${clock.lasting(period * 1000)}` : null,
+    access === "reading" ? null : said(access),
+    isLimited ? range(withUnit(t("{low} to {high}", { low: least, high: most }), register), step) : null,
+    period ? t("every {age}", { age: clock.lasting(period * 1000) }) : null,
   ]
     .filter(Boolean)
     .join(" · ");
 }
 
-export function draw(t) {
+const range = (ends, step) => (step ? t("{range} by {step}", { range: ends, step }) : ends);
+
+export function draw(at) {
   for (const { register, value, age } of rows) {
-    const found = known(name, register.name, t);
+    const found = known(name, register.name, at);
     showValue(value, found, store.drives.get(name).registers.get(register.name), false);
     put(
       age,
       found === null || found.value === null
-        ? (found?.status ?? "not read")
+        ? found
+          ? said(found.status)
+          : t("not read")
         : clock.lasting(found.age),
     );
     if (age.textContent === "") put(age, UNKNOWN);

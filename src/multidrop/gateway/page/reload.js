@@ -3,11 +3,13 @@
 import { confirm, send, tell } from "./ask.js";
 import { glyph, make, named } from "./dom.js";
 import { store } from "./store.js";
+import { pieces, t } from "./texts.js";
 
 const PATIENCE_MS = 60000; // request timeout: planning many lines takes long
-const WHAT =
+const WHAT = t(
   "Polling follows the new file. No motor is started or stopped, and motors of removed drives keep their " +
-  "state. If the file has a mistake, nothing changes.";
+    "state. If the file has a mistake, nothing changes.",
+);
 
 // Return true if this page's user may reload the plant file.
 export const mayReload = () => store.plant?.file === true && store.plant.may?.role === "write";
@@ -15,14 +17,18 @@ export const mayReload = () => store.plant?.file === true && store.plant.may?.ro
 // Ask for confirmation, and reload the plant file.
 export async function reload() {
   const file = () => named(store.plant.name);
-  if (!(await confirm(["Reload ", file(), "?"], [make("p", {}, WHAT)], ["Reload ", file()]))) return;
-  tell(["Reloading ", file(), " …"], [make("p", {}, "Polling continues.")]);
+  const title = pieces("Reload {file}?", { file: file() }),
+    yes = pieces("Reload {file}", { file: file() });
+  if (!(await confirm(title, [make("p", {}, WHAT)], yes))) return;
+  tell(pieces("Reloading {file} …", { file: file() }), [make("p", {}, t("Polling continues."))]);
   let shown;
   try {
     shown = outcome(await send("api/reload", () => ({ confirm: true }), { patience: PATIENCE_MS }));
   } catch (error) {
     const isRefused = error.status >= 400 && error.status < 500;
-    const title = isRefused ? "The file was not reloaded" : "It is unknown whether the file was reloaded";
+    const title = isRefused
+      ? t("The file was not reloaded")
+      : t("It is unknown whether the file was reloaded");
     shown = [title, make("p", { class: "bad" }, glyph("fault"), ` ${error.message}`)];
   }
   dispatchEvent(new Event("reloaded"));
@@ -33,13 +39,14 @@ export async function reload() {
 function outcome({ done, text, mistakes = [], restart = [] }) {
   if (done === true) {
     const waits = restart.length
-      ? [make("p", {}, "Needs a restart:"), list(restart, "")]
-      : [make("p", {}, "No restart is needed.")];
+      ? [make("p", {}, t("Needs a restart:")), list(restart, "")]
+      : [make("p", {}, t("No restart is needed."))];
     return [text, waits];
   }
-  const count = mistakes.length === 1 ? "1 mistake" : `${mistakes.length} mistakes`;
+  const n = mistakes.length;
+  const count = t(n === 1 ? "The file has {n} mistake" : "The file has {n} mistakes", { n });
   return [
-    mistakes.length ? `The file has ${count}` : "The file was not reloaded",
+    n ? count : t("The file was not reloaded"),
     [make("p", {}, `${text[0].toUpperCase()}${text.slice(1)}.`), list(mistakes, "bad")],
   ];
 }
@@ -48,7 +55,7 @@ const list = (sentences, kind) =>
   sentences.length
     ? make(
         "ul",
-        { class: "outcome", tabindex: "0", "aria-label": "Messages" }, // focusable, so that keys scroll it
+        { class: "outcome", tabindex: "0", "aria-label": t("Messages") }, // focusable, so that keys scroll it
         sentences.map(sentence =>
           make("li", { class: kind }, kind ? glyph("fault") : null, named(sentence)),
         ),

@@ -3,6 +3,7 @@
 import * as clock from "./clock.js";
 import { fill, glyph, make, named, put, setClass } from "./dom.js";
 import { driveAge, isLive, key, noteOf, reading, state, store } from "./store.js";
+import { said, t } from "./texts.js";
 import { STATES, UNKNOWN, makeValue, share, showValue } from "./values.js";
 
 export const COLUMNS = 8;
@@ -35,7 +36,7 @@ export function makeHead(line, unfold) {
         parts.fold ?? name,
         parts.fold && parts.count,
         make("span", { class: "wide port" }, [line.port, line.speed].filter(Boolean).join(" · ")),
-        make("span", { class: "wire" }, "wire ", parts.bar, parts.share),
+        make("span", { class: "wire" }, `${t("wire")} `, parts.bar, parts.share),
         parts.rate,
         parts.missed,
       ),
@@ -55,8 +56,8 @@ export function makeRow(drive) {
     canvas: make("canvas", { "aria-hidden": "true" }),
     shape: make("span", { class: "shape" }),
     word: make("span", { class: "word" }),
-    age: make("td", { class: "age" }),
-    missed: make("td", { class: "missed" }),
+    age: make("td", { class: "age", "data-head": t("age") }),
+    missed: make("td", { class: "missed", "data-head": t("missed") }),
   };
   parts.link = make(
     "a",
@@ -84,15 +85,15 @@ export function makeRow(drive) {
 }
 
 function stateWord(is, drive, age) {
-  if (is === "fault") return drive.fault ?? "fault";
+  if (is === "fault") return drive.fault ? said(drive.fault) : STATES.fault;
   if (is !== "silent") return STATES[is] ?? is;
-  return age === null ? "silent, never answered" : `silent for ${clock.lasting(age)}`;
+  return age === null ? t("silent, never answered") : t("silent for {age}", { age: clock.lasting(age) });
 }
 
 // Return the absolute value of a drive's frequency or setpoint in hertz, or null if the value is old.
-function hertz(name, part, t) {
+function hertz(name, part, at) {
   const register = key(name, part),
-    found = register && reading(name, register, t);
+    found = register && reading(name, register, at);
   const isShown = found && found.value !== null && !found.isOld;
   return isShown && store.drives.get(name).registers.get(register).unit === "Hz"
     ? Math.abs(found.value)
@@ -100,10 +101,10 @@ function hertz(name, part, t) {
 }
 
 // Return the frequency that a full bar means, the same for all drives, or null if no bars are drawn.
-export function fullBar(t) {
+export function fullBar(at) {
   const shown = [...store.drives.keys()].flatMap(name => {
-    const actual = hertz(name, "frequency", t);
-    return actual === null ? [] : [actual, hertz(name, "setpoint", t) ?? 0];
+    const actual = hertz(name, "frequency", at);
+    return actual === null ? [] : [actual, hertz(name, "setpoint", at) ?? 0];
   });
   if (!shown.length) return null;
   const most = shown.reduce((a, b) => Math.max(a, b));
@@ -111,9 +112,9 @@ export function fullBar(t) {
 }
 
 // Draw frequency and setpoint as a bar.
-function drawBar(r, t, full) {
-  const actual = hertz(r.name, "frequency", t),
-    set = hertz(r.name, "setpoint", t);
+function drawBar(r, at, full) {
+  const actual = hertz(r.name, "frequency", at),
+    set = hertz(r.name, "setpoint", at);
   const length = value => `${(value / full) * 100}%`;
   r.bars.hidden = actual === null;
   r.set.hidden = set === null;
@@ -123,16 +124,16 @@ function drawBar(r, t, full) {
 }
 
 // Update a drive's row; `full` is the frequency of a full bar in hertz. Return true if the state has changed.
-export function drawRow(r, t, full) {
+export function drawRow(r, at, full) {
   const drive = store.frame?.drives[r.name],
     is = state(r.name),
-    age = driveAge(r.name, t),
+    age = driveAge(r.name, at),
     own = store.drives.get(r.name);
-  const changed = drawState(r, is, drive, age, t);
+  const changed = drawState(r, is, drive, age, at);
   const [frequency, current] = ["frequency", "current"].map(part => key(r.name, part));
-  showValue(r.frequency, frequency && reading(r.name, frequency, t), own.registers.get(frequency));
-  showValue(r.current, current && reading(r.name, current, t), own.registers.get(current), false);
-  drawBar(r, t, full);
+  showValue(r.frequency, frequency && reading(r.name, frequency, at), own.registers.get(frequency));
+  showValue(r.current, current && reading(r.name, current, at), own.registers.get(current), false);
+  drawBar(r, at, full);
   put(r.age, age === null ? UNKNOWN : clock.lasting(age));
   const missed = drive?.missed ?? null;
   put(r.missed, missed === null ? UNKNOWN : missed === 0 ? "0" : share(missed));
@@ -141,7 +142,7 @@ export function drawRow(r, t, full) {
   return changed;
 }
 
-function drawState(r, is, drive, age, t) {
+function drawState(r, is, drive, age, at) {
   const changed = r.state !== is;
   if (changed) {
     fill(r.shape, glyph(STATES[is] ? is : "unknown"));
@@ -150,8 +151,8 @@ function drawState(r, is, drive, age, t) {
     r.state = is;
   }
   const word = stateWord(is, drive, age);
-  put(r.word, isLive(t) || !store.frame ? word : `last: ${word}`);
-  const title = [word, noteOf(r.name)].filter(Boolean).join(": ");
+  put(r.word, isLive(at) || !store.frame ? word : t("last: {word}", { word }));
+  const title = [word, said(noteOf(r.name))].filter(Boolean).join(": ");
   if (r.word.title !== title) r.word.title = title;
   return changed;
 }
@@ -162,19 +163,19 @@ export function drawHead(h) {
   h.used.style.width = `${Math.min(1, used ?? 0) * 100}%`;
   h.planned.style.left = `${Math.min(1, planned ?? 0) * 100}%`;
   h.planned.hidden = planned === null;
-  const words = `${share(used)} used, ${share(planned)} planned`;
+  const words = t("{used} used, {planned} planned", { used: share(used), planned: share(planned) });
   put(h.share, ` ${words}`);
   if (h.bar.getAttribute("aria-label") !== words) h.bar.setAttribute("aria-label", words);
-  put(h.rate, rate === null ? "" : `${rate.toFixed(1)} exchanges/s`);
+  put(h.rate, rate === null ? "" : t("{n} exchanges/s", { n: rate.toFixed(1) }));
   put(
     h.missed,
     lost
-      ? `port lost: ${lost}`
+      ? t("line lost: {why}", { why: said(lost) })
       : misses === null
         ? ""
         : misses
-          ? `${misses} missed in the last minute`
-          : "none missed",
+          ? t("{n} missed in the last minute", { n: misses })
+          : t("none missed"),
   );
   const asked = rate === null ? 0 : rate * 60; // requests in the last minute
   setClass(h.missed, "lost", Boolean(lost));

@@ -6,24 +6,27 @@ import * as clock from "./clock.js";
 import { find, make } from "./dom.js";
 import { mayReload, reload } from "./reload.js";
 import { store } from "./store.js";
-import { count } from "./values.js";
+import { LANGUAGES, choose, language, said, t } from "./texts.js";
 
 const THEME = "multidrop-theme";
 const THEMES = [
-  ["", "same as system"],
-  ["light", "light"],
-  ["dark", "dark"],
+  ["", t("same as system")],
+  ["light", t("light")],
+  ["dark", t("dark")],
 ];
 const keys = () => [
-  ["↑ ↓", "another drive"],
-  ["Enter", "open the drive"],
-  ["/", "filter"],
-  [`1 to ${document.querySelectorAll("nav a:not([hidden])").length}`, "views"],
-  ["s", "stop the selected drive (asks first)"],
-  ["Shift S", "stop all drives (asks first)"],
-  ["u", "UTC or local time"],
-  ["a, b", "markers in trends"],
-  ["Esc", "close; undo a zoom"],
+  ["↑ ↓", t("another drive")],
+  ["Enter", t("open the drive")],
+  ["/", t("filter")],
+  [
+    t("{low} to {high}", { low: 1, high: document.querySelectorAll("nav a:not([hidden])").length }),
+    t("views"),
+  ],
+  ["s", t("stop the selected drive (asks first)")],
+  ["Shift S", t("stop all drives (asks first)")],
+  ["u", t("UTC or local time")],
+  ["a, b", t("markers in trends")],
+  ["Esc", t("close; undo a zoom")],
 ];
 
 export function begin() {
@@ -45,8 +48,8 @@ function kept() {
 
 function labelClock() {
   find("#clock").title = clock.isUtc()
-    ? "All times are UTC. Press to switch to local time."
-    : "All times are this device's local time. Press to switch to UTC.";
+    ? t("All times are UTC. Press to switch to local time.")
+    : t("All times are this device's local time. Press to switch to UTC.");
 }
 
 function setTheme(name) {
@@ -66,17 +69,18 @@ async function show() {
     box.checked = is;
     return make("label", {}, box, title);
   };
-  const may = store.plant?.may ?? {};
+  const may = store.plant?.may ?? {},
+    n = may.write?.length ?? 0;
   const contents = [
     make(
       "fieldset",
       {},
-      make("legend", {}, "Times"),
+      make("legend", {}, t("Times")),
       radio("zone", "UTC", "UTC", clock.isUtc(), () => clock.isUtc() || clock.switchZone()),
       radio(
         "zone",
         "local",
-        `local (${Intl.DateTimeFormat().resolvedOptions().timeZone})`,
+        t("local ({zone})", { zone: Intl.DateTimeFormat().resolvedOptions().timeZone }),
         !clock.isUtc(),
         () => clock.isUtc() && clock.switchZone(),
       ),
@@ -84,14 +88,26 @@ async function show() {
     make(
       "fieldset",
       {},
-      make("legend", {}, "Theme"),
+      make("legend", {}, t("Language")),
+      LANGUAGES.map(([code, title]) =>
+        radio("language", code, title, code === language, () => choose(code)),
+      ),
+    ),
+    make(
+      "fieldset",
+      {},
+      make("legend", {}, t("Theme")),
       THEMES.map(([value, title]) => radio("theme", value, title, kept() === value, () => setTheme(value))),
     ),
     make(
       "p",
       {},
-      `Your right: ${may.role ?? "look"}. You may write ${count(may.write?.length ?? 0, "register")}. ` +
-        `Version ${store.plant?.version ?? "–"}.`,
+      t(
+        n === 1
+          ? "Your right: {role}. You may write {n} register. Version {version}."
+          : "Your right: {role}. You may write {n} registers. Version {version}.",
+        { role: said(may.role ?? "look"), n, version: store.plant?.version ?? "–" },
+      ),
     ),
     make(
       "dl",
@@ -99,17 +115,19 @@ async function show() {
       keys().flatMap(([key, what]) => [make("dt", {}, make("kbd", {}, key)), make("dd", {}, what)]),
     ),
   ];
-  const choice = await tell("Settings", contents, [
-    ...(mayReload() ? [["reload", "Reload the plant file", "calm"]] : []),
-    ["token", "Enter a token", "calm"],
-    ["forget", "Sign out", "calm"],
+  const choice = await tell(t("Settings"), contents, [
+    ...(mayReload() ? [["reload", t("Reload the plant file"), "calm"]] : []),
+    ["token", t("Enter a token"), "calm"],
+    ["forget", t("Sign out"), "calm"],
   ]);
   if (choice === "reload") await reload();
   if (choice === "token")
-    await askToken("A token gives the right to stop or to write. Ask the gateway's administrator for one.");
+    await askToken(
+      t("A token gives the right to stop or to write. Ask the gateway's administrator for one."),
+    );
   if (choice === "forget") {
     await post("api/forget", {}).catch(error =>
-      tell("Not signed out", make("p", { class: "bad" }, error.message)),
+      tell(t("Not signed out"), make("p", { class: "bad" }, error.message)),
     );
     dispatchEvent(new Event("signed"));
   }

@@ -2,41 +2,44 @@
 
 import { STOP, confirm, send, tell } from "./ask.js";
 import { fill, find, glyph, make, named } from "./dom.js";
+import { pieces, said, t } from "./texts.js";
 
-const HOW =
+const HOW = t(
   "A stop is sent before all polling and repeated until the drive confirms it. " +
-  "Each motor slows down as set in its drive.";
-const SENT = "Sending the stop.";
-const TAKEN =
+    "Each motor slows down as set in its drive.",
+);
+const SENT = t("Sending the stop.");
+const TAKEN = t(
   "The gateway has accepted the stop. If a drive does not answer, its stop is repeated for 30 s; the " +
-  "outcome is shown then.";
-const UNTAKEN = "The gateway has not accepted the stop";
-const HARD = "Use the hard-wired stop at the machine if a motor must stop now.";
-const HARD_NOW = "Use the hard-wired stop at the machine now. This page keeps waiting for the gateway.";
+    "outcome is shown then.",
+);
+const UNTAKEN = t("The gateway has not accepted the stop");
+const HARD = t("Use the hard-wired stop at the machine if a motor must stop now.");
+const HARD_NOW = t("Use the hard-wired stop at the machine now. This page keeps waiting for the gateway.");
 const TAKEN_MS = 1500; // time limit for the gateway to confirm that it has accepted a stop
 
 // Return the target of "Stop all" in the present view: the button's label, the target's name, the requests.
 function target() {
   const { drives, lines, plant, fleet } = find("#stopall").dataset;
-  const all = drives > 1 ? `all ${drives} drives` : "all drives";
-  const where = lines > 1 ? `All ${lines} lines at once. ` : "";
+  const all = drives > 1 ? t("all {n} drives", { n: drives }) : t("all drives");
+  const where = lines > 1 ? t("All {n} lines at once.", { n: lines }) : "";
   const own = ["api/stop", { drives: null }];
   if (!fleet || !location.hash.startsWith("#/fleet"))
-    return { label: "Stop all", what: all, where, requests: [own] };
-  const here = `${all} of ${plant}`;
+    return { label: t("Stop all"), what: all, where, requests: [own] };
+  const here = t("{drives} of {plant}", { drives: all, plant });
   if (fleet === "stops")
     return {
-      label: "Stop the fleet",
-      what: "the whole fleet",
-      where: `All drives of all lines of the fleet, and ${here}. `,
+      label: t("Stop the fleet"),
+      what: t("the whole fleet"),
+      where: t("All drives of all lines of the fleet, and {here}.", { here }),
       requests: [own, ["api/fleet/stop", {}]],
     };
   return {
-    label: "Stop this plant",
+    label: t("Stop this plant"),
     what: here,
-    where:
-      "This stops the drives of this plant only. To stop the fleet, run " +
-      "`multidrop fleet stop --all`. ",
+    where: t(
+      "This stops the drives of this plant only. To stop the fleet, run `multidrop fleet stop --all`.",
+    ),
     requests: [own],
   };
 }
@@ -45,19 +48,21 @@ function target() {
 export function showTarget() {
   const { label, what } = target();
   find("#stopall").textContent = label;
-  find("#stopall").title = `Stop ${what}`;
+  find("#stopall").title = t("Stop {what}", { what });
 }
 
 // Ask for confirmation, and stop all drives.
-export async function stopAll() {
+async function stopAll() {
   const { what, where, requests } = target();
-  if (await confirm(`Stop ${what}?`, [make("p", {}, where + HOW)], `Stop ${what}`, STOP))
+  const contents = [make("p", {}, where ? `${where} ${HOW}` : HOW)];
+  if (await confirm(t("Stop {what}?", { what }), contents, t("Stop {what}", { what }), STOP))
     await stop(requests, what);
 }
 
 // Ask for confirmation, and stop this drive.
 export async function stopOne(name) {
-  const [title, yes] = [["Stop ", named(name), "?"], ["Stop ", named(name)]];
+  const title = pieces("Stop {what}?", { what: named(name) }),
+    yes = pieces("Stop {what}", { what: named(name) });
   if (await confirm(title, [make("p", {}, HOW)], yes, STOP))
     await stop([["api/stop", { drives: [name] }]], name);
 }
@@ -73,12 +78,13 @@ function showProgress(what, isShown) {
     words.className = isBad ? "bad" : "";
   };
   const open = () => void tell(title, [words]).catch(() => {});
-  const stopping = ["Stopping ", named(what), " …"];
+  const stopping = pieces("Stopping {what} …", { what: named(what) });
   show(stopping, `${SENT} ${HARD}`, false);
   if (isShown) open();
   const waiting = new Set(); // timers of requests that the gateway has not confirmed yet
   const late = () => {
-    show([UNTAKEN], `No confirmation within ${TAKEN_MS / 1000} s. ${HARD_NOW}`, true);
+    const unconfirmed = t("No confirmation within {n} s.", { n: TAKEN_MS / 1000 });
+    show([UNTAKEN], `${unconfirmed} ${HARD_NOW}`, true);
     if (!words.closest("dialog[open]")) open();
   };
   return () => {
@@ -102,11 +108,13 @@ async function stop(requests, what) {
     const watch = showProgress(what, true);
     const ends = await Promise.all(requests.map(([path, body]) => ending(path, body, watch())));
     const failed = ends.find(end => end.error);
-    const shown = failed ? failure(failed.error, ends) : outcome(Object.assign({}, ...ends.map(e => e.told)));
+    const shown = failed
+      ? failure(failed.error, ends)
+      : outcome(Object.assign({}, ...ends.map(e => e.told)));
     again = await tell(
       shown.title,
       shown.contents,
-      shown.isWhole ? [] : [["again", "Send the stop again", STOP]],
+      shown.isWhole ? [] : [["again", t("Send the stop again"), STOP]],
     );
   }
 }
@@ -124,7 +132,7 @@ function failure(error, ends) {
   const isRefused = error.status >= 400 && error.status < 500;
   const others = ends.filter(end => end.told).map(end => outcome(end.told));
   return {
-    title: isRefused ? "The stop was not sent" : "It is unknown whether the stop was sent",
+    title: isRefused ? t("The stop was not sent") : t("It is unknown whether the stop was sent"),
     contents: [
       make("p", { class: "bad" }, glyph("fault"), ` ${error.message} ${HARD}`),
       ...others.flatMap(({ title, contents }) => [make("p", {}, `${title}.`), ...contents]),
@@ -143,17 +151,17 @@ function outcome(told) {
       { class: done === true ? "" : "bad" },
       done === true ? null : glyph("fault"),
       named(name),
-      `: ${text}`,
+      `: ${said(text)}`,
     ),
   );
   const isWhole = rows.length > 0 && failed.length === 0;
   const title = isWhole
     ? rows.length === 1
-      ? "The drive is stopped"
-      : `All ${rows.length} drives are stopped`
+      ? t("The drive is stopped")
+      : t("All {n} drives are stopped", { n: rows.length })
     : rows.length
-      ? `${failed.length} of ${rows.length} drives are not confirmed as stopped`
-      : "No drive was stopped";
+      ? t("{n} of {all} drives are not confirmed as stopped", { n: failed.length, all: rows.length })
+      : t("No drive was stopped");
   const contents = [
     items.length ? make("ul", { class: "outcome" }, items) : null,
     isWhole ? null : make("p", {}, HARD),
@@ -166,8 +174,9 @@ const WHOLE_MS = 8000; // time limit for loading the other parts of the page
 // Show a message if other parts of the page were not loaded in time.
 setTimeout(() => {
   if (document.body.dataset.begun) return;
-  find("#notice").textContent =
-    "This page was not fully loaded. Stop all works; reload the page for the rest.";
+  find("#notice").textContent = t(
+    "This page was not fully loaded. Stop all works; reload the page for the rest.",
+  );
   find("#notice").classList.add("bad");
   find("#notice").hidden = false;
 }, WHOLE_MS);
@@ -178,7 +187,9 @@ addEventListener("hashchange", showTarget);
 find("#ask").addEventListener("click", event => {
   const isIn = element => {
     const { left, right, top, bottom } = element.getBoundingClientRect();
-    return left <= event.clientX && event.clientX <= right && top <= event.clientY && event.clientY <= bottom;
+    return (
+      left <= event.clientX && event.clientX <= right && top <= event.clientY && event.clientY <= bottom
+    );
   };
   const ask = find("#ask");
   if (event.target === ask && !isIn(ask) && isIn(find("#stopall"))) stopAll();

@@ -2,6 +2,7 @@
 // Each value has its time, so that an old value never looks new.
 
 import { Ring } from "./ring.js";
+import { t } from "./texts.js";
 
 const SAMPLES = 2e6; // limit of samples kept, of all registers together
 const UNPOLLED_S = 5; // how long a value of an unpolled register stays current
@@ -135,9 +136,8 @@ export function reading(name, register, now) {
   const drive = store.drives.get(name),
     newest = drive?.newest.get(register);
   const good = drive?.good.get(register);
-  if (!good)
-    return newest ? { value: null, ...newest, age: now - newest.ms, isOld: true } : null;
-  const status = newest ? newest.status : "no longer polled";
+  if (!good) return newest ? { value: null, ...newest, age: now - newest.ms, isOld: true } : null;
+  const status = newest ? newest.status : t("no longer polled");
   const age = (isLive(now) ? store.time : now) - good.ms;
   return {
     value: good.value,
@@ -156,13 +156,13 @@ export function takeOthers(drive, values) {
 }
 
 // Return the reading of a register that is polled, or that is read because its drive is viewed.
-export function known(drive, register, t) {
-  const polled = reading(drive, register, t),
+export function known(drive, register, at) {
+  const polled = reading(drive, register, at),
     row = others.drive === drive ? others.values[register] : undefined;
   if (polled || !row) return polled;
   const [value, ms, status] = row,
-    age = t - ms,
-    isSilent = state(drive) === "silent" || !isLive(t);
+    age = at - ms,
+    isSilent = state(drive) === "silent" || !isLive(at);
   return { value, ms, status, age, isOld: status !== "ok" || age > LOOK_MS || isSilent };
 }
 

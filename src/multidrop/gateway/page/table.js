@@ -5,23 +5,24 @@ import { now } from "./link.js";
 import { drawHead, drawRow, fullBar, makeHead, makeRow } from "./rows.js";
 import { spark } from "./spark.js";
 import { isLive, key, onPlant, state, store } from "./store.js";
-import { count } from "./values.js";
+import { t } from "./texts.js";
+import { drives } from "./values.js";
 
 const HEADS = [
-  ["Drive", "name"],
-  ["Model", "model"],
-  ["State", "state"],
-  ["Frequency", "frequency"],
-  ["Current", "current"],
-  ["Last minute", "minute"],
-  ["Age", "age"],
-  ["Missed", "missed"],
+  [t("Drive"), "name"],
+  [t("Model"), "model"],
+  [t("State"), "state"],
+  [t("Frequency"), "frequency"],
+  [t("Current"), "current"],
+  [t("Last minute"), "minute"],
+  [t("Age"), "age"],
+  [t("Missed"), "missed"],
 ];
 const SHOWN = {
-  all: ["All", () => true],
-  runs: ["Running", s => s === "runs"],
-  stands: ["Stopped", s => s === "stands" || s === "still"],
-  bad: ["Fault, silent, unknown", s => s === "fault" || s === "silent" || s === "unknown"],
+  all: [t("All"), () => true],
+  runs: [t("Running"), s => s === "runs"],
+  stands: [t("Stopped"), s => s === "stands" || s === "still"],
+  bad: [t("Fault, silent, unknown"), s => s === "fault" || s === "silent" || s === "unknown"],
 };
 
 const scale = make("span", { class: "full" });
@@ -69,7 +70,7 @@ function build() {
   const table = make(
     "table",
     {},
-    make("caption", { class: "hidden" }, "Drives by line"),
+    make("caption", { class: "hidden" }, t("Drives by line")),
     tableHead(HEADS),
     store.plant.lines.map(body),
   );
@@ -133,10 +134,10 @@ export function neighbour(step) {
 export const focusChosen = () => rows.find(r => r.name === chosen)?.link.focus();
 
 export function drawRows() {
-  const t = now(),
-    full = fullBar(t);
-  put(scale, full === null ? "" : `full bar ${full} Hz`);
-  const changed = rows.map(row => drawRow(row, t, full)).includes(true);
+  const at = now(),
+    full = fullBar(at);
+  put(scale, full === null ? "" : t("full bar {n} Hz", { n: full }));
+  const changed = rows.map(row => drawRow(row, at, full)).includes(true);
   if (changed) drawFilter();
   for (const h of heads) drawHead(h);
 }
@@ -144,14 +145,14 @@ export function drawRows() {
 export function drawSparks() {
   const run = colour("run"),
     dim = colour("bar"),
-    t = now(),
-    isNow = isLive(t);
+    at = now(),
+    isNow = isLive(at);
   for (const r of rows) {
     const register = key(r.name, "frequency");
     spark(
       r.canvas,
       store.drives.get(r.name).pasts.get(register),
-      isNow ? store.time : t,
+      isNow ? store.time : at,
       state(r.name) === "runs" && isNow ? run : dim,
     );
   }
@@ -170,9 +171,9 @@ function drawFilter() {
     h.row.hidden = isFiltered && h.rows.every(r => r.row.hidden);
     h.fold?.setAttribute("aria-expanded", isOpen);
     const running = h.rows.filter(r => state(r.name) === "runs").length;
-    put(h.count, `${count(h.rows.length, "drive")}, ${running} running`);
+    put(h.count, t("{drives}, {n} running", { drives: drives(h.rows.length), n: running }));
   }
-  put(none, isFiltered && rows.every(r => r.row.hidden) ? "No drive matches the filter." : "");
+  put(none, isFiltered && rows.every(r => r.row.hidden) ? t("No drive matches the filter.") : "");
   for (const button of find("#chips").children) {
     const is = SHOWN[button.dataset.show][1];
     button.setAttribute("aria-pressed", button.dataset.show === show);

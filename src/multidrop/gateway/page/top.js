@@ -5,10 +5,12 @@ import { fill, find, glyph, make, named, put, say, setClass } from "./dom.js";
 import { correction, link, now } from "./link.js";
 import { showTarget } from "./stop.js";
 import { LIVE_MS, isLive, lasting, state, store } from "./store.js";
-import { count } from "./values.js";
+import { said, sentence, t } from "./texts.js";
+import { drives } from "./values.js";
 
 const DEAD_MS = 3000;
 const SKEW_MS = 2000; // larger errors of the viewer's clock are reported
+const RIGHTS = { look: t("may look"), stop: t("may stop"), write: t("may write") };
 let told = "";
 let shownStrip = "",
   ages = []; // [element, alarm] for each duration in the strip
@@ -25,47 +27,56 @@ export function showPlant() {
   stopall.dataset.plant = name;
   stopall.dataset.fleet = plant.fleet ? (plant.fleet_stop ? "stops" : "looks") : "";
   showTarget();
-  put(find("#role"), `${plant.demo ? "simulated, " : ""}may ${plant.may?.role ?? "look"}`);
+  const right = RIGHTS[plant.may?.role ?? "look"];
+  put(find("#role"), plant.demo ? t("simulated, {right}", { right }) : right);
 }
 
 // Update the head. Called a few times a second.
 export function drawTop() {
-  const t = now(),
-    age = t - store.time,
-    isNow = isLive(t);
+  const at = now(),
+    age = at - store.time,
+    isNow = isLive(at);
   const words =
     store.frame === null
       ? store.isLost
-        ? "no connection"
-        : "connecting"
+        ? t("no connection")
+        : t("connecting")
       : isNow
-        ? "live"
-        : `${Math.max(1, Math.round(age / 1000))} s old`;
-  put(find("#link span"), age < 120000 || store.frame === null ? words : `${clock.lasting(age)} old`);
+        ? t("live")
+        : t("{age} old", { age: t("{n} s", { n: Math.max(1, Math.round(age / 1000)) }) });
+  put(
+    find("#link span"),
+    age < 120000 || store.frame === null ? words : t("{age} old", { age: clock.lasting(age) }),
+  );
   setClass(find("#link"), "stale", !isNow);
   setClass(document.body, "stale", store.frame !== null && !isNow);
   setClass(document.body, "dead", store.frame !== null && (store.isLost || age > DEAD_MS));
-  put(find("#clock"), `${clock.time(t)} ${clock.zoneName()}`);
+  put(find("#clock"), `${clock.time(at)} ${clock.zoneName()}`);
   drawNotice(isNow, age);
   tellChange(isNow);
-  drawStrip(t);
+  drawStrip(at);
 }
 
 function drawNotice(isNow, age) {
   const parts = [];
-  if (store.isLost) parts.push(link.why.replace(/\.?$/, "."));
-  else if (store.frame && age > LIVE_MS) parts.push("The gateway sends no new values.");
+  if (store.isLost) parts.push(sentence(link.why));
+  else if (store.frame && age > LIVE_MS) parts.push(t("The gateway sends no new values."));
   if (store.frame && !isNow)
-    parts.push(`The values shown are from ${clock.when(store.time)} ${clock.zoneName()}.`);
+    parts.push(
+      t("The values shown are from {time}.", { time: `${clock.when(store.time)} ${clock.zoneName()}` }),
+    );
   const wrong = store.plant?.mistakes?.length ?? 0;
-  const mistakes = wrong === 1 ? "a mistake" : `${wrong} mistakes`;
-  if (wrong) parts.push(`The plant file has ${mistakes}; the previous plant stays in use.`);
-  for (const trouble of store.frame?.troubles ?? []) parts.push(`${trouble}.`);
+  if (wrong === 1) parts.push(t("The plant file has a mistake; the previous plant stays in use."));
+  if (wrong > 1)
+    parts.push(t("The plant file has {n} mistakes; the previous plant stays in use.", { n: wrong }));
+  for (const trouble of store.frame?.troubles ?? []) parts.push(`${said(trouble)}.`);
   const off = correction();
   if (Math.abs(off) > SKEW_MS) {
+    const time = clock.lasting(Math.abs(off));
     parts.push(
-      `This device's clock is ${clock.lasting(Math.abs(off))} ${off > 0 ? "slow" : "fast"}; ` +
-        "times shown here are the gateway's.",
+      off > 0
+        ? t("This device's clock is {time} slow; times shown here are the gateway's.", { time })
+        : t("This device's clock is {time} fast; times shown here are the gateway's.", { time }),
     );
   }
   const notice = find("#notice");
@@ -77,12 +88,12 @@ function drawNotice(isNow, age) {
 function tellChange(isNow) {
   const words = store.frame === null && !store.isLost ? "" : isNow ? "live" : "old";
   if (words && words !== told && (told || words === "old"))
-    say(words === "live" ? "Values are live again." : "Values are old: no new values arrive.");
+    say(words === "live" ? t("Values are live again.") : t("Values are old: no new values arrive."));
   told = words || told;
 }
 
 // Show the active alarms with their full text; a click opens the drive.
-function drawStrip(t) {
+function drawStrip(at) {
   const alarms = lasting(),
     most = innerWidth < 641 ? 2 : 5;
   const number = find("#count"),
@@ -98,15 +109,17 @@ function drawStrip(t) {
   const sign = JSON.stringify([shown, alarms.length, calm()]);
   if (sign !== shownStrip) buildStrip(shown, alarms.length - shown.length);
   shownStrip = sign;
-  for (const [age, alarm] of ages) put(age, `, ${clock.since(alarm, t)}`);
+  for (const [age, alarm] of ages) put(age, `, ${clock.since(alarm, at)}`);
 }
 
 // Return the text that the strip shows without active alarms.
 function calm() {
-  if (!store.frame) return "No values yet.";
+  if (!store.frame) return t("No values yet.");
   const unknown = [...store.drives.keys()].filter(name => state(name) === "unknown").length;
-  const others = unknown ? `, ${unknown} in unknown state` : "";
-  return `${count(store.drives.size, "drive")}, no known fault, none silent${others}.`;
+  const all = drives(store.drives.size);
+  return unknown
+    ? t("{drives}, no known fault, none silent, {n} in unknown state.", { drives: all, n: unknown })
+    : t("{drives}, no known fault, none silent.", { drives: all });
 }
 
 function buildStrip(alarms, more) {
@@ -117,7 +130,7 @@ function buildStrip(alarms, more) {
     fill(
       strip,
       alarms.map(item),
-      more ? make("li", {}, make("a", { href: "#/faults" }, `and ${more} more`)) : null,
+      more ? make("li", {}, make("a", { href: "#/faults" }, t("and {n} more", { n: more }))) : null,
     );
 }
 
@@ -133,9 +146,9 @@ function item(alarm) {
       "a",
       { class: acknowledged ? "seen" : kind, href },
       glyph(kind),
-      named(drive || `line ${line}`),
+      named(drive || t("line {line}", { line })),
       ": ",
-      named(text),
+      named(said(text)),
       age,
     ),
   );

@@ -7,36 +7,33 @@ import * as markers from "./markers.js";
 import * as picker from "./picker.js";
 import { COLOURS, dashes, heldAt, join, line, makePlot, summary, swatch, wide } from "./plots.js";
 import { holdsFor, store } from "./store.js";
-import { number, words } from "./values.js";
+import { said } from "./texts.js";
+import { number, registerName } from "./values.js";
 
 // Make the plot of one quantity of these drives. `set` is called with the time range of a mouse drag.
 export function makeTrend(place, { register, unit, drives }, told, { view, set, count, stepMs }) {
   const spec = store.drives.get(drives[0]).registers.get(register);
-  const out = make("output"),
+  const name = registerName(spec),
+    out = make("output"),
     box = make("div", { class: "plotbox", role: "img" });
   place.append(
     make(
       "div",
       { class: "plot" },
-      make(
-        "div",
-        { class: "plothead" },
-        make("b", {}, words(register) + (unit ? `, ${unit}` : "")),
-        out,
-      ),
+      make("div", { class: "plothead" }, make("b", {}, [name, said(unit)].filter(Boolean).join(", ")), out),
       box,
     ),
   );
   const series = [],
     bands = [],
     tables = [],
-    said = [];
-  for (const name of drives) {
-    const { time, least, mean, most } = told[label(name, register)],
-      index = picker.index(name),
+    summaries = [];
+  for (const drive of drives) {
+    const { time, least, mean, most } = told[label(drive, register)],
+      index = picker.index(drive),
       k = series.length + 1;
     const bare = { stroke: "transparent", points: { show: false } };
-    series.push(bare, bare, line(index, name, dashes(index)));
+    series.push(bare, bare, line(index, drive, dashes(index)));
     bands.push({
       series: [k, k + 1],
       fill: colour(COLOURS[index % COLOURS.length])
@@ -44,11 +41,11 @@ export function makeTrend(place, { register, unit, drives }, told, { view, set, 
         .replace(")", ", 0.22)"),
     });
     tables.push([time, most, least, mean]);
-    said.push(summary(name, mean, unit, spec.digits));
+    summaries.push(summary(drive, mean, said(unit), spec.digits));
   }
-  const marks = drives.map(name => (drives.length > 1 ? swatch(picker.index(name)) : null)),
+  const marks = drives.map(drive => (drives.length > 1 ? swatch(picker.index(drive)) : null)),
     widths = tables.map(([, most, least]) => widest([...most, ...least], spec.digits)),
-    holds = drives.map(name => holdsFor(name, register) + stepMs),
+    holds = drives.map(drive => holdsFor(drive, register) + stepMs),
     legend = u => fill(out, under(u, { drives, marks, widths, holds, spec }));
   const height = Math.max(150, Math.min(300, (innerHeight - 300) / count));
   const plot = makePlot(box, join(tables), {
@@ -75,7 +72,7 @@ export function makeTrend(place, { register, unit, drives }, told, { view, set, 
     },
   });
   legend(plot);
-  box.setAttribute("aria-label", `${words(register)}. ${said.join(". ")}`);
+  box.setAttribute("aria-label", `${name}. ${summaries.join(". ")}`);
   return { plot, drives, holds, spec, register, unit };
 }
 

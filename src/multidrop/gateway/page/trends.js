@@ -3,21 +3,23 @@
 import { confirmForm } from "./ask.js";
 import * as clock from "./clock.js";
 import { fill, find, make, put } from "./dom.js";
-import { exportLink, label, leftOut, read, unitOf } from "./history.js";
+import { exportLink, label, notes, read, unitOf } from "./history.js";
 import { draw as drawLane } from "./lane.js";
 import { now } from "./link.js";
 import * as markers from "./markers.js";
 import { isThere } from "./plots.js";
 import * as picker from "./picker.js";
 import { onPlant, store } from "./store.js";
+import { t } from "./texts.js";
 import { makeTrend } from "./trend_plot.js";
+import * as triggers from "./triggers.js";
 
 const RANGES = [
-  [900, "15 min"],
-  [3600, "1 h"],
-  [8 * 3600, "8 h"],
-  [86400, "24 h"],
-  [7 * 86400, "7 days"],
+  [900, t("{n} min", { n: 15 })],
+  [3600, t("{n} h", { n: 1 })],
+  [8 * 3600, t("{n} h", { n: 8 })],
+  [86400, t("{n} h", { n: 24 })],
+  [7 * 86400, t("{n} days", { n: 7 })],
 ];
 const LEAST_MS = 1000;
 const ANEW_MS = 5000;
@@ -41,11 +43,11 @@ export function begin() {
     make("button", { type: "button", "data-seconds": seconds, onclick: () => last(seconds) }, name),
   );
   const steps = [
-    ["◀", "Earlier", () => pan(-0.5)],
-    ["▶", "Later", () => pan(0.5)],
-    ["−", "Zoom out", () => zoom(2)],
-    ["+", "Zoom in", () => zoom(0.5)],
-    ["Back", "Back to the previous range", back],
+    ["◀", t("Earlier"), () => pan(-0.5)],
+    ["▶", t("Later"), () => pan(0.5)],
+    ["−", t("Zoom out"), () => zoom(2)],
+    ["+", t("Zoom in"), () => zoom(0.5)],
+    [t("Back"), t("Back to the previous range"), back],
   ];
   fill(
     find("#trends"),
@@ -55,13 +57,14 @@ export function begin() {
       { class: "card plots" },
       make(
         "div",
-        { class: "ranges", role: "group", "aria-label": "Time range" },
+        { class: "ranges", role: "group", "aria-label": t("Time range") },
         buttons,
         steps.map(([sign, name, what]) =>
           make("button", { type: "button", "aria-label": name, title: name, onclick: what }, sign),
         ),
+        triggers.begin(set, ask),
         markers.buttons(),
-        make("button", { class: "span", id: "span", type: "button", title: "Dates", onclick: askDates }),
+        make("button", { class: "span", id: "span", type: "button", title: t("Dates"), onclick: askDates }),
         make("a", { id: "csv", download: true }, "CSV"),
         make("a", { id: "parquet", download: true }, "Parquet"),
       ),
@@ -87,16 +90,19 @@ export function show(options) {
   if (options.get("from")) set(Number(options.get("from")), Number(options.get("to")), false);
   else if (!view.to || view.follows) last((view.to - view.from) / 1000 || 3600);
   ask();
+  triggers.watch(true);
 }
 
 export function hide() {
   isShown = false;
+  triggers.watch(false);
   serial++;
 }
 
 function set(from, to, follows) {
   const isSame = Math.abs(from - view.from) + Math.abs(to - view.to) < (view.to - view.from) / 1000;
   if (isSame && !follows) return; // every plot reports the same drag
+  triggers.leave();
   if (view.to) view.back.push([view.from, view.to, view.follows]);
   view.back.splice(0, view.back.length - 50);
   Object.assign(view, { from, to: Math.max(to, from + LEAST_MS), follows });
@@ -125,14 +131,14 @@ async function askDates() {
   from.dataset.first = "";
   const check = () =>
     to.setCustomValidity(
-      clock.parsed(to.value) > clock.parsed(from.value) ? "" : "The end must be after the start.",
+      clock.parsed(to.value) > clock.parsed(from.value) ? "" : t("The end must be after the start."),
     );
   for (const field of [from, to]) field.addEventListener("input", check);
   const contents = [
-    make("label", { class: "field", for: from.id }, `From, ${clock.zoneName()}`, from),
-    make("label", { class: "field", for: to.id }, `To, ${clock.zoneName()}`, to),
+    make("label", { class: "field", for: from.id }, t("From, {zone}", { zone: clock.zoneName() }), from),
+    make("label", { class: "field", for: to.id }, t("To, {zone}", { zone: clock.zoneName() }), to),
   ];
-  if (await confirmForm("Time range", contents, "Show", ""))
+  if (await confirmForm(t("Time range"), contents, t("Show"), ""))
     set(clock.parsed(from.value), clock.parsed(to.value), false);
 }
 
@@ -140,6 +146,7 @@ export function back() {
   const before = view.back.pop();
   if (!before) return;
   [view.from, view.to, view.follows] = before;
+  triggers.leave();
   ask();
 }
 
@@ -164,16 +171,11 @@ function showSpan() {
   }
 }
 
-const isPolled = (name, register) => {
-  const period = store.drives.get(name).registers.get(register)?.period_s;
-  return period !== undefined && period !== null;
-};
-
 const wanted = () =>
   picker.quantities().flatMap(register =>
     picker
       .drives()
-      .filter(name => isPolled(name, register))
+      .filter(name => picker.isPolled(name, register))
       .map(name => label(name, register)),
   );
 
@@ -182,7 +184,7 @@ async function fetchAll() {
     labels = wanted();
   if (!isShown || !store.plant) return;
   drawLane(find("#lane"), view.from, view.to, picker.showsFaults() ? picker.drives() : []);
-  let note = labels.length ? "" : "Select a drive and a quantity.";
+  let note = labels.length ? "" : t("Select a drive and a quantity.");
   told = { series: {} };
   try {
     if (labels.length)
@@ -191,7 +193,7 @@ async function fetchAll() {
     note = error.message;
   }
   if (mine !== serial || !isShown) return;
-  note = [note, ...leftOut(told.series)].filter(Boolean).join(" ");
+  note = [triggers.note(), note, ...notes(told.series)].filter(Boolean).join(" ");
   put(find("#trend-note"), note);
   find("#trend-note").hidden = note === "";
   draw();

@@ -2,32 +2,36 @@
 
 import * as clock from "./clock.js";
 import { make, setClass } from "./dom.js";
+import { said, t } from "./texts.js";
 
 export const STATES = {
-  runs: "running",
-  stands: "stopped",
-  fault: "fault",
-  silent: "silent",
-  still: "at rest: 0 Hz",
-  unknown: "unknown",
+  runs: t("running"),
+  stands: t("stopped"),
+  fault: t("fault"),
+  silent: t("silent"),
+  still: t("at rest: 0 Hz"),
+  unknown: t("unknown"),
 };
 export const ALARMS = {
-  fault: "fault",
-  stopped: "stopped by itself",
-  limit: "limit",
-  port: "port lost",
-  silent: "silent",
+  fault: t("fault"),
+  stopped: t("stopped by itself"),
+  limit: t("limit"),
+  port: t("line lost"),
+  silent: t("silent"),
 };
 export const UNKNOWN = "–";
 const MOST_BITS = 32;
 
 export const words = name => name.replaceAll("_", " ");
 
+// Return a register's title in the viewer's language if the gateway has one, else its name.
+export const registerName = ({ name, title: known }) => known || words(name);
+
 // Return a value's number, or its name if the register names its values, without a unit.
 export function text(value, register) {
   if (value === null || value === undefined || Number.isNaN(value)) return UNKNOWN;
   if (register?.kind === "words")
-    return register.words?.[value] ? `${words(register.words[value])} (${value})` : String(value);
+    return register.words?.[value] ? `${said(words(register.words[value]))} (${value})` : String(value);
   if (register?.kind === "bits") return bits(value, register.words ?? {});
   return number(Number(value), register?.digits);
 }
@@ -46,18 +50,21 @@ export function number(value, digits) {
 function bits(value, names) {
   const set = [];
   for (let bit = 0; bit < MOST_BITS; bit++)
-    if (Math.floor(value / 2 ** bit) % 2) set.push(words(names[2 ** bit] ?? `bit ${bit}`));
-  return set.length ? set.join(", ") : "none set";
+    if (Math.floor(value / 2 ** bit) % 2) set.push(said(words(names[2 ** bit] ?? `bit ${bit}`)));
+  return set.length ? set.join(", ") : t("none set");
 }
 
 export const unit = register =>
   register?.unit && register.kind !== "words" && register.kind !== "bits" ? register.unit : "";
 
+// Return a register's unit in the viewer's language.
+export const unitName = register => said(unit(register));
+
 // Return a text with the register's unit, if any.
-export const withUnit = (told, register) => (unit(register) ? `${told} ${unit(register)}` : String(told));
+export const withUnit = (told, register) => `${told} ${unitName(register)}`.trim();
 
 // Return a register's name with its unit, as the head of a plot or a field.
-export const title = register => words(register.name) + (unit(register) ? `, ${unit(register)}` : "");
+export const title = register => [registerName(register), unitName(register)].filter(Boolean).join(", ");
 
 // Make the elements of a cell once: the number, its unit, and the time of an old value.
 export function makeValue() {
@@ -77,8 +84,8 @@ export function showValue(parts, reading, register, isDated = true, isNamed = is
   set(parts.number, isThere ? text(reading.value, register) : UNKNOWN);
   // a number without a unit needs its name
   const isBare = !unit(register) && register?.kind === "number" && isNamed;
-  set(parts.unit, isThere ? (isBare ? words(register.name) : unit(register)) : "");
-  set(parts.age, isOld && isDated ? `${clock.lasting(reading.age)} old` : "");
+  set(parts.unit, isThere ? (isBare ? registerName(register) : unitName(register)) : "");
+  set(parts.age, isOld && isDated ? t("{age} old", { age: clock.lasting(reading.age) }) : "");
   setClass(parts.whole, "old", isOld);
   const why = reason(reading);
   if (parts.whole.title !== why) parts.whole.title = why;
@@ -86,11 +93,12 @@ export function showValue(parts, reading, register, isDated = true, isNamed = is
 
 // Return why a value is missing or old, or "" for a fresh value.
 function reason(reading) {
-  if (reading === null) return "never read";
-  if (reading.value === null) return `never read: ${reading.status}`;
+  if (reading === null) return t("never read");
+  if (reading.value === null) return t("never read: {status}", { status: said(reading.status) });
   if (!reading.isOld) return "";
-  const since = reading.status === "ok" ? "" : `; since then: ${reading.status}`;
-  return `of ${clock.moment(reading.ms)} ${clock.zoneName()}${since}`;
+  const at = `${clock.moment(reading.ms)} ${clock.zoneName()}`;
+  if (reading.status === "ok") return t("of {time}", { time: at });
+  return t("of {time}; since then: {status}", { time: at, status: said(reading.status) });
 }
 
 function set(element, value) {
@@ -98,7 +106,7 @@ function set(element, value) {
 }
 
 // Return a number with its noun: "1 drive", "31 drives".
-export const count = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;
+export const drives = n => t(n === 1 ? "{n} drive" : "{n} drives", { n });
 
 // Return a share in per cent, or a dash if it is unknown; a small share is never shown as 0.
 export function share(part) {
@@ -110,4 +118,4 @@ export function share(part) {
 }
 
 export const milliseconds = ms =>
-  ms === null || ms === undefined ? UNKNOWN : `${ms < 10 ? ms.toFixed(1) : Math.round(ms)} ms`;
+  ms === null || ms === undefined ? UNKNOWN : t("{n} ms", { n: ms < 10 ? ms.toFixed(1) : Math.round(ms) });

@@ -1,0 +1,58 @@
+// The page's texts in the viewer's language. Code names a text by its English wording; texts.toml has the
+// other languages. If the texts could not be fetched, the page is in English, and its buttons work.
+
+const texts = new Map(Object.entries(await globalThis.texts));
+// Placeholders of the gateway's texts, and the values that they stand for: a number, or a register's name.
+const VALUES = { "{n}": /\d+(\.\d+)?/, "{name}": /^\w+/ };
+
+export const LANGUAGES = [
+  ["en", "English"],
+  ["ru", "Русский"],
+  ["zh", "中文"],
+];
+export const language = document.documentElement.lang;
+
+// The path of the plant's description. The browser's own languages are in each request's headers.
+export const plantPath =
+  document.documentElement.dataset.chosen === undefined ? "api/plant" : `api/plant?lang=${language}`;
+
+// Return the pieces of a text, with a text or an element in place of each placeholder such as {drive}.
+export const pieces = (english, values = {}) =>
+  (texts.get(english) ?? english).split(/\{(\w+)\}/).map((piece, i) => (i % 2 ? values[piece] : piece));
+
+// Return a text with its values.
+export const t = (english, values) => pieces(english, values).join("");
+
+// Return a text from the gateway, such as "unconfirmed: no reply" or "undervoltage (UV)", in the viewer's
+// language. Parts that texts.toml lacks stay English.
+export function said(english) {
+  const [head, ...rest] = String(english).split(": ");
+  return texts.get(english) ?? (rest.length ? `${word(head)}: ${said(rest.join(": "))}` : word(head));
+}
+
+function word(english) {
+  const [plain, code = ""] = english.split(/(?= \([\w-]+\)$)/);
+  return (texts.get(plain) ?? withValue(plain) ?? plain) + code;
+}
+
+// Return the translation of a text that contains one value, such as "status is not polled"; null without one.
+function withValue(plain) {
+  for (const [placeholder, pattern] of Object.entries(VALUES)) {
+    const found = texts.get(plain.replace(pattern, placeholder));
+    if (found) return found.replace(placeholder, pattern.exec(plain)[0]);
+  }
+  return null;
+}
+
+// Return a text with a full stop at its end.
+export const sentence = text => (/[.。]$/.test(text) ? text : `${text}.`);
+
+// Keep the choice of a language in this browser, and show the page in this language.
+export function choose(name) {
+  try {
+    localStorage.setItem("multidrop-language", name);
+  } catch {
+    return; // the browser forbids storage: the page stays in the browser's language
+  }
+  location.reload();
+}

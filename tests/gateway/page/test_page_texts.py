@@ -1,0 +1,370 @@
+"""The page's texts: each is in the catalogue, in all languages and with the same placeholders."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import fake_plant
+import pytest
+from fake_gateway import FakeGateway
+from watching import Opener, aborting, until, until_met, until_settled, violations
+
+from multidrop.control import CommandOutcome
+from multidrop.control.outcome import Effect, Seen
+from multidrop.core.result import Status
+from multidrop.drive.named_verbs import LISTED_VERBS
+from multidrop.drive.register import Access
+from multidrop.fleet.leases.member import MemberState
+from multidrop.gateway.http.page_files import PAGE, read_files
+from multidrop.gateway.http.rights import Right
+from multidrop.gateway.live import alarms, hub
+from multidrop.history.quantities import RAW
+
+LANGUAGES = {"ru", "zh"}
+CATALOGUE = (PAGE / "texts.toml").read_text("utf-8")
+TEXTS: dict[str, dict[str, str]] = tomllib.loads(CATALOGUE)
+OWN_PART, GATEWAY_PART = map(tomllib.loads, re.split(r"^# ====.*$", CATALOGUE, flags=re.MULTILINE))
+SCRIPTS = {path.name: path.read_text("utf-8") for path in sorted(PAGE.glob("*.js"))}
+NAMES = {"UTC", "CSV", "Parquet", "Enter", "Esc", "Shift S", "multidrop", "English", "Русский", "中文"}
+OTHERS = {"danger stop", "Etc/UTC", "px system-ui, sans-serif", "11px system-ui, DejaVu Sans, sans-serif"}
+
+
+def lack_of(register: str, polled: list[str]) -> str:
+    """Return the gateway's text for a state that is unknown because this register has no value."""
+    watched: Any = SimpleNamespace(reader=SimpleNamespace(has_state=True, lacks=register), cells=polled)
+    return hub._lack(watched)
+
+
+GATEWAY_WORDS = {
+    *(str(status) for status in Status),
+    *(one.value for kind in (CommandOutcome, Effect, Seen, MemberState, Access) for one in kind),
+    *(verb.replace("_", " ") for verb in LISTED_VERBS),
+    *(right.name.lower() for right in Right),
+    *(alarms.UNCALLED, hub.UNNAMED, hub.NOT_ASKED, hub.INCOMPLETE, RAW),
+    *(lack_of("{name}", cells) for cells in ([], ["{name}"])),
+}
+TRANSLATING = {"t", "pieces", "said"}  # functions whose first argument is a key of the catalogue
+# by function: index of the first argument that the function shows
+SHOWING = {"make": 2, "put": 1, "fill": 1, "named": 0, "say": 0, "Error": 0, "Refused": 1}
+SHOWN = {"title", "aria-label", "placeholder", "alt", "data-head"}  # attributes that a person reads
+TECHNICAL = {"class", "find", "closest", "matches", "matchMedia", "querySelector", "querySelectorAll"}
+
+TOKEN = re.compile(
+    r"""(?P<comment>//[^\n]*)
+      | (?P<regex>/(?![/*\s=])(?:\\.|\[[^\]]*\]|[^/\n])+/[a-z]*(?=[.,)]))
+      | (?P<key>(?<=[{,\s])(?:"[\w-]+"|\w+)(?=:\s))
+      | (?P<text>"(?:\\.|[^"\\])*")
+      | (?P<template>`)
+      | (?P<call>[\w$]+(?=\())
+      | (?P<open>[(\[{])
+      | (?P<close>[)\]}])
+      | (?P<comma>,)
+      | (?P<other>[\w$]+|\s+|.)""",
+    re.DOTALL | re.VERBOSE,
+)
+TEMPLATE = re.compile(r"((?:\\.|[^`$\\]|\$(?!\{))*)(`|\$\{)", re.DOTALL)
+WORD = re.compile(r"[^\W\d_]{2,}")
+SENTENCE = re.compile(r"[A-Z][a-z]|[^\W\d_] [^\W\d_]")
+ASSIGNED = re.compile(r"\.(?:title|textContent|innerText|placeholder|ariaLabel) = [\"`]\w")
+COMPARED = re.compile(r"([!=]==) \"[^\"]*\"")
+PLACEHOLDER = re.compile(r"\{\w+\}")
+
+
+class Bracket(NamedTuple):
+    """An open bracket: name of the called function, number of the argument, and key in an object."""
+
+    call: str = ""
+    argument: int = 0
+    key: str = ""
+
+
+class Literal(NamedTuple):
+    """A literal of a script, with the brackets around it from outside to inside."""
+
+    text: str
+    around: tuple[Bracket, ...]
+
+    @property
+    def is_key(self) -> bool:
+        """True if the literal is a key of the catalogue."""
+        return self.around[-1].call in TRANSLATING and self.around[-1].argument == 0
+
+    @property
+    def is_shown(self) -> bool:
+        """True if the literal is at a place that a person sees, or if it looks like a text."""
+        inner = next((one for one in reversed(self.around) if one.call or one.key), Bracket())
+        if inner.call in TECHNICAL or inner.key in TECHNICAL:
+            return False
+        first = SHOWING.get(inner.call)
+        is_at_shown_place = inner.key in SHOWN or (first is not None and inner.argument >= first)
+        return bool((WORD if is_at_shown_place else SENTENCE).search(self.text))
+
+
+def literals(script: str) -> Iterator[Literal]:
+    """Yield the string literals of a script, and the texts between the values of its templates."""
+    script = COMPARED.sub(r"\1 0", re.sub(r'"\s*\+\s*"', "", script))
+    brackets, call, at = [Bracket()], "", 0
+    while at < len(script):
+        if brackets[-1].call == "`":
+            found = TEMPLATE.match(script, at)
+            assert found is not None
+            yield Literal(found[1], (*brackets[:-1],))
+            brackets[-1:] = [brackets[-1], Bracket()] if found[2] == "${" else []
+        else:
+            found = TOKEN.match(script, at)
+            assert found is not None
+            kind, last = found.lastgroup, brackets[-1]
+            if kind == "text":
+                yield Literal(found[0][1:-1], (*brackets,))
+            elif kind in ("open", "template"):
+                brackets.append(Bracket("`" if kind == "template" else call))
+            elif kind == "close":
+                brackets.pop()
+            elif kind == "comma":
+                brackets[-1] = last._replace(argument=last.argument + 1, key="")
+            elif kind == "key":
+                brackets[-1] = last._replace(key=found[0].strip('"'))
+            call = found[0] if kind == "call" else ""
+        at = found.end()
+
+
+def strangers(script: str) -> list[str]:
+    """Return the visible texts of a script that the catalogue does not translate."""
+    found = [one.text for one in literals(script) if not one.is_key and one.is_shown]
+    return [text for text in found if text not in NAMES | OTHERS] + ASSIGNED.findall(script)
+
+
+class HtmlTexts(HTMLParser):
+    """Collects the page's readable attributes, and its texts except those in `noscript`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.texts: set[str] = set()
+        self._is_noscript = False
+        self.feed((PAGE / "index.html").read_text("utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._is_noscript |= tag == "noscript"
+        self.texts |= {value for name, value in attrs if name in SHOWN and value}
+
+    def handle_endtag(self, tag: str) -> None:
+        self._is_noscript &= tag != "noscript"
+
+    def handle_data(self, data: str) -> None:
+        if WORD.search(data) and not self._is_noscript:
+            self.texts.add(data.strip())
+
+
+# keys of the catalogue that the page itself names, in its scripts or its HTML
+PAGE_TEXTS = {one.text for script in SCRIPTS.values() for one in literals(script) if one.is_key}
+PAGE_TEXTS |= HtmlTexts().texts
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_each_visible_text_of_a_script_is_in_the_catalogue(script: str) -> None:
+    found = literals(SCRIPTS[script])
+    assert strangers(SCRIPTS[script]) == []
+    assert {one.text for one in found if one.is_key} - TEXTS.keys() == set()
+
+
+@pytest.mark.parametrize(
+    "script",
+    [
+        'make("p", {}, "hello")',
+        'make("p", {}, isBad ? "hello" : null)',
+        'make("input", { placeholder: "hello", class: "a b" })',
+        "put(element, `${n} drives`)",
+        'const TITLE = "Hello";',
+        'const why = { a: ["two words", 1] };',
+        'element.title = "hello"',
+        'throw new Error("hello")',
+        't("Stop {what}", { what: "a drive" })',
+    ],
+)
+def test_literal_outside_the_catalogue_is_found(script: str) -> None:
+    assert strangers(script) != []
+
+
+def test_each_text_of_the_html_and_no_text_of_the_css_is_shown_from_the_catalogue() -> None:
+    assert HtmlTexts().texts - TEXTS.keys() - NAMES == set()
+    styles = "".join(path.read_text("utf-8") for path in PAGE.glob("*.css"))
+    assert [text for text in re.findall(r"content:([^;]*);", styles) if re.search(r'"[^"]*\w', text)] == []
+
+
+def test_each_text_has_all_languages_with_the_same_placeholders() -> None:
+    for english, translations in TEXTS.items():
+        assert translations.keys() == LANGUAGES, english
+        for language, text in translations.items():
+            expected = sorted(PLACEHOLDER.findall(english))
+            assert sorted(PLACEHOLDER.findall(text)) == expected, (english, language)
+            assert text.strip() == text != "", (english, language)
+
+
+def test_closed_lists_of_the_gateway_are_in_the_catalogue() -> None:
+    assert GATEWAY_WORDS - TEXTS.keys() == set()
+
+
+def test_catalogue_has_no_unused_text() -> None:
+    assert OWN_PART.keys() - PAGE_TEXTS == set()
+    sources = "".join(
+        path.read_text("utf-8")
+        for room in ("control", "drive", "families", "gateway/live")
+        for path in (PAGE.parents[1] / room).rglob("*.*")
+        if path.suffix in (".py", ".toml")
+    )
+    others = GATEWAY_PART.keys() - GATEWAY_WORDS
+    assert [text for text in others if PLACEHOLDER.split(text)[0] not in sources] == []
+
+
+def test_each_language_is_served_as_one_file() -> None:
+    files = read_files(PAGE)
+    assert {name for name in files if name.startswith("texts.")} == {
+        "texts.js",
+        *(f"texts.{language}.json" for language in LANGUAGES),
+    }
+    assert json.loads(files["texts.zh.json"].body)["Stop all"] == TEXTS["Stop all"]["zh"]
+    assert 'TRANSLATED = ["ru", "zh"]' in SCRIPTS["boot.js"]
+    assert re.findall(r'  \["(\w+)", "\w+"\],', SCRIPTS["texts.js"]) == ["en", "ru", "zh"]
+
+
+# ---- the page's languages: their choice, and every view in each of them on a narrow screen ----
+
+
+VIEWS = ("#/drives", "#/drives/pump-1", "#/trends", "#/faults", "#/lines", "#/log", "#/fleet")
+NARROW = {"width": 360, "height": 780}
+STOP_ALL = {"en": "Stop all", **TEXTS["Stop all"]}
+LIVE = {"en": "live", **TEXTS["live"]}
+# Return two lists: visible texts and attributes, without the plant's names; elements that are too wide.
+READ = """() => {
+  const attributes = ["title", "aria-label", "placeholder", "data-head"];
+  const visible = element => element.checkVisibility({ visibilityProperty: true });
+  const texts = [], nodes = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  while (nodes.nextNode()) {
+    const { parentElement: parent, data } = nodes.currentNode;
+    if (visible(parent) && !parent.closest("bdi, kbd, noscript")) texts.push(data);
+  }
+  for (const name of attributes)
+    for (const element of document.querySelectorAll(`[${name}]`))
+      if (visible(element)) texts.push(element.getAttribute(name));
+  const wide = [...document.querySelectorAll("html, body, main, dialog, button, .card")].filter(
+    element => visible(element) && element.scrollWidth > element.clientWidth + 1,
+  );
+  return [texts, wide.map(element => `${element.tagName} ${element.className} ${element.textContent}`)];
+}"""
+
+
+def english_in(texts: list[str]) -> set[str]:
+    """Return the pieces of the page's English texts, with four letters or more, that these texts contain."""
+    joined = "\n".join(texts)
+    pieces = {piece.strip(" .,:;()") for text in PAGE_TEXTS - NAMES for piece in PLACEHOLDER.split(text)}
+    pieces.remove("table")  # references to manuals, such as "table 9-2", stay English
+    return {
+        piece
+        for piece in pieces
+        if re.search(r"[a-zA-Z]{4}", piece) and re.search(rf"(?<![\w-]){re.escape(piece)}(?![\w-])", joined)
+    }
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("language", ["ru", "zh"])
+def test_each_view_fits_a_narrow_screen_and_has_no_english_text(
+    opened: Opener, axe: str, few_drives: int, language: str
+) -> None:
+    page = opened(live=False, locale=language)
+    page.set_viewport_size(NARROW)
+    until(page, f"document.querySelector('#link').textContent === '{LIVE[language]}'")
+    page.evaluate(axe)
+    found: dict[str, Any] = {}
+
+    def read(view: str) -> None:
+        until_settled(page)
+        texts, wide = page.evaluate(READ)
+        assert len(texts) > 10, view
+        found[view] = [*english_in(texts), *wide, *violations(page)]
+
+    for view in VIEWS:
+        page.evaluate("view => { location.hash = view }", view)
+        read(view)
+    page.locator("#more").click()
+    read("settings")
+    page.keyboard.press("Escape")
+    page.locator("#stopall").click()
+    read("question about a stop")
+    page.locator("#ask .danger").click()
+    stopped = TEXTS["All {n} drives are stopped"][language].replace("{n}", str(few_drives))
+    page.get_by_role("heading", name=stopped).wait_for()
+    read("outcome of a stop")
+    assert {view: problems for view, problems in found.items() if problems} == {}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("locale", "language"),
+    [("ru-RU", "ru"), ("zh-TW", "zh"), ("de-DE", "en")],
+)
+def test_browser_chooses_the_language(opened: Opener, locale: str, language: str) -> None:
+    page = opened(live=False, locale=locale)
+    page.locator("#link").get_by_text(LIVE[language], exact=True).wait_for()
+    assert page.locator("html").get_attribute("lang") == language
+    assert page.locator("#stopall").inner_text() == STOP_ALL[language]
+
+
+@pytest.mark.long
+def test_choice_on_the_page_wins_and_is_kept(opened: Opener) -> None:
+    page = opened(live=False, locale="ru-RU")
+    page.locator("#link").get_by_text(LIVE["ru"], exact=True).wait_for()
+    for title, language in (("中文", "zh"), ("English", "en")):
+        page.locator("#more").click()
+        with page.expect_request(lambda request, one=language: request.url.endswith(f"api/plant?lang={one}")):
+            page.get_by_label(title).click()
+        page.locator("#link").get_by_text(LIVE[language], exact=True).wait_for()
+        other = page.context.new_page()
+        other.goto(page.url)
+        other.locator("#link").get_by_text(LIVE[language], exact=True).wait_for()
+        assert other.locator("html").get_attribute("lang") == language
+        other.close()
+
+
+@pytest.mark.long
+def test_titles_of_registers_are_shown_in_the_language_of_the_gateways_answer(
+    opened: Opener, gateway: FakeGateway
+) -> None:
+    first = fake_plant.plant({})["lines"][0]
+    titled = [one | {"title": f"«{one['name']}»"} for one in first["drives"][0]["registers"]]
+    gateway.plant_changes = {"lines": [first | {"drives": [first["drives"][0] | {"registers": titled}]}]}
+    page = opened("#/drives/pump-1")
+    for place, name in (("th", "output_frequency"), ("option", "dc_bus_voltage")):
+        page.locator(f"#panel {place}", has_text=f"«{name}»").first.wait_for(state="attached")
+    assert page.get_by_role("button", name="Change «frequency_setpoint»").is_visible()
+
+
+@pytest.mark.long
+def test_page_without_its_texts_is_in_english_and_stops_drives(opened: Opener, gateway: FakeGateway) -> None:
+    page = opened(live=False, locale="ru-RU", prepare=aborting("**/page/texts.ru.json"))
+    page.locator("#link").get_by_text("live", exact=True).wait_for()
+    assert page.locator("html").get_attribute("lang") == "en"
+    page.get_by_role("button", name="Stop all", exact=True).click()
+    page.get_by_role("button", name="Stop all 31 drives").click()
+    until_met(page, lambda: gateway.posts == [("/api/stop", {"drives": None})])
+
+
+@pytest.mark.long
+def test_texts_of_the_gateway_are_translated_in_parts(opened: Opener) -> None:
+    page = opened(live=False, locale="zh-CN")
+    said = "texts => import('/page/texts.js').then(({ said }) => texts.map(said))"
+    expected = {
+        "no reply": "无应答",
+        "unconfirmed: not sent: expired": f"未确认: {TEXTS['not sent: expired']['zh']}",
+        "stopped: seen to stand after 1.2 s": "已停止: 1.2 秒后电机停稳",
+        "undervoltage (UV)": "欠电压 (UV)",
+        "terminals is not polled": "寄存器 terminals 未轮询",
+        "raw count": "原始值",
+        "constructor": "constructor",
+    }
+    assert page.evaluate(said, [*expected]) == [*expected.values()]
