@@ -13,6 +13,7 @@ from typing import cast
 import pytest
 from controlled_loop import ControlledLoop
 from controlled_loop import run_controlled as run_test
+from examples import usually
 from modbus_gateway import DONE, PATIENCE, FakeLine, Gateway, RawClient, RawReply, plant_of, request, serving
 
 from multidrop import Drive, reading
@@ -20,6 +21,14 @@ from multidrop.control import CommandResult
 from multidrop.families import InvtCHE
 from multidrop.gateway.modbus_server import clients as modbus_clients
 from multidrop.gateway.modbus_server.clients import ModbusClient, ModbusPort
+from multidrop.gateway.modbus_server.line_share import (
+    BURST_S,
+    EXPIRY_S,
+    MOST_WAITING,
+    SHARE,
+    LineShare,
+    PassingBusy,
+)
 from multidrop.gateway.modbus_server.protocol import MbapRequest, take_request
 from multidrop.gateway.modbus_server.settings import ModbusSettings
 
@@ -83,7 +92,7 @@ def transactions(written: bytes) -> list[int]:
     return found
 
 
-async def test_answers_have_their_requests_ids_and_are_sent_as_they_are_ready() -> None:
+async def test_answers_have_their_requests_ids_and_are_sent_when_ready() -> None:
     async def slow(found: MbapRequest) -> bytes:
         await asyncio.sleep(found.transaction)
         return found.reply(bytes([found.transaction]))
@@ -119,13 +128,13 @@ async def test_a_flooding_client_does_not_delay_others() -> None:
 
 
 def slowly(found: MbapRequest, _: ModbusClient) -> bytes:
-    """Answer after the event loop's clock has advanced by 0.5 ms."""
+    """Return an answer that takes 0.5 ms by the event loop's clock."""
     cast(ControlledLoop, asyncio.get_running_loop()).passing.now += 0.0005
     return found.reply(b"")
 
 
 async def test_busy_clients_share_the_time_of_one_round() -> None:
-    """A stop through any interface may have to wait for one round in which every client has a turn."""
+    """A stop through any interface may have to wait for one round, in which every client has a turn."""
     share = modbus_clients.RoundShare()
     clock = cast(ControlledLoop, asyncio.get_running_loop()).passing
     ports = [ModbusPort(slowly, lambda _: True, lambda: clock.now, share) for _ in range(2)]
@@ -246,7 +255,7 @@ def test_requests_of_a_client_that_reads_no_answers_are_read_within_limits(
         client.resume_writing()
         await asyncio.sleep(1)
         answered = transactions(transport.written[kept:])
-        assert answered == [*range(500), *range(1000, 1500)]  # as many reads as fit into the queue
+        assert answered == [*range(500), *range(1000, 1500)]  # only the reads that fit into the queue
         client.data_received(reads(7, 8))
         assert transactions(transport.written)[-1] == 7
 
@@ -284,7 +293,7 @@ async def test_a_client_beyond_the_limit_replaces_the_longest_idle_one() -> None
         found.append(connected(port)[1])
         await asyncio.sleep(0.1)
     refused = connected(port)[1]
-    assert refused.ended == "aborted"  # no client has been idle for 10 s
+    assert refused.ended == "aborted"  # none is replaced: no client was idle for 10 s
     await asyncio.sleep(modbus_clients.FORGETTABLE_S - 6.35)
     assert not connected(port)[1].ended
     assert [transport.ended for transport in found[:2]] == ["aborted", ""]
@@ -298,7 +307,7 @@ async def test_client_whose_address_is_not_listed_is_refused() -> None:
     assert not port.clients
 
 
-async def test_answers_for_a_disconnected_client_are_cancelled_after_their_start() -> None:
+async def test_a_started_answer_is_cancelled_if_its_client_disconnects() -> None:
     happened = []
 
     async def slow(found: MbapRequest) -> bytes:
@@ -363,18 +372,8 @@ def test_reset_connections_do_not_affect_other_clients() -> None:
         assert good.ask(1, 3, 0x3003, 1).words == [231]
 
 
-def test_a_port_in_use_is_reported_in_one_sentence() -> None:
-    plant = plant_of(("hall", InvtCHE(1, name="mill")))
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        number = cast(int, taken.getsockname()[1])
-        with (
-            pytest.raises(OSError, match=f"127.0.0.1:{number} cannot be opened: another program"),
-            serving(plant, ModbusSettings(listen=f"127.0.0.1:{number}")),
-        ):
-            pass
-
-
-def test_a_stop_waits_neither_for_earlier_requests_nor_for_a_client_that_reads() -> None:
+@pytest.mark.long
+def test_a_stop_waits_neither_for_earlier_requests_nor_until_answers_are_read() -> None:
     plant = plant_of(("hall", InvtCHE(1, name="mill")))
     with serving(plant, ModbusSettings(listen="127.0.0.1:0", may="stop")) as gateway:
         stopped = threading.Event()
@@ -403,11 +402,7 @@ class Ramp(Drive):
     """A device whose registers hold different numbers."""
 
 
-Wide = type(
-    "Wide",
-    (Ramp,),
-    {f"level_{at}": reading(at) for at in range(POLLED + PASSED)},
-)
+Wide = type("Wide", (Ramp,), {f"level_{at}": reading(at) for at in range(POLLED + PASSED)})
 
 
 def value(unit: int, address: int) -> int:
@@ -416,7 +411,7 @@ def value(unit: int, address: int) -> int:
 
 
 class SlowLine(FakeLine):
-    """A line that answers with the registers' numbers; some answers come after those to later requests."""
+    """A line that answers with the registers' numbers; later requests may be answered earlier."""
 
     async def ask(self, drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:
         await asyncio.sleep(0.001 * (start % 5))
@@ -447,7 +442,7 @@ def drawn(chance: random.Random) -> tuple[int, int]:
 
 
 def pipeline(client: RawClient, unit: int, requests: int) -> int:
-    """Send windows of requests, and check that each reply is right; return how many were passed on."""
+    """Send windows of requests, and check each reply; return how many requests went to the line."""
     chance = random.Random(unit)
     passed = 0
     for first in range(0, requests, WINDOW):
@@ -485,7 +480,7 @@ def all_clients(gateway: Gateway, requests: int) -> None:
         thread.join()
     if failures:
         raise failures[0]
-    assert sum(passed) > 10  # so some answers were out of order
+    assert sum(passed) > 10  # some went to the line, so answers were out of order
 
 
 @pytest.mark.long
@@ -499,14 +494,14 @@ def test_a_million_requests_are_answered_under_their_own_ids(gateway: Gateway) -
 
 
 @pytest.mark.long
-def test_client_that_reads_late_gets_all_answers(gateway: Gateway) -> None:
+def test_a_client_that_reads_its_answers_late_gets_all_of_them(gateway: Gateway) -> None:
     """The client sends all requests before it reads; meanwhile the server holds back unread answers."""
     requests = 20_000
     with gateway.client() as client:
         frames = b"".join(request(number, 1, 3, 0, 120) for number in range(requests))
         sender = threading.Thread(target=client.send, args=(frames,))
         sender.start()
-        with gateway.client() as other:  # served while the first client's answers are unread
+        with gateway.client() as other:  # served although the first client's answers are unread
             for _ in range(50):
                 assert other.ask(2, 3, 1, 1).words == expected(2, 1, 1)
         for number in range(requests):
@@ -514,3 +509,143 @@ def test_client_that_reads_late_gets_all_answers(gateway: Gateway) -> None:
             assert reply is not None
             assert (reply.transaction, reply.words) == (number, expected(1, 0, 120))
         sender.join()
+
+
+# ---- the share of a line's time that Modbus clients may use: measured, limited, and divided fairly ----
+
+
+class PacedLine:
+    """A line whose requests take `seconds` each; records their start times and how many overlapped."""
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        self.under_way = self.most = 0
+        self.begun: list[float] = []
+        self.left: list[float] = []
+
+    async def ask(self, left: float) -> list[int]:
+        self.begun.append(asyncio.get_running_loop().time())
+        self.left.append(left)
+        self.under_way += 1
+        self.most = max(self.most, self.under_way)
+        await asyncio.sleep(self.seconds)
+        self.under_way -= 1
+        return [len(self.begun)]
+
+
+async def flood(share: LineShare, line: PacedLine, seconds: float, clients: int = 3) -> int:
+    """Send requests without pause for `seconds`; return how many were answered."""
+    loop = asyncio.get_running_loop()
+    until = loop.time() + seconds
+    answered = 0
+
+    async def client(name: object) -> None:
+        nonlocal answered
+        while loop.time() < until:
+            try:
+                await share.ask(name, line.ask)
+                answered += 1
+            except PassingBusy:
+                await asyncio.sleep(0.01)
+
+    await asyncio.gather(*(client(f"client {number % clients}") for number in range(clients * 4)))
+    return answered
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seconds", usually(0.03, 0.005, 0.7))
+async def test_a_flooding_client_gets_exactly_a_fifth_of_the_line_s_time(seconds: float) -> None:
+    loop = asyncio.get_running_loop()
+    begun = loop.time()
+    share, line = LineShare(), PacedLine(seconds)
+    await flood(share, line, 60.0)
+    passed = loop.time() - begun
+    used = seconds * len(line.begun)
+    assert used <= SHARE * passed + BURST_S + seconds
+    assert used >= SHARE * 60.0 - BURST_S - 2 * seconds
+    assert line.most == 1
+
+
+@pytest.mark.long
+async def test_line_time_used_in_any_second_is_at_most_share_plus_burst() -> None:
+    share, line = LineShare(), PacedLine(0.01)
+    await flood(share, line, 30.0)
+    first = line.begun[0]
+    for second in range(28):
+        window = [at for at in line.begun if second <= at - first < second + 1]
+        assert len(window) * 0.01 <= SHARE + BURST_S + 0.01 + 1e-6
+
+
+async def test_ninth_waiting_request_is_refused_immediately() -> None:
+    share, line = LineShare(), PacedLine(0.5)
+    asked = [share.ask("one", line.ask) for _ in range(1 + MOST_WAITING)]  # the first is in progress
+    await asyncio.sleep(0)
+    with pytest.raises(PassingBusy, match="8 requests are waiting"):
+        share.ask("one", line.ask)
+    results = await asyncio.gather(*asked, return_exceptions=True)
+    assert results[0] == [1]
+    assert all(isinstance(result, PassingBusy) for result in results[1:])  # the share is used up
+
+
+async def test_request_that_waited_a_second_is_dropped() -> None:
+    loop = asyncio.get_running_loop()
+    share, line = LineShare(), PacedLine(1.5)
+    first, second = share.ask("one", line.ask), share.ask("two", line.ask)
+    begun = loop.time()
+    with pytest.raises(PassingBusy, match="within 1 s"):
+        await second
+    assert loop.time() - begun == pytest.approx(EXPIRY_S)
+    assert await first == [1]
+    await asyncio.sleep(60)
+    assert len(line.begun) == 1
+
+
+async def test_each_request_is_passed_on_with_the_seconds_left_until_it_expires() -> None:
+    share, line = LineShare(), PacedLine(0.15)
+    first, second = share.ask("one", line.ask), share.ask("one", line.ask)
+    await asyncio.gather(first, second)
+    assert line.left == [pytest.approx(1.0), pytest.approx(0.85)]
+
+
+async def test_last_request_of_a_greedy_client_is_dropped_for_another_client() -> None:
+    share, line = LineShare(), PacedLine(0.01)
+    greedy = [share.ask("greedy", line.ask) for _ in range(1 + MOST_WAITING)]
+    await asyncio.sleep(0)
+    modest = share.ask("modest", line.ask)
+    results = await asyncio.gather(*greedy, return_exceptions=True)
+    assert [isinstance(result, PassingBusy) for result in results] == [False] * MOST_WAITING + [True]
+    assert await modest
+
+
+async def test_requests_of_a_disconnected_client_are_dropped_but_the_current_one_ends() -> None:
+    share, line = LineShare(), PacedLine(0.1)
+    gone = [share.ask("gone", line.ask) for _ in range(3)]
+    stays = share.ask("stays", line.ask)
+    await asyncio.sleep(0.05)
+    for asked in gone:
+        asked.cancel()
+    assert await stays == [2]
+    assert line.most == 1
+    assert line.begun[1] - line.begun[0] >= 0.1
+
+
+async def test_failed_request_raises_for_its_client_and_the_next_one_runs() -> None:
+    async def fails(left: float) -> list[int]:
+        raise TimeoutError("no reply")
+
+    share, line = LineShare(), PacedLine(0.01)
+    first, second = share.ask("one", fails), share.ask("one", line.ask)
+    with pytest.raises(TimeoutError):
+        await first
+    assert await second == [1]
+
+
+async def test_closing_refuses_the_current_and_all_waiting_requests() -> None:
+    share, line = LineShare(), PacedLine(0.1)
+    current, waits = share.ask("one", line.ask), share.ask("one", line.ask)
+    await asyncio.sleep(0.01)
+    share.close()
+    with pytest.raises(PassingBusy, match="the gateway is shutting down"):
+        await waits
+    with pytest.raises(PassingBusy, match="the gateway is shutting down"):
+        await asyncio.wait_for(current, 1.0)

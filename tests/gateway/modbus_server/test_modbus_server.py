@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from lines import until
-from modbus_gateway import Gateway, plant_of, request, serving
+from modbus_gateway import DONE, PATIENCE, Gateway, plant_of, request, serving
 from tables import table
 
 from multidrop import (
@@ -35,10 +35,9 @@ from multidrop.core import NumberFormat
 from multidrop.drive import COIL, Kept
 from multidrop.errors import PortLost
 from multidrop.families import DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
-from multidrop.gateway.commands import BUSY
+from multidrop.gateway.commands import BUSY, MOST_STOPS
 from multidrop.gateway.http.rights import NOT_ALLOWED, NOT_LISTED, Caller, Right
 from multidrop.gateway.modbus_server.line_share import PassingBusy
-from multidrop.gateway.modbus_server.server import MOST_STOPS
 from multidrop.gateway.modbus_server.settings import ModbusSettings
 
 CHE_OUTPUT_VOLTAGE, CHE_SETPOINT, CHE_CONTROL = 0x3003, 0x2000, 0x1000  # CHE100 manual v1.4, p. 117
@@ -105,7 +104,7 @@ def test_stale_values_are_requested_from_the_drive(gateway: Gateway, why: str) -
     assert gateway.line.asked == [("mill", 3, CHE_OUTPUT_VOLTAGE, 1)]
 
 
-def test_passed_bits_are_packed_from_the_lowest_bit_on() -> None:
+def test_bits_read_from_a_drive_are_packed_from_the_lowest_bit_on() -> None:
     with (
         serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="any")) as gateway,
         gateway.client() as client,
@@ -115,18 +114,18 @@ def test_passed_bits_are_packed_from_the_lowest_bit_on() -> None:
 
 def test_undeclared_addresses_are_refused_by_default(gateway: Gateway) -> None:
     assert code(gateway, 1, 3, 0x7000, 1) == 2
-    assert code(gateway, 1, 4, CHE_OUTPUT_VOLTAGE, 1) == 2  # declared in the other table only
+    assert code(gateway, 1, 4, CHE_OUTPUT_VOLTAGE, 1) == 2  # declared only for function 3
     assert code(gateway, 4, 3, 0, 1) == 2  # this unit's drive speaks no Modbus
     assert gateway.line.asked == []
 
 
-def test_passing_any_passes_all_addresses_to_the_drive() -> None:
+def test_with_passing_any_undeclared_addresses_are_read_from_the_drive() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="any")) as gateway:
         assert code(gateway, 1, 4, 0x7000, 2) is None
         assert gateway.line.asked == [("mill", 4, 0x7000, 2)]
 
 
-def test_passing_off_sends_no_read_to_the_drive() -> None:
+def test_with_passing_off_no_read_is_sent_to_the_drive() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="off")) as gateway:
         gateway.hub.values["mill", "output_voltage"] = 231.0
         assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) is None
@@ -154,7 +153,7 @@ def test_value_from_before_a_write_is_not_used_after_the_write(gateway: Gateway)
 
 
 def test_value_from_before_a_command_is_not_used_after_a_reload(gateway: Gateway) -> None:
-    """The command came through another interface."""
+    """The command was sent through another interface."""
     gateway.hub.ages["mill", "output_voltage"] = 0.2
     with gateway.client() as client:
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
@@ -164,10 +163,7 @@ def test_value_from_before_a_command_is_not_used_after_a_reload(gateway: Gateway
 
 
 @table("function", [1, 2, 3, 4])
-@table(
-    ("start", "count", "expected"),
-    [(0, 0, 3), (0, 2001, 3), (0xFFFF, 2, 2), (0x7000, 1, 2)],
-)
+@table(("start", "count", "expected"), [(0, 0, 3), (0, 2001, 3), (0xFFFF, 2, 2), (0x7000, 1, 2)])
 def test_invalid_address_ranges_have_exception_codes(
     gateway: Gateway, function: int, start: int, count: int, expected: int
 ) -> None:
@@ -194,7 +190,7 @@ def test_unsupported_functions_are_refused(gateway: Gateway, function: int) -> N
     assert (gateway.line.asked, gateway.commands.written, gateway.commands.stopped) == ([], [], [])
 
 
-def test_unknown_unit_id_is_answered_with_no_path(gateway: Gateway) -> None:
+def test_an_unknown_unit_id_is_answered_with_the_exception_for_no_path(gateway: Gateway) -> None:
     for unit in (5, 247, 255):
         assert code(gateway, unit, 3, 0, 1) == 0x0A
         assert code(gateway, unit, 6, 0, 1) == 0x0A
@@ -227,7 +223,7 @@ FAILURES = [
 
 
 @pytest.mark.parametrize(("failure", "expected"), FAILURES, ids=lambda one: type(one).__name__)
-def test_error_of_a_passed_read_has_its_exception_code(
+def test_a_failed_read_from_a_drive_has_the_exception_code_of_its_error(
     gateway: Gateway, failure: Exception, expected: int
 ) -> None:
     gateway.hub.values.clear()
@@ -236,7 +232,7 @@ def test_error_of_a_passed_read_has_its_exception_code(
 
 
 @pytest.mark.slow
-def test_passed_reads_beyond_the_queue_are_answered_busy(gateway: Gateway) -> None:
+def test_reads_that_find_the_queue_full_are_answered_busy(gateway: Gateway) -> None:
     gateway.hub.values.clear()
     gateway.line.seconds = 0.6  # three times BURST_S
     with gateway.client() as client:
@@ -244,7 +240,7 @@ def test_passed_reads_beyond_the_queue_are_answered_busy(gateway: Gateway) -> No
         replies = [client.receive() for _ in range(12)]
     codes = {reply.transaction: reply.code for reply in replies if reply is not None}
     assert codes == {0: None, **dict.fromkeys(range(1, 12), 6)}
-    assert len(gateway.line.asked) == 1  # no line time is left for 2 s, so the others expire
+    assert len(gateway.line.asked) == 1  # no line time is left for 2 s, so the other reads expire
 
 
 # ---- writes ----
@@ -272,7 +268,7 @@ def test_write_is_carried_out_by_commands_and_echoed(gateway: Gateway) -> None:
 @table(
     ("function", "words", "data", "expected"),
     [
-        (6, (0x7000, 1), b"", 2),  # no register at this address
+        (6, (0x7000, 1), b"", 2),  # 2: no register at this address
         (6, (0, 1), b"", 2),  # a read-only register
         (6, (2, 1), b"", 3),  # the first half of a register
         (6, (3, 1), b"", 2),  # the second half of a register
@@ -308,7 +304,7 @@ OUTCOMES = [
     (Unconfirmed("mill", "setpoint", "no reply"), 0x0B),
     (NoReply("mill"), 0x0B),
     (NotVerified("mill", "setpoint", "it holds 49"), 4),
-    (BusError("mill: setpoint was taken as 49"), 4),  # an Outcome of Effect.TAKEN_AS
+    (BusError("mill: setpoint was taken as 49"), 4),  # raised for Effect.TAKEN_AS
     (DriveException("mill", 6, "busy"), 6),
     (DriveException("mill", 4, "failure"), 4),
     (PortLost("/dev/ttyUSB0", "vanished"), 0x0A),
@@ -361,7 +357,7 @@ def test_every_write_that_means_stop_calls_a_stop(gateway: Gateway) -> None:
         assert client.ask(3, 6, IBD_CONTROL, IBD_STOP).code is None
         assert client.ask(3, 6, IBD_CONTROL, 0).code == 3  # 0 means "no command" and stops no motor
         for yes in (1, 2, 0xFF00, 0xFFFF):  # values that masters use for "true"
-            assert client.ask(4, 6, BLOCK + 10, yes).code is None  # works for Delixi's own protocol too
+            assert client.ask(4, 6, BLOCK + 10, yes).code is None  # also with Delixi's own protocol
     stopped = [drives for drives, _ in gateway.commands.stopped]
     assert stopped == [["mill"]] * 4 + [["pump"]] + [["belt"]] * 4
 
@@ -394,8 +390,8 @@ MIXED = {  # unit, address and words of writes that contain a stop
 }
 
 
-@pytest.mark.parametrize("mixed", MIXED)
-@pytest.mark.parametrize("may", ["stop", "write"])
+@table("mixed", MIXED)
+@table("may", ["stop", "write"])
 def test_stop_in_a_write_of_several_words_is_sent_alone(mixed: str, may: str) -> None:
     unit, address, words = MIXED[mixed]
     data = struct.pack(f">B{len(words)}H", 2 * len(words), *words)
@@ -409,10 +405,10 @@ def test_stop_in_a_write_of_several_words_is_sent_alone(mixed: str, may: str) ->
 
 
 def test_stop_in_a_write_of_several_coils_is_sent_alone() -> None:
-    """Start off, stop on, emergency stop off: the ER-G-220's coils 0 to 2 (section 10)."""
+    """The write sets start off, stop on, emergency stop off: coils 0 to 2 of the ER-G-220."""
     drives = plant_of(("hall", ErmanERG220(1, name="mixer")))
     with serving(drives, ModbusSettings(listen="127.0.0.1:0", may="write")) as gateway:
-        assert code(gateway, 1, 15, 0, 3, data=b"\1\1") == 3  # the write has a start but no stop
+        assert code(gateway, 1, 15, 0, 3, data=b"\1\1") == 3  # this write contains a start but no stop
         assert gateway.commands.stopped == []
         assert code(gateway, 1, 15, 0, 3, data=b"\1\2") == 3
         until(lambda: bool(gateway.commands.stopped))  # the answer does not wait for the stop
@@ -435,50 +431,41 @@ def test_read_only_gateway_ignores_a_stop_in_a_write_of_several_words() -> None:
         assert gateway.commands.stopped == []
 
 
-def stop_slowly(gateway: Gateway, seconds: float) -> threading.Event:
-    """Make stops take this many seconds; return an event that is set when a stop has ended."""
-    ended = threading.Event()
+class HeldCommands:
+    """Makes commands wait until `release` is set; with `only_writes`, stops end immediately."""
 
-    async def slowly() -> CommandResult:
-        await asyncio.sleep(seconds)
-        ended.set()
-        return CommandResult(CommandOutcome.DONE, "stopped")
+    def __init__(self, gateway: Gateway, *, only_writes: bool = False) -> None:
+        self.release, self.ended = threading.Event(), threading.Event()
+        self._commands, self._only_writes = gateway.commands, only_writes
+        gateway.commands.told = self._carry_out
 
-    gateway.commands.told = slowly
-    return ended
-
-
-@pytest.mark.slow
-def test_slow_stop_is_answered_with_acknowledge_and_continues(gateway: Gateway) -> None:
-    ended = stop_slowly(gateway, 1.0)
-    with gateway.client() as client:
-        assert client.ask(1, 6, CHE_CONTROL, 5).code == 5
-    assert ended.wait(30)
+    async def _carry_out(self) -> CommandResult:
+        is_stop = bool(self._commands.stopped)
+        while not (self.release.is_set() or (self._only_writes and is_stop)):
+            await asyncio.sleep(0.01)
+        self.ended.set()
+        return DONE
 
 
-def test_stop_continues_after_its_client_is_disconnected(gateway: Gateway) -> None:
-    ended = stop_slowly(gateway, 0.2)
+@pytest.mark.parametrize("is_disconnected", [False, True])
+def test_slow_stop_is_answered_with_acknowledge_and_continues(
+    gateway: Gateway, is_disconnected: bool
+) -> None:
+    held = HeldCommands(gateway)
     with gateway.client() as client:
         client.send(request(1, 1, 6, CHE_CONTROL, 5))
-        client.send(b"\xff" * 20)  # garbage: the server closes the connection
-        client.receive()
-    assert ended.wait(30)
+        if is_disconnected:
+            client.send(b"\xff" * 20)  # garbage: the server closes the connection
+        reply = client.receive()
+        assert (reply and reply.code) == (None if is_disconnected else 5)
+    assert not held.ended.is_set()
+    held.release.set()
+    assert held.ended.wait(PATIENCE)
 
 
 def test_a_stop_does_not_wait_for_earlier_requests_of_its_client(gateway: Gateway) -> None:
     """Sixteen writes hang; the stop that follows them is called immediately."""
-    stopped = threading.Event()
-    hang = threading.Event()
-
-    async def hanging() -> CommandResult:
-        if gateway.commands.stopped:
-            stopped.set()
-            return CommandResult(CommandOutcome.DONE, "stopped")
-        while not hang.is_set():
-            await asyncio.sleep(0.01)
-        return CommandResult(CommandOutcome.DONE, "written")
-
-    gateway.commands.told = hanging
+    held = HeldCommands(gateway, only_writes=True)
     with gateway.client() as client:
         for number in range(16):
             client.send(request(number, 1, 6, CHE_SETPOINT, number))
@@ -490,27 +477,19 @@ def test_a_stop_does_not_wait_for_earlier_requests_of_its_client(gateway: Gatewa
         reply = client.receive()
         assert reply is not None
         assert (reply.transaction, reply.code) == (17, None)
-        assert stopped.is_set()
-        hang.set()
+        held.release.set()
         assert {reply.transaction for _ in range(16) if (reply := client.receive())} == set(range(16))
 
 
 def test_concurrent_stops_are_limited_and_each_request_is_answered(gateway: Gateway) -> None:
-    release = threading.Event()
-
-    async def hanging() -> CommandResult:
-        while not release.is_set():
-            await asyncio.sleep(0.01)
-        return CommandResult(CommandOutcome.DONE, "stopped")
-
-    gateway.commands.told = hanging
+    held = HeldCommands(gateway)
     with gateway.client() as client:
         for number in range(100):
             client.send(request(number, 1, 6, CHE_CONTROL, 5))
         codes = [reply.code for _ in range(100) if (reply := client.receive())]
         assert codes == [5] * 100
         assert len(gateway.commands.stopped) == MOST_STOPS
-        release.set()
+        held.release.set()
 
 
 @table(
@@ -570,7 +549,7 @@ def test_common_block_of_a_running_drive_has_its_values(gateway: Gateway) -> Non
     assert gateway.line.asked == []
 
 
-def test_large_numbers_use_both_words(gateway: Gateway) -> None:
+def test_large_numbers_use_both_words_in_the_common_block(gateway: Gateway) -> None:
     gateway.hub.values["mill", "output_frequency"] = 1500.0
     assert block(gateway)[2:4] == [2, 0x49F0]  # 150000
 

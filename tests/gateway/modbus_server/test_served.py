@@ -1,23 +1,34 @@
-"""The Modbus server as a part of the gateway: from `[serve.modbus]` in a plant file to line and audit log."""
+"""The Modbus server as a part of the gateway, set up by the table `[serve.modbus]` of a plant file."""
 
 from __future__ import annotations
 
-import asyncio
+import re
 import socket
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import pytest
+from gateways import gateway_of
 from lines import until
-from modbus_gateway import RawClient, RawReply, request
-from peers import require_module
+from modbus_gateway import RawClient, RawReply, plant_of, request
+from tables import table
 
-from multidrop import InvtCHE, Plant, PlantError
+from multidrop import Drive, InvtCHE, Plant, PlantError, load_family, reading, setting, text
 from multidrop.control import read_audit
+from multidrop.drive import COIL, HOLDING, Carrier
+from multidrop.families import MODELS, InnovertIBD
+from multidrop.families.registry import find_model
+from multidrop.gateway.modbus_server import clients as modbus_clients
+from multidrop.gateway.modbus_server import common_block
+from multidrop.gateway.modbus_server import line_share as passing
+from multidrop.gateway.modbus_server.protocol import ModbusCode
+from multidrop.gateway.modbus_server.settings import ModbusSettings
+from multidrop.gateway.modbus_server.unit_ids import MAIN, StopWrite, Unit, Units
 from multidrop.gateway.settings import read_settings
+from multidrop.plant.model import PolledDrive
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 PLANT = """
@@ -41,51 +52,8 @@ address = 1
 every = "50 ms"
 poll = ["output_voltage", "status"]
 """
-SETPOINT, CONTROL, OUTPUT_VOLTAGE, OUTPUT_CURRENT = (
-    0x2000,
-    0x1000,
-    0x3003,
-    0x3004,
-)  # CHE100 manual v1.4, p. 117
-
-
-@contextmanager
-def gateway_of(path: Path) -> Iterator[Any]:
-    """Run the gateway of a plant file in a thread until the `with` block is left."""
-    require_module("uvicorn")
-    from multidrop.gateway.gateway import Gateway
-
-    ready = threading.Event()
-    found: list[Any] = []
-    failures: list[BaseException] = []
-    loop = asyncio.new_event_loop()
-
-    async def main() -> None:
-        plant = Plant.load(path)
-        gateway = Gateway(plant, read_settings(plant, {}))
-        found.append(gateway)
-        await gateway.run(ready.set)
-
-    def run() -> None:
-        try:
-            loop.run_until_complete(main())
-        except BaseException as failure:
-            failures.append(failure)
-        finally:
-            ready.set()
-            loop.close()
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        assert ready.wait(60)
-        if failures:
-            raise failures[0]
-        yield found[0]
-    finally:
-        if not loop.is_closed():
-            loop.call_soon_threadsafe(found[0].end)
-        thread.join()
+# CHE100 manual v1.4, p. 117
+SETPOINT, CONTROL, OUTPUT_VOLTAGE, OUTPUT_CURRENT = 0x2000, 0x1000, 0x3003, 0x3004
 
 
 @contextmanager
@@ -113,11 +81,10 @@ def reply_to(client: RawClient, *words: int) -> RawReply:
 def test_drives_of_a_plant_file_are_read_written_and_stopped(tmp_path: Path) -> None:
     with simulated_plant(tmp_path) as (drive, path), gateway_of(path) as gateway:
         drive["output_voltage"] = 231
-        server = gateway.feeds["modbus"]
+        server: Any = gateway.feeds["modbus"]
         with RawClient(server.ports[""]) as client:
-            until(lambda: reply_to(client, 3, OUTPUT_VOLTAGE, 1).words == [231] and server.answered["cached"])
+            until(lambda: reply_to(client, 3, OUTPUT_VOLTAGE, 1).words == [231])
             assert reply_to(client, 3, OUTPUT_CURRENT, 1).words == [0]  # not polled, so read from the drive
-            assert server.answered["passed"] > 0
             assert reply_to(client, 6, SETPOINT, 5000).code is None
             assert reply_to(client, 3, SETPOINT, 1).words == [5000]
             assert reply_to(client, 6, CONTROL, 1).code == 3
@@ -136,12 +103,13 @@ def test_a_port_in_use_is_reported_before_polling(tmp_path: Path) -> None:
     with simulated_plant(tmp_path) as (drive, path), socket.create_server(("127.0.0.1", 0)) as taken:
         number = taken.getsockname()[1]
         path.write_text(path.read_text().replace(':0"\nmay', f':{number}"\nmay'))
-        with pytest.raises(ValueError, match=f"127.0.0.1:{number} cannot be opened"), gateway_of(path):
+        sentence = f"127.0.0.1:{number} cannot be opened: another program"
+        with pytest.raises(ValueError, match=sentence), gateway_of(path):
             pass
         assert drive.counters.requests == 0
 
 
-def test_mistakes_in_the_table_are_reported_with_their_place(tmp_path: Path) -> None:
+def test_mistakes_in_the_modbus_table_are_reported_with_their_place(tmp_path: Path) -> None:
     with simulated_plant(tmp_path) as (_, path):
         text = path.read_text()
         path.write_text(
@@ -156,3 +124,248 @@ def test_mistakes_in_the_table_are_reported_with_their_place(tmp_path: Path) -> 
         path.write_text(text.replace("mill = 21", "mil = 21"))
         with pytest.raises(PlantError, match="units: there is no drive 'mil'; did you mean mill"):
             read_settings(Plant.load(path), {})
+
+
+# ---- the table [serve.modbus]: its mistakes, and the clients that may connect ----
+
+
+@table(
+    ("settings", "sentence"),
+    [
+        ({"listen": "1502"}, '"1502" is not an address and port; write listen = "127.0.0.1:1502"'),
+        ({"listen": "example.org:1502"}, "is open to other machines"),
+        ({"listen": "127.0.0.1:70000"}, "is not an address and port"),
+        ({"listen": "0.0.0.0:1502"}, "is open to other machines, and Modbus has no tokens"),
+        ({"listen": "[::]:1502"}, "is open to other machines"),
+        ({"passing": "all"}, "passing = 'all' is not one of off, declared, any"),
+        ({"may": "root"}, "may = 'root' is not one of look, stop, write"),
+        ({"units": {"pump": 0}}, "pump = 0 is not a unit id"),
+        ({"units": {"pump": True}}, "pump = True is not a unit id"),
+        ({"ports": {"hall": 1502}}, "hall = 1502 is in use by listen"),
+        ({"ports": {"hall": "x"}}, "hall = 'x' is not a port"),
+        ({"clients": ("10.0.0.0/33",)}, "'10.0.0.0/33' is neither an address nor a network"),
+        ({"common": 0xFFF8}, "is not an address"),
+    ],
+)
+def test_a_mistake_in_the_settings_is_reported_in_one_sentence(
+    settings: dict[str, object], sentence: str
+) -> None:
+    with pytest.raises(ValueError, match=r"^[\w\"]+") as mistake:
+        ModbusSettings(**settings)  # type: ignore[arg-type]
+    assert sentence in str(mistake.value)
+
+
+def test_all_mistakes_are_reported_together() -> None:
+    with pytest.raises(ValueError, match="listen") as mistake:
+        ModbusSettings(listen="x", passing="all", may="root", clients=("y",))
+    assert len(str(mistake.value).splitlines()) == 4
+
+
+def test_only_listed_clients_may_connect_or_local_ones_without_a_list() -> None:
+    alone = ModbusSettings()
+    assert [alone.may_connect(address) for address in ("127.0.0.1", "::1", "10.0.0.5")] == [True, True, False]
+    named = ModbusSettings(listen="0.0.0.0:1502", clients=("10.0.0.0/24", "fe80::1"))
+    for address, may in (
+        ("10.0.0.5", True),
+        ("::ffff:10.0.0.5", True),
+        ("10.0.1.5", False),
+        ("fe80::1%eth0", True),
+        ("127.0.0.1", False),
+    ):
+        assert named.may_connect(address) is may
+
+
+# ---- the documentation of the Modbus server: its plant files load, and its tables match the code ----
+
+
+DOCS = Path(__file__).parents[3] / "docs"
+HOWTO = (DOCS / "howto" / "modbus-server.md").read_text("utf-8")
+REFERENCE = (DOCS / "reference" / "modbus-server.md").read_text("utf-8")
+PLANTS = re.findall(r"```toml\n# ([\w-]+\.toml)\n(.*?)```", HOWTO, re.DOTALL)
+
+
+@table(("name", "text"), PLANTS, ids=[name for name, _ in PLANTS])
+def test_plant_files_in_the_how_to_page_load(tmp_path: Path, name: str, text: str) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    assert isinstance(read_settings(Plant.load(path), {}).parts["modbus"], ModbusSettings)
+
+
+def rows(heading: str) -> dict[str, str]:
+    table = REFERENCE.partition(f"## {heading}\n")[2].partition("\n## ")[0]
+    found = (line.strip("| ").split(" | ", 1) for line in re.findall(r"^\|.*\|$", table, re.MULTILINE)[2:])
+    return {name.strip("` "): rest for name, rest in found}
+
+
+def test_every_settings_key_has_a_row_in_the_page() -> None:
+    assert list(rows("`[serve.modbus]`")) == [one.name for one in fields(ModbusSettings)]
+    for name, rest in rows("`[serve.modbus]`").items():
+        default = getattr(ModbusSettings(), name)
+        if name in ("listen", "passing", "may"):
+            assert f'"{default}"' in rest
+
+
+def test_every_exception_code_has_a_row_in_the_page() -> None:
+    assert set(rows("Exceptions")) == {f"{code:02X}" for code in ModbusCode} | {"others"}
+
+
+def test_the_common_block_is_laid_out_as_the_page_says() -> None:
+    offsets = [int(address.rstrip("H"), 16) - ModbusSettings().common for address in rows("The common block")]
+    layout = common_block
+    assert offsets == [
+        *(layout.STATE, layout.FAULT, layout.FREQUENCY, layout.CURRENT, layout.SETPOINT),
+        *(layout.AGE, layout.STOP, layout.STOP + 1),
+    ]
+    sizes = [int(rest.split(" | ")[0]) for rest in rows("The common block").values()]
+    assert sum(sizes) == common_block.COMMON_LENGTH
+    states = re.findall(r"(\d) (\w+)", next(iter(rows("The common block").values())).partition("state: ")[2])
+    assert {name: int(number) for number, name in states} == common_block.STATES
+
+
+def test_the_limits_of_clients_are_as_the_page_says() -> None:
+    text = REFERENCE.partition("## Clients")[2]
+    numbers = [int(number) for number in re.findall(r"\d+", text)]
+    assert numbers == [
+        *(modbus_clients.MOST_CLIENTS, modbus_clients.FORGETTABLE_S, modbus_clients.MOST_UNDER_WAY),
+        *(passing.MOST_WAITING, modbus_clients.IDLE_S, modbus_clients.STALLED_S),
+        *(modbus_clients.MOST_BEHIND // 1024, 6, modbus_clients.MOST_UNTAKEN // 1024),
+    ]
+
+
+# ---- unit ids: a drive's address if it is unique; all clashes are reported at once ----
+
+
+FAMILIES = Path(__file__).parents[3] / "src" / "multidrop" / "families" / "shipped"
+
+
+def numbers(units: Units) -> dict[tuple[str, int], str]:
+    return {(port, number): unit.drive.name for port, number, unit in units}
+
+
+def test_unit_id_is_the_drives_address() -> None:
+    units = Units(
+        plant_of(("hall", InnovertIBD(1, name="pump")), ("yard", InvtCHE(9, name="mill"))), ModbusSettings()
+    )
+    assert numbers(units) == {(MAIN, 1): "pump", (MAIN, 9): "mill"}
+    found = units.find(MAIN, 9)
+    assert found is not None
+    assert (found.drive.name, found.line) == ("mill", "yard")
+    assert units.find(MAIN, 2) is None
+    assert units.find("yard", 9) is None
+
+
+def test_all_clashing_unit_ids_are_reported_with_the_free_ones() -> None:
+    plant = plant_of(
+        ("hall", InnovertIBD(1, name="pump")),
+        ("hall", InnovertIBD(2, name="fan")),
+        ("yard", InvtCHE(1, name="mill")),
+        ("yard", InvtCHE(2, name="saw")),
+        ("yard", InvtCHE(5, name="belt")),
+    )
+    with pytest.raises(ValueError, match="unit 1 would be") as mistake:
+        Units(plant, ModbusSettings())
+    first, second, last = str(mistake.value).splitlines()
+    assert first == "unit 1 would be pump (line hall) and mill (line yard)"
+    assert second == "unit 2 would be fan (line hall) and saw (line yard)"
+    assert 'such as units = { "mill" = 3 }' in last
+    assert last.endswith("free numbers: 3 to 4, 6 to 247")
+
+
+def test_configured_unit_id_or_port_resolves_a_clash() -> None:
+    plant = plant_of(("hall", InnovertIBD(1, name="pump")), ("yard", InvtCHE(1, name="mill")))
+    assert numbers(Units(plant, ModbusSettings(units={"mill": 21}))) == {
+        (MAIN, 1): "pump",
+        (MAIN, 21): "mill",
+    }
+    own = Units(plant, ModbusSettings(ports={"yard": 1503}))
+    assert numbers(own) == {(MAIN, 1): "pump", ("yard", 1): "mill"}
+
+
+def test_configured_unit_id_that_clashes_is_reported() -> None:
+    plant = plant_of(("hall", InnovertIBD(1, name="pump")), ("yard", InvtCHE(9, name="mill")))
+    with pytest.raises(ValueError, match=r"unit 1 would be pump .* and mill"):
+        Units(plant, ModbusSettings(units={"mill": 1}))
+
+
+def test_unknown_drives_and_lines_in_the_settings_are_reported() -> None:
+    plant = plant_of(("hall", InnovertIBD(1, name="pump")))
+    with pytest.raises(ValueError, match="units: there is no drive 'pumb'") as mistake:
+        Units(plant, ModbusSettings(units={"pumb": 3}, ports={"hal": 1503}))
+    assert str(mistake.value).splitlines()[1].endswith("there is no line 'hal'; did you mean hall?")
+
+
+def test_drive_with_address_0_cannot_be_a_unit() -> None:
+    class Behind(Drive):
+        addresses = range(256)
+        level = reading(0, "m")
+
+    with pytest.raises(ValueError, match=r"meter \(line net\) cannot be unit 0, but 1 to 255"):
+        Units(plant_of(("net", Behind(0, name="meter", framing="tcp"))), ModbusSettings())
+    assert numbers(Units(plant_of(("net", Behind(255, name="meter", framing="tcp"))), ModbusSettings())) == {
+        (MAIN, 255): "meter"
+    }
+
+
+def test_common_block_must_not_overlap_registers() -> None:
+    class Parameters(Drive):
+        frequency_source = setting(0xF003)
+
+    plant = plant_of(("hall", Parameters(1, name="pump")))
+    with pytest.raises(ValueError, match="pump has registers at F003H, in the range of the common block"):
+        Units(plant, ModbusSettings())
+    Units(plant, ModbusSettings(common=0xE000))
+
+
+def test_no_family_has_registers_in_the_range_of_the_common_block() -> None:
+    families = [find_model(name) for name in MODELS] + [load_family(path) for path in FAMILIES.glob("*.toml")]
+    assert len(families) > 10
+    common = set(ModbusSettings().common_addresses)
+    for family in families:
+        unit = Unit("hall", PolledDrive(family(family.addresses[0]), ()))
+        assert not unit.holding_addresses() & common
+
+
+# ---- units ----
+
+
+@table(
+    ("model", "register", "raw"),
+    [  # stop commands as the manuals print them
+        ("erman-er-g-220", "stop_coil", 1),
+        ("invt-che", "control", 5),
+        ("invt-che", "control", 6),  # coast
+        ("innovert-ibd", "control", 1),
+        ("delixi-modbus", "control", 1),
+        ("invt-che", "control", 8),  # jog stop
+        ("yd1000", "control", 0xC000),
+        ("yd1000", "control", 0x8000),  # manual section 8.1
+        ("optidrive-e3", "control", 0),
+        ("delta-ms300", "control", 1),
+    ],
+)
+def test_unit_has_the_stop_writes_of_its_family(model: str, register: str, raw: int) -> None:
+    unit = Unit("hall", PolledDrive(find_model(model)(1), ()))
+    assert StopWrite(register, raw) in unit.stops
+
+
+def test_raw_value_without_effect_is_not_a_stop() -> None:
+    unit = Unit("hall", PolledDrive(InnovertIBD(1), ()))
+    assert unit.stops == {StopWrite("control", 1)}  # 0 means "no command", and is not a stop
+
+
+def test_addresses_of_registers_texts_and_readable_gaps_count_as_declared() -> None:
+    class Meter(Drive):
+        readable_gaps = {HOLDING: range(10, 20)}
+        level = reading(9, "m")
+        relay = setting(3, table=COIL)
+        serial = text(20, 4)
+
+    unit = Unit("hall", PolledDrive(Meter(1), ()))
+    assert unit.is_declared(3, range(9, 24))
+    assert not unit.is_declared(3, range(9, 25))
+    assert not unit.is_declared(4, range(9, 10))
+    assert unit.is_declared(1, range(3, 4))
+    assert not unit.is_declared(2, range(3, 4))
+    assert unit.writable(Carrier.BIT, 3) is Meter.relay
+    assert unit.writable(Carrier.WORD, 9) is None
+    assert unit.writable(Carrier.WORD, 3) is None

@@ -11,8 +11,7 @@ from enum import IntEnum
 from typing import Any, NamedTuple
 
 import pytest
-from batches import UTC_0, completion
-from completions import add_rows
+from batches import UTC_0, add_rows, completion
 from examples import PART
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -21,6 +20,7 @@ from tables import table
 from multidrop.core import Columns, Names, NumberFormat, RowLayout
 from multidrop.drive import Drive
 from multidrop.drive.register import COIL, DISCRETE, HOLDING, INPUT, Register, reading, row_field
+from multidrop.gateway.modbus_server.protocol import Garbage, MbapRequest, take_request
 from multidrop.gateway.modbus_server.words import DriveWords, Lack, exact_data
 from multidrop.plant.model import Polled, PolledDrive
 from multidrop.polling.batch import Batch
@@ -80,12 +80,12 @@ def sent(draw: st.DrawFn) -> tuple[NumberFormat, str, float, float, bytes]:
 @example((NumberFormat.F32, "ABCD", 1, 0, b"\0\0\0\x01"))  # the smallest positive float
 @example((NumberFormat.U64, "ABCD", 1, 0, (2**53 + 1).to_bytes(8)))  # not representable as float64
 @example((NumberFormat.U64, "ABCD", 0.1, 0, (2**53 + 1).to_bytes(8)))
-@example((NumberFormat.U64, "ABCD", 60, 0, (2**53 + 1).to_bytes(8)))  # the raw count has no float64 either
+@example((NumberFormat.U64, "ABCD", 60, 0, (2**53 + 1).to_bytes(8)))  # nor is its raw count
 @example((NumberFormat.I64, "ABCD", 1, 0, (-(2**53) - 1).to_bytes(8, signed=True)))
 @example((NumberFormat.F64, "ABCD", 0.1, 0, struct.pack(">d", 0.30000000000000004)))
-@example((NumberFormat.F64, "ABCD", 1, 1000, struct.pack(">d", 1e-20)))  # lost when the offset is added
+@example((NumberFormat.F64, "ABCD", 1, 1000, struct.pack(">d", 1e-20)))  # adding the offset loses this value
 @example((NumberFormat.F32, "ABCD", 1, 273.15, struct.pack(">f", 1e-20)))
-def test_computed_words_equal_the_drives_words_or_are_none(
+def test_words_computed_from_a_row_are_the_drives_words_or_unknown(
     case: tuple[NumberFormat, str, float, float, bytes],
 ) -> None:
     number_format, order, step, offset, data = case
@@ -96,7 +96,7 @@ def test_computed_words_equal_the_drives_words_or_are_none(
 
 
 @given(st.sampled_from(WHOLE), st.sampled_from(STEPS), st.sampled_from(OFFSETS), st.data())
-def test_integer_values_always_have_words(
+def test_words_are_known_for_all_integer_values(
     number_format: NumberFormat, step: float, offset: float, data: st.DataObject
 ) -> None:
     size = BYTES[number_format]
@@ -110,7 +110,7 @@ def test_integer_values_always_have_words(
 
 @pytest.mark.slow
 def test_every_raw_count_of_16_bits_has_its_word() -> None:
-    """By default every seventh count is tested."""
+    """By default, only every 19th raw count is tested."""
     for step in (0.1, 0.01, -0.25):
         register = declared(step=step)
         for raw in range(0, 0x10000, 2 * PART - 1):
@@ -119,7 +119,7 @@ def test_every_raw_count_of_16_bits_has_its_word() -> None:
 
 
 @given(st.floats(width=32, allow_nan=False).filter(bool), st.sampled_from(ORDERS))
-def test_floats_other_than_zero_have_words(number: float, order: str) -> None:
+def test_words_are_known_for_floats_other_than_zero(number: float, order: str) -> None:
     register = declared(number_format=NumberFormat.F32, order=order)
     data = struct.pack(">f", number)
     places = {"ABCD": (0, 1, 2, 3), "CDAB": (2, 3, 0, 1), "BADC": (1, 0, 3, 2), "DCBA": (3, 2, 1, 0)}[order]
@@ -131,7 +131,7 @@ def test_floats_other_than_zero_have_words(number: float, order: str) -> None:
 
 
 @table("value", [math.inf, -math.inf, math.nan, 1e300, 0.3, -1, 65536, 2**70])
-def test_value_without_a_raw_count_has_no_words(value: float) -> None:
+def test_words_are_unknown_for_a_value_without_a_raw_count(value: float) -> None:
     assert exact_data(declared(), value) is None
 
 
@@ -144,11 +144,11 @@ def test_value_without_a_raw_count_has_no_words(value: float) -> None:
         {"invalid": 5},  # the raw count that means "no value"
     ],
 )
-def test_format_that_leaves_bits_undefined_has_no_words(details: dict[str, Any]) -> None:
+def test_words_are_unknown_for_a_format_that_leaves_bits_undefined(details: dict[str, Any]) -> None:
     assert exact_data(declared(**details), 5.0) is None
 
 
-def test_register_with_a_scale_register_has_no_words() -> None:
+def test_words_are_unknown_for_a_register_with_a_scale_register() -> None:
     family = type(
         "Scaled",
         (Drive,),
@@ -250,3 +250,75 @@ def test_rows_from_before_a_write_are_not_used() -> None:
 def test_newest_row_of_registers_at_the_same_address_is_used() -> None:
     assert read(3, 0, 1, again=FakeRow(NOW, 14.49)) == [1449]
     assert read(3, 0, 1, speed=FakeRow(NOW, None)) == [1450]
+
+
+# ---- MBAP: requests are parsed correctly however their bytes are divided ----
+
+
+# MODBUS Messaging on TCP/IP Implementation Guide V1.0b, 4.4.2.1 and the example of section 3.1.3:
+# transaction 1501H, protocol 0, length 6, unit FFH, function 03, start 0004H, count 0001H
+PRINTED = bytes.fromhex("15 01 00 00 00 06 FF 03 00 04 00 01")
+
+
+def test_example_of_the_modbus_guide_is_parsed_and_answered() -> None:
+    buffer = bytearray(PRINTED)
+    found = take_request(buffer)
+    assert found == MbapRequest(0x1501, 0xFF, 3, bytes.fromhex("00 04 00 01"))
+    assert not buffer
+    assert found.reply(bytes.fromhex("02 00 05")) == bytes.fromhex("15 01 00 00 00 05 FF 03 02 00 05")
+    assert found.exception(2) == bytes.fromhex("15 01 00 00 00 03 FF 83 02")
+
+
+def test_request_that_arrives_byte_by_byte_is_parsed() -> None:
+    buffer = bytearray()
+    for byte in PRINTED[:-1]:
+        buffer.append(byte)
+        assert take_request(buffer) is None
+    buffer.append(PRINTED[-1])
+    assert take_request(buffer) is not None
+
+
+@table(
+    "header",
+    [
+        "00 01 00 01",  # another protocol id
+        "00 01 FF FF 00 06 01 03",
+        "47 45 54 20",  # GET
+        "16 03 01 02",  # TLS
+        "00 01 00 00 00 00",
+        "00 01 00 00 00 01",
+        "00 01 00 00 00 FF",  # one byte longer than the longest frame
+        "00 01 00 00 FF FF",
+    ],
+)
+def test_an_invalid_header_raises_garbage_as_soon_as_it_arrives(header: str) -> None:
+    with pytest.raises(Garbage):
+        take_request(bytearray.fromhex(header))
+
+
+frames = st.builds(
+    lambda transaction, unit, function, data: (
+        struct.pack(">HHHBB", transaction, 0, 2 + len(data), unit, function) + data
+    ),
+    st.integers(0, 0xFFFF),
+    st.integers(0, 255),
+    st.integers(0, 255),
+    st.binary(max_size=252),
+)
+
+
+@given(st.lists(frames, max_size=6), st.lists(st.integers(1, 40), min_size=1, max_size=40))
+def test_requests_are_parsed_the_same_however_their_bytes_arrive(sent: list[bytes], cuts: list[int]) -> None:
+    whole = b"".join(sent)
+    buffer, found, at = bytearray(), [], 0
+    while at < len(whole):
+        size = cuts[len(found) % len(cuts)]
+        buffer += whole[at : at + size]
+        at += size
+        while taken := take_request(buffer):
+            found.append(taken)
+    assert not buffer
+    assert [
+        struct.pack(">HHHBB", one.transaction, 0, 2 + len(one.data), one.unit, one.function) + one.data
+        for one in found
+    ] == sent

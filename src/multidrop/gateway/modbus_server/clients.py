@@ -1,7 +1,7 @@
 """Connections of Modbus TCP clients.
 
-Requests are always received, even from a client that does not read its answers. So a stop waits neither for
-earlier requests nor for its client to read answers.
+Requests are always received, even from a client that does not read its answers. So a stop waits neither
+for earlier requests nor until its client reads answers.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from multidrop.gateway.modbus_server.protocol import (
 )
 from multidrop.supervisor import supervisor
 
-SLICE = 64  # most requests of one client in its turn
-SLICE_S = 0.002  # longest turn of a client
-ROUND_S = 0.004  # time of one turn of all busy clients together: the longest wait of a stop
+SLICE = 64  # limit of one client's requests that are answered in one turn
+SLICE_S = 0.002  # limit of one client's turn in s
+ROUND_S = 0.004  # time limit in s of one turn of all busy clients together; a stop waits at most this long
 MOST_CLIENTS = 64  # limit of clients per TCP port
 MOST_BEHIND = 1 << 18  # limit of one client's pending requests in bytes
 MOST_UNTAKEN = 1 << 18  # limit of a client's unread answers in bytes
 MOST_UNDER_WAY = 16  # limit of one client's requests that wait for lines
 IDLE_S = 300.0  # a client that is idle for this long is disconnected
-FORGETTABLE_S = 10.0  # idle time after which a client is disconnected if a new one needs its place
+FORGETTABLE_S = 10.0  # a client idle for this long is disconnected if a new client needs its place
 STALLED_S = 10.0  # a client that reads none of its answers for this long is disconnected
 SWEEP_S = 1.0  # interval of checking all clients
 
 _log = logging.getLogger("multidrop.gateway")
 
 
-# The frame of an answer, or an awaitable that returns the frame; None closes the connection. If the client
+# An answer: its frame, or an awaitable that returns the frame; None closes the connection. If the client
 # disconnects, the awaitable is cancelled: shield work that must be finished.
 Answer = bytes | Awaitable[bytes] | None
 
@@ -55,8 +55,8 @@ class ModbusClient(asyncio.Protocol):
         self._waiting = bytearray()  # frames waiting for their turn
         self._under_way: set[asyncio.Future[bytes]] = set()
         self._is_draining = False
-        self._is_refused = False  # it sent a forbidden or invalid request: the connection closes
-        self._has_ended = False  # the client has closed its sending side, and may still read
+        self._is_refused = False  # True after a forbidden or invalid request: the connection will be closed
+        self._has_ended = False  # True: the client has closed its sending side, but may still read
         self._has_lost_answers = False
         self._stalled_since: float | None = None
         self.last_request = port.clock()
@@ -88,7 +88,7 @@ class ModbusClient(asyncio.Protocol):
         self._port.share.note(self, is_busy=False)
         self._port.forget(self)
         for task in self._under_way:
-            asyncio.get_running_loop().call_soon(task.cancel)  # later, so that each task has started
+            asyncio.get_running_loop().call_soon(task.cancel)  # later: by then, the task has started
 
     def data_received(self, data: bytes) -> None:
         if self._is_refused:
@@ -177,7 +177,9 @@ class ModbusClient(asyncio.Protocol):
         return bool(self._waiting) and self._stalled_since is None
 
     def _answered(self, request: MbapRequest) -> bytes:
-        """Return the answer to a request if it is known immediately; b"" otherwise."""
+        """Return the answer to a request if it is known immediately; b"" if it will follow later, or if
+        there is none.
+        """
         answer = self._port.serve(request, self)
         if isinstance(answer, bytes):
             return answer
@@ -207,7 +209,7 @@ class ModbusClient(asyncio.Protocol):
             self.close()
 
     def _write(self, data: bytes) -> None:
-        """Write answers, or drop them if the client has left too many unread."""
+        """Write answers; drop them if the client has stopped reading and left too many bytes unread."""
         if not data or self.transport is None or self.transport.is_closing():
             return
         if self._stalled_since is not None and self.transport.get_write_buffer_size() > MOST_UNTAKEN:
@@ -233,7 +235,7 @@ class ModbusClient(asyncio.Protocol):
 
 
 class RoundShare:
-    """Divides the time of one round of the event loop among the busy clients of all ports."""
+    """Divides the time for clients in one round of the event loop among the busy clients of all ports."""
 
     def __init__(self) -> None:
         self._busy: set[ModbusClient] = set()

@@ -1,12 +1,14 @@
 """Common block: state, values and stop of every drive at the same addresses and in the same units.
 
-Numbers of two 16-bit words have the high word first. A value that is not fresh reads as a reserved number,
-never as 0.
+Numbers of two 16-bit words have the high word first. A value that is not fresh reads as a reserved
+number, never as 0. The computed channels of a drive are in a second block.
 """
 
 from __future__ import annotations
 
-from typing import Any
+import math
+import struct
+from typing import Any, NamedTuple
 
 from multidrop import PolledDrive, Register
 from multidrop.gateway.live.hub import Hub
@@ -18,13 +20,44 @@ STATE, FAULT, FREQUENCY, CURRENT, SETPOINT, AGE, STOP = 0, 1, 2, 4, 6, 8, 10  # 
 STATES = {"unknown": 0, "stands": 1, "runs": 2, "fault": 3, "silent": 4}
 NO_FAULT, FAULT_WITHOUT_NUMBER, FAULT_UNKNOWN = 0, 0xFFFE, 0xFFFF
 NO_NUMBER = -(1 << 31)  # 8000 0000H: the value is unknown, or out of range
-NEVER, LONGEST_AGE = 0xFFFF_FFFF, 0xFFFF_FFFE  # ages in ms: of a drive without values so far; the largest age
+NEVER, LONGEST_AGE = 0xFFFF_FFFF, 0xFFFF_FFFE  # in place of an age in ms: no value so far; this age or more
 
 _PER_UNIT = 100
 
 
+class CommonNumber(NamedTuple):
+    """A number of the common block, as the address map describes it."""
+
+    name: str
+    at: int  # offset in words
+    words: int
+    format: str
+    step: float
+    unit: str | None  # None: the unit of the drive's setpoint
+    unknown: int  # the reserved number for a value that is not current
+    note: str = ""
+
+
+NUMBERS = (
+    CommonNumber(
+        *("state", STATE, 1, "u16", 1, "", STATES["unknown"]),
+        ", ".join(f"{number} {state}" for state, number in STATES.items()),
+    ),
+    CommonNumber(
+        *("fault", FAULT, 1, "u16", 1, "", FAULT_UNKNOWN),
+        f"{NO_FAULT} none, {FAULT_WITHOUT_NUMBER} a fault without a number",
+    ),
+    CommonNumber("frequency", FREQUENCY, 2, "i32", 1 / _PER_UNIT, "Hz", NO_NUMBER),
+    CommonNumber("current", CURRENT, 2, "i32", 1 / _PER_UNIT, "A", NO_NUMBER),
+    CommonNumber("setpoint", SETPOINT, 2, "i32", 1 / _PER_UNIT, None, NO_NUMBER),
+    CommonNumber("age", AGE, 2, "u32", 1, "ms", NEVER, "time since the request of the newest value"),
+)
+
+
 class CommonBlock:
     """The common block of one drive; its words are computed on request."""
+
+    length = COMMON_LENGTH
 
     def __init__(self, polled: PolledDrive) -> None:
         self._name = polled.drive.name
@@ -53,7 +86,7 @@ class CommonBlock:
         return row.value if row and is_fresh(row, now_ns, woke_ns) else None
 
     def _fault(self, hub: Hub, now_ns: int, woke_ns: int, state: str) -> int:
-        """Return the family's number of the present fault, or one of the reserved fault numbers."""
+        """Return the present fault's number in its drive family, or one of the reserved fault numbers."""
         if state != "fault":
             return NO_FAULT if state in ("stands", "runs") else FAULT_UNKNOWN
         value = self._fresh_value(hub, now_ns, woke_ns, "fault", "")
@@ -71,8 +104,34 @@ class CommonBlock:
         return min(max(now_ns - answer[1], 0) // 1_000_000, LONGEST_AGE)
 
 
+class ChannelBlock:
+    """The computed channels of one drive in the plant file's order, each as a float of two words."""
+
+    def __init__(self, polled: PolledDrive) -> None:
+        self._drive = polled.drive.name
+        self.channels = polled.channels
+        self.length = 2 * len(self.channels)
+
+    def words(self, hub: Hub, now_ns: int) -> list[int]:
+        """Return the words at the monotonic time `now_ns`; a value that is not fresh is NaN."""
+        since_ns = hub.woke_ns()
+        words: list[int] = []
+        for channel in self.channels:
+            row = hub.newest(self._drive, channel.name)
+            value = row.value if row and is_fresh(row, now_ns, since_ns) else None
+            words += struct.unpack(">2H", _float(math.nan if value is None else value))
+        return words
+
+
+def _float(value: float) -> bytes:
+    try:
+        return struct.pack(">f", value)
+    except OverflowError:
+        return struct.pack(">f", math.copysign(math.inf, value))
+
+
 def _units(register: Register[Any]) -> tuple[str | None, ...]:
-    """Return the units in which a register may be requested; None means any unit but raw counts."""
+    """Return the units in which a register may be requested; None (any unit) is left out for raw counts."""
     is_raw = register.values is None and register.step is None
     return (register.value_unit,) if is_raw else (register.value_unit, None)
 

@@ -1,7 +1,7 @@
 """LineShare: the share of a line's time that clients of the Modbus server may use.
 
-Reads that polled rows cannot answer are sent to the drive one at a time, before polls, for a fifth of the
-line's time at most. The time is measured, so a silent drive uses up its clients' share.
+Reads that polled rows cannot answer are sent to the drive one at a time, before polls. They may use a fifth
+of the line's time. The time is measured, so timeouts of a silent drive count too.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from typing import Any
 from multidrop.supervisor import supervisor
 
 SHARE = 0.2  # share of a line's time
-BURST_S = 0.2  # limit of the line time that clients save up during a pause
+BURST_S = 0.2  # limit of the unused line time, in s, that clients save up
 MOST_WAITING = 8  # limit of waiting requests per line
 EXPIRY_S = 1.0  # a request that has waited for this long is dropped
+CLOSED = "the gateway is shutting down, or has read its plant file again"
 
 
 class PassingBusy(Exception):
@@ -38,20 +39,18 @@ class LineShare:
 
     def __init__(self, share: float = SHARE) -> None:
         self._loop = asyncio.get_running_loop()
-        self._share = share
+        self.share = share
         self._waiting: list[_WaitingAsk] = []
         self._running: asyncio.Task[None] | None = None
         self._left_s = BURST_S  # line time available now; negative after a long request
         self._filled = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
-        self.used_s = 0.0  # line time used so far
-        self.asked = 0
 
     def ask(self, client: object, work: Callable[[float], Awaitable[Any]]) -> asyncio.Future[Any]:
         """Queue work, and return a future of its result; `work` is called with the seconds until its expiry.
 
-        Raises PassingBusy, directly or in the future, if the work is dropped. If the queue is full, the last
-        request of the client with the most waiting requests is dropped for a client with fewer.
+        If the work is dropped, this call or the future raises PassingBusy. If the queue is full and another
+        client has at least two more waiting requests, the last request of that client is dropped instead.
         """
         if len(self._waiting) >= MOST_WAITING:
             self._make_place(client)
@@ -67,7 +66,7 @@ class LineShare:
         waiting = Counter(id(asked.client) for asked in self._waiting)
         greediest, most = waiting.most_common(1)[0]
         if most <= waiting[id(client)] + 1:
-            raise PassingBusy(f"{len(self._waiting)} requests wait for this line already")
+            raise PassingBusy(f"{len(self._waiting)} requests are waiting for this line already")
         last = next(asked for asked in reversed(self._waiting) if id(asked.client) == greediest)
         self._refuse(last, "other clients with fewer requests wait for this line")
 
@@ -97,7 +96,7 @@ class LineShare:
         self._fill(now)
         if self._left_s <= 0:
             if self._timer is None:
-                self._timer = self._loop.call_at(now - self._left_s / self._share + 1e-4, self._wake)
+                self._timer = self._loop.call_at(now - self._left_s / self.share + 1e-4, self._wake)
             return
         asked = self._waiting.pop(0)
         self._running = supervisor().start("passed request", self._run(asked))
@@ -107,16 +106,20 @@ class LineShare:
         self._step()
 
     def _fill(self, now: float) -> None:
-        self._left_s = min(BURST_S, self._left_s + (now - self._filled) * self._share)
+        self._left_s = min(BURST_S, self._left_s + (now - self._filled) * self.share)
         self._filled = now
 
     async def _run(self, asked: _WaitingAsk) -> None:
-        """Carry out a request, even if its client disconnects: the line is in use until the request ends."""
+        """Carry out a request to its end, even if its client disconnects, because the line stays in use."""
         begun = self._loop.time()
         try:
             result = await asked.work(asked.expires - begun)
             if not asked.answer.done():
                 asked.answer.set_result(result)
+        except asyncio.CancelledError:
+            if not asked.answer.done():
+                asked.answer.set_exception(PassingBusy(CLOSED))
+            raise
         except Exception as failure:
             if not asked.answer.done():
                 asked.answer.set_exception(failure)
@@ -124,15 +127,13 @@ class LineShare:
             ended = self._loop.time()
             self._fill(ended)
             self._left_s -= ended - begun
-            self.used_s += ended - begun
-            self.asked += 1
             self._running = None
             self._step()
 
     def close(self) -> None:
         """Drop all waiting requests, and cancel the current one."""
         for asked in list(self._waiting):
-            self._refuse(asked, "the gateway is shutting down")
+            self._refuse(asked, CLOSED)
         if self._timer is not None:
             self._timer.cancel()
         if self._running is not None:

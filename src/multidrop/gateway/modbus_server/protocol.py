@@ -31,7 +31,7 @@ from multidrop.gateway.commands import BUSY
 from multidrop.gateway.http.rights import NOT_ALLOWED, NOT_LISTED
 from multidrop.gateway.modbus_server.line_share import PassingBusy
 
-MOST_DATA = 253  # bytes of a function code and its data (application protocol V1.1b3, 4.1)
+MOST_DATA = 253  # limit, in bytes, of a function code and its data (application protocol V1.1b3, 4.1)
 _HEADER = struct.Struct(">HHHB")
 _FUNCTION = _HEADER.size  # offset of the function code
 
@@ -60,15 +60,15 @@ class MbapRequest(NamedTuple):
 def take_frame(buffer: bytearray) -> bytes | None:
     """Remove the first frame from the buffer and return it; None if it is incomplete.
 
-    Raises Garbage for an invalid header: the start of the next frame is unknown then.
+    Raises Garbage for an invalid header, after which the start of the next frame is unknown.
     """
     if len(buffer) >= 4 and buffer[2:4] != b"\0\0":
-        raise Garbage(f"protocol id {int.from_bytes(buffer[2:4]):04X}H, and Modbus has 0")
+        raise Garbage(f"protocol id {int.from_bytes(buffer[2:4]):04X}H, but in Modbus TCP it is 0")
     if len(buffer) < 6:
         return None
     length = int.from_bytes(buffer[4:6])
     if not 2 <= length <= 1 + MOST_DATA:
-        raise Garbage(f"length {length}, and a frame has 2 to {1 + MOST_DATA} bytes after it")
+        raise Garbage(f"length {length}, but it must be 2 to {1 + MOST_DATA}")
     if len(buffer) < 6 + length:
         return None
     frame = bytes(buffer[: 6 + length])
@@ -148,8 +148,8 @@ def code_of(error: BaseException | None) -> int:
     return next((code for kind, code in _CODES if isinstance(error, kind)), ModbusCode.DEVICE_FAILURE)
 
 
-MOST_READ = {1: 2000, 2: 2000, 3: 125, 4: 125}  # limit of one request, by function: sections 6.1 to 6.4
-MOST_WRITTEN = {0x0F: 1968, 0x10: 123}  # limit of one request, by function: sections 6.11 and 6.12
+MOST_READ = {1: 2000, 2: 2000, 3: 125, 4: 125}  # limit of bits or words, by function: sections 6.1 to 6.4
+MOST_WRITTEN = {0x0F: 1968, 0x10: 123}  # limit of bits or words, by function: 6.11 and 6.12
 ADDRESSES = 0x10000
 
 

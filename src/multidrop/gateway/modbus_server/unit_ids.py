@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple, Protocol
@@ -10,19 +9,20 @@ from typing import Any, NamedTuple, Protocol
 from multidrop import Plant, PolledDrive, Register
 from multidrop.drive import Carrier
 from multidrop.gateway.commands import drives_of
-from multidrop.gateway.modbus_server.common_block import CommonBlock
+from multidrop.gateway.modbus_server.common_block import ChannelBlock, CommonBlock
 from multidrop.gateway.modbus_server.protocol import WriteRequest
 from multidrop.gateway.modbus_server.words import DriveWords, reading_function
+from multidrop.printable import did_you_mean
 
-MAIN = ""  # key of the TCP port of all lines that have no own port
+MAIN = ""  # key of the TCP port of all lines that have no port of their own
 UNITS = range(1, 248)  # 0 is a broadcast, 248 to 255 are reserved
-LAST_UNIT = 255  # reserved ids up to this one are accepted, because some devices use them
+LAST_UNIT = 255  # reserved ids, up to this one, are accepted too, because some devices use them
 _WRITES = {Carrier.BIT: (0x05, 0x0F), Carrier.WORD: (0x06, 0x10)}
 _STOPS = ("stop", "coast", "emergency_stop")
 
 
 class StopWrite(NamedTuple):
-    """A register and a raw value of it. A stop verb of the drive writes that value to stop the motor."""
+    """A register, and a raw value that stops the motor if it is written to the register."""
 
     register: str
     raw: float
@@ -36,8 +36,10 @@ class Unit:
         self.drive = polled.drive
         self.words = DriveWords(polled)
         self.common = CommonBlock(polled)
+        self.channels = ChannelBlock(polled)
         self.stops = frozenset(_stop_writes(polled.drive))
-        self._readable: dict[int, set[int]] = {code: set() for code in range(5)}  # by function; 0: unreadable
+        # addresses by the function code that reads them; 0: no function does
+        self._readable: dict[int, set[int]] = {code: set() for code in range(5)}
         self._gaps: list[tuple[int, range]] = []
         self._writable: dict[tuple[Carrier, int], Register[Any]] = {}
         for register in self.drive.registers.values():
@@ -69,8 +71,8 @@ class Unit:
         """Return the writable register that starts at this address; None if there is none."""
         return self._writable.get((carrier, address))
 
-    def has_stop_in(self, written: WriteRequest, common_stop: int) -> bool:
-        """Return True if a request writes a stop: to a register of the drive, or in the common block."""
+    def has_stop_in(self, written: WriteRequest, common_stop: int | None) -> bool:
+        """Return True if a request writes a stop to a register, or to `common_stop` in the common block."""
         carrier, start, size, data = written
         for at in range(size):
             if carrier is Carrier.WORD and start + at == common_stop and data[2 * at : 2 * at + 2] != b"\0\0":
@@ -94,10 +96,10 @@ class Unit:
 
 
 def _stop_writes(drive: Any) -> Iterator[StopWrite]:
-    """Yield the first write of each stop verb of the family.
+    """Yield the register and raw value of the first write of each stop verb of the family.
 
-    Also yield other raw values that the register declares harmless, such as YD1000's 8000H. Omit 0, which
-    may mean "no command".
+    Also yield the other raw values in `harmless` of the register's declaration, such as YD1000's 8000H.
+    Omit 0, which may mean "no command".
     """
     for name in _STOPS:
         try:
@@ -108,7 +110,7 @@ def _stop_writes(drive: Any) -> Iterator[StopWrite]:
             if isinstance(register, Register) and value is not None:
                 counts = {register.encode(value), *filter(None, register.harmless or ())}
                 yield from (StopWrite(register.name, raw) for raw in counts)
-        except Exception:  # the family has no such verb, or its script needs a bus
+        except Exception:  # the family lacks this verb, or the verb's script needs a bus
             continue
 
 
@@ -121,13 +123,16 @@ class UnitSettings(Protocol):
     def ports(self) -> Mapping[str, int]: ...
     @property
     def common_addresses(self) -> range: ...
+    @property
+    def channels(self) -> int: ...
 
 
 class Units:
     """All units of a plant, by TCP port (MAIN, or a line's name) and unit id.
 
-    A line with its own port is reached only there. Raises ValueError with a sentence per line for each
-    mistake, such as a unit id of two drives, or an unknown name in the settings.
+    The drives of a line with its own port are reached only on that port. Raises ValueError with a
+    sentence per line for each mistake, such as two drives with one unit id, or an unknown name in the
+    settings.
     """
 
     def __init__(self, plant: Plant, settings: UnitSettings) -> None:
@@ -161,7 +166,7 @@ def _by_port(plant: Plant, settings: UnitSettings) -> Mapping[str, Mapping[int, 
 
 
 def _clashes(port: str, units: Mapping[int, list[Unit]]) -> Iterator[str]:
-    """Yield a sentence for each duplicate or invalid unit id, and one with the free ids."""
+    """Yield a sentence for each duplicate or invalid unit id, and a sentence that lists the free ids."""
     where = "" if port == MAIN else f" on the port of line {port}"
     wrong: list[str] = []  # names of drives
     for number, found in sorted(units.items()):
@@ -193,7 +198,15 @@ def _ranges(numbers: Iterable[int]) -> str:
 
 
 def _overlap(unit: Unit, settings: UnitSettings) -> Iterator[str]:
-    """Yield a sentence if the common block overlaps registers of the family."""
+    """Yield a sentence if the common block or the channel block overlaps registers of the family, or the
+    other block.
+    """
+    channels = range(settings.channels, settings.channels + unit.channels.length)
+    if channels.stop > 0x10000 or set(channels) & (unit.holding_addresses() | set(settings.common_addresses)):
+        yield (
+            f"{unit.drive.name}: the {unit.channels.length} words of its channels do not fit at "
+            f"{settings.channels:04X}H: move them, such as channels = 0xE100"
+        )
     own = sorted(unit.holding_addresses() & set(settings.common_addresses))
     if own:
         yield (
@@ -211,6 +224,4 @@ def _unknown_names(plant: Plant, settings: UnitSettings) -> Iterator[str]:
     ):
         for name in given:
             if known and name not in known:
-                near = difflib.get_close_matches(name, known, n=2)
-                hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(known)}"
-                yield f"{key}: there is no {kind} {name!r}; {hint}"
+                yield f"{key}: there is no {kind} {name!r}; {did_you_mean(name, known)}"

@@ -1,10 +1,11 @@
 """DriveWords: the 16-bit words that a drive sent, computed from polled values.
 
-Rows have values in units, but Modbus clients expect the drive's raw words. Batches have no raw words, because
-these would cost 8 bytes per row. A word is computed only if it is certain: encoding the value as a raw count
-and decoding it must give the value again, and the neighbouring counts must give other values. Some words are
-always uncertain: those of registers that are part of a word or have a scale register, of `I8` and
-`U32_EITHER`, which leave bits open, and of a float's zero, which has two signs.
+Rows have values in units, but Modbus clients expect the drive's raw words. Batches have no raw words,
+because these would cost 8 bytes per row. A word is computed only if it is certain: encoding the value
+as a raw count and decoding it must give the value again, and the neighbouring counts must give other
+values. The words of some registers are always uncertain: a register that is only a part of a word, one that
+has a scale register, and one with the format `I8` or `U32_EITHER`, which do not determine all bits. A float's
+zero is uncertain too, because its sign is unknown.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _FLOATS = {
     NumberFormat.F64: (">d", ">Q"),
 }
 _OPEN = frozenset({NumberFormat.I8, NumberFormat.U32_EITHER})
-MOST_KNOWN = 8192  # limit of cached values; drives of a family share their registers
+MOST_KNOWN = 8192  # limit of cached values; all drives of a family share the cache
 _MOST_EXACT = 1 << 53  # a float64 represents every whole number up to this one
 _FUNCTIONS = {Carrier.BIT: (1, 2), Carrier.WORD: (3, 4)}
 
@@ -39,24 +40,30 @@ def reading_function(table: Table) -> int:
 
 
 class Lack(Enum):
-    """The reason why a range of addresses cannot be answered from polled rows."""
+    """The reason why a read of these addresses cannot be answered from polled rows."""
 
     UNPOLLED = "not polled, or the words are uncertain"
     STALE = "polled, but the newest row is a miss or old"
 
 
 def is_fresh(row: Newest | None, now_ns: int, since_ns: int = 0) -> bool:
-    """Return True if a row has a current value that is not older than `since_ns`."""
+    """Return True if a row has a value that is still current and was requested at `since_ns` or later."""
     if row is None or row.value is None:
         return False
     return row.monotonic_ns >= since_ns and now_ns - row.monotonic_ns <= row.holds_ns
+
+
+def is_certain(register: Register[Any]) -> bool:
+    """Return True if the words of this register are certain for most of its values."""
+    coding = register.coding
+    return register.part is None and not register.scale_register and coding.number_format not in _OPEN
 
 
 @lru_cache(maxsize=MOST_KNOWN)
 def exact_data(register: Register[Any], value: float) -> bytes | None:
     """Return the bytes that the drive sends for this value (a coil: one byte, 0 or 1); None if uncertain."""
     coding = register.coding
-    if register.part is not None or register.scale_register or coding.number_format in _OPEN:
+    if not is_certain(register):
         return None
     try:
         if coding.number_format is NumberFormat.BIT:
@@ -78,7 +85,7 @@ def exact_data(register: Register[Any], value: float) -> bytes | None:
 
 
 def _nearest_count(register: Register[Any], value: float) -> float | None:
-    """Return the raw count whose value is nearest; None if other counts may have the same value."""
+    """Return the raw count whose value is nearest to this value; None if other counts may have it too."""
     multiplier, addend, divisor = register.coding.factors
     count = value if multiplier == divisor and not addend else (value * divisor - addend) / multiplier
     if register.coding.number_format not in _FLOATS:
@@ -111,7 +118,8 @@ class _Place:
         self._data: bytes | None = None
 
     def word(self, row: Newest | None, at: int, now_ns: int, since_ns: int) -> int | Lack:
-        """Return the word (of a coil: the bit) at this offset in the newest row, or the reason for its lack.
+        """Return the word (of a coil: the bit) at this offset in the newest row, or the reason why it is
+        unknown.
 
         Misses, stale rows and rows older than `since_ns` are not used.
         """
@@ -131,12 +139,15 @@ class DriveWords:
 
     def __init__(self, polled: PolledDrive) -> None:
         self._at: dict[tuple[int, int], list[tuple[_Place, int]]] = {}
+        self.registers: set[str] = set()  # names of the registers whose words are usually known
         for poll in polled.polls:
             register = poll.register
             function = reading_function(register.table)
             if not function:
                 continue
             place = _Place(register)
+            if is_certain(register):
+                self.registers.add(register.name)
             for at in range(register.words):
                 key = function, register.address + at
                 self._at.setdefault(key, []).append((place, at))
@@ -151,7 +162,7 @@ class DriveWords:
     ) -> list[int] | Lack:
         """Return the words or bits at these addresses from fresh rows, or why that is impossible.
 
-        `newest` returns the newest row of a register by name. Rows older than `since_ns` do not count.
+        `newest` returns the newest row of a register by name. Rows older than `since_ns` are not used.
         """
         words: list[int] = []
         lacks: list[Lack] = []

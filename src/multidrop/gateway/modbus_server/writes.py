@@ -1,0 +1,139 @@
+"""Writes and stops of Modbus clients. They obey the same rules as all commands, and never start a motor."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from typing import Any, Protocol
+
+from multidrop import Register
+from multidrop.drive import Carrier
+from multidrop.gateway.commands import MOST_STOPS, Commands
+from multidrop.gateway.http.rights import Caller, Right
+from multidrop.gateway.modbus_server.common_block import STOP
+from multidrop.gateway.modbus_server.protocol import WRITES, Declined, MbapRequest, ModbusCode, code_of
+from multidrop.gateway.modbus_server.unit_ids import StopWrite, Unit
+from multidrop.supervisor import supervisor
+
+STOP_WAIT_S = 0.4  # how long a stop's answer waits for the motor: less than the usual timeout of clients
+
+_log = logging.getLogger("multidrop.gateway")
+
+
+class WritingClient(Protocol):
+    """The client that sent a request."""
+
+    @property
+    def address(self) -> str: ...
+    @property
+    def is_full(self) -> bool:
+        """True while too many requests of this client are in progress."""
+
+
+class ClientWrites:
+    """Carries out the writes of clients that share a role and an interface, such as "modbus".
+
+    `common` has the addresses of the common block, or is None without such a block. If a write that `begin`
+    accepted is refused later, `note_refused` is called with request, drive, reason and client.
+    """
+
+    def __init__(
+        self,
+        commands: Commands,
+        role: Right,
+        way: str,
+        common: range | None,
+        note_refused: Callable[[MbapRequest, str, str, Any], object] = lambda *refusal: None,
+    ) -> None:
+        self._commands = commands
+        self._role = role
+        self._way = way
+        self._note_refused = note_refused
+        self._common = common or range(0)
+        self._common_stop = common.start + STOP if common else None
+        self._stops: dict[str, set[asyncio.Task[int]]] = {}  # stops in progress, by drive
+
+    def begin(
+        self, unit: Unit, request: MbapRequest, client: WritingClient, stop_wait_s: float = STOP_WAIT_S
+    ) -> Awaitable[bytes]:
+        """Start a write or a stop, and return an awaitable of its answer.
+
+        The answer to a stop comes after `stop_wait_s` at the latest. Raises Declined for a request that is
+        not allowed.
+        """
+        if self._role < Right.STOP:
+            raise Declined(ModbusCode.ILLEGAL_FUNCTION)  # clients may only read
+        carrier, address, count, data = written = WRITES[request.function](request)
+        register = unit.writable(carrier, address)
+        is_one = count == (register.words if register else 1)
+        if not is_one and unit.has_stop_in(written, self._common_stop):
+            with suppress(Declined):  # raised only if many stops of the drive are in progress already
+                self._begin_stop(unit, client)
+            raise Declined(ModbusCode.ILLEGAL_VALUE)  # the rest is not written: it may start a motor
+        if carrier is Carrier.WORD and address in self._common:
+            if address != self._common_stop:
+                raise Declined(ModbusCode.ILLEGAL_ADDRESS)
+            if count != 1 or data == b"\0\0":
+                raise Declined(ModbusCode.ILLEGAL_VALUE)
+            return self._later(request, self._begin_stop(unit, client), stop_wait_s)
+        if register is None:
+            raise Declined(
+                ModbusCode.ILLEGAL_ADDRESS if self._role >= Right.WRITE else ModbusCode.ILLEGAL_FUNCTION
+            )
+        raw = register.coding.raw_in(data, 0) if is_one else None
+        if raw is not None and StopWrite(register.name, raw) in unit.stops:
+            return self._later(request, self._begin_stop(unit, client), stop_wait_s)
+        if self._role < Right.WRITE:
+            raise Declined(ModbusCode.ILLEGAL_FUNCTION)
+        if raw is None or register.commands:
+            raise Declined(ModbusCode.ILLEGAL_VALUE)
+        if client.is_full:
+            raise Declined(ModbusCode.BUSY)
+        write = self._write_one(unit, register, raw, request, client)
+        return self._later(request, supervisor().start("modbus write", write), None)
+
+    async def _later(self, request: MbapRequest, task: asyncio.Task[int], wait_s: float | None) -> bytes:
+        """Return the answer to a command, or after `wait_s` "acknowledge"; then the command continues."""
+        done, _ = await asyncio.wait([task], timeout=wait_s)
+        # "acknowledge" means that the command is still in progress
+        code = task.result() if done else ModbusCode.ACKNOWLEDGE
+        return request.exception(code) if code else request.reply(request.data[:4])
+
+    async def _write_one(
+        self, unit: Unit, register: Register[Any], raw: float, request: MbapRequest, client: WritingClient
+    ) -> int:
+        """Write a register; return 0 or an exception code."""
+        value = raw if register.values is not None else register.decode(raw)
+        result = await self._commands.write(unit.drive.name, register.name, value, self.caller(client))
+        if isinstance(result.error, ValueError):  # includes WriteForbidden
+            self._note_refused(request, unit.drive.name, result.text, client)
+        return 0 if result.ok else code_of(result.error)
+
+    def _begin_stop(self, unit: Unit, client: WritingClient) -> asyncio.Task[int]:
+        """Start a stop immediately. Raises Declined if MOST_STOPS of this drive are in progress."""
+        name = unit.drive.name
+        under_way = self._stops.setdefault(name, set())
+        if len(under_way) >= MOST_STOPS:
+            raise Declined(ModbusCode.ACKNOWLEDGE)
+        task = supervisor().start("modbus stop", self._stop_one(unit, self.caller(client)))
+        under_way.add(task)
+        task.add_done_callback(under_way.discard)
+        return task
+
+    async def _stop_one(self, unit: Unit, caller: Caller) -> int:
+        name = unit.drive.name
+        try:
+            result = (await self._commands.stop([name], caller))[name]
+        except Exception:
+            _log.exception("stop of %s by way of %s", name, self._way)
+            return ModbusCode.NO_RESPONSE
+        if result.ok:
+            return 0
+        code = code_of(result.error)
+        return ModbusCode.NO_RESPONSE if code == ModbusCode.DEVICE_FAILURE else code
+
+    def caller(self, client: WritingClient) -> Caller:
+        """Return the client as the sender of a command."""
+        return Caller("anyone", self._way, client.address, self._role)

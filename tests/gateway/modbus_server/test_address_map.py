@@ -1,0 +1,303 @@
+"""The address map: a Modbus client that knows only the map's rows reads the same values as /api/frame."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import random
+import struct
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from gateways import gateway_of
+from lines import until
+from peers import require_module
+
+from multidrop import Plant
+from multidrop.cli import main
+from multidrop.gateway.modbus_server import address_map
+from multidrop.sim import SimulatedDrive, Simulator, Wire
+
+FAMILY = """
+[family]
+title = "Mixed formats"
+manual = "of this test"
+counts_from = 0
+[reading]
+word = { at = 0, unit = "A", step = 0.1, offset = -5 }
+signed = { at = 1, unit = "%", number_format = "I16" }
+swapped = { at = 2, number_format = "U16", order = "BA" }
+long = { at = 3, unit = "kWh", number_format = "U32", order = "CDAB", step = 0.01 }
+negative = { at = 5, number_format = "I32", order = "DCBA", invalid = [2147483647] }
+single = { at = 7, unit = "bar", number_format = "F32", order = "BADC" }
+double = { at = 9, number_format = "F64", order = "CDAB" }
+huge = { at = 13, number_format = "U64" }
+digits = { at = 17, number_format = "BCD32" }
+low = { at = 19, part = "0-3" }
+high = { at = 19, part = "4-15", number_format = "I16" }
+scaled = { at = 20, unit = "W", scale_register = "power_of_ten" }
+power_of_ten = { at = 21, number_format = "I16" }
+byte = { at = 22, number_format = "I8" }
+input = { at = 0, unit = "V", table = "input", number_format = "F16" }
+lamp = { at = 4, table = "coil" }
+door = { at = 5, table = "discrete" }
+[text]
+serial = { at = 0x30, length = 4, order = "BA" }
+"""
+PLANT = """
+[serve]
+listen = "127.0.0.1:0"
+[serve.may]
+write = ["mill.setpoint"]
+[serve.modbus]
+listen = "127.0.0.1:0"
+ports = {{ yard = 0 }}
+units = {{ meter = 21 }}
+may = "write"
+passing = "{passing}"
+
+[[line]]
+name = "hall"
+port = "{hall}"
+[[line.drive]]
+name = "mill"
+model = "invt-che"
+address = 1
+every = "50 ms"
+poll = ["status", "output_frequency", "output_current", "output_torque", "fault"]
+[[line.drive.channel]]
+name = "half"
+value = "output_frequency / 2"
+unit = "Hz"
+
+[[line]]
+name = "yard"
+port = "{yard}"
+[[line.drive]]
+name = "meter"
+model = "mixed.toml"
+address = 1
+every = "50 ms"
+"""
+READ = {1: "read_coils", 2: "read_discrete_inputs", 3: "read_holding_registers", 4: "read_input_registers"}
+STRUCT = {"u16": "H", "i16": "h", "u32": "I", "i32": "i", "u64": "Q", "f16": "e", "f32": "f", "f64": "d"}
+UNPOLLED = "output_voltage", 0x3003  # name and address of a register of the mill: CHE100 manual v1.4, p. 117
+
+
+class Client:
+    """Clients of pymodbus, one for each port in a map. They know only the map's rows."""
+
+    def __init__(self) -> None:
+        self._clients: dict[int, Any] = {}
+
+    def close(self) -> None:
+        for client in self._clients.values():
+            client.close()
+
+    def _of(self, row: dict[str, Any]) -> Any:
+        port = row["tcp_port"]
+        if port not in self._clients:
+            self._clients[port] = require_module("pymodbus.client").ModbusTcpClient("127.0.0.1", port=port)
+            assert self._clients[port].connect()
+        return self._clients[port]
+
+    def words(self, row: dict[str, Any], function: int, address: int, count: int) -> list[int] | int:
+        """Return the words or bits at an address of the row's unit, or an exception code."""
+        while True:
+            read = getattr(self._of(row), READ[function])
+            found = read(address, count=count, device_id=row["unit_id"])
+            if not found.isError():
+                return list(found.registers if function in (3, 4) else found.bits[:count])
+            if found.exception_code not in (6, 11):  # 6: the clients' share of the line's time is used up
+                return int(found.exception_code)
+
+    def write(self, row: dict[str, Any]) -> int:
+        """Write the present value of a row; return an exception code, or 0."""
+        words = self.words(row, row["function"], row["address"], row["words"])
+        assert isinstance(words, list)
+        if row["function"] == 1:
+            done = self._of(row).write_coil(row["address"], bool(words[0]), device_id=row["unit_id"])
+        else:
+            done = self._of(row).write_registers(row["address"], words, device_id=row["unit_id"])
+        return int(done.exception_code) if done.isError() else 0
+
+    def number(self, row: dict[str, Any]) -> float:
+        """Return the value of a row in its unit."""
+        words = self.words(row, row["function"], row["address"], row["words"])
+        assert isinstance(words, list), (row["name"], words)
+        if row["format"] == "bit":
+            return float(words[0])
+        data = struct.pack(f">{len(words)}H", *words)
+        found = decoded(bytes(byte for _, byte in sorted(zip(row["order"], data, strict=True))), row)
+        power = 0
+        if row["scale_address"] is not None:
+            (word,) = self.words(row, row["function"], row["scale_address"], 1)  # type: ignore[misc]
+            power = word - (word >> 15 << 16)
+        return float(found * 10.0**power * row["step"] + row["offset"])
+
+
+def decoded(data: bytes, row: dict[str, Any]) -> float:
+    """Return the number of a row in bytes whose most significant byte is first."""
+    if row["format"].startswith("bcd"):
+        return int(data.hex())
+    if row["bits"]:
+        low, high = map(int, row["bits"].split(" to "))
+        part = int.from_bytes(data) >> low & ((1 << high - low + 1) - 1)
+        return part - (part >> high - low << high - low + 1) * row["format"].startswith("i")
+    (number,) = struct.unpack(f">{STRUCT[row['format']]}", data)
+    return float(number)
+
+
+@contextmanager
+def served(folder: Path, passing: str) -> Iterator[Any]:
+    """Run a gateway with two simulated drives, whose registers hold random words."""
+    (folder / "mixed.toml").write_text(FAMILY)
+    path = folder / "plant.toml"
+    path.write_text(PLANT.format(passing=passing, hall="/dev/a", yard="/dev/b"))
+    chance, drives = random.Random(43), []
+    for line in Plant.load(path).lines:
+        drive = SimulatedDrive(line.drives[0].drive)
+        for register in drive.drive.registers.values():
+            for cell in drive.memory.of(register):
+                # only decimal digits, so that the word is valid as BCD too, and no float is infinite
+                cell.raw = (
+                    chance.randint(0, 1) if register.is_bit else int(f"{chance.randint(1, 9999):d}", 16)
+                )
+        drives.append(drive)
+    drives[0]["device"], drives[0]["setpoint"] = 0x0101, 50
+    drives[1]["power_of_ten"] = -2
+    drives[1]["huge"] = (1 << 53) - 1  # larger numbers are not certain: the rows have them as floats
+    with Simulator([Wire([one], unpaced=True) for one in drives]) as simulator:
+        hall, yard = (wire.path for wire in simulator.wires)
+        path.write_text(PLANT.format(passing=passing, hall=hall, yard=yard))
+        with gateway_of(path) as gateway:
+            until(lambda: all(gateway.hub.last_answer(name) for name in ("mill", "meter")))
+            yield gateway
+
+
+def get(gateway: Any, path: str) -> Any:
+    with urllib.request.urlopen(f"http://127.0.0.1:{gateway.port}{path}") as answer:
+        text = answer.read().decode()
+        return json.loads(text) if "json" in answer.headers["content-type"] else text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("passing", ["declared", "off"])
+def test_a_client_that_follows_the_map_reads_the_values_of_the_page(tmp_path: Path, passing: str) -> None:
+    with served(tmp_path, passing) as gateway, closing(Client()) as client:
+        rows = get(gateway, "/api/modbus-map")
+        until(lambda: None not in [one[0] for drive in values(gateway).values() for one in drive.values()])
+        shown = values(gateway)
+        read = [row for row in rows if "read" in row["access"] and row["format"] != "text"]
+        names = {(row["drive"], row["name"]) for row in read}
+        uncertain = {("meter", name) for name in ("low", "high", "scaled", "byte")}
+        polled = {(drive, name) for drive, found in shown.items() for name in found}
+        assert polled - names == (uncertain if passing == "off" else set())
+        assert (("mill", UNPOLLED[0]) in names) is (passing == "declared")
+
+        def wrong() -> list[str]:
+            """Return the names of rows whose values differ from the page, as old values may for a moment."""
+            pairs = [(row, shown[row["drive"]].get(row["name"])) for row in read]
+            return [
+                row["name"]
+                for row, value in pairs
+                if value and not math.isclose(client.number(row), value[0], rel_tol=1e-6)
+            ]
+
+        until(lambda: wrong() == [])
+        check_common_block(rows, shown["mill"], client)
+        texts = [row for row in rows if row["format"] == "text"]
+        assert [row["name"] for row in texts] == (["serial"] if passing == "declared" else [])
+        if passing == "off":
+            assert client.words(rows[0], 3, UNPOLLED[1], 1) == 2
+            assert client.words(read[-1], 3, 19, 1) == 2
+
+
+def values(gateway: Any) -> dict[str, dict[str, list[Any]]]:
+    """Return the values on the page by drive and name, each as a list that starts with the number."""
+    drives = get(gateway, "/api/frame")["drives"]
+    return {name: drive["values"] for name, drive in drives.items()}
+
+
+def check_common_block(rows: list[dict[str, Any]], shown: dict[str, list[Any]], client: Client) -> None:
+    common = {row["name"]: row for row in rows if row["drive"] == "mill" and row["source"] == "gateway"}
+    assert client.number(common["common_frequency"]) == pytest.approx(shown["output_frequency"][0])
+    assert client.number(common["common_current"]) == pytest.approx(shown["output_current"][0])
+    assert client.number(common["half"]) == pytest.approx(shown["output_frequency"][0] / 2, rel=1e-6)
+    state = client.number(common["common_state"])
+    assert {row["status_address"] for row in rows} == {common["common_state"]["address"]}
+    assert f"{state:g} " in common["common_state"]["note"]
+    unknown = client.words(common["common_setpoint"], 3, common["common_setpoint"]["address"], 2)
+    assert isinstance(unknown, list)
+    assert "{:04X}{:04X}H".format(*unknown) == common["common_setpoint"]["unknown"]
+
+
+@pytest.mark.slow
+def test_clients_can_write_exactly_the_rows_that_are_marked_writable(tmp_path: Path) -> None:
+    with served(tmp_path, "declared") as gateway, closing(Client()) as client:
+        rows = get(gateway, "/api/modbus-map")
+        assert [row["name"] for row in rows if "write" in row["access"]] == [
+            *("common_stop", "setpoint", "common_stop"),
+        ]
+        known = [row for row in rows if row["function"] in (1, 3) and row["format"] != "text"]
+        refused = [row for row in known if client.write(row)]
+        assert [row["name"] for row in known if row not in refused] == ["setpoint"]
+
+
+@pytest.mark.slow
+def test_http_and_the_command_give_the_same_address_map(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with served(tmp_path, "declared") as gateway:
+        rows = get(gateway, "/api/modbus-map")
+        listed = [*csv.DictReader(io.StringIO(get(gateway, "/api/modbus-map?format=csv")))]
+        with pytest.raises(urllib.error.HTTPError, match="400"):
+            get(gateway, "/api/modbus-map?format=xml")
+    as_text = [{key: "" if value is None else str(value) for key, value in row.items()} for row in rows]
+    assert listed == as_text
+    plant, path = str(tmp_path / "plant.toml"), tmp_path / "map.json"
+    assert main(["serve", plant, "--modbus-map", str(path)]) == 0
+    assert capsys.readouterr().out == f"{path}: {len(rows)} values of 2 drives\n"
+    assert json.loads(path.read_text()) == [{**row, "tcp_port": 0} for row in rows]
+    assert main(["serve", plant, "--modbus-map", str(path)]) == 2
+    assert main(["serve", plant, "--modbus-map", "map.xls"]) == 2
+    assert "map.xls: the name of an address map ends in .csv or .json" in capsys.readouterr().err
+
+
+def test_the_map_states_an_invalid_count_of_32_bits_and_the_bits_of_a_byte(tmp_path: Path) -> None:
+    (tmp_path / "mixed.toml").write_text(FAMILY)
+    (tmp_path / "plant.toml").write_text(PLANT.format(passing="declared", hall="/dev/a", yard="/dev/b"))
+    assert main(["serve", str(tmp_path / "plant.toml"), "--modbus-map", str(tmp_path / "map.json")]) == 0
+    rows = {row["name"]: row for row in json.loads((tmp_path / "map.json").read_text())}
+    assert rows["negative"]["unknown"] == "exception 0BH or 2147483647"
+    assert (rows["byte"]["format"], rows["byte"]["bits"]) == ("i8", "0 to 7")
+
+
+def test_rows_of_the_json_map_are_encoded_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A call of json.dumps stops all other threads until it ends."""
+    encoded: list[Any] = []
+
+    def dumps(row: Any, **_: Any) -> str:
+        encoded.append(row)
+        return "{}"
+
+    monkeypatch.setattr("json.dumps", dumps)
+    row = address_map.AddressRow("a", "b", 502, 1, 0, "n", "n", "read", 3, None, 0, 1, "u16")
+    assert json.loads(address_map.to_json([row] * 3)) == [{}] * 3
+    assert encoded == [row._asdict()] * 3
+
+
+def test_plant_without_modbus_server_has_no_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(
+        '[[line]]\nname = "a"\nport = "/dev/a"\n[[line.drive]]\nname = "b"\naddress = 1\nmodel = "yd1000"\n'
+    )
+    assert main(["serve", str(path), "--modbus-map", str(tmp_path / "map.csv")]) == 2
+    assert "plant.toml has no Modbus server: add [serve.modbus]" in capsys.readouterr().err
