@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import signal
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -15,15 +16,19 @@ from statistics import median
 from typing import Any, NamedTuple
 
 import pytest
+from brokers import PLAIN_FAN, ROOT, Host, Listener, Running, command, has, mosquitto, nats, publish
 from brokers import Broker as BrokerProcess
-from brokers import Listener, mosquitto
+from brokers import Broker as RunningBroker
 from examples import usually
 from gateways import Served, plant_text, running, tokens
 from lines import HOST_LATE, until
+from nats_clusters import old_server_program, server_program
 from peers import require_module
 
 from multidrop import Batch, InvtCHE, Plant
+from multidrop.control import CommandOutcome, CommandResult
 from multidrop.gateway.gateway import Gateway
+from multidrop.gateway.http.rights import Caller, Right
 from multidrop.gateway.mqtt.broker import (
     MOST_UNDER_WAY,
     MOST_WAITING,
@@ -33,6 +38,8 @@ from multidrop.gateway.mqtt.broker import (
     Publication,
     parse_broker,
 )
+from multidrop.gateway.mqtt.broker_commands import MOST_UNDER_WAY as MOST_COMMANDS
+from multidrop.gateway.mqtt.broker_commands import BrokerCommands
 from multidrop.gateway.settings import read_settings
 from multidrop.sim import Simulator, Wire, simulated
 
@@ -112,19 +119,19 @@ def test_acknowledged_messages_make_room_immediately() -> None:
         outbox.put(said(f"{topic}"))
     outbox.acknowledge(range(1, MOST_UNDER_WAY + 1))
     assert len(wire.sent) == 2 * MOST_UNDER_WAY
-    outbox.acknowledge([1, 2, 3 * MOST_UNDER_WAY])  # numbers of an earlier connection
+    outbox.acknowledge([1, 2, 3 * MOST_UNDER_WAY])  # message numbers of an earlier connection
     assert len(wire.sent) == 2 * MOST_UNDER_WAY
 
 
 def test_messages_beyond_the_limit_are_dropped_and_counted() -> None:
-    """The limit is needed because senders of commands can choose the topics of answers."""
+    """Without a limit, commands that choose a new topic for each answer could fill the memory."""
     wire = BreakableConnection()
     outbox = Outbox(wire.send)
     wire.is_open = False
     for at in range(MOST_WAITING + 10):
         outbox.put(said(f"{at}"))
     assert outbox.dropped == 10
-    outbox.put(said("0", b"newer"))  # replaces the pending message of this topic
+    outbox.put(said("0", b"newer"))  # replaces the topic's pending message
     assert outbox.dropped == 11
     wire.is_open = True
     outbox.flush()
@@ -167,7 +174,7 @@ class Loop:
 def test_event_loop_is_woken_once_for_a_burst_of_acknowledgements(monkeypatch: pytest.MonkeyPatch) -> None:
     require_module("paho.mqtt.client")
     broker, loop, told = Broker(parse_broker("mqtt://localhost"), Login(), "a", Silent()), Loop(), list[int]()
-    monkeypatch.setattr(broker, "_loop", loop)
+    monkeypatch.setattr(broker, "loop", loop)
     monkeypatch.setattr(broker.outbox, "acknowledge", told.extend)
     for number in range(20):
         broker._client.on_publish(broker._client, None, number, 0, None)
@@ -189,11 +196,11 @@ SERVE = '[serve.may]\nstop = "anyone"\n[serve.mqtt]\nbroker = "{}"\nevery = "0.1
 class Slot(NamedTuple):
     at_ns: int  # time of the request (CLOCK_MONOTONIC)
     status: str
-    late_s: float  # delay from the request until the part received the row
+    late_s: float  # time from the request until the part received the row
 
 
 class Slots:
-    """A part that records every polling slot of each drive, and how late the part receives the row."""
+    """A part that records each poll of each drive, and how long after the request the part gets the row."""
 
     def __init__(self) -> None:
         self._found: dict[str, list[Slot]] = defaultdict(list)
@@ -288,6 +295,176 @@ def test_polling_is_unchanged_while_the_broker_is_frozen_or_gone(tmp_path: Path,
     for phase, found in phases.items():
         for name in DRIVES:
             statuses = {one.status for one in found[name]}
-            assert abs(len(found[name]) - wanted) <= 1, (phase, name)  # no slot is missing
+            assert abs(len(found[name]) - wanted) <= 1, (phase, name)  # every poll has a row
             assert statuses <= {"ok", *HOST_LATE}, (phase, name)
             assert median(one.late_s for one in found[name]) < PERIOD_S, (phase, name)
+
+
+# ---- BrokerCommands: the limit of concurrent commands from a broker, which does not apply to stops ----
+
+
+CALLER = Caller("anyone", "mqtt", "broker", Right.WRITE)
+NOW_MS = 1_000_000
+
+
+class HeldCommands:
+    """Commands that end when the test releases them; stops end immediately."""
+
+    plant_ns = None
+
+    def __init__(self) -> None:
+        self.go_on = asyncio.Event()
+        self.begun: list[float] = []
+        self.stopped: list[Sequence[str] | None] = []
+
+    def stopped_ns(self, drive: str) -> None:
+        return None
+
+    async def write(self, drive: str, register: str, value: float, caller: Caller) -> CommandResult:
+        self.begun.append(value)
+        await self.go_on.wait()
+        return CommandResult(CommandOutcome.DONE, "done")
+
+    async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, CommandResult]:
+        self.stopped.append(drives)
+        return {"pump-1": CommandResult(CommandOutcome.DONE, "stopped")}
+
+
+async def test_concurrent_broker_writes_are_limited_and_stops_are_not() -> None:
+    told: list[tuple[str, str]] = []
+    commands: Any = HeldCommands()
+    orders = BrokerCommands(
+        commands, CALLER, lambda: NOW_MS, lambda drive, what, end, _: told.append((what, end.text))
+    )
+    for value in range(MOST_COMMANDS + 2):
+        orders.write("pump-1", "setpoint", value, NOW_MS)
+    await asyncio.sleep(0)  # the commands start
+    assert commands.begun == [*range(MOST_COMMANDS)]
+    refused = f"not sent: {MOST_COMMANDS} others are under way"
+    assert told == [(f"setpoint = {MOST_COMMANDS + at}", refused) for at in range(2)]
+    for _ in range(3):
+        orders.stop(["pump-1"])
+    await asyncio.sleep(0)
+    assert commands.stopped == [["pump-1"]] * 3
+    commands.go_on.set()
+    await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
+    orders.write("pump-1", "setpoint", 99.0, NOW_MS)
+    await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
+    assert commands.begun[-1] == 99.0
+
+
+# ---- MQTT through the listener of nats-server: retained state, the last will, commands, and Sparkplug ----
+
+
+Start = Callable[..., tuple[Any, Running]]
+
+
+def nats_of(program: Callable[[], str]) -> Any:
+    """Return a test parameter: the fixture `broker` then runs this nats-server."""
+    return pytest.mark.parametrize("broker", [lambda folder: nats(folder, program())], indirect=True)
+
+
+on_nats = nats_of(server_program)
+
+
+def now_ms() -> int:
+    return time.time_ns() // 1_000_000
+
+
+@pytest.mark.slow
+@on_nats
+def test_state_is_retained_and_the_will_reports_a_lost_gateway(
+    broker: RunningBroker, listener: Listener, start: Start
+) -> None:
+    _, running = start()
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    listener.wait_for(has(f"multidrop/{PLAIN_FAN.name}/available", b"online"))
+    later = Listener(broker)
+    said = later.wait_for(has("multidrop/pump-1"))
+    later.close()
+    assert said.is_retained
+    assert json.loads(said.payload)["values"] == {"output_frequency": 49.5, "status": "FORWARD"}
+    running.cut(0)
+    listener.wait_for(has("multidrop/gateway", b"offline"))
+    listener.wait_for(has("multidrop/gateway", b"online"))
+
+
+@pytest.mark.slow
+@on_nats
+def test_delayed_and_repeated_commands_are_refused_and_stops_are_not(
+    broker: RunningBroker, listener: Listener, start: Start
+) -> None:
+    def told() -> Any:
+        return json.loads(listener.wait_for(has("multidrop/pump-1/told")).payload)
+
+    def write(value: float, time_ms: int, *options: str) -> None:
+        body = json.dumps({"value": value, "time": time_ms}).encode()
+        publish(broker, "multidrop/pump-1/set/setpoint", body, *options)
+
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    sent_ms = now_ms()
+    write(25.0, sent_ms)
+    assert told()["done"] is True
+    write(25.0, sent_ms)
+    assert told()["text"] == "not sent: it came a second time"
+    write(26.0, now_ms() - 60_000)
+    assert "s ago by the clocks of sender and gateway" in told()["text"]
+    publish(broker, "multidrop/pump-1/stop", b"stop", "-q", "1")
+    assert told()["what"] == "stop"
+    assert known.commands.noted == [("write", "pump-1", "setpoint", 25.0), ("stop", ["pump-1"])]
+
+
+@pytest.mark.slow
+@on_nats
+def test_retained_command_is_refused(broker: RunningBroker, listener: Listener, start: Start) -> None:
+    body = json.dumps({"value": 25.0, "time": now_ms() + 1000}).encode()
+    publish(broker, "multidrop/pump-1/set/setpoint", body, "-r")
+    known, _ = start(commands=True)
+    said = listener.wait_for(has("multidrop/pump-1/told"))
+    assert json.loads(said.payload)["text"].startswith("not sent: it was retained")
+    assert known.commands.noted == []
+
+
+@pytest.mark.slow
+@nats_of(old_server_program)
+def test_rejected_topics_do_not_delay_others(broker: RunningBroker, listener: Listener, start: Start) -> None:
+    """Sparkplug's topics have a dot; nats-server before 2.10 closes connections because of it."""
+    known, running = start(sparkplug="works", node="line")
+    listener.wait_for(has("multidrop/pump-1"))
+    until(lambda: running._part.health().startswith(f"no connection to 127.0.0.1:{broker.port}"))
+    known.hub.values[("pump-1", "output_frequency")] = 50.0
+    running.step()
+    listener.wait_for(
+        lambda heard: (
+            heard.topic == "multidrop/pump-1"
+            and json.loads(heard.payload)["values"]["output_frequency"] == 50.0
+        )
+    )
+    assert "multidrop/gateway" not in [h.topic for h in listener.all if h.payload == b"offline"]
+
+
+@pytest.mark.slow
+@on_nats
+def test_sparkplug_births_data_deaths_and_commands(broker: RunningBroker, host: Host, start: Start) -> None:
+    known, running = start(sparkplug="works", node="line", commands=True)
+    assert host.values(host.wait_for("NBIRTH")) == {"bdSeq": 0, "Node Control/Rebirth": False}
+    born = host.values(host.wait_for("DBIRTH", "pump-1"))
+    assert (born["output_frequency"], born["status"]) == (49.5, "FORWARD")
+    host.wait_for("DBIRTH", PLAIN_FAN.name)
+    known.hub.values[("pump-1", "output_frequency")] = 50.0
+    running.step()
+    assert host.values(host.wait_for("DDATA", "pump-1")) == {"output_frequency": 50.0}
+    command(broker, ROOT.format("NCMD"), name="Node Control/Rebirth", boolean_value=True, datatype=11)
+    assert host.values(host.wait_for("NBIRTH"))["bdSeq"] == 0
+    host.wait_for("DBIRTH", "pump-1")
+    host.wait_for("DBIRTH", PLAIN_FAN.name)
+    known.hub.states[PLAIN_FAN.name] = "silent"
+    running.step()
+    host.wait_for("DDEATH", PLAIN_FAN.name)
+    topic = ROOT.format("DCMD") + "/pump-1"
+    command(broker, topic, name="Device Control/Stop", boolean_value=True, datatype=11)
+    until(lambda: known.commands.noted == [("stop", ["pump-1"])])
+    running.cut(1)
+    assert host.values(host.wait_for("NDEATH")) == {"bdSeq": 0}
+    assert host.values(host.wait_for("NBIRTH"))["bdSeq"] == 1

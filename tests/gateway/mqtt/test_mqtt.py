@@ -15,22 +15,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from brokers import (
-    FAN,
-    Broker,
-    Listener,
-    Published,
-    Running,
-    free_port,
-    has,
-    inside,
-    publish,
-    without_fan,
-)
+from brokers import FAN, Broker, Listener, Published, Running, free_port, has, inside, publish, without_fan
 from examples import in_turn
 from gateways import certificate, served
 from lines import until
 from peers import require_module
+from tables import table
 
 from multidrop import Drive, InvtCHE, PolledDrive
 from multidrop.control import CommandOutcome, CommandResult
@@ -141,7 +131,7 @@ def test_closing_publishes_offline(broker: Broker, listener: Listener, tmp_path:
 def test_failing_publisher_is_offline_and_still_carries_out_stops(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
-    """Otherwise the broker's retained values would look current, because the connection is up."""
+    """Without "offline", the broker's retained values would look current while the connection is up."""
     known, running = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     state = known.hub.states.pop("pump-1")
@@ -167,7 +157,7 @@ def test_failing_publisher_is_offline_on_a_new_connection_too(listener: Listener
     listener.wait_for(has("multidrop/gateway", b"online"))
     state = known.hub.states.pop("pump-1")
     running.cut(0)
-    for said in (b"offline", b"online", b"offline"):  # the will, the new connection, its failure
+    for said in (b"offline", b"online", b"offline"):  # will, reconnection, failed publication
         listener.wait_for(has("multidrop/gateway", said))
     known.hub.states["pump-1"] = state
     running.step()
@@ -223,7 +213,7 @@ def write_of(value: object, time_ms: int, **more: object) -> bytes:
     return json.dumps({"value": value, "time": time_ms, **more}).encode()
 
 
-def test_fresh_write_is_carried_out_and_its_copy_is_not(
+def test_a_fresh_write_is_carried_out_but_its_copy_is_not(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
     known, _ = start(commands=True)
@@ -316,7 +306,7 @@ def test_stop_verb_is_carried_out_whatever_its_age(
     for _ in range(2):
         publish(broker, "multidrop/pump-1/act", json.dumps({"verb": verb, "id": [], **more}).encode())
         answer = told(listener)
-        assert COMMAND_ID.fullmatch(answer.pop("id"))  # its own id instead of the invalid one
+        assert COMMAND_ID.fullmatch(answer.pop("id"))  # the gateway made an id in place of the invalid one
         assert answer == {"what": verb, "done": True, "text": "done"}
     assert known.commands.noted == [("act", "pump-1", verb, {})] * 2
 
@@ -392,7 +382,7 @@ def test_command_older_than_a_reload_is_refused(broker: Broker, listener: Listen
 def test_command_older_than_a_stop_is_refused(
     broker: Broker, listener: Listener, start: Start, after_ms: int, is_taken: bool
 ) -> None:
-    """A broker may deliver a delayed command after the stop; the sender's clock may be fast by 2 s."""
+    """A broker may deliver a delayed command after the stop. The sender's clock may be up to 2 s fast."""
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     sent_ms = now_ms()
@@ -430,8 +420,8 @@ def test_verb_that_does_not_name_the_drive_of_its_topic_is_refused(
         (b"25", "it is not a JSON object"),
         (b'{"value": 25}', "time is missing"),
         (b'{"time": 25}', "value is missing"),
-        (b'{"value": "25", "time": 1}', "value is '25', and not a number"),
-        (b'{"value": true, "time": 1}', "value is True, and not a number"),
+        (b'{"value": "25", "time": 1}', "value is '25', not a number"),
+        (b'{"value": true, "time": 1}', "value is True, not a number"),
         (b'{"value": 25, "time": "1"}', "time is not a whole number of ms"),
         (b"\xc3\x28", "codec"),
         (b"[" * 60_000, "nested too deeply"),
@@ -452,7 +442,7 @@ def test_invalid_commands_are_reported(
 def test_an_unsendable_answer_does_not_affect_other_messages(
     broker: Broker, listener: Listener, start: Start, drive: str, verb: str
 ) -> None:
-    """A verb is not UTF-8, and the topic of another answer would be too long (65,536 bytes)."""
+    """One answer contains a verb that is not UTF-8. The other's topic is too long (65,536 bytes)."""
     known, running = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     outbox = running._part._brokers[0].outbox
@@ -491,14 +481,14 @@ def test_without_commands_only_node_commands_are_subscribed(tmp_path: Path) -> N
     require_module("paho.mqtt.client")
     part: Any = build(MqttSettings(sparkplug="works", node="line"), inside(tmp_path))
     assert [speaker.topics() for speaker in part._speakers] == [
-        [("multidrop/gateway", 0), ("multidrop/+/available", 0)],  # retained topics of removed drives
+        [("multidrop/gateway", 0), ("multidrop/+/available", 0)],  # to find topics of removed drives
         [("spBv1.0/works/NCMD/line", 1)],
     ]
 
 
 @pytest.mark.parametrize("is_retained", [False, True])
 async def test_commands_are_ignored_unless_enabled(tmp_path: Path, is_retained: bool) -> None:
-    """A broker may send messages on topics without a subscription."""
+    """A broker may send messages even on topics to which the gateway has not subscribed."""
     require_module("paho.mqtt.client")
     known = inside(tmp_path)
     part: Any = build(MqttSettings(sparkplug="works", node="line"), known)
@@ -577,8 +567,8 @@ def rendered(part: dict[str, Any], said: dict[str, Any]) -> str:
     return str(jinja2.Environment().from_string(part["value_template"]).render(value_json=said))
 
 
-# By platform: the keys used here, and the keys that Home Assistant requires. Source: its documentation of
-# MQTT, version 2026.11 (device discovery, sensor, binary sensor, number, select, button).
+# By platform: the keys that Home Assistant requires, and the other keys used here. Source: Home Assistant's
+# documentation of MQTT, version 2026.11 (device discovery, sensor, binary sensor, number, select, button).
 HA_KEYS = {
     "sensor": (
         {"state_topic"},
@@ -600,7 +590,7 @@ HA_KEYS = {
 
 
 def check_components(found: Any) -> None:
-    assert not {"state_topic", "command_topic", "value_template"} & found.keys()  # each component has its own
+    assert not {"state_topic", "command_topic", "value_template"} & found.keys()  # only components have them
     assert found["dev"]["ids"]
     for part in found["cmps"].values():
         needed, known = HA_KEYS[part["p"]]
@@ -618,7 +608,7 @@ def check_components(found: Any) -> None:
     assert len(set(ids)) == len(ids)
 
 
-@pytest.mark.parametrize("model", MODELS)
+@table("model", MODELS)
 def test_components_of_each_family_have_valid_home_assistant_keys(model: str) -> None:
     drive = MODELS[model](1, name="pump-1")
     registers = list(drive.registers)
@@ -630,7 +620,7 @@ def test_components_of_each_family_have_valid_home_assistant_keys(model: str) ->
 
 
 class Awkward(Drive):
-    """A user's own drive, whose registers have the names of our components."""
+    """A user's drive class whose registers are named like the gateway's Home Assistant components."""
 
     title = "ACME A-1"
     running = reading(1, "Hz")
@@ -667,7 +657,7 @@ def test_home_assistant_number_of_an_unpolled_register_has_no_state() -> None:
     )
 
 
-@pytest.mark.parametrize(
+@table(
     ("state", "problem", "running"),
     [
         ("runs", "OFF", "ON"),
@@ -816,7 +806,7 @@ class PutMessages:
         return {one.topic for one in self.put_in if one.is_retained and one.make() == b""}
 
 
-def test_topics_of_a_drive_removed_without_a_connection_are_deleted_on_the_next(tmp_path: Path) -> None:
+def test_topics_of_a_drive_removed_while_disconnected_are_deleted_later(tmp_path: Path) -> None:
     """Pending deletions are dropped when a connection breaks, so they must be repeated on the next one."""
     known = inside(tmp_path)
     whole = known.plant
@@ -834,6 +824,17 @@ def test_topics_of_a_drive_removed_without_a_connection_are_deleted_on_the_next(
     topics.adopt(whole)
     topics.connected()
     assert topics.outbox.emptied() == set()
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_no_topic_is_deleted_before_the_lines_of_a_fleet_are_read(tmp_path: Path, is_known: bool) -> None:
+    known = inside(tmp_path)
+    plant = known.plant if is_known else replace(known.plant, lines=())
+    topics = JsonTopics(MqttSettings(), known._replace(plant=plant), now_ms)
+    topics.outbox = PutMessages()
+    topics.received("multidrop/gateway", b"offline", is_retained=True)
+    topics.received("multidrop/old/available", b"online", is_retained=True)
+    assert bool(topics.outbox.emptied()) is is_known
 
 
 def test_retained_messages_of_a_removed_drive_are_deleted(

@@ -17,9 +17,16 @@ from lines import until
 from peers import require_module, require_program
 from tables import table
 
+from multidrop.control import CommandOutcome, CommandResult
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.mqtt.home_assistant import discovery_topic
-from multidrop.gateway.mqtt.json_topics import MOST_DISCOVERY, MOST_KEPT, RetainedTopics
+from multidrop.gateway.mqtt.json_topics import (
+    MOST_DISCOVERY,
+    MOST_KEPT,
+    JsonTopics,
+    RetainedTopics,
+    _read_write,
+)
 from multidrop.gateway.mqtt.part import build
 from multidrop.gateway.mqtt.settings import MqttSettings
 
@@ -55,7 +62,7 @@ def test_retained_messages_of_present_drives_stay() -> None:
     assert heard(GATEWAY, *mine) == []
     back = RetainedTopics("works", home_assistant=True)
     assert back.hear("works/old/available", b"offline", THERE) == []
-    assert back.hear(*GATEWAY, {*THERE, "old"}) == []  # a reload has added the drive since
+    assert back.hear(*GATEWAY, {*THERE, "old"}) == []  # in the meantime a reload has added the drive
 
 
 def test_no_topic_is_deleted_while_another_gateway_has_the_prefix() -> None:
@@ -216,3 +223,56 @@ def test_start_delayed_by_a_broker_until_after_a_stop_is_refused(tmp_path: Path)
             publisher.stdin.close()
             publisher.wait()
             listener.close()
+
+
+# ---- the Node-RED flow in the documentation uses only topics of the gateway ----
+
+
+HOWTO = Path(__file__).parents[3] / "docs" / "howto"
+FLOW: list[dict[str, Any]] = json.loads((HOWTO / "node-red-flow.json").read_text("utf-8"))
+
+
+class Noted:
+    """An outbox that records topics."""
+
+    def __init__(self) -> None:
+        self.topics: list[str] = []
+
+    def put(self, message: Any) -> None:
+        self.topics.append(message.topic)
+
+
+def topics_of(kind: str) -> list[str]:
+    return [node["topic"] for node in FLOW if node["type"] == kind]
+
+
+def test_each_topic_of_the_flow_is_published_or_taken(tmp_path: Path) -> None:
+    matches = require_module("paho.mqtt.client").topic_matches_sub
+    topics = JsonTopics(MqttSettings(commands=True), inside(tmp_path), lambda: 7)
+    topics.outbox = noted = Noted()
+    topics.connected()
+    topics._report("pump-1", "stop", CommandResult(CommandOutcome.DONE, "stopped"), "id")
+    published = [*noted.topics, "multidrop/pump-1/rows"]  # test_sparkplug_node.py tests the topic of rows
+    taken = [topic for topic, _ in topics.topics()]
+    assert len(topics_of("mqtt in")) == 4
+    for topic in topics_of("mqtt in"):
+        assert any(matches(topic, one) for one in published), topic
+    assert len(topics_of("mqtt out")) == 2
+    for topic in topics_of("mqtt out"):
+        assert any(matches(one, topic) for one in taken), topic
+
+
+def test_command_of_the_flow_is_a_valid_write() -> None:
+    [rule] = next(node["rules"] for node in FLOW if node["type"] == "change")
+    given = json.loads(rule["to"].replace("$millis()", "1795262400000"))
+    assert _read_write(given) == (25, 1_795_262_400_000)
+
+
+def test_flow_is_complete_and_the_page_lists_its_topics() -> None:
+    ids = {node["id"] for node in FLOW}
+    assert {to for node in FLOW for wire in node.get("wires", []) for to in wire} <= ids
+    assert {
+        node[key] for node in FLOW for key in ("z", "broker") if node["type"] != "mqtt-broker" and key in node
+    } <= ids
+    page = (HOWTO / "node-red.md").read_text("utf-8")
+    assert all(f"| `{topic}` |" in page for topic in topics_of("mqtt in") + topics_of("mqtt out"))

@@ -3,32 +3,30 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from brokers import (
-    FAN,
-    ROOT,
-    Broker,
-    Host,
-    Running,
-    command,
-    inside,
-    sparkplug_messages,
-    without_fan,
-)
-from peers import require_module
+from batches import add_rows, new_completion
+from brokers import FAN, ROOT, Broker, Host, Running, command, inside, sparkplug_messages, without_fan
+from hypothesis import given
+from hypothesis import strategies as st
+from lines import until
+from peers import require_installed, require_module
 from profile_families import VfdEl
+from tables import table
 
 from multidrop import DelixiModbus, Drive, InvtCHE
+from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
 from multidrop.gateway.mqtt.broker import Outbox, Publication
 from multidrop.gateway.mqtt.part import build
 from multidrop.gateway.mqtt.settings import MqttSettings
-from multidrop.gateway.mqtt.sparkplug import DataType, Metric, payload, read_command
+from multidrop.gateway.mqtt.sparkplug import DataType, Given, Metric, payload, read_command
 from multidrop.gateway.mqtt.sparkplug_node import STOP, SparkplugNode
+from multidrop.polling.batch import Batch
 
 
 @pytest.fixture
@@ -68,7 +66,7 @@ def test_node_sends_births_data_and_deaths(host: Host, node: tuple[Any, Running]
 
 
 def test_fault_text_is_published_without_a_polled_fault_register(tmp_path: Path) -> None:
-    """This drive's register `fault` is a number without names, and is not polled."""
+    """The values of this drive's register `fault` are numbers without names. The register is not polled."""
     known = inside(tmp_path, VfdEl(2, name="mill"))
     known.hub.states["mill"], known.hub.faults["mill"] = "fault", "it shows a fault"
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line"), known, lambda: 7)
@@ -234,7 +232,7 @@ async def test_stop_in_an_invalid_payload_is_sent(
 async def test_retained_write_is_refused_and_retained_stop_is_sent(
     tmp_path: Path, *, is_retained: bool
 ) -> None:
-    """A retained write is delivered on every connection, and may be recent on the first."""
+    """A broker repeats a retained write at every connection, so even a recent one is refused."""
     known = inside(tmp_path)
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line", commands=True), known, lambda: 1_000)
     given = [Metric(DataType.DOUBLE, 25.0, 1_000, "setpoint"), Metric(DataType.BOOLEAN, 1, 1_000, STOP)]
@@ -261,3 +259,189 @@ def test_reload_sends_deaths_of_removed_drives_and_births_of_others(
     assert host.values(host.wait_for("DDATA", "pump-1")) == {"output_frequency": 50.0}
     assert host.kinds[born:] == ["DDATA"]
     assert known.commands.noted == []
+
+
+# ---- Sparkplug's payloads, against Eclipse's own message definitions and Google's protobuf ----
+
+
+SPANS: dict[DataType, st.SearchStrategy[Any]] = {
+    DataType.INT64: st.integers(-(2**63), 2**63 - 1),
+    DataType.DOUBLE: st.floats(),
+    DataType.BOOLEAN: st.booleans(),
+    DataType.STRING: st.text(),
+}
+metrics = st.sampled_from(DataType).flatmap(
+    lambda kind: st.builds(
+        Metric,
+        st.just(kind),
+        st.none() | SPANS[kind],
+        st.integers(0, 2**63),
+        st.text(),
+        st.none() | st.integers(0, 2**63),
+    )
+)
+
+
+def value_of(metric: Any) -> object:
+    """Return a metric's value as a Sparkplug host reads it."""
+    if metric.is_null:
+        return None
+    value = getattr(metric, metric.WhichOneof("value"))
+    return value - 2**64 if metric.datatype == DataType.INT64 and value >= 2**63 else value
+
+
+@pytest.mark.long
+@given(st.integers(0, 2**63), st.lists(metrics, max_size=5), st.none() | st.integers(0, 255))
+def test_a_host_can_decode_all_payloads(time_ms: int, said: list[Metric], seq: int | None) -> None:
+    received = sparkplug_messages().Payload.FromString(payload(time_ms, said, seq))
+    assert received.timestamp == time_ms
+    assert (received.seq if received.HasField("seq") else None) == seq
+    for one, metric in zip(received.metrics, said, strict=True):
+        assert (one.name, one.timestamp, one.datatype) == (metric.name, metric.time_ms, metric.datatype)
+        assert (one.alias if one.HasField("alias") else None) == metric.alias
+        found = value_of(one)
+        if isinstance(metric.value, float) and math.isnan(metric.value):
+            assert isinstance(found, float)
+            assert math.isnan(found)
+        else:
+            assert found == metric.value
+
+
+@table(
+    ("field", "value"),
+    [
+        ("int_value", 7),
+        ("long_value", 7),
+        ("double_value", 7.5),
+        ("float_value", 0.5),
+        ("boolean_value", True),
+        ("string_value", "жар"),
+    ],
+)
+def test_command_of_a_sparkplug_host_is_decoded(field: str, value: object) -> None:
+    messages = sparkplug_messages()
+    sent = messages.Payload(timestamp=1234, seq=3)
+    sent.metrics.add(name="setpoint", alias=9, datatype=10, timestamp=5, **{field: value})
+    sent.metrics.add(name="nothing", is_null=True)
+    assert read_command(sent.SerializeToString()) == (
+        1234,
+        [Given("setpoint", 9, value), Given("nothing", None, None)],  # type: ignore[arg-type]
+    )
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes_are_decoded_or_refused(data: bytes) -> None:
+    try:
+        time_ms, found = read_command(data)
+    except ValueError:
+        return
+    assert time_ms >= 0
+    assert len(found) <= len(data)
+
+
+@given(st.data())
+def test_damaged_command_is_decoded_or_raises_value_error(data: st.DataObject) -> None:
+    whole = bytearray(payload(5, [Metric(DataType.DOUBLE, 2.5, 5, "setpoint", 3)], 1))
+    whole[data.draw(st.integers(0, len(whole) - 1))] = data.draw(st.integers(0, 255))
+    del whole[data.draw(st.integers(0, len(whole))) :]
+    test_any_bytes_are_decoded_or_refused.hypothesis.inner_test(bytes(whole))  # type: ignore[attr-defined]
+
+
+# ---- all rows over MQTT: JSON on a topic of each drive, and historical values of a Sparkplug node ----
+
+
+require_installed("pyarrow")
+NOON_MS = 1_795_262_400_000
+DRIVES, REGISTERS = Names(["pump-1", FAN.name, "gone"]), Names(["output_frequency", "status", "gone"])
+
+
+def batch(*given: tuple[int, int, int, int]) -> Batch:
+    """Return a batch of rows, each given as ms after noon, drive code, register code and value."""
+    columns = Columns(len(given))
+    for ms, drive, register, value in given:
+        found = new_completion(result=7, sent_ns=ms * 1_000_000, first_ns=ms * 1_000_000 + 1)
+        found.reply.data_len = 2
+        found.reply.data[0:2] = list(value.to_bytes(2, "big"))
+        layout = RowLayout(drive, [Field(0, NumberFormat.U16, register, 1.0, 1.0)])
+        assert add_rows(columns, layout, found, NOON_MS * 1_000_000)
+    return Batch(columns, DRIVES, REGISTERS)
+
+
+@pytest.fixture
+def row_node(broker: Broker, host: Host, tmp_path: Path) -> Iterator[tuple[Any, Any, Running]]:
+    """Return the context, the part, and the running part of a node that sends all rows."""
+    known = inside(tmp_path)
+    part = build(MqttSettings(broker.address, sparkplug="works", node="line", rows=True), known)
+    running = Running(part)
+    yield known, part, running
+    running.close()
+
+
+def history(host: Host, kind: str, drive: str) -> list[tuple[str, int, Any]]:
+    """Wait for a message; return name, ms after noon, and value of its historical metrics."""
+    found = host.wait_for(kind, drive)
+    values = host.values(found)
+    return [
+        (name, metric.timestamp - NOON_MS, values[name])
+        for metric in found.metrics
+        if metric.is_historical and (name := host.aliases[metric.alias])
+    ]
+
+
+def test_failed_start_leaves_no_spool_open(tmp_path: Path) -> None:
+    settings = MqttSettings("mqtt://127.0.0.1:9", sparkplug="works", node="line", rows=True)
+    other = tmp_path / settings.spool / "sparkplug" / "rows.csv"
+    other.parent.mkdir(parents=True)
+    other.touch()
+    for _ in range(2):
+        with pytest.raises(ValueError, match="sparkplug is not a spool"):
+            build(settings, inside(tmp_path))
+
+
+@pytest.mark.slow
+def test_rows_polled_while_the_broker_was_away_are_historical(
+    broker: Broker, host: Host, row_node: tuple[Any, Any, Running]
+) -> None:
+    _, part, _ = row_node
+    host.wait_for("DBIRTH", FAN.name)
+    for one in part._brokers:
+        one._client.reconnect_delay_set(3, 3)  # no reconnection until the second host listens
+    broker.kill()
+    until(lambda: "no connection" in part.health())
+    part.take(batch((1, 0, 0, 40), (2, 1, 0, 41), (3, 2, 0, 42), (4, 0, 2, 43), (5, 0, 1, 1)))
+    assert all(one._spool.sync(30.0) for one in part._forwarded)
+    broker.start()
+    again = Host(broker)
+    again.wait_for("NBIRTH")
+    assert history(again, "DDATA", "pump-1") == [("output_frequency", 1, 40.0), ("status", 5, "FORWARD")]
+    assert history(again, "DDATA", FAN.name) == [("output_frequency", 2, 41.0)]
+    until(lambda: part.health() == "")
+    again.close()
+    assert [one._forwarder.rows for one in part._forwarded] == [5, 5]
+
+
+@pytest.mark.slow
+def test_a_silent_drive_gets_a_birth_before_its_historical_values(
+    host: Host, row_node: tuple[Any, Any, Running]
+) -> None:
+    known, part, running = row_node
+    host.wait_for("DBIRTH", FAN.name)
+    known.hub.states["pump-1"] = "silent"
+    running.step()
+    host.wait_for("DDEATH", "pump-1")
+    part.take(batch((7, 0, 0, 44)))
+    assert part._forwarded[1]._spool.sync(30.0)
+    host.wait_for("DBIRTH", "pump-1")
+    assert history(host, "DDATA", "pump-1") == [("output_frequency", 7, 44.0)]
+    until(lambda: part._forwarded[1]._forwarder.rows == 1)
+    running.step()
+    host.wait_for("DDEATH", "pump-1")
+
+
+def test_live_values_have_the_time_of_their_row(host: Host, row_node: tuple[Any, Any, Running]) -> None:
+    known, _, running = row_node
+    host.wait_for("DBIRTH", FAN.name)
+    known.hub.values["pump-1", "output_frequency"] = 48.0
+    running.step()
+    [metric] = host.wait_for("DDATA", "pump-1").metrics
+    assert (metric.timestamp, metric.is_historical) == (7, False)

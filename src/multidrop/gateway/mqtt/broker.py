@@ -15,12 +15,14 @@ from urllib.parse import urlsplit
 from multidrop.printable import masked
 from multidrop.supervisor import Hung, supervisor
 
-MOST_UNDER_WAY = 64  # limit of unacknowledged messages: enough for the drives of two lines
+MOST_UNDER_WAY = 64  # limit of unacknowledged messages in flight: enough for the drives of two lines
 MOST_WAITING = 4096  # limit of pending messages, one per topic; no plant needs more topics
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 RETRY_S = (1, 30)  # first and longest pause before reconnecting
 KEEP_ALIVE_S = 15
 FAREWELL_S = 1.0  # time limit for the last messages
+CONFIRM_S = 10.0  # time limit for the broker to confirm messages
+CONFIRMED = "multidrop/confirmed"  # a topic to which this client does not subscribe
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
 
 
@@ -34,7 +36,7 @@ class Publication(NamedTuple):
 
 
 class Outbox:
-    """Pending messages, one per topic, and a limited number of unacknowledged ones.
+    """Pending messages, one per topic, and a limited number of messages that the broker has not acknowledged.
 
     `send` takes a message and returns its number, or None if it cannot be sent now.
     """
@@ -47,7 +49,7 @@ class Outbox:
         self.dropped = 0  # messages replaced by a newer one, or lost with the connection
 
     def put(self, message: Publication) -> None:
-        """Queue the message, in place of any older message of the same topic."""
+        """Queue the message; it replaces a pending message of the same topic."""
         if message.topic in self._waiting or len(self._waiting) >= MOST_WAITING:
             self.dropped += 1
         if message.topic in self._waiting or len(self._waiting) < MOST_WAITING:
@@ -59,12 +61,12 @@ class Outbox:
         self.dropped += self._waiting.pop(topic, None) is not None
 
     def flush(self) -> None:
-        """Send pending messages, up to MOST_UNDER_WAY unacknowledged ones."""
+        """Send pending messages, as long as fewer than MOST_UNDER_WAY are unacknowledged."""
         while self._waiting and len(self._under_way) < MOST_UNDER_WAY:
             topic = next(iter(self._waiting))
             try:
                 number = self._send(self._waiting[topic])
-            except Exception as failure:  # drop this message, which no broker accepts, and send the others
+            except Exception as failure:  # no broker would accept this message: drop it, and send the others
                 del self._waiting[topic]
                 self.dropped += 1
                 _log.warning("the message on %.100r cannot be sent: %r", topic, failure)
@@ -76,12 +78,12 @@ class Outbox:
             self.sent += 1
 
     def acknowledge(self, numbers: Iterable[int]) -> None:
-        """Note that the broker has received messages."""
+        """Record that the broker has received the messages with these numbers."""
         self._under_way.difference_update(numbers)
         self.flush()
 
     def forget(self) -> None:
-        """Drop all messages after a lost connection."""
+        """Drop all messages, because the connection was lost."""
         self.dropped += len(self._waiting) + len(self._under_way)
         self._waiting.clear()
         self._under_way.clear()
@@ -149,7 +151,7 @@ class Speaker(Protocol):
 
 
 class Broker:
-    """The connection of a speaker. Paho's thread sends; only the method `close` waits for that thread."""
+    """A speaker's connection to a broker. Paho's thread sends; only `close` waits for that thread."""
 
     def __init__(self, address: Address, login: Login, name: str, speaker: Speaker) -> None:
         from paho.mqtt.client import Client
@@ -157,12 +159,14 @@ class Broker:
 
         self._address = address
         self._name = name
-        self._thread: threading.Thread | None = None  # paho's thread for this connection
+        self._thread: threading.Thread | None = None  # the thread of the paho client for this connection
         self._speaker = speaker
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self.loop: asyncio.AbstractEventLoop | None = None
         self.outbox = Outbox(self._send)
         self.is_connected = False
         self.failure = ""  # why the speaker cannot publish now
+        self._connections = 0
+        self._confirming: dict[int, asyncio.Future[None]] = {}  # by number of the packet
         self._client: Any = Client(CallbackAPIVersion.VERSION2, client_id=name, clean_session=True)
         self._client.reconnect_delay_set(*RETRY_S)
         self._client.max_inflight_messages_set(0)  # the outbox sets the limit
@@ -175,25 +179,26 @@ class Broker:
         self._client.on_disconnect = lambda *given: self._call(self._lost, str(given[3]))
         self._client.on_publish = self._on_publish
         self._client.on_message = self._on_message
-        self._arrived: deque[int] = deque()  # numbers of acknowledged messages, for the loop
+        self._client.on_unsubscribe = lambda *given: self._call(self._confirm, given[2])
+        self._arrived: deque[int] = deque()  # numbers of acknowledged messages, which the loop must handle
         self._why = ""
 
     def open(self) -> None:
         """Start to connect, and retry after each failure."""
-        self._loop = asyncio.get_running_loop()
+        self.loop = asyncio.get_running_loop()
         self._set_will()
         self._client.connect_async(self._address.host, self._address.port, KEEP_ALIVE_S)
         self._client.loop_start()
         self._thread = next((one for one in threading.enumerate() if one.name.endswith(self._name)), None)
 
     async def close(self) -> None:
-        """Send pending messages for FAREWELL_S at most, and disconnect."""
+        """Send pending messages for at most FAREWELL_S seconds, then disconnect."""
         begun = asyncio.get_running_loop().time()
         while self.is_connected and not self.outbox.is_idle:
             if asyncio.get_running_loop().time() - begun > FAREWELL_S:
                 break
             await asyncio.sleep(0.01)
-        self._loop = None
+        self.loop = None
         self._client.disconnect()
         with suppress(Hung):  # paho's daemon thread may wait for a name server
             await supervisor().within("mqtt", FAREWELL_S, self._client.loop_stop)
@@ -201,25 +206,25 @@ class Broker:
         self._client = None  # frees the sockets by which paho wakes its thread
 
     def publish(self) -> None:
-        """Let the speaker publish. Without a connection, messages wait, and newer messages replace them.
+        """Let the speaker publish. Without a connection, the newest message of each topic waits.
 
         Raises RuntimeError if paho's thread has ended.
         """
         if self._thread is not None and not self._thread.is_alive():
-            raise RuntimeError("the thread of its connection has ended")
+            raise RuntimeError("the thread of the broker's connection has ended")
         had_failed = self.failure
         self._let(self._speaker.publish)
         if had_failed and not self.failure and self.is_connected:
             self.publish_all()
 
     def publish_all(self) -> None:
-        """Let the speaker (the publishing format) send all its messages, as it does on a new connection."""
+        """Let the speaker send all its messages, as on a new connection."""
         self._let(self._speaker.connected)
 
     def _let(self, say: Callable[[], None]) -> None:
         """Let the speaker publish. If that fails, publish "offline", but keep receiving commands.
 
-        Without "offline", the drives' values that the broker retains would look fresh.
+        Without "offline", retained values at the broker would look current.
         """
         try:
             say()
@@ -231,6 +236,28 @@ class Broker:
             self.failure = f"publishing fails: {type(failure).__name__}: {failure}"
         else:
             self.failure = ""
+
+    async def confirm(self) -> None:
+        """Wait until the broker has received all messages put into the outbox so far. Raises OSError.
+
+        A message of QoS 0 is not acknowledged, but a broker handles packets in their order. So the
+        broker's answer to a later packet confirms all messages before that packet. The later packet used
+        here unsubscribes from CONFIRMED, which has no other effect.
+        """
+        connection = self._connections
+        async with asyncio.timeout(CONFIRM_S):
+            while self.is_connected and not self.outbox.is_idle:
+                await asyncio.sleep(0.01)
+            if not self.is_connected or connection != self._connections:
+                raise ConnectionError(self.trouble)
+            _, number = self._client.unsubscribe(CONFIRMED)
+            self._confirming[number] = confirmed = asyncio.get_running_loop().create_future()
+            await confirmed
+
+    def _confirm(self, number: int) -> None:
+        confirmed = self._confirming.pop(number, None)
+        if confirmed is not None and not confirmed.done():
+            confirmed.set_result(None)
 
     @property
     def trouble(self) -> str:
@@ -253,12 +280,13 @@ class Broker:
 
     def _greet(self) -> None:
         self.is_connected = True
+        self._connections += 1
         self._why = ""
         _log.info("connected to %s:%d", self._address.host, self._address.port)
         for topic, qos in self._speaker.topics():
             self._client.subscribe(topic, qos)
         self.failure = ""  # forget the failure of the previous connection
-        self.outbox.forget()  # the first message of a connection must be the speaker's birth
+        self.outbox.forget()  # drop old messages: the speaker's birth must be sent first
         self.publish_all()
 
     def _acknowledge(self) -> None:
@@ -275,13 +303,17 @@ class Broker:
     def _lost(self, why: str) -> None:
         self.is_connected = False
         self.outbox.forget()
+        for confirmed in self._confirming.values():
+            if not confirmed.done():
+                confirmed.set_exception(ConnectionError(why))
+        self._confirming.clear()
         self._set_will()
         self._failed(why)
 
     # ---- in paho's thread ----
 
     def _call(self, what: Callable[..., None], *given: Any) -> None:
-        loop = self._loop
+        loop = self.loop
         if loop is not None and not loop.is_closed():
             loop.call_soon_threadsafe(what, *given)
 

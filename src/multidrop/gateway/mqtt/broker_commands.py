@@ -1,8 +1,8 @@
 """BrokerCommands: check commands from a broker, which may delay, retain and duplicate messages.
 
-A write or a verb is carried out only if it was sent within the last seconds, after the latest stop of its
-drive and the latest reload of the plant, and is not a copy. A verb that stops the motor is always carried
-out.
+A write or a verb is carried out only if it is not a copy and was sent at most MOST_AGE_S ago. It must
+also have been sent after the latest stop of its drive and the latest reload of the plant. A verb that
+stops the motor is always carried out.
 """
 
 from __future__ import annotations
@@ -18,17 +18,21 @@ from multidrop.gateway.commands import MOST_AGE_S, Commands
 from multidrop.gateway.http.rights import Caller
 from multidrop.supervisor import supervisor
 
-MOST_AGE_MS = round(MOST_AGE_S * 1e3)  # a broker that was suspended delivers all delayed messages together
-MOST_AHEAD_MS = 2_000  # tolerance for a sender's clock that is ahead
+# age limit of commands: a broker that was suspended delivers all delayed messages together
+MOST_AGE_MS = round(MOST_AGE_S * 1e3)
+MOST_AHEAD_MS = 2_000  # how far a sender's clock may be ahead
 MOST_UNDER_WAY = 16  # limit of concurrent commands; stops are not counted
-REMEMBERED = 1_000  # newest commands, to recognise copies
+REMEMBERED = 1_000  # number of newest commands that are kept, to recognise copies
 
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
 Report = Callable[[str, str, CommandResult, str], None]  # the drive, the command's text, its result, its id
 
 
 class BrokerCommands:
-    """Checks commands and carries them out; calls `report` with each result. `utc_ms` returns the time."""
+    """Checks commands and carries them out; calls `report` with each result.
+
+    `utc_ms` returns the present time (UTC) in ms.
+    """
 
     def __init__(self, commands: Commands, caller: Caller, utc_ms: Callable[[], int], report: Report) -> None:
         self._commands = commands
@@ -48,7 +52,7 @@ class BrokerCommands:
         self._begin(self._do(drive, verb, caller, self._commands.act(drive, verb, options, caller)))
 
     def write(self, drive: str, register: str, value: float, time_ms: int, given_id: object = None) -> None:
-        """Write a register if the command may be carried out (see the module); else report why not.
+        """Write a register if the rules in the module's docstring allow it; else report why not.
 
         Raises ValueError for an invalid id.
         """
@@ -60,7 +64,7 @@ class BrokerCommands:
     def act(
         self, drive: str, verb: str, options: Mapping[str, object], time_ms: int, given_id: object = None
     ) -> None:
-        """Carry out a verb if the command may be carried out (see the module); else report why not.
+        """Carry out a verb if the rules in the module's docstring allow it; else report why not.
 
         Raises ValueError for an invalid id.
         """
@@ -79,7 +83,7 @@ class BrokerCommands:
     def _may_be_before(at_ns: int | None, age_ms: int) -> bool:
         """Return True if a command of this age may have been sent before `at_ns`.
 
-        The sender's clock may be ahead by MOST_AHEAD_MS. Without `at_ns`, return False.
+        The sender's clock may be ahead by MOST_AHEAD_MS. If `at_ns` is None, return False.
         """
         if at_ns is None:
             return False
@@ -91,7 +95,7 @@ class BrokerCommands:
             self.refuse(drive, what, why, caller.command)
             return False
         self._came.append(command)
-        self._under_way += 1  # counted here, not in the task: a broker may deliver many commands together
+        self._under_way += 1  # counted here, because many commands may arrive before the first task starts
         return True
 
     def _why_not(self, drive: str, command: object, age_ms: int) -> str:

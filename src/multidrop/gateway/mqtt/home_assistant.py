@@ -1,6 +1,7 @@
 """Discovery messages for Home Assistant (homeassistant/device/ID/config), one for each drive.
 
-Each component has its own state topic: a state topic of the device would also apply to numbers and buttons.
+Each component has its own state topic, because a state topic of the device would also apply to numbers
+and buttons.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ CLASSES = {  # Home Assistant's device_class by unit
     "s": "duration",
 }
 STATES = (RUNS, STANDS, FAULT, SILENT, UNKNOWN)
-OWN = ("problem", "running", "set", "value")  # suffixes of ids that are not names of registers
+OWN = ("problem", "running", "set", "value")  # ids of other components end in these words
 MOST = 1e12  # limit of a number's range in Home Assistant
 LEAST_STEP = 0.001  # smallest step of a number that Home Assistant accepts
-STALE_PERIODS = 3  # a sensor is unavailable after this many periods
+STALE_PERIODS = 3  # a sensor becomes unavailable after this many publishing periods without a value
 # Commands carry the time of Home Assistant's clock, so the gateway can refuse delayed commands.
 COMMAND = '{{"value": {{{{ {} }}}}, "time": {{{{ (now().timestamp() * 1000) | int }}}}}}'
 
@@ -43,7 +44,8 @@ def discovery_topic(prefix: str, drive: str) -> str:
 
 
 def object_id(prefix: str, drive: str) -> str:
-    """Return an id with only the characters that Home Assistant allows; other characters become code points.
+    """Return an id with only the characters that Home Assistant allows; other characters are replaced by
+    their code points.
 
     The first "-" ends the prefix, so ids of different prefixes and drives differ.
     """
@@ -108,7 +110,7 @@ def discovery(
     ).encode()
 
 
-# The value of each binary sensor by the drive's state; unknown in all other states.
+# The value of each binary sensor by the drive's state; in all other states the value is unknown.
 BINARY = {
     "problem": {RUNS: "OFF", STANDS: "OFF", FAULT: "ON"},
     "running": {RUNS: "ON", STANDS: "OFF"},
@@ -116,7 +118,7 @@ BINARY = {
 
 
 def _unused(key: str, parts: Mapping[str, Any]) -> str:
-    """Return an unused key for a component: a register may have the name "running"."""
+    """Return an unused key for a component, because a register may also be named "running"."""
     return _unused(f"{key}_", parts) if key in parts else key
 
 

@@ -1,4 +1,4 @@
-"""JSON topics: PREFIX/DRIVE has a drive's newest values, null for each that is not fresh.
+"""JSON topics: PREFIX/DRIVE has a drive's newest values, and null for each value that is not fresh.
 
 PREFIX/DRIVE/available and PREFIX/gateway have "online" or "offline"; PREFIX/DRIVE/told has results of
 commands.
@@ -15,23 +15,24 @@ from typing import Any, NamedTuple
 from multidrop import Plant
 from multidrop.control import CommandResult
 from multidrop.gateway.commands import STOPPING, drives_of
-from multidrop.gateway.live.hub import SILENT
+from multidrop.gateway.live.hub import SILENT, published_values
 from multidrop.gateway.mqtt.broker import Publication
 from multidrop.gateway.mqtt.broker_commands import BrokerCommands
 from multidrop.gateway.mqtt.home_assistant import DISCOVERY, discovery, discovery_topic, object_id
-from multidrop.gateway.mqtt.settings import MqttSettings, fresh_values
+from multidrop.gateway.mqtt.settings import MqttSettings
 from multidrop.gateway.parts import PartContext
 from multidrop.plant import drive_meant
+from multidrop.printable import is_number, is_whole
 
 ONLINE, OFFLINE = b"online", b"offline"
-MOST_KEPT = 256  # limit of retained messages examined per connection; the next connection examines others
-MOST_DISCOVERY = 1 << 18  # limit of a discovery message in bytes
+MOST_KEPT = 256  # limit of retained messages examined on one connection; the next connection examines others
+MOST_DISCOVERY = 1 << 18  # limit of the length of a discovery message in bytes
 EXAMPLES = {
     "set": '{"value": 25.0, "time": UTC in ms}',
     "act": '{"verb": "start", "drive": "pump-1", "time": UTC in ms}',
 }
-MOST_BYTES = 65_536  # limit of a write or a verb
-NOTHING = b""  # removes a retained message
+MOST_BYTES = 65_536  # limit of the payload of a write or a verb in bytes
+NOTHING = b""  # payload that deletes the topic's retained message
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
 
 
@@ -43,10 +44,10 @@ class KeptTopic(NamedTuple):
 
 
 class RetainedTopics:
-    """Finds retained messages of removed drives.
+    """Finds retained MQTT messages of drives that were removed from the plant.
 
-    Such messages remain if a gateway is killed, and a drive is removed from its plant file before the next
-    start. Only topics of the own prefix are returned, and only a limited number, whatever the broker sends.
+    Such messages remain if a gateway is killed, and a drive is removed from its plant file before the
+    next start. The methods return only topics under the gateway's own prefix, and at most MOST_KEPT.
     """
 
     def __init__(self, prefix: str, *, home_assistant: bool) -> None:
@@ -55,8 +56,8 @@ class RetainedTopics:
         self.begin()
 
     def begin(self) -> None:
-        """Forget the messages of the previous connection. Called on a new connection."""
-        self._is_alone = False  # no other gateway is online with this prefix
+        """Forget the messages of the previous connection. Called when a new connection starts."""
+        self._is_alone = False  # True: no other gateway is online under this prefix
         self._found: list[KeptTopic] = []
         self._looked_at = 0
 
@@ -66,7 +67,10 @@ class RetainedTopics:
         return [*kept, f"{DISCOVERY}/device/+/config"] if self._home_assistant else kept
 
     def hear(self, topic: str, payload: bytes, there: Collection[str]) -> list[str]:
-        """Process a retained message; return the topics to delete now. `there` are the plant's drives."""
+        """Process a retained message; return the topics to delete now.
+
+        `there` has the names of the plant's drives.
+        """
         if topic == f"{self._prefix}/gateway":
             self._is_alone = payload == OFFLINE
         elif self._looked_at < MOST_KEPT:
@@ -93,7 +97,7 @@ class RetainedTopics:
         return [KeptTopic(drive, topic)]
 
     def _drive_in(self, topic: str) -> str | None:
-        """Return the drive whose values are published on this topic."""
+        """Return the drive whose values are published on this topic; None for any other topic."""
         drive = topic.removeprefix(f"{self._prefix}/")
         return drive if drive and topic == f"{self._prefix}/{drive}" and "/" not in drive else None
 
@@ -107,7 +111,8 @@ def _state_topic(payload: bytes) -> str:
     except (ValueError, RecursionError):
         return ""
     parts = said.get("cmps") if isinstance(said, dict) else None
-    state = parts.get("state") if isinstance(parts, dict) else said  # older messages have it at the top
+    # older messages have the state topic at the top level
+    state = parts.get("state") if isinstance(parts, dict) else said
     found = state.get("state_topic") if isinstance(state, dict) else None
     return found if isinstance(found, str) else ""
 
@@ -125,7 +130,7 @@ class JsonTopics:
         self._plant = context.plant
         self._commands = BrokerCommands(context.commands, settings.caller, utc_ms, self._report)
         self._available: dict[str, bytes] = {}
-        self._left: set[str] = set()  # removed drives whose retained messages must be deleted
+        self._left: set[str] = set()  # removed drives whose retained messages must still be deleted
         self._retained_topics = RetainedTopics(settings.prefix, home_assistant=settings.home_assistant)
 
     def _topic(self, *levels: str) -> str:
@@ -152,7 +157,8 @@ class JsonTopics:
         self._available.clear()
         self._retained_topics.begin()
         self.outbox.put(self._kept(self._topic("gateway"), ONLINE))
-        self._take_back()  # the previous connection may have broken before the broker got these deletions
+        # delete again: the previous connection may have broken before the broker got the deletions
+        self._take_back()
         if self._settings.home_assistant:
             for drive in self._hub.drives:
                 self._discover(drive)
@@ -174,6 +180,8 @@ class JsonTopics:
 
     def _look_back(self, topic: str, payload: bytes) -> None:
         """If this retained message belongs to a removed drive, delete the drive's retained messages."""
+        if not self._plant.lines:  # a fleet's lines are not read yet
+            return
         for left in self._retained_topics.hear(topic, payload, drives_of(self._plant)):
             self.outbox.put(self._kept(left, NOTHING))
 
@@ -191,10 +199,9 @@ class JsonTopics:
         try:
             if what[0] == "act" and str(given.get("verb")) in STOPPING:
                 for one in self._to_stop(drive, given):
-                    self._commands.stop_by(
-                        one, given["verb"], {}, named
-                    )  # wrong options must not prevent a stop
-            elif is_retained:  # it would be carried out again on every connection
+                    # options are ignored: wrong ones must not prevent a stop
+                    self._commands.stop_by(one, given["verb"], {}, named)
+            elif is_retained:  # a retained command would be carried out again on every connection
                 kept = "it was retained; publish it without retain"
                 self._commands.refuse(drive, "/".join(what), kept, named)
             elif what[0] == "set":
@@ -267,7 +274,7 @@ class JsonTopics:
             "time": None if answer is None else answer[0] // 1_000_000,
             "state": shown.state,
             "fault": shown.fault,
-            "values": fresh_values(self._hub, drive),
+            "values": published_values(self._hub, drive),
         }
         return json.dumps(said, ensure_ascii=False).encode()
 
@@ -305,20 +312,20 @@ def _read_write(given: Mapping[str, Any]) -> tuple[float, int]:
     """Return value and time of a write. Raises ValueError for an invalid message."""
     _check_keys(given, "value", "time")
     value = given["value"]
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f"value is {value!r}, and not a number")
+    if not is_number(value):
+        raise ValueError(f"value is {value!r}, not a number")
     return value, _time(given)
 
 
 def _read_act(drive: str, given: Mapping[str, Any]) -> tuple[str, dict[str, object], int]:
-    """Return verb, options and time. Raises ValueError for an invalid message or another drive."""
+    """Return verb, options and time. Raises ValueError if the message is invalid or names another drive."""
     _check_keys(given, "verb", "drive", "time")
     return str(given["verb"]), _options(drive, given), _time(given)
 
 
 def _options(drive: str, given: Mapping[str, Any]) -> dict[str, object]:
     if given.get("drive", drive) != drive:
-        raise ValueError(f"it names drive {given['drive']!r}, and its topic {drive!r}")
+        raise ValueError(f"it names drive {given['drive']!r}, but its topic names {drive!r}")
     options = given.get("options", {})
     if not isinstance(options, dict):
         raise ValueError("options is not an object")
@@ -327,14 +334,14 @@ def _options(drive: str, given: Mapping[str, Any]) -> dict[str, object]:
 
 def _time(given: Mapping[str, Any]) -> int:
     time: object = given["time"]
-    if isinstance(time, bool) or not isinstance(time, int):
+    if not is_whole(time):
         raise ValueError("time is not a whole number of ms")
     return time
 
 
 def _read(payload: bytes) -> dict[str, Any]:
     if len(payload) > MOST_BYTES:
-        raise ValueError(f"it has {len(payload)} bytes")
+        raise ValueError(f"it has {len(payload)} bytes, more than {MOST_BYTES}")
     try:
         given = json.loads(payload)
     except RecursionError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from multidrop import Batch, Plant
 from multidrop.exposition import MetricFamily
@@ -16,6 +16,10 @@ from multidrop.gateway.mqtt.json_topics import JsonTopics
 from multidrop.gateway.mqtt.settings import MqttSettings
 from multidrop.gateway.mqtt.sparkplug_node import SparkplugNode
 from multidrop.gateway.parts import PartContext
+from multidrop.supervisor import supervisor
+
+if TYPE_CHECKING:
+    from multidrop.gateway.forward.part import Forwarding
 
 Settings = MqttSettings
 
@@ -26,11 +30,16 @@ def build(settings: MqttSettings, context: PartContext) -> Mqtt:
     speakers: list[Any] = [topics]
     if settings.sparkplug:
         speakers.append(SparkplugNode(settings, context, utc_ms))
-    return Mqtt(settings, context, topics, speakers)
+    part = Mqtt(settings, context, topics, speakers)
+    if settings.rows:
+        part.forward_rows(settings, context)
+    return part
 
 
 class Mqtt:
-    """The formats (`Speaker`), each with its own connection because a connection has only one will."""
+    """The MQTT part. Each message format (`Speaker`) has its own connection, because a connection has only
+    one will.
+    """
 
     def __init__(
         self, settings: MqttSettings, context: PartContext, topics: JsonTopics, speakers: list[Any]
@@ -40,17 +49,37 @@ class Mqtt:
         self._topics = topics
         self._speakers = speakers
         self._brokers = []
+        self._forwarded: list[Forwarding] = []
         for speaker in speakers:
             name = f"{settings.prefix}/{context.plant.path.stem}/{speaker.kind}"  # unique among gateways
             broker = Broker(address, login, name, speaker)
             speaker.outbox = broker.outbox
             self._brokers.append(broker)
 
+    def forward_rows(self, settings: MqttSettings, context: PartContext) -> None:
+        """Also publish every row, besides each register's newest value.
+
+        Raises ImportError without pyarrow, ValueError for an invalid spool.
+        """
+        from multidrop.gateway.mqtt.rows import json_rows, sparkplug_rows
+
+        address, login = parse_broker(settings.broker), settings.login(context.plant)
+        self._forwarded.append(json_rows(settings, context, address, login))
+        try:
+            for broker, node in zip(self._brokers[1:], self._speakers[1:], strict=True):
+                self._forwarded.append(sparkplug_rows(settings, context, broker, node))
+        except ValueError:
+            for one in self._forwarded:
+                one.abandon()
+            raise
+
     def take(self, batch: Batch) -> None:
-        """Ignore the batch: the hub has the newest rows."""
+        """Store the rows if the setting `rows` is on. The newest rows come from the hub."""
+        for one in self._forwarded:
+            one.take(batch)
 
     def note_alarm(self, alarm: Alarm, change: AlarmChange) -> None:
-        """Publish the active alarms, because one began, changed or ended."""
+        """Publish the list of active alarms, because an alarm began, changed or ended."""
         if self._brokers[0].is_connected:
             self._topics.publish_alarms()
 
@@ -60,18 +89,34 @@ class Mqtt:
             speaker.adopt(plant)
             if broker.is_connected:
                 broker.publish_all()
+        for one in self._forwarded:
+            one.adopt(plant)
 
     async def run(self, sleep: Callable[[float], Awaitable[object]] = asyncio.sleep) -> None:
         """Publish periodically until cancelled."""
         for broker in self._brokers:
             broker.open()
-        while True:
-            for broker in self._brokers:
-                broker.publish()
-            await sleep(self._every)
+        forwarding = [supervisor().start("mqtt rows", one.run()) for one in self._forwarded]
+        try:
+            while True:
+                for broker in self._brokers:
+                    broker.publish()
+                for task in forwarding:
+                    if task.done():
+                        task.result()
+                await sleep(self._every)
+        finally:
+            for task in forwarding:
+                task.cancel()
 
     async def close(self) -> None:
-        """Send the last messages and disconnect."""
+        """Send the last messages and disconnect; write the last rows to the disk."""
+        closing = [self._leave(), *(one.close() for one in self._forwarded)]
+        for failure in await asyncio.gather(*closing, return_exceptions=True):
+            if failure is not None:
+                raise failure
+
+    async def _leave(self) -> None:
         for broker, speaker in zip(self._brokers, self._speakers, strict=True):
             if broker.is_connected:
                 speaker.leave()
@@ -80,6 +125,7 @@ class Mqtt:
     def health(self) -> str:
         """Return why publishing fails; "" if it works."""
         troubles = [broker.failure if broker.is_connected else broker.trouble for broker in self._brokers]
+        troubles += [one.health() for one in self._forwarded]
         return next(filter(None, troubles), "")
 
     def figures(self) -> list[MetricFamily]:
@@ -104,4 +150,5 @@ class Mqtt:
                 "Connections to the broker that are up: one for JSON, and one more for Sparkplug.",
                 [("", {}, connected)],
             ),
+            *(family for one in self._forwarded for family in one.figures()),
         ]

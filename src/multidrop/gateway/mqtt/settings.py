@@ -1,42 +1,47 @@
-"""The table [serve.mqtt] of a plant file, and the published values of a drive."""
+"""The table [serve.mqtt] of a plant file."""
 
 from __future__ import annotations
 
 import re
 import ssl
 from collections.abc import Iterator
-from dataclasses import dataclass
-from math import isfinite
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from multidrop import Plant, Register
+from multidrop import Plant
 from multidrop.gateway.commands import drives_of
+from multidrop.gateway.forward.settings import spool_mistakes
 from multidrop.gateway.http.rights import Caller, Right
-from multidrop.gateway.live.hub import Hub
 from multidrop.gateway.mqtt.broker import Login, parse_broker
 from multidrop.plant import check_drive_name
-from multidrop.toml_check import parse_duration
+from multidrop.toml_check import DURATION, SIZE, parse_duration
 
-LEVEL = re.compile(r"[^+#/\0]+")  # one level of a topic
+LEVEL = re.compile(r"[^+#/\x00]+")  # one level of a topic
 OTHERS = ("homeassistant", "spBv1.0")  # first levels reserved for discovery and Sparkplug
 LEAST_EVERY_S, MOST_EVERY_S = 0.1, 3600.0
+BROKER = r"^[Mm][Qq][Tt][Tt][Ss]?://(\[[0-9A-Fa-f:.]+\]|[^@:/?#\[\]]+)(:[0-9]{1,5})?/*$"
+PREFIX = rf"^(?!\$)(?!({'|'.join(OTHERS)})(/|$)){LEVEL.pattern}(/{LEVEL.pattern})*$"
 
 
 @dataclass(frozen=True)
 class MqttSettings:
     """The settings of MQTT. Raises ValueError with a line for each mistake."""
 
-    broker: str = "mqtt://localhost:1883"
-    prefix: str = "multidrop"
-    every: str = "1 s"  # time between two messages of a drive
+    broker: str = field(default="mqtt://localhost:1883", metadata={"pattern": BROKER})
+    prefix: str = field(default="multidrop", metadata={"pattern": PREFIX})
+    every: str = field(default="1 s", metadata=DURATION)  # time between two messages of a drive
     user: str = ""
     password: str = ""  # path of the file with the password
-    authorities: str = ""  # path of a file of certificates that verify a broker of mqtts://
+    authorities: str = ""  # path of a file of certificates that verify the broker, for mqtts://
     home_assistant: bool = False
-    sparkplug: str = ""  # the group; "": no Sparkplug
-    node: str = ""  # name of the edge node; default: the plant file's name
+    # Group of the Sparkplug edge node; "": Sparkplug is off.
+    sparkplug: str = field(default="", metadata={"pattern": rf"^(?!STATE$){LEVEL.pattern}$"})
+    # Name of the Sparkplug edge node; default: the plant file's name.
+    node: str = field(default="", metadata={"pattern": rf"^{LEVEL.pattern}$"})
     commands: bool = False  # allow publishers to write the registers and verbs listed in [serve.may]
+    rows: bool = False  # publish all rows, also rows polled while there was no connection to the broker
+    spool: str = "spool"  # folder of the rows that are not published yet
+    most: str = field(default="1 GB", metadata=SIZE)  # limit of the size of the spool on the disk
 
     def __post_init__(self) -> None:
         wrong = []
@@ -54,6 +59,7 @@ class MqttSettings:
             wrong.append(f'prefix = "{self.prefix}" is not a valid topic; write prefix = "multidrop"')
         if self.prefix.split("/")[0] in OTHERS:
             wrong.append(f'prefix = "{self.prefix}" is a reserved topic; write prefix = "multidrop"')
+        wrong += spool_mistakes(self.most)
         if self.sparkplug == "STATE":
             wrong.append('sparkplug = "STATE" is reserved for Sparkplug hosts; name another group')
         wrong += [
@@ -66,13 +72,18 @@ class MqttSettings:
 
     @property
     def every_s(self) -> float:
-        """Seconds between two messages of a drive."""
+        """The time in s between two messages of a drive."""
         return parse_duration(self.every)
 
     @property
     def caller(self) -> Caller:
         """The caller of all commands from the broker."""
         return Caller(self.user or "anyone", "mqtt", parse_broker(self.broker).host, Right.WRITE)
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """The libraries that the part imports."""
+        return ("paho", "pyarrow") if self.rows else ("paho",)
 
     def check(self, plant: Plant) -> list[str]:
         """Return a sentence for each missing file, and each drive name that cannot be a topic."""
@@ -89,7 +100,7 @@ class MqttSettings:
             if not LEVEL.fullmatch(name):
                 yield f"drive {name!r} cannot be a topic: choose a name without + # and /"
             try:
-                check_drive_name(name)  # a plant without a file was not checked
+                check_drive_name(name)  # a plant made without a file was not checked before
             except ValueError as mistake:
                 yield f"drive {name!r}: {mistake}"
         if self.sparkplug and not self.node and not LEVEL.fullmatch(plant.path.stem):
@@ -105,7 +116,7 @@ class MqttSettings:
 def _has_certificates(path: Path) -> bool:
     try:
         ssl.create_default_context(cafile=str(path))
-    except OSError:  # also if the file has no certificates
+    except OSError:  # also raised if the file has no certificates
         return False
     return True
 
@@ -113,18 +124,3 @@ def _has_certificates(path: Path) -> bool:
 def _beside(plant: Plant, name: str) -> Path:
     """Return the path of a file named relative to the plant file."""
     return plant.path.parent / name
-
-
-def shown(register: Register[Any], value: float) -> float | str:
-    """Return a register's value as published: a number, or the name of a choice."""
-    return value if register.values is None else register.format(register.decode(value))
-
-
-def fresh_values(hub: Hub, drive: str) -> dict[str, float | str | None]:
-    """Return the values of a drive's polled registers; None for stale, infinite and missing values."""
-    return {
-        register.name: shown(register, good[2])
-        if is_current and good is not None and newest is good and isfinite(good[2])
-        else None
-        for register, newest, good, is_current in hub.known(drive)
-    }

@@ -17,17 +17,17 @@ SEQUENCES = 256  # seq and bdSeq count from 0 to 255 and start again
 
 # Field numbers of Payload and Metric (section 6.4.1).
 _TIMESTAMP, _METRICS, _SEQ = 1, 2, 3
-_NAME, _ALIAS, _METRIC_TIME, _DATATYPE, _IS_NULL, _PROPERTIES = 1, 2, 3, 4, 7, 9
+_NAME, _ALIAS, _METRIC_TIME, _DATATYPE, _IS_HISTORICAL, _IS_NULL, _PROPERTIES = 1, 2, 3, 4, 5, 7, 9
 _INT, _LONG, _FLOAT, _DOUBLE, _BOOLEAN, _STRING = 10, 11, 12, 13, 14, 15
 
 # Field numbers of PropertySet and PropertyValue.
 _KEYS, _VALUES = 1, 2
 _TYPE, _TEXT = 1, 8
-ENGINEERING_UNIT = "engUnit"  # the property that hosts show as a metric's unit
+ENGINEERING_UNIT = "engUnit"  # the property that Sparkplug hosts show as a metric's unit
 
 _VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5  # wire types
-MOST_PAYLOAD = 65_536  # limit of a command in bytes
-_MOST_VARINT = 10  # most bytes of a varint
+MOST_PAYLOAD = 65_536  # limit of the length of a command in bytes
+_MOST_VARINT = 10  # limit of the length of a varint in bytes
 
 
 class DataType(IntEnum):
@@ -40,7 +40,7 @@ class DataType(IntEnum):
 
 
 class Metric(NamedTuple):
-    """One metric: by name and alias in a birth, by alias alone afterwards."""
+    """A metric. A birth has the metric's name and alias; later messages have only the alias."""
 
     datatype: DataType
     value: float | str | None  # None: a null value
@@ -48,12 +48,13 @@ class Metric(NamedTuple):
     name: str = ""
     alias: int | None = None
     unit: str = ""  # only in a birth
+    is_historical: bool = False  # not the present value
 
 
 class Given(NamedTuple):
     """A metric in a received command."""
 
-    name: str  # "" if it has only an alias
+    name: str  # "" if the metric has only an alias
     alias: int | None
     value: float | str | None
 
@@ -73,6 +74,8 @@ def _metric(metric: Metric) -> bytes:
     if metric.alias is not None:
         parts.append(_number(_ALIAS, metric.alias))
     parts += [_number(_METRIC_TIME, metric.time_ms), _number(_DATATYPE, metric.datatype)]
+    if metric.is_historical:
+        parts.append(_number(_IS_HISTORICAL, 1))
     if metric.unit:
         value = _number(_TYPE, DataType.STRING) + _bytes(_TEXT, metric.unit.encode())
         parts.append(_bytes(_PROPERTIES, _bytes(_KEYS, ENGINEERING_UNIT.encode()) + _bytes(_VALUES, value)))

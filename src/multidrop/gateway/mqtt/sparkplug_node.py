@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any, NamedTuple
 
-from multidrop import Plant, Register
+from multidrop import Drive, Plant, Register
 from multidrop.control import CommandResult
 from multidrop.gateway.commands import drives_of
-from multidrop.gateway.live.hub import SILENT
+from multidrop.gateway.live.hub import SILENT, published_values
 from multidrop.gateway.mqtt.broker import Publication
 from multidrop.gateway.mqtt.broker_commands import BrokerCommands
-from multidrop.gateway.mqtt.settings import MqttSettings, fresh_values
+from multidrop.gateway.mqtt.settings import MqttSettings
 from multidrop.gateway.mqtt.sparkplug import (
     BIRTH_DEATH,
     NAMESPACE,
@@ -27,10 +27,20 @@ from multidrop.gateway.mqtt.sparkplug import (
 from multidrop.gateway.parts import PartContext
 
 STATE, FAULT, STOP = "state", "fault", "Device Control/Stop"
-OWN = (STATE, FAULT)  # metrics of every drive, as text
-REGISTERS = "registers/"  # prefix of metrics of registers whose names are in OWN
+OWN = (STATE, FAULT)  # names of the text metrics that every drive has
+REGISTERS = "registers/"  # prefix of the metric's name if a register's name is in OWN
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
+MOST_PAST = 500  # limit of historical values that are sent together
 Value = float | str | None
+
+
+class PastValue(NamedTuple):
+    """A register's value and its time, to be sent as a historical value."""
+
+    drive: str
+    register: str
+    time_ms: int
+    value: Value
 
 
 class SparkplugNode:
@@ -47,10 +57,11 @@ class SparkplugNode:
         self._utc_ms = utc_ms
         self._node = settings.node or context.plant.path.stem
         self._commands = BrokerCommands(context.commands, settings.caller, utc_ms, self._report)
-        self._birth = -1  # bdSeq
+        self._birth = -1  # the node's bdSeq (birth/death sequence number)
         self._seq = 0
-        self._said: dict[str, dict[str, Value]] = {}  # last values of drives whose birth was sent
-        self._changed: dict[str, dict[str, Value]] = {}
+        self._said: dict[str, dict[str, Value]] = {}  # values last sent, of drives whose birth was sent
+        self._changed: dict[str, dict[str, tuple[Value, int]]] = {}  # new values and their times in ms
+        self._past: dict[str, list[PastValue]] = {}  # historical values for the next messages
         self._aliases: dict[tuple[str, str], int] = {}
 
     def _topic(self, kind: str, *device: str) -> str:
@@ -113,14 +124,49 @@ class SparkplugNode:
                 continue
             changed = {name: value for name, value in values.items() if value != before[name]}
             if changed:
-                self._changed.setdefault(drive, {}).update(changed)
+                times = self._times(drive)
+                self._changed.setdefault(drive, {}).update(
+                    {name: (value, times[name]) for name, value in changed.items()}
+                )
                 self._put(drive, "DDATA", self._data)
 
     def leave(self) -> None:
         """Send the node's death, because a regular disconnect does not send the will."""
         self.outbox.put(Publication(self._topic("NDEATH"), self._death, qos=1))
 
-    # ---- payloads, each made when it is sent because of its sequence number ----
+    # ---- historical values ----
+
+    def find(self, drive: str, register: str) -> tuple[Drive | None, Register[Any] | None]:
+        """Return the drive, and its register or channel, of these names; None for one that has no metric."""
+        known = drives_of(self._plant).get(drive) if drive in {*self._hub.drives} else None
+        metrics = {one.name: one for one, *_ in self._hub.known(drive)} if known else {}
+        return known, metrics.get(register)
+
+    async def send_past(self, values: Sequence[PastValue], confirm: Callable[[], Awaitable[None]]) -> None:
+        """Send values as historical ones. Raises OSError if `confirm` does, or if values are not sent.
+
+        Values of drives and registers without a metric are left out. If a drive is silent, its birth is
+        sent first, and its death follows when `publish` is called.
+        """
+        metrics = {drive: self._values(drive).keys() for drive in self._hub.drives}
+        for begin in range(0, len(values), MOST_PAST):
+            self._past = {}
+            for one in values[begin : begin + MOST_PAST]:
+                if _metric_of(one.register) in metrics.get(one.drive, ()):
+                    self._past.setdefault(one.drive, []).append(one)
+            try:
+                for drive in [*self._past]:
+                    if drive not in self._said:
+                        self._said[drive] = self._values(drive)
+                        self._replace_pending(drive, "DBIRTH", self._device_birth)
+                    self._put(drive, "DDATA", self._data)
+                await confirm()
+                if self._past:
+                    raise ConnectionError("a birth or a death came in between")
+            finally:
+                self._past = {}
+
+    # ---- payloads; each has a sequence number, so it is made when it is sent ----
 
     def _replace_pending(self, drive: str, kind: str, make: Any) -> None:
         """Send a birth or death, and drop the drive's other pending messages."""
@@ -148,7 +194,7 @@ class SparkplugNode:
         return payload(now, metrics, self._seq)
 
     def _device_birth(self, drive: str) -> bytes:
-        now, values = self._utc_ms(), self._values(drive)
+        now, values, times = self._utc_ms(), self._values(drive), self._times(drive)
         self._said[drive] = values
         self._changed.pop(drive, None)
         metrics = []
@@ -156,7 +202,7 @@ class SparkplugNode:
             register = self._register(drive, name)
             unit = register.value_unit if register and register.values is None else ""
             alias = self._alias(drive, name)
-            metrics.append(Metric(_datatype(register), value, now, name, alias, unit))
+            metrics.append(Metric(_datatype(register), value, times[name], name, alias, unit))
         if self._settings.commands:
             metrics.append(Metric(DataType.BOOLEAN, False, now, STOP, self._alias(drive, STOP)))
         return payload(now, metrics, self._next())
@@ -165,20 +211,32 @@ class SparkplugNode:
         return payload(self._utc_ms(), [], self._next())
 
     def _data(self, drive: str) -> bytes:
-        now = self._utc_ms()
         metrics = [
-            Metric(_datatype(self._register(drive, name)), value, now, alias=self._alias(drive, name))
-            for name, value in self._changed.pop(drive, {}).items()
+            Metric(_datatype(self._register(drive, name)), value, time, alias=self._alias(drive, name))
+            for name, (value, time) in self._changed.pop(drive, {}).items()
         ]
-        return payload(now, metrics, self._next())
+        for past in self._past.pop(drive, []):
+            name = _metric_of(past.register)
+            kind, alias = _datatype(self._register(drive, name)), self._alias(drive, name)
+            metrics.append(Metric(kind, past.value, past.time_ms, alias=alias, is_historical=True))
+        return payload(self._utc_ms(), metrics, self._next())
 
     def _values(self, drive: str) -> dict[str, Value]:
         shown = self._hub.seen(drive)
         found: dict[str, Value] = {STATE: shown.state, FAULT: shown.fault}
-        found |= {_metric_of(name): value for name, value in fresh_values(self._hub, drive).items()}
+        found |= {_metric_of(name): value for name, value in published_values(self._hub, drive).items()}
         for name in self._writable(drive):
             found.setdefault(_metric_of(name), None)
         return found
+
+    def _times(self, drive: str) -> dict[str, int]:
+        """Return the time of each metric, UTC in ms: when its current value was polled; without one, now."""
+        now = self._utc_ms()
+        times = dict.fromkeys(self._values(drive), now)
+        for register, newest, good, is_current in self._hub.known(drive):
+            if is_current and good is not None and newest is good:
+                times[_metric_of(register.name)] = good[0] // 1_000_000
+        return times
 
     def _writable(self, drive: str) -> list[str]:
         if not self._settings.commands:
@@ -191,8 +249,9 @@ class SparkplugNode:
         return {} if known is None else dict(known.registers)
 
     def _register(self, drive: str, name: str) -> Register[Any] | None:
-        """Return the register of a metric; None for the metrics "state" and "fault" of every drive."""
-        return None if name in OWN else self._registers(drive)[name.removeprefix(REGISTERS)]
+        """Return the register or channel of a metric; None for the metrics "state" and "fault"."""
+        known = self._registers(drive) | {one.name: one for one, *_ in self._hub.known(drive)}
+        return None if name in OWN else known[name.removeprefix(REGISTERS)]
 
     def _alias(self, drive: str, name: str) -> int:
         return self._aliases.setdefault((drive, name), len(self._aliases) + 1)
