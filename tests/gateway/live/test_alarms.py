@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from batches import SECOND, UTC_0, completion
+from batches import SECOND, UTC_0, add_rows, completion
 from commands import Run
-from completions import add_rows
 from gateways import POLL, Served, plant_text, running, served, written
 from lines import until
 from tables import table
 
-from multidrop import BusError, Plant, WriteForbidden
+from multidrop import BusError, Plant, PlantError, WriteForbidden
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
 from multidrop.drive import can_show_fault
 from multidrop.errors import Advice
@@ -30,13 +29,14 @@ from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live.alarm_file import AlarmFile, alarm_in
 from multidrop.gateway.live.alarms import Alarm, Alarms
 from multidrop.gateway.live.hub import RAN_NS, Hub, Shown
+from multidrop.gateway.live.limits import Limit, Limits
 from multidrop.gateway.settings import read_settings
 from multidrop.polling.batch import Batch
 
 ERMAN = '["status", "output_frequency", "last_fault"]'
 REGISTERS = ("status", "output_frequency", "last_fault", "fault_record_1")
-NOT_AT_REST = "at rest its state takes two readings one after the other, which polled values are not"
-RUNNING, STOPPED = 1, 0  # values of an ERMAN's status register
+NOT_AT_REST = "at rest its state needs two readings in a row, which polled values do not give"
+RUNNING, STOPPED = 1, 0  # values of the status register of an ERMAN drive
 
 
 def hub_of(folder: Path, model: str, poll: str) -> Hub:
@@ -66,7 +66,7 @@ def test_changed_fault_record_is_shown_as_a_fault(tmp_path: Path) -> None:
     take(hub, 10, status=RUNNING, output_frequency=500, last_fault=0)
     assert hub.seen("pump-1").state == "runs"
     take(hub, 11, last_fault=ErmanFault.OVERHEAT | 1 << 8)
-    assert hub.seen("pump-1") == Shown("fault", "overheat, bit 8")  # although older rows say "runs"
+    assert hub.seen("pump-1") == Shown("fault", "overheat, bit 8")  # older rows show "runs"
     take(hub, 12, status=STOPPED, output_frequency=0, last_fault=ErmanFault.OVERHEAT | 1 << 8)
     assert hub.seen("pump-1")[:2] == ("fault", "overheat, bit 8")
     for at_s in (20, 20 + RAN_NS / SECOND):
@@ -76,7 +76,7 @@ def test_changed_fault_record_is_shown_as_a_fault(tmp_path: Path) -> None:
     assert hub.seen("pump-1").state == "stands"
 
 
-def test_reset_ends_a_recorded_fault_and_an_old_record_is_no_fault(tmp_path: Path) -> None:
+def test_a_reset_ends_a_recorded_fault_and_an_old_record_is_not_a_fault(tmp_path: Path) -> None:
     hub = hub_of(tmp_path, "erman-er-g-220", ERMAN)
     take(hub, 10, status=STOPPED, output_frequency=0, last_fault=ErmanFault.OVERHEAT)
     past = "last fault overheat, which may still be in force"
@@ -146,28 +146,25 @@ def seen(events: Alarms) -> list[tuple[str, str, int, int | None]]:
 
 
 @pytest.mark.parametrize("standing", [STANDS, Shown("unknown", None)])
-def test_motor_that_stops_without_a_command_is_an_alarm(standing: Shown) -> None:
+def test_a_motor_that_stops_without_a_command_raises_an_alarm(standing: Shown) -> None:
     events = Alarms()
     for time, shown in ((1000, standing), (2000, RUNS), (3000, standing), (4999, standing)):
         events.look(time, "pump-1", shown, 0)
-    assert seen(events) == []  # the motor may be reversing
+    assert seen(events) == []  # no alarm yet: the motor may be reversing
     events.look(5000, "pump-1", standing, 0)
     assert seen(events) == [("pump-1", "stopped", 3000, None)]
     events.look(6000, "pump-1", RUNS, 0)
     told = [("pump-1", "stopped", 3000, 6000)]
     assert seen(events) == told
-    for time, shown, stops in (
-        (7000, standing, 1),
-        (9000, standing, 1),
-        (10000, RUNS, 1),
-    ):  # stops = 1: a stop was called
+    # stops = 1: a stop was called
+    for time, shown, stops in ((7000, standing, 1), (9000, standing, 1), (10000, RUNS, 1)):
         events.look(time, "pump-1", shown, stops)
-    for time, stops in ((11000, None), (13000, 1)):  # None: a jog or setpoint 0; 1: a stop
+    for time, stops in ((11000, None), (13000, 1)):  # None: jog or setpoint 0; 1: after a stop
         events.look(time, "pump-1", standing, stops)
     assert seen(events) == told
 
 
-def test_a_fault_raises_no_alarm_of_a_stopped_motor() -> None:
+def test_a_motor_that_a_fault_stops_raises_no_alarm_besides_that_of_the_fault() -> None:
     events = Alarms()
     for time, shown in enumerate((RUNS, Shown("silent", "no reply"), Shown("fault", "a"), STANDS), 1):
         events.look(time, "pump-1", shown, 0)
@@ -182,13 +179,13 @@ def test_alarms_are_ordered_by_kind_and_acknowledged_ones_last() -> None:
     events.look(2003, "pump-2", STANDS, 0)
     events.look_at_line(4, "hall", "there is no such port")
     events.look(5, "pump-3", Shown("silent", "no reply"))
-    events.look(6, "pump-4", Shown("silent", "port lost"))  # the line has the alarm of a lost port
+    events.look(6, "pump-4", Shown("silent", "port lost"))  # no alarm: the line has one for its port
     assert [one.kind for one in events.shown()] == ["fault", "stopped", "port", "silent"]
     first = events.acknowledge(events.shown()[0].id, 7, "anna by page", "fan is dirty")
     assert (first.acknowledged, first.by, first.note) == (7, "anna by page", "fan is dirty")
     assert [one.kind for one in events.shown()] == ["stopped", "port", "silent", "fault"]
     stopped = events.acknowledge(events.shown()[0].id, 8, "anna by page")
-    assert ("pump-2", "stopped", 3, 8) in seen(events)  # acknowledging this kind ends it
+    assert ("pump-2", "stopped", 3, 8) in seen(events)  # acknowledging an alarm of this kind ends it
     with pytest.raises(KeyError):
         events.acknowledge("1 fault pump-9", 9, "anna")
     events.acknowledge(stopped.id, 10, "boris", "the switch")
@@ -238,7 +235,7 @@ def test_alarms_of_an_earlier_run_continue_or_end() -> None:
 
 
 def test_alarms_read_late_are_merged_with_present_alarms() -> None:
-    """With a slow disk, the drives are observed before the alarms of earlier runs are read."""
+    """On a slow disk, the alarms of earlier runs are read after the first observation of the drives."""
     events = Alarms(100)
     events.look(101, "pump-1", Shown("fault", "overheat"))
     events.look(101, "pump-2", STANDS)
@@ -267,7 +264,7 @@ def past_of(path: Path) -> list[Alarm]:
     return kept.past or []
 
 
-def test_newest_line_of_each_alarm_in_the_file_is_valid(tmp_path: Path) -> None:
+def test_the_newest_line_of_each_alarm_in_the_file_counts(tmp_path: Path) -> None:
     path = tmp_path / "alarms.jsonl"
     kept = started(path)
     for alarm in (ALARM, ALARM._replace(ended=5), ALARM._replace(time=9)):
@@ -282,9 +279,7 @@ def test_newest_line_of_each_alarm_in_the_file_is_valid(tmp_path: Path) -> None:
     assert len(past_of(path)) == 3
 
 
-@pytest.mark.parametrize(
-    "change", [{"time": "1"}, {"time": True}, {"ended": 1.5}, {"kind": "x"}, {"drive": None}, {"note": 1}]
-)
+@table("change", [{"time": "1"}, {"time": True}, {"ended": 1.5}, {"kind": "x"}, {"drive": None}, {"note": 1}])
 def test_invalid_lines_of_the_alarm_file_are_ignored(change: Mapping[str, object]) -> None:
     whole = json.loads(json.dumps(ALARM.as_json()))
     assert alarm_in(json.dumps(whole).encode()) == ALARM
@@ -330,13 +325,13 @@ def test_alarms_are_logged_acknowledged_and_kept_over_a_restart(
 ) -> None:
     caplog.set_level(logging.INFO, "multidrop.gateway")
     words = "overcurrent while accelerating (OC1)"
-    stopper: dict[str, str] = {}
     with served(tmp_path) as gateway:
         gateway.await_state("pump-1", "stands")
         gateway.sims["pump-1"].trip(4)  # type: ignore[attr-defined]
         until(lambda: [(one["drive"], one["text"]) for one in faults(gateway)] == [("pump-1", words)])
         [alarm] = faults(gateway)
         assert alarm["is_before"] is False
+        assert gateway.frame()["drives"]["pump-1"]["fault"] == words
         stopper = {"authorization": gateway.bearer(Right.STOP)}
         body = {"alarm": alarm["id"], "note": "belt stuck"}
         assert gateway.post("/api/acknowledge", body).status == 401
@@ -383,7 +378,8 @@ def test_a_lost_port_is_one_alarm_of_its_line(tmp_path: Path) -> None:
         assert "there is no such port" in alarm["text"]
 
 
-def test_motor_stopped_by_us_raises_no_alarm_and_by_others_does(tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_only_a_motor_that_the_gateway_did_not_stop_raises_an_alarm(tmp_path: Path) -> None:
     serve = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
     with served(tmp_path, serve) as gateway:
         writer = {"authorization": gateway.bearer(Right.WRITE)}
@@ -422,3 +418,70 @@ def test_motor_stopped_by_us_raises_no_alarm_and_by_others_does(tmp_path: Path) 
 )
 def test_errors_for_page_users_have_no_function_names(failure: BusError, said: str) -> None:
     assert in_words(str(failure), failure) == said
+
+
+# ---- limits of values: duration, hysteresis, missing values, mistakes in the plant file ----
+
+
+ABOVE = Limit("pump", "current", "A", True, 30.0, lasting_s=5.0, hysteresis=2.0)
+BELOW = Limit("pump", "pressure", "bar", False, 1.0, hysteresis=0.5)
+
+
+@table(
+    ("values", "beyond"),
+    [
+        ([31, 31, 31, 31, 31, 31], [False, False, False, False, False, True]),
+        ([31, 31, 29, 31, 31, 31], [False] * 6),  # the duration restarts
+        ([31, 31, 31, 31, 31, 31, 28.5, 28.0], [False] * 5 + [True, True, False]),
+        ([31, 31, 31, 31, None, 31, 31], [False] * 7),  # after a missing value, the duration restarts
+        ([31, 31, 31, 31, 31, 31, None, 29], [False] * 5 + [True] * 3),
+        ([30] * 7, [False] * 7),  # the bound itself is allowed
+    ],
+)
+def test_a_limit_counts_as_exceeded_after_its_duration_and_until_its_hysteresis_is_passed(
+    values: list[float | None], beyond: list[bool]
+) -> None:
+    limits, text, seen = Limits([ABOVE]), "", []
+    for second, value in enumerate(values):
+        text = limits.exceeded(second, "pump", {} if value is None else {"current": value}, text)
+        seen.append(text == "current above 30 A")
+    assert seen == beyond
+
+
+def test_a_second_exceeded_limit_raises_a_new_alarm_but_a_smaller_excess_does_not() -> None:
+    limits = Limits([ABOVE._replace(lasting_s=0.0), BELOW])
+    noted: list[Alarm] = []
+    alarms = Alarms(note=lambda alarm, change: noted.append(alarm))
+    for time, current, pressure in ((1, 31, 2), (2, 31, 0.5), (3, 20, 1.4), (4, 20, 1.5)):
+        values = {"current": current, "pressure": pressure}
+        alarms.look_at_limits(time, "pump", lambda before, v=values: limits.exceeded(0, "pump", v, before))
+    assert [(one.time, one.text, one.ended) for one in noted] == [
+        (1, "current above 30 A", None),
+        (1, "current above 30 A", 2),
+        (2, "current above 30 A; pressure below 1 bar", None),
+        (2, "pressure below 1 bar", None),
+        (2, "pressure below 1 bar", 4),
+    ]
+
+
+def test_limit_stays_exceeded_over_a_restart() -> None:
+    assert Limits([ABOVE]).exceeded(0, "pump", {"current": 29}, "current above 30 A")
+
+
+@table(
+    ("limit", "sentence"),
+    [
+        ('register = "fault"\nabove = 1', "'drive' is missing"),
+        ('drive = "pump-1"\nregister = "setpoint"\nabove = 1', "pump-1.setpoint is not polled"),
+        ('drive = "pump-1"\nregister = "fault"', "give either above or below"),
+        ('drive = "pump-1"\nregister = "fault"\nabove = 1\nbelow = 0', "give either above or below"),
+        ('drive = "pump-1"\nregister = "fault"\nabove = nan', "must be finite"),
+        ('drive = "pump-1"\nregister = "fault"\nabove = 1\nhysteresis = -1', "not below 0"),
+        ('drive = "pump-1"\nregister = "fault"\nabove = 1\nfor = "5"', "is not a duration"),
+    ],
+)
+def test_invalid_limit_is_refused(tmp_path: Path, limit: str, sentence: str) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(plant_text("/dev/ttyUSB0", ["pump-1"]) + f"\n[[serve.limit]]\n{limit}\n")
+    with pytest.raises(PlantError, match=f"limit number 1: .*{sentence}"):
+        read_settings(Plant.load(path), {})

@@ -77,7 +77,7 @@ async def test_changes_are_computed_once_per_known_frame(
     assert compared == [1]
 
 
-async def test_five_frames_a_second_at_most(frames: Frames, clock: Clock, made: list[int]) -> None:
+async def test_at_most_five_frames_are_made_per_second(frames: Frames, clock: Clock, made: list[int]) -> None:
     seen = -1
     for _ in range(1000):  # 10 s with a change every 10 ms
         clock.now += 0.01
@@ -93,8 +93,8 @@ async def test_five_frames_a_second_at_most(frames: Frames, clock: Clock, made: 
     assert 45 <= len(made) <= 51
 
 
-async def test_news_within_the_frame_interval_get_a_later_frame(frames: Frames, clock: Clock) -> None:
-    """Viewers get that frame without any further event."""
+async def test_rows_within_the_frame_interval_appear_in_the_next_frame(frames: Frames, clock: Clock) -> None:
+    """Viewers get the next frame without any further event."""
     first = await frames.after(-1)
     assert first is not None
     frames.note_news()
@@ -125,7 +125,7 @@ async def test_late_viewer_gets_the_newest_frame(frames: Frames, clock: Clock) -
     assert late is not None
     assert late.n == 51
     assert told(late) == {"n": 51, "revision": 1}
-    other = await frames.after(900)  # a frame number of an earlier process
+    other = await frames.after(900)  # 900: a frame number of an earlier process
     assert other is late
 
 
@@ -162,7 +162,7 @@ def test_changes_turn_the_old_frame_into_the_new_one(before: dict[str, Any], now
 
 
 async def view(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
-    """Check viewers that skip frames. A picture is a plant's data, and a number of frames to skip."""
+    """Check viewers that skip frames. A picture has the data of one frame, and a number of frames to skip."""
     clock, whole = Clock(), dict[int, dict[str, Any]]()
 
     def make(n: int) -> dict[str, Any]:
@@ -171,7 +171,7 @@ async def view(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
         return whole[n]
 
     frames = Frames(make, clock, begin)
-    has: dict[int, dict[str, Any]] = {}  # data of each viewer; key: it fetches every n-th frame
+    has: dict[int, dict[str, Any]] = {}  # by n: data of a viewer that fetches every n-th frame
     for turn, _ in enumerate(pictures):
         clock.now += 0.25
         frames.note_news()
@@ -195,11 +195,11 @@ async def view(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
 def test_viewer_that_skips_frames_ends_with_the_newest_one(
     pictures: list[tuple[dict[str, Any], int]], begin: int
 ) -> None:
-    """The plant changes halfway."""
+    """The plant description changes in the middle of the run."""
     asyncio.run(view(pictures, begin))
 
 
-async def test_waiting_viewer_gets_none_at_timeout_and_close(
+async def test_a_waiting_viewer_gets_no_frame_at_its_timeout_or_at_closing(
     frames: Frames, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "WAIT_S", 0.01)
@@ -211,7 +211,7 @@ async def test_waiting_viewer_gets_none_at_timeout_and_close(
     waiting = [asyncio.create_task(frames.after(first.n)) for _ in range(3)]
     await asyncio.sleep(0)
     assert [one.done() for one in waiting] == [False, False, True]
-    with pytest.raises(OverflowError, match="2 viewers wait already"):
+    with pytest.raises(OverflowError, match="2 viewers are waiting already"):
         await waiting.pop()
     frames.close()
     assert await asyncio.gather(*waiting) == [None, None]
@@ -230,11 +230,13 @@ async def test_too_many_viewers_get_an_error(frames: Frames, monkeypatch: pytest
     scope = {"type": "http", "query_string": f"after={first.n}".encode(), "headers": []}
     await FrameRoute(frames)(scope, None, send)  # type: ignore[arg-type]
     assert [one.get("status") for one in sent] == [503, None]
-    assert json.loads(sent[1]["body"]) == {"error": "0 viewers wait already"}
+    assert json.loads(sent[1]["body"]) == {"error": "0 viewers are waiting already"}
 
 
-def test_frame_follows_the_check_for_alarms(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Alarms and frame are made from the same rows, so the drives are examined only once in 0.2 s."""
+def test_frame_is_made_after_the_check_for_alarms_of_the_same_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At most once in 0.2 s, drives are checked for alarms; then a frame is made from the same rows."""
     gateway = Gateway(written(tmp_path), ServeSettings(port=0))
     gateway.listener.close()
     done: list[str] = []

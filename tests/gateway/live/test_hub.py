@@ -2,23 +2,41 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
-from batches import SECOND, UTC_0, completion
-from completions import add_miss, add_rows
+from batches import SECOND, UTC_0, add_miss, add_rows, completion
 from gateways import written
 from hypothesis import given
 from hypothesis import strategies as st
+from lines import line, plant, polled
+from tables import table
 
-from multidrop import Plant
+from multidrop import Drive, Plant, PolledDrive, reading, setting
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
+from multidrop.families import MODELS, DelixiModbus, InvtCHE
 from multidrop.gateway.live.alarms import Alarms
+from multidrop.gateway.live.descriptions import describe_line
 from multidrop.gateway.live.frames import frame_of, lost_of
-from multidrop.gateway.live.hub import INCOMPLETE, LEAST_SLEEP_NS, NOT_ASKED, Hub, Newest, Shown
+from multidrop.gateway.live.hub import (
+    INCOMPLETE,
+    LEAST_SLEEP_NS,
+    NOT_ASKED,
+    Hub,
+    Known,
+    Newest,
+    Shown,
+    published_values,
+)
 from multidrop.gateway.live.recent_statistics import RecentStatistics
-from multidrop.gateway.mqtt.settings import fresh_values
+from multidrop.gateway.metrics import OTHER, base_unit, plant_families
+from multidrop.gateway.modbus_server import common_block
+from multidrop.gateway.modbus_server.common_block import NO_NUMBER, CommonBlock
+from multidrop.gateway.mqtt.home_assistant import discovery
 from multidrop.polling.batch import Batch
 
 REGISTERS = ("status", "output_frequency", "output_current", "fault")
@@ -66,7 +84,7 @@ def all_of(at: int, status: int, frequency: int = 0, fault: int = 0) -> Batch:
 
 
 def is_fresh(hub: Hub) -> bool:
-    """Return True if the frequency of the first pump is current, even after a miss."""
+    """Return True if the frequency of pump-1 is still current; a later miss does not change that."""
     return next(current for one, _, _, current in hub.known("pump-1") if one.name == "output_frequency")
 
 
@@ -79,7 +97,7 @@ def test_registers_are_unknown_before_their_first_request(hub: Hub) -> None:
     assert hub.state("pump-9") == "unknown"
 
 
-def test_after_a_miss_the_value_before_it_stays_the_last_good_row(hub: Hub) -> None:
+def test_a_miss_does_not_replace_the_last_good_row(hub: Hub) -> None:
     hub.take(rows((10, FREQUENCY, 25), (11, FREQUENCY, Status.NO_REPLY)))
     sent, missed = 10 * PERIOD, 11 * PERIOD
     good = next(good for one, _, good, _ in hub.known("pump-1") if one.name == "output_frequency")
@@ -141,7 +159,9 @@ def test_drive_that_answers_with_exceptions_is_not_silent(hub: Hub) -> None:
     assert hub.state("pump-1") == "unknown"
 
 
-def test_line_is_lost_if_all_its_newest_rows_have_that_status(hub: Hub, clock: HubClock) -> None:
+def test_a_line_counts_as_lost_if_all_its_newest_rows_have_the_status_of_a_lost_port(
+    hub: Hub, clock: HubClock
+) -> None:
     hub.take(all_of(10, FORWARD, 25))
     assert lost_of(hub, "hall") is None
     hub.take(rows(*((30, register, Status.LINE_LOST) for register in range(3))))
@@ -155,7 +175,7 @@ def test_line_is_lost_if_all_its_newest_rows_have_that_status(hub: Hub, clock: H
 
 
 def test_values_become_stale_without_new_rows(hub: Hub, clock: HubClock) -> None:
-    """The time passes without rows and without the event loop, as in a suspended process."""
+    """Time passes without rows, and the event loop does not run, as in a suspended process."""
     hub.take(all_of(10, FORWARD, 25))
     clock.now_ns += SECOND
     assert is_fresh(hub)
@@ -169,7 +189,7 @@ def test_values_from_before_a_sleep_are_stale(hub: Hub, clock: HubClock) -> None
     """The monotonic clock stopped during the sleep, so the ages of rows do not include it."""
     hub.take(all_of(10, FORWARD, 25))
     assert hub.state("pump-1") == "runs"
-    clock.now_ns, clock.slept_ns = 11 * PERIOD + 1, 8 * 3600 * SECOND  # no row and no check in between
+    clock.now_ns, clock.slept_ns = 11 * PERIOD + 1, 8 * 3600 * SECOND  # the hub has not read it since
     assert not is_fresh(hub)
     assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
     assert not any(fresh for *_, fresh in hub.known("pump-1"))
@@ -188,7 +208,7 @@ def test_sleep_before_the_start_makes_no_value_stale(tmp_path: Path) -> None:
     assert hub.woke_ns() == 0
 
 
-def test_pause_between_reading_two_clocks_is_not_taken_for_sleep(tmp_path: Path) -> None:
+def test_a_pause_between_the_readings_of_two_clocks_is_not_taken_for_sleep(tmp_path: Path) -> None:
     slept = [0]
     hub = Hub(written(tmp_path), lambda: (20 * PERIOD, slept[0]))
     hub.take(all_of(19, FORWARD, 25))
@@ -213,7 +233,7 @@ def test_values_of_an_overloaded_line_stay_fresh_for_three_rounds(tmp_path: Path
     path.write_text(path.read_text().replace("baudrate = 38400", "baudrate = 1200"))
     hub = Hub(Plant.load(path), clock)
     cycle_s = hub.plant.metadata()["planned"]["hall"]["cycle_ms"] / 1000
-    assert cycle_s > 1  # the plant file requests 0.1 s
+    assert cycle_s > 1  # although the plant file asks for 0.1 s
     hub.take(all_of(10, FORWARD, 25))
     row = hub.newest("pump-1", "output_frequency")
     assert row is not None
@@ -225,7 +245,7 @@ def test_values_of_an_overloaded_line_stay_fresh_for_three_rounds(tmp_path: Path
 
 def test_last_minute_has_one_point_a_second_and_null_for_a_miss(hub: Hub) -> None:
     assert hub.last_minute() == {}
-    for at in range(0, 1000, 5):  # in periods of 100 ms
+    for at in range(0, 1000, 5):  # 1000 periods of 100 ms
         hub.take(rows((at, FREQUENCY, Status.NO_REPLY if at == 990 else at)))
         hub.note_minute()
     points = hub.last_minute()["pump-1"]["output_frequency"]
@@ -272,7 +292,7 @@ SHOWN = st.sampled_from(
 
 
 @given(st.lists(SHOWN, max_size=30))
-def test_alarms_begin_and_end_once(shown: list[Shown]) -> None:
+def test_each_alarm_begins_and_ends_once(shown: list[Shown]) -> None:
     """Alarms for random states equal those of a simple reference implementation."""
     events = Alarms()
     fault: str | None = None
@@ -329,7 +349,7 @@ def test_ended_alarms_are_bounded() -> None:
         assert time > 100 or events.since == 7
     assert len(events.between(0, 9999)) <= 1001
     oldest = events.between(0, 9999)[-1]
-    assert events.since == oldest.time - 1  # end of the newest forgotten alarm
+    assert events.since == oldest.time - 1  # when the newest forgotten alarm ended
     assert events.begun == 2000
     assert len(events.shown()) <= 21
 
@@ -349,11 +369,11 @@ def test_frame_has_no_value_that_is_overdue_or_followed_by_a_miss(hub: Hub, cloc
         assert [*told["output_current"][:1], *told["output_current"][2:4]] == current
         assert told["fault"] == (None, told["fault"][1], "not asked yet")
         said = {"status": None, "output_frequency": frequency[0], "output_current": None, "fault": None}
-        assert fresh_values(hub, "pump-1") == said  # values published by MQTT
+        assert published_values(hub, "pump-1") == said  # the values that MQTT publishes
 
 
 def test_age_is_right_if_a_clock_was_set_back_or_stopped_in_sleep(hub: Hub, clock: HubClock) -> None:
-    """If the age were too short, the last value of a silent drive would look new."""
+    """With too small an age, the last value of a silent drive would look new."""
     hub.take(rows((10, FREQUENCY, 25), (20, FREQUENCY, Status.NO_REPLY)))
     asked_ns = UTC_0 + 10 * PERIOD
     hour_ns = 3600 * SECOND
@@ -370,3 +390,121 @@ def test_age_is_right_if_a_clock_was_set_back_or_stopped_in_sleep(hub: Hub, cloc
         assert (now, status, last) == (None, "no reply", 25.0), told
         assert pump["ages_ms"][then] == pump["ages_ms"][pump["seen"]] == age_ms, told
         assert pump["ages_ms"][missed] == age_ms - 1_000, told
+
+
+# ---- registers whose documents state no scale: raw counts are never reported in amperes, volts or hertz ----
+
+
+COMMON = (common_block.FREQUENCY, common_block.CURRENT, common_block.SETPOINT)
+
+
+class FullHub(Hub):
+    """A hub in which every polled register has a fresh value of 25."""
+
+    def newest(self, drive: str, register: str) -> Newest | None:
+        return Newest(1, 1, 25.0, "ok", 1)
+
+    def known(self, drive: str) -> Iterator[Known]:
+        for register, *_ in super().known(drive):
+            yield register, (1, 1, 25.0, 0), (1, 1, 25.0, 0), True
+
+
+class Fan(Drive):
+    """A user's own drive, whose manual states a unit but no scale."""
+
+    pressure = setting(1, "Pa", step=None, moves=False)
+
+
+def described(*drives: PolledDrive) -> dict[str, Any]:
+    hub = Hub(plant(line("/dev/null", *drives)))
+    return describe_line(hub, hub.plant.lines[0], "en")
+
+
+def number(words: list[int], at: int) -> int:
+    return int.from_bytes(bytes([*divmod(words[at], 256), *divmod(words[at + 1], 256)]), "big", signed=True)
+
+
+@table("model", MODELS)
+def test_only_scaled_values_have_a_unit(model: str) -> None:
+    drive = MODELS[model](1)
+    for register in described(polled(drive, drive.readings()))["drives"][0]["registers"]:
+        known = drive.registers[register["name"]]
+        assert register["unit"] == ("raw count" if known.step is None else known.unit)
+        if known.writable and known.values is None:  # the page's dialog needs a range
+            assert register["least"] < register["most"], known.name
+            known.encode(register["least"])
+            known.encode(register["most"])
+            assert (register["at_least"], register["at_most"]) == (known.at_least, known.at_most)
+
+
+def test_the_common_block_has_no_number_for_a_raw_count() -> None:
+    delixi, che = DelixiModbus(1, name="fan"), InvtCHE(2, name="pump", maximum_frequency=50)
+    names = ("output_frequency", "output_current")
+    drives = [polled(drive, [drive.registers[name] for name in names]) for drive in (delixi, che)]
+    hub = FullHub(plant(line("/dev/null", *drives)))
+    (fan, pump) = (CommonBlock(each).words(hub, 1) for each in drives)
+    assert [number(fan, at) for at in COMMON] == [2500, NO_NUMBER, NO_NUMBER]
+    assert [number(pump, at) for at in COMMON] == [2500, 2500, NO_NUMBER]
+
+
+def test_metric_of_raw_counts_is_named_raw() -> None:
+    drive = DelixiModbus(1, name="fan")
+    hub = FullHub(plant(line("/dev/null", polled(drive, [drive.output_frequency, drive.output_current]))))
+    found = {
+        family.name: [labels["register"] for _, labels, _ in family.samples]
+        for family in plant_families(hub, {})
+        if family.name.startswith("multidrop_register_") and "age" not in family.name
+    }
+    assert found == {
+        "multidrop_register_hertz": ["output_frequency"],
+        "multidrop_register_raw": ["output_current"],
+    }
+
+
+def test_metrics_are_in_base_units() -> None:
+    registers = {
+        register.value_unit: base_unit(register)
+        for family in MODELS.values()
+        for register in family.registers.values()
+        if register.values is None
+    }
+    assert {unit for unit, base in registers.items() if base is OTHER} == set()
+    assert (registers["V"], registers["%"]) == (("volts", 1.0), ("ratio", 0.01))
+    assert base_unit(reading(0, "kW")) == ("watts", 1000.0)
+    assert base_unit(reading(0, "m³/h")) is OTHER
+    assert base_unit(InvtCHE(1).status).name == "code"
+
+
+def test_home_assistant_shows_an_unscaled_number_as_a_raw_count() -> None:
+    topics = dict.fromkeys(("set", "stop", "state", "gateway", "available"), "topic")
+    details = {"prefix": "", "version": "1", "every_s": 1.0, "writable": ["pressure"], "takes_commands": True}
+    found = json.loads(discovery(Fan(1), [Fan.pressure], topics, **details))  # type: ignore[arg-type]
+    assert found["cmps"]["pressure_set"]["unit_of_measurement"] == "raw count"
+    assert "unit_of_measurement" not in found["cmps"]["pressure"]
+
+
+class Transmitter(Drive):
+    """A user's own device, whose registers have different numbers of digits."""
+
+    pressure = setting(1, "Pa", number_format=NumberFormat.F32, moves=False)
+    level = setting(3, "m", step=0.01, moves=False)
+    power = reading(4, "W", scale_register="power_scale")
+    power_scale = reading(5, number_format=NumberFormat.I16)
+
+
+def test_description_gives_no_digits_for_a_float() -> None:
+    told = described(polled(Transmitter(1), Transmitter.readings()))
+    registers = {each["name"]: each for each in told["drives"][0]["registers"]}
+    assert [registers[name]["digits"] for name in ("pressure", "level", "power")] == [None, 2, None]
+    assert [registers[name]["step"] for name in ("pressure", "level")] == [None, 0.01]
+
+
+def test_home_assistant_gets_no_precision_for_a_float() -> None:
+    topics = dict.fromkeys(("set", "stop", "state", "gateway", "available"), "topic")
+    details = {"prefix": "", "version": "1", "every_s": 1.0, "writable": ["pressure", "level"]}
+    drive = Transmitter(1, name="tank")
+    said = json.loads(discovery(drive, drive.registers.values(), topics, takes_commands=True, **details))
+    parts = said["cmps"]
+    shown = [parts[name].get("suggested_display_precision") for name in ("pressure", "level", "power")]
+    assert shown == [None, 2, None]
+    assert [parts[f"{name}_set"]["step"] for name in ("pressure", "level")] == [0.001, 0.01]

@@ -17,20 +17,14 @@ import pytest
 from gateways import Served, served
 from lines import PATIENCE, until
 from peers import require_program
+from tables import table
 
 from multidrop import Drive, WriteForbidden
 from multidrop.control import CommandResult
 from multidrop.gateway import commands as commands_module
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.http.rights import Right
-from multidrop.gateway.live.frames import (
-    ANOTHER_PLANT,
-    DOUBLED,
-    MOST_AGE_NS,
-    OVERTAKEN,
-    TOO_LATE,
-    SeenFrames,
-)
+from multidrop.gateway.live.frames import ANOTHER_PLANT, DOUBLED, MOST_AGE_NS, OVERTAKEN, TOO_LATE, SeenFrames
 
 MAY = """[serve.may]
 stop = "anyone"
@@ -42,7 +36,7 @@ WRITE = {"drive": "pump-1", "register": "setpoint", "value": 50.0}
 
 
 class Times:
-    """SeenFrames with a clock, and with the times of drives' stops, which a test sets."""
+    """A SeenFrames with a clock and times of stops that the test sets, as `now_ns` and `stopped`."""
 
     def __init__(self) -> None:
         self.now_ns = 10**12
@@ -73,12 +67,12 @@ def test_a_command_may_be_sent_until_its_frame_is_too_old(times: Times) -> None:
     assert times.rule(7, command="jog") == TOO_LATE
 
 
-def test_command_for_an_unknown_live_frame_is_refused(times: Times) -> None:
+def test_a_command_that_names_an_unknown_frame_is_refused(times: Times) -> None:
     times.frames.note(7)
     assert [times.rule(seen) for seen in (8, 6, -1, 0)] == [TOO_LATE] * 4
 
 
-def test_stop_invalidates_commands_of_its_drive_only(times: Times) -> None:
+def test_a_stop_makes_only_commands_of_its_drive_invalid(times: Times) -> None:
     times.frames.note(7)
     times.stopped["pump-1"] = times.now_ns  # equal times: the stop may be later than the frame
     assert times.rule(7) == OVERTAKEN
@@ -114,6 +108,12 @@ def test_old_frames_are_forgotten(times: Times) -> None:
 
 
 # ---- through the gateway ----
+
+
+@pytest.fixture(scope="module")
+def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with served(tmp_path_factory.mktemp("frames"), MAY) as found:
+        yield found
 
 
 @contextmanager
@@ -165,7 +165,7 @@ def test_command_delayed_too_long_is_not_sent(tmp_path: Path, path: str, body: d
         assert commands(gateway) == []
 
 
-def test_stop_delayed_as_long_is_sent(tmp_path: Path) -> None:
+def test_a_stop_is_sent_although_it_was_delayed_too_long_for_a_command(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         assert gateway.command("/api/write", WRITE, authorization=gateway.bearer(Right.WRITE)).json["done"]
         assert gateway.command("/api/act", START, authorization=gateway.bearer(Right.WRITE)).json["done"]
@@ -177,7 +177,7 @@ def test_stop_delayed_as_long_is_sent(tmp_path: Path) -> None:
         assert not motor.goal
 
 
-def test_start_from_a_frame_before_a_stop_is_not_sent(tmp_path: Path) -> None:
+def test_a_start_that_names_a_frame_from_before_a_stop_is_not_sent(tmp_path: Path) -> None:
     """Otherwise a proxy that repeats or delays a start could start a motor after a stop."""
     writer = {}
     with served(tmp_path, MAY) as gateway:
@@ -187,7 +187,7 @@ def test_start_from_a_frame_before_a_stop_is_not_sent(tmp_path: Path) -> None:
         assert gateway.post("/api/write", {**WRITE, "seen": seen}, **writer).json["done"] is True
         assert gateway.post("/api/act", start, **writer).json["done"] is True
         doubled = gateway.post("/api/act", start, **writer).json["text"]
-        assert "it is a repetition" in doubled
+        assert "it repeats an earlier request" in doubled
         assert gateway.post("/api/stop", {"drives": ["pump-1"]}).json["pump-1"]["done"] is True
         sent = commands(gateway)
         overtaken = gateway.post("/api/act", start, **writer).json["text"]
@@ -208,7 +208,7 @@ def test_command_that_waited_too_long_for_a_thread_is_not_sent(tmp_path: Path) -
     with served(tmp_path, MAY) as gateway:
         gateway.gateway.seen_frames.clock = lambda: boottime_ns() - MOST_AGE_NS + 50_000_000
         start = {**START, "seen": gateway.frame_number()}
-        gateway.gateway.seen_frames.clock = lambda: 0  # on arrival the command is recent
+        gateway.gateway.seen_frames.clock = lambda: 0  # so that the command is admitted
         with pytest.MonkeyPatch.context() as patch, held_up(gateway, "/api/act", start) as client:
             patch.setattr("multidrop.supervisor.threading", SimpleNamespace(Thread=Late))
             client.sendall(b"}")
@@ -220,18 +220,19 @@ def test_command_that_waited_too_long_for_a_thread_is_not_sent(tmp_path: Path) -
         assert commands(gateway) == []
 
 
-def test_stop_called_as_a_start_begins_prevents_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with served(tmp_path, MAY) as gateway:
-        act = commands_module.carry_out_verb
+def test_a_stop_called_while_a_start_begins_prevents_the_start(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    act, before = commands_module.carry_out_verb, commands(gateway)
 
-        def act_after_a_stop(drive: Drive, **given: Any) -> CommandResult:
-            gateway.gateway.commands._note_stop([drive.name])
-            return act(drive, **given)
+    def act_after_a_stop(drive: Drive, **given: Any) -> CommandResult:
+        gateway.gateway.commands._note_stop([drive.name])
+        return act(drive, **given)
 
-        monkeypatch.setattr(commands_module, "carry_out_verb", act_after_a_stop)
-        told = gateway.command("/api/act", START, authorization=gateway.bearer(Right.WRITE)).json
-        assert (told["done"], "start was not sent" in told["text"]) == (False, True)
-        assert commands(gateway) == []
+    monkeypatch.setattr(commands_module, "carry_out_verb", act_after_a_stop)
+    told = gateway.command("/api/act", START, authorization=gateway.bearer(Right.WRITE)).json
+    assert (told["done"], "start was not sent" in told["text"]) == (False, True)
+    assert commands(gateway) == before
 
 
 @pytest.mark.slow
@@ -246,25 +247,22 @@ def test_frame_of_a_previous_process_is_refused(tmp_path: Path) -> None:
         assert commands(gateway) == []
 
 
-@pytest.mark.parametrize("verb", ["start", "jog", "reset_fault", "set_frequency"])
-def test_writes_and_verbs_without_a_frame_number_are_refused(tmp_path: Path, verb: str) -> None:
-    with served(tmp_path, MAY) as gateway:
-        writer = {"authorization": gateway.bearer(Right.WRITE)}
-        options = {"hz": 20.0} if verb == "set_frequency" else {}
-        body = {"drive": "pump-1", "verb": verb, "options": options}
-        for wrong in ({}, {"seen": None}, {"seen": "7"}, {"seen": True}, {"seen": 1.5}, {"seen": 10**300}):
-            found = gateway.post("/api/act", {**body, **wrong}, **writer)
-            assert (found.status, found.json["error"].partition(" or")[0]) == (400, "seen is missing")
-            assert gateway.post("/api/write", {**WRITE, **wrong}, **writer).status == 400
-        assert commands(gateway) == []
-        assert gateway.gateway.commands.called == 0
+@table("wrong", [{}, {"seen": None}, {"seen": "7"}, {"seen": True}, {"seen": 1.5}, {"seen": 10**300}])
+def test_writes_and_verbs_without_a_frame_number_are_refused(gateway: Served, wrong: dict[str, Any]) -> None:
+    before, called = commands(gateway), gateway.gateway.commands.called
+    writer = {"authorization": gateway.bearer(Right.WRITE)}
+    verbs = {"start": {}, "jog": {}, "reset_fault": {}, "set_frequency": {"hz": 20.0}}
+    acts = [{"drive": "pump-1", "verb": verb, "options": options} for verb, options in verbs.items()]
+    for path, body in (("/api/write", WRITE), *(("/api/act", act) for act in acts)):
+        found = gateway.post(path, {**body, **wrong}, **writer)
+        assert (found.status, found.json["error"].partition(" or")[0]) == (400, "seen is missing")
+    assert (commands(gateway), gateway.gateway.commands.called) == (before, called)
 
 
-def test_stops_need_no_frame(tmp_path: Path) -> None:
-    with served(tmp_path, MAY) as gateway:
-        for verb in ("stop", "coast"):
-            told = gateway.post("/api/act", {"drive": "pump-1", "verb": verb, "options": {}}).json
-            assert told["done"] is True
+def test_stops_need_no_frame(gateway: Served) -> None:
+    for verb in ("stop", "coast"):
+        told = gateway.post("/api/act", {"drive": "pump-1", "verb": verb, "options": {}}).json
+        assert told["done"] is True
 
 
 @pytest.mark.slow
@@ -282,14 +280,12 @@ def test_documented_start_from_a_shell_works(tmp_path: Path) -> None:
         assert json.loads(ran.stdout)["text"] == "pump-1: start is done"
 
 
-def test_frames_count_the_stops_of_each_drive(tmp_path: Path) -> None:
-    with served(tmp_path, MAY) as gateway:
+def test_frames_state_the_number_of_stops_of_each_drive(gateway: Served) -> None:
+    def stops() -> list[int]:
+        return [gateway.frame()["drives"][name]["stops"] for name in ("pump-1", "pump-2")]
 
-        def stops() -> list[int]:
-            return [gateway.frame()["drives"][name]["stops"] for name in ("pump-1", "pump-2")]
-
-        assert stops() == [0, 0]
-        gateway.post("/api/stop", {"drives": ["pump-1"]})
-        until(lambda: stops() == [1, 0])
-        gateway.post("/api/stop")
-        until(lambda: stops() == [2, 1])
+    first, second = stops()
+    gateway.post("/api/stop", {"drives": ["pump-1"]})
+    until(lambda: stops() == [first + 1, second])
+    gateway.post("/api/stop")
+    until(lambda: stops() == [first + 2, second + 1])

@@ -3,37 +3,60 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
-from collections.abc import Iterator
+import weakref
+from collections import Counter
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from gateways import Served, served
+from gateways import Served, served, written
 from lines import line, plant, polled, until
 
-from multidrop import NoReply
+from multidrop import LineError, NoReply, WriteForbidden
 from multidrop.control.eeprom_ledger import LedgerCell
+from multidrop.core import Counters, Status
+from multidrop.drive import parameters
+from multidrop.drive.parameters import ParameterGroup, ParameterSpace
 from multidrop.families import ErmanERG220, InvtCHE
 from multidrop.gateway.live import drive_reads
 from multidrop.gateway.live.descriptions import describe_line
+from multidrop.gateway.live.drive_reads import Identities
 from multidrop.gateway.live.hub import Hub
+from multidrop.gateway.live.recent_statistics import MINUTES, RecentStatistics
+from multidrop.gateway.live.views import line_views
+from multidrop.gateway.metrics import plant_families
+from multidrop.transport.statistics import LineStatistics, line_statistics
 
 MAY = '[serve.may]\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
 
 
-@pytest.fixture
-def gateway(tmp_path: Path) -> Iterator[Served]:
-    with served(tmp_path, MAY) as found:
-        until(lambda: found.frame()["drives"]["pump-2"]["state"] == "stands")
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with served(tmp_path_factory.mktemp("views"), MAY) as found:
         yield found
+
+
+@pytest.fixture
+def gateway(shared: Served) -> Iterator[Served]:
+    """One gateway for all tests. When a test starts, both drives answer, and no view reads are pending."""
+    shared.await_state("pump-2", "stands")
+    yield shared
+    for sim in shared.sims.values():
+        sim.deaf_until = 0.0
+    shared.loop.call_soon_threadsafe(shared.gateway.side_reads.cancel)
+    until(lambda: not shared.gateway.side_reads.under_way)
 
 
 def test_plant_description_has_data_of_plant_file_and_manual(gateway: Served) -> None:
     plant = gateway.get("/api/plant").json
-    assert plant["name"] == "plant.toml"
+    assert (plant["name"], plant["history"]) == ("plant.toml", False)
     assert plant["may"] == {"role": "look", "write": [], "verbs": []}
     (line,) = plant["lines"]
     assert (line["name"], line["speed"]) == ("hall", "38400 8N1")
@@ -57,10 +80,10 @@ def test_plant_description_has_data_of_plant_file_and_manual(gateway: Served) ->
         assert gateway.get("/api/plant", **headers).json["may"]["write"] == may
 
 
-def test_drives_of_one_line_have_their_own_speeds() -> None:
+def test_a_line_is_described_with_the_baud_rates_of_all_its_drives() -> None:
     drives = [polled(drive, drive.readings()) for drive in (ErmanERG220(1), InvtCHE(2), InvtCHE(3))]
     hub = Hub(plant(line("/dev/null", *drives)))
-    told = describe_line(hub, hub.plant.lines[0])
+    told = describe_line(hub, hub.plant.lines[0], "en")
     assert told["speed"] == "38400 8N1, 9600 8N1"
     assert [drive["speed"] for drive in told["drives"]] == ["38400 8N1", "9600 8N1", "9600 8N1"]
 
@@ -83,7 +106,7 @@ def test_a_frame_has_values_with_their_own_times(gateway: Served) -> None:
     assert frame["lines"]["hall"]["lost"] is None
     following = gateway.get(f"/api/frame?after={frame['n']}").json
     assert following["n"] > frame["n"] == following["since"]
-    assert "revision" not in following  # a frame of changes omits equal values
+    assert "revision" not in following  # not changed, and so not in a frame of changes
 
 
 def test_new_page_gets_the_samples_of_the_last_minute(gateway: Served) -> None:
@@ -121,19 +144,12 @@ def test_values_of_a_silent_drive_are_marked_as_old(gateway: Served) -> None:
     until(lasting)  # on a busy machine there may have been other alarms before
     begun = lasting()[0]
     assert begun["kind"] == "silent"
-    gateway.sims["pump-2"].deaf_until = 0.0
+    gateway.sims["pump-2"].deaf_until = 0.0  # the drive answers again
     until(lambda: begun["time"] in [one["time"] for one in alarms() if one["ended"]])
     told = gateway.get("/api/alarms?from=0&to=9999999999999").json
     assert begun["time"] in [one["time"] for one in told["alarms"]]
     assert told["since"] <= begun["time"]
     assert gateway.get("/api/alarms?from=0&to=1").json["alarms"] == []
-
-
-@pytest.mark.slow
-def test_a_fault_has_the_text_of_its_drive(gateway: Served) -> None:
-    gateway.sims["pump-1"].trip(4)  # type: ignore[attr-defined]
-    gateway.await_state("pump-1", "fault")
-    until(lambda: gateway.frame()["drives"]["pump-1"]["fault"] == "overcurrent while accelerating (OC1)")
 
 
 @pytest.mark.long
@@ -185,7 +201,7 @@ def test_lines_show_the_delays_of_each_drive(gateway: Served) -> None:
 
 @pytest.mark.long
 def test_misses_of_a_silent_drive_are_counted_against_requested_values(gateway: Served) -> None:
-    """Misses count values, of which one request has several, so they must not be divided by requests."""
+    """One request reads several values. Misses are counted by value, and so divided by requested values."""
     recent = gateway.gateway.recent
 
     def came() -> int:
@@ -207,7 +223,7 @@ def test_misses_of_a_silent_drive_are_counted_against_requested_values(gateway: 
 
 
 def test_drive_shows_only_eeprom_writes_of_its_port_address_and_family(gateway: Served) -> None:
-    """Another drive may have the same address on another port, or may have had it on this port before."""
+    """Another drive may have the same address on another port, or may have had this address earlier."""
     drive = gateway.gateway.plant.find_drive("pump-1")[1]
     assert gateway.gateway.poller
     port = gateway.gateway.poller.bus("hall").line.identity
@@ -223,8 +239,8 @@ def test_drive_shows_only_eeprom_writes_of_its_port_address_and_family(gateway: 
 
 
 @pytest.mark.slow
-def test_ask_reads_words_outside_the_register_table(gateway: Served) -> None:
-    """Modbus masters get words as the drive stores them."""
+def test_the_function_ask_reads_the_words_at_any_address(gateway: Served) -> None:
+    """`ask` returns words as the drive stores them, for Modbus masters."""
     gateway.sims["pump-1"]["output_current"] = 12.3
 
     def ask(drive: str, expiry_s: float) -> list[int]:
@@ -248,3 +264,215 @@ def test_ask_reads_words_outside_the_register_table(gateway: Served) -> None:
 def test_health_is_ok_while_all_drives_answer(gateway: Served) -> None:
     health = gateway.get("/health")
     assert (health.status, health.json["status"], health.json["lines"]) == (200, "ok", {"hall": "ok"})
+
+
+def test_gateway_without_triggers_answers_with_an_empty_list(gateway: Served) -> None:
+    assert gateway.get("/api/triggers").json == {"triggers": []}
+
+
+# ---- statistics of the last hour, from few stored readings ----
+
+
+MINUTE_MS = 60_000
+
+
+def reading(seconds: int, *, per_s: int = 10) -> LineStatistics:
+    """Return a line's statistics after `seconds` of samples, with a miss every 30 s."""
+    missed = Counter({int(Status.NO_REPLY): seconds // 30})
+    counters = Counters()._replace(values=seconds * per_s, sent=seconds * per_s, missed=missed)
+    return line_statistics(float(seconds), {"pump-1": counters}, None)
+
+
+@pytest.fixture
+def recent(tmp_path: Path) -> RecentStatistics:
+    return RecentStatistics(written(tmp_path))
+
+
+@pytest.mark.slow
+def test_hour_has_60_minutes_of_figures_but_few_readings_are_stored(recent: RecentStatistics) -> None:
+    alive: list[weakref.ref[LineStatistics]] = []
+    for second in range(0, 70 * 60 + 31, 5):
+        found = reading(second)
+        alive.append(weakref.ref(found))
+        recent.tick(float(second), second * 1000, {"hall": found})
+    del found
+    hour = recent.hour("hall")
+    assert len(hour) == MINUTES
+    assert [one["time"] for one in hour] == [minute * MINUTE_MS for minute in range(11, 71)]
+    assert all(one["asked"] == 602 and one["misses"] == {"no reply": 2} for one in hour[:-1])
+    assert hour[-1] == {"time": 70 * MINUTE_MS, "asked": 301, "misses": {"no reply": 1}}
+    assert sum(one() is not None for one in alive) < 10
+    assert recent.hour("roof") == []
+
+
+def test_line_figures_cover_the_last_seconds(recent: RecentStatistics) -> None:
+    for second in range(200):
+        recent.tick(float(second), second * 1000, {"hall": reading(second)})
+        if second == 100:
+            assert recent.line("hall")["misses"] == 3
+    assert recent.line("hall")["rate"] == 10.0
+    assert recent.drive_figures("pump-1")["missed"] == pytest.approx(2 / 600, abs=1e-3)
+    assert recent.line("roof")["rate"] is None
+
+
+def test_figures_without_replies_are_none_not_zero(recent: RecentStatistics, tmp_path: Path) -> None:
+    assert recent.line("hall")["misses"] is None
+    for second in range(100):
+        recent.tick(float(second), second * 1000, {"hall": reading(second)})  # a reading without any reply
+    assert recent.line("hall")["p99"] is None
+    plant = written(tmp_path)
+    gateway: Any = SimpleNamespace(plant=plant, hub=Hub(plant), recent=recent)
+    drive = line_views(gateway)["hall"]["drives"]["pump-1"]
+    assert (drive["p50"], drive["p99"]) == (None, None)
+    families = plant_families(gateway.hub, recent.newest)
+    (delays,) = [one for one in families if one.name == "multidrop_response_delay_seconds"]
+    assert delays.samples == [("_count", {"line": "hall", "drive": "pump-1"}, 0.0)]
+
+
+def test_a_reopened_line_has_figures_only_after_its_second_reading(recent: RecentStatistics) -> None:
+    recent.tick(100.0, 100_000, {"hall": replace(reading(100), epoch=1)})
+    recent.tick(101.0, 101_000, {"hall": replace(reading(1), epoch=2)})
+    assert (recent.line("hall")["rate"], recent.line("hall")["used"]) == (None, None)
+    recent.tick(106.0, 106_000, {"hall": replace(reading(6), epoch=2)})
+    assert recent.line("hall")["rate"] == 10.0
+
+
+def test_a_removed_drive_never_makes_a_rate_negative(recent: RecentStatistics) -> None:
+    recent.tick(100.0, 100_000, {"hall": reading(100)})
+    recent.tick(101.0, 101_000, {"hall": replace(reading(1), seconds=101.0)})
+    assert recent.line("hall")["rate"] == 0.0
+
+
+# ---- identities are checked before the first stop is called, so that the stop is sent immediately ----
+
+
+MAY_STOP = '[serve.may]\nstop = "anyone"\n'
+
+
+@pytest.mark.long
+def test_first_stop_reads_no_identity(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No identity is read between the call of a stop and its Modbus frame."""
+    asked: list[str] = []
+    with served(tmp_path, MAY_STOP) as gateway:
+        bus = gateway.gateway.bus("hall")
+        check = bus._performer._writer.identity_check
+        until(lambda: all(map(check.is_known, bus.drives)))
+        with monkeypatch.context() as patched:
+            patched.setattr(check, "_read", lambda drive, *more, **options: asked.append(drive.name))
+            told = gateway.post("/api/stop").json
+        assert [one["done"] for one in told.values()] == [True, True]
+    assert asked == []
+
+
+class AskedBus:
+    """A bus that records the checked drives, and raises the exceptions in `failures`."""
+
+    def __init__(self, failures: dict[str, Exception]) -> None:
+        self.names: list[str] = []
+        self.known: set[str] = set()
+        self._failures = failures
+
+    def knows_identity(self, drive: Any) -> bool:
+        return drive.name in self.known
+
+    def check_identity(self, drive: Any, *, rest_s: float) -> None:
+        self.names.append(drive.name)
+        if drive.name in self._failures:
+            raise self._failures[drive.name]
+
+
+def ask_all(bus: AskedBus, is_there: Callable[[str], bool], *names: str) -> list[str]:
+    """Check these drives in two rounds; return "failed" for each unexpected exception."""
+    drives = [SimpleNamespace(drive=SimpleNamespace(name=name)) for name in names]
+    plant = SimpleNamespace(lines=[SimpleNamespace(name="hall", drives=drives)])
+    failed: list[str] = []
+    rounds = 0
+
+    def present() -> Any:
+        nonlocal rounds
+        rounds += 1
+        if rounds > 2:
+            raise asyncio.CancelledError
+        return plant
+
+    of: Any = Identities
+    identities = of(present, lambda line: bus, is_there, lambda: failed.append("failed"))
+    with suppress(asyncio.CancelledError):
+        asyncio.run(identities.run())
+    return failed
+
+
+@pytest.fixture
+def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drive_reads, "PAUSE_S", 0.0)
+    monkeypatch.setattr(drive_reads, "ROUND_S", 0.0)
+
+
+@pytest.mark.usefixtures("_at_once")
+def test_identity_of_a_silent_drive_is_not_read() -> None:
+    bus = AskedBus({})
+    assert ask_all(bus, lambda name: name != "silent", "pump-1", "silent", "pump-2") == []
+    assert bus.names == ["pump-1", "pump-2"] * 2
+
+
+@pytest.mark.usefixtures("_at_once")
+def test_known_identity_is_not_read_again() -> None:
+    """No thread is started for a known identity either."""
+    bus = AskedBus({})
+    bus.known.add("pump-1")
+    assert ask_all(bus, lambda name: True, "pump-1", "pump-2") == []
+    assert bus.names == ["pump-2"] * 2
+
+
+@pytest.mark.usefixtures("_at_once")
+def test_wrong_identity_is_logged_once_and_failures_do_not_end_the_check(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    stranger = WriteForbidden(
+        "nothing is written to fan-1, so it is not a CHE", rule="it does not look like its family"
+    )
+    failures = {"fan-1": stranger, "lost": LineError("/dev/x", "gone"), "broken": RuntimeError("a bug")}
+    bus = AskedBus(failures)
+    with caplog.at_level(logging.WARNING):
+        assert ask_all(bus, lambda name: True, *failures, "pump-1") == ["failed", "failed"]
+    assert [one.message for one in caplog.records] == [str(stranger)]
+    assert bus.names == [*failures, "pump-1"] * 2
+
+
+# ---- parameters over HTTP: read on request only, and exported as files ----
+
+
+PARAMETERS = "/api/parameters/pump-1"
+
+
+def parameter_state(gateway: Served) -> str:
+    return str(gateway.get(PARAMETERS).json["state"])
+
+
+def test_parameters_are_read_on_request_and_exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    space = ParameterSpace(groups=(ParameterGroup("P.", 0x2000, range(3)),))
+    monkeypatch.setattr(InvtCHE, "parameter_space", space)
+    parameters._parameters_of.cache_clear()
+    with served(tmp_path) as gateway:
+        gateway.sims["pump-1"]["setpoint"] = 12.5
+        assert parameter_state(gateway) == "none"
+        assert gateway.get(f"{PARAMETERS}?format=toml").status == 409
+        assert gateway.get(f"{PARAMETERS}?read=1").json["state"] in ("reading", "read")
+        until(lambda: parameter_state(gateway) == "read")
+        (row,) = gateway.get(PARAMETERS).json["parameters"]
+        assert (row["code"], row["name"], row["value"]) == ("P.00", "setpoint", "12.50 %")
+        answer = gateway.get(f"{PARAMETERS}?format=csv")
+        assert b"\nP.00;1250;setpoint;12.50 %;\n" in answer.body
+        assert "attachment" in answer.headers["content-disposition"]
+        assert b'"P.00" = 1250' in gateway.get(f"{PARAMETERS}?format=toml").body
+        assert gateway.get(f"{PARAMETERS}?format=exe").status == 400
+        assert gateway.sims["pump-1"].counters.functions[6] == 0
+    parameters._parameters_of.cache_clear()
+
+
+def test_parameters_of_a_family_without_known_addresses_are_refused(tmp_path: Path) -> None:
+    with served(tmp_path) as gateway:
+        gateway.get(f"{PARAMETERS}?read=1")
+        until(lambda: parameter_state(gateway) == "failed")
+        assert "no reliable rule" in gateway.get(PARAMETERS).json["error"]
+        assert gateway.get("/api/parameters/nobody").status == 404

@@ -1,4 +1,4 @@
-"""AlarmFile: keeps alarms on disk. A thread reads and writes, so polling never waits for a disk."""
+"""AlarmFile: keeps alarms on disk, in a thread of its own, so that polling never waits for a disk."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from queue import Empty, Full, Queue
 from typing import Any
 
 from multidrop.gateway.live.alarms import KINDS, MOST_ENDED, Alarm
+from multidrop.whole_file import whole_file
 
 MOST_WAITING = 10_000  # limit of alarms queued for writing
-MOST_BYTES = 4 << 20  # size at which the file is rewritten with its newest alarms
-SLOW_S = 10.0  # a disk access that takes longer is reported
+MOST_BYTES = 4 << 20  # a longer file is rewritten with only the newest alarms
+SLOW_S = 10.0  # a disk access that takes longer than this (in s) is reported
 CLOSE_S = 2.0
 
 
 class AlarmFile:
-    """A file of alarms as JSON lines; if an alarm has several lines, the newest is valid.
+    """A file of alarms as JSON lines; if an alarm has several lines, the last one counts.
 
-    Only `run` waits for the disk. No method raises.
+    All disk access is in `run`, which needs a thread of its own. No method raises.
     """
 
     def __init__(self, path: Path) -> None:
@@ -103,13 +104,12 @@ class AlarmFile:
             with self.path.open("a", encoding="utf-8") as file:
                 file.writelines(map(_line, changed))
             return
-        new = self.path.with_name(f"{self.path.name}.new")
-        new.write_text("".join(map(_line, known.values())), "utf-8")
-        new.replace(self.path)
+        with whole_file(self.path) as part:
+            part.write_text("".join(map(_line, known.values())), "utf-8")
 
 
 def _line(alarm: Alarm) -> str:
-    """Return the alarm's line. It starts with a newline: a power cut may have truncated the previous one."""
+    """Return the alarm's line. It starts with a newline: a power cut may have truncated the line before."""
     return f"\n{json.dumps(alarm.as_json())}\n"
 
 

@@ -23,7 +23,8 @@ from multidrop.gateway.live.hub import (
 STOPPED, PORT, LIMIT = "stopped", "port", "limit"  # kinds of alarms in addition to FAULT and SILENT
 KINDS = (FAULT, STOPPED, LIMIT, PORT, SILENT)  # the most serious kind first
 UNCALLED = "the motor stopped, and no stop was called here"
-STANDS_MS = 2000  # a motor must be at rest this long, because a reversing motor passes 0 Hz
+# a motor counts as stopped after this time (in ms) at rest, because a reversing motor passes 0 Hz
+STANDS_MS = 2000
 MOST_ENDED = 1000  # limit of ended alarms that are kept
 MOST_SHOWN = 20  # limit of ended alarms that clients see
 SEPARATOR = "; "  # between a drive's exceeded limits in the alarm's text
@@ -31,7 +32,7 @@ LOST = ("port lost", "port refused its settings")  # statuses of a line's rows w
 
 
 class AlarmChange(Enum):
-    """What happened to an alarm."""
+    """What happened to an alarm: it started, ended or changed."""
 
     BEGAN = "began"
     CHANGED = "changed"  # the alarm was acknowledged, or its text has changed
@@ -47,7 +48,7 @@ class Alarm(NamedTuple):
     ended: int | None
     kind: str
     line: str = ""
-    is_before: bool = False  # True: first seen at `time`, but it may have started earlier
+    is_before: bool = False  # True: `time` is when the alarm was first seen; it may have started earlier
     acknowledged: int | None = None
     by: str = ""  # the caller who acknowledged the alarm
     note: str = ""
@@ -56,6 +57,11 @@ class Alarm(NamedTuple):
     def id(self) -> str:
         """A unique id, stable across restarts."""
         return f"{self.time} {self.kind} {self.drive or self.line}"
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """The line, drive and kind. Only one alarm with the same key is active at a time."""
+        return self.line, self.drive, self.kind
 
     def as_json(self) -> dict[str, Any]:
         """Return the alarm as its file keeps it, with times in ms."""
@@ -70,8 +76,8 @@ class Alarm(NamedTuple):
 class Alarms:
     """The active alarms, and the latest ended ones.
 
-    `since` is the UTC time in ms from which the record is complete. `note` is called with each alarm that
-    started, ended or changed, and with what happened to it.
+    `since` is a UTC time in ms: alarms that ended earlier may be forgotten. `note` is called with each alarm
+    that started, ended or changed, and with the kind of change.
     """
 
     def __init__(
@@ -79,10 +85,12 @@ class Alarms:
     ) -> None:
         self.since = since
         self._note = note
-        self._lasting: dict[tuple[str, str, str], Alarm] = {}  # active, oldest first; keys: line, drive, kind
+        # active alarms, oldest first, by line, drive and kind
+        self._lasting: dict[tuple[str, str, str], Alarm] = {}
         self._ended: deque[Alarm] = deque(maxlen=MOST_ENDED)
         self._known: set[tuple[str, str]] = set()  # lines and drives seen so far
-        self._runs: dict[str, int] = {}  # by drive: the argument `stops` of `look` when a run was first seen
+        # by drive: value of the argument `stops` of `look` when a run was first seen
+        self._runs: dict[str, int] = {}
         self._stands: dict[str, int] = {}  # by drive: when a motor that ran was first seen at rest
         self.begun = 0  # number of alarms so far
 
@@ -96,7 +104,8 @@ class Alarms:
         """
         state, words = shown.state, shown.words
         if state == SILENT:
-            if not (words or "").startswith(LOST):  # a lost port raises one alarm of the line instead
+            # for a lost port, the line has one alarm instead of one for each drive
+            if not (words or "").startswith(LOST):
                 self._begin(time, "", drive, SILENT, words or "no reply")
             return
         if words == NOT_ASKED:
@@ -130,7 +139,7 @@ class Alarms:
         self._stands.pop(drive, None)
 
     def look_at_line(self, time: int, line: str, lost: str | None) -> None:
-        """Note why a line's port is lost, or with None that the port works."""
+        """Note why a line's port is lost. If `lost` is None, note that the port works."""
         if lost is None:
             self._end(time, line, "", PORT)
         else:
@@ -139,7 +148,8 @@ class Alarms:
     def look_at_limits(self, time: int, drive: str, exceeded: Callable[[str], str]) -> None:
         """Note a drive's exceeded limits.
 
-        `exceeded` takes the text of the active alarm ("" without one), and returns the present text.
+        `exceeded` is called with the text of the active alarm ("" without one), and returns the alarm's
+        new text ("" if no limit is exceeded).
         """
         lasting = self._lasting.get(("", drive, LIMIT))
         text = exceeded(lasting.text if lasting else "")
@@ -149,7 +159,7 @@ class Alarms:
             self._end(time, "", drive, LIMIT)
 
     def note_there(self, line: str) -> None:
-        """Note that a line works, so that a later loss has an exact start."""
+        """Note that a line works: if its port is lost later, the start of that alarm is exact."""
         self._known.add((line, ""))
 
     def forget(self, name: str, time: int) -> None:
@@ -172,16 +182,19 @@ class Alarms:
             raise KeyError(id)
         changed = found._replace(acknowledged=time, by=by, note=note)
         if found.ended is None:
-            self._lasting[_key(found)] = changed
+            self._lasting[found.key] = changed
         else:
             self._ended[self._ended.index(found)] = changed
         self._note(changed, AlarmChange.CHANGED)
         if changed.kind == STOPPED and changed.ended is None:
-            self._end(time, *_key(changed))
+            self._end(time, *changed.key)
         return changed
 
     def restore(self, kept: Iterable[Alarm], time: int, names: Collection[str]) -> None:
-        """Take over the alarms of an earlier run; those of drives and lines not in `names` end now."""
+        """Take over the alarms of an earlier run.
+
+        Alarms of drives and lines that are not in `names` end now.
+        """
         kept = sorted(kept, key=lambda alarm: alarm.ended or alarm.time)
         if kept:
             self.since = min(self.since, *(alarm.time for alarm in kept))
@@ -195,11 +208,11 @@ class Alarms:
 
     def _take_up(self, alarm: Alarm, time: int, names: Collection[str]) -> None:
         """Continue an alarm of an earlier run, or end it if it is over or its drive or line was removed."""
-        key = _key(alarm)
+        key = alarm.key
         present = self._lasting.get(key)
         is_seen = key[:2] in self._known and present is None
         if present is not None and present.is_before and present.text in (alarm.text, UNNAMED):
-            self._lasting[key] = alarm  # the present alarm continues the earlier one
+            self._lasting[key] = alarm  # both are the same alarm: keep the earlier one, with its start
         elif present is not None or is_seen or (alarm.drive or alarm.line) not in names:
             self._ended.append(alarm._replace(ended=time))
             self._note(self._ended[-1], AlarmChange.ENDED)
@@ -239,7 +252,7 @@ class Alarms:
             return
         is_less = kind == LIMIT and before is not None and _parts(text) < _parts(before.text)
         if before is not None and (before.text == UNNAMED or kind == PORT or is_less):
-            # This is the same alarm, with a better text.
+            # the active alarm continues, with this more precise text
             self._lasting[key] = before._replace(text=text)
             self._note(self._lasting[key], AlarmChange.CHANGED)
             return
@@ -257,10 +270,6 @@ class Alarms:
             self._note(self._ended[-1], AlarmChange.ENDED)
 
 
-def _key(alarm: Alarm) -> tuple[str, str, str]:
-    return alarm.line, alarm.drive, alarm.kind
-
-
 def _parts(text: str) -> set[str]:
-    """Return the limits in the text of an alarm of kind LIMIT."""
+    """Return the exceeded limits that the text of an alarm of kind LIMIT lists."""
     return {*text.split(SEPARATOR)}

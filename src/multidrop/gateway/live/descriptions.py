@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 CURRENTS = ("output_current",)
 
 
-def describe(gateway: Gateway, right: Right | None) -> dict[str, Any]:
-    """Return the answer to GET /api/plant for a caller with this right."""
+def describe(gateway: Gateway, right: Right | None, language: str) -> dict[str, Any]:
+    """Return the answer to GET /api/plant for a caller with this right, with titles in this language."""
     is_writer = right is Right.WRITE
     may, fleet = gateway.settings.may, gateway.feeds.get("fleet")
     return {
@@ -25,33 +25,35 @@ def describe(gateway: Gateway, right: Right | None) -> dict[str, Any]:
         "version": gateway.version,
         "name": gateway.hub.plant.path.name,
         "demo": gateway.settings.is_demo,
-        "file": gateway.reload.has_file,  # a reload is possible
-        "fleet": fleet is not None,  # /api/fleet is available
-        "fleet_stop": getattr(fleet, "can_stop", False),  # /api/fleet/stop is available
-        "mistakes": gateway.reload.mistakes,  # mistakes in the plant file, if the newest reload was refused
+        "file": gateway.reload.has_file,  # True: a reload is possible
+        "history": "history" in {**gateway.feeds, **gateway.parts.pending},  # True: /api/history is available
+        "fleet": fleet is not None,  # True: /api/fleet is available
+        "fleet_stop": getattr(fleet, "can_stop", False),  # True: /api/fleet/stop is available
+        # mistakes in the plant file that the latest reload found; empty if it succeeded
+        "mistakes": gateway.reload.mistakes,
         "may": {
             "role": None if right is None else right.name.lower(),
             "write": sorted(may.write) if is_writer else [],
             "verbs": sorted(may.verbs) if is_writer else [],
         },
-        "lines": [describe_line(gateway.hub, line) for line in gateway.hub.plant.lines],
+        "lines": [describe_line(gateway.hub, line, language) for line in gateway.hub.plant.lines],
     }
 
 
-def describe_line(hub: Hub, line: PlantLine) -> dict[str, Any]:
+def describe_line(hub: Hub, line: PlantLine, language: str) -> dict[str, Any]:
     """Return a line's part of the description."""
     speeds = dict.fromkeys(str(polled.drive.settings) for polled in line.drives)
     return {
         "name": line.name,
         "port": line.port,
         "speed": ", ".join(speeds),
-        "drives": [_drive(hub, polled) for polled in line.drives],
+        "drives": [_drive(hub, polled, language) for polled in line.drives],
     }
 
 
-def _drive(hub: Hub, polled: PolledDrive) -> dict[str, Any]:
+def _drive(hub: Hub, polled: PolledDrive, language: str) -> dict[str, Any]:
     drive = polled.drive
-    periods = {poll.register.name: poll.every or 0.0 for poll in polled.polls}
+    periods = {poll.register.name: poll.every or 0.0 for poll in polled.series}
     return {
         "name": drive.name,
         "family": drive.model or type(drive).__name__,
@@ -60,9 +62,9 @@ def _drive(hub: Hub, polled: PolledDrive) -> dict[str, Any]:
         "speed": str(drive.settings),
         "key": _key_registers(drive, periods),
         "registers": [
-            _register(register)
+            _register(register, language)
             | {"period_s": periods.get(register.name), "holds_s": hub.holds_s(drive.name, register.name)}
-            for register in drive.registers.values()
+            for register in (*drive.registers.values(), *(one.register for one in polled.channels))
         ],
         "verbs": verbs_of(drive),
     }
@@ -82,11 +84,11 @@ def _key_registers(drive: Drive, periods: dict[str, float]) -> dict[str, str | N
 
 
 def digits_of(register: Register[Any]) -> int | None:
-    """Return the digits after the decimal point; None if they vary by value, as of a float."""
+    """Return the number of digits after the decimal point; None if it varies, as for a float."""
     return None if register.is_float or register.scale_register else register.decimals
 
 
-def _register(register: Register[Any]) -> dict[str, Any]:
+def _register(register: Register[Any], language: str) -> dict[str, Any]:
     values = register.values
     least, most = _span(register)
     kind = "number" if values is None else "bits" if issubclass(values, Flag) else "words"
@@ -94,6 +96,7 @@ def _register(register: Register[Any]) -> dict[str, Any]:
     words = {str(int(member)): register.in_words(member) for member in members}
     return {
         "name": register.name,
+        "title": register.title_in(language),
         "unit": register.value_unit,
         "digits": digits_of(register),
         "kind": kind,

@@ -12,9 +12,9 @@ from typing import Any
 from multidrop import Bus, BusError, Drive, NoReply, Plant, WriteForbidden
 from multidrop.supervisor import supervisor
 
-PAUSE_S = 0.2  # least pause between two reads on a line, for polling
+PAUSE_S = 0.2  # least pause between two reads on a line, which leaves time for polling
 SHARE = 20  # the pause is at least this many times the duration of the last read
-LOOKED_S = 3.0  # reading stops this long after the last view of a drive
+LOOKED_S = 3.0  # a drive is read until this many seconds after its last view
 MOST_DRIVES = 4  # limit of drives that are read concurrently
 READ_S = 30.0  # time limit of one read
 
@@ -23,6 +23,7 @@ UNANSWERED = "no reply"
 Found = dict[str, list[Any]]  # by register: value or None, time (UTC, ms), "ok" or the failure
 ROUND_S = 2.0  # pause between two rounds of identity checks
 ASKED_S = 30.0  # time limit of one identity check
+REST_S = 0.1  # pause before each read of an identity check, which leaves time for polling
 _log = logging.getLogger("multidrop.gateway")
 
 
@@ -41,7 +42,7 @@ class SideReads:
     ) -> None:
         self._bus = bus
         self._is_there = is_there
-        self._turns: dict[str, asyncio.Lock] = {}  # by line: held during a read
+        self._turns: dict[str, asyncio.Lock] = {}  # by line: a lock that is held during a read
         self._clock = clock
         self._utc_ms = utc_ms
         self._looked: dict[str, float] = {}
@@ -49,16 +50,23 @@ class SideReads:
         self._tasks: dict[str, asyncio.Task[None]] = {}
 
     def look(self, plant: Plant, name: str) -> Found:
-        """Return the values read so far, and continue reading. Raises ValueError for an unknown drive."""
+        """Return the values read so far, and read on for LOOKED_S. Raises ValueError for an unknown drive."""
         line, drive = plant.find_drive(name)
         self._looked[name] = self._clock()
         found = self._found.setdefault(name, {})
-        if name not in self._tasks and len(self._tasks) < MOST_DRIVES:
+        if name not in self._tasks and len(self._tasks) < MOST_DRIVES and self._can_read(line.name):
             polled = next(one for one in line.drives if one.drive is drive)
             others = set(drive.registers) - {poll.register.name for poll in polled.polls}
             names = [one for one in drive.registers if one in others and drive.registers[one].readable]
             self._tasks[name] = supervisor().start("side reads", self._read(line.name, drive, names))
         return found
+
+    def _can_read(self, line: str) -> bool:
+        """Return True if this process has a bus for the line."""
+        try:
+            return self._bus(line) is not None
+        except ValueError:
+            return False
 
     @property
     def under_way(self) -> int:
@@ -93,7 +101,7 @@ class SideReads:
         finally:
             if self._tasks.get(drive.name) is asyncio.current_task():
                 del self._tasks[drive.name]
-                self._found.pop(drive.name, None)  # stale values must not be shown
+                self._found.pop(drive.name, None)  # values that are no longer updated must not be shown
 
     async def _read_in_turn(self, line: str, drive: Drive, register: str) -> None:
         begun = self._clock()
@@ -113,7 +121,8 @@ class SideReads:
 
 
 class Identities:
-    """Checks each drive's identity once while its port is open: the drive's first stop need not wait for it.
+    """Checks each drive's identity once while its port is open, so that the drive's first stop need not
+    wait for the check.
 
     `fail` is called in the `except` block of an unexpected exception, so it can log the exception.
     """
@@ -153,10 +162,10 @@ class Identities:
 
     def _ask(self, line: str, drive: Drive) -> None:
         try:
-            self._bus(line).check_identity(drive)
+            self._bus(line).check_identity(drive, rest_s=REST_S)
         except WriteForbidden as refusal:
             if self._refused.get(drive.name) != str(refusal):
                 _log.warning("%s", refusal)
             self._refused[drive.name] = str(refusal)
-        except (BusError, ValueError):  # retried later, or the drive was removed
+        except (BusError, ValueError):  # checked again in a later round, unless the drive was removed
             pass

@@ -1,8 +1,8 @@
 """Frames: the state of the plant for all viewers, made at most five times a second.
 
-A viewer requests the next frame after the last one, so no queue builds up for a slow viewer. The request
-names the viewer's frame, and the answer has the changes since that frame, or a whole frame if that one is no
-longer remembered.
+A viewer requests a frame only after it has received the last one, so no queue builds up for a slow viewer.
+The request has the number of the viewer's newest frame, and the answer has the changes since that frame. If
+the gateway no longer remembers that frame, the answer is the whole newest frame.
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ from multidrop.gateway.live.hub import Hub, KeptRow
 from multidrop.gateway.live.recent_statistics import RecentStatistics
 
 LEAST_S = 0.2  # least mean time between two frames
-EARLY_S = 0.02  # a frame may come this much earlier after a late one
+EARLY_S = 0.02  # after a late frame, the next one may come this much earlier than LEAST_S
 WAIT_S = 20.0  # longest wait for a frame
 MOST_VIEWERS = 200  # limit of concurrently waiting viewers
-WHOLE = -1  # in a request: the viewer has no frame
-REMEMBERED = 6  # number of newest frames kept; a viewer may be a second behind
+WHOLE = -1  # frame number in the request of a viewer that has no frame yet
+REMEMBERED = 6  # number of newest frames that are kept, for viewers that are up to a second behind
 
 Times = tuple[int, int]  # one moment in UTC and by CLOCK_MONOTONIC, both in ns
 MOST_AGE_NS = round(MOST_AGE_S * 1e9)
-TOO_LATE, OVERTAKEN, DOUBLED = "too late", "a stop was called", "it came before"  # WriteForbidden.rule
-ANOTHER_PLANT = "the plant was read anew"  # a value of WriteForbidden.rule
+# values of WriteForbidden.rule
+TOO_LATE, OVERTAKEN, DOUBLED = "too late", "a stop was called", "it came before"
+ANOTHER_PLANT = "the plant was read again"
 
 
 class Encoded(NamedTuple):
@@ -53,7 +54,7 @@ def frame_of(
     revision: int,
     time_ns: int,
 ) -> dict[str, Any]:
-    """Return the present frame; `stops` counts the stops of each drive."""
+    """Return the present frame. `stops` has the number of stops of each drive so far."""
     return {
         "n": n,
         "revision": revision,
@@ -96,9 +97,9 @@ def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
 
 
 def _age_ms(now: Times, asked: Times) -> int:
-    """Return the age in ms, the larger one by two clocks.
+    """Return the larger of two ages in ms: that by UTC, and that by CLOCK_MONOTONIC.
 
-    UTC may be set back, and CLOCK_MONOTONIC stops while the computer sleeps.
+    UTC may be set back, and CLOCK_MONOTONIC stops while the computer sleeps: both make an age too small.
     """
     return max(one // 1_000_000 - then // 1_000_000 for one, then in zip(now, asked, strict=True))
 
@@ -133,7 +134,7 @@ def _finite(value: float) -> float | None:
 def lost_of(hub: Hub, line: str) -> str | None:
     """Return why a line's port is stalled or lost; None if the port works.
 
-    The port is lost if the newest rows of all its registers have that status.
+    The port counts as lost if the newest rows of all registers of the line have a status in LOST.
     """
     if line in hub.stalled:
         return hub.stalled[line]
@@ -164,8 +165,8 @@ def changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
 class Frames:
     """The newest frames and the viewers waiting for the next one.
 
-    `clock` returns monotonic seconds. Frame numbers start at `begin`, which is random: a frame of an earlier
-    process is never mistaken for a frame of this process.
+    `clock` returns monotonic seconds. Frame numbers start at `begin`, which is random so that a frame of an
+    earlier process is never mistaken for a frame of this process.
     """
 
     def __init__(
@@ -175,7 +176,8 @@ class Frames:
         self._clock = clock
         self._begin = begin
         self._remembered: deque[dict[str, Any]] = deque(maxlen=REMEMBERED)  # the newest last
-        self._encoded: dict[int, Encoded] = {}  # the newest frame, by the frame it is relative to
+        # encodings of the newest frame, by the number of the frame that a viewer has already (or WHOLE)
+        self._encoded: dict[int, Encoded] = {}
         self._due = 0.0
         self._timer: asyncio.TimerHandle | None = None
         self._has_news = True
@@ -207,17 +209,17 @@ class Frames:
         self._build_when_due()
 
     async def after(self, n: int) -> Encoded | None:
-        """Return the newest frame as soon as it is not the n-th; None if WAIT_S pass without a new frame.
+        """Return the newest frame as soon as its number is not `n`; None if WAIT_S pass without a new frame.
 
-        The result has only the changes since the n-th frame if that is still remembered. Raises OverflowError
-        if too many viewers wait.
+        If frame `n` is still remembered, the result has only the changes since that frame. Raises
+        OverflowError if too many viewers wait.
         """
         if self._has_news and self._clock() >= self._due:
             self._build()
         if (news := self._since(n)) is not None:
             return news
         if len(self._waiting) >= MOST_VIEWERS:
-            raise OverflowError(f"{MOST_VIEWERS} viewers wait already")
+            raise OverflowError(f"{MOST_VIEWERS} viewers are waiting already")
         if self._is_closed:
             return None
         loop = asyncio.get_running_loop()
@@ -238,7 +240,7 @@ class Frames:
         self._wake()
 
     def _since(self, n: int) -> Encoded | None:
-        """Return the newest frame relative to the n-th; None if the n-th is the newest."""
+        """Return the newest frame relative to frame `n`; None if frame `n` is the newest."""
         if not self._remembered or self._remembered[-1]["n"] == n:
             return None
         newest = self._remembered[-1]
@@ -277,14 +279,15 @@ class SeenFrames:
     sent once, within MOST_AGE_S of that frame, and only if no stop and no reload followed the frame. Clocks
     of other computers are not used.
 
-    `clock` returns ns and includes the computer's sleep.
+    `clock` returns a time in ns that goes on while the computer sleeps.
     """
 
     def __init__(self, clock: Callable[[], int], commands: Commands) -> None:
         self.clock = clock
         self._commands = commands
-        self._made: dict[int, int] = {}  # when each frame was made (ns), by its number
-        self._came: dict[int, set[object]] = {}  # commands admitted, by the frame that they named
+        self._made: dict[int, int] = {}  # by a frame's number: when the frame was made (ns)
+        # admitted commands, by the number of the frame that they named
+        self._came: dict[int, set[object]] = {}
 
     def note(self, n: int) -> None:
         """Note that the frame of this number is made now."""
@@ -295,9 +298,12 @@ class SeenFrames:
             self._came.pop(old, None)
 
     def admit(self, drive: str, what: str, command: object, seen: int) -> int:
-        """Return the time in ns until which a command may be sent if its sender has seen this frame.
+        """Admit a command whose sender has seen frame `seen`.
 
-        Raises WriteForbidden if it is too late or a repetition, or if a stop or reload came after the frame.
+        Return the time in ns until which the command may be sent.
+
+        Raises WriteForbidden if the command is too late or a repetition, or if a stop or reload
+        followed the frame.
         """
         made_ns = self._made.get(seen)
         until_ns = 0 if made_ns is None else made_ns + MOST_AGE_NS
@@ -313,6 +319,8 @@ class SeenFrames:
         came = self._came.setdefault(seen, set())
         if command in came:
             first = "see the answer to the first request"
-            raise WriteForbidden(f"{what} was not sent again: it is a repetition; {first}", rule=DOUBLED)
+            raise WriteForbidden(
+                f"{what} was not sent again: it repeats an earlier request; {first}", rule=DOUBLED
+            )
         came.add(command)
         return until_ns

@@ -1,27 +1,30 @@
 """Hub: the newest row of every register of every drive, and each drive's state from these rows.
 
 Rows and times are arguments: this module does no I/O. Rows have times of CLOCK_MONOTONIC, which stops while
-the computer sleeps: after a sleep, all earlier rows are stale.
+the computer sleeps. So after a sleep all earlier rows count as stale.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from math import isfinite
 from operator import itemgetter
 from typing import Any, NamedTuple
 
-from multidrop import Batch, Condition, Plant, PolledDrive, Register
+from multidrop import Batch, Condition, Plant, Polled, PolledDrive, Register
+from multidrop.channels import ChannelSet
 from multidrop.drive import FAULT_RECORDS, StateReader
-from multidrop.plant import current_for
+from multidrop.plant import current_for, series_of
 
 KeptRow = tuple[int, int, float, int]  # UTC ns, monotonic ns, value (undefined in a miss), status code
-Known = tuple[Register[Any], KeptRow | None, KeptRow | None, bool]  # register, newest row, good row, is fresh
+# register, newest row, newest good row, whether the good row is fresh
+Known = tuple[Register[Any], KeptRow | None, KeptRow | None, bool]
 RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
-UNNAMED = "it shows a fault"  # the words for a fault without a text
-NOT_ASKED = "not asked recently"  # the words for state UNKNOWN if no value is fresh
-INCOMPLETE = "not all of it is known"  # words of UNKNOWN if values are missing: a fault is possible
+UNNAMED = "it shows a fault"  # text for a fault that has no text of its own
+NOT_ASKED = "not asked recently"  # text for the state UNKNOWN if no value is fresh
+# text for UNKNOWN if some values are missing: the drive may have a fault
+INCOMPLETE = "not all of it is known"
 _STATES = {
     Condition.STOPPED: STANDS,
     Condition.RUNNING: RUNS,
@@ -30,9 +33,11 @@ _STATES = {
     Condition.FAULT: FAULT,
     Condition.UNKNOWN: UNKNOWN,
 }
-LEAST_SLEEP_NS = 100_000_000  # a smaller difference is not a sleep: the two clocks are read in turn
+# the time asleep may increase by less than this without a sleep, because its two clocks are read one by one
+LEAST_SLEEP_NS = 100_000_000
 FAULT_REGISTER = "fault"
-RAN_NS = 3_000_000_000  # a fault is over if the motor turns this long after the fault record changed
+# a fault is over if the motor still turns this long (in ns) after the fault record changed
+RAN_NS = 3_000_000_000
 _ANSWERED = ("exception ", "no valid value")  # prefixes of a miss's status if the drive replied
 
 
@@ -44,7 +49,8 @@ class RegisterRows:
     def __init__(self, register: Register[Any], period_s: float, since_ns: int) -> None:
         self.register = register
         self.holds_ns = round(current_for(period_s) * 1e9)  # how long a value stays current
-        self.since_ns = since_ns  # rows requested earlier belong to another drive of the same name
+        # rows requested before this time are ignored: they belong to another drive of the same name
+        self.since_ns = since_ns
         self.newest: KeptRow | None = None
         self.good: KeptRow | None = None
 
@@ -81,7 +87,7 @@ class FreshValues(Mapping[str, float]):
         return sum(1 for _ in self)
 
 
-FREQUENCIES = ("output_frequency", "motor_speed")  # registers of a drive's frequency, the best one first
+FREQUENCIES = ("output_frequency", "motor_speed")  # registers that show a drive's frequency, the best first
 MINUTE_POINTS = 60
 LEAST_POINT_MS = 900  # least time between two points of the last minute
 
@@ -97,7 +103,9 @@ class Newest(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """A drive's state (RUNS, STANDS, FAULT, SILENT or UNKNOWN), and the words for a fault or silence."""
+    """A drive's state (RUNS, STANDS, FAULT, SILENT or UNKNOWN), and the text that describes a fault or
+    silence.
+    """
 
     state: str
     words: str | None
@@ -120,18 +128,24 @@ class _Trip(NamedTuple):
     at_ns: int
 
 
+def _rows_of(polls: Iterable[Polled], cycle_s: float, since_ns: int) -> dict[str, RegisterRows]:
+    return {
+        poll.register.name: RegisterRows(poll.register, max(cycle_s, poll.every or 0.0), since_ns)
+        for poll in polls
+    }
+
+
 class _Watched:
     """One drive of the plant, with the rows of its polled registers and its fault record."""
 
     def __init__(self, polled: PolledDrive, cycle_s: float, since_ns: int) -> None:
         self.polled = polled
         self.reader = StateReader(polled.drive)
-        self.record: float | None = None  # fault record as last seen
+        self.record: float | None = None  # newest value of the fault record
         self.trip: _Trip | None = None
-        self.cells = {
-            poll.register.name: RegisterRows(poll.register, max(cycle_s, poll.every or 0.0), since_ns)
-            for poll in polled.polls
-        }
+        self.cells = _rows_of(polled.polls, cycle_s, since_ns)
+        # not in `cells`, because the rows of channels do not show whether the drive answers
+        self.channels = _rows_of(polled.series[len(polled.polls) :], cycle_s, since_ns)
         self.frequency = next((name for name in FREQUENCIES if name in self.cells), "")
         self.minute: deque[tuple[int, float | None]] = deque(maxlen=MINUTE_POINTS)  # time in ms, value
 
@@ -139,19 +153,24 @@ class _Watched:
 class Hub:
     """The newest rows of a plant; `take` receives every batch.
 
-    `clock` returns CLOCK_MONOTONIC and the computer's total time asleep, both in ns.
+    `clock` returns CLOCK_MONOTONIC and the computer's total time asleep, both in ns. `late_s` is how long
+    after its request a row may arrive, in s.
     """
 
-    def __init__(self, plant: Plant, clock: Callable[[], tuple[int, int]] = lambda: (0, 0)) -> None:
+    def __init__(
+        self, plant: Plant, clock: Callable[[], tuple[int, int]] = lambda: (0, 0), *, late_s: float = 0.0
+    ) -> None:
         self.plant = plant
         self._clock = clock
+        self._late_s = late_s
         _, self._slept_ns = clock()
         self._woke_ns = 0  # monotonic time at which a sleep was noticed
         self.time = 0  # time of the newest row, UTC in ns
         self.taken = 0  # number of batches received
         self.unopened: dict[str, str] = {}  # by line: why its port could not be opened
-        self.stalled: dict[str, str] = {}  # by line: why its open port takes no bytes
-        self._cells: dict[int, RegisterRows | None] = {}  # by drive and register code; None: not in the plant
+        self.stalled: dict[str, str] = {}  # by line: why its open port accepts no bytes
+        # by the codes of drive and register in a batch, as one number; None: not in the plant
+        self._cells: dict[int, RegisterRows | None] = {}
         self._statuses: tuple[str, ...] = ("ok",)
         self._watched: dict[str, _Watched] = {}
         self.adopt(plant)
@@ -170,13 +189,17 @@ class Hub:
         self._watched = {}
         planned = plant.metadata()["planned"] if planned is None else planned
         for line in plant.lines:
-            cycle_s = planned[line.name]["cycle_ms"] / 1e3
+            cycle_s = planned[line.name]["cycle_ms"] / 1e3 + self._late_s
             for polled in line.drives:
                 known = before.get(polled.drive.name)
                 stays = known is not None and known.polled == polled
                 self._watched[polled.drive.name] = (
                     known if known is not None and stays else _Watched(polled, cycle_s, since_ns)
                 )
+        for (drive, name), seconds in ChannelSet(series_of(plant, planned)).holds_s.items():
+            cell = self._watched[drive].channels[name]
+            # longer if an input of the channel belongs to another drive, whose values stay current longer
+            cell.holds_ns = max(cell.holds_ns, round(seconds * 1e9))
 
     def take(self, batch: Batch) -> None:
         """Note the newest rows of a batch; takes about 1 us per row."""
@@ -213,7 +236,7 @@ class Hub:
 
     def _cell(self, drive: str, register: str) -> RegisterRows | None:
         watched = self._watched.get(drive)
-        return watched.cells.get(register) if watched else None
+        return watched.cells.get(register) or watched.channels.get(register) if watched else None
 
     def now_ns(self) -> int:
         """Return the present time by the clock of rows, CLOCK_MONOTONIC."""
@@ -240,7 +263,7 @@ class Hub:
     # ---- the last minute ----
 
     def note_minute(self) -> None:
-        """Add each drive's newest frequency to its last minute; call this once a second."""
+        """Add each drive's newest frequency to the record of its last minute; call this once a second."""
         for watched in self._watched.values():
             cell = watched.cells.get(watched.frequency)
             if cell is None or cell.newest is None:
@@ -280,9 +303,10 @@ class Hub:
         return iter(self._watched)
 
     def known(self, drive: str) -> Iterator[Known]:
-        """Yield each polled register of a drive with its rows (see `Known`), in the plant file's order."""
+        """Yield each polled register and channel of a drive with its rows, in the plant file's order."""
         now_ns, woke_ns = self._times()
-        for cell in self._watched[drive].cells.values():
+        watched = self._watched[drive]
+        for cell in (*watched.cells.values(), *watched.channels.values()):
             yield cell.register, cell.newest, cell.good, cell.is_current(now_ns, woke_ns)
 
     def status(self, code: int) -> str:
@@ -307,13 +331,13 @@ class Hub:
         return Shown(UNKNOWN, None) if watched is None else self._look(watched)
 
     def is_set_to_zero(self, drive: str) -> bool:
-        """Return True if a drive's setpoint is known to be 0: its motor may be at rest during a run."""
+        """Return True if a drive's setpoint is known to be 0: its motor may then rest during a run."""
         watched = self._watched[drive]
         setpoint = watched.polled.drive.setpoint_name
         return bool(FreshValues(watched.cells, *self._times()).get(setpoint) == 0)
 
     def note_reset(self, drive: str) -> None:
-        """Forget a fault that the drive's fault record has shown, because it was reset."""
+        """Forget a fault that the drive's fault record has shown, because the fault was reset."""
         watched = self._watched.get(drive)
         if watched is not None:
             _forget_trip(watched)
@@ -341,16 +365,14 @@ class Hub:
         if not watched.reader.has_state and fresh.get(FAULT_REGISTER):
             register = watched.polled.drive.registers[FAULT_REGISTER]
             return Shown(FAULT, _words(register, fresh[FAULT_REGISTER]))
-        is_turning = any(
-            fresh.get(name) for name in FREQUENCIES
-        )  # a motor at 0 Hz may run with a setpoint of 0
-        if is_turning:
+        # 0 Hz alone does not show a state, because the drive may run with setpoint 0
+        if any(fresh.get(name) for name in FREQUENCIES):
             return Shown(RUNS, None)
         note = found.note if found is not None else _lack(watched)
         return Shown(UNKNOWN, INCOMPLETE if any(name not in fresh for name in watched.cells) else None, note)
 
     def _unseen(self, watched: _Watched) -> Shown:
-        """Return the state of a drive without fresh values: silent, refusing, or not asked recently."""
+        """Return SILENT for a drive without fresh values, or UNKNOWN if it has replied or was not asked."""
         newest = [cell.newest for cell in watched.cells.values() if cell.newest]
         misses = [row for row in newest if row[3] != 0]
         if not misses or len(misses) < len(watched.cells):
@@ -363,17 +385,17 @@ class Hub:
 
 
 def _lack(watched: _Watched) -> str:
-    """Return why a drive's state is unknown, as text for the page."""
+    """Return the page's text that says why a drive's state is unknown."""
     reader = watched.reader
     if not reader.has_state:
         return "its family has no register for its state"
     if not reader.lacks:
-        return "at rest its state takes two readings one after the other, which polled values are not"
+        return "at rest its state needs two readings in a row, which polled values do not give"
     return f"{reader.lacks} is {'not known' if reader.lacks in watched.cells else 'not polled'}"
 
 
 def _look_for_trip(watched: _Watched) -> None:
-    """Note a fault that a change of the fault record shows. The first record read may be of an old fault."""
+    """Note a fault if the fault record has changed. Skip its first value: that fault may be an old one."""
     name = next((name for name in FAULT_RECORDS if name in watched.cells), "")
     cell = watched.cells.get(name)
     if cell is None or cell.good is None:
@@ -393,7 +415,8 @@ def _turns_since(watched: _Watched, since_ns: int) -> bool:
 
 def _forget_trip(watched: _Watched) -> None:
     watched.trip = None
-    watched.reader = StateReader(watched.polled.drive)  # the old reader remembers the fault record
+    # replaced, because the old reader remembers the fault record
+    watched.reader = StateReader(watched.polled.drive)
 
 
 def _words(register: Register[Any], value: float) -> str:
@@ -401,3 +424,21 @@ def _words(register: Register[Any], value: float) -> str:
     if register.values is not None:
         return register.in_words(register.decode(value))
     return f"{register.name.replace('_', ' ')}: {register.format(value)}"
+
+
+# ---- values as MQTT and OPC UA publish them ----
+
+
+def published_value(register: Register[Any], value: float) -> float | str:
+    """Return a register's value as published: a number, or the name of a choice."""
+    return value if register.values is None else register.format(register.decode(value))
+
+
+def published_values(hub: Hub, drive: str) -> dict[str, float | str | None]:
+    """Return the values of a drive's polled registers; None for stale, infinite and missing values."""
+    return {
+        register.name: published_value(register, good[2])
+        if is_current and good is not None and newest is good and isfinite(good[2])
+        else None
+        for register, newest, good, is_current in hub.known(drive)
+    }

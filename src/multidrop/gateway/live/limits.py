@@ -9,22 +9,22 @@ from typing import Any, NamedTuple
 from multidrop import Plant
 from multidrop.gateway.live.alarms import SEPARATOR
 from multidrop.gateway.live.hub import Hub
-from multidrop.toml_check import Key, TomlPlace, parse_duration
+from multidrop.toml_check import DURATION, Key, TomlPlace, parse_duration
 
-_KEYS = {
+LIMIT_KEYS = {
     "drive": Key(str, 'drive = "pump-1"', needed=True),
     "register": Key(str, 'register = "output_current"', needed=True),
     "above": Key((int, float), "above = 30.0"),
     "below": Key((int, float), "below = 5.0"),
-    "for": Key(str, 'for = "5 s"'),
-    "hysteresis": Key((int, float), "hysteresis = 2.0"),
+    "for": Key(str, 'for = "5 s"', keywords=DURATION),
+    "hysteresis": Key((int, float), "hysteresis = 2.0", keywords={"minimum": 0}),
 }
 
 
 class Limit(NamedTuple):
-    """A bound of a polled value. It is exceeded once the value was beyond it for `lasting_s` seconds.
+    """A bound of a polled value. It is exceeded once the value has been beyond it for `lasting_s` seconds.
 
-    It stays exceeded until the value is back by `hysteresis`, which is in the register's unit.
+    It stays exceeded until the value is back within the bound by `hysteresis`, in the register's unit.
     """
 
     drive: str
@@ -45,7 +45,7 @@ class Limit(NamedTuple):
 
 
 class Limits:
-    """The limits of a plant, and since when each value is beyond its bound."""
+    """The limits of a plant, and for each of them the time when its value went beyond the bound."""
 
     def __init__(self, limits: Iterable[Limit]) -> None:
         self._of: dict[str, list[Limit]] = {}
@@ -59,9 +59,9 @@ class Limits:
     def exceeded(self, now_s: float, drive: str, values: Mapping[str, float], before: str) -> str:
         """Return the drive's exceeded limits as a text; "" if there are none.
 
-        `values` has the current values by register. While a value is missing, its limit stays as it was, and
-        its time starts anew afterwards.
-        `before` is the text that the previous call returned, or the text of an alarm of an earlier run.
+        `values` has the current values by register. While a value is missing, its limit keeps its state,
+        and `lasting_s` starts again afterwards. `before` is the text that the previous call returned, or
+        the text of an alarm of an earlier run.
         """
         found = []
         for limit in self._of.get(drive, ()):
@@ -95,18 +95,21 @@ def read_limits(tables: Any, plant: Plant, place: TomlPlace) -> tuple[Limit, ...
         (polled.drive.name, poll.register.name): poll.register.unit
         for line in plant.lines
         for polled in line.drives
-        for poll in polled.polls
+        for poll in polled.series
     }
     found = []
     for table, inside in place.inside("limit", tables):
-        given = inside.check(table, _KEYS)
+        given = inside.check(table, LIMIT_KEYS)
         if {"drive", "register"} <= given.keys():
             found.append(inside.attempt(_limit, given, units if plant.lines else None))
     return tuple(limit for limit in found if limit is not None)
 
 
 def _limit(given: Mapping[str, Any], units: Mapping[tuple[str, str], str] | None) -> Limit:
-    """Return a limit; `units` has the polled registers, None if these are unknown. Raises ValueError."""
+    """Return a limit. `units` has the unit of each polled register, or is None if the plant has no lines.
+
+    Raises ValueError for an invalid limit.
+    """
     drive, register = given["drive"], given["register"]
     if units is not None and (drive, register) not in units:
         raise ValueError(f"{drive}.{register} is not polled: only polled values can have a limit")

@@ -1,4 +1,4 @@
-"""Reads of all parameters of single drives, for the page and its export. Nothing is written."""
+"""Reads of all parameters of single drives, for the page and its export. No parameter is written."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from multidrop.supervisor import Hung, supervisor
 MOST_READS = 2  # limit of drives whose parameters are read concurrently
 READ_S = 3600.0  # time limit of one read
 MOST_PAUSE_S = 1.0
-SHARE = 3  # the pause after a block, for polling, as a multiple of the block's duration
+SHARE = 3  # pause after a block, which leaves time for polling: this many times the block's duration
 
 
 @dataclass
@@ -50,11 +50,14 @@ class ParameterReads:
         return read if read is not None and read.drive is drive else None
 
     def begin(self, plant: Plant, name: str) -> ParameterRead:
-        """Start a read of this drive, unless it is in progress. Raises ValueError for an unknown drive."""
+        """Start a read of this drive, unless one is in progress. Raises ValueError for an unknown drive."""
         read = self.of(plant, name)
         if read is not None and read.task is not None and not read.task.done():
             return read
         read = self._reads[name] = ParameterRead(plant.find_drive(name)[1])
+        if read.drive.bus is None:
+            read.error = "parameters are read only by the gateway that polls the drive"
+            return read
         read.task = supervisor().start("parameter reads", self._read(read))
         return read
 

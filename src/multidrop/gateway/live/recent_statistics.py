@@ -9,7 +9,7 @@ from typing import Any
 from multidrop import Plant
 from multidrop.transport import LineStatistics, Statistics
 
-SECONDS = 5.0  # averaging time of a line's use, and refresh interval of the last minute's figures
+SECONDS = 5.0  # time over which a line's use is averaged; refresh interval of the last minute's figures
 MINUTES = 60
 
 Reading = Mapping[str, LineStatistics]
@@ -24,13 +24,14 @@ class RecentStatistics:
         self._minute: dict[str, LineStatistics | None] = {}  # by line: statistics over the last minute
         self._due = 0.0  # when the figures of the last minute are refreshed
         self._drives: dict[str, dict[str, Any]] = {}  # by drive: figures of the last minute
-        self._figures: dict[str, dict[str, Any]] = {}  # by line, from the newest reading
-        self._minutes: deque[tuple[int, Reading]] = deque(maxlen=2)  # few, because a reading is large
+        self._figures: dict[str, dict[str, Any]] = {}  # by line: figures from the newest reading
+        # one reading a minute; only two, because readings are large
+        self._minutes: deque[tuple[int, Reading]] = deque(maxlen=2)
         self._hours: dict[str, deque[dict[str, Any]]] = {}  # figures of whole minutes by line
         self.adopt(plant)
 
     def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
-        """Use another plant. Counts of a line or drive that was reopened start at zero."""
+        """Use another plant."""
         planned = plant.metadata()["planned"] if planned is None else planned
         self._planned = {name: float(line["utilisation"]) for name, line in planned.items()}
         self._hours = {name: minutes for name, minutes in self._hours.items() if name in self._planned}
@@ -66,7 +67,8 @@ class RecentStatistics:
     def line(self, name: str) -> dict[str, Any]:
         """Return a line's figures: measured and planned share of wire time, and exchanges per second.
 
-        Also the last minute's 99th percentile of response delays in ms, and its number of misses.
+        For the last minute, they also include the 99th percentile of response delays in ms, and the number
+        of misses.
         """
         return self._figures.get(name) or self._line_figures(name, None)
 
@@ -112,7 +114,7 @@ class RecentStatistics:
         return found.drives.get(name) if found else None
 
     def hour(self, line: str) -> list[dict[str, Any]]:
-        """Return how many values were requested and missed in each of the last 60 minutes, oldest first."""
+        """Return the numbers of requested and missed values for each of the last 60 minutes, oldest first."""
         return [*self._hours.get(line, ()), *self._this_minute(line)][-MINUTES:]
 
     def _this_minute(self, line: str) -> list[dict[str, Any]]:

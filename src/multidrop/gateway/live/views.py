@@ -1,4 +1,4 @@
-"""Views of a gateway for pages and probes, made on request: one drive, lines, health and metrics."""
+"""Views of a gateway for pages and health probes, made on request: one drive, all lines, and health."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def line_views(gateway: Gateway) -> dict[str, Any]:
 def health_of(gateway: Gateway) -> dict[str, Any]:
     """Return the health as "ok", "degraded" or "failed", with details by line and part.
 
-    "failed" means that no rows arrive, or that a permanent task or thread has ended.
+    "failed" means that no rows have arrived yet, or that a permanent task or thread has ended.
     """
     supervisor().look()
     dead, hung = supervisor().dead | gateway.parts.dead, supervisor().hung
@@ -128,7 +128,7 @@ def health_of(gateway: Gateway) -> dict[str, Any]:
 
 
 def parts_of(gateway: Gateway) -> dict[str, str]:
-    """Return by part: "ok", or the part's problem."""
+    """Return the health of each part: "ok", or its problem."""
     parts, dead, kept = gateway.parts, supervisor().dead, gateway.alarm_file
     return (
         {name: _health_of_part(feed) for name, feed in parts.feeds.items()}
@@ -140,18 +140,19 @@ def parts_of(gateway: Gateway) -> dict[str, str]:
 
 
 def failing_lines_of(gateway: Gateway) -> dict[str, str]:
-    """Return the lines whose polling raises an exception, for example in a user's class, and the reasons."""
+    """Return the reason for each line whose polling raises an exception, as a user's class may do."""
     failures = {} if gateway.poller is None else gateway.poller.line_failures
     return {line: f"polling fails: {why}" for line, why in failures.items()}
 
 
 def audit_trouble_of(gateway: Gateway) -> str:
-    """Return why a line's newest write is missing in the audit log; "" if no line's is missing."""
+    """Return why a line's newest write is missing in the audit log; "" if the newest writes of all lines are
+    there.
+    """
     if gateway.unaudited:
         return gateway.unaudited
-    poller = gateway.poller
-    lines = [line.name for line in gateway.plant.lines] if poller else []
-    found = (poller.bus(line).audit_trouble for line in lines if poller)
+    buses = gateway.poller.buses if gateway.poller else {}
+    found = (bus.audit_trouble for bus in buses.values())
     return next((f"the newest write is not noted: {why}" for why in found if why), "")
 
 
@@ -167,7 +168,7 @@ def troubles_of(gateway: Gateway) -> list[str]:
 def _health_of_part(feed: object) -> str:
     try:
         return str(getattr(feed, "health", str)()) or "ok"
-    except Exception as failure:  # the exception is a problem of the part, too
+    except Exception as failure:  # report the exception as a problem of the part
         return f"{type(failure).__name__}: {failure}"
 
 
