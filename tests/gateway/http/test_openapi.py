@@ -1,30 +1,40 @@
-"""openapi.json describes all routes; commands have ids; unknown words get 4xx; texts are compressed."""
+"""The API: openapi.json describes all routes, commands have ids, and unknown names are refused."""
 
 from __future__ import annotations
 
+import asyncio
 import gzip
 import json
 import logging
 import os
 import re
 import subprocess
-from collections.abc import Iterator
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import product
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qs, unquote
 
 import pytest
 from gateways import Answer, Served, served
-from lines import until
+from lines import PATIENCE, until
 from peers import require_program
+from starlette.requests import Request
+from tables import table
 
 from multidrop.gateway.commands import VERBS
+from multidrop.gateway.http import page_files
+from multidrop.gateway.http.exports import MOST_EXPORTS, Exports
+from multidrop.gateway.http.messages import language_of
 from multidrop.gateway.http.operations import OPERATIONS, openapi
 from multidrop.gateway.http.rights import COMMAND_ID, May, Right
 
 DRIVES = ["pump-1", "pump-2", "pump-9"]  # the last one is unknown
 MAY = May("anyone", Right.WRITE, frozenset({"pump-1.setpoint"}), frozenset({"pump-1.start"}))
 PHASES = os.environ.get("SCHEMATHESIS_PHASES", "fuzzing")
-EXAMPLES = os.environ.get("SCHEMATHESIS_EXAMPLES", "3")  # examples of each route, in each phase
+EXAMPLES = os.environ.get("SCHEMATHESIS_EXAMPLES", "3")  # number of examples of each route in each phase
 START = {"drive": "pump-1", "verb": "start"}
 
 
@@ -32,7 +42,8 @@ START = {"drive": "pump-1", "verb": "start"}
 def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """A gateway whose callers have all rights."""
     folder = tmp_path_factory.mktemp("open")
-    with served(folder, "[serve.history]\n", may=MAY, tokens=(), audit=folder / "audit.jsonl") as gateway:
+    parts = '[serve.history]\n[serve.modbus]\nlisten = "127.0.0.1:0"\n'
+    with served(folder, parts, may=MAY, tokens=(), audit=folder / "audit.jsonl") as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)
         yield gateway
 
@@ -70,7 +81,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_unknown_words_of_commands_are_refused(gateway: Served, case: str) -> None:
+def test_commands_with_unknown_names_are_refused(gateway: Served, case: str) -> None:
     path, body, status, sentence = REFUSED[case]
     answer = gateway.command(path, body)
     assert (answer.status, answer.json["error"].startswith(sentence)) == (status, True)
@@ -86,8 +97,7 @@ def test_answer_log_and_audit_log_name_the_command(gateway: Served, caplog: pyte
     assert COMMAND_ID.fullmatch(own)
     found = gateway.get("/api/audit").json["entries"]
     assert [one["outcome"] for one in found if one.get("id") == "order-7"] == ["done", "called"]
-    # Two records of each drive.
-    until(lambda: len([one for one in audit(gateway) if one.get("id") == own]) == 4)
+    until(lambda: recorded(gateway, own) >= {*product(["called", "stopped"], ["pump-1", "pump-2"])})
     assert (
         "pump-1.setpoint = 40.0, asked for by anyone by http from 127.0.0.1 (command order-7)" in caplog.text
     )
@@ -99,7 +109,13 @@ def audit(gateway: Served) -> list[dict[str, Any]]:
     return found
 
 
-def test_times_are_iso_text_or_ms(gateway: Served) -> None:
+def recorded(gateway: Served, command: str) -> set[tuple[str, str]]:
+    """Return the pairs of outcome and drive in the audit records of a command."""
+    records = [one for one in audit(gateway) if one.get("id") == command]
+    return {(one["outcome"], drive) for one in records for drive in one["drive"].split(", ")}
+
+
+def test_requests_give_times_as_iso_text_or_ms(gateway: Served) -> None:
     def status(begin: str) -> int:
         return gateway.get(f"/api/alarms?from={begin}&to=2100-01-01").status
 
@@ -119,6 +135,35 @@ def test_long_answers_are_compressed(gateway: Served, path: str) -> None:
     assert len(packed.body) < len(plain.body) / 2
     if path != "/metrics":  # metrics change between two requests
         assert gzip.decompress(packed.body) == plain.body
+
+
+@pytest.mark.parametrize(
+    ("query", "accepted", "title"),
+    [
+        ("", "ru-RU,ru;q=0.9,en;q=0.8", "выходная частота"),
+        ("", "ru;q=0.1, zh-CN;q=0.7, fr", "输出频率"),
+        ("", "en-GB, ru;q=0.9", "output frequency"),
+        ("", "ru;q=0", "output frequency"),
+        ("", ";;q=,=\xff", "output frequency"),
+        ("?lang=ru", "zh", "выходная частота"),
+        ("?lang=de", "ru", "output frequency"),
+    ],
+)
+def test_registers_have_titles_in_the_language_of_the_request(
+    gateway: Served, query: str, accepted: str, title: str
+) -> None:
+    answer = gateway.get(f"/api/plant{query}", accept_language=accepted, accept_encoding="gzip")
+    assert answer.headers["vary"] == "accept-language, accept-encoding"
+    registers = json.loads(gzip.decompress(answer.body))["lines"][0]["drives"][0]["registers"]
+    assert title in [register["title"] for register in registers]
+    assert "output_frequency" in [register["name"] for register in registers]
+
+
+@pytest.mark.parametrize("hostile", ["a" * 10**6, "zh" + " " * 10**6], ids=["letters", "spaces"])
+def test_a_long_list_of_languages_is_read_in_linear_time(hostile: str) -> None:
+    """With quadratic time, this test would take hours, and a 60 kB header would delay stops for a minute."""
+    headers = [(b"accept-language", f"{hostile}!, ru".encode())]
+    assert language_of(Request({"type": "http", "headers": headers, "query_string": b""})) == "ru"
 
 
 def test_short_answers_and_answers_to_commands_are_not_compressed(gateway: Served) -> None:
@@ -141,8 +186,8 @@ def test_csv_exports_are_compressed(gateway: Served) -> None:
 def test_schemathesis_finds_no_undeclared_answer(gateway: Served, tmp_path: Path) -> None:
     """Let schemathesis send valid and invalid requests, and check each answer by openapi.json.
 
-    Only one of its checks is left out: a schema cannot express some rules for valid requests, such as that
-    `from` is before `to`.
+    One check is excluded: that each request which is valid by its schema is accepted. A schema cannot express
+    some rules, such as that `from` is before `to`.
     """
     described = tmp_path / "openapi.json"
     described.write_text(json.dumps(narrowed(gateway.get("/openapi.json").json)))
@@ -162,7 +207,7 @@ def test_schemathesis_finds_no_undeclared_answer(gateway: Served, tmp_path: Path
 
 
 def narrowed(node: Any, key: str = "", *, is_answer: bool = False) -> Any:
-    """Return the API's description, narrowed: only the names in DRIVES, and no additional keys in answers."""
+    """Return the API's description, narrowed: only the drives in DRIVES, no additional keys in answers."""
     if isinstance(node, list):
         return [narrowed(one, key, is_answer=is_answer) for one in node]
     if not isinstance(node, dict):
@@ -175,3 +220,123 @@ def narrowed(node: Any, key: str = "", *, is_answer: bool = False) -> Any:
         found["schema"] = {"enum": DRIVES}
     is_whole = is_answer and node.get("type") == "object" and "properties" in node
     return found | {"additionalProperties": False} if is_whole else found
+
+
+# ---- exports over HTTP: their limit, and their effect on other requests ----
+
+
+EXPORT = "/api/export?from=0&to=1&format={}"
+
+
+class SlowHistory:
+    """A history whose exports wait until the test releases them."""
+
+    def __init__(self) -> None:
+        self.begun = 0
+        self.go_on = threading.Event()
+
+    def take(self, batch: object) -> None: ...
+
+    def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
+        if names:
+            raise ValueError(f"{names[0]!r} is no series")
+        return self._pieces()
+
+    def _pieces(self) -> Iterator[bytes]:
+        yield b"PAR1"
+        self.begun += 1
+        assert self.go_on.wait(PATIENCE)
+
+    async def close(self) -> None: ...
+
+
+def test_concurrent_exports_are_limited_and_delay_no_stop(tmp_path: Path) -> None:
+    with (
+        served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway,
+        ThreadPoolExecutor(MOST_EXPORTS) as clients,
+    ):
+        part: Any = SlowHistory()
+        gateway.gateway.feeds["history"] = part
+        try:
+            for wrong in ("xlsx", "csv&series=pump"):  # invalid exports do not count towards the limit
+                for _ in range(2 * MOST_EXPORTS):
+                    assert gateway.get(EXPORT.format(wrong)).status == 400
+            paths = [EXPORT.format(("csv", "parquet")[at % 2]) for at in range(MOST_EXPORTS)]
+            exports = [clients.submit(gateway.get, path) for path in paths]
+            until(lambda: part.begun == MOST_EXPORTS)
+            refused = gateway.get(EXPORT.format("csv"))
+            assert (refused.status, refused.json["error"][:11]) == (503, "8 exports a")
+            assert gateway.post("/api/stop", {"drives": ["pump-1"]}).json["pump-1"]["done"] is True
+            assert gateway.get("/page/index.html").status == 200
+        finally:
+            part.go_on.set()
+        assert [done.result(PATIENCE).body for done in exports] == [b"PAR1"] * MOST_EXPORTS
+        until(lambda: gateway.get(EXPORT.format("csv")).status == 200)
+
+
+@table(
+    ("asked", "name"),
+    [
+        ("series=pump-1.speed&", "pump-1.speed 2026-11-21T12-00-00Z to 2026-11-21T12-10-00Z"),
+        ("series=pump-1.speed&series=pump-1.current&", "pump-1 2026-11-21T12-00-00Z to 2026-11-21T12-10-00Z"),
+        ("series=a.x&series=b.x&series=c.x&", "a and 2 more 2026-11-21T12-00-00Z to 2026-11-21T12-10-00Z"),
+        ("", "all drives 2026-11-21T12-00-00Z to 2026-11-21T12-10-00Z"),
+        ("series=..%2F%22x%0A.y&", "..__x_.y 2026-11-21T12-00-00Z to 2026-11-21T12-10-00Z"),
+        ("series=%D0%BD%D0%B0%D1%81%D0%BE%D1%81.y&", "насос.y 2026-11-21T12-00-00Z to 2026-11-21T12-10-00Z"),
+    ],
+)
+def test_export_file_name_has_drive_and_time_range(asked: str, name: str) -> None:
+    noon = 1_795_262_400_000
+
+    class Quick(SlowHistory):
+        def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
+            return iter(())
+
+    async def named() -> str:
+        part: Any = Quick()
+        names = parse_qs(asked).get("series", [])
+        response = await Exports().respond(part, names, noon, noon + 600_000, "csv")
+        return response.headers["content-disposition"]
+
+    said = asyncio.run(named())
+    plain, _, whole = said.partition("; filename*=UTF-8''")
+    assert unquote(whole) == f"{name}.csv"
+    assert plain.isascii()
+    assert plain.count('"') == 2
+
+
+# ---- the page's files over HTTP: types, ETags, and paths outside the page's folder ----
+
+
+TYPES = {
+    "/": "text/html; charset=utf-8",
+    "/page/app.js": "text/javascript; charset=utf-8",
+    "/page/style.css": "text/css; charset=utf-8",
+    "/page/icon.svg": "image/svg+xml",
+    "/page/vendor/uPlot-LICENSE": "text/plain; charset=utf-8",
+}
+
+
+@table(("path", "media_type"), TYPES.items())
+def test_page_files_have_types_and_a_request_with_a_known_etag_gets_304(
+    gateway: Served, path: str, media_type: str
+) -> None:
+    answer = gateway.get(path)
+    assert (answer.status, answer.headers["content-type"]) == (200, media_type)
+    again = gateway.get(path, if_none_match=answer.headers["etag"])
+    assert (again.status, again.body, again.headers["cache-control"]) == (304, b"", "no-cache")
+    head = gateway.request("HEAD", path)
+    assert (head.status, head.headers["content-length"]) == (200, str(len(answer.body)))
+
+
+@table("name", ["", "app", "../gateway.py", "%2e%2e/gateway.py", "vendor", "/etc/passwd"])
+def test_files_outside_the_page_folder_are_not_served(gateway: Served, name: str) -> None:
+    answer = gateway.get(f"/page/{name}")
+    assert (answer.status, answer.json) == (404, {"error": "unknown path"})
+
+
+def test_installation_without_a_page_answers_404(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page_files.PageFiles.__init__, "__defaults__", (tmp_path / "missing",))
+    with served(tmp_path) as gateway:
+        assert "this version of multidrop has no page" in gateway.get("/").json["error"]
+        assert gateway.get("/api/plant").status == 200

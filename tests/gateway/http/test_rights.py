@@ -1,17 +1,36 @@
-"""Check the rights of callers on every HTTP route against one table; refuse requests from foreign pages."""
+"""Callers have exactly the rights in TABLE; requests from pages of other sites are refused."""
 
 from __future__ import annotations
 
+import asyncio
 import http.client
+import threading
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any, NoReturn
 
 import pytest
 from gateways import Served, served
 from lines import PATIENCE, until
+from modbus_gateway import plant_of
+from tables import table
 
-from multidrop.gateway.http.rights import MOST_WRONG, SCHEMES, OwnNames, Right
+from multidrop import Drive, InvtCHE, Plant, WriteForbidden
+from multidrop.control import CommandOutcome, CommandResult
+from multidrop.gateway import commands
+from multidrop.gateway.commands import BUSY, STOPPING, VERBS, Commands
+from multidrop.gateway.http.rights import (
+    MOST_WRONG,
+    NEVER_THIS_WAY,
+    NOT_ALLOWED,
+    NOT_LISTED,
+    SCHEMES,
+    Caller,
+    May,
+    OwnNames,
+    Right,
+)
 
 MAY = '[serve.may]\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start", "pump-1.reset_fault"]\n'
 LOOPBACK_STOPS = MAY.replace("[serve.may]", '[serve.may]\nstop = "anyone"')
@@ -30,7 +49,8 @@ STOP_VERB = ("/api/act", {"drive": "pump-2", "verb": "stop", "options": {}})
 ACTS = (STOP, WRITE, UNLISTED_WRITE, RESET, UNLISTED_VERB, STOP_VERB)
 
 LOCAL, OTHER = "127.0.0.1", "10.0.0.7"  # client addresses as a proxy reports them
-# By settings and caller's address: for each right of a token, the status of LOOKS and of each of ACTS.
+# Keys: settings and caller's address. Values, for each right of a token (None: no token): the expected status
+# of all requests in LOOKS, and the expected status of each request in ACTS.
 TABLE = {
     (MAY, LOCAL): [
         (None, 200, (401, 401, 401, 401, 401, 401)),
@@ -71,7 +91,9 @@ TABLE = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("serve", "address"), TABLE)
-def test_each_caller_has_the_rights_of_the_table(tmp_path: Path, serve: str, address: str) -> None:
+def test_callers_have_the_rights_of_their_token_and_the_settings(
+    tmp_path: Path, serve: str, address: str
+) -> None:
     with served(tmp_path, serve, behind_proxy=address is OTHER) as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)
         for right, look, acts in TABLE[serve, address]:
@@ -81,7 +103,7 @@ def test_each_caller_has_the_rights_of_the_table(tmp_path: Path, serve: str, add
             looks = {path: gateway.get(path, **headers).status for path in LOOKS}
             assert looks == dict.fromkeys(LOOKS, look), right
             assert tuple(gateway.command(path, body, **headers).status for path, body in ACTS) == acts, right
-            assert gateway.get("/", **headers).status in (200, 404)  # the page itself needs no right
+            assert gateway.get("/", **headers).status in (200, 404)  # the page's files need no right
 
 
 @pytest.mark.parametrize("way", ["authorization", "cookie"])
@@ -97,7 +119,7 @@ def test_wrong_token_is_refused_even_if_none_is_needed(tmp_path: Path, way: str)
         for path, body in (WRITE, RESET, UNLISTED_VERB):
             assert gateway.post(path, {**body, "seen": 1}, **wrong).status == 401
         assert gateway.gateway.commands.called == 0
-        for path, body in (STOP, STOP_VERB):  # anyone may send these
+        for path, body in (STOP, STOP_VERB):  # these stops need no right, not even with a wrong token
             assert gateway.post(path, body, **wrong).status == 200
         assert gateway.gateway.commands.called == 2
         for at in range(MOST_WRONG):
@@ -159,7 +181,7 @@ ORIGINS = {  # (Origin header, Host header, allowed schemes): True if it is a pa
     ("https://plant.example", "plant.example", ("https",)): True,
     ("https://plant.example:443", "plant.example", ("https",)): True,
     ("https://plant.example:8443", "plant.example:8443", ("https",)): True,
-    ("http://plant.example", "plant.example", ("https",)): False,  # its port is 80, ours is 443
+    ("http://plant.example", "plant.example", ("https",)): False,  # port 80, but the gateway's is 443
     ("https://plant.example", "plant.example", ("http",)): False,
     ("https://plant.example", "plant.example", SCHEMES): True,  # behind a proxy with TLS
     ("http://plant.example", "plant.example:443", SCHEMES): False,
@@ -171,8 +193,10 @@ ORIGINS = {  # (Origin header, Host header, allowed schemes): True if it is a pa
 }
 
 
-@pytest.mark.parametrize("case", ORIGINS)
-def test_origin_is_ours_only_with_our_scheme_host_and_port(case: tuple[str, str, tuple[str, ...]]) -> None:
+@table("case", ORIGINS)
+def test_an_origin_is_accepted_only_with_the_gateways_scheme_host_and_port(
+    case: tuple[str, str, tuple[str, ...]],
+) -> None:
     origin, host, schemes = case
     names = OwnNames(["plant.example"], "0.0.0.0", 443)
     assert names.has_origin(origin, host, schemes) is ORIGINS[case]
@@ -266,18 +290,17 @@ def test_page_keeps_its_token_in_a_cookie_hidden_from_scripts(open_gateway: Serv
 
 
 def test_after_five_wrong_tokens_an_address_is_refused_but_may_stop(tmp_path: Path) -> None:
-    """Right tokens from other addresses still work, and so do stops from this address with a right token."""
+    """A valid token still works from other addresses. From this address, it is accepted only for a stop."""
     now = [1000.0]
     with served(tmp_path, CLOSED, behind_proxy=True) as gateway:
-        gateway.gateway.tokens.find("")  # one look-up before the clock is replaced
-        guard_clock(gateway, now)
+        gateway.gateway.guard_clock = lambda: now[0]
         anna = {"x_forwarded_for": "10.0.0.1"}
         wrong = {**anna, "authorization": "Bearer wrong"}
         right = {**anna, "authorization": gateway.bearer(Right.STOP)}
         for at in range(MOST_WRONG):
             assert gateway.get("/api/plant", **anna, authorization=f"Bearer wrong-{at}").status == 401
         assert gateway.get("/api/plant", **wrong).status == 429
-        assert gateway.get("/api/plant", **right).status == 429  # refused without a check of the token
+        assert gateway.get("/api/plant", **right).status == 429  # refused although the token is right
         assert gateway.post("/api/token", {"token": gateway.secrets[Right.STOP]}, **anna).status == 429
         assert gateway.post(*STOP, **right).json["pump-1"]["done"] is True
         assert gateway.post(*STOP, **wrong).status == 401
@@ -290,16 +313,16 @@ def test_after_five_wrong_tokens_an_address_is_refused_but_may_stop(tmp_path: Pa
         assert gateway.get("/api/plant", **right).status == 200
 
 
-@pytest.mark.parametrize("told", [{}, {"x_forwarded_for": "127.0.0.1"}, {"x_forwarded_for": "10.0.0.7, ::1"}])
-def test_callers_behind_a_proxy_are_not_local(tmp_path: Path, told: dict[str, str]) -> None:
-    """The proxy is on this machine itself, but its clients need not be."""
+def test_callers_behind_a_proxy_are_not_local(tmp_path: Path) -> None:
+    """The proxy runs on this machine, but its clients may be elsewhere."""
     with served(tmp_path, LOOPBACK_STOPS, behind_proxy=True) as gateway:
-        assert gateway.post(*STOP, **told).status == 401
-        assert gateway.get("/api/plant", **told).json["may"]["role"] == "look"
+        for told in ({}, {"x_forwarded_for": "127.0.0.1"}, {"x_forwarded_for": "10.0.0.7, ::1"}):
+            assert gateway.post(*STOP, **told).status == 401, told
+            assert gateway.get("/api/plant", **told).json["may"]["role"] == "look", told
         assert gateway.gateway.commands.called == 0
 
 
-def test_wrong_tokens_behind_a_proxy_block_only_their_address(tmp_path: Path) -> None:
+def test_wrong_tokens_behind_a_proxy_block_only_their_senders_address(tmp_path: Path) -> None:
     """A proxy such as HAProxy appends its own X-Forwarded-For header to the client's."""
     with served(tmp_path, CLOSED, behind_proxy=True) as gateway:
         for at in range(MOST_WRONG):
@@ -316,7 +339,7 @@ def test_wrong_tokens_behind_a_proxy_block_only_their_address(tmp_path: Path) ->
         assert gateway.get("/api/plant", **anna | {"x_forwarded_for": "10.0.0.66"}).status == 429
 
 
-def test_new_token_is_accepted_after_many_requests_with_a_revoked_one(tmp_path: Path) -> None:
+def test_a_new_token_is_accepted_after_many_requests_with_a_revoked_token(tmp_path: Path) -> None:
     """A browser keeps sending its cookie with every request for a frame."""
     with served(tmp_path, CLOSED) as gateway:
         old = {"cookie": "multidrop=taken-away"}
@@ -327,11 +350,6 @@ def test_new_token_is_accepted_after_many_requests_with_a_revoked_one(tmp_path: 
         assert signed.status == 200
         kept = signed.headers["set-cookie"].partition(";")[0]
         assert gateway.post(*STOP, cookie=kept).json["pump-1"]["done"] is True
-
-
-def guard_clock(gateway: Served, now: list[float]) -> None:
-    """Replace the guard's clock by the time `now[0]`."""
-    gateway.gateway.guard_clock = lambda: now[0]
 
 
 @pytest.mark.slow
@@ -352,3 +370,107 @@ def test_audit_log_names_the_caller_and_its_interface(tmp_path: Path) -> None:
         for wrong in ("tomorrow", "", "2026-11-22T25:30%2B03:00", *years):
             assert gateway.get(f"/api/audit?before={wrong}").status == 400
         assert gateway.get("/api/audit?count=1").json == {"entries": records[:1], "more": True}
+
+
+# ---- rights checked by Commands, for every interface that sends commands ----
+
+
+ALL = May(write=frozenset({"mill.setpoint"}), verbs=frozenset(f"mill.{verb}" for verb in VERBS))
+WAYS = ("page", "http", "mqtt", "modbus")
+
+
+class GuardedLines:
+    """A plant with one drive. Every command must be refused before it needs the drive's bus."""
+
+    plant: Plant = plant_of(("hall", InvtCHE(1, name="mill")), polled=False)
+
+    def bus(self, line: str) -> NoReturn:
+        raise AssertionError("a command that nobody may send came to the line")
+
+    @property
+    def plant_now(self) -> Plant:
+        return self.plant
+
+    plant_coming = None
+
+
+def rules_of(may: May, way: str, role: Right) -> dict[str, str | None]:
+    """Return the rule by which each command is refused; None if the caller had the right to send it."""
+    caller = Caller("anna", way, "10.0.0.7", role)
+
+    async def carried_out() -> dict[str, Any]:
+        control = Commands(GuardedLines(), may)  # type: ignore[arg-type]
+        told: dict[str, Any] = {verb: await control.act("mill", verb, {}, caller) for verb in VERBS}
+        told["write"] = await control.write("mill", "setpoint", 10.0, caller)
+        stopped = await control.stop(["mill"], caller)
+        return told | {"stop all": stopped["mill"]}
+
+    return {
+        what: told.error.rule if isinstance(told.error, WriteForbidden) else None
+        for what, told in asyncio.run(carried_out()).items()
+    }
+
+
+@table("way", WAYS)
+def test_callers_with_the_role_look_can_send_no_command(way: str) -> None:
+    by_verb = NEVER_THIS_WAY if way == "modbus" else NOT_ALLOWED
+    expected = dict.fromkeys(VERBS, by_verb) | {"write": NOT_ALLOWED, "stop all": NOT_ALLOWED}
+    assert rules_of(ALL, way, Right.LOOK) == expected
+
+
+@table("way", WAYS)
+def test_callers_with_the_role_stop_can_only_stop(way: str) -> None:
+    rules = rules_of(ALL, way, Right.STOP)
+    moving = [rules[verb] for verb in VERBS if verb not in STOPPING]
+    assert {*moving} == {NEVER_THIS_WAY if way == "modbus" else NOT_ALLOWED}
+    assert rules["write"] == NOT_ALLOWED
+    assert rules["stop all"] not in (NOT_ALLOWED, NOT_LISTED)
+
+
+@table("way", WAYS)
+def test_writes_that_are_not_listed_are_refused_even_with_the_right_to_write(way: str) -> None:
+    rules = rules_of(May(), way, Right.WRITE)
+    listed = {verb: rules[verb] for verb in VERBS if verb != "stop"}
+    assert {*listed.values()} == {NEVER_THIS_WAY if way == "modbus" else NOT_LISTED}
+    assert rules["write"] == NOT_LISTED
+    assert rules["stop all"] not in (NOT_ALLOWED, NOT_LISTED)
+
+
+def test_verbs_over_modbus_are_refused_even_if_listed() -> None:
+    """Modbus has no dialog in which a person could confirm a verb."""
+    rules = rules_of(ALL, "modbus", Right.WRITE)
+    assert {rules[verb] for verb in VERBS} == {NEVER_THIS_WAY}
+
+
+def test_concurrent_writes_per_line_are_limited_and_stops_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each write uses a thread, so a blocked line could otherwise use any number of threads."""
+    go_on = threading.Event()
+
+    def slow(drive: Drive, **command: object) -> CommandResult:
+        assert go_on.wait(PATIENCE)
+        return CommandResult(CommandOutcome.DONE, "done")
+
+    async def carry_out() -> None:
+        control = Commands(GuardedLines(), ALL)  # type: ignore[arg-type]
+        writer = Caller("anna", "http", "10.0.0.7", Right.WRITE)
+        some = [asyncio.ensure_future(control.write("mill", "setpoint", at, writer)) for at in range(8)]
+        await asyncio.sleep(0)  # all writes are in progress now
+        for further in (
+            control.write("mill", "setpoint", 9.0, writer),
+            control.act("mill", "start", {}, writer),
+        ):
+            told = await further
+            assert isinstance(told.error, WriteForbidden)
+            assert told.error.rule == BUSY
+        stopped = await control.stop(["mill"], writer)
+        assert not isinstance(stopped["mill"].error, WriteForbidden)
+        go_on.set()
+        await asyncio.gather(*some)
+        assert (await control.write("mill", "setpoint", 9.0, writer)).ok  # one of the writes has ended
+
+    for work in ("write_register", "carry_out_verb"):
+        monkeypatch.setattr(commands, work, slow)
+    try:
+        asyncio.run(carry_out())
+    finally:
+        go_on.set()

@@ -1,8 +1,8 @@
 """HTTP connections: their number, time limits, and the order of requests.
 
-Slow, silent or greedy clients do not delay other clients. If MOST_OPEN connections are open, a connection of
-such a client is closed. So a new connection, which may bring a stop, is always accepted. Requests are
-answered one at a time, possible stops first.
+A slow, silent or greedy client does not delay the others. A new connection is always accepted, because its
+request may stop a motor. If MOST_OPEN connections are open already, an old one is closed for it, such as that
+of a greedy client. Requests start one by one, and those that may be stops start first.
 """
 
 from __future__ import annotations
@@ -21,18 +21,24 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from multidrop.gateway.http.messages import JsonResponse
 
-MOST_OPEN = 256  # limit: a process usually has 1024 descriptors, and lines and files need some
+# limit of open connections: a process usually has 1024 file descriptors, and lines and files need some
+MOST_OPEN = 256
 FIRST_S = 10.0  # time limit for a TLS handshake and the first request
-AGAIN_S = 40.0  # time limit between requests; the web server itself closes idle connections after 30 s
-FRESH_S = 1.0  # a new connection should send its first request within this time
-MOST_FRESH = 64  # limit of fresh connections that are protected from being closed
-STALLED_S = 10.0  # a client that reads none of its answers for this long is closed
+# time limit, after an answer, for the next request to arrive completely. If the client sends nothing, uvicorn
+# closes the connection after 30 s already.
+AGAIN_S = 40.0
+# a new connection counts as fresh until its first request, for at most this long (in s); idle and busy
+# connections are closed before fresh ones
+FRESH_S = 1.0
+MOST_FRESH = 64  # if more connections than this are fresh, the oldest of them is closed first
+STALLED_S = 10.0  # a client's connection is closed if the client reads none of its answers for this long
 
 ENDS = "the gateway is shutting down: the outcome of this request is unknown"
 
 BODY_HEADERS = (b"content-length", b"transfer-encoding")
-STOP_PATHS, VERB_PATH = ("/api/stop", "/api/fleet/stop"), "/api/act"  # a verb may be a kind of stop
-BACKLOG = 64  # pending connections; all are accepted together, before MOST_OPEN applies
+# paths of stop requests; a request to VERB_PATH may be a stop too
+STOP_PATHS, VERB_PATH = ("/api/stop", "/api/fleet/stop"), "/api/act"
+BACKLOG = 64  # limit of connections that wait to be accepted; they are accepted even if MOST_OPEN are open
 _WHY = {
     errno.EADDRINUSE: "another program listens there",
     errno.EACCES: "this user has no permission",
@@ -41,12 +47,15 @@ _WHY = {
 
 
 class Rank(IntEnum):
-    """The order in which connections are closed at MOST_OPEN; within a rank, the oldest is closed first."""
+    """The order in which connections are closed if MOST_OPEN are open.
 
-    GREEDY = 0  # the client sends requests without waiting for answers, or does not read these
+    Within a rank, the first in the order of `Connections` is closed first.
+    """
+
+    GREEDY = 0  # the client sends requests without waiting for answers, or does not read its answers
     IDLE = 1
     BUSY = 2
-    FRESH = 3  # new, and still without a request
+    FRESH = 3  # the connection is new, and no request has arrived on it yet
     STOPS = 4  # the request may be a stop
 
 
@@ -57,7 +66,7 @@ class _Open:
 
     def __init__(self, peer: socket.socket, now: float) -> None:
         self.peer = peer
-        self.ends = now + FIRST_S  # deadline for its next request
+        self.ends = now + FIRST_S  # deadline for the client's next request
         self.fresh_until = now + FRESH_S
         self.is_busy = self.is_stop = False
         self.is_greedy = False
@@ -79,7 +88,7 @@ class _Open:
 
 
 class Connections:
-    """The open connections by client address, the longest idle first."""
+    """The open connections by client address, ordered by latest answer, or without one by opening."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -87,7 +96,7 @@ class Connections:
         self.ended = 0  # number of connections that this object has closed
 
     def add(self, peer: socket.socket, address: Any) -> None:
-        """Note a new connection, and close another one if there are too many."""
+        """Note a new connection, and close older ones while more than MOST_OPEN are open."""
         self._forget_closed()
         self._open.pop(address[:2], None)
         now = self._clock()
@@ -108,14 +117,15 @@ class Connections:
                 self._end(client)
 
     def begin(self, client: tuple[str, int] | None) -> None:
-        """Note that a request has arrived completely."""
+        """Note that a request of this client has arrived completely."""
         if client in self._open:
             self._open[client].is_busy = True
 
     def is_stop(self, client: tuple[str, int] | None, path: str) -> bool:
         """Record and return whether a new request of this client may be a stop.
 
-        A verb does not count as a possible stop while its client sends requests without waiting for answers.
+        A request to VERB_PATH does not count as a stop if its client sends requests without waiting for
+        answers.
         """
         found = self._open.get(client) if client else None
         is_stop = path in STOP_PATHS or (path == VERB_PATH and not (found and found.is_greedy))
@@ -129,14 +139,15 @@ class Connections:
             self._open[client].is_greedy = is_greedy
 
     def note_stall(self, client: tuple[str, int] | None, *, is_stalled: bool) -> None:
-        """Note whether answers are pending because the client does not read."""
+        """Note whether answers are pending because the client does not read them."""
         if client in self._open:
             self._open[client].stalled_since = self._clock() if is_stalled else None
 
     def finish(self, client: tuple[str, int] | None) -> None:
-        """Note that a request was answered."""
+        """Note that a request of this client was answered."""
         if client in self._open:
-            found = self._open[client] = self._open.pop(client)  # moves it to the end of the order
+            # inserted again, and so last in the order
+            found = self._open[client] = self._open.pop(client)
             found.is_busy = found.is_stop = False
             found.fresh_until, found.ends = 0.0, self._clock() + AGAIN_S
 
@@ -166,7 +177,8 @@ class CountingSocket(socket.socket):
 
 
 class Turns:
-    """Starts one request in each round of the event loop: first the queue `stops`, then the queue `others`.
+    """Starts one request in each round of the event loop: from the queue `stops` if that has a request,
+    else from `others`.
 
     The loop reads all sockets in each round, so a stop waits for one request at most.
     """
@@ -191,14 +203,16 @@ class Turns:
         self._is_taken = False
         while not self._is_taken and (waiting := self.stops or self.others):
             turn = waiting.popleft()
-            if not turn.done():  # otherwise its request was cancelled
+            if not turn.done():  # a turn that is done belongs to a cancelled request
                 turn.set_result(None)
                 self._is_taken = True
                 asyncio.get_running_loop().call_soon(self._give)
 
 
 class WatchedProtocol(H11Protocol):
-    """A connection that notes if its client sends requests ahead of answers, or does not read answers."""
+    """A connection that notes whether its client sends requests without waiting for answers, or does not
+    read answers.
+    """
 
     @property
     def _connections(self) -> Connections:
@@ -230,9 +244,9 @@ class WatchedProtocol(H11Protocol):
 
 
 class Watched:
-    """An application that notes the start and end of requests in `connections`.
+    """An ASGI application that notes the start and end of each request in `connections`.
 
-    Each request waits for its turn; possible stops go first.
+    Each request waits for its turn; requests that may be stops go first.
     """
 
     def __init__(self, app: ASGIApp, connections: Connections) -> None:
@@ -268,7 +282,7 @@ class Watched:
 
 
 def listen(host: str, port: int) -> CountingSocket:
-    """Return a listening socket. Raises OSError with a sentence if the port cannot be opened."""
+    """Return a listening socket. Raises OSError, with a message for the user, if that fails."""
     try:
         family, _, _, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
@@ -277,7 +291,7 @@ def listen(host: str, port: int) -> CountingSocket:
         raise OSError(
             f"listen: this machine does not have the address {host}: {failure.strerror}"
         ) from failure
-    # asyncio sets TCP_NODELAY only if the protocol is named; without it each frame waits 40 ms.
+    # With IPPROTO_TCP given, asyncio sets TCP_NODELAY. Without it, each answer would wait 40 ms.
     listener = CountingSocket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

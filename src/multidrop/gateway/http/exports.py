@@ -23,9 +23,9 @@ from multidrop.gateway.live.parameter_reads import ParameterRead
 from multidrop.supervisor import supervisor
 
 MOST_EXPORTS = 8  # limit of concurrent exports
-PIECE_S = 600.0  # time limit for making one piece; for Parquet, the first piece includes the whole file
+PIECE_S = 600.0  # time limit for making one piece of a file; a whole Parquet file counts as one piece
 R = TypeVar("R")
-MOST_NAME = 80  # limit of characters of a series' name in a file name
+MOST_NAME = 80  # a series' name is cut to this many characters in a file name
 FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')  # characters that some systems forbid in file names
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
 PARAMETER_KINDS = {
@@ -45,7 +45,7 @@ class Exports:
     ) -> Response:
         """Return a file of series from the historian `part`; with `is_gzipped`, compressed for transfer.
 
-        Raises Hung, and Denied for wrong arguments or too many exports.
+        Raises Hung if the disk hangs, and Denied for wrong arguments or too many exports.
         """
         if kind not in KINDS:
             raise Denied(400, f"format = {kind[:20]!r} is neither csv nor parquet")
@@ -60,7 +60,7 @@ class Exports:
                 raise Denied(400, str(failure)) from failure
             raise
         name = f"{_what(names)} {_moment(begin)} to {_moment(end)}.{kind}"
-        headers = _attachment(name) | {"vary": "accept-encoding"}
+        headers = attachment(name) | {"vary": "accept-encoding"}
         if is_gzipped:
             pieces = _gzipped(pieces)
             headers["content-encoding"] = "gzip"
@@ -68,7 +68,7 @@ class Exports:
 
 
 class _Export(StreamingResponse):
-    """One export, until its client has received all or disconnected."""
+    """One export. It ends when its client has received the whole file or has disconnected."""
 
     def __init__(
         self, exports: Exports, pieces: Iterator[bytes], kind: str, headers: Mapping[str, str]
@@ -89,16 +89,17 @@ def parameter_file(read: ParameterRead, kind: str) -> Response:
         raise Denied(400, f"format = {kind[:20]!r} is neither toml nor csv")
     make, media_type = PARAMETER_KINDS[kind]
     name = f"{_what([f'{read.drive.name}.'])} {read.found.saved.replace(':', '-')}.{kind}"
-    return Response(make(read.found, type(read.drive)), media_type=media_type, headers=_attachment(name))
+    return Response(make(read.found, type(read.drive)), media_type=media_type, headers=attachment(name))
 
 
-def _attachment(name: str) -> dict[str, str]:
+def attachment(name: str) -> dict[str, str]:
+    """Return the header that makes a browser save an answer as a file of this name."""
     plain = name.encode("ascii", "replace").decode().replace("?", "_")
     return {"content-disposition": f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name)}"}
 
 
 def _gzipped(pieces: Iterator[bytes]) -> Iterator[bytes]:
-    """Compress the pieces as one gzip stream; yield it in fewer and larger pieces."""
+    """Compress the pieces into one gzip stream, and yield this stream in fewer, larger pieces."""
     stream = zlib.compressobj(wbits=31)
     try:
         for piece in pieces:
@@ -125,7 +126,7 @@ async def _in_thread(work: Callable[[], R]) -> R:
 
 
 def _what(names: Sequence[str]) -> str:
-    """Return the drives of these series in a form allowed in file names."""
+    """Return the names of the drives of these series, in a form that is allowed in file names."""
     drives = list(dict.fromkeys(name.rpartition(".")[0] for name in names))
     if not drives:
         return "all drives"

@@ -11,11 +11,22 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from multidrop.gateway.http.messages import Denied, JsonResponse
-from multidrop.gateway.http.rights import SCHEMES, Caller, May, OwnNames, Right, Token, Tokens, is_loopback
+from multidrop.gateway.http.rights import (
+    ANYONE,
+    SCHEMES,
+    Caller,
+    May,
+    OwnNames,
+    Right,
+    Token,
+    Tokens,
+    caller_with,
+    is_loopback,
+)
 
 COOKIE = "multidrop"
 CSP = "default-src 'self'; base-uri 'none'; form-action 'none'; object-src 'none'; frame-ancestors 'none'"
-HEADERS = {  # headers of API answers; few, because every frame is sent with them
+HEADERS = {  # headers of API answers; few, because the very frequent frames have them too
     "content-security-policy": "default-src 'none'; frame-ancestors 'none'",
     "cross-origin-resource-policy": "same-origin",
     "x-content-type-options": "nosniff",
@@ -26,13 +37,15 @@ PAGE_HEADERS = HEADERS | {
     "cross-origin-opener-policy": "same-origin",
     "x-frame-options": "DENY",
     "referrer-policy": "no-referrer",
-    "cache-control": "no-cache",  # browsers check the ETag on each load
+    # browsers keep a copy of each file, and check by its ETag at each load whether the copy is up to date
+    "cache-control": "no-cache",
 }
-ANYONE = "anyone"
 WRONG = "the token is wrong"
 SHUT = "too many wrong tokens came from this address: try again in a minute"
-HAS_WRONG_TOKEN = "has_wrong_token"  # scope's key of a wrong token: routes then accept only stops
-MOST_HEAD = 64 * 1024  # limit of a request's head in bytes; browsers send the cookies of all ports of a host
+# key in the ASGI scope of a request with a wrong token; such a request may only be a stop
+HAS_WRONG_TOKEN = "has_wrong_token"
+# limit of a request's headers in bytes; large, because a browser sends the cookies of all ports of a host
+MOST_HEAD = 64 * 1024
 
 
 def _raw(headers: Mapping[str, str]) -> list[tuple[bytes, bytes]]:
@@ -52,7 +65,7 @@ class Needed(NamedTuple):
 
 
 class Guard:
-    """Passes allowed requests to `app`, with the caller in the scope's `caller`; refuses all others."""
+    """Passes allowed requests to `app`, with the caller in the scope's key `caller`; refuses all others."""
 
     def __init__(
         self,
@@ -75,7 +88,7 @@ class Guard:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
-            return  # uvicorn then refuses the connection
+            return  # not HTTP: uvicorn refuses the connection
 
         is_page = scope["path"] == "/" or scope["path"].startswith("/page/")
         added = _RAW_PAGE_HEADERS if is_page else _RAW_HEADERS
@@ -95,7 +108,8 @@ class Guard:
                 response.headers["allow"] = self._find(scope["path"]).method
             if denied.status == 401:
                 response.headers["www-authenticate"] = "Bearer"
-                if COOKIE in Headers(scope=scope).get("cookie", ""):  # remove the wrong token
+                # remove the wrong token from the browser
+                if COOKIE in Headers(scope=scope).get("cookie", ""):
                     response.delete_cookie(COOKIE, httponly=True, samesite="strict")
             await response(scope, receive, send_with_headers)
             return
@@ -106,13 +120,15 @@ class Guard:
         hosts = headers.getlist("host")
         if len(hosts) != 1 or not self._names.has_host(hosts[0]):
             name = hosts[0] if hosts else ""
-            raise Denied(421, f"{name[:100]!r} is not this gateway; add it to names of [serve] if it is")
+            raise Denied(
+                421, f"{name[:100]!r} is not a name of this gateway; if it is, add it to names of [serve]"
+            )
         path: str = scope["path"]
         needed = self._find(path)
         if needed.right is not Right.STOP and _length(scope) > MOST_HEAD:
             raise Denied(431, f"the headers are longer than {MOST_HEAD} bytes")
         if scope["method"] != needed.method and (scope["method"], needed.method) != ("HEAD", "GET"):
-            raise Denied(405, f"{path[:100]!r} takes {needed.method} alone")
+            raise Denied(405, f"{path[:100]!r} takes only {needed.method}")
         self._check_site(headers, hosts[0], needed, SCHEMES if self._behind_proxy else (scope["scheme"],))
         if needed.right is None:
             return Caller(ANYONE, "page", self.address(scope, headers), Right.LOOK)
@@ -128,7 +144,7 @@ class Guard:
         return self._needed[path]
 
     def _check_site(self, headers: Headers, host: str, needed: Needed, schemes: Sequence[str]) -> None:
-        """Raise Denied if the headers of the browser say that another site's page sent the request."""
+        """Raise Denied if the browser's headers say that a page of another site sent the request."""
         origin = headers.get("origin")
         if origin is not None and not self._names.has_origin(origin, host, schemes):
             raise Denied(403, f"the request comes from a page of {origin[:100]!r}, not of this gateway")
@@ -142,11 +158,11 @@ class Guard:
                 raise Denied(415, "the body must be application/json")
 
     def _admit(self, scope: Scope, headers: Headers, needed: Right) -> Caller:
-        """Return the caller of a request that needs this right. Raises Denied without it.
+        """Return the caller of a request that needs the right `needed`. Raises Denied if the caller lacks it.
 
-        A wrong token is refused even if the request needs no token; only a stop that needs no token is
-        accepted. After several wrong tokens, requests from that address with a token are refused for a while;
-        the tokens of stops are always checked.
+        A request with a wrong token is refused, even if it would need no token. Only a stop that needs no
+        token is still accepted. After several wrong tokens, requests from that address with a token are
+        refused for a while; the tokens of stops are always checked.
         """
         address = self.address(scope, headers)
         local = is_loopback(address) and not self._behind_proxy
@@ -163,22 +179,21 @@ class Guard:
             if needed is not Right.STOP or free is None or free < Right.STOP:
                 raise Denied(429, SHUT) if is_shut else Denied(401, WRONG)
             scope[HAS_WRONG_TOKEN] = True
-        if token is not None and (free is None or token.right >= free):
-            caller = Caller(token.name, way, address, token.right)
-        elif free is not None:
-            caller = Caller(ANYONE, way, address, free)
-        else:
+        caller = caller_with(token, free, way, address)
+        if caller is None:
             raise Denied(401, "a token is needed")
         if caller.role >= needed:
             return caller
         if token is None:
             raise Denied(401, f"this needs a token to {needed.name.lower()}")
         raise Denied(
-            403, f"{caller.name} may {caller.role.name.lower()}, and this needs {needed.name.lower()}"
+            403,
+            f"{caller.name} has only the right to {caller.role.name.lower()}, but this needs the right to "
+            f"{needed.name.lower()}",
         )
 
     def address(self, scope: Scope, headers: Headers) -> str:
-        """Return the client's address; behind a proxy, the last one in the X-Forwarded-For header."""
+        """Return the client's address; behind a proxy, the last address in the X-Forwarded-For header."""
         client: Any = scope.get("client")
         peer = str(client[0]) if client else ""
         if not self._behind_proxy:
@@ -188,7 +203,7 @@ class Guard:
 
 
 def _length(scope: Scope) -> int:
-    """Return the bytes of a request's path, query and headers."""
+    """Return the length of a request's path, query and headers in bytes."""
     words = sum(len(name) + len(value) for name, value in scope["headers"])
     return words + len(scope["raw_path"]) + len(scope["query_string"])
 

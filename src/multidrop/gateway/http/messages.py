@@ -6,6 +6,7 @@ import asyncio
 import gzip
 import json
 import logging
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
@@ -15,19 +16,23 @@ from typing import Any
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response, StreamingResponse
 
+from multidrop.drive import chosen_language
 from multidrop.gateway.http.rights import Caller
-from multidrop.printable import plain_whole
+from multidrop.printable import is_whole, plain_whole
 from multidrop.supervisor import Hung, supervisor
 
 LEAST_MS, MOST_MS = -62_135_596_800_000, 253_402_300_799_999  # years 1 to 9999, in ms since 1970
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-COMPRESSIBLE = ("text", "json", "javascript", "svg", "toml")  # parts of the media types that are compressed
+# answers are compressed if their media type contains one of these words
+COMPRESSIBLE = ("text", "json", "javascript", "svg", "toml")
 LEAST_COMPRESSED = 1024  # in bytes; shorter answers are not compressed
 LEVEL = 6
 COMPRESSION_S = 10.0  # time limit for compressing an answer
 MOST_BYTES = 64 * 1024  # limit of a request's body in bytes
 BODY_S = 10.0  # time limit for receiving a body
-STOP_BODY_S = 3.0  # time limit for a stop's body, enough for one or two retransmissions
+STOP_BODY_S = 3.0  # time limit for receiving a stop's body, enough for one or two TCP retransmissions
+# a language in Accept-Language, and its weight from 0 to 1
+_ACCEPTED = re.compile(r"([A-Za-z][A-Za-z0-9-]*)(?:;q=([01](?:\.[0-9]{0,3})?))?")
 _log = logging.getLogger("multidrop.gateway")
 
 
@@ -53,7 +58,7 @@ def takes_gzip(headers: Mapping[str, str]) -> bool:
 
 
 async def compressed(request: Request, response: Response) -> Response:
-    """Return the response compressed if it is a text of some length and its client accepts gzip.
+    """Return a response, compressed if it is a long text and its client accepts gzip.
 
     A thread compresses it, to keep the event loop free for stops. If no thread is free, the response is not
     compressed.
@@ -75,6 +80,16 @@ async def compressed(request: Request, response: Response) -> Response:
 def caller_of(request: Request) -> Caller:
     caller: Caller = request.scope["caller"]
     return caller
+
+
+def language_of(request: Request) -> str:
+    """Return the language of titles: the query's `lang`, else the one that Accept-Language prefers."""
+    if "lang" in request.query_params:
+        return chosen_language([request.query_params["lang"]])
+    header = "".join(request.headers.get("accept-language", "").split())
+    accepted = filter(None, map(_ACCEPTED.fullmatch, header.split(",")))
+    weights = {found[1]: float(found[2] or 1) for found in accepted}
+    return chosen_language(sorted(filter(weights.get, weights), key=weights.__getitem__, reverse=True))
 
 
 async def body_of(request: Request, seconds: float | None = None) -> dict[str, Any]:
@@ -138,9 +153,9 @@ def text_in(body: Mapping[str, Any], key: str) -> str:
 
 
 def frame_in(body: Mapping[str, Any]) -> int:
-    """Return the number of the newest frame that a command's sender has seen. Raises Denied."""
+    """Return the number of the newest frame that a command's sender has seen. Raises Denied without one."""
     seen = body.get("seen")
-    if isinstance(seen, bool) or not isinstance(seen, int) or not 0 <= seen < 1 << 63:
+    if not is_whole(seen) or not 0 <= seen < 1 << 63:
         raise Denied(400, "seen is missing or not a whole number: give the n of your newest frame")
     return seen
 

@@ -12,9 +12,9 @@ from multidrop.gateway.http.rights import Right
 from multidrop.gateway.http.schemas import Schema
 
 ANY: Schema = {}
-WITH_BODY = (400, 408, 413)  # statuses of routes that refuse an invalid, late or long body
+WITH_BODY = (400, 408, 413)  # statuses with which a route refuses an invalid, late or long body
 FRAME = "/api/frame"
-HEADERS_TOO_LONG = 431  # not checked for stops
+HEADERS_TOO_LONG = 431  # HTTP status; the length of headers is not checked for stops
 REASONS = {
     304: "The client has the newest version.",
     400: "A parameter or the body is invalid.",
@@ -35,8 +35,8 @@ REASONS = {
 class Operation(NamedTuple):
     """One route: who may use it, the method of `Pages` that answers it, and its description for clients.
 
-    `answer` has the schema of each media type of a successful answer, and `refusals` the statuses of other
-    answers, besides those that the guard gives on every route.
+    `answer` has the schema of a successful answer, by media type. `refusals` has the HTTP statuses of other
+    answers, without the statuses that the guard may give on every route.
     """
 
     path: str  # `{name}` matches the rest of the path
@@ -46,7 +46,7 @@ class Operation(NamedTuple):
     answer: Mapping[str, Schema]
     refusals: tuple[int, ...] = ()
     query: Mapping[str, Schema] = {}
-    required: tuple[str, ...] = ()  # names in `query` that must be given
+    required: tuple[str, ...] = ()  # names in `query` that a request must have
     body: Schema | None = None  # the body of a POST; None: the route is a GET
 
     @property
@@ -79,6 +79,7 @@ OPERATIONS = (
         Right.LOOK,
         "Lines, drives and registers, and what the caller may do.",
         json_of(schemas.PLANT),
+        query={"lang": schemas.LANGUAGE},
     ),
     Operation(
         FRAME,
@@ -129,6 +130,15 @@ OPERATIONS = (
         (404,),
     ),
     Operation(
+        "/api/modbus-map",
+        "modbus_map",
+        Right.LOOK,
+        "The addresses of all values of the Modbus server, for import into SCADA systems.",
+        json_of(schemas.MODBUS_MAP) | {"text/csv": FILE},
+        (400, 404),
+        {"format": {"enum": ["json", "csv"], "default": "json"}},
+    ),
+    Operation(
         "/api/history",
         "history",
         Right.LOOK,
@@ -166,6 +176,13 @@ OPERATIONS = (
         (400,),
         SPAN,
         ("from", "to"),
+    ),
+    Operation(
+        "/api/triggers",
+        "triggers",
+        Right.LOOK,
+        "The last trigger of each name, newest first.",
+        json_of(schemas.TRIGGERS),
     ),
     Operation(
         "/health",
@@ -211,7 +228,7 @@ OPERATIONS = (
     Operation(
         "/api/act",
         "act",
-        Right.STOP,  # the class Commands checks the right that the verb needs
+        Right.STOP,  # enough for stops; the class Commands checks the right that the verb needs
         "Carry out a verb once.",
         json_of(schemas.COMMANDED),
         (404, *WITH_BODY),
@@ -248,7 +265,7 @@ OPERATIONS = (
 )
 
 NEEDED: Mapping[str, Needed] = {
-    "/api/": Needed("GET", Right.LOOK),  # for unknown paths
+    "/api/": Needed("GET", Right.LOOK),  # for the paths under /api/ that are not in the table
     **{one.path.partition("{")[0]: Needed(one.method, one.right) for one in OPERATIONS},
 }
 
@@ -285,7 +302,8 @@ def _described(one: Operation) -> dict[str, Any]:
     if one.body is not None:
         found["requestBody"] = {"required": True, "content": {"application/json": {"schema": one.body}}}
     if one.right is not None:
-        found["security"] = [{}, {"token": []}]  # the plant file may let anyone look or stop
+        # a token is optional, because the plant file may let anyone look or stop
+        found["security"] = [{}, {"token": []}]
         found["description"] = f"Needs the right `{one.right.name.lower()}`."
     return found
 

@@ -1,4 +1,4 @@
-"""Callers, tokens and rights. Texts and times are arguments: this module does no I/O."""
+"""Callers, tokens and rights. File contents and times are arguments: this module does no I/O."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from ipaddress import ip_address
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
-NOT_LISTED = "not on the list"  # this and the next two: values of WriteForbidden.rule
+# values of WriteForbidden.rule
+NOT_LISTED = "not on the list"
 NOT_ALLOWED = "the role does not allow it"
 NEVER_THIS_WAY = "never by this way"
+ANYONE = "anyone"  # the name of callers without a token
 
-MOST_WRONG, WINDOW_S = 5, 60.0  # wrong tokens allowed to an address within this time
+# limit of wrong tokens from one address, and for how many s each wrong token counts
+MOST_WRONG, WINDOW_S = 5, 60.0
 MOST_ADDRESSES = 10_000  # limit of addresses whose wrong tokens are remembered
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
 SCHEMES = ("http", "https")
@@ -27,7 +30,7 @@ SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 class Right(IntEnum):
-    """Roles; each includes the rights of those before it."""
+    """Roles, in ascending order: each role includes the rights of the roles before it."""
 
     LOOK = 0
     STOP = 1
@@ -38,10 +41,10 @@ class Caller(NamedTuple):
     """The sender of a request, and its role."""
 
     name: str  # a token's name, or "anyone"
-    way: str  # "page", "http", "mqtt", "modbus"
+    way: str  # the interface: "page", "http", "mqtt", "modbus", "tool" or "opcua"
     address: str
     role: Right
-    command: str = ""  # the id of the command that it sends
+    command: str = ""  # the id of the command that the caller sends
 
     @property
     def by(self) -> str:
@@ -50,7 +53,9 @@ class Caller(NamedTuple):
         return f"{self.name} by {self.way} from {self.address}{command}"
 
     def commanding(self, given: object = None) -> Caller:
-        """Return the caller with `given` as the command's id; if it is None, with the present or a new id.
+        """Return this caller with `given` as the command's id.
+
+        If `given` is None, keep the present id or make a new id.
 
         Raises ValueError for an invalid id.
         """
@@ -61,7 +66,9 @@ class Caller(NamedTuple):
         return self._replace(command=given)
 
     def stopping(self, given: object = None) -> Caller:
-        """Return the same as `commanding`, but replace an invalid id by a new id: no stop is refused."""
+        """Return the same as `commanding`, but replace an invalid id by a new id, so that no stop is
+        refused.
+        """
         try:
             return self.commanding(given)
         except ValueError:
@@ -69,7 +76,10 @@ class Caller(NamedTuple):
 
 
 class Token(NamedTuple):
-    """One line of the token file. It has only a digest, so the file alone gives no access."""
+    """One line of the token file.
+
+    The line has only a digest of the secret, so the file alone gives no access.
+    """
 
     name: str
     right: Right
@@ -114,7 +124,7 @@ def read_tokens(text: str) -> tuple[list[Token], list[str]]:
 
 
 class Tokens:
-    """The valid tokens, and the wrong tokens from each address.
+    """The valid tokens, and the wrong tokens that each address has sent recently.
 
     A repeated wrong token counts once, because a browser sends a revoked token with every request.
     """
@@ -127,7 +137,7 @@ class Tokens:
         return len(self._tokens)
 
     def replace(self, tokens: Iterable[Token]) -> None:
-        """Use the tokens of a reloaded file."""
+        """Use the tokens in a reloaded token file."""
         self._tokens = tuple(tokens)
 
     def find(self, secret: str) -> Token | None:
@@ -150,7 +160,7 @@ class Tokens:
     def note_wrong(self, address: str, secret: str, now: float) -> bool:
         """Count a wrong token; return False if this address has sent the same token recently, else True.
 
-        If MOST_ADDRESSES are remembered already, the oldest one is forgotten.
+        If MOST_ADDRESSES are remembered already, the oldest address is forgotten.
         """
         given = digest(secret)
         if address not in self._wrong and len(self._wrong) >= MOST_ADDRESSES:
@@ -171,7 +181,7 @@ class May(NamedTuple):
     verbs: frozenset[str] = frozenset()
 
     def bounded_by(self, other: May) -> May:
-        """Return this table with the rights of callers without a token limited to those in both tables."""
+        """Return this table, but give callers without a token only the rights that both tables give."""
         look = "anyone" if self.look == other.look == "anyone" else "token"
         return self._replace(look=look, on_loopback=min(self.on_loopback, other.on_loopback))
 
@@ -180,6 +190,16 @@ class May(NamedTuple):
         if is_loopback and self.on_loopback > Right.LOOK:
             return self.on_loopback
         return Right.LOOK if self.look == "anyone" else None
+
+
+def caller_with(token: Token | None, free: Right | None, way: str, address: str) -> Caller | None:
+    """Return a caller with the larger of two rights: its token's, and that of callers without a token.
+
+    Return None if both are missing: the caller has no access.
+    """
+    if token is not None and (free is None or token.right >= free):
+        return Caller(token.name, way, address, token.right)
+    return None if free is None else Caller(ANYONE, way, address, free)
 
 
 @lru_cache(maxsize=256)
@@ -204,18 +224,18 @@ class OwnNames:
         self.replace(names)
 
     def replace(self, names: Iterable[str]) -> None:
-        """Use the names of a reloaded file."""
+        """Use the names in a reloaded plant file."""
         self._hosts = frozenset({*self._always, *(name.lower() for name in names)})
 
     def has_host(self, host: str) -> bool:
-        """Return True if a Host header names this gateway; a proxy's port may differ."""
+        """Return True if a Host header names this gateway. Its port is not checked: a proxy's may differ."""
         split = _split(host)
         return split is not None and split[0] in self._hosts
 
     def has_origin(self, origin: str, host: str, schemes: Container[str]) -> bool:
-        """Return True for an Origin header of the gateway's page: host and port equal those of the request.
+        """Return True for the Origin header of the gateway's page: it has the host and port in `host`.
 
-        `schemes` are the allowed URL schemes of the page.
+        `host` is the request's Host header, and `schemes` are the allowed URL schemes of the page.
         """
         scheme, _, rest = origin.partition("://")
         if scheme not in schemes:
@@ -227,7 +247,7 @@ class OwnNames:
         return (theirs[0], theirs[1] or usual) == (ours[0], ours[1] or usual)
 
 
-@lru_cache(maxsize=64)  # all requests of a viewer have the same header
+@lru_cache(maxsize=64)  # cached, because all requests of a viewer have the same header
 def _split(host: str) -> tuple[str, int | None] | None:
     """Return name and port of a Host header; None if it is invalid."""
     if not re.fullmatch(r"[A-Za-z0-9._-]+(:[0-9]{1,5})?|\[[0-9A-Fa-f:.]+\](:[0-9]{1,5})?", host):

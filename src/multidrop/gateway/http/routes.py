@@ -24,7 +24,7 @@ from multidrop.control import CommandOutcome, CommandResult, read_audit
 from multidrop.exposition import expose_metrics
 from multidrop.gateway.clock import iso_time, utc_ms
 from multidrop.gateway.commands import STOPPING, Admit, UnknownDrive
-from multidrop.gateway.http.exports import Exports, parameter_file
+from multidrop.gateway.http.exports import KINDS, Exports, attachment, parameter_file
 from multidrop.gateway.http.guard import COOKIE, HAS_WRONG_TOKEN, SHUT, WRONG, Guard
 from multidrop.gateway.http.messages import (
     Denied,
@@ -35,6 +35,7 @@ from multidrop.gateway.http.messages import (
     compressed,
     drives_to_stop,
     frame_in,
+    language_of,
     moment_in,
     number_in,
     span_in,
@@ -48,6 +49,8 @@ from multidrop.gateway.live.descriptions import describe
 from multidrop.gateway.live.frames import WHOLE, Frames
 from multidrop.gateway.live.views import drive_view, health_of, line_views
 from multidrop.gateway.metrics import families_of
+from multidrop.gateway.modbus_server.address_map import to_csv, to_json
+from multidrop.printable import is_number
 from multidrop.supervisor import Hung, supervisor
 
 if TYPE_CHECKING:
@@ -55,15 +58,17 @@ if TYPE_CHECKING:
 
 
 MOST_QUERIES = 2  # limit of concurrent queries of the audit log
-AUDIT_S = 20.0  # time limit of one such query
+AUDIT_S = 20.0  # time limit of a query of the audit log
 COOKIE_S = 30 * 24 * 3600
+MAP_S = 20.0  # time limit for making the address map
 MOST_RECORDS = 200  # limit of the audit log's entries in one answer
-MOST_NOTE = 500  # limit of characters of an acknowledgement's note
-HEAD_S = 0.5  # the head of a stop's answer is sent after this time; it confirms that the stop was accepted
-UNBUFFERED = {"x-accel-buffering": "no"}  # proxies forward the head immediately
+MOST_NOTE = 500  # limit of an acknowledgement's note in characters
+# the head of a stop's answer is sent after this many seconds, to confirm that the stop was accepted
+HEAD_S = 0.5
+UNBUFFERED = {"x-accel-buffering": "no"}  # makes proxies forward the head immediately
 RIGHTS_RULES = (NOT_ALLOWED, NOT_LISTED, NEVER_THIS_WAY)
 
-_UTC = re.compile(r"\d{4}-\d\d-\d\d(T\d\d:\d\d(:\d\d(\.\d+)?)?Z?)?", re.ASCII)  # the time is optional
+_UTC = re.compile(r"\d{4}-\d\d-\d\d(T\d\d:\d\d(:\d\d(\.\d+)?)?Z?)?", re.ASCII)  # the time of day is optional
 R = TypeVar("R")
 _log = logging.getLogger("multidrop.gateway")
 _PLAIN = [(b"content-type", b"application/json"), (b"vary", b"accept-encoding")]
@@ -86,7 +91,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
     others = Starlette(routes=routes, exception_handlers=handlers)
 
     async def app(scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer requests for frames without the router, because they are by far the most frequent."""
+        """Answer requests for frames without the router: they are by far the most frequent requests."""
         await (pages.frame if scope["path"] == FRAME else others)(scope, receive, send)
 
     return Guard(
@@ -101,7 +106,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
 
 
 def _endpoint(pages: Pages, operation: Operation) -> Any:
-    """Return the method of `pages` that answers a route; answers of GET are compressed."""
+    """Return the method of `pages` that answers a route; answers to GET are compressed."""
     handler = getattr(pages, operation.handler)
     if operation.method == "POST" or operation.path == FRAME:
         return handler
@@ -153,7 +158,7 @@ def _answer_fleet(results: Mapping[str, tuple[bool, str]]) -> Response:
 
 
 def _time_asked(query: Mapping[str, str]) -> str:
-    """Return the query's parameter `before` as ISO 8601 text; "" if it is missing. Raises Denied."""
+    """Return the query's parameter `before` as ISO 8601 text; "" if missing. Raises Denied if invalid."""
     if "before" not in query or _UTC.fullmatch(query["before"]):
         return query.get("before", "")
     return iso_time(moment_in(query["before"], "before"))
@@ -162,8 +167,8 @@ def _time_asked(query: Mapping[str, str]) -> str:
 def newest_records(path: Path | None, before: str = "", count: int = MOST_RECORDS) -> dict[str, Any]:
     """Return the newest `count` entries of an audit log before this time (ISO 8601, UTC; "": now).
 
-    The newest entry is first. `more` is True if there are older entries. Raises OSError if the log cannot be
-    read.
+    The newest entry is first. `more` in the answer is True if there are older entries. Raises OSError if
+    the log cannot be read.
     """
     count = max(1, min(count, MOST_RECORDS))
     found: deque[dict[str, Any]] = deque(maxlen=count + 1)
@@ -174,10 +179,10 @@ def newest_records(path: Path | None, before: str = "", count: int = MOST_RECORD
 
 
 async def _answer_stop(work: Coroutine[Any, Any, R], respond: Callable[[R], Response]) -> Response:
-    """Return the answer to a stop, which continues even if its client disconnects.
+    """Return the answer to a stop. The stop continues even if its client disconnects.
 
-    If the stop takes longer than HEAD_S, the answer starts before its end. A client that gets no head knows
-    that its stop was not accepted.
+    If the stop takes longer than HEAD_S, the head of the answer is sent before the stop ends. A client that
+    gets no head knows that its stop was not accepted.
     """
     task = supervisor().start("stop", work)
     await asyncio.wait({task}, timeout=HEAD_S)
@@ -205,7 +210,9 @@ class Pages(PageFiles):
     # ---- queries ----
 
     async def plant(self, request: Request) -> Response:
-        return JsonResponse(describe(self._gateway, caller_of(request).role))
+        """Return the plant's description, with titles in the language of the request."""
+        content = describe(self._gateway, caller_of(request).role, language_of(request))
+        return JsonResponse(content, headers={"vary": "accept-language"})
 
     async def drive(self, request: Request) -> Response:
         try:
@@ -214,7 +221,9 @@ class Pages(PageFiles):
             return _error(404, str(unknown))
 
     async def parameters(self, request: Request) -> Response:
-        """Return a drive's parameters as JSON, or with `format` as a file; with `read`, read them first."""
+        """Return a drive's parameters as JSON, or with `format` as a file; with `read`, read them from the
+        drive first.
+        """
         reads, query, name = self._gateway.parameter_reads, request.query_params, request.path_params["name"]
         try:
             read = (reads.begin if "read" in query else reads.of)(self._gateway.plant, name)
@@ -238,6 +247,22 @@ class Pages(PageFiles):
             return _error(404, "this gateway shows no fleet; add [serve.fleet] to the plant file")
         return JsonResponse(part.state())
 
+    async def modbus_map(self, request: Request) -> Response:
+        part: Any = self._gateway.feeds.get("modbus")
+        if part is None:
+            return _error(404, "this gateway is no Modbus server; add [serve.modbus] to the plant file")
+        kind = request.query_params.get("format", "json")
+        if kind not in ("json", "csv"):
+            raise Denied(400, f"format = {kind[:20]!r} is neither json nor csv")
+
+        def made() -> Response:
+            rows = part.address_map()
+            if kind == "json":
+                return Response(to_json(rows), media_type=JsonResponse.media_type)
+            return Response(to_csv(rows), media_type=KINDS["csv"], headers=attachment("modbus-map.csv"))
+
+        return await supervisor().within("address maps", MAP_S, made)
+
     async def health(self, request: Request) -> Response:
         health = health_of(self._gateway)
         return JsonResponse(health, 503 if health["status"] == "failed" else 200)
@@ -256,6 +281,10 @@ class Pages(PageFiles):
         alarms = self._gateway.alarms
         found = [alarm.as_answer() for alarm in alarms.between(*span_in(request.query_params))]
         return JsonResponse({"alarms": found, "since": iso_time(alarms.since)})
+
+    async def triggers(self, request: Request) -> Response:
+        part: Any = self._gateway.feeds.get("trigger")
+        return JsonResponse({"triggers": [] if part is None else part.as_answer()})
 
     async def acknowledge(self, request: Request) -> Response:
         """Acknowledge an alarm, with the caller's note."""
@@ -303,7 +332,7 @@ class Pages(PageFiles):
         return await _answer_stop(self._gateway.commands.stop(drives, caller), partial(_answer_all, caller))
 
     async def stop_fleet(self, request: Request) -> Response:
-        """Stop all drives of the fleet, with the commander's key of `[serve.fleet]`."""
+        """Stop all drives of the fleet. This needs a commander's key: `commander` in `[serve.fleet]`."""
         part: Any = self._gateway.feeds.get("fleet")
         if part is None or not part.can_stop:
             raise Denied(404, "this gateway cannot stop the fleet; add commander to [serve.fleet]")
@@ -314,7 +343,7 @@ class Pages(PageFiles):
     async def write(self, request: Request) -> Response:
         body = await body_of(request)
         value = body.get("value")
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
+        if not is_number(value):
             raise Denied(400, "value is missing or not a number")
         drive, register = text_in(body, "drive"), text_in(body, "register")
         caller = commander_in(request, body)
@@ -338,7 +367,7 @@ class Pages(PageFiles):
         return _answer(caller, await acting)
 
     def _admission(self, drive: str, command: object, body: Mapping[str, Any]) -> Admit:
-        """Return a function that checks a command against the frame its sender saw. Stops are not checked."""
+        """Return `SeenFrames.admit` for a command and the frame that its sender saw. Stops need no frame."""
         frames = self._gateway.seen_frames
         return lambda what: frames.admit(drive, what, (drive, command), frame_in(body))
 
@@ -358,9 +387,10 @@ class Pages(PageFiles):
     # ---- tokens ----
 
     async def token(self, request: Request) -> Response:
-        """Store a token in a cookie that scripts cannot read.
+        """Log in: store the request's token in a cookie that scripts cannot read.
 
-        After several wrong tokens, an address must wait before its next attempt, unless it wants to stop.
+        After several wrong tokens, an address must wait before its next attempt. The wait is skipped if
+        the body says that the token is for a stop.
         """
         gateway, caller = self._gateway, caller_of(request)
         body = await body_of(request)
@@ -387,7 +417,7 @@ class Pages(PageFiles):
 
 
 class FrameRoute:
-    """Answers `/api/frame?after=N` as soon as there is a frame with another number than N."""
+    """Answers `/api/frame?after=N` as soon as there is a frame whose number is not N."""
 
     def __init__(self, frames: Frames) -> None:
         self._frames = frames

@@ -68,8 +68,14 @@ ERROR = record(error=TEXT)
 
 # ---- plant ----
 
+LANGUAGE: Schema = {
+    **TEXT,
+    "description": "The language of the registers' titles; by default that of the header Accept-Language",
+    "examples": ["ru"],
+}
 _REGISTER = record(
     name=TEXT,
+    title=TEXT,
     unit=TEXT,
     digits=maybe(WHOLE),
     kind={"enum": ["number", "bits", "words"]},
@@ -101,6 +107,7 @@ PLANT = record(
     name=TEXT,
     demo=FLAG,
     file=FLAG,
+    history=FLAG,
     fleet=FLAG,
     fleet_stop=FLAG,
     mistakes=TEXTS,
@@ -201,6 +208,32 @@ PARAMETERS: Schema = {
     ),
     "required": ["state"],
 }
+MODBUS_MAP = listed(
+    record(
+        line=TEXT,
+        drive=TEXT,
+        tcp_port=WHOLE,
+        unit_id=WHOLE,
+        status_address=WHOLE,
+        name=TEXT,
+        title=TEXT,
+        access={"enum": ["read", "write", "read and write"]},
+        function=maybe(WHOLE),
+        write_function=maybe(WHOLE),
+        address=WHOLE,
+        words=WHOLE,
+        format=TEXT,
+        order=TEXT,
+        bits=TEXT,
+        step=maybe(NUMBER),
+        offset=NUMBER,
+        scale_address=maybe(WHOLE),
+        unit=TEXT,
+        unknown=TEXT,
+        source={"enum": ["polled", "drive", "gateway"]},
+        note=TEXT,
+    )
+)
 HEALTH = record(
     status={"enum": ["ok", "degraded", "failed"]},
     version=TEXT,
@@ -231,6 +264,17 @@ HISTORY = record(
             left_out=TEXTS,
         )
     ),
+)
+TRIGGERS = record(
+    triggers=listed(
+        record(
+            name=TEXT,
+            condition=TEXT,
+            time=TIME,
+            **{"from": TIME, "to": TIME},
+            signals=listed(record(drive=TEXT, register=TEXT)),
+        )
+    )
 )
 AUDIT = record(entries=listed({"type": "object"}), more=FLAG)
 
