@@ -1,8 +1,11 @@
-"""The time when a drive's latest command ended, and outcomes of commands, for all interfaces."""
+"""Results of commands, the end time of a drive's latest command, and computed channels in a gateway."""
 
 from __future__ import annotations
 
 import asyncio
+import json
+import math
+import struct
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -10,22 +13,28 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from modbus_gateway import plant_of
+from gateways import served
+from lines import until
+from modbus_gateway import plant_of, serving
 from simulated_bus import one
 from tables import table
 
 from multidrop import Bus, InvtCHE, Plant
+from multidrop.channels import Channel
 from multidrop.control import CommandResult, Ledger
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.rights import Caller, May, Right
+from multidrop.gateway.live.hub import Hub, published_values
 from multidrop.gateway.live.views import drive_view
+from multidrop.gateway.modbus_server.settings import ModbusSettings
+from multidrop.plant.model import PlantLine, PolledDrive
 
 CALLER = Caller("anna", "http", "10.0.0.7", Right.WRITE)
 MAY = May(write=frozenset({"mill.setpoint"}), verbs=frozenset({"mill.start"}))
 
 
 class UnopenedLines:
-    """A plant of two drives whose line is not polled: each command fails, and so ends."""
+    """A plant of two drives whose line is not polled, so that each command ends with a failure."""
 
     plant: Plant = plant_of(("hall", InvtCHE(1, name="mill")), ("hall", InvtCHE(2, name="fan")), polled=False)
 
@@ -51,7 +60,7 @@ class UnopenedLines:
     ],
     ids=["a write", "a verb", "a stop", "a stop of all"],
 )
-def test_time_of_the_latest_commands_end_is_known(command: Callable[[Commands], Awaitable[Any]]) -> None:
+def test_end_time_of_the_latest_command_is_known(command: Callable[[Commands], Awaitable[Any]]) -> None:
     commands = Commands(UnopenedLines(), MAY)
     assert commands.ended_ns("mill") == 0
     begun_ns = time.monotonic_ns()
@@ -82,12 +91,12 @@ def test_result_names_a_drive_that_was_removed_from_its_line(
     assert told.text.startswith("mill is ")
 
 
-@pytest.mark.parametrize(
+@table(
     "value",
     [10**400, -(10**400), float("inf"), float("nan"), 1.5],
     ids=["huge", "huge below 0", "inf", "nan", "1.5"],
 )
-@pytest.mark.parametrize("register", ["setpoint", "control"])
+@table("register", ["setpoint", "control"])
 def test_an_invalid_number_is_reported(register: str, value: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """JSON allows integers that are too large for a float."""
     line, mill, _ = one(monkeypatch, InvtCHE(1, name="mill", maximum_frequency=50))
@@ -153,3 +162,90 @@ async def test_view_of_a_drive_is_found_by_another_unicode_spelling(tmp_path: Pa
     found = await drive_view(gateway, "Lu\u0308fter")
     assert found["drive"] == "L\u00fcfter"
     assert found["values"] == {"of": "L\u00fcfter"}
+
+
+# ---- computed channels in a gateway: on the page, in metrics, MQTT, Modbus TCP and limits ----
+
+
+CHANNELS = """
+[[line.drive.channel]]
+name = "half"
+value = "output_frequency / 2 + 25"
+unit = "Hz"
+[[line.drive.channel]]
+name = "charge"
+value = "integral(output_current + pump-1.output_current)"
+unit = "A*h"
+[[serve.limit]]
+drive = "pump-2"
+register = "half"
+above = 10
+"""
+
+
+@pytest.mark.slow
+def test_channels_are_on_the_page_in_metrics_and_in_mqtt(tmp_path: Path) -> None:
+    with served(tmp_path, CHANNELS) as gateway:
+        until(lambda: gateway.frame()["drives"]["pump-2"]["values"]["half"][0] == 25.0)
+        drive = gateway.get("/api/plant").json["lines"][0]["drives"][1]
+        about = next(register for register in drive["registers"] if register["name"] == "charge")
+        assert (about["unit"], about["access"], about["note"][:19]) == (
+            "A*h",
+            "reading",
+            "computed: integral(",
+        )
+        assert about["period_s"] == 0.1
+        metrics = gateway.get("/metrics").body.decode()
+        assert 'multidrop_register_hertz{line="hall",drive="pump-2",register="half"} 25' in metrics
+        hub = gateway.gateway.hub
+        assert published_values(hub, "pump-2")["half"] == 25.0
+        until(lambda: any("half above 10 Hz" in alarm["text"] for alarm in gateway.frame()["alarms"]))
+        gateway.sims["pump-2"].deaf_until = math.inf
+        gateway.await_state("pump-2", "silent")
+        assert published_values(hub, "pump-2")["half"] is None
+    kept = json.loads((tmp_path / "plant.simulated.totals.json").read_text())
+    assert kept["pump-2.charge"]["value"].startswith("integral(")
+
+
+def with_channels() -> Plant:
+    """Return a plant with a drive that has two channels."""
+    drive = InvtCHE(1, name="mill")
+    channels = (
+        Channel("power", "output_voltage * output_current", "W"),
+        Channel("starts", "count(status == 1)"),
+    )
+    polled = PolledDrive(drive, ["output_voltage", "output_current", "status"], channels=channels)
+    return Plant([PlantLine("hall", "/dev/hall", drives=[polled])], Path("plant.toml"))
+
+
+def test_a_channel_stays_fresh_as_long_as_its_slowest_input() -> None:
+    slow = PolledDrive(InvtCHE(1, name="fan"), ["output_voltage"], every=60)
+    channels = Channel("other", "fan.output_voltage", "V"), Channel("own", "output_voltage", "V")
+    fast = PolledDrive(InvtCHE(1, name="mill"), ["output_voltage"], every=1, channels=channels)
+    lines = [PlantLine("hall", "/dev/hall", drives=[fast]), PlantLine("roof", "/dev/roof", drives=[slow])]
+    hub = Hub(Plant(lines, Path("plant.toml")))
+    assert [hub.holds_s("mill", name) for name in ("other", "own")] == [180, 3]
+
+
+def test_modbus_clients_read_channels_as_floats() -> None:
+    with (
+        serving(with_channels(), ModbusSettings(listen="127.0.0.1:0")) as gateway,
+        gateway.client() as client,
+    ):
+        gateway.hub.values[("mill", "power")] = 1234.5
+        words = client.ask(1, 3, 0xF100, 4).words
+        power, starts = struct.unpack(">2f", struct.pack(">4H", *words))
+        assert power == 1234.5
+        assert math.isnan(starts)
+        assert client.ask(1, 4, 0xF102, 2).words == [0x7FC0, 0]
+        assert client.ask(1, 3, 0xF103, 2).code == 2  # beyond the last channel
+        gateway.hub.values[("mill", "starts")] = 1e300
+        assert client.ask(1, 3, 0xF102, 2).words == [0x7F80, 0]
+    assert gateway.line.asked == []
+
+
+@pytest.mark.parametrize("channels", [0xF00E, 0xFFFE, 0x3003])
+def test_channels_must_not_overlap_other_addresses(channels: int) -> None:
+    (sentence,) = ModbusSettings(channels=channels).check(with_channels())
+    assert sentence.startswith("mill: the 4 words of its channels do not fit at ")
+    assert ModbusSettings(channels=channels).check(plant_of(("hall", InvtCHE(1, name="mill")))) == []

@@ -68,16 +68,12 @@ def stands(gateway: Served, drive: str) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("path", "body"),
-    [
-        ("/api/stop", {"drives": None}),
-        ("/api/act", {"drive": "pump-1", "verb": "coast"}),
-    ],
+    ("path", "body"), [("/api/stop", {"drives": None}), ("/api/act", {"drive": "pump-1", "verb": "coast"})]
 )
-def test_head_of_the_answer_confirms_an_unfinished_stop(
+def test_the_http_head_of_the_answer_confirms_a_stop_in_progress(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str, body: dict[str, object]
 ) -> None:
-    """A page that gets no HTTP head can tell that the gateway has not accepted the stop."""
+    """If no HTTP head arrives, the page knows that the gateway has not accepted the stop."""
     held = threading.Event()
 
     async def slow(*args: object, **options: object) -> object:
@@ -210,8 +206,9 @@ def test_stop_of_unknown_names_stops_known_drives_and_reports_each(tmp_path: Pat
     assert [*told] == names
 
 
-@pytest.mark.parametrize("verb", ["stop", "coast"])
-@pytest.mark.parametrize("options", [None, [], "now", {"direction": "forward"}])
+@pytest.mark.long
+@table("verb", ["stop", "coast"])
+@table("options", [None, [], "now", {"direction": "forward"}])
 def test_wrong_options_do_not_prevent_a_stop_verb(tmp_path: Path, verb: str, options: object) -> None:
     """Some programs send null instead of an empty object."""
     with served(tmp_path, MAY) as gateway:
@@ -329,7 +326,7 @@ def test_stop_does_not_wait_for_hanging_writes(tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.slow
-def test_commands_from_before_a_stop_are_not_sent_after_it(tmp_path: Path) -> None:
+def test_commands_called_before_a_stop_are_not_sent_after_it(tmp_path: Path) -> None:
     """A command whose thread starts only after a stop was called is refused because of the stop."""
     begun: list[threading.Thread] = []
 
@@ -395,7 +392,7 @@ def test_stop_is_repeated_to_a_silent_drive_and_delays_no_other(tmp_path: Path) 
 
 @pytest.mark.long
 def test_many_stops_of_a_silent_drive_delay_no_other(tmp_path: Path) -> None:
-    """Otherwise each stop is repeated for 30 s, and the stop of another drive waits for all of them."""
+    """The gateway repeats one of the 40 stops, not each, so it can send another drive's stop immediately."""
     with served(tmp_path, MAY) as gateway, ThreadPoolExecutor(40) as callers:
         start(gateway, "pump-1", "pump-2")
         gateway.sims["pump-2"].deaf_until = float("inf")
@@ -433,7 +430,7 @@ def test_only_one_of_many_coasts_is_repeated(tmp_path: Path, monkeypatch: pytest
 
 @pytest.mark.long
 def test_stop_of_a_restarted_drive_is_sent_as_a_new_stop(tmp_path: Path) -> None:
-    """The first stop is still repeated to the silent drive, but has ended for the restarted drive."""
+    """The first stop is still repeated for the silent drive, but has ended for the restarted drive."""
     with served(tmp_path, MAY) as gateway, ThreadPoolExecutor(1) as caller:
         start(gateway, "pump-1", "pump-2")
         gateway.sims["pump-2"].deaf_until = float("inf")
@@ -441,7 +438,7 @@ def test_stop_of_a_restarted_drive_is_sent_as_a_new_stop(tmp_path: Path) -> None
         motor = gateway.sims["pump-1"].motor  # type: ignore[attr-defined]
         bus = gateway.gateway.bus("hall")
         until(lambda: not motor.goal and set(bus.stops_under_way()) == {"pump-2"})
-        motor.run()  # started at the drive's own panel
+        motor.run()  # the motor is started at the drive's own panel
         until(lambda: motor.goal)
         told = gateway.post("/api/stop", {"drives": ["pump-1"]}).json["pump-1"]
         assert told["done"]
@@ -475,7 +472,7 @@ def test_verbs_and_writes_report_their_results(tmp_path: Path) -> None:
         told = gateway.command(
             "/api/write", {"drive": "pump-1", "register": "control", "value": 1.5}, **writer
         ).json
-        assert told["text"] == "control takes a choice's name or its whole number, not 1.5"
+        assert told["text"] == "control takes the name or the number of a choice, not 1.5"
         told = gateway.command(
             "/api/write", {"drive": "pump-1", "register": "control", "value": 1}, **writer
         ).json
@@ -532,22 +529,16 @@ def test_only_stops_are_sent_while_the_audit_log_cannot_be_written(
 @pytest.mark.usefixtures("_broken_parts")
 def test_part_that_cannot_start_is_reported_in_one_sentence(tmp_path: Path) -> None:
     for how, sentence in (
-        (
-            "library",
-            r"\[serve.mqtt\]: it needs nosuch, which is not installed: pip install 'paho-mqtt",
-        ),
+        ("library", r"\[serve.mqtt\]: it needs nosuch, which is not installed: pip install 'paho-mqtt"),
         ("port", r"\[serve.mqtt\]: 127.0.0.1:1502 cannot be had"),
     ):
-        with (
-            pytest.raises(ValueError, match=sentence),
-            served(tmp_path, f'[serve.mqtt]\nbreaks = "{how}"\n'),
-        ):
+        with pytest.raises(ValueError, match=sentence), served(tmp_path, f'[serve.mqtt]\nbreaks = "{how}"\n'):
             pass
     plant = written(tmp_path, '[serve.mqtt]\nbreaks = "somehow"\n[serve.history]\nbreks = 1\n')
     with pytest.raises(PlantError) as wrong:
         read_settings(plant, {})
     assert [one.partition(": ")[2] for one in wrong.value.mistakes] == [
-        "[serve.history]: unknown key 'breks'; did you mean 'breaks'?",
+        "[serve.history]: unknown key 'breks'; did you mean breaks?",
         "[serve.mqtt]: breaks = 'somehow' is no way to break",
         "[serve.mqtt]: nor would another one be",
     ]

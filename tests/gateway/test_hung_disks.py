@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from errno import ENOSPC
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, BinaryIO, NoReturn
 
 import pytest
 from gateways import Served, served, serving, simulated_plant
@@ -122,7 +124,7 @@ def test_history_whose_disk_hangs_during_a_reload_starts_later(tmp_path: Path, f
         assert health(gateway)["parts"] == {}
         fifos.let_go()
         until(lambda: health(gateway)["status"] == "ok")
-        assert gateway.gateway.feeds == {}  # the reloaded plant file has no history
+        assert gateway.gateway.feeds == {}  # the reloaded plant file has no [serve.history]
 
 
 def test_history_that_fails_after_its_disk_answers_is_reported_as_dead(tmp_path: Path, fifos: Fifos) -> None:
@@ -214,7 +216,7 @@ def test_hung_plant_file_fails_only_its_reload(
         until(lambda: health(gateway)["status"] == "ok")
 
 
-def test_later_reload_does_not_wait_for_a_hung_one(tmp_path: Path, fifos: Fifos) -> None:
+def test_a_later_reload_does_not_wait_for_a_hung_reload(tmp_path: Path, fifos: Fifos) -> None:
     with served(tmp_path, SERVE) as gateway:
         path, good = gateway.gateway.plant.path, gateway.gateway.plant.path.read_text()
         fifos.put(path)
@@ -288,13 +290,13 @@ def test_a_ledger_and_an_audit_log_that_hang_are_reported(
 # ---- the page's files ----
 
 
-def test_hung_page_files_end_their_requests_and_delay_no_others(
+def test_requests_for_hung_page_files_fail_and_delay_no_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on, read = threading.Event(), Path.read_bytes
 
     def read_bytes(path: Path) -> bytes:
-        assert go_on.wait(PATIENCE)
+        assert page_files.PAGE not in path.parents or go_on.wait(PATIENCE)
         return read(path)
 
     monkeypatch.setattr(page_files, "READ_S", SHORT_S)
@@ -308,7 +310,7 @@ def test_hung_page_files_end_their_requests_and_delay_no_others(
         assert_stops_and_polls(gateway)
         go_on.set()
         until(lambda: health(gateway)["status"] == "ok")
-        assert gateway.get("/page/app.js").status == 200
+        until(lambda: gateway.get("/page/app.js").status == 200)
 
 
 # ---- shutdown ----
@@ -328,7 +330,7 @@ def test_sigterm_ends_a_gateway_whose_disks_hang(tmp_path: Path, fifos: Fifos) -
 
 @pytest.mark.long
 def test_sigterm_ends_a_gateway_that_waits_for_a_thread(tmp_path: Path) -> None:
-    """A library's thread would keep the interpreter running."""
+    """A thread of a library never ends, so Python would not exit by itself."""
     script = tmp_path / "hangs.py"
     script.write_text(HANGING)
     with simulated_plant(tmp_path, SERVE) as path:
@@ -341,3 +343,108 @@ def test_sigterm_ends_a_gateway_that_waits_for_a_thread(tmp_path: Path) -> None:
         finally:
             process.kill()
             process.communicate()
+
+
+# ---- a full disk on its own file system: polling and stops continue, and /health reports the disk ----
+
+
+ON_DISK = """
+[serve]
+audit = "disk/audit.jsonl"
+[serve.may]
+stop = "anyone"
+[serve.history]
+folder = "disk/history"
+"""
+FULL = "No space left on device"
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """Mount a file system of 1 MB beside the plant file."""
+    path = tmp_path / "disk"
+    path.mkdir()
+    if os.geteuid() != 0 or shutil.which("mount") is None:
+        pytest.skip("only root may mount a file system of its own")
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=1m", "none", path], capture_output=True, text=True
+    )
+    if mounted.returncode:
+        pytest.skip(f"no file system can be mounted here: {mounted.stderr.strip()}")
+    yield path
+    subprocess.run(["umount", "--lazy", path], check=True)
+
+
+def fill(disk: Path) -> Path:
+    """Fill the remaining space with a file, and return its path."""
+    path = disk / "filler"
+    with path.open("wb", buffering=0) as file:
+        while has_room(file):
+            pass
+    return path
+
+
+def has_room(file: BinaryIO) -> bool:
+    try:
+        file.write(bytes(4096))
+    except OSError as failure:
+        if failure.errno != ENOSPC:
+            raise
+        return False
+    return True
+
+
+def disk_health(gateway: Served) -> tuple[str, str, str]:
+    """Return from /health the status and the entries about history and audit log."""
+    found = gateway.get("/health").json
+    return found["status"], found["parts"]["history"], found["audit"]
+
+
+def stop(gateway: Served) -> None:
+    told = gateway.post("/api/stop").json
+    assert [one["done"] for one in told.values()] == [True, True]
+
+
+def dropped(gateway: Served) -> float:
+    lines = gateway.get("/metrics").body.decode().splitlines()
+    (line,) = [line for line in lines if line.startswith("multidrop_history_dropped_total ")]
+    return float(line.split()[1])
+
+
+@pytest.mark.long
+def test_full_disk_is_reported_while_polling_and_stops_continue(disk: Path, tmp_path: Path) -> None:
+    with served(tmp_path, ON_DISK) as gateway:
+        gateway.await_state("pump-2", "stands")
+        history = gateway.gateway.feeds["history"]
+        until(lambda: history.state.rows > 0)
+        stop(gateway)
+        until(lambda: gateway.get("/api/audit").json["entries"])
+        assert disk_health(gateway) == ("ok", "ok", "ok")
+
+        filler = fill(disk)
+        until(lambda: FULL in disk_health(gateway)[1])
+        noted = len(gateway.get("/api/audit").json["entries"])
+        sent = [sim.counters.requests for sim in gateway.sims.values()]
+        while FULL not in disk_health(gateway)[2]:  # the last block of the log may still have some space
+            stop(gateway)
+            assert len(gateway.get("/api/audit").json["entries"]) < noted + 40
+        status, recorded, audit = disk_health(gateway)
+        assert status == "degraded"
+        assert recorded.startswith("nothing is recorded: ")
+        assert audit.startswith("the newest write is not noted: ")
+        until(lambda: len(gateway.frame()["troubles"]) == 2)
+        assert all(FULL in trouble for trouble in gateway.frame()["troubles"])
+        until(lambda: dropped(gateway) > 40)
+        now = [sim.counters.requests for sim in gateway.sims.values()]
+        assert all(after > before + 10 for before, after in zip(sent, now, strict=True))
+        assert gateway.gateway.poller is not None
+        assert gateway.gateway.poller.summary()["dropped"] == 0
+
+        rows = history.state.rows
+        filler.unlink()
+        until(lambda: history.state.rows > rows and disk_health(gateway)[1] == "ok")
+        stop(gateway)
+        until(lambda: disk_health(gateway) == ("ok", "ok", "ok"))
+        until(lambda: gateway.frame()["troubles"] == [])
+        assert len(gateway.get("/api/audit").json["entries"]) > noted
+        assert list(gateway.gateway.failures.values()) == []

@@ -15,6 +15,7 @@ from time import monotonic, sleep
 from typing import Any
 
 import pytest
+from examples import usually
 from gateways import simulated_plant
 from interruptions import every, interrupted_before
 from kills import BoundProcess
@@ -64,9 +65,10 @@ def falls_silent(drive: Counting) -> None:
     until(has_ended, 10.0)
 
 
-@pytest.mark.parametrize("step", [1009, pytest.param(53, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("step", usually(151, 53))
 def test_gateway_interrupted_at_any_bytecode_ends(drive: Counting, tmp_path: Path, step: int) -> None:
-    """Raise KeyboardInterrupt before every n-th bytecode of the main thread, from start to end."""
+    """Raise KeyboardInterrupt before every `step`th bytecode of the main thread, from start to end."""
     plant = Plant.load(tmp_path / "plant.toml")
 
     def live() -> None:
@@ -78,7 +80,7 @@ def test_gateway_interrupted_at_any_bytecode_ends(drive: Counting, tmp_path: Pat
             live()
         falls_silent(drive)
         gc.collect()
-        with Bus(plant.lines[0].port, baudrate=38400) as bus:  # possible only if the port is free
+        with Bus(plant.lines[0].port, baudrate=38400) as bus:  # opening succeeds only if the port is free
             bus.attach(InvtCHE, 1).read(InvtCHE.registers["output_current"])
         return bool(found)
 
@@ -87,7 +89,7 @@ def test_gateway_interrupted_at_any_bytecode_ends(drive: Counting, tmp_path: Pat
 
 # ---- signals ----
 
-# If an interruption hits a callback of its import system, Python only prints it and continues.
+# If KeyboardInterrupt is raised in a callback of Python's import system, Python prints it and continues.
 IN_AN_IMPORT = re.compile(
     r"Exception ignored in: .*\nTraceback \(most recent call last\):\n  File \"<frozen importlib.*\n"
     r"KeyboardInterrupt: *\n"
@@ -130,7 +132,7 @@ def test_a_signal_at_any_moment_ends_the_command(tmp_path: Path, number: int, ag
             usual_s = monotonic() - begun
             process.send_signal(number)
             process.communicate(timeout=PATIENCE)
-        for moment in range(1, 13):  # a delay of 0 would interrupt the script before the command
+        for moment in range(1, 13):  # a delay of 0 would interrupt the script before it runs the command
             delays = [usual_s * moment / 9] + ([] if again is None else [again])
             with started(path, number, *delays) as process:
                 _, errors = process.communicate(timeout=PATIENCE)

@@ -2,22 +2,79 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import subprocess
 import time
-from collections.abc import Mapping
+import urllib.parse
+import urllib.request
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
-from gateways import Served, served
-from lines import until
+import yaml
+from brokers import free_port
+from gateways import Served, served, serving
+from lines import PATIENCE, until
 from peers import require_program
-from prometheus_server import Prometheus, scraping
 
 from multidrop import exposition
 from multidrop.exposition import MetricFamily, expose_metrics
+from multidrop.gateway.http.page_files import PAGE
 from multidrop.gateway.http.rights import Right
+
+# ---- a Prometheus server that scrapes a gateway ----
+
+
+class Prometheus:
+    """A client of the HTTP API of a Prometheus server."""
+
+    def __init__(self, port: int) -> None:
+        self._url = f"http://127.0.0.1:{port}/api/v1/"
+
+    def ask(self, path: str, **query: str) -> Any:
+        url = f"{self._url}{path}?{urllib.parse.urlencode(query)}"
+        with urllib.request.urlopen(url, timeout=PATIENCE) as answer:
+            return json.load(answer)["data"]
+
+    def is_there(self) -> bool:
+        try:
+            return bool(self.ask("targets")["activeTargets"])
+        except OSError:
+            return False
+
+    def query(self, text: str) -> dict[tuple[str, ...], float]:
+        """Return the present samples of a query, by the values of their labels."""
+        found = self.ask("query", query=text)["result"]
+        return {tuple(sorted(one["metric"].values())): float(one["value"][1]) for one in found}
+
+    def targets(self) -> dict[str, tuple[str, str]]:
+        """Return health and last error of the target of each job."""
+        found = self.ask("targets")["activeTargets"]
+        return {one["labels"]["job"]: (one["health"], one["lastError"]) for one in found}
+
+
+@contextmanager
+def scraping(folder: Path, jobs: str) -> Iterator[Prometheus]:
+    program = require_program("prometheus")
+    (folder / "prometheus.yml").write_text(jobs)
+    port = free_port()
+    command = [
+        *(program, f"--config.file={folder}/prometheus.yml", f"--storage.tsdb.path={folder}/tsdb"),
+        *(f"--web.listen-address=127.0.0.1:{port}", "--log.level=error"),
+    ]
+    with (folder / "prometheus.log").open("w") as log, subprocess.Popen(command, stderr=log) as process:
+        try:
+            found = Prometheus(port)
+            until(lambda: process.poll() is not None or found.is_there())
+            assert process.poll() is None, (folder / "prometheus.log").read_text()
+            yield found
+        finally:
+            process.kill()
+
 
 try:
     from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse
@@ -69,7 +126,7 @@ def test_metrics_have_values_states_and_counters(tmp_path: Path) -> None:
         about = {"line": "hall", "drive": "pump-1", "model": "invt-che", "address": "1"}
         assert about in [one.labels for one in found["multidrop_drive"].samples]
         alarms = [one.value for one in found["multidrop_alarm_active"].samples]
-        assert alarms == [0.0] * 9  # kinds: port for the line, all others for each drive
+        assert alarms == [0.0] * 9  # kind `port` for the line, all other kinds for each drive
         health = {one.labels["multidrop_health"]: one.value for one in found["multidrop_health"].samples}
         assert health == {"ok": 1.0, "degraded": 0.0, "failed": 0.0}
         assert found["process_open_fds"].samples[0].value > 5
@@ -77,7 +134,7 @@ def test_metrics_have_values_states_and_counters(tmp_path: Path) -> None:
         until(lambda: families(gateway)["multidrop_line_samples"].samples[0].value > 8)
         assert found["multidrop_line_samples"].type == "counter"
         assert found["multidrop_build"].samples[0].labels == {"version": gateway.gateway.version}
-        delays = {  # of drives that have replied; updated once a second
+        delays = {  # delays of drives that have replied; updated once a second
             (one.name.removeprefix("multidrop_response_delay_seconds"), one.labels.get("quantile"))
             for one in families(gateway)["multidrop_response_delay_seconds"].samples
         }
@@ -148,7 +205,7 @@ def test_prometheus_scrapes_each_second_and_a_silent_drive_is_stale(tmp_path: Pa
         jobs = JOBS.format(port=gateway.gateway.port, secret=gateway.secrets[Right.LOOK])
         with scraping(tmp_path, jobs) as prometheus:
             until(lambda: drives(prometheus) == {"pump-1", "pump-2"})
-            until(lambda: prometheus.targets()["stranger"][0] != "unknown")  # until the first scrape
+            until(lambda: prometheus.targets()["stranger"][0] != "unknown")  # waits for the first scrape
             assert prometheus.targets() == {
                 "known": ("up", ""),
                 "stranger": ("down", "server returned HTTP status 401 Unauthorized"),
@@ -183,3 +240,110 @@ def test_promtool_accepts_the_metrics(tmp_path: Path) -> None:
         assert answer.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
         checked = subprocess.run([program, "check", "metrics"], input=answer.body, capture_output=True)
         assert (checked.returncode, checked.stdout, checked.stderr) == (0, b"", b"")
+
+
+# ---- dashboard and alert rules in a real Prometheus ----
+
+
+FOLDER = PAGE / "prometheus"
+DASHBOARD, ALERTS = FOLDER / "dashboard.json", FOLDER / "alerts.yml"
+JOB = """
+global: {{scrape_interval: 1s}}
+scrape_configs:
+  - job_name: multidrop
+    static_configs: [{{targets: ["127.0.0.1:{port}"]}}]
+"""
+
+
+def alerts() -> Iterator[tuple[str, str]]:
+    """Yield the name and the expression of each alert."""
+    for group in yaml.safe_load(ALERTS.read_text())["groups"]:
+        for rule in group["rules"]:
+            yield rule["alert"], rule["expr"]
+
+
+def queries() -> Iterator[tuple[str, str]]:
+    """Yield name and text of each query of the dashboard, and of each alert's query without its threshold."""
+    dashboard = json.loads(DASHBOARD.read_text())
+    for panel in dashboard["panels"]:
+        for target in panel["targets"]:
+            found = re.sub(r"\$(instance|line|drive)\b", ".*", target["expr"])
+            yield panel["title"], found.replace("$__rate_interval", "5s")
+    for variable in dashboard["templating"]["list"]:
+        if variable["type"] == "query":
+            found = re.sub(r"\$(instance|line|drive)\b", ".*", variable["definition"])
+            yield variable["name"], re.sub(r"label_values\((.*), (\w+)\)", r"count by (\2) (\1)", found)
+    for name, expression in alerts():
+        yield name, re.sub(r" (==|>) [\d.]+$", "", expression)
+
+
+def empty(prometheus: Prometheus) -> list[tuple[str, str]]:
+    """Return the queries without data."""
+    return [(name, text) for name, text in queries() if not prometheus.query(text)]
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_prometheus_has_data_for_each_query_of_dashboard_and_alerts(tmp_path: Path) -> None:
+    with serving(Path("--demo"), "--no-browser") as (_, url):
+        port = int(url.rstrip("/").rpartition(":")[2])
+        with scraping(tmp_path, JOB.format(port=port)) as prometheus:
+            until(lambda: len(prometheus.query('multidrop_register_hertz{register="output_frequency"}')) > 5)
+            with suppress(AssertionError):
+                until(lambda: not empty(prometheus))
+            assert empty(prometheus) == []
+
+
+GATEWAY = 'instance="gw"'
+PUMP = f'{GATEWAY}, line="hall", drive="pump-1"'
+FIRING = {  # by alert: series and their values each minute, which make it fire within 15 min
+    "MultidropGatewayDown": {f'up{{{GATEWAY}, job="multidrop"}}': "0x20"},
+    "MultidropGatewayFailed": {f'multidrop_health{{{GATEWAY}, multidrop_health="failed"}}': "1x20"},
+    "MultidropGatewayDegraded": {f'multidrop_health{{{GATEWAY}, multidrop_health="degraded"}}': "1x20"},
+    "MultidropLineLost": {f'multidrop_line_up{{{GATEWAY}, line="hall"}}': "0x20"},
+    "MultidropDriveFault": {f'multidrop_alarm_active{{{PUMP}, kind="fault"}}': "1x20"},
+    "MultidropMotorStopped": {f'multidrop_alarm_active{{{PUMP}, kind="stopped"}}': "1x20"},
+    "MultidropLimit": {f'multidrop_alarm_active{{{PUMP}, kind="limit"}}': "1x20"},
+    "MultidropDriveSilent": {f'multidrop_alarm_active{{{PUMP}, kind="silent"}}': "1x20"},
+    "MultidropValuesOld": {f'multidrop_register_age_seconds{{{PUMP}, register="load"}}': "0+60x20"},
+    "MultidropMisses": {
+        f'multidrop_misses_total{{{PUMP}, reason="no reply"}}': "0+300x20",
+        f'multidrop_line_samples_total{{{GATEWAY}, line="hall"}}': "0+900x20",
+    },
+    "MultidropRowsLost": {f"multidrop_rows_dropped_total{{{GATEWAY}}}": "0+1x20"},
+    "MultidropPartFailing": {f'multidrop_part_failures_total{{{GATEWAY}, part="mqtt"}}': "0+1x20"},
+    "MultidropHistoryLost": {f"multidrop_history_dropped_total{{{GATEWAY}}}": "0+1x20"},
+}
+CALM = {  # by series: values that must make no alert fire
+    f'up{{{GATEWAY}, job="multidrop"}}': "1x20",
+    f'multidrop_health{{{GATEWAY}, multidrop_health="failed"}}': "0x20",
+    f'multidrop_line_up{{{GATEWAY}, line="hall"}}': "1x20",
+    f'multidrop_alarm_active{{{PUMP}, kind="fault"}}': "0x20",
+    f'multidrop_register_age_seconds{{{PUMP}, register="load"}}': "1x20",
+    f'multidrop_misses_total{{{PUMP}, reason="no reply"}}': "0+1x20",
+    f'multidrop_line_samples_total{{{GATEWAY}, line="hall"}}': "0+900x20",
+    f"multidrop_rows_dropped_total{{{GATEWAY}}}": "5x20",
+}
+
+
+def rule_test(series: dict[str, str], alert: str, count: int) -> dict[str, Any]:
+    """Return a test for promtool: with these series, `count` alerts of this name fire after 15 min."""
+    samples = [{"labels": "{}", "value": count}] if count else []
+    query = f'count(ALERTS{{alertname=~"{alert}", alertstate="firing"}})'
+    return {
+        "interval": "1m",
+        "input_series": [{"series": name, "values": values} for name, values in series.items()],
+        "promql_expr_test": [{"expr": query, "eval_time": "15m", "exp_samples": samples}],
+    }
+
+
+@pytest.mark.slow
+def test_each_alert_fires_for_its_series_only(tmp_path: Path) -> None:
+    program = require_program("promtool")
+    assert {*FIRING} == {name for name, _ in alerts()}
+    tests = [rule_test(series, alert, 1) for alert, series in FIRING.items()]
+    tests.append(rule_test(CALM, ".*", 0))
+    file = tmp_path / "tests.yml"
+    file.write_text(json.dumps({"rule_files": [str(ALERTS)], "evaluation_interval": "1m", "tests": tests}))
+    ran = subprocess.run([program, "test", "rules", str(file)], capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stdout + ran.stderr

@@ -1,11 +1,14 @@
-"""Notifications: one message for each alarm that begins or ends, whatever its targets do."""
+"""Notifications: each alarm that begins or ends is sent once, even if targets fail or hang."""
 
 from __future__ import annotations
 
 import json
+import socket
 import sys
 import threading
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from math import inf
 from pathlib import Path
@@ -14,9 +17,10 @@ from typing import Any
 
 import pytest
 from gateways import served
-from lines import until
+from lines import PATIENCE, until
 from tables import table
 
+from multidrop.gateway import http_post
 from multidrop.gateway.live.alarms import FAULT, PORT, Alarm, AlarmChange, Alarms
 from multidrop.gateway.live.hub import RUNS, Shown
 from multidrop.gateway.notifications import (
@@ -40,14 +44,14 @@ def over(alarm: Alarm, ended: int = 2_000) -> Alarm:
 
 
 def flaps(number: int) -> list[Alarm]:
-    """Return an alarm that begins and ends this many times."""
+    """Return the alarms to note if a drive's alarm begins and ends this many times."""
     return [
         one for at in range(number) for one in (BEGUN._replace(time=at), over(BEGUN._replace(time=at), at))
     ]
 
 
 def note(part: Notifications, alarm: Alarm) -> None:
-    """Tell the part that an alarm began or ended."""
+    """Notify the part that an alarm began or ended."""
     part.note_alarm(alarm, AlarmChange.BEGAN if alarm.ended is None else AlarmChange.ENDED)
 
 
@@ -56,7 +60,7 @@ def described(alarm: Alarm, left_out: int) -> dict[str, Any]:
 
 
 class Clocked:
-    """A sender whose time is `now_s`; it records messages, or fails while `failure` is set."""
+    """A sender with a simulated clock, `now_s`. It records messages, or fails while `failure` is set."""
 
     def __init__(self, most: int = 3600) -> None:
         self.now_s = 0.0
@@ -79,7 +83,7 @@ class Clocked:
 # ---- which alarms are sent ----
 
 
-def test_thousand_flaps_are_sent_as_one_message_for_each_begin_and_end() -> None:
+def test_each_begin_and_end_of_a_thousand_flaps_is_sent_as_one_message() -> None:
     target, alarms = Clocked(), flaps(1000)
     part = Notifications([target.sender], [FAULT])
     for alarm in alarms:
@@ -105,7 +109,7 @@ def test_acknowledgements_new_texts_and_other_kinds_are_not_sent() -> None:
     assert [(one["event"], one["line"]) for one in target.messages] == [("begin", "hall"), ("end", "hall")]
 
 
-def test_restart_repeats_no_message() -> None:
+def test_restart_repeats_no_notification() -> None:
     target = Clocked()
     alarms = Alarms(note=Notifications([target.sender], [FAULT, PORT]).note_alarm)
     lost = Alarm(1_000, "", "the port is lost", None, PORT, "hall")
@@ -130,15 +134,15 @@ def test_beyond_the_hourly_limit_the_newest_message_is_sent_when_allowed() -> No
     target.now_s += 61
     target.send_all()
     [newest] = target.messages[60:]
-    assert (newest["event"], newest["time"]) == ("begin", "1970-01-01T00:00:00.100+00:00")
+    assert (newest["event"], newest["time"]) == ("begin", "1970-01-01T00:00:00.100Z")
     assert newest["text"] == "pump: fault: overcurrent (140 earlier messages were left out)"
 
 
-def test_waiting_messages_are_bounded() -> None:
+def test_number_of_waiting_notifications_is_limited() -> None:
     queue = AlarmQueue(60, 0.0)
-    for number in range(3 * MOST_WAITING):
+    for number in range(MOST_WAITING + 100):
         queue.put(BEGUN._replace(drive=f"pump-{number}"))
-    assert (len(queue), queue.left_out) == (MOST_WAITING, 2 * MOST_WAITING)
+    assert (len(queue), queue.left_out) == (MOST_WAITING, 100)
 
 
 def test_failed_message_is_sent_again_after_growing_pauses() -> None:
@@ -147,13 +151,13 @@ def test_failed_message_is_sent_again_after_growing_pauses() -> None:
     target.failure = OSError("500")
     pauses = [target.send_all() for _ in range(8)]
     assert (pauses[:3], pauses[-1]) == ([5, 10, 20], MOST_RETRY_S)
-    assert target.sender.trouble == "target takes no messages: 500"
+    assert target.sender.problem == "target takes no messages: 500"
     target.failure = None
     assert target.send_all() == inf
-    assert (len(target.messages), target.sender.trouble) == (1, "")
+    assert (len(target.messages), target.sender.problem) == (1, "")
 
 
-def test_message_that_a_target_refuses_for_good_does_not_block_later_ones() -> None:
+def test_a_message_that_a_target_permanently_refuses_does_not_block_later_messages() -> None:
     target = Clocked()
     target.sender.put(BEGUN)
     target.failure = ValueError("no JSON")
@@ -166,7 +170,7 @@ def test_message_that_a_target_refuses_for_good_does_not_block_later_ones() -> N
     ]
 
 
-def test_message_put_right_before_the_end_is_sent() -> None:
+def test_a_message_that_is_queued_right_before_the_end_is_sent() -> None:
     target = Clocked()
     thread = threading.Thread(target=target.sender.run)
     thread.start()
@@ -240,10 +244,52 @@ def test_webhook_gets_json_and_its_refusal_is_an_error(webhook: SimpleNamespace,
         "kind": "fault",
         "alarm": "overcurrent",
         "id": "1000 fault pump",
-        "time": "1970-01-01T00:00:01.000+00:00",
+        "time": "1970-01-01T00:00:01.000Z",
         "ended": None,
         "page": "http://page/",
     }
+
+
+def test_refused_connection_is_reported_in_one_sentence() -> None:
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))  # bound, but not listening
+        send = sender_to(AlarmTarget("target", f"http://127.0.0.1:{unused.getsockname()[1]}/"))
+        with pytest.raises(OSError, match=r"^Connection refused$"):
+            send(described(BEGUN, 0))
+
+
+def test_answer_that_is_not_http_is_reported_in_one_sentence() -> None:
+    def answer() -> None:
+        peer, _ = listener.accept()
+        with peer:
+            peer.recv(1 << 16)
+            peer.sendall(b"SSH-2.0-OpenSSH_9.6\r\n")
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=answer)
+        thread.start()
+        with pytest.raises(OSError, match=r"^the answer is not HTTP$"):
+            http_post.post(f"http://127.0.0.1:{listener.getsockname()[1]}/", b"", {})
+        thread.join()
+
+
+def test_the_wait_for_an_answer_that_arrives_byte_by_byte_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http_post, "SEND_S", 0.1)
+    ends = time.monotonic() + PATIENCE
+
+    def trickle() -> None:
+        peer, _ = listener.accept()
+        with peer, suppress(OSError):  # raised once the client has closed the connection
+            while time.monotonic() < ends:
+                peer.sendall(b"H")
+                time.sleep(0.01)
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=trickle)
+        thread.start()
+        with pytest.raises(OSError, match=r"did not end within 0.1 s|timed out"):
+            http_post.post(f"http://127.0.0.1:{listener.getsockname()[1]}/", b"", {})
+        thread.join()
 
 
 @table(
@@ -273,7 +319,7 @@ def test_name_of_a_target_shows_no_secret(tmp_path: Path) -> None:
     ]
 
 
-def test_missing_apprise_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_apprise_is_reported_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "apprise", None)
     (tmp_path / "targets").write_text("ntfy://alarms\n")
     context: Any = SimpleNamespace(plant=SimpleNamespace(path=tmp_path / "plant.toml"), page="")
@@ -282,7 +328,8 @@ def test_missing_apprise_is_one_sentence(tmp_path: Path, monkeypatch: pytest.Mon
         build("notify", settings, context)
 
 
-@pytest.mark.filterwarnings("ignore:.*imghdr:DeprecationWarning")  # which Apprise imports
+@pytest.mark.long
+@pytest.mark.filterwarnings("ignore:.*imghdr:DeprecationWarning")  # Apprise imports imghdr
 def test_apprise_sends_title_and_text(webhook: SimpleNamespace) -> None:
     pytest.importorskip("apprise")
     send = sender_to(AlarmTarget("target", webhook.url.replace("http://", "json://")))
@@ -290,7 +337,7 @@ def test_apprise_sends_title_and_text(webhook: SimpleNamespace) -> None:
     [posted] = webhook.posted
     assert (posted["title"], posted["message"]) == ("plant: pump", "pump: fault: overcurrent")
     webhook.status = 500
-    with pytest.raises(OSError, match="did not take"):
+    with pytest.raises(OSError, match="did not accept"):
         send(described(BEGUN, 0))
 
 
@@ -307,7 +354,8 @@ def test_gateway_sends_faults_and_exceeded_limits(tmp_path: Path, webhook: Simpl
         gateway.sims["pump-1"].motor.reset()  # type: ignore[attr-defined]
         until(lambda: "500" in gateway.get("/health").json["parts"].get("notify", ""))
         assert "secret-path" not in gateway.get("/health").body.decode()
-    assert {(one["drive"], one["kind"], one["alarm"]) for one in webhook.posted[:2]} == {
-        ("pump-1", "limit", "output_frequency below 1 Hz"),
-        ("pump-1", "fault", "overcurrent while accelerating (OC1)"),
-    }
+    found = {(one["drive"], one["kind"]): one["alarm"] for one in webhook.posted[:2]}
+    assert found.keys() == {("pump-1", "limit"), ("pump-1", "fault")}
+    assert found["pump-1", "limit"] == "output_frequency below 1 Hz"
+    # The status may be read before the register with the fault's number.
+    assert found["pump-1", "fault"] in ("overcurrent while accelerating (OC1)", "it shows a fault")

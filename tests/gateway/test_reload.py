@@ -32,7 +32,7 @@ MAY = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump
 def reload(gateway: Served) -> Any:
     answer = gateway.post("/api/reload", {"confirm": True}, authorization=gateway.bearer(Right.WRITE))
     assert answer.status == 200
-    until(lambda: gateway.frame()["revision"] == gateway.gateway.revision)  # the next frame follows soon
+    until(lambda: gateway.frame()["revision"] == gateway.gateway.revision)
     return answer.json
 
 
@@ -66,7 +66,10 @@ class Rows:
 def two_lines(
     folder: Path, serve: str = MAY, fans: Sequence[str] = ("fan-1",)
 ) -> Iterator[tuple[Served, Rows]]:
-    """Yield a gateway with the lines hall (pump-1) and roof (fan-1), and its rows. Other fans are silent."""
+    """Yield a gateway with the lines hall (pump-1) and roof (`fans`), and its rows.
+
+    Fans other than fan-1 are silent.
+    """
     secrets, known = tokens()
     sims = {name: simulated(InvtCHE(1, name=name, baudrate=38400)) for name in ("pump-1", "fan-1")}
     path = folder / "plant.toml"
@@ -153,13 +156,13 @@ def test_reload_adds_and_removes_drives_and_keeps_unchanged_lines(tmp_path: Path
         frame = gateway.frame()
         assert (frame["revision"], frame["drives"].keys()) == (revision + 1, {"pump-1", "fan-2"})
         ended = [one["ended"] for one in frame["alarms"] if one["drive"] == "fan-1"]
-        assert ended  # on a busy machine there may be several
+        assert ended  # on a busy machine, fan-1 may have several alarms
         assert None not in ended
         names = [line["drives"][0]["name"] for line in gateway.get("/api/plant").json["lines"]]
         assert names == ["pump-1", "fan-2"]
         assert rows.adopted == [gateway.gateway.plant]
         assert gateway.gateway.plant.lines[0].drives[0].drive is pump.drive
-        adopted_ns = time.monotonic_ns()  # rows requested before may still arrive
+        adopted_ns = time.monotonic_ns()  # rows of earlier requests may still arrive
 
         def later() -> list[str]:
             return [drive for drive, _, at_ns in rows.found if at_ns > adopted_ns]
@@ -182,7 +185,7 @@ def test_a_missing_port_is_reported(tmp_path: Path) -> None:
         edit(gateway, roof, str(tmp_path / "nosuch"))
         assert reload(gateway)["done"] is True
         assert gateway.frame()["lines"]["roof"]["lost"] == f"{tmp_path}/nosuch: there is no such port"
-        assert reload(gateway)["done"] is True  # a second reload keeps the reason
+        assert reload(gateway)["done"] is True  # the reason stays after a second reload
         assert gateway.frame()["lines"]["roof"]["lost"] == f"{tmp_path}/nosuch: there is no such port"
         edit(gateway, str(tmp_path / "nosuch"), roof)
         assert reload(gateway)["done"] is True
@@ -215,7 +218,7 @@ def test_rights_names_and_tokens_are_reloaded_and_other_keys_need_a_restart(tmp_
         assert write("pump-2").json["done"] is True
 
 
-def test_local_rights_do_not_grow_before_the_restart(tmp_path: Path) -> None:
+def test_a_reload_gives_local_clients_no_further_rights_before_the_restart(tmp_path: Path) -> None:
     with served(tmp_path, "[serve]\nbehind_proxy = false\n") as gateway:
         edit(gateway, "behind_proxy = false\n", f"behind_proxy = true\n{MAY}")
         assert reload(gateway)["restart"] == ["behind_proxy of [serve] takes effect after a restart"]
@@ -263,15 +266,15 @@ def test_a_removed_token_is_invalid_after_a_reload(tmp_path: Path) -> None:
             writer = {"authorization": client.bearer(Right.WRITE)}
             assert client.post("/api/reload", {"confirm": True}, **writer).json["done"] is True
             assert answers() == [401, 401, 200, 200]
-            read_ns = gateway.commands.plant_ns  # time of the reload, which commands from brokers must follow
+            read_ns = gateway.commands.plant_ns  # time of the reload
             assert read_ns is not None
             assert begun_ns <= read_ns <= boottime_ns()
 
 
-def test_reads_before_a_reload_are_not_shown_after_it(
+def test_values_read_before_a_reload_are_not_shown_after_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The name may now mean another drive, which may be silent."""
+    """After the reload the name may mean another drive, which may be silent."""
     monkeypatch.setattr(drive_reads, "PAUSE_S", 0.0)
     with served(tmp_path, MAY) as gateway:
         gateway.await_state("pump-1", "stands")
@@ -289,7 +292,7 @@ def test_reads_before_a_reload_are_not_shown_after_it(
         assert values() == []
 
 
-def test_look_rights_do_not_grow_before_the_restart(tmp_path: Path) -> None:
+def test_a_reload_gives_no_right_to_look_before_the_restart(tmp_path: Path) -> None:
     """Until the restart the gateway listens on the old address, which other clients can reach."""
     serve = '[serve]\nlisten = "127.0.0.1:0"\ntokens = "tokens"\n[serve.may]\nlook = "token"\n'
     with served(tmp_path, serve) as gateway:
@@ -403,7 +406,7 @@ def held_up(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading
 def test_stop_does_not_wait_for_ports_that_a_reload_opens(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
 ) -> None:
-    """The drive has been replaced already, while the port of another line is still being opened."""
+    """The drive has already been replaced. The port of another line is still being opened."""
     verbs = '"fan-1.start", "fan-1.coast"'
     may = MAY.replace("pump-1", "fan-1").replace('"fan-1.start"', verbs)
     with two_lines(tmp_path, may, ("fan-1", "fan-2")) as (gateway, _):
@@ -452,7 +455,7 @@ dc_bus_voltage = { at = 0x3002, unit = "A", step = 0.5, place = "1" }
 def test_rows_of_a_changed_drive_are_never_recorded_with_another_unit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The new drive, of another family, is polled already while another line is still being opened."""
+    """The new drive has another family. It is polled already, while another line is still being opened."""
     (tmp_path / "other.toml").write_text(OTHER)
     with two_lines(tmp_path, "[serve.history]\n" + MAY) as (gateway, _):
         path, poller, hub = gateway.gateway.plant.path, gateway.gateway.poller, gateway.gateway.hub

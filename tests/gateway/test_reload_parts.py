@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pytest
 from brokers import Listener, free_port, mosquitto
 from gateways import Served, served
-from lines import PATIENCE, until
+from lines import PATIENCE, line, plant, polled, until
 from modbus_gateway import RawClient
 from peers import require_module
 
+from multidrop import Drive, InvtCHE, Plant
 from multidrop.gateway import parts as parts_module
+from multidrop.gateway.commands import stop_meant
 from multidrop.gateway.http.rights import Right
 
 MODBUS = '[serve.modbus]\nlisten = "127.0.0.1:{}"\nunits = {{ pump-1 = {} }}\n'
@@ -65,9 +69,9 @@ def test_reload_starts_changes_and_ends_the_modbus_server(gateway: Served) -> No
     assert gateway.gateway.feeds["modbus"] is server  # the table is unchanged, so clients stay connected
     assert reload(gateway, MODBUS.format(second, 22)) == IN_EFFECT
     until(lambda: status_of(second, 22) == [3])
-    assert not is_open(first)
+    until(lambda: not is_open(first))
     assert reload(gateway, "") == IN_EFFECT
-    assert not is_open(second)
+    until(lambda: not is_open(second))
     assert parts(gateway) == {}
 
 
@@ -111,7 +115,7 @@ def test_reload_with_an_unexpected_failure_of_a_part_changes_nothing(
 def test_part_that_loses_its_port_during_a_reload_is_reported(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The reload fails, and meanwhile another program has opened the part's previous port."""
+    """The reload fails. Another program has opened the part's previous port in the meantime."""
     first = free_port()
     assert reload(gateway, MODBUS.format(first, 21))["done"] is True
     others = []
@@ -128,10 +132,7 @@ def test_part_that_loses_its_port_during_a_reload_is_reported(
     assert [
         one["done"]
         for one in gateway.post("/api/stop", {}, authorization=gateway.bearer(Right.STOP)).json.values()
-    ] == [
-        True,
-        True,
-    ]
+    ] == [True, True]
     monkeypatch.undo()
     assert reload(gateway, MODBUS.format(first, 21)) == IN_EFFECT
     until(lambda: status_of(first, 21) == [3])
@@ -194,3 +195,119 @@ def test_reload_starts_changes_and_ends_mqtt(gateway: Served, tmp_path: Path) ->
             says("new/gateway", b"offline")
         finally:
             heard.close()
+
+
+# ---- stops during a reload that moves drives' names from one line to another ----
+
+
+Names = dict[str, Drive]
+
+
+@dataclass
+class End:
+    """The result of a stop, with the drive that was stopped."""
+
+    drive: Drive | None
+    ok: bool = True
+
+
+@dataclass
+class Lines:
+    """Lines of a poller. The test changes the lines, and can delay their stops."""
+
+    plant_now: Plant
+    plant_coming: Plant | None = None
+    held: dict[int, asyncio.Event] = field(default_factory=dict)  # by drive address: delays the drive's stop
+    failing: set[int] = field(default_factory=set)
+    begun: list[Drive | None] = field(default_factory=list)
+
+    async def stop(self, now: Plant, names: list[str]) -> dict[str, End]:
+        """Stop these drives; the stop of a held drive waits for the drive's event."""
+        there = {polled.drive.name: polled.drive for line in now.lines for polled in line.drives}
+        found = {name: there.get(name) for name in names}
+        self.begun += found.values()
+        for drive in found.values():
+            if drive is not None and drive.address in self.held:
+                await self.held[drive.address].wait()
+        return {
+            name: End(drive, drive is not None and drive.address not in self.failing)
+            for name, drive in found.items()
+        }
+
+
+def plant_of(*drives: Drive) -> Plant:
+    """Return a plant with a line for each drive."""
+    return plant(
+        *(
+            line(f"/dev/tty{number}", polled(drive, []), name=f"hall-{number}")
+            for number, drive in enumerate(drives)
+        )
+    )
+
+
+async def until_met(met: Callable[[], object]) -> None:
+    async with asyncio.timeout(PATIENCE):
+        while not met():
+            await asyncio.sleep(0)
+
+
+def told(ends: dict[str, End]) -> Names:
+    return {name: end.drive for name, end in ends.items() if end.drive is not None}
+
+
+FAN, PUMP = InvtCHE(1, name="fan"), InvtCHE(2, name="pump")
+NEW_FAN = InvtCHE(2, name="fan")
+
+
+@pytest.mark.parametrize("names", [["fan"], None])
+def test_new_drive_is_stopped_while_the_stop_of_its_predecessor_continues(names: list[str] | None) -> None:
+    """The predecessor's stop may take half a minute, for example if that drive is silent."""
+    silent = asyncio.Event()
+    lines = Lines(plant_of(PUMP, FAN), held={FAN.address: silent})
+
+    async def main() -> dict[str, End]:
+        stopping = asyncio.create_task(stop_meant(lines, names, lines.stop))
+        await until_met(lambda: FAN in lines.begun)
+        lines.plant_coming = lines.plant_now = plant_of(NEW_FAN)
+        await until_met(lambda: NEW_FAN in lines.begun)
+        assert not stopping.done()
+        lines.plant_coming = None
+        silent.set()
+        return await stopping
+
+    ends = asyncio.run(main())
+    # the result is the new drive's, although the old drive's result came later
+    assert ends["fan"].drive is NEW_FAN
+    assert lines.begun.count(NEW_FAN) == 1
+
+
+def test_a_stop_that_fails_while_lines_change_is_sent_again() -> None:
+    silent = asyncio.Event()
+    lines = Lines(plant_of(PUMP, FAN), held={FAN.address: silent}, failing={FAN.address})
+
+    async def main() -> dict[str, End]:
+        stopping = asyncio.create_task(stop_meant(lines, ["fan"], lines.stop))
+        await until_met(lambda: FAN in lines.begun)
+        lines.plant_now = plant_of(PUMP, FAN, InvtCHE(3, name="mill"))
+        silent.set()
+        return await stopping
+
+    assert not asyncio.run(main())["fan"].ok
+    assert lines.begun == [FAN, FAN]
+
+
+async def test_stop_by_a_name_of_the_new_plant_is_sent_once_the_drive_is_attached() -> None:
+    """The name may have another spelling. Other drives of the present plant are not stopped."""
+    new = InvtCHE(2, name="L\u00fcfter")
+    lines = Lines(plant_of(PUMP, FAN), plant_of(new, FAN))
+    stopping = asyncio.create_task(stop_meant(lines, ["Lu\u0308fter"], lines.stop))
+    await until_met(lambda: lines.begun)
+    lines.plant_now, lines.plant_coming = plant_of(new, FAN), None
+    assert told(await stopping) == {"Lu\u0308fter": new}
+    assert lines.begun == [None, new]
+
+
+async def test_without_a_reload_only_the_named_drives_are_stopped() -> None:
+    lines = Lines(plant_of(PUMP, FAN))
+    assert told(await stop_meant(lines, ["fan", "nobody"], lines.stop)) == {"fan": FAN}
+    assert lines.begun == [FAN, None]

@@ -10,26 +10,44 @@ import signal
 import socket
 import ssl
 import subprocess
+import sys
 import time
 from contextlib import ExitStack, closing, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from commands import MULTIDROP, Run, multidrop
-from gateways import certificate, get, served, serving, simulated_plant, written
+from gateways import (
+    Served,
+    certificate,
+    get,
+    plant_text,
+    running,
+    served,
+    serving,
+    simulated_plant,
+    tokens,
+    written,
+)
 from kills import BoundProcess
 from lines import PATIENCE, until
+from tables import table
 
+from multidrop import InvtCHE, Plant
 from multidrop.cli import serve as serve_command
+from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.connections import listen
 from multidrop.gateway.http.rights import Right, digest, read_tokens
+from multidrop.gateway.settings import read_settings
+from multidrop.sim import Simulator, Wire, simulated
 
 UNITS = sorted((Path(__file__).parents[2] / "packaging").glob("*.service"))
 
 
 @pytest.mark.long
-def test_service_manager_gets_ready_alive_and_stopping(tmp_path: Path) -> None:
+def test_the_service_manager_is_notified_of_ready_alive_and_stopping(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         manager.settimeout(PATIENCE)
@@ -84,7 +102,7 @@ def test_sighup_reloads_and_notifies_systemd(tmp_path: Path) -> None:
                 assert process.returncode == 0
     messages = [json.loads(line)["message"] for line in errors.splitlines()]
     assert messages.count("reload, asked for by a signal") == 2
-    mistake = f"the previous plant stays in use: {path}: unknown key 'lin'; did you mean 'line'?"
+    mistake = f"the previous plant stays in use: {path}: unknown key 'lin'; did you mean line?"
     assert mistake in messages
     assert "the plant file is in effect" in messages
 
@@ -98,7 +116,7 @@ def test_plant_without_a_file_cannot_be_reloaded(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_sigterm_ends_it_while_viewers_wait(tmp_path: Path) -> None:
+def test_sigterm_ends_the_gateway_while_viewers_wait(tmp_path: Path) -> None:
     with ExitStack() as stack:
         path = stack.enter_context(simulated_plant(tmp_path, '[serve]\nlisten = "127.0.0.1:0"\n'))
         process, url = stack.enter_context(serving(path))
@@ -124,7 +142,8 @@ def test_stop_does_not_wait_for_an_unread_log(tmp_path: Path) -> None:
     """Nothing reads the log if a user pressed Ctrl-S in the terminal, or if the journal hangs."""
     with simulated_plant(tmp_path, '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\n') as path:
         unread, log = os.pipe()
-        words = [*MULTIDROP, "serve", str(path)]
+        patient = f"from multidrop.cli import main, serve; serve.END_S = {PATIENCE}; raise SystemExit(main())"
+        words = [sys.executable, "-c", patient, "serve", str(path)]
         with (
             os.fdopen(unread),
             os.fdopen(log, "wb"),
@@ -133,7 +152,7 @@ def test_stop_does_not_wait_for_an_unread_log(tmp_path: Path) -> None:
             try:
                 assert process.stdout is not None
                 port = int(process.stdout.readline().rstrip("/\n").rpartition(":")[2])
-                os.set_blocking(log, False)  # to fill the pipe without blocking
+                os.set_blocking(log, False)  # so that filling the pipe does not block
                 with suppress(BlockingIOError):
                     while True:
                         os.write(log, bytes(1))
@@ -158,7 +177,7 @@ def test_serve_with_tls_answers_over_https(tmp_path: Path) -> None:
         assert url.startswith("https://127.0.0.1:")
         port = int(url.rstrip("/").rpartition(":")[2])
         context = ssl.create_default_context(cafile=str(tmp_path / "own.pem"))
-        silent = socket.create_connection(("127.0.0.1", port))  # no handshake; others do not wait
+        silent = socket.create_connection(("127.0.0.1", port))  # never sends its TLS handshake
         connection = http.client.HTTPSConnection("localhost", port, context=context, timeout=PATIENCE)
         connection.request("POST", "/api/token", '{"token": "secret"}', {"content-type": "application/json"})
         response = connection.getresponse()
@@ -220,7 +239,7 @@ def test_a_new_token_is_shown_once(run: Run) -> None:
     assert digest(told.rpartition(" ")[2].strip()) == token.sha256
 
 
-@pytest.mark.parametrize(
+@table(
     ("words", "sentence"),
     [
         ((), "name a plant file, or try `multidrop serve --demo`"),
@@ -283,3 +302,67 @@ def test_systemd_unit_file_is_valid_and_exposes_little(tmp_path: Path, path: Pat
     judge = ["systemd-analyze", "security", "--offline=true", "--threshold=20", "--no-pager", str(unit)]
     judged = subprocess.run(judge, capture_output=True, text=True)
     assert judged.returncode == 0, judged.stdout
+
+
+# ---- if a port is missing when the gateway starts, its line is lost, and the other lines are polled ----
+
+
+SERVE = '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\n'
+
+
+@pytest.mark.slow
+def test_line_with_a_missing_port_is_polled_as_soon_as_the_port_appears(tmp_path: Path) -> None:
+    port = tmp_path / "late"
+    sims = [simulated(InvtCHE(1, name=name, baudrate=38400)) for name in ("pump-1", "fan-1")]
+    with Simulator([Wire([sim], unpaced=True) for sim in sims]) as simulator:
+        text = plant_text(simulator.wires[0].path, ["pump-1"])
+        text += plant_text(str(port), ["fan-1"], SERVE).replace('"hall"', '"roof"')
+        (tmp_path / "plant.toml").write_text(text)
+        plant = Plant.load(tmp_path / "plant.toml")
+        gateway = Gateway(plant, read_settings(plant, {}))
+        with running(gateway):
+            served = Served(gateway, dict(zip(("pump-1", "fan-1"), sims, strict=True)), tokens()[0])
+            served.await_state("pump-1", "stands")
+            served.await_state("fan-1", "silent")
+            lost = served.frame()["lines"]["roof"]["lost"]
+            assert lost == f"{port}: there is no such port"
+            assert served.get("/api/lines").json["roof"]["lost"] == lost
+            health = served.get("/health")
+            assert (health.status, health.json["status"]) == (200, "degraded")
+            assert health.json["lines"] == {"hall": "ok", "roof": lost}
+            metrics = served.get("/metrics").body.decode()
+            assert 'multidrop_line_up{line="hall"} 1.0\n' in metrics
+            assert 'multidrop_line_up{line="roof"} 0.0\n' in metrics
+            assert served.post("/api/stop", {"drives": ["pump-1"]}).json["pump-1"]["done"] is True
+
+            port.symlink_to(simulator.wires[1].path)
+            served.await_state("fan-1", "stands")
+            assert served.get("/health").json["lines"] == {"hall": "ok", "roof": "ok"}
+            until(lambda: 'multidrop_line_up{line="roof"} 1.0\n' in served.get("/metrics").body.decode())
+            until(lambda: not gateway.hub.unopened)
+            assert served.get("/health").json["status"] == "ok"
+
+
+@pytest.mark.slow
+def test_reason_of_a_port_lost_later_is_reported(tmp_path: Path) -> None:
+    port = tmp_path / "hall"
+    plant = written(tmp_path, SERVE, port=str(port))
+    gateway = Gateway(plant, read_settings(plant, {}))
+    with ExitStack() as stack:
+        with Simulator([Wire([simulated(InvtCHE(1, baudrate=38400))], unpaced=True, port=str(port))]):
+            stack.enter_context(running(gateway))
+            served = Served(gateway, {}, tokens()[0])
+            served.await_state("pump-1", "stands")
+        told = {"hall": f"{port}: there is no such port"}
+        until(lambda: served.get("/health").json["lines"] == told)
+        until(lambda: gateway.status == "STATUS=polling 0 lines; 1 lost")
+        assert served.get("/health").json["status"] == "degraded"
+
+
+def test_an_invalid_port_leaves_no_socket_open(tmp_path: Path) -> None:
+    plant = written(tmp_path, SERVE)
+    plant = replace(plant, lines=(plant.lines[0].at("nosuch://port"),))  # invalid in a plant file
+    gateway = Gateway(plant, read_settings(plant, {}))
+    with pytest.raises(ValueError, match="nosuch"), running(gateway):
+        pass
+    assert gateway.listener.fileno() == -1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -86,10 +87,10 @@ verbs = ["pump-1.fly"]
 """
     found = mistakes(tmp_path, serve)
     expected = [
-        "[serve]: unknown key 'nmaes'; did you mean 'names'?",
-        "[serve]: unknown key 'mqqt'; did you mean 'mqtt'?",
+        "[serve]: unknown key 'nmaes'; did you mean names?",
+        "[serve]: unknown key 'mqqt'; did you mean mqtt?",
         "[serve]: behind_proxy = 'yes' is not right; write behind_proxy = true",
-        '[serve]: listen = "everywhere" is not an address and port; write listen = "127.0.0.1:8750"',
+        '[serve]: "everywhere" is not an address and port; write listen = "127.0.0.1:8750"',
         "[serve]: names: 'http://plant.example/' is not a host name; write names = [\"plant.example\"], "
         "without a port",
         f"[serve]: certificate {tmp_path}/cert.pem cannot be read: No such file or directory",
@@ -103,7 +104,7 @@ verbs = ["pump-1.fly"]
         "[serve.may]: write: 'setpoint' is not right; write write = [\"pump-1.frequency_setpoint\"]",
         "[serve.may]: write: pump-1.setpint: INVT CHE has no register 'setpint'; did you mean setpoint or "
         "pid_setpoint?",
-        "[serve.may]: verbs: pump-1 has no verb 'fly' that a list allows; it has start, jog, reset_fault, "
+        "[serve.may]: verbs: pump-1 has no verb 'fly' for this list; choose from start, jog, reset_fault, "
         "set_frequency, coast",
         f"[serve]: audit {tmp_path}/no/such/folder/audit.jsonl cannot be written: No such file or directory",
     ]
@@ -141,7 +142,7 @@ def test_a_pattern_allows_only_drives_that_have_the_register(tmp_path: Path) -> 
     assert found.write == {"pump-1.setpoint", "pump-2.setpoint"}
 
 
-def test_a_drive_whose_name_has_a_star_is_meant_by_its_own_name(tmp_path: Path) -> None:
+def test_an_entry_equal_to_a_drive_name_with_a_star_allows_only_that_drive(tmp_path: Path) -> None:
     plant = written(tmp_path, '[serve.may]\nverbs = ["p*.start"]\n', "p*", "pump-1")
     assert read_settings(plant, {}).may.verbs == {"p*.start"}
 
@@ -150,16 +151,19 @@ def test_a_drive_whose_name_has_a_star_is_meant_by_its_own_name(tmp_path: Path) 
     ("may", "sentence"),
     [
         ('verbs = ["fan-?.start"]', "there is no drive 'fan-?'; did you mean fan-1"),
-        ('verbs = ["pump-1.*"]', "pump-1 has no verb '*' that a list allows; it has start, "),
-        ('verbs = ["*.stop"]', "*.stop allows nothing: fan-1 has no verb 'stop' that a list allows; it has "),
-        ('verbs = ["Pump-*.start"]', "Pump-*.start allows nothing: there is no drive 'Pump-*'"),
+        ('verbs = ["pump-1.*"]', "pump-1 has no verb '*' for this list; choose from start, "),
+        (
+            'verbs = ["*.stop"]',
+            "*.stop matches no register or verb: fan-1 has no verb 'stop' for this list",
+        ),
+        ('verbs = ["Pump-*.start"]', "Pump-*.start matches no register or verb: there is no drive 'Pump-*'"),
         ('write = ["*.output_current"]', "fan-1.output_current is never written: it can only be read"),
         ('write = ["*"]', "'*' is not right; write write = "),
         (
             'family.yd1000 = { verbs = ["start"] }',
             "family yd1000: no drive has this model; the plant has invt-che",
         ),
-        ('family.invt-che = { verbs = ["pump-1.start"] }', "has no verb 'pump-1.start' that a list allows"),
+        ('family.invt-che = { verbs = ["pump-1.start"] }', "has no verb 'pump-1.start' for this list"),
         ('family.invt-che = { look = ["token"] }', "family invt-che: unknown key 'look'"),
         ('family.invt-che = ["start"]', "family invt-che: ['start'] is not a table with write, verbs"),
     ],
@@ -250,6 +254,104 @@ def test_mismatched_or_invalid_certificates_are_reported(
     paths = [certificates / name for name in pair]
     (only,) = mistakes(tmp_path, f'[serve]\ncertificate = "{paths[0]}"\nkey = "{paths[1]}"\n')
     assert only == f"[serve]: certificate {paths[0]} and key {paths[1]} {why}"
+
+
+@table(
+    ("keys", "sentences"),
+    [
+        ('pre = "5 s"', ["conditions is missing; add conditions = { trip = "]),
+        (
+            'post = "5"\nconditions = { a = 3, "\\u0007" = "fault" }',
+            [
+                "post = '5' is not a duration",
+                "a = 3 is not a condition",
+                "a trigger's name has 1 to 60 printable",
+            ],
+        ),
+        (
+            'conditions = { a = "output_current > 30", b = "pump-1.outptu_current > 3" }',
+            [
+                "output_current > 30: output_current has no drive; write it as pump-1.output_current",
+                "pump-1.outptu_current > 3: column 1: ",
+            ],
+        ),
+    ],
+)
+def test_mistakes_in_triggers_are_reported(tmp_path: Path, keys: str, sentences: list[str]) -> None:
+    found = mistakes(tmp_path, f"[serve.trigger]\n{keys}\n")
+    assert len(found) == len(sentences)
+    for sentence in sentences:
+        assert any(one.startswith(f"[serve.trigger]: {sentence}") for one in found), found
+
+
+@table(
+    ("serve", "sentence"),
+    [
+        (
+            '[serve.modbus]\nlisten = "127.0.0.1:8750"',
+            "[serve.modbus]: listen: port 8750 is in use by listen of [serve]",
+        ),
+        (
+            '[serve]\nlisten = "localhost:4840"\n[serve.opcua]',
+            "[serve.opcua]: listen: port 4840 is in use by listen of [serve]",
+        ),
+        (
+            '[serve]\nbehind_proxy = true\nlisten = "0.0.0.0:1503"\n[serve.modbus]\nports = { hall = 1503 }',
+            "[serve.modbus]: ports.hall: port 1503 is in use by listen of [serve]",
+        ),
+        (
+            '[serve.modbus]\n[serve.tool]\nclients = ["::1"]\nrtu = { hall = "[::]:1502" }',
+            "[serve.tool]: rtu.hall: port 1502 is in use by listen of [serve.modbus]",
+        ),
+    ],
+)
+def test_a_port_that_two_interfaces_would_open_is_reported(tmp_path: Path, serve: str, sentence: str) -> None:
+    assert mistakes(tmp_path, f"{serve}\n") == [f"{sentence}; choose another port"]
+
+
+def test_an_address_on_a_port_that_two_interfaces_use_is_reported_once(tmp_path: Path) -> None:
+    serve = '[serve.modbus]\nlisten = "127.0.0.1:8750"\n[serve.opcua]\nlisten = "127.0.0.1:8750"\n'
+    in_use = "listen: port 8750 is in use by listen of [serve]; choose another port"
+    assert mistakes(tmp_path, serve) == [f"[serve.modbus]: {in_use}", f"[serve.opcua]: {in_use}"]
+
+
+def test_interfaces_may_use_one_port_number_on_different_addresses(tmp_path: Path) -> None:
+    serve = '[serve]\nlisten = "{}"\n[serve.modbus]\nlisten = "{}"\nclients = ["::1"]\n'
+    for page, modbus in (("127.0.0.1", "127.0.0.2"), ("[::1]", "127.0.0.1"), ("[::1]", "0.0.0.0")):
+        read_settings(written(tmp_path, serve.format(f"{page}:1502", f"{modbus}:1502")), {})
+    read_settings(written(tmp_path, serve.format("127.0.0.1:0", "127.0.0.1:0")), {})
+
+
+@table(
+    ("serve", "library", "extra"),
+    [
+        ("[serve.opcua]", "asyncua", "opcua"),
+        ("[serve.mqtt]", "paho", "mqtt"),
+        ("[serve.mqtt]\nrows = true", "pyarrow", "parquet"),
+        ("[serve.notify]", "apprise", "notify"),
+    ],
+)
+def test_a_missing_library_of_an_interface_is_reported(
+    tmp_path: Path, serve: str, library: str, extra: str
+) -> None:
+    (tmp_path / "targets").write_text("ntfy://alarms\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, library, None)
+        (only,) = mistakes(tmp_path, f"{serve}\n")
+    start = f"{serve.split()[0]}: it needs {library}, which is not installed: pip install "
+    assert only.startswith(start)
+    assert f"multidrop[{extra}]" in only
+
+
+@table("host", ["pump 1", "10.0.0", "10.0.0.256", "10.0.0.5:1502", "http://plant", "[10.0.0.5]x", "[::1"])
+def test_an_invalid_host_in_an_address_is_reported(tmp_path: Path, host: str) -> None:
+    tables = '[serve]\nlisten = "{0}"\n[serve.opcua]\nlisten = "{0}"\n[serve.modbus]\nlisten = "{0}"\n{1}\n'
+    clients = 'clients = ["::1"]\n[serve.tool]\nclients = ["::1"]\nrtu = {{ hall = "{0}" }}'
+    found = mistakes(tmp_path, tables.format(f"{host}:80", clients.format(f"{host}:80")))
+    assert [one.split(": ")[0] for one in found] == [
+        *("[serve]", "[serve.modbus]", "[serve.opcua]", "[serve.tool]"),
+    ]
+    assert all(f'"{host}:80" is not an address and port; write ' in one for one in found)
 
 
 def test_certificate_without_its_key_is_reported(tmp_path: Path, certificates: Path) -> None:

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import ast
 import asyncio
+import re
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from examples import usually
 from gateways import Served, running, served, simulated_plant
-from lines import until
+from lines import PATIENCE, until
 from peers import require_module
 
 import multidrop.gateway
 from multidrop import Plant, Poller
-from multidrop.gateway import historian
+from multidrop.gateway import historian, notifications
+from multidrop.gateway.forward import forwarder
 from multidrop.gateway.gateway import Gateway
+from multidrop.gateway.live.alarms import FAULT, Alarm
 from multidrop.gateway.settings import ServeSettings
 from multidrop.supervisor import Hung, Supervisor, in_time, supervisor
 
@@ -36,17 +40,19 @@ broker = "mqtt://127.0.0.1:9"
 [serve.fleet]
 nats = ["nats://127.0.0.1:9"]
 """
-TASKS = {"web", "polling", "statistics", "identities", "fleet", "history", "modbus", "mqtt"}
+TASKS = {"web", "polling", "statistics", "identities", "alarms", "fleet", "history", "modbus", "mqtt"}
+ALARM = Alarm(1_000, "pump-1", "overcurrent", None, FAULT)
 THREADS = {"multidrop poller", "multidrop history", "paho-mqtt-client"}
 
 
 def test_no_other_module_of_the_gateway_starts_a_task_or_a_thread() -> None:
+    root = Path(multidrop.gateway.__file__).parent
     found = set()
-    for path in Path(multidrop.gateway.__file__).parent.glob("*.py"):
+    for path in root.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in STARTERS:
-                found.add(path.name)
-    assert found == set()
+                found.add(path.relative_to(root).as_posix())
+    assert found == {"opcua/server.py"}  # the OPC UA server cancels its task when it closes
 
 
 # ---- tasks and threads of a gateway ----
@@ -86,8 +92,8 @@ def test_gateway_has_only_the_listed_tasks_and_threads(gateway: Served) -> None:
     assert there == THREADS
 
 
-@pytest.mark.parametrize("name", sorted(TASKS - {"web"}))
-def test_killed_task_makes_health_fail_but_stops_work(
+@pytest.mark.parametrize("name", usually("polling", *sorted(TASKS - {"web", "polling"})))
+def test_after_the_kill_of_a_task_health_fails_but_stops_are_still_sent(
     gateway: Served, name: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert dead(gateway) == {}
@@ -97,7 +103,7 @@ def test_killed_task_makes_health_fail_but_stops_work(
     assert all(one["done"] for one in gateway.post("/api/stop").json.values())
 
 
-def test_failing_poller_makes_health_fail_but_stops_work(
+def test_if_the_poller_fails_health_fails_but_stops_are_still_sent(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail() -> None:
@@ -135,10 +141,11 @@ def test_a_thread_of_the_history_that_ends_makes_health_fail(
     part._writer._compactor.end()
 
 
+@pytest.mark.long
 def test_a_thread_of_the_broker_s_connection_that_ends_makes_health_fail(gateway: Served) -> None:
     part: Any = gateway.gateway.feeds["mqtt"]
-    part._brokers[0]._client.disconnect()  # without a request by the gateway
-    until(lambda: dead(gateway) == {"mqtt": "RuntimeError: the thread of its connection has ended"})
+    part._brokers[0]._client.disconnect()  # the gateway has not requested this disconnect
+    until(lambda: dead(gateway) == {"mqtt": "RuntimeError: the thread of the broker's connection has ended"})
 
 
 def test_a_watched_thread_that_ends_makes_health_fail(gateway: Served) -> None:
@@ -156,6 +163,109 @@ def test_gateway_ends_if_its_web_server_ends(tmp_path: Path) -> None:
         with ended, running(gateway) as loop:
             in_loop(loop, lambda found: found.kept["web"].cancel())
             until(lambda: gateway.listener.fileno() < 0)
+
+
+# ---- a gateway with all parts: no task and no thread is missing in these lists ----
+
+ALL_PARTS = f"""
+[[line.drive.channel]]
+name = "starts"
+value = "count(output_frequency > 1)"
+{PARTS}
+[serve.opcua]
+listen = "127.0.0.1:0"
+[serve.notify]
+[serve.upload]
+url = "http://127.0.0.1:9/rows"
+[serve.influx]
+url = "http://127.0.0.1:9/write?db=plant"
+[serve.postgres]
+database = "host=127.0.0.1 port=9 connect_timeout=1"
+[serve.tool]
+pty = {{ hall = "tool" }}
+[serve.trigger]
+conditions = {{ trip = "fault" }}
+"""
+ALL_TASKS = {*TASKS, "opcua", "notify", "upload", "influx", "postgres", "tool", "trigger"}
+OTHER_TASKS = {"end", "fleet: ServerPath.keep", "fleet: FleetWatch.run", "main of the test"}
+# Threads that end at an exception, and threads that continue after one.
+ENDING = {"alarms", "target", "upload rows", "influx rows", "postgres rows", "opcua server"}
+CONTINUING = {"history", "spool", "totals"}
+# Threads of libraries, and the poller's thread (tests/polling/test_failures.py).
+OTHER_THREADS = {"paho-mqtt-client", "multidrop poller", "multidrop-sim", "gateway under test"}
+POSSIBLE_THREADS = {"multidrop log", "asyncio"}  # started when something is logged, or a name is looked up
+
+
+def names_of_threads(before: set[threading.Thread]) -> set[str]:
+    """Return the names of all threads that were not there before, without numbers and addresses."""
+    names = {
+        re.sub(r"(_\d+| http://.*|-multidrop/.*)$", "", one.name) for one in {*threading.enumerate()} - before
+    }
+    return names - POSSIBLE_THREADS
+
+
+def names_of_tasks(loop: asyncio.AbstractEventLoop) -> set[str]:
+    """Return the names of a loop's tasks, or of their functions if they have no name."""
+    tasks = asyncio.all_tasks(loop)
+    return {
+        re.sub(r"^Task-\d+$", getattr(task.get_coro(), "__qualname__", ""), task.get_name()) for task in tasks
+    }
+
+
+@pytest.mark.slow
+def test_each_thread_and_task_of_all_parts_is_listed_and_reported_if_it_ends(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for library in ("paho.mqtt.client", "nats", "asyncua", "psycopg", "pyarrow"):
+        require_module(library)
+    (tmp_path / "targets").write_text("http://127.0.0.1:9/hook\n")
+    for module in (forwarder, notifications):
+        monkeypatch.setattr(module, "MOST_RETRY_S", 0.1)
+
+    def fail(*details: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    before = {*threading.enumerate()}
+    with served(tmp_path, ALL_PARTS) as gateway, pytest.MonkeyPatch.context() as broken:
+        parts: Any = gateway.gateway.feeds
+        until(lambda: parts["opcua"].is_ready)
+        listed = {f"multidrop {name}" for name in (*ENDING, *CONTINUING)} | OTHER_THREADS
+        until(lambda: names_of_threads(before) == listed)
+        assert in_loop(gateway.loop, lambda found: set(found.kept)) == ALL_TASKS
+        until(lambda: names_of_tasks(gateway.loop) == ALL_TASKS | OTHER_TASKS)
+
+        totals: Any = gateway.gateway.poller._added._totals  # type: ignore[union-attr]
+        with pytest.MonkeyPatch.context() as briefly:
+            briefly.setattr(parts["history"]._writer, "_write_waiting", fail)
+            briefly.setattr(parts["influx"]._spool, "_write_due_rows", fail)
+            parts["influx"]._spool.sync(0.01)
+            totals.write({"what JSON does not have": totals})
+            sentences = ("the history's thread continues", "writing the spool", "totals are not kept")
+            until(lambda: all(sentence in caplog.text for sentence in sentences))
+        totals.write({"kept": 1})
+        until(lambda: "kept" in totals.read())
+        assert parts["influx"]._spool.sync(PATIENCE)
+        assert dead(gateway) == {}
+
+        alarms, sender = gateway.gateway.alarm_file, parts["notify"]._senders[0]
+        forwarders = {name: parts[name]._forwarder for name in ("upload", "influx", "postgres")}
+        broken.setattr(alarms, "_write", fail)
+        for one in (sender, *forwarders.values()):
+            broken.setattr(one, "step", fail)
+        broken.setattr(parts["opcua"]._opened[2], "write", fail)
+        for note in (alarms.note, sender.put):  # type: ignore[union-attr]
+            note(ALARM)
+        killed = {"alarms", "notify", "opcua", *forwarders}
+        until(lambda: dead(gateway) == dict.fromkeys(killed, "ZeroDivisionError: a bug"))
+        for name in killed:
+            assert f"{name} has ended, and does not come back: ZeroDivisionError: a bug" in caplog.text
+        newest = gateway.get("/health").json["newest_row"]
+        until(lambda: gateway.get("/health").json["newest_row"] > newest)
+
+        others = ALL_TASKS - killed - {"web"}
+        in_loop(gateway.loop, lambda found: [found.kept[name].cancel() for name in others])
+        until(lambda: dead(gateway).keys() == ALL_TASKS - {"web"})
+        assert all(one["done"] for one in gateway.post("/api/stop").json.values())
 
 
 # ---- the supervisor alone ----
@@ -189,7 +299,7 @@ def test_task_that_is_started_again_is_no_longer_reported_as_dead() -> None:
 
 
 @pytest.mark.parametrize("failure", [ValueError("no"), SystemExit("no"), StopIteration("no")])
-async def test_within_raises_the_errors_of_the_work(failure: BaseException) -> None:
+async def test_within_raises_the_errors_of_the_function_it_runs(failure: BaseException) -> None:
     def work() -> None:
         raise failure
 
@@ -204,7 +314,7 @@ async def test_hanging_work_raises_hung_and_is_reported_until_work_succeeds() ->
         await threads.within("history", 0.01, go_on.wait)
     assert await threads.within("other", 60, lambda: 3) == 3
     assert list(threads.hung) == ["history"]
-    with pytest.raises(Hung, match="history: 1 others are not done"):
+    with pytest.raises(Hung, match="history: 1 earlier tasks of this name are not done"):
         await threads.within("history", 0.01, go_on.wait, most=1)
     assert threads.under_way == ["history"]
     assert await threads.within("history", 60, lambda: 4) == 4  # the disk answers again

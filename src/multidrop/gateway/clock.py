@@ -1,4 +1,6 @@
-"""Clocks: CLOCK_MONOTONIC, which dates polled rows; CLOCK_BOOTTIME, which includes sleep; and UTC."""
+"""Clocks: the monotonic clock, which gives polled rows their times; the boot-time clock, which also runs
+while the computer sleeps; and UTC.
+"""
 
 from __future__ import annotations
 
@@ -8,30 +10,30 @@ from datetime import UTC, datetime
 if hasattr(time, "CLOCK_MONOTONIC"):
 
     def monotonic_ns() -> int:
-        """Return the time of CLOCK_MONOTONIC, which dates polled rows, in ns."""
+        """Return the time of CLOCK_MONOTONIC in ns. Polled rows have times of this clock."""
         return time.clock_gettime_ns(time.CLOCK_MONOTONIC)
 
 else:
 
     def monotonic_ns() -> int:
-        """Return the monotonic time, which dates polled rows, in ns."""
+        """Return the monotonic time in ns. Polled rows have times of this clock."""
         return time.monotonic_ns()
 
 
 if hasattr(time, "CLOCK_BOOTTIME"):
 
     def boottime_ns() -> int:
-        """Return the time of CLOCK_BOOTTIME, which includes the computer's sleep, in ns."""
+        """Return the time of CLOCK_BOOTTIME, which also runs while the computer sleeps, in ns."""
         return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
-else:  # on macOS and Windows the monotonic clock includes sleep
+else:  # on macOS and Windows the monotonic clock itself runs while the computer sleeps
     boottime_ns = monotonic_ns
 
 
 def now_and_slept_ns() -> tuple[int, int]:
-    """Return the monotonic time and the computer's total time asleep since its boot, both in ns.
+    """Return the monotonic time and the total time that the computer has slept since its boot, both in ns.
 
-    The boot-time clock is read first, so that a pause between the two reads never counts as sleep.
+    Reads the boot-time clock first, so that a pause between the two reads never counts as sleep.
     """
     booted_ns = boottime_ns()
     now_ns = monotonic_ns()

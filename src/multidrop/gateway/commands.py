@@ -1,4 +1,4 @@
-"""Commands: check and carry out everything that is written through the gateway, over every interface.
+"""Commands: check and carry out the writes and verbs that arrive over the gateway's interfaces.
 
 The caller's role, the plant file's lists and the library's own rules must allow a command. A stop needs only
 the role, and does not wait for other commands.
@@ -11,7 +11,7 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from math import inf
 from typing import Any, NamedTuple, Protocol, TypeVar
@@ -39,13 +39,16 @@ from multidrop.gateway.http.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTE
 from multidrop.plant import drive_meant
 from multidrop.supervisor import supervisor
 
-MOST_AGE_S = 5.0  # an older write or verb, such as one that a network delayed, is refused; stops never are
-LOOK_S = 0.02  # during a reload: interval of checking for changed drives that must be stopped again
+MOST_AGE_S = 5.0  # writes and verbs that a network delayed longer are refused; stops are not
+LOOK_S = 0.02  # during a reload: interval between checks for replaced drives, which must be stopped again
 MOST_WRITES = 8  # limit of concurrent writes on one line; stops are not counted
-BUSY = "too many writes are under way"  # a value of WriteForbidden.rule
-UNAUDITED = "the audit log cannot be written"  # a value of WriteForbidden.rule
-OVERTAKEN = "a stop was called"  # a value of WriteForbidden.rule
-WAYS_WITHOUT_VERBS = frozenset({"modbus"})
+MOST_STOPS = 8  # limit of concurrent stops of a drive from one interface
+# Values of WriteForbidden.rule.
+BUSY = "too many writes are under way"
+UNAUDITED = "the audit log cannot be written"
+OVERTAKEN = "a stop was called"
+
+WAYS_WITHOUT_VERBS = frozenset({"modbus", "tool"})
 
 # A function that takes a command's text and returns the deadline for sending the command (CLOCK_BOOTTIME,
 # ns). It raises WriteForbidden if the command must not be sent.
@@ -105,9 +108,9 @@ class Commands:
         self, lines: PolledLines, may: May, on_reset: Callable[[str], object] = lambda drive: None
     ) -> None:
         self.may = may
-        self.withheld = ""  # why all commands except stops are refused now; "": they are allowed
+        self.withheld = ""  # why all commands except stops are refused now; "" if commands are accepted
         self._on_reset = on_reset
-        self._halts: Counter[str] = Counter()  # by drive: commands, besides stops, that can end a run
+        self._halts: Counter[str] = Counter()  # by drive: commands other than stops that can end a run
         self._jogging: Counter[str] = Counter()  # by drive: jogs in progress
         self._lines = lines
         self.called = 0  # number of admitted commands so far
@@ -116,11 +119,12 @@ class Commands:
         self._stopped_ns: dict[str, int] = {}  # by drive: when its latest stop was called (CLOCK_BOOTTIME)
         self._repeated = {verb: RepeatedStops(partial(stop_drive_by, verb)) for verb in STOPPING}
         self._repeated["stop"] = RepeatedStops()
-        self._ended_ns: dict[str, int] = {}  # by drive: when its latest command ended (CLOCK_MONOTONIC)
+        # by drive: when its latest command, including stops, ended (CLOCK_MONOTONIC)
+        self._ended_ns: dict[str, int] = {}
         self.plant_ns: int | None = None  # when the plant file was last reloaded (CLOCK_BOOTTIME)
 
     def note_reload(self) -> None:
-        """Record the time of a reload: from now on, the name of a drive may mean another drive."""
+        """Record the time of a reload: a drive's name in an older command may mean another drive now."""
         self.plant_ns = boottime_ns()
 
     def ended_ns(self, drive: str) -> int:
@@ -152,11 +156,11 @@ class Commands:
     # ---- stops ----
 
     async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, CommandResult]:
-        """Stop these drives, or all with None; return the result of each.
+        """Stop these drives, or all drives if `drives` is None; return the result of each.
 
         All stops run concurrently, and a failed stop does not end the others. Only the caller's role is
-        checked. If a reload changes a drive during its stop, the drive is stopped again under its new
-        configuration.
+        checked. If a reload changes a drive while it is being stopped, the drive is stopped again under
+        its new configuration.
         """
         if caller.role < Right.STOP:
             wanted = drives_of(self._lines.plant) if drives is None else drives
@@ -179,7 +183,7 @@ class Commands:
     async def _stop_by(
         self, verb: str, lines: Sequence[LineStop], wanted: Iterable[str], caller: Caller
     ) -> dict[str, CommandResult]:
-        """Stop the drives of these lines by a verb; return a result for each wanted name."""
+        """Stop the wanted drives of these lines by a verb; return a result for each wanted name."""
         names = [drive.name for line in lines for drive in line.drives]
         self._note_stop(names)
         with _written_by(caller):
@@ -219,7 +223,7 @@ class Commands:
     ) -> CommandResult:
         """Carry out a verb once; all verbs but "stop" must be listed in the plant file.
 
-        Callers over Modbus are refused, because no person confirms their commands.
+        Callers over Modbus and tool ports are refused, because no person confirms their commands.
         """
         drive = drive_meant(drive, names_of(self._lines)) if verb in STOPPING else drive
         what = f"{drive}.{verb}"
@@ -255,6 +259,12 @@ class Commands:
             self._on_reset(drive)
         return result
 
+    def note_refused(self, line: str, drive: str, what: str, why: str, caller: Caller) -> None:
+        """Record in the audit log a write that the Modbus server or a tool port refused."""
+        _log.warning("%s: %s, asked for by %s: %s", drive, what, caller.by, why)
+        with _written_by(caller), suppress(ValueError):  # raised if a reload has removed the line
+            self._lines.bus(line).note_refused(drive, what, why)
+
     def _moves(self, drive: str, register: str) -> bool:
         """Return True for a register whose writes may start or stop the motor."""
         known = drives_of(self._lines.plant).get(drive)
@@ -278,7 +288,7 @@ class Commands:
     ) -> CommandResult:
         try:
             line, known = self._lines.plant.find_drive(drive)
-        except ValueError:  # the drive is only in the plant of a reload in progress
+        except ValueError:  # the drive is only in the plant that a reload is about to put into use
             return _refused(UnknownDrive(drive))
         if self.withheld:
             return _refused(WriteForbidden(f"{what} was not sent: {self.withheld}", rule=UNAUDITED))
@@ -293,7 +303,9 @@ class Commands:
         stops = self.stops[drive]
 
         def limit_ns() -> float:
-            """Return the deadline for sending the command (CLOCK_MONOTONIC, ns); 0 once a stop was called."""
+            """Return the deadline for sending the command (CLOCK_MONOTONIC, ns); 0 if a stop was called in
+            the meantime.
+            """
             return until_ns - boottime_ns() + monotonic_ns() if self.stops[drive] == stops else 0
 
         def why_not() -> CommandResult | None:
@@ -317,7 +329,10 @@ class Commands:
 
 @contextmanager
 def _written_by(caller: Caller) -> Iterator[None]:
-    """Name the caller in the audit log; log each command before it is sent, unless it is a stop."""
+    """Within the block, audit entries name the caller.
+
+    The first entry of each command, except a stop, is written before the command is sent.
+    """
     name, way = _printable(caller.name), _printable(f"{caller.way} from {caller.address}")
     with written_by(name or "anyone", way, caller.command), noted_first():
         yield
@@ -331,7 +346,7 @@ def _printable(text: str) -> str:
 
 
 class StopEnd(Protocol):
-    """The result of a stop, such as CommandResult."""
+    """The result of a stop. CommandResult has these attributes."""
 
     @property
     def ok(self) -> bool: ...
@@ -345,7 +360,7 @@ def drives_of(plant: Plant) -> dict[str, Drive]:
 
 
 def names_of(lines: PolledLines) -> set[str]:
-    """Return the names of all drives of the present plant, and of the new plant during a reload."""
+    """Return the names of all drives of the present plant. During a reload, add those of the new plant."""
     return {*drives_of(lines.plant_now), *drives_of(lines.plant_coming or lines.plant_now)}
 
 
@@ -357,8 +372,9 @@ async def stop_meant(
     """Stop the drives with these names, or all if None; return the result of each drive's latest stop.
 
     Names may have another spelling (see `drive_meant`). `stop` is called with the present plant and the
-    names. If a reload changes a drive before all stops have ended, that drive is stopped again as soon as it
-    is attached. If a stop failed and lines have changed since, the drive is stopped once more at the end.
+    names. If a reload changes a drive before all stops have ended, that drive is stopped again as soon as
+    it is attached. If a drive's stop failed and the plant's lines have changed since the first stop, the
+    drive is stopped once more after the other stops.
     """
     known = names_of(lines)
     meant = {name: drive_meant(name, known) for name in drives or ()}

@@ -11,7 +11,6 @@ from collections.abc import Awaitable, Callable, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
-from math import inf
 from typing import Any
 
 import uvicorn
@@ -21,6 +20,7 @@ from multidrop import Bus, LineError, Plant, Poller
 from multidrop.control import Ledger
 from multidrop.gateway.clock import boottime_ns, now_and_slept_ns, utc_ms
 from multidrop.gateway.commands import Commands
+from multidrop.gateway.fleet_stops import FleetStops
 from multidrop.gateway.http.connections import BACKLOG, Connections, Watched, WatchedProtocol, listen
 from multidrop.gateway.http.guard import MOST_HEAD
 from multidrop.gateway.http.rights import OwnNames, Tokens
@@ -40,13 +40,14 @@ from multidrop.gateway.sd_notify import Notifier
 from multidrop.gateway.settings import AUDIT_S, ServeSettings, check_writable
 from multidrop.supervisor import Hung, in_time, supervisor
 
-TAKE_S = 0.1  # time between two deliveries of rows by the poller: half the time between frames
-LOOK_S = 0.2  # time between checks for alarms; a frame follows each check
+TAKE_S = 0.1  # interval of taking rows from the poller: half of LOOK_S
+LOOK_S = 0.2  # interval of checks for alarms; after each check, the pages get a frame of values
 TICK_S = 1.0  # interval of reading statistics
 LOG_S = 60.0  # interval of log lines about a part that keeps failing
 RESTORE_S = 2.0  # how long to wait for the alarms of earlier runs
-MOST_ASKED = 16  # limit of concurrent requests for registers outside the drives' tables
-ASKED_S = 30.0  # time limit of one such request
+FLEET_LATE_S = 2.0  # how long rows of a fleet may take to arrive
+MOST_ASKED = 16  # limit of concurrent requests for registers that are not declared in the drives' tables
+ASKED_S = 30.0  # time limit of one request for a register that is not declared
 END_S = 4.0  # time limit of shutdown, stops included
 GRACE_S = 1  # part of END_S for finishing HTTP requests in flight
 
@@ -56,8 +57,8 @@ _log = logging.getLogger("multidrop.gateway")
 class Gateway:
     """A polled plant and its interfaces.
 
-    Raises ValueError or OSError if an interface cannot be opened, and then closes the others. A missing port
-    of a line raises no error: the line counts as lost, and its port is retried.
+    Raises ValueError or OSError if an interface cannot be opened, after closing the other interfaces. A
+    missing port of a line raises no error: the line counts as lost, and its port is retried.
     """
 
     clock = staticmethod(time.monotonic)
@@ -68,27 +69,27 @@ class Gateway:
         self.plant = plant
         self.settings = settings
         self.version = multidrop.__version__
-        self.revision = secrets.randbits(32)  # version of the plant: random at first, plus 1 for each reload
+        self.revision = secrets.randbits(32)  # version of the plant: random at the start, +1 at each reload
         self.failures: dict[str, int] = {}
         self.audit = settings.audit
-        self.unaudited = ""  # why the audit log is not written; "": it is written
+        self.unaudited = ""  # why the audit log is not written; "" if it is written
         self.parts = LiveParts(self)
         self.feeds = self.parts.feeds
         self.guard_clock: Callable[[], float] = self.clock
         self._logged: dict[str, float] = {}
         self.begun = self.clock()
         self._looked = 0.0
-        self._has_news = False  # a frame is due
+        self._has_news = False  # True: something has changed since the newest frame
         self.ledger = ledger or Ledger()
         self.poller: Poller | None = None  # None before polling starts
-        self._made: Poller | None = None  # the same object as `poller`, but set before polling starts
+        self._made: Poller | None = None  # the same poller, set before it starts
         self._end = asyncio.Event()
         self.listener = listen(settings.host, settings.port)
         self.connections = self.listener.connections = Connections(self.clock)
         self.port: int = self.listener.getsockname()[1]
         self.own_names = OwnNames(settings.names, settings.host, self.port)
         self.tokens = Tokens(settings.tokens)
-        self.hub = Hub(plant, now_and_slept_ns)
+        self.hub = Hub(plant, now_and_slept_ns, late_s=0.0 if plant.lines else FLEET_LATE_S)
         self.limits = Limits(settings.limits)
         self.alarms = Alarms(utc_ms(), self._note_alarm)
         self.alarm_file = AlarmFile(settings.alarms) if settings.alarms else None
@@ -96,7 +97,11 @@ class Gateway:
         self.recent = RecentStatistics(plant)
         self.notifier = Notifier()
         self.reload = Reload(self, read)
-        self.commands = Commands(self, settings.may, lambda drive: self.hub.note_reset(drive))
+        self.commands = (
+            Commands(self, settings.may, lambda drive: self.hub.note_reset(drive))
+            if plant.lines
+            else FleetStops(self, settings.may, lambda: self.feeds.get("fleet"))
+        )
         self.seen_frames = SeenFrames(boottime_ns, self.commands)
         self.frames = Frames(self._frame, self.clock, begin=secrets.randbits(48))
         self.side_reads = SideReads(self.bus, self._is_there, self.clock, utc_ms)
@@ -110,15 +115,15 @@ class Gateway:
     async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
         """Poll and serve until `end` is called; then return within END_S, even if a disk hangs.
 
-        If an exception interrupts it, polling is ended before the exception propagates. Raises RuntimeError
-        if the web server ends by itself.
+        If an exception interrupts `run`, polling is ended before the exception propagates. Raises
+        RuntimeError if the web server ends by itself.
         """
         try:
             await self._run(on_ready)
         except BaseException:
             self.listener.close()
             if self._made is not None:
-                with suppress(Exception):  # any failure is logged already
+                with suppress(Exception):  # any failure was logged before
                     in_time("polling", END_S, self._made.close)
             raise
 
@@ -128,12 +133,11 @@ class Gateway:
         end = supervisor().start("end", self._end.wait())
         try:
             if self.alarm_file is not None:
-                keeping = supervisor().thread("alarms", inf, self.alarm_file.run)
-                supervisor().watch("alarms", lambda: not keeping.done())
+                supervisor().keep_thread("alarms", self.alarm_file.run)
             await self.parts.build(self.settings.parts, self.plant)
             await self._find_audit()
-            poller = self._made = Poller(nothing, ledger=self.ledger, audit=self.audit)
-            self.poller = poller.__enter__()  # `_close` closes it in a thread, because that may take long
+            poller = self._made = self._source() or Poller(nothing, ledger=self.ledger, audit=self.audit)
+            self.poller = poller.__enter__()  # `_close` closes it in a thread, because closing may take long
             adopting = supervisor().thread("adoption", ADOPTION_S, partial(poller.adopt, self.plant))
             either: set[asyncio.Future[Any]] = {end, adopting}
             await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
@@ -158,6 +162,19 @@ class Gateway:
             end.cancel()
             await self._close(server)
 
+    def _source(self) -> Any:
+        """Return the source of the fleet's lines if the plant file has no lines, else None.
+
+        Raises OSError if the part `fleet`, which has this source, is not built yet.
+        """
+        if self.plant.lines:
+            return None
+        source = self.parts.source()
+        if source is None:
+            raise OSError("[serve.fleet]: its files cannot be read yet, and the plant file has no lines")
+        source.on_change = partial(self.reload.begin, "the fleet")
+        return source
+
     async def _close(self, server: _Server) -> None:
         """Shut down within END_S; log and abandon work that hangs."""
         ends = self.clock() + END_S
@@ -178,6 +195,7 @@ class Gateway:
             self.guarded("hub", self.hand_out, self.poller)  # rows received during shutdown
         await self._end_of("parts", left_s(0.2), self.parts.close(left_s(0.4)))
         if self.alarm_file is not None:
+            supervisor().let_go("alarms")
             await self._end_of(
                 "alarms", left_s(0.1), supervisor().within("alarm file", END_S, self.alarm_file.close)
             )
@@ -220,7 +238,7 @@ class Gateway:
             Watched(make_app(self), self.connections),
             backlog=BACKLOG,
             http=WatchedProtocol,
-            h11_max_incomplete_event_size=MOST_HEAD,  # limit of a request's head that arrives in pieces
+            h11_max_incomplete_event_size=MOST_HEAD,  # limit, in bytes, of an incomplete HTTP head
             ws="none",
             lifespan="off",
             log_config=None,
@@ -247,7 +265,9 @@ class Gateway:
             await asyncio.sleep(TAKE_S)
 
     def hand_out(self, poller: Poller) -> None:
-        """Give each batch of polled rows to the hub and to all parts, even if a part fails."""
+        """Give each batch of polled rows to the hub and to all parts; if one of them fails, continue with
+        the others.
+        """
         while batch := poller.take():
             self._has_news = True
             batch = self.reload.without_changed_drives(batch)
@@ -276,10 +296,12 @@ class Gateway:
             if lost is None and any(self.hub.last_answer(polled.drive.name) for polled in line.drives):
                 self.alarms.note_there(line.name)
             if lost is None and self.hub.taken:
-                self.hub.unopened.pop(line.name, None)  # the port works now, so this reason is outdated
+                self.hub.unopened.pop(line.name, None)  # the port works now: forget why it did not open
 
     def _restore_alarms(self) -> bool:
-        """Take over the alarms of earlier runs; return False while these are read (RESTORE_S at most)."""
+        """Take over earlier runs' alarms. Return False while they are being read, for at most RESTORE_S."""
+        if not self.plant.lines:  # the lines come from a fleet, and are not read yet
+            return False
         past = self.alarm_file.past if self.alarm_file is not None else []
         if past is None and self.clock() - self.begun < RESTORE_S:
             return False
@@ -308,11 +330,12 @@ class Gateway:
     def guarded(self, name: str, work: Callable[..., object], *arguments: object) -> None:
         try:
             work(*arguments)
-        except (Exception, SystemExit):  # a user's class may raise either; polling and stops continue
+        # a user's drive class may raise either exception; polling and stops continue
+        except (Exception, SystemExit):
             self.note_failure(name)
 
     def note_failure(self, name: str) -> None:
-        """Count the exception that is being handled, and log it at most once in LOG_S."""
+        """Count the exception that is being handled, and log it at most once every LOG_S seconds."""
         self.count_failure(name)
         if self.clock() - self._logged.get(name, -LOG_S) >= LOG_S:
             self._logged[name] = self.clock()
@@ -330,15 +353,17 @@ class Gateway:
             self.guarded("minute", self.hub.note_minute)
             self.guarded("connections", self.connections.sweep)
             supervisor().look()
-            self._has_news = True  # also without new rows: a frame's time shows that the gateway is alive
+            # make a frame even without new rows: its time shows viewers that the gateway is alive
+            self._has_news = True
             if notifier.watchdog_s:
                 notifier.send("WATCHDOG=1")
             await asyncio.sleep(every)
 
     def _read_statistics(self, poller: Poller) -> None:
         self.recent.tick(self.clock(), utc_ms(), poller.statistics())
-        failing = {line: why for line, bus in poller.buses.items() if (why := bus.why_lost)}
-        self.hub.stalled = {line: why for line, why in failing.items() if not poller.buses[line].line.is_lost}
+        buses = poller.buses
+        failing = {line: why for line, bus in buses.items() if (why := bus.why_lost)}
+        self.hub.stalled = {line: why for line, why in failing.items() if not buses[line].line.is_lost}
         self.hub.unopened |= failing
 
     def note_unopened(self, failures: Mapping[str, LineError]) -> None:
@@ -357,7 +382,7 @@ class Gateway:
 
     @property
     def plant_now(self) -> Plant:
-        """The plant that is polled now, also during a reload."""
+        """The plant that is polled now. During a reload, some of its lines may already be new."""
         return self.plant if self.poller is None or self.plant_coming is None else self.poller.plant
 
     @property
@@ -377,18 +402,25 @@ class Gateway:
         return self.poller.bus(line)
 
     async def ask(self, drive: str, function: int, start: int, count: int, expiry_s: float) -> list[int]:
-        """Return `count` 16-bit words or bits, read from a drive at address `start`; see `Drive.read_raw`."""
+        """Read `count` 16-bit words or bits of a drive from address `start` on; see `Drive.read_raw`.
+
+        For a Modbus function without addresses, return the bytes of the reply's data.
+        """
         _, known = self.plant.find_drive(drive)
         work = partial(known.read_raw, function, start, count, expiry=expiry_s)
         data = await supervisor().within("passed requests", ASKED_S, work, most=MOST_ASKED)
         if function in (1, 2):
             return [data[bit // 8] >> bit % 8 & 1 for bit in range(count)]
+        if function not in (3, 4):
+            return list(data)
         return list(struct.unpack(f">{count}H", data))
 
     def part_context(self, plant: Plant) -> PartContext:
-        """Return the objects of the gateway that a part built for this plant may use."""
+        """Return the gateway's objects for a part: those that the part may use with this plant."""
         folder, page = self.settings.folder, self.settings.page
-        return PartContext(plant, self.hub, self.commands, self.ask, folder, self.version, self.alarms, page)
+        return PartContext(
+            plant, self.hub, self.commands, self.ask, folder, self.version, self.alarms, self.tokens, page
+        )
 
     def _frame(self, n: int) -> dict[str, Any]:
         self.seen_frames.note(n)

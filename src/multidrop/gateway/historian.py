@@ -6,7 +6,7 @@ import asyncio
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
 from math import isfinite
@@ -22,15 +22,18 @@ from multidrop.gateway.parts import PartContext
 from multidrop.history import Buckets, HistoryState, HistoryWriter
 from multidrop.recording import parse_age, parse_size
 from multidrop.supervisor import supervisor
+from multidrop.toml_check import SIZE
 
 MS_NS = 1_000_000
 LOOK_S = 1.0  # interval of checking that the writing thread is alive
 CLOSING_S = 3.0  # time limit for writing the last rows
-QUERY_S = 30.0  # time limit of a query, and of its wait for other queries
+QUERY_S = 30.0  # time limit of a query, and of its wait until other queries end
 MOST_QUERIES = 2  # limit of concurrent queries
 PIECE = 1 << 16  # bytes of an export read at a time
 UNFINISHED = ".export-"  # prefix of temporary folders of exports
-MOST_BUCKETS = 200_000  # limit of one answer (5 MB): the page's 24 series on a screen of 8000 px
+AGE = r"^\s*\d+(\.\d+)?\s*(s|min|h|days?|weeks?)\s*$"  # what `parse_age` accepts, for the JSON Schema
+# limit of buckets in one answer (5 MB), enough for the page's 24 series on a screen of 8000 px
+MOST_BUCKETS = 200_000
 
 
 @dataclass(frozen=True)
@@ -38,9 +41,9 @@ class HistorySettings:
     """The settings in the table `[serve.history]`. Raises ValueError with a line for each mistake."""
 
     folder: str = "history"
-    keep: str = "30 days"
-    most: str = "20 GB"
-    rotate: str = "10 min"
+    keep: str = field(default="30 days", metadata={"pattern": AGE})
+    most: str = field(default="20 GB", metadata=SIZE)
+    rotate: str = field(default="10 min", metadata={"pattern": AGE})
 
     def __post_init__(self) -> None:
         mistakes = []
@@ -64,7 +67,7 @@ def build(settings: HistorySettings, context: PartContext) -> Historian:
     try:
         return Historian(context.plant, folder, settings)
     except OSError as failure:
-        if failure.filename is None:  # the message is already a sentence
+        if failure.filename is None:  # the message of such an OSError is already a sentence
             raise
         raise OSError(f"folder {folder} cannot be written: {failure.strerror}") from failure
 
@@ -83,12 +86,13 @@ class Historian:
             keep=parse_age(settings.keep),
             most=parse_size(settings.most),
         )
-        for left in folder.glob(f"{UNFINISHED}*"):  # left by a killed process: no other one records here now
+        # Exports that a killed process left: no other process uses this folder now.
+        for left in folder.glob(f"{UNFINISHED}*"):
             rmtree(left, ignore_errors=True)
         self.history = History(folder)
         self._is_closed = False
 
-    # ---- part of the gateway ----
+    # ---- the methods of Part ----
 
     def take(self, batch: Batch) -> None:
         """Copy the rows within microseconds; another thread writes them."""
@@ -111,7 +115,7 @@ class Historian:
         self.history.close()
 
     def adopt(self, plant: Plant) -> None:
-        """Use another plant: the next file of the history has its metadata."""
+        """Use another plant: write its metadata into the next file of the history."""
         self._writer.begin(plant.metadata())
 
     def health(self) -> str:
@@ -144,7 +148,9 @@ class Historian:
         """
         names = list(dict.fromkeys(names))
         if len(names) * points > MOST_BUCKETS:
-            raise ValueError(f"{len(names)} series of {points} points: an answer has {MOST_BUCKETS} at most")
+            raise ValueError(
+                f"{len(names)} series of {points} points exceed the limit of {MOST_BUCKETS} points per answer"
+            )
         work = partial(self._series, names, begin * MS_NS, end * MS_NS, points)
         return await supervisor().within("history queries", QUERY_S, work, most=MOST_QUERIES)
 
@@ -155,17 +161,19 @@ class Historian:
         return f'{{"step_ms":{step / MS_NS},"series":{{{",".join(pieces)}}}}}'.encode()
 
     def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
-        """Return a file of these series (of all if `names` is empty) in pieces; `kind` is "csv" or "parquet".
+        """Return an iterator over the pieces of a file of these series (of all if `names` is empty).
 
-        Call and iterate it in threads, because it reads files. Raises the errors of `series`: those for wrong
-        arguments at the call, the others also during the iteration.
+        `kind` is "csv" or "parquet".
+
+        This call and the iterator read files, so use both in threads. Both may raise OSError and ImportError;
+        only this call raises ValueError.
         """
         series, begin_ns, end_ns = names or None, begin * MS_NS, end * MS_NS
         if kind not in ("csv", "parquet"):
             raise ValueError(f"format = {kind!r} is neither csv nor parquet")
         if kind == "csv":
             return self.history.csv(series, begin_ns, end_ns)
-        self.history.read(series, begin_ns, end_ns)  # raises the errors for wrong arguments now
+        self.history.read(series, begin_ns, end_ns)  # raises ValueError now, not during the iteration
         return self._parquet(series, begin_ns, end_ns)
 
     def _parquet(self, names: Sequence[str] | None, begin: int, end: int) -> Iterator[bytes]:

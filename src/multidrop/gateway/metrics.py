@@ -25,7 +25,7 @@ from multidrop.transport import LineStatistics
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
 
-Sample = tuple[str, Mapping[str, str], float]  # the name's suffix, labels, value
+Sample = tuple[str, Mapping[str, str], float]  # suffix of the metric's name, labels, value
 HEALTH = ("ok", "degraded", "failed")
 STATES = (RUNS, STANDS, FAULT, SILENT, UNKNOWN)
 
@@ -37,7 +37,7 @@ class BaseUnit(NamedTuple):
     factor: float = 1.0
 
 
-UNITS = {  # keys: units of registers
+UNITS = {  # by unit of a register
     "Hz": BaseUnit("hertz"),
     "kHz": BaseUnit("hertz", 1e3),
     "A": BaseUnit("amperes"),
@@ -61,7 +61,7 @@ UNITS = {  # keys: units of registers
     "": BaseUnit("number"),
 }
 CODE = BaseUnit("code")  # unit of registers with named values; the metric has the raw counts
-OTHER = BaseUnit("other")  # series of this unit have the label `unit`
+OTHER = BaseUnit("other")  # for all other units: each series has its unit as a label
 TEXTS = {
     "code": "Numbers of named values, such as states.",
     "number": "Values without a unit.",
@@ -117,7 +117,7 @@ def _models(hub: Hub) -> Iterator[Sample]:
 
 
 def _value_families(hub: Hub) -> Iterator[MetricFamily]:
-    """Yield a family for each unit, with the current values of polled registers, and one for their ages."""
+    """Yield one family of polled registers' current values for each unit, then one family of all ages."""
     values: dict[str, list[Sample]] = {}
     ages: list[Sample] = []
     now_ns = hub.now_ns()
@@ -218,7 +218,7 @@ def counter(name: str, text: str, value: float) -> MetricFamily:
 
 
 def process_families() -> Iterator[MetricFamily]:
-    """Yield the usual metrics of a process. Except on Linux, yield only its CPU time."""
+    """Yield the usual metrics of a process; on systems other than Linux only its CPU time."""
     yield counter("process_cpu_seconds", "CPU time of user and system.", time.process_time())
     if sys.platform != "linux":
         return

@@ -1,7 +1,7 @@
 """The part `notify`: a message for each alarm that begins or ends, to webhooks and to Apprise's services.
 
 Each target has its own thread, so a target that hangs delays nothing else. Addresses of targets contain
-secrets. No message shows more of them than their scheme, and the host of a webhook.
+secrets. Logs and errors show only the scheme of an address, and the host of a webhook.
 """
 
 from __future__ import annotations
@@ -13,12 +13,11 @@ import os
 import re
 import threading
 import time
-import urllib.request
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
-from datetime import UTC, datetime
+from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
+from importlib.util import find_spec
 from math import inf
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,28 +25,28 @@ from urllib.parse import urlsplit
 
 from multidrop import Batch, Plant
 from multidrop.exposition import MetricFamily
+from multidrop.gateway.clock import iso_time
+from multidrop.gateway.http_post import SEND_S, Refused, post
 from multidrop.gateway.live.alarms import KINDS, Alarm, AlarmChange
 from multidrop.gateway.metrics import counter
-from multidrop.gateway.parts import PartContext
+from multidrop.gateway.parts import PartContext, missing_library
 from multidrop.gateway.settings import Folders
 from multidrop.printable import printable
 from multidrop.supervisor import supervisor
 
 MOST_TARGETS = 20
-MOST_BYTES = 65_536  # limit of the file of targets
+MOST_BYTES = 65_536  # limit of the size of the file of targets in bytes
 MOST_WAITING = 1000  # limit of alarms that wait for a target
 MOST_AN_HOUR = 1000
-SEND_S = 20.0  # time limit for a webhook that sends no bytes during an attempt
 RETRY_S, MOST_RETRY_S = 5.0, 300.0  # pause after the first failed attempt, and the longest pause
 CLOSE_S = 2.0
-REFUSED = (400, 413, 422)  # HTTP statuses after which a message is not sent again
 SCHEME = re.compile(r"[a-z][a-z0-9+.-]*")
 
 _log = logging.getLogger("multidrop.gateway.notify")
 
 
 class AlarmTarget(NamedTuple):
-    """Where messages go; `name` shows no secret."""
+    """A target of messages, with a name that shows no secret part of its URL."""
 
     name: str
     url: str
@@ -62,8 +61,10 @@ class NotifySettings:
     """The settings in the table `[serve.notify]`. Raises ValueError with a line for each mistake."""
 
     targets: str = "targets"  # path of a file with a URL on each line
-    on: tuple[str, ...] = KINDS  # kinds of alarms that are sent
-    most: int = 60  # limit of messages an hour to each target
+    # Kinds of alarms that are sent.
+    on: tuple[str, ...] = field(default=KINDS, metadata={"items": {"enum": [*KINDS]}})
+    # Limit of messages an hour to each target.
+    most: int = field(default=60, metadata={"minimum": 1, "maximum": MOST_AN_HOUR})
 
     def __post_init__(self) -> None:
         wrong = [
@@ -77,19 +78,24 @@ class NotifySettings:
             raise ValueError("\n".join(wrong))
 
     def check(self, plant: Plant) -> list[str]:
-        """Return a sentence for each mistake in the file of targets."""
+        """Return a sentence for each mistake in the file of targets, and for a missing library."""
         path = _path_of(self.targets, plant)
         try:
-            return read_targets(path)[1]
+            targets, wrong = read_targets(path)
         except OSError as failure:
             return [f'targets = "{self.targets}": {path} cannot be read: {failure.strerror}']
+        if not all(target.is_webhook for target in targets) and find_spec("apprise") is None:
+            wrong.append(missing_library("notify", ImportError(name="apprise")))
+        return wrong
 
 
 Settings = NotifySettings
 
 
 def _path_of(targets: str, plant: Plant) -> Path:
-    """Return the file of targets: among the service's credentials, else beside the plant file."""
+    """Return the path of the file of targets: a credential of the systemd service, else a file beside
+    the plant file.
+    """
     return Folders(plant.path, os.environ).find(targets)
 
 
@@ -133,7 +139,7 @@ def _shown(url: str) -> str:
 
 
 def build(settings: NotifySettings, context: PartContext) -> Notifications:
-    """Return the part. Raises ImportError if a target needs Apprise and it is not installed, and OSError."""
+    """Return the part. Raises ImportError without a needed Apprise, OSError if the targets are unreadable."""
     targets, _ = read_targets(_path_of(settings.targets, context.plant))
     describe = partial(message_of, context.plant.path.stem, context.page)
     senders = [
@@ -147,7 +153,10 @@ def build(settings: NotifySettings, context: PartContext) -> Notifications:
 
 
 def message_of(plant: str, page: str, alarm: Alarm, left_out: int) -> dict[str, Any]:
-    """Return the JSON object for an alarm; `left_out` earlier messages were not sent."""
+    """Return the message about an alarm as a JSON object.
+
+    `left_out` is the number of earlier messages that were not sent.
+    """
     where = alarm.drive or f"line {alarm.line}"
     over = " is over" if alarm.ended is not None else ""
     text = f"{where}: {alarm.kind}{over}: {alarm.text}"
@@ -163,21 +172,17 @@ def message_of(plant: str, page: str, alarm: Alarm, left_out: int) -> dict[str, 
         "kind": alarm.kind,
         "alarm": alarm.text,
         "id": alarm.id,
-        "time": _iso(alarm.time),
-        "ended": None if alarm.ended is None else _iso(alarm.ended),
+        "time": iso_time(alarm.time),
+        "ended": None if alarm.ended is None else iso_time(alarm.ended),
         "page": page,
     }
 
 
-def _iso(time_ms: int) -> str:
-    return datetime.fromtimestamp(time_ms / 1000, UTC).isoformat(timespec="milliseconds")
-
-
 class AlarmQueue:
-    """Alarms that wait for one target, oldest first, and the number of messages that the target may get now.
+    """The alarms that wait for one target, the oldest first, and the target's hourly limit of messages.
 
-    `most` messages an hour are allowed. Above that rate, only the newest message of each alarm waits; it also
-    states how many messages were left out.
+    `most` messages an hour are allowed. Above that rate, only the newest message of each alarm waits. The
+    next message that is sent states how many messages were left out.
     """
 
     def __init__(self, most: int, now_s: float) -> None:
@@ -200,7 +205,7 @@ class AlarmQueue:
             self.left_out += excess
 
     def next(self, now_s: float) -> tuple[Alarm | None, float]:
-        """Return the alarm to send now, or None and the seconds until the next one (inf: none waits)."""
+        """Return the alarm to send now and 0; else None and how long to wait, in s (inf: no alarm waits)."""
         rate = self._most / 3600
         self._allowed = min(self._most, self._allowed + (now_s - self._filled_s) * rate)
         self._filled_s = now_s
@@ -213,57 +218,47 @@ class AlarmQueue:
 
     def note_sent(self, alarm: Alarm) -> None:
         """Remove an alarm that `next` returned: its message was sent."""
-        self._waiting = [one for one in self._waiting if one is not alarm]
+        self._remove(alarm)
         self._allowed -= 1
         self.left_out = 0
 
     def drop(self, alarm: Alarm) -> None:
         """Remove an alarm that `next` returned, because the target will never accept its message."""
-        self._waiting = [one for one in self._waiting if one is not alarm]
+        self._remove(alarm)
         self.left_out += 1
 
+    def _remove(self, alarm: Alarm) -> None:
+        self._waiting = [one for one in self._waiting if one is not alarm]
+
     def _keep_newest(self) -> None:
-        newest = {(alarm.line, alarm.drive, alarm.kind): alarm for alarm in self._waiting}
+        newest = {alarm.key: alarm for alarm in self._waiting}
         self.left_out += len(self._waiting) - len(newest)
-        self._waiting = [alarm for alarm in self._waiting if newest.get(_key(alarm)) is alarm]
-
-
-def _key(alarm: Alarm) -> tuple[str, str, str]:
-    return alarm.line, alarm.drive, alarm.kind
+        self._waiting = [alarm for alarm in self._waiting if newest[alarm.key] is alarm]
 
 
 # ---- targets ----
 
 
-class _NoRedirects(urllib.request.HTTPRedirectHandler):
-    """Refuses redirects: they would change a POST to a GET, and could name any host."""
-
-    def redirect_request(self, *arguments: Any) -> None:
-        return None
-
-
 def sender_to(target: AlarmTarget) -> Callable[[dict[str, Any]], None]:
-    """Return a function that sends a message to this target, and raises OSError if it was not taken."""
+    """Return a function that sends a message to this target; it raises OSError if that fails."""
     if target.is_webhook:
-        return partial(_post, urllib.request.build_opener(_NoRedirects), target.url)
+        return partial(_post, target.url)
     apprise: Any = import_module("apprise")
-    logging.getLogger("apprise").propagate = False  # its log lines may contain addresses
+    # the library's log lines may contain addresses, which are secret
+    logging.getLogger("apprise").propagate = False
     service = apprise.Apprise()
     if not service.add(target.url):
         raise ValueError(f"{target.name} is not an address that Apprise knows")
     return partial(_notify, service)
 
 
-def _post(opener: urllib.request.OpenerDirector, url: str, message: dict[str, Any]) -> None:
-    body = json.dumps(message).encode()
-    headers = {"content-type": "application/json", "user-agent": "multidrop"}
-    with opener.open(urllib.request.Request(url, body, headers), timeout=SEND_S):
-        pass  # the opener raises HTTPError, an OSError, unless the status is 2xx
+def _post(url: str, message: dict[str, Any]) -> None:
+    post(url, json.dumps(message).encode(), {"content-type": "application/json"})
 
 
 def _notify(service: Any, message: dict[str, Any]) -> None:
     if not service.notify(title=message["title"], body=message["text"]):
-        raise OSError("the service did not take the message")
+        raise OSError("the service did not accept the message")
 
 
 class Sender:
@@ -278,7 +273,7 @@ class Sender:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.name = name
-        self.trouble = ""  # why the target does not take messages now
+        self._trouble = ""  # why the target does not take messages now
         self.sent = 0
         self._send = send
         self._queue = queue
@@ -294,7 +289,7 @@ class Sender:
         """Why the target accepts no messages now; "" if it accepts them."""
         if self._clock() - self._sending_since_s > 2 * SEND_S:
             return f"{self.name} has not answered for {2 * SEND_S:g} s"
-        return self.trouble
+        return self._trouble
 
     def put(self, alarm: Alarm) -> None:
         """Queue a message for an alarm that began or ended."""
@@ -303,7 +298,7 @@ class Sender:
             self._changed.notify()
 
     def close(self) -> None:
-        """End `run` once the messages that may be sent now are sent."""
+        """Make `run` send the messages that the hourly limit still allows, and then return."""
         with self._changed:
             self._is_closed = True
             self._changed.notify()
@@ -332,14 +327,14 @@ class Sender:
             self._send(self._describe(alarm, left_out))
         except Exception as failure:  # the library of any service may raise anything
             self._note_failure(failure)
-            if isinstance(failure, ValueError) or getattr(failure, "code", 0) in REFUSED:
+            if isinstance(failure, (ValueError, Refused)):
                 with self._changed:
-                    self._queue.drop(alarm)  # otherwise this alarm would block all later messages
+                    self._queue.drop(alarm)  # drop the alarm, because it would block all later messages
             pause_s, self._retry_s = self._retry_s, min(2 * self._retry_s, MOST_RETRY_S)
             return pause_s
         finally:
             self._sending_since_s = inf
-        self.trouble, self._retry_s = "", RETRY_S
+        self._trouble, self._retry_s = "", RETRY_S
         self.sent += 1
         with self._changed:
             self._queue.note_sent(alarm)
@@ -348,8 +343,8 @@ class Sender:
     def _note_failure(self, failure: Exception) -> None:
         reason = str(failure) if isinstance(failure, OSError) else type(failure).__name__
         trouble = f"{self.name} takes no messages: {printable(reason)[:200]}"
-        if trouble != self.trouble:
-            self.trouble = trouble
+        if trouble != self._trouble:
+            self._trouble = trouble
             _log.warning("%s", trouble)
 
 
@@ -376,7 +371,7 @@ class Notifications:
         await asyncio.gather(*map(asyncio.shield, self._threads))
 
     async def close(self) -> None:
-        """Send the messages that may be sent now, for at most CLOSE_S."""
+        """Send the messages that the hourly limits still allow, for at most CLOSE_S seconds."""
         for sender in self._senders:
             sender.close()
         if self._threads:

@@ -1,4 +1,4 @@
-"""The five optional parts of the gateway: fleet view, history, Modbus server, MQTT and notifications.
+"""The optional parts of the gateway, such as the history, MQTT, databases and the OPC UA server.
 
 Each part has a table in `[serve]` and receives every batch of rows. If a part fails, the failure is counted
 and logged, and the other parts continue.
@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, Protocol
 from multidrop import Batch, Plant
 from multidrop.extras import install_command
 from multidrop.gateway.commands import Commands
+from multidrop.gateway.http.rights import Tokens
 from multidrop.gateway.live.alarms import Alarms
 from multidrop.gateway.live.hub import Hub
 from multidrop.supervisor import supervisor
@@ -24,17 +25,26 @@ from multidrop.supervisor import supervisor
 BUILD_S = 3.0  # how long a start or a reload waits for parts whose disks do not answer
 END_S = 3.0  # time limit for closing a part
 
-# Module of each part, imported when its table is used. It has `Settings`, a frozen dataclass of the table's
-# keys and their defaults, and `build`, which takes these settings and PartContext and returns a Part.
+# Module of each part, imported when its table is used. The module has `Settings`, a frozen dataclass of the
+# table's keys and their defaults, and `build(settings, context)`, which returns a Part.
 PARTS: Mapping[str, str] = {
     "fleet": "multidrop.fleet.page_part",
     "history": "multidrop.gateway.historian",
+    "influx": "multidrop.gateway.forward.influx",
     "modbus": "multidrop.gateway.modbus_server.server",
     "mqtt": "multidrop.gateway.mqtt.part",
     "notify": "multidrop.gateway.notifications",
+    "opcua": "multidrop.gateway.opcua.part",
+    "postgres": "multidrop.gateway.forward.postgres",
+    "tool": "multidrop.gateway.tool_ports.server",
+    "trigger": "multidrop.gateway.live.triggers",
+    "upload": "multidrop.gateway.forward.upload",
 }
+# by library: the extra of multidrop that installs it; lists only libraries that several parts need
+EXTRAS = {"pyarrow": "parquet", "psycopg": "postgres"}
 
-# Reads registers that need not be in the drive's table: drive, function, first address, count, expiry in s.
+# A function that reads any registers of a drive, declared or not. Its arguments: drive, Modbus function,
+# first address, count, expiry in s.
 Ask = Callable[[str, int, int, int, float], Awaitable[list[int]]]
 
 _log = logging.getLogger("multidrop.gateway")
@@ -50,15 +60,17 @@ class PartContext(NamedTuple):
     folder: Path  # base of relative paths in the settings
     version: str
     alarms: Alarms
+    tokens: Tokens
     page: str = ""  # address of the gateway's page; "": unknown
 
 
 class Part(Protocol):
     """The methods of a part.
 
-    Four more methods are optional: `adopt(plant)` is called after a reload, and `note_alarm(alarm, change)`
-    when an alarm starts, changes or ends. `health()` returns a problem or "",
-    and `figures()` metric families.
+    Four more methods are optional: `adopt(plant)` is called after a reload, and `note_alarm(alarm,
+    change)` when an alarm starts, changes or ends. `health()` returns a problem or "", and `figures()`
+    returns metric families. The part `fleet` may have the attribute `source`, which the gateway
+    uses instead of a poller.
     """
 
     def take(self, batch: Batch) -> None:
@@ -68,7 +80,7 @@ class Part(Protocol):
         """Run until cancelled."""
 
     async def close(self) -> None:
-        """Finish; called after the last batch."""
+        """Shut down; called after the last batch."""
 
 
 class PartHost(Protocol):
@@ -82,26 +94,36 @@ class PartHost(Protocol):
 
 
 def build(name: str, settings: object, context: PartContext) -> Part:
-    """Return the part of this table. If a library is missing, raises ValueError that names the extra."""
+    """Build and return the part of this table.
+
+    If a library is missing, raises ValueError with the name of the extra that installs it.
+    """
     try:
         part: Part = import_module(PARTS[name]).build(settings, context)
     except ImportError as missing:
-        library = missing.name or str(missing)
-        raise ValueError(f"it needs {library}, which is not installed: {install_command(name)}") from missing
+        raise ValueError(missing_library(name, missing)) from missing
     return part
 
 
+def missing_library(name: str, missing: ImportError) -> str:
+    """Return the error message for this part: a library that it needs is not installed."""
+    library = missing.name or str(missing)
+    extra = EXTRAS.get(library.partition(".")[0], name)
+    return f"it needs {library}, which is not installed: {install_command(extra)}"
+
+
 class Building(NamedTuple):
-    """A part under construction in a thread: its files may be on a disk that does not answer."""
+    """A part that a thread builds, because the part's files may be on a disk that does not answer."""
 
     settings: Any
     part: asyncio.Future[Part]
 
 
 class LiveParts:
-    """The running parts by table name, in `feeds`.
+    """The running parts, in `feeds` by the name of their table.
 
-    A part whose files do not answer does not delay the gateway: it stays in `pending` until it is built.
+    If a part's files are on a disk that does not answer, the gateway starts without that part. The part
+    stays in `pending` until it is built.
     """
 
     def __init__(self, host: PartHost) -> None:
@@ -113,8 +135,14 @@ class LiveParts:
         self._built: dict[str, Building] = {}  # parts that are not started yet
         self._replaced: dict[str, Any] = {}  # settings of the parts that the reload in progress closed
 
+    def source(self) -> Any:
+        """Return the attribute `source` of a new part; None if no new part has it."""
+        built = [one.part.result() for one in self._built.values() if one.part.done()]
+        sources = (getattr(part, "source", None) for part in built)
+        return next((source for source in sources if source is not None), None)
+
     def take_up(self) -> None:
-        """Start the new parts: the plant they were built for is in effect now."""
+        """Start the new parts, because the plant for which they were built is in effect now."""
         built, self._built, self._replaced = self._built, {}, {}
         for name, building in built.items():
             self._settings[name] = building.settings
@@ -155,7 +183,7 @@ class LiveParts:
             try:
                 await self.build({name: settings}, self._host.plant)
                 self.take_up()
-            except Exception as failure:  # such as a port that another program uses now
+            except Exception as failure:  # for example, another program uses the part's port now
                 self.dead[name] = str(failure)
                 _log.error("%s did not start again: %s", name, failure)
 
@@ -184,7 +212,7 @@ class LiveParts:
     # ---- one part ----
 
     async def _start_when_built(self, name: str, building: Building) -> None:
-        """Start a part when it is built, unless a reload or the shutdown removed it before."""
+        """Start a part once it is built, unless a reload or the shutdown has removed the part by then."""
         await asyncio.wait([building.part])
         if self.pending.get(name) is not building:
             return
@@ -192,7 +220,7 @@ class LiveParts:
         failure = building.part.exception()
         if failure is None:
             part: Any = building.part.result()
-            if hasattr(part, "adopt"):  # the plant may have been reloaded since
+            if hasattr(part, "adopt"):  # the plant may have been reloaded in the meantime
                 self._host.guarded(name, part.adopt, self._host.plant)
             self._start(name, part)
             return
@@ -222,7 +250,7 @@ class LiveParts:
 
 
 async def _close_when_built(built: Mapping[str, Building]) -> None:
-    """Close each of these parts when it is built; wait only for the parts that are built already."""
+    """Close the parts that are built, and return; each of the others is closed once it is built."""
 
     async def close(name: str, part: asyncio.Future[Part]) -> None:
         await asyncio.wait([part])

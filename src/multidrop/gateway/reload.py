@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 Read = Callable[[], "tuple[Plant, ServeSettings]"]
 AT_ONCE = ("names", "tokens", "may", "limit", *PARTS)  # keys of [serve] that need no restart
 READ_S = 10.0  # time limit for reading the file
-QUICK_S = 1.0  # least time for reading the file before a later reload cancels the read
+QUICK_S = 1.0  # a later reload cancels a read of the file only after this time
 MOST_READS = 8  # limit of concurrent reads, because reads may hang
-ADOPTION_S = 60.0  # a longer adoption, which opens ports and stops drives, counts as hanging
+ADOPTION_S = 60.0  # time limit for adopting a plant, which opens ports and stops drives
 RESTART = "takes effect after a restart"
 NO_FILE = "this plant has no file to be read again"
 
@@ -57,6 +57,7 @@ class Reload:
         self._turn = asyncio.Lock()
         self._soon: asyncio.Task[None] | None = None
         self._is_wanted = False
+        self._by = ""  # who started the newest reload
         self._is_overtaken = asyncio.Event()  # set when a later reload was requested
         self.coming: Plant | None = None  # the plant that is being adopted; None otherwise
         self._changed: frozenset[str] = frozenset()  # drives that the adoption changes
@@ -66,9 +67,10 @@ class Reload:
         """Return True if the plant has a file that can be read again."""
         return self._read is not None
 
-    def begin(self) -> None:
-        """Start a reload, or repeat the one in progress when it has ended. Call this in the loop."""
+    def begin(self, by: str = "a signal") -> None:
+        """Start a reload. If one is in progress, start another when it has ended. Call this in the loop."""
         self._is_wanted = True
+        self._by = by
         self._is_overtaken.set()
         if self._soon is None or self._soon.done():
             self._soon = supervisor().start("reload", self._carry_out_wanted())
@@ -76,7 +78,7 @@ class Reload:
     async def _carry_out_wanted(self) -> None:
         while self._is_wanted:
             self._is_wanted = False
-            await self.carry_out("a signal")
+            await self.carry_out(self._by)
 
     async def close(self) -> None:
         """Cancel a reload that `begin` started."""
@@ -85,7 +87,7 @@ class Reload:
             await asyncio.gather(self._soon, return_exceptions=True)
 
     async def carry_out(self, by: str) -> Reloaded:
-        """Read the file and poll its plant; if that fails, keep the old plant and return the reason."""
+        """Read the file and poll its plant. If that fails, keep the old plant and return the reason."""
         self._is_overtaken.set()
         async with self._turn:
             _log.info("reload, asked for by %s", by)
@@ -105,7 +107,7 @@ class Reload:
 
         def work() -> tuple[Plant, ServeSettings, Mapping[str, Any]]:
             plant, settings = read()
-            return plant, settings, plant.metadata()["planned"]
+            return plant, settings, _planned(plant)
 
         self._is_overtaken.clear()
         reading = supervisor().start("reload", supervisor().within("reload", READ_S, work, most=MOST_READS))
@@ -115,7 +117,7 @@ class Reload:
         overtaken.cancel()
         if not reading.done():
             reading.cancel()
-            raise Hung("a later reload takes its place")
+            raise Hung("a later reload replaces this one")
         return reading.result()
 
     async def _carry_out(self) -> Reloaded:
@@ -123,18 +125,24 @@ class Reload:
         if self._read is None or poller is None:
             return Reloaded(False, NO_FILE)
         plant, settings, planned = await self._read_within(self._read)
+        is_followed = not isinstance(poller, Poller)
+        if is_followed and (plant.lines or settings.parts.get("fleet") != gateway.settings.parts["fleet"]):
+            raise ValueError(f"[serve.fleet] and [[line]]: a change of either {RESTART}")
         if gateway.audit:  # adopting the plant opens this log
             await supervisor().within("audit log", AUDIT_S, partial(check_writable, gateway.audit))
         await gateway.parts.replace(settings.parts, plant)
         gateway.hand_out(poller)
-        self._changed = _changed_drives(gateway.plant, plant)
+        self._changed = frozenset() if is_followed else changed_drives(gateway.plant, plant)
         self.coming = plant
         try:
             unopened = await supervisor().thread("adoption", ADOPTION_S, partial(poller.adopt, plant))
+            if is_followed:  # the plant file has no lines, but the fleet does
+                planned = await supervisor().thread("plan", ADOPTION_S, partial(_planned, poller.plant))
             self._take_up(poller, settings, planned)
             gateway.parts.take_up()
         except Exception:
-            if poller.plant.lines != gateway.plant.lines:  # some new lines are polled already: use these
+            # The poller may have changed some lines already: show the lines that it polls.
+            if poller.plant.lines != gateway.plant.lines:
                 self._take_up(poller, gateway.settings, None)
             await gateway.parts.take_back()
             raise
@@ -149,7 +157,7 @@ class Reload:
         return Reloaded(True, f"{plant.path.name} is in effect", (), self.restart)
 
     def _take_up(self, poller: Poller, settings: ServeSettings, planned: Mapping[str, Any] | None) -> None:
-        """Use the plant that is polled now, and its settings that need no restart."""
+        """Show the plant that is polled now, and apply those of its settings that need no restart."""
         gateway, plant = self._gateway, poller.plant
         gateway.hand_out(poller)  # remaining rows of the previous plant
         lines = {line.name for line in gateway.plant.lines} - {line.name for line in plant.lines}
@@ -169,7 +177,7 @@ class Reload:
         gateway.guarded("frames", gateway.frames.note_news)
 
     def without_changed_drives(self, batch: Batch) -> Batch:
-        """Remove the rows of drives that the reload in progress changes.
+        """Return the batch without the rows of drives that the reload in progress changes.
 
         It is unknown whether such a row was polled under the old plant or the new one.
         """
@@ -193,7 +201,8 @@ class Reload:
         gateway, may = self._gateway, settings.may
         now = gateway.settings
         if (settings.behind_proxy, settings.host) != (now.behind_proxy, now.host):
-            may = may.bounded_by(now.may)  # until a restart, other clients can connect than the file says
+            # The gateway still listens on the old address: give its clients without a token no new rights.
+            may = may.bounded_by(now.may)
         gateway.settings = replace(
             gateway.settings, names=settings.names, tokens=settings.tokens, may=may, limits=settings.limits
         )
@@ -212,11 +221,13 @@ class Reload:
         return Reloaded(False, "the previous plant stays in use: the file has mistakes", self.mistakes)
 
 
-def _changed_drives(before: Plant, coming: Plant) -> frozenset[str]:
-    """Return the drives that only one plant has, or that differ in type, address or polled registers."""
+def changed_drives(before: Plant, coming: Plant) -> frozenset[str]:
+    """Return the names of drives that only one of the plants has, or that differ in type, address, polled
+    registers or channels.
+    """
     meanings = [
         {
-            one.drive.name: (type(one.drive), one.drive.address, one.polls)
+            one.drive.name: (type(one.drive), one.drive.address, one.polls, one.channels)
             for line in plant.lines
             for one in line.drives
         }
@@ -224,6 +235,11 @@ def _changed_drives(before: Plant, coming: Plant) -> frozenset[str]:
     ]
     ours, theirs = meanings
     return frozenset(name for name in ours | theirs if ours.get(name) != theirs.get(name))
+
+
+def _planned(plant: Plant) -> Mapping[str, Any]:
+    planned: Mapping[str, Any] = plant.metadata()["planned"]
+    return planned
 
 
 def _sentence(failure: Exception) -> str:

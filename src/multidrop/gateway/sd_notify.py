@@ -16,13 +16,13 @@ class Notifier:
 
     @property
     def watchdog_s(self) -> float | None:
-        """The longest time between WATCHDOG=1 messages that the service manager allows, in s; None: any."""
+        """The service manager's limit of the time between WATCHDOG=1 messages, in s; None: no limit."""
         asked = os.environ.get("WATCHDOG_USEC", "")
         mine = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         return int(asked) / 1e6 if asked.isdigit() and int(asked) > 0 and mine else None
 
     def send_reloading(self) -> None:
-        """Report the start of a reload, with its time; READY=1 ends it."""
+        """Report the start of a reload, with its time. A later READY=1 reports the end of the reload."""
         self.send("RELOADING=1", f"MONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
 
     def send(self, *lines: str) -> None:

@@ -8,22 +8,23 @@ import re
 import ssl
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import MISSING, Field, dataclass, field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import partial
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from multidrop import Plant, PlantError
 from multidrop.gateway.http.rights import May, Right, Token, is_loopback, read_tokens
-from multidrop.gateway.live.limits import Limit, read_limits
-from multidrop.gateway.parts import PARTS
+from multidrop.gateway.live.limits import LIMIT_KEYS, Limit, read_limits
+from multidrop.gateway.parts import PARTS, missing_library
 from multidrop.plant import MAY_KEYS, allowed
 from multidrop.supervisor import Hung, in_time
-from multidrop.toml_check import Key, TomlPlace
+from multidrop.toml_check import ADDRESS, Key, TomlPlace, json_schema, parse_address
 
 LISTEN = "127.0.0.1:8750"
-AUDIT_S = 2.0  # time limit for the disk of the audit log
+AUDIT_S = 2.0  # how long to wait for the disk of the audit log
 HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
 EXAMPLES = {  # example values in error messages, by type
     bool: "true",
@@ -35,24 +36,45 @@ EXAMPLES = {  # example values in error messages, by type
     tuple: '["one", "two"]',
 }
 
+_MAY = {
+    "look": Key(str, 'look = "anyone"', keywords={"enum": ["anyone", "token"]}),
+    "stop": Key(str, 'stop = "token"', keywords={"enum": ["anyone", "token"]}),
+    **MAY_KEYS,
+}
+
 _SERVE = {
-    "listen": Key(str, f'listen = "{LISTEN}"'),
-    "names": Key(list, 'names = ["plant.example"]'),
+    "listen": Key(str, f'listen = "{LISTEN}"', keywords=ADDRESS),
+    "names": Key(
+        list,
+        'names = ["plant.example"]',
+        keywords={"items": {"type": "string", "pattern": f"^{HOST.pattern}$"}},
+    ),
     "certificate": Key(str, 'certificate = "cert.pem"'),
     "key": Key(str, 'key = "key.pem"'),
     "behind_proxy": Key(bool, "behind_proxy = true"),
     "tokens": Key(str, 'tokens = "tokens"'),
     "audit": Key(str, 'audit = "audit.jsonl"'),
     "alarms": Key(str, 'alarms = "alarms.jsonl"'),
-    "may": Key(dict, "[serve.may], a table"),
-    "limit": Key(list, "[[serve.limit]], a table for each limit"),
+    "may": Key(dict, "[serve.may], a table", keywords=json_schema(_MAY)),
+    "limit": Key(
+        list,
+        "[[serve.limit]], a table for each limit",
+        keywords={"items": json_schema(LIMIT_KEYS, oneOf=[{"required": ["above"]}, {"required": ["below"]}])},
+    ),
 } | {name: Key(dict, f"[serve.{name}], a table") for name in PARTS}
 
-_MAY = {
-    "look": Key(str, 'look = "anyone"'),
-    "stop": Key(str, 'stop = "token"'),
-    **MAY_KEYS,
+
+NOT_FOLLOWED = {  # parts that a gateway without lines of its own cannot have, and why
+    **dict.fromkeys(
+        ("history", "influx", "postgres", "upload"), "`multidrop hub` stores the samples of a fleet"
+    ),
+    "modbus": "it serves only values that this gateway polls",
+    "tool": "vendors' programs use the lines of this gateway",
+    "trigger": "it needs the rows that this gateway polls",
 }
+
+
+ListenAddress = tuple[str, int]  # host and port
 
 
 @dataclass(frozen=True)
@@ -85,7 +107,8 @@ class ServeSettings:
 
 
 class Folders:
-    """Finds the files that `[serve]` names: among the service's credentials, else beside the plant file.
+    """Finds the files that `[serve]` names: first among the service's credentials, then beside the plant
+    file.
 
     Output files are in the service's state folder; without a service, beside the plant file.
     """
@@ -109,14 +132,34 @@ def read_plant(load: Callable[[], Plant], environment: Mapping[str, str]) -> tup
     try:
         plant = load()
     except PlantError as wrong:
-        if wrong.rest is None:
+        if wrong.right is None:
             raise
         try:
-            read_settings(wrong.rest, environment)
+            read_settings(replace(wrong.right, lines=()), environment)
         except PlantError as also:
             raise PlantError((*wrong.mistakes, *also.mistakes)) from None
         raise
-    return plant, read_settings(plant, environment)
+    settings = read_settings(plant, environment)
+    if not plant.lines:
+        _check_followed(plant, settings)
+    return plant, settings
+
+
+def _check_followed(plant: Plant, settings: ServeSettings) -> None:
+    """Check the settings of a plant file without lines: its drives are those of a fleet.
+
+    Raises PlantError for settings that need lines in the file.
+    """
+    place = TomlPlace(plant.path)
+    for name, other in NOT_FOLLOWED.items():
+        if name in settings.parts:
+            place.wrong(f"[serve.{name}] needs lines in this plant file; {other}")
+    if getattr(settings.parts.get("mqtt"), "rows", False):
+        place.wrong("rows = true of [serve.mqtt] needs lines in this plant file")
+    if MAY_KEYS.keys() & plant.serve.get("may", {}).keys():
+        place.wrong("[serve.may] lists need lines in this plant file; [fleet.may] is for a fleet's drives")
+    if place.config_errors:
+        raise PlantError(tuple(place.config_errors))
 
 
 def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings:
@@ -127,7 +170,8 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
     place = TomlPlace(plant.path, ("[serve]",))
     folders = Folders(plant.path, environment)
     given = place.check(dict(plant.serve), _SERVE)
-    host, port = place.attempt(_address, given.get("listen", LISTEN)) or ("127.0.0.1", 0)
+    listen = given.get("listen", LISTEN)
+    host, port = place.attempt(parse_address, listen, f'listen = "{LISTEN}"') or ("127.0.0.1", 0)
     names = tuple(filter(None, (place.attempt(_name, name) for name in given.get("names", ()))))
     tls = _tls(given, folders, place)
     tokens = _tokens(given, folders, place)
@@ -150,33 +194,26 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
         for name in PARTS
         if name in given
     }
+    _check_ports((host, port), parts, place)
     if place.config_errors:
         raise PlantError(tuple(place.config_errors))
     digest = _digest(folders.find(given[key]) for key in ("certificate", "key")) if tls else ""
     alarms = folders.state / given.get("alarms", "alarms.jsonl")
     return ServeSettings(
-        host,
-        port,
-        names,
-        tls,
-        digest,
-        behind_proxy,
-        tuple(tokens),
-        may,
-        audit,
-        alarms,
-        limits,
-        folders.state,
-        parts,
+        host=host,
+        port=port,
+        names=names,
+        tls=tls,
+        certificate=digest,
+        behind_proxy=behind_proxy,
+        tokens=tuple(tokens),
+        may=may,
+        audit=audit,
+        alarms=alarms,
+        limits=limits,
+        folder=folders.state,
+        parts=parts,
     )
-
-
-def _address(text: str) -> tuple[str, int]:
-    host, colon, port = text.rpartition(":")
-    host = host[1:-1] if host.startswith("[") and host.endswith("]") else host
-    if not colon or not host or not re.fullmatch(r"[0-9]{1,5}", port) or int(port) > 65535:
-        raise ValueError(f'listen = "{text}" is not an address and port; write listen = "{LISTEN}"')
-    return host, int(port)
 
 
 def _name(name: object) -> str:
@@ -239,9 +276,11 @@ def _may(table: Any, look: str, plant: Plant, place: TomlPlace) -> May:
 
 def _part(name: str, table: Mapping[str, Any], plant: Plant, place: TomlPlace) -> Any:
     """Return a part's settings, checked by its dataclass of settings; None if there are mistakes."""
-    made = import_module(PARTS[name]).Settings
-    defaults = {one.name: _default(one) for one in fields(made) if one.init}
-    keys = {name: _key_of(name, default) for name, default in defaults.items()}
+    try:
+        made, keys = _settings_of(name)
+    except ImportError as missing:
+        place.wrong(missing_library(name, missing))
+        return None
     before = len(place.config_errors)
     given = place.check(dict(table), keys)
     try:
@@ -253,19 +292,74 @@ def _part(name: str, table: Mapping[str, Any], plant: Plant, place: TomlPlace) -
     if len(place.config_errors) == before and hasattr(found, "check"):
         for sentence in found.check(plant):
             place.wrong(sentence)
+    for library in getattr(found, "libraries", ()):
+        if find_spec(library) is None:
+            place.wrong(missing_library(name, ImportError(name=library)))
     return found
 
 
-def _default(one: Field[Any]) -> Any:
-    return one.default_factory() if one.default_factory is not MISSING else one.default
+def _check_ports(page: ListenAddress, parts: Mapping[str, Any], place: TomlPlace) -> None:
+    """Add a mistake for each address of a part that the web server or another part listens on too."""
+    taken = {"listen of [serve]": page}
+    for name, part in parts.items():
+        own: Mapping[str, ListenAddress] = getattr(part, "addresses", {})
+        for key, address in own.items():
+            other = next((other for other, used in taken.items() if _are_one_port(address, used)), None)
+            if other:
+                there = place.of_file(place.path, f"[serve.{name}]")
+                there.wrong(f"{key}: port {address[1]} is in use by {other}; choose another port")
+        taken |= {f"{key} of [serve.{name}]": address for key, address in own.items()}
 
 
-def _key_of(name: str, default: object) -> Key:
-    if default is None:
-        return Key((str, int, float, dict, list), f"{name} = …")
+def _are_one_port(one: ListenAddress, other: ListenAddress) -> bool:
+    """Return True if only one socket can listen on these two addresses; port 0 means any free port."""
+    hosts = {"127.0.0.1" if host == "localhost" else host for host, _ in (one, other)}
+    is_ipv4 = not any(":" in host for host in hosts)
+    overlap = len(hosts) == 1 or "::" in hosts or ("0.0.0.0" in hosts and is_ipv4)
+    return one[1] == other[1] != 0 and overlap
+
+
+def _settings_of(part: str) -> tuple[Any, dict[str, Key]]:
+    """Return the dataclass of a part's settings, and the keys of its table.
+
+    The metadata of a dataclass field are the JSON Schema keywords of the field's key.
+    """
+    made = import_module(PARTS[part]).Settings
+    return made, {one.name: _key_of(one) for one in fields(made) if one.init}
+
+
+def _key_of(one: Field[Any]) -> Key:
+    default = one.default_factory() if one.default_factory is not MISSING else one.default
     kind = list if isinstance(default, tuple) else type(default)
     example = json.dumps(default) if kind is str and default else EXAMPLES[kind]
-    return Key((int, float) if kind is float else kind, f"{name} = {example}")
+    return Key((int, float) if kind is float else kind, f"{one.name} = {example}", keywords=one.metadata)
+
+
+# ---- JSON Schema ----
+
+
+def serve_schema() -> dict[str, Any]:
+    """Return the JSON Schema of `[serve]`, made from the table's own keys and from the keys of the parts."""
+    is_private = {"pattern": r"^(localhost|127\.[0-9.]+|\[?::1\]?):"}
+    is_public = {"required": ["listen"], "properties": {"listen": {"not": is_private}}}
+    is_protected = [
+        {"required": ["behind_proxy"], "properties": {"behind_proxy": {"const": True}}},
+        {"required": ["tokens", "certificate", "key"]},
+    ]
+    looks_by_token = {"required": ["look"], "properties": {"look": {"const": "token"}}}
+    needs_tokens = {"required": ["may"], "properties": {"may": looks_by_token}}
+    schema = json_schema(
+        _SERVE,
+        dependencies={"certificate": ["key"], "key": ["certificate"]},
+        allOf=[
+            {"if": is_public, "then": {"anyOf": is_protected}},
+            {"if": needs_tokens, "then": {"required": ["tokens"]}},
+        ],
+    )
+    for name in PARTS:
+        with suppress(ImportError):  # if a part's library is missing, the schema lacks the part's keys
+            schema["properties"][name] |= json_schema(_settings_of(name)[1])
+    return schema
 
 
 # ---- files ----
@@ -284,7 +378,7 @@ def _digest(paths: Iterable[Path]) -> str:
 
 
 def _check_audit(path: Path) -> bool:
-    """Check that the file can be written; a disk that hangs is not a mistake in the plant file."""
+    """Raise ValueError if the file cannot be written; return True if it can, or if its disk hangs."""
     with suppress(Hung):
         in_time("audit log", AUDIT_S, partial(check_writable, path))
     return True
