@@ -12,17 +12,11 @@ from typing import Any
 import pytest
 from simulated_bus import SimulatedBus, one
 
-from multidrop.control.audit_log import read_audit
-from multidrop.control.author import written_by
+from multidrop.control.audit_log import read_audit, written_by
 from multidrop.control.ramp import start_staggered
 from multidrop.core import Completion, Exchange, Framing, Message, build_reply
 from multidrop.drive import Condition
-from multidrop.errors import (
-    BusError,
-    DriveException,
-    LineError,
-    Unconfirmed,
-)
+from multidrop.errors import BusError, DriveException, LineError, Unconfirmed
 from multidrop.families import YD1000, InvtCHE
 from multidrop.families.invt_che import CHEControl
 from multidrop.transport.aside_log import flush
@@ -72,7 +66,7 @@ def test_the_audit_log_has_every_write(monkeypatch: pytest.MonkeyPatch, tmp_path
     assert (noted[1]["drive"], noted[1]["address"], noted[1]["port"]) == ("invt-che@1", 1, "hall")
 
 
-def test_an_unwritable_log_prevents_no_stop(
+def test_a_stop_is_sent_if_the_log_cannot_be_written(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1), audit="/dev/full")
@@ -85,7 +79,6 @@ def test_an_unwritable_log_prevents_no_stop(
 
 LOST = LineError("hall", "the port was lost")
 LOST.is_sent = True
-
 
 ENDINGS: dict[str, tuple[BaseException, int, Callable[[SimulatedBus, Any], object], str]] = {
     "port lost at the reading back": (
@@ -112,7 +105,7 @@ ENDINGS: dict[str, tuple[BaseException, int, Callable[[SimulatedBus, Any], objec
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_a_write_without_an_outcome_is_recorded(
+def test_a_write_that_is_interrupted_or_fails_is_recorded(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ending: str
 ) -> None:
     failure, function, act, what = ENDINGS[ending]
@@ -175,7 +168,7 @@ def test_every_kind_of_write_has_its_author(audited: Audited) -> None:
         drive.set_frequency(30)
     drive.set_frequency(10)
     noted = audited.noted()
-    annas = [entry for entry in noted if entry[1] == "anna"]  # a stop's last record may come late
+    annas = [entry for entry in noted if entry[1] == "anna"]
     assert {write.partition(" = ")[0] for write, _, _ in annas} >= {"setpoint", "control"}
     assert len(annas) >= 6
     assert {way for _, _, way in annas} == {"web, 10.0.0.7"}
@@ -193,7 +186,7 @@ def test_an_unconfirmed_write_is_recorded_with_its_author(audited: Audited) -> N
 
 
 def test_stops_after_a_failed_staggered_start_have_the_callers_author(audited: Audited) -> None:
-    """`start_staggered` stops its drives on new threads, which must have the caller as author."""
+    """The records of the stops name the caller as author, although the stops run on new threads."""
     drive = audited.drive
     drive.set_frequency(20)
     audited.line.loses = lambda request: request.data == b"\0\1"
@@ -242,7 +235,7 @@ class Nameless:
         raise ZeroDivisionError
 
 
-NAMES: list[tuple[Any, str | None]] = [  # each with the name that a stop's record has
+NAMES: list[tuple[Any, str | None]] = [  # an author, and the author's name in the record of a stop
     ("", None),
     ("  ", None),
     ("a\nb", r"a\nb"),

@@ -1,4 +1,4 @@
-"""Broadcasts: only to drives of one confirmed family; a setpoint is not broadcast after a stop."""
+"""Broadcasts are sent only to drives of one confirmed family; no setpoint is broadcast after a stop."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from examples import every_third
 from line_driver import MS, LineDriver
 from motors import MAKE, STARTS
 from simulated_bus import SimulatedBus, is_write, one
-from stop_frames import all_stopped
+from stop_frames import all_stopped, che_drives
+from tables import table
 from toy import Status, Toy
 
 from multidrop.control.audit_log import read_audit
+from multidrop.control.call import written_before
 from multidrop.control.outcome import Seen
-from multidrop.control.time_limit import written_before
 from multidrop.core import Completion, Exchange, Message
 from multidrop.drive import Condition, Drive, Script, State
 from multidrop.drive.register import Kept, command, setting
@@ -77,7 +79,9 @@ def test_stop_all_does_not_broadcast_if_families_differ(monkeypatch: pytest.Monk
 
 
 @every_broadcasting
-def test_stop_all_broadcasts_if_all_drives_are_alike(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+def test_stop_all_broadcasts_if_all_drives_are_of_one_family(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
     line, drives, _ = line_of(monkeypatch, model, model)
     line.bus.stop_all()
     (sent,) = broadcasts(line)
@@ -96,7 +100,7 @@ def test_stop_all_sends_no_broadcast_if_the_family_has_none(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("models", [("erman-er-g-220", "erman-er-g-220"), ("invt-che", "yd1000")])
-def test_a_drive_that_was_sent_neither_broadcast_nor_stop_is_failed(
+def test_stop_all_reports_failed_if_neither_broadcast_nor_stop_was_sent(
     monkeypatch: pytest.MonkeyPatch, models: tuple[str, str]
 ) -> None:
     line, _, _ = line_of(monkeypatch, *models)
@@ -109,7 +113,7 @@ def test_a_drive_that_was_sent_neither_broadcast_nor_stop_is_failed(
 
 
 class Quiet(Toy):
-    """A drive whose harmless broadcast is no stop."""
+    """A drive with one harmless broadcast, which is not a stop."""
 
     model = "quiet"
     broadcasts = True
@@ -142,7 +146,7 @@ def test_a_stop_broadcasts_only_stop_words(monkeypatch: pytest.MonkeyPatch, conf
 
 
 @every_broadcasting
-def test_a_broadcast_insists_only_if_it_is_a_stop(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+def test_only_the_broadcast_of_a_stop_insists(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
     line, drives, _ = line_of(monkeypatch, model, model)
     register = drives[0].control
     insists: list[bool] = []
@@ -159,7 +163,7 @@ def test_a_broadcast_insists_only_if_it_is_a_stop(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("is_sent", [False, True])
-def test_a_failed_broadcast_counts_as_sent_only_if_it_may_have_left(
+def test_a_failed_broadcast_counts_as_sent_only_if_it_may_have_been_sent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_sent: bool
 ) -> None:
     audit = tmp_path / "audit"
@@ -187,7 +191,7 @@ def test_a_failed_broadcast_counts_as_sent_only_if_it_may_have_left(
 def test_a_broadcast_is_refused_if_one_drive_is_of_another_family(
     monkeypatch: pytest.MonkeyPatch, address: int
 ) -> None:
-    """A Goodrive's setpoint has the address of a CHE's control word."""
+    """The address of a Goodrive's setpoint is that of a CHE's control word."""
     sims = [simulated(InvtCHE(at, maximum_frequency=50)) for at in (1, 2)]
     sims[address - 1]["device"] = 0x010A
     line = SimulatedBus(monkeypatch, *sims)
@@ -198,8 +202,8 @@ def test_a_broadcast_is_refused_if_one_drive_is_of_another_family(
 
 
 @every_broadcasting
-@pytest.mark.parametrize("frames", range(1, 12))
-def test_no_call_from_before_a_broadcast_stop_starts_a_motor_after_it(
+@pytest.mark.parametrize("frames", every_third(range(1, 12)))
+def test_a_start_called_before_a_broadcast_stop_is_not_sent_after_it(
     monkeypatch: pytest.MonkeyPatch, model: str, frames: int
 ) -> None:
     line, drives, _ = line_of(monkeypatch, model, model)
@@ -228,8 +232,10 @@ def setpoint_of(drive: Any) -> Any:
     return drive.register(drive.setpoint_name)
 
 
-@pytest.mark.parametrize("model", SETTING)
-def test_after_leave_a_stop_is_broadcast_but_no_setpoint(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+@table("model", SETTING)
+def test_after_leave_stops_are_broadcast_but_setpoints_are_refused(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
     line, drives, _ = line_of(monkeypatch, model, model)
     assert 0 in setpoint_of(drives[0]).broadcast
     line.bus.leave()
@@ -262,7 +268,7 @@ def test_a_setpoint_broadcast_is_cancelled_by_a_later_stop(
 
 
 def test_an_expired_setpoint_is_not_broadcast(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The audit log must not record it as possibly sent."""
+    """The audit log must not record the write as possibly sent."""
     audit = tmp_path / "audit"
     sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
     line = SimulatedBus(monkeypatch, *sims, audit=audit)
@@ -331,7 +337,7 @@ def test_notes_of_two_interruptions_say_that_the_stop_was_broadcast(monkeypatch:
 # ---- a stop of all drives ----
 
 
-def test_only_stop_and_zero_are_broadcast_and_never_on_a_mixed_line(
+def test_only_stops_and_zeros_are_broadcast_and_nothing_on_a_mixed_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
@@ -371,7 +377,7 @@ def test_a_drive_that_is_unreadable_after_a_broadcast_is_reported(monkeypatch: p
 
 
 def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.MonkeyPatch) -> None:
-    """100 ms at least, by the serial-driver guide (V1.02, 2.4.1)."""
+    """The delay is at least 100 ms (serial-line guide V1.02, 2.4.1)."""
     line, _, _ = one(monkeypatch, InvtCHE(1))
     made: list[Exchange] = []
 
@@ -393,13 +399,7 @@ def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.Mon
 
 
 def test_stop_all_broadcasts_if_safe_and_checks_each_drive(monkeypatch: pytest.MonkeyPatch) -> None:
-    sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
-    line = SimulatedBus(monkeypatch, *sims)
-    for sim in sims:
-        drive = line.attach(sim.drive)
-        drive.set_frequency(20)
-        drive.start()
-    line.sleep(1)
+    line, _, sims = che_drives(monkeypatch, 3, runs_s=1)
     begun = len(line.frames)
     stopped = line.bus.stop_all()
     assert line.frames[begun][1] == "00 06 10 00 00 05 4C D8"
@@ -410,12 +410,7 @@ def test_stop_all_broadcasts_if_safe_and_checks_each_drive(monkeypatch: pytest.M
 
 def test_each_drive_is_stopped_if_the_broadcast_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     """The port is lost during the broadcast, and comes back."""
-    sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
-    line = SimulatedBus(monkeypatch, *sims)
-    for sim in sims:
-        drive = line.attach(sim.drive)
-        drive.set_frequency(20)
-        drive.start()
+    line, _, sims = che_drives(monkeypatch, 2, runs_s=0)
 
     def fails(request: Message) -> bytes | None:
         if request.address == 0:

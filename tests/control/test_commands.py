@@ -12,14 +12,14 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from command_desks import desks
 from controlled_loop import run_controlled
+from fleets import desks
 from lines import PATIENCE
 from simulated_bus import SimulatedBus, is_write, one
+from tables import table
 
 from multidrop import InnovertIBD, InvtCHE
 from multidrop.control import commands
-from multidrop.control.command_results import CommandOutcome, CommandResult
 from multidrop.control.commands import (
     AGAIN_S,
     BEGINNING_S,
@@ -38,6 +38,7 @@ from multidrop.control.commands import (
     stop_line,
     write_register,
 )
+from multidrop.control.outcome import CommandOutcome, CommandResult
 from multidrop.core import Message, build_reply
 from multidrop.errors import NotAttached
 from multidrop.sim import simulated
@@ -56,34 +57,24 @@ STOPS: dict[str, Stop] = {
 }
 
 
-@pytest.mark.parametrize("way", STOPS)
-def test_a_stop_refused_by_the_drive_is_failed(monkeypatch: pytest.MonkeyPatch, way: str) -> None:
+@table("way", STOPS)
+def test_a_stop_has_the_outcome_done_unknown_or_failed(monkeypatch: pytest.MonkeyPatch, way: str) -> None:
+    _, drive, _ = one(monkeypatch, InnovertIBD(1))
+    assert STOPS[way](drive)[drive.name].ok
     line, drive, _ = one(monkeypatch, InnovertIBD(1))
+    line.loses = is_write
+    assert STOPS[way](drive)[drive.name].outcome is CommandOutcome.UNKNOWN
 
     def refuse(request: Message) -> bytes | None:
-        if not is_write(request):
-            return None
         refusal = Message(request.address, request.function, request.start, exception=1)
-        return build_reply(drive.framing, refusal)
+        return build_reply(drive.framing, refusal) if is_write(request) else None
 
+    line, drive, _ = one(monkeypatch, InnovertIBD(1))
     line.answers = refuse
     result = STOPS[way](drive)[drive.name]
     assert result.outcome is CommandOutcome.FAILED
     assert "refuses" in result.text
     assert line.written
-
-
-@pytest.mark.parametrize("way", STOPS)
-def test_an_unconfirmed_stop_is_unknown(monkeypatch: pytest.MonkeyPatch, way: str) -> None:
-    line, drive, _ = one(monkeypatch, InnovertIBD(1))
-    line.loses = is_write
-    assert STOPS[way](drive)[drive.name].outcome is CommandOutcome.UNKNOWN
-
-
-@pytest.mark.parametrize("way", STOPS)
-def test_a_stop_that_is_seen_to_succeed_is_done(monkeypatch: pytest.MonkeyPatch, way: str) -> None:
-    _, drive, _ = one(monkeypatch, InnovertIBD(1))
-    assert STOPS[way](drive)[drive.name].ok
 
 
 def test_a_stop_of_a_removed_line_has_the_outcome_unknown_for_each_drive() -> None:
@@ -115,7 +106,7 @@ def test_commands_to_a_drive_without_a_line_are_not_sent() -> None:
         ("ten", CommandOutcome.REFUSED, "setpoint"),
     ],
 )
-def test_a_write_has_a_result_and_never_raises(
+def test_a_write_returns_a_result_and_never_raises(
     monkeypatch: pytest.MonkeyPatch, value: Any, outcome: CommandOutcome, text: str
 ) -> None:
     _, mill, _ = one(monkeypatch, InvtCHE(1, name="mill", maximum_frequency=50))
@@ -201,7 +192,7 @@ def test_without_threads_the_event_loop_keeps_running_and_later_threads_are_used
     assert turns > 2
 
 
-async def test_a_stop_without_effect_ends_as_unknown(
+async def test_a_stop_without_effect_ends_with_the_outcome_unknown(
     threads: Threads, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(commands, "STOP_S", 0.0)
@@ -211,7 +202,7 @@ async def test_a_stop_without_effect_ends_as_unknown(
 
 
 @pytest.mark.slow
-async def test_a_motor_is_stopped_without_a_thread(threads: Threads, tmp_path: Path) -> None:
+async def test_a_motor_is_stopped_if_no_thread_can_be_started(threads: Threads, tmp_path: Path) -> None:
     with desks(tmp_path) as desk:
         stopped = await desk.stop(drives=["pump"])
     assert stopped is not None
@@ -219,7 +210,7 @@ async def test_a_motor_is_stopped_without_a_thread(threads: Threads, tmp_path: P
     assert {name for name, _ in desk.writes} == {"control"}
 
 
-def test_without_a_thread_a_command_is_not_sent(threads: Threads) -> None:
+def test_a_command_is_not_sent_if_no_thread_can_be_started(threads: Threads) -> None:
     async def main() -> CommandResult:
         return await begin_command(lambda: STANDS, lambda: inf, lambda: None)
 
@@ -242,9 +233,6 @@ async def test_stops_without_threads_go_on_if_their_callers_are_cancelled(thread
 # ---- stops that many clients call ----
 
 
-STANDS = CommandResult(CommandOutcome.DONE, "stopped")
-
-
 SILENT = CommandResult(CommandOutcome.UNKNOWN, "no reply")
 
 
@@ -255,7 +243,7 @@ async def until_met(met: Callable[[], bool]) -> None:
 
 
 class NotedStops:
-    """A drive that records its stops; each lasts until the test releases it."""
+    """A drive that records its stops. Each stop lasts until the test releases it."""
 
     name = "pump"
 
@@ -299,7 +287,7 @@ async def test_a_stop_called_while_another_is_repeated_is_sent_once() -> None:
     assert stops.of(drive) is None
 
 
-async def test_a_stop_is_repeated_itself_if_the_earlier_stop_gives_up() -> None:
+async def test_a_second_stop_is_repeated_once_the_first_gives_up() -> None:
     pump, stops = NotedStops(), RepeatedStops(stop_noted, on_threads)
     drive: Any = pump
     before = asyncio.get_running_loop().create_future()
@@ -311,7 +299,7 @@ async def test_a_stop_is_repeated_itself_if_the_earlier_stop_gives_up() -> None:
     await until_met(lambda: len(pump.calls) == 2 and not stops._sent)
     await asyncio.sleep(0.05)
     before.set_result({"pump": SILENT})
-    await until_met(lambda: pump.calls[-1] is None)  # now repeated, as a stop that was called alone
+    await until_met(lambda: pump.calls[-1] is None)  # the earlier stop gave up: now this one is repeated
     assert pump.calls.count(None) == 1  # one repeated stop for both calls
     pump.turns.release()
     assert (await called)["pump"].ok is False
@@ -325,11 +313,11 @@ def test_a_stop_counts_as_repeated_from_its_call_to_its_end() -> None:
         repeated = asyncio.get_running_loop().create_future()
         pump.under_way = {}
         stops.note([drive], repeated)
-        assert stops.of(drive) is repeated  # although its thread may not have started yet
+        assert stops.of(drive) is repeated  # even before the stop's thread has started
         await asyncio.sleep(0.9 * BEGINNING_S)
         assert stops.of(drive) is repeated
         await asyncio.sleep(0.2 * BEGINNING_S)
-        assert stops.of(drive) is None  # its own stop is over; the stops of others on the line continue
+        assert stops.of(drive) is None  # this drive's stop is over; those of the other drives continue
         pump.under_way = {"pump": "no stop was sent yet"}
         await asyncio.sleep(20.0)
         assert stops.of(drive) is repeated
@@ -401,11 +389,14 @@ class TimedStops:
         return [ended]
 
     async def called_beside(self, seconds: float) -> CommandResult:
-        """Return the result of a stop called during a repeated stop, which gives up after `seconds`."""
+        """Return the result of a stop that is called during a repeated stop.
+
+        The repeated stop gives up after `seconds`.
+        """
         repeated = asyncio.get_running_loop().create_future()
         self.stops.note([self._drive], repeated)
         called = self.stops.send_once(self._drive)
-        assert len(self.stops._tasks) == 1  # the only reference to the task
+        assert len(self.stops._tasks) == 1  # the set has the only reference to the task
         asyncio.get_running_loop().call_later(seconds, repeated.set_result, {"pump": SILENT})
         told = (await called)["pump"]
         assert not self.stops._tasks
@@ -418,7 +409,7 @@ def test_the_result_of_a_replacing_stop_is_returned() -> None:
     assert timed.calls == [0.0, None]
 
 
-def test_a_stop_already_repeated_for_its_time_is_not_repeated_again() -> None:
+def test_a_second_stop_is_not_repeated_if_the_first_took_all_of_its_time() -> None:
     timed = TimedStops(NotedStops(), 0)
     assert run_controlled(timed.called_beside(REPEATED_S + 1)) == SILENT
     assert timed.calls == [0.0]

@@ -13,14 +13,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from disks import full_at, read_only_directory
+from interruptions import full_at, read_only_directory
 from simulated_bus import SimulatedBus, one
 
 from multidrop.cli import main
 from multidrop.control import audit_log
 from multidrop.control import records as write_records
-from multidrop.control.audit_log import AuditLog, read_audit
-from multidrop.control.author import noted_first, written_by
+from multidrop.control.audit_log import AuditLog, noted_first, read_audit, written_by
 from multidrop.control.eeprom_ledger import Ledger, LedgerCell
 from multidrop.control.outcome import Effect
 from multidrop.core import Message
@@ -53,7 +52,7 @@ def test_a_record_that_did_not_fit_on_the_disk_damages_no_other(tmp_path: Path, 
     log.add(0, {"write": "first"})
     with full_at(path.stat().st_size + room):
         for _ in range(2):
-            with pytest.raises(OSError, match=r"only a part|File too large"):
+            with pytest.raises(OSError, match=r"only part|File too large"):
                 log.add(1, {"write": "lost" * 20})
     other.add(2, {"write": "second"})
     log.add(3, {"write": "third"})
@@ -73,7 +72,7 @@ def test_reading_the_audit_log_skips_lines_that_are_not_records(tmp_path: Path) 
 def test_closing_waits_for_a_record_that_another_thread_writes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A stop is recorded when it ends; its line may be closed at the same time."""
+    """A stop is recorded when it ends; the drive's line may be closed at the same time."""
     begun, go_on = threading.Event(), threading.Event()
 
     class SlowLog(AuditLog):
@@ -115,7 +114,7 @@ def _is_record(line: bytes) -> bool:
     return True
 
 
-def test_a_full_disk_prevents_no_stop_and_later_records_are_written(
+def test_a_stop_is_sent_despite_a_full_disk_and_later_records_are_written(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "audit.jsonl"
@@ -139,7 +138,7 @@ def test_a_full_disk_prevents_no_stop_and_later_records_are_written(
     ]
 
 
-def test_on_a_full_disk_noted_first_prevents_writes_but_no_stop(
+def test_with_noted_first_a_full_disk_prevents_writes_but_not_stops(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     path = tmp_path / "audit.jsonl"
@@ -191,7 +190,7 @@ def test_an_interrupted_stop_is_recorded_as_sent_but_unknown(
 def test_a_stop_has_two_audit_records_however_often_it_is_sent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """The first record is written before the first frame is sent, so it exists if the process is killed."""
+    """The first record is written before the first frame is sent, so it survives a kill of the process."""
     path = tmp_path / "audit.jsonl"
     line = SimulatedBus(monkeypatch, *(simulated(InvtCHE(address)) for address in (1, 2)), audit=path)
     drives = [line.attach(InvtCHE(address)) for address in (1, 2)]
@@ -258,7 +257,7 @@ def test_a_full_disk_makes_the_ledger_refuse_writes_until_there_is_room(tmp_path
         assert ledger.enter(CELL, NOON + at, 0.0) == ""
     others = 0
     with full_at(room), raises_unkept():
-        while others < 1000:  # until the file must grow
+        while others < 1000:  # writes until the file must grow
             others += not ledger.enter(LedgerCell("p" * 200, 2, "m", f"r{others}"), NOON, 0.0)
     assert others < 1000
     assert ledger.enter(CELL, NOON + 3, 0.0) == ""
@@ -274,7 +273,7 @@ def test_a_ledger_created_on_a_full_disk_works_once_there_is_room(tmp_path: Path
     assert writes(ledger) == 1
 
 
-def test_an_unwritable_ledger_prevents_eeprom_writes_but_no_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unwritable_ledger_prevents_eeprom_writes_but_not_stops(monkeypatch: pytest.MonkeyPatch) -> None:
     with read_only_directory() as directory:
         for path in (directory / "wear.sqlite", directory / "deep" / "wear.sqlite"):
             line, drive, _ = one(monkeypatch, DelixiModbus(1), ledger=path)
@@ -285,26 +284,26 @@ def test_an_unwritable_ledger_prevents_eeprom_writes_but_no_stop(monkeypatch: py
             assert len(line.written) == 1
 
 
-def test_a_clock_set_back_by_an_hour_allows_only_one_write(tmp_path: Path) -> None:
+def test_after_a_clock_is_set_back_by_an_hour_only_one_write_is_allowed(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path / "wear.sqlite")
     assert ledger.enter(CELL, NOON, 60.0) == ""
     set_back = NOON - HOUR
     assert ledger.enter(CELL, set_back, 60.0) == ""
-    for second in range(60):  # by the clock after it was set back
+    for second in range(60):  # each second of the first minute after the change
         assert "was written" in ledger.enter(CELL, set_back + second, 60.0)
     assert ledger.enter(CELL, set_back + 60, 60.0) == ""
     assert writes(ledger) == 3
 
 
-def test_a_clock_set_back_by_a_quarter_second_allows_one_write(tmp_path: Path) -> None:
-    """The time since the last write is unknown then."""
+def test_after_a_clock_is_set_back_by_a_quarter_second_one_write_is_allowed(tmp_path: Path) -> None:
+    """After a clock is set back, the time since the last write is unknown."""
     ledger = Ledger(tmp_path / "wear")
     assert ledger.enter(CELL, 1000.0, 60.0) == ""
     assert ledger.enter(CELL, 999.75, 60.0) == ""
     assert "was written 0 s ago" in ledger.enter(CELL, 999.75, 60.0)
 
 
-def test_stops_are_counted_together_or_not_at_all(tmp_path: Path) -> None:
+def test_the_ledger_counts_all_writes_of_a_stop_or_none(tmp_path: Path) -> None:
     """One transaction is used, because each transaction may wait for the disk or for another process."""
     ledger = Ledger(tmp_path / "wear")
     wrong = replace(CELL, register="no text: \udcff")
@@ -315,11 +314,11 @@ def test_stops_are_counted_together_or_not_at_all(tmp_path: Path) -> None:
     assert [wear.writes for wear in ledger.wear(1000.0)] == [2]
 
 
-def test_a_clock_set_back_restores_no_budget(tmp_path: Path) -> None:
+def test_setting_the_clock_back_restores_no_budget(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path / "wear.sqlite", budget=10)
     for at in range(10):
         assert ledger.enter(CELL, NOON + at, 0.0) == ""
-    for set_back in (HOUR, 86400.0, NOON):  # NOON: to 1970, where a board without a battery starts
+    for set_back in (HOUR, 86400.0, NOON):  # NOON: back to 1970, the date of a board without a battery
         assert "10 times in a year" in ledger.enter(CELL, NOON - set_back, 0.0)
 
 
@@ -348,12 +347,12 @@ def test_a_setpoint_loop_writes_once_a_minute_despite_a_clock_set_back(
         tried.append(second)
     gaps = sorted(after - before for before, after in pairwise(tried))
     assert len(tried) >= 5
-    assert all(gap >= 58 for gap in gaps[1:])  # except the gap in which the clock was set back
+    assert all(gap >= 58 for gap in gaps[1:])  # all intervals but the one in which the clock was set back
     assert sim.counters.eeprom_writes["frequency"] == len(tried)
     line.bus.close()
     times = [str(each["time"]) for each in read_audit(log)]
     assert len(times) == len(tried)
-    assert times != sorted(times)  # the records are in the order of writing, with times as the clock had them
+    assert times != sorted(times)  # records keep the order of the writes; the clock's times do not
 
 
 def test_ledger_counts_remain_when_the_bus_is_closed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Exit by a signal: all buses are stopped in parallel, and a second signal does not abort the stops."""
+"""Exit by a signal: the drives of all buses are stopped in parallel; a second signal does not abort this."""
 
 from __future__ import annotations
 
@@ -14,18 +14,20 @@ from typing import Any
 import pytest
 from examples import usually
 from kills import BoundProcess
-from lines import PATIENCE, until
+from lines import PATIENCE, line, plant, polled, until
 from motors import ReceivedRequests
 
+from multidrop.bus import Bus
 from multidrop.control.exit_hook import CUT_SHORT, ExitHook, LastAct
 from multidrop.families import InvtCHE
+from multidrop.poller import Poller
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 BOTH = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 
 
 class Act:
-    """Work to be done at the process's end, which takes as long as the test wants."""
+    """The two callbacks of an exit hook's entry; `work` returns once the test sets `go_on`."""
 
     def __init__(self) -> None:
         self.is_begun = False
@@ -54,7 +56,7 @@ def caught() -> Iterator[list[int]]:
 
 
 @BOTH
-def test_a_second_signal_is_delayed_until_all_stops_are_over(caught: list[int], number: int) -> None:
+def test_a_second_signal_is_delayed_until_all_stops_have_ended(caught: list[int], number: int) -> None:
     hook, acts = ExitHook(), [Act(), Act()]
     for act in acts:
         hook.add(act.begin, act.work)
@@ -89,7 +91,7 @@ def test_a_signal_while_one_bus_closes_starts_the_stops_of_others(caught: list[i
 
 
 def test_a_bus_opened_after_the_signal_is_stopped_immediately(caught: list[int]) -> None:
-    """Otherwise its motors would keep turning while the process waits."""
+    """Otherwise the new bus's motors would turn while the process waits for the other stops."""
     hook, acts = ExitHook(), [Act(), Act()]
     hook.add(acts[0].begin, acts[0].work)
     signal.raise_signal(signal.SIGTERM)
@@ -107,7 +109,7 @@ def test_a_third_signal_within_a_second_ends_the_wait_with_a_message(
     monkeypatch.setattr("multidrop.control.exit_hook.time.monotonic", lambda: now)
     hook, act = ExitHook(), Act()
     made = hook.add(act.begin, act.work)
-    for _ in range(5):  # signals that come slowly do not count, however many
+    for _ in range(5):  # signals that are 0.7 s apart never end the wait
         signal.raise_signal(signal.SIGINT)
         now += 0.7
     assert caught == []
@@ -117,7 +119,7 @@ def test_a_third_signal_within_a_second_ends_the_wait_with_a_message(
         now += 0.1
         assert len(caught) == count
     assert capfd.readouterr().err == f"multidrop: {CUT_SHORT}\n"
-    hook.finish(made)  # does not wait for the act any more
+    hook.finish(made)  # no longer waits for the act
     act.go_on.set()
     until(lambda: not threading_names() & {"multidrop exit"})
     assert len(caught) == 1
@@ -177,7 +179,9 @@ def threading_names() -> set[str]:
     return {thread.name for thread in threading.enumerate()}
 
 
-def test_a_failing_act_does_not_delay_others(caught: list[int], caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failing_action_at_exit_does_not_delay_others(
+    caught: list[int], caplog: pytest.LogCaptureFixture
+) -> None:
     def fail() -> None:
         raise ZeroDivisionError
 
@@ -187,7 +191,7 @@ def test_a_failing_act_does_not_delay_others(caught: list[int], caplog: pytest.L
     assert "the drives could not be stopped" in caplog.text
 
 
-def test_a_last_act_may_be_finished_on_any_thread(caught: list[int]) -> None:
+def test_an_action_at_exit_may_be_finished_on_any_thread(caught: list[int]) -> None:
     hook, act = ExitHook(), Act()
     made = hook.add(act.begin, act.work)
     act.go_on.set()
@@ -222,7 +226,7 @@ def test_a_bus_opened_while_the_last_one_closes_still_handles_signals(
     until(lambda: caught == [signal.SIGTERM])
 
 
-def test_adding_an_act_raises_if_no_handler_can_be_installed(
+def test_adding_an_action_at_exit_raises_if_no_signal_handler_can_be_installed(
     caught: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hook, acts = ExitHook(), [Act(), Act()]
@@ -253,7 +257,7 @@ def test_adding_an_act_raises_if_no_handler_can_be_installed(
     assert not acts[1].is_begun
 
 
-def test_our_handler_restored_after_the_end_has_the_earlier_effect(caught: list[int]) -> None:
+def test_our_handler_put_back_after_its_bus_closed_has_the_earlier_effect(caught: list[int]) -> None:
     """Other code replaced the hook's handler, and put it back after the bus was closed."""
     hook = ExitHook()
     for comes_again in (False, True):
@@ -291,7 +295,7 @@ def test_a_later_bus_handles_signals_that_the_program_took_over(caught: list[int
 
 @pytest.mark.parametrize("effect", ["called", "default", "ignored"])
 def test_a_program_handler_may_call_our_handler(caught: list[int], effect: str) -> None:
-    """The signal has its earlier effect once. The default effect, which ends the process, is left out."""
+    """After the stops, the signal has its earlier effect once, unless that is the default effect."""
     hook, act, handled = ExitHook(), Act(), list[int]()
     if effect != "called":
         signal.signal(signal.SIGTERM, signal.SIG_DFL if effect == "default" else signal.SIG_IGN)
@@ -306,7 +310,7 @@ def test_a_program_handler_may_call_our_handler(caught: list[int], effect: str) 
     signal.raise_signal(signal.SIGTERM)
     assert act.is_begun
     act.go_on.set()
-    until(lambda: len(handled) == 2)  # on arrival, and after the stops
+    until(lambda: len(handled) == 2)  # `handle` runs when the signal arrives, and after the stops
     assert caught == ([signal.SIGTERM] if effect == "called" else [])
 
 
@@ -348,7 +352,7 @@ def test_a_bus_made_on_a_thread_warns_that_the_program_replaced_our_handler(
     assert acts[0].is_over
 
 
-def test_a_forked_child_has_its_own_last_acts(caught: list[int]) -> None:
+def test_a_forked_child_has_its_own_actions_at_exit(caught: list[int]) -> None:
     hook, acts = ExitHook(), [Act(), Act()]
     hook.add(acts[0].begin, acts[0].work)
     signal.raise_signal(signal.SIGTERM)
@@ -477,7 +481,7 @@ def test_a_third_signal_ends_the_process_though_a_drive_is_silent() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["wait", "steer", "read"])
-def test_ctrl_c_is_raised_in_the_user_s_code_once_the_motors_stand(how: str) -> None:
+def test_ctrl_c_is_raised_in_the_users_code_after_the_motors_have_stopped(how: str) -> None:
     """The traceback has no lines of this package, whatever the program was doing."""
     with lines(1) as (received, ports), client(how, ports) as process:
         process.send_signal(signal.SIGINT)
@@ -496,7 +500,7 @@ def test_ctrl_c_is_raised_in_the_user_s_code_once_the_motors_stand(how: str) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", usually(signal.SIGTERM, signal.SIGINT))
 def test_a_second_signal_leaves_no_motor_running(number: int) -> None:
-    """The second signal arrives when perhaps only the first drive was sent its stop."""
+    """The second signal may arrive when only the first drive has been sent a stop."""
     with lines(1) as (received, ports), client("wait", ports) as process:
         process.send_signal(number)
         until(lambda: stops(received[0]))
@@ -546,10 +550,6 @@ def seen(drive: ReceivedRequests, others: list[ReceivedRequests], found: list[bo
 
 @pytest.mark.slow
 def test_a_poller_stops_the_drives_of_all_its_lines(monkeypatch: pytest.MonkeyPatch) -> None:
-    from lines import line, plant, polled
-
-    from multidrop.poller import Poller
-
     with lines(2) as (received, ports):
         drives = [InvtCHE(1, maximum_frequency=50, name=f"pump-{number}") for number in (1, 2)]
         declared = [
@@ -567,10 +567,6 @@ def test_a_poller_stops_the_drives_of_all_its_lines(monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.parametrize("leaves", ["poller", "line"])
 def test_a_poller_restores_the_handlers_that_its_bus_replaced(caught: list[int], leaves: str) -> None:
-    from lines import line, plant, polled
-
-    from multidrop.poller import Poller
-
     drive = InvtCHE(1, maximum_frequency=50, name="pump")
     before = signal.getsignal(signal.SIGTERM)
     with lines(1) as (received, (port,)):
@@ -587,11 +583,6 @@ def test_a_signal_stops_drives_although_the_program_installed_a_handler_between_
     caught: list[int],
 ) -> None:
     """The program's own SIGTERM handler, installed between two pollers, runs once the motor has stopped."""
-    from lines import line, plant, polled
-
-    from multidrop.bus import Bus
-    from multidrop.poller import Poller
-
     drive = InvtCHE(1, maximum_frequency=50, name="pump")
     energised: list[bool] = []
     with lines(2) as (received, ports):

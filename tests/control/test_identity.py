@@ -13,6 +13,7 @@ from lines import line, plant, polled, until
 from motors import MAKE, ReceivedRequests
 from simulated_bus import SimulatedBus, is_write, one
 from stop_frames import STOPS, first, writes
+from tables import table
 
 from multidrop import Bus, Drive, InnovertIBD, InvtCHE, NoReply, Poller, Unconfirmed, WriteForbidden
 from multidrop.control import records
@@ -21,10 +22,7 @@ from multidrop.core import PAUSE_NS, Completion, Exchange, Framing, Message, bui
 from multidrop.drive import Script, write
 from multidrop.drive.register import Kept, reading, setting
 from multidrop.drive.verbs import verb
-from multidrop.errors import (
-    BusError,
-    CheckAgain,
-)
+from multidrop.errors import BusError, CheckAgain
 from multidrop.families import YD1000, DelixiModbus
 from multidrop.families.invt_che import CHEControl
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
@@ -58,7 +56,7 @@ def be_silent(bus: Bus, drive: Any, received: ReceivedRequests) -> None:
     received.loses = lambda request: True
     with pytest.raises(NoReply):
         drive.read(next(register for register in drive.registers.values() if register.readable))
-    until(lambda: len(received.requests) == bus.statistics().counters.sent)  # the last one may be late
+    until(lambda: len(received.requests) == bus.statistics().counters.sent)  # waits for the last request
     received.loses = lambda request: False
     received.requests.clear()
     timeouts.least_timeout_ns = timeouts.most_timeout_ns = 1_000_000_000
@@ -77,9 +75,7 @@ def test_a_replaced_drive_is_not_started() -> None:
         assert received.writes == []
 
 
-def test_a_drive_replaced_while_its_write_is_counted_is_not_written(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_drive_replaced_while_its_write_is_counted_is_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
     """A locked ledger delays the write; meanwhile the adapter is unplugged, and another line plugged in."""
     line, drive, _ = one(monkeypatch, YD1000(1))
 
@@ -104,7 +100,7 @@ def test_a_silent_drive_is_identified_once_before_the_next_write(
         monkeypatch.setattr(type(drive).identify, "_script", lambda drive: iter(looks.append("look") or ()))
         before = bus.peers[drive].silences
         drive.set_frequency(10)
-        assert looks == [] or bus.peers[drive].silences > before  # silent only if this computer was too busy
+        assert looks == [] or bus.peers[drive].silences > before  # a busy computer may miss a reply
         looks.clear()
         be_silent(bus, drive, received)
         drive.set_frequency(20)
@@ -136,8 +132,8 @@ def test_a_drive_is_identified_once_after_ten_seconds_without_a_reply(
         assert looks == ["look"]
 
 
-@pytest.mark.parametrize("model", MAKE)
-def test_a_stop_after_an_idle_time_is_sent_without_a_read_before(model: str) -> None:
+@table("model", MAKE)
+def test_a_stop_after_an_idle_time_is_sent_without_reading_first(model: str) -> None:
     with known(model) as (bus, drive, received):
         bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
         received.requests.clear()
@@ -147,7 +143,7 @@ def test_a_stop_after_an_idle_time_is_sent_without_a_read_before(model: str) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", MAKE)
-def test_a_stop_of_a_silent_drive_is_sent_without_a_read_before(model: str) -> None:
+def test_a_stop_of_a_silent_drive_is_sent_without_reading_first(model: str) -> None:
     with known(model) as (bus, drive, received):
         drive.set_frequency(10)
         drive.start()
@@ -190,7 +186,7 @@ def _on_another_port(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_setpoint_that_cannot_be_read_is_forgotten_once_the_drive_may_have_lost_its_power(
     model: str, lose: Callable[[Bus, Any, pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The drive may also have been replaced, even if it was polled."""
+    """The drive may even have been replaced between two polls."""
     with known(model) as (bus, drive, received):
         drive.set_frequency(10)
         received.requests.clear()
@@ -264,9 +260,7 @@ def test_missed_polls_count_as_silence() -> None:
 # ---- drives that were detached and attached again ----
 
 
-def test_a_detached_drive_is_identified_again_before_a_start(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_detached_drive_is_identified_again_before_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
     bus, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(10)
     bus.bus.detach(drive)
@@ -296,7 +290,7 @@ def test_detaching_a_drive_forgets_a_suspicion_about_its_identity(monkeypatch: p
     bus, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     sim["device"] = GOODRIVE
     check = bus.bus._writer.identity_check
-    for _ in range(2):  # without the detach, the second suspicion would be proof
+    for _ in range(2):  # without the detach, the second wrong identity would withhold the stop
         with pytest.raises(CheckAgain):
             check.check_before_stop(drive, drive.control, 5)
         bus.bus.detach(drive)
@@ -341,11 +335,11 @@ def test_one_register_is_read_before_the_first_stop_without_waiting(
     if not is_lost:
         drive.stop()
         assert asked[0] == (True, True)
-    bus.queue = object()  # as after the port was reopened
+    bus.queue = object()  # a new queue, as after the port was reopened
     drive.read(drive.speed)
     asked.clear()
     drive.stop()
-    assert asked[0] == (True, True)  # no read first, because the drive has answered since
+    assert asked[0] == (True, True)  # no read first: the drive has answered since the port was reopened
 
 
 @pytest.mark.parametrize("is_in_step", [True, False])
@@ -407,8 +401,8 @@ REFUSALS = [
 ]
 
 
-@pytest.mark.parametrize(("model", "code"), REFUSALS)
-def test_an_exception_to_the_identity_check_prevents_no_stop(
+@table(("model", "code"), REFUSALS)
+def test_a_stop_is_sent_after_an_exception_to_the_identity_check(
     monkeypatch: pytest.MonkeyPatch, model: str, code: int
 ) -> None:
     line, drive, sim = one(monkeypatch, MAKE[model](1))
@@ -430,7 +424,7 @@ def test_an_exception_to_the_identity_check_prevents_no_stop(
     assert STOPS[model](writes(line)[0])  # the stop is the first write
 
 
-@pytest.mark.parametrize("model", MAKE)
+@table("model", MAKE)
 def test_a_stop_and_its_identity_check_do_not_wait_for_late_replies(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
@@ -449,7 +443,7 @@ def test_a_stop_and_its_identity_check_do_not_wait_for_late_replies(
     assert all(insisted)
 
 
-@pytest.mark.parametrize("model", MAKE)
+@table("model", MAKE)
 def test_a_lost_identity_check_is_not_repeated_before_the_stop(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
@@ -489,7 +483,7 @@ def test_the_error_of_a_withheld_stop_says_what_to_do(monkeypatch: pytest.Monkey
     line, drive, sim = one(monkeypatch, InvtCHE(1))
     sim["device"] = 0x010A
     with pytest.raises(
-        WriteForbidden, match=r"no stop was sent .* said twice .*010AH.* Use the hard-wired stop"
+        WriteForbidden, match=r"no stop was sent .* two reads showed .*010AH.* Use the hard-wired stop"
     ):
         drive.stop()
     assert line.written == []
@@ -506,7 +500,7 @@ OTHERS: Sequence[tuple[Drive, Drive]] = (  # (declared drive, actual drive) of o
 )
 
 
-@pytest.mark.parametrize("pair", OTHERS, ids=lambda pair: f"{pair[0].model} for {pair[1].model}")
+@table("pair", OTHERS)
 def test_the_error_of_a_withheld_stop_names_the_command_for_the_other_family(
     monkeypatch: pytest.MonkeyPatch, pair: tuple[Drive, Drive]
 ) -> None:
@@ -546,8 +540,8 @@ def shows(line: SimulatedBus, drive: Drive, name: str, count: int) -> None:
     line.answers = lambda request: reply if request.start == register.address else None
 
 
-@pytest.mark.parametrize(("model", "name", "count"), OUT_OF_DATE)
-@pytest.mark.parametrize("how", ["stop", "stop_all", "write"])
+@table(("model", "name", "count"), OUT_OF_DATE)
+@table("how", ["stop", "stop_all", "write"])
 def test_one_unexpected_value_prevents_a_start_but_no_stop(
     monkeypatch: pytest.MonkeyPatch, model: str, name: str, count: int, how: str
 ) -> None:
@@ -570,11 +564,11 @@ def test_one_unexpected_value_prevents_a_start_but_no_stop(
     assert STOPS[model](writes(line)[0])
 
 
-@pytest.mark.parametrize("model", MAKE)
+@table("model", MAKE)
 def test_a_drive_that_refuses_the_identity_check_is_sent_its_stop(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
-    """The ERMAN's identity check only reads with function 04, which some other makes answer too."""
+    """Only function 04 is answered: its reads are all that the ERMAN's identity check needs."""
     line, drive, _ = one(monkeypatch, MAKE[model](1))
 
     def refuse(request: Message) -> bytes | None:
@@ -590,7 +584,7 @@ def test_a_drive_that_refuses_the_identity_check_is_sent_its_stop(
 
 
 def test_no_stop_waits_for_a_second_check_of_another_drive(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A known drive's stop does not wait for the first check of another drive either."""
+    """The stop of an identified drive does not wait for the first check of another drive either."""
     others = [YD1000(1), InvtCHE(2, maximum_frequency=50), InvtCHE(3, maximum_frequency=50)]
     line = SimulatedBus(monkeypatch, *(simulated(drive) for drive in others))
     line.attach(InvtCHE(1, maximum_frequency=50))

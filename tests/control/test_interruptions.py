@@ -1,4 +1,4 @@
-"""Ctrl-C at any step of an exchange: the caller learns what may have been sent, and nothing leaks."""
+"""Ctrl-C at any step of an exchange: the caller learns what may have been sent, and no resource leaks."""
 
 from __future__ import annotations
 
@@ -31,12 +31,15 @@ CODE = of_a_port.Line.carry_out.__code__
 
 
 def counts(frame: FrameType) -> bool:
-    """Return True if an interruption may be raised before this line, which excludes the last line."""
+    """Return True if an interruption may be raised before this line of an exchange: any line but the last."""
     return frame.f_code is CODE and "discard" not in getline(CODE.co_filename, frame.f_lineno)
 
 
 def interrupted(call: Callable[[], object], nth: int) -> KeyboardInterrupt | None:
-    """Call a function with an interruption before the nth line of its exchanges; None if it has fewer."""
+    """Call a function and interrupt it before the nth line of its exchanges; return the interruption.
+
+    Return None if the exchanges have fewer lines.
+    """
     try:
         with interrupted_at(nth, counts):
             call()
@@ -93,7 +96,7 @@ OF_TWO_WRITES = ("erman-er-g-220", "invt-che")  # a stop's second write takes ST
 
 
 class Restless(Own):
-    """A drive whose stop reads without waiting, and never sees the motor stand."""
+    """A drive whose stop reads without waiting, and never sees the motor at rest."""
 
     model = "restless"
     title = "OWN 4"
@@ -149,7 +152,7 @@ def test_a_stop_that_is_interrupted_is_sent_once_more(
     ]
 
 
-def test_an_interrupted_stop_ends_a_jog_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_stop_also_ends_a_jog(monkeypatch: pytest.MonkeyPatch) -> None:
     """The motor's state is not read after an interruption, so the motor may be jogging."""
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.jog()

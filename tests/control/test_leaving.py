@@ -14,6 +14,7 @@ from weakref import ref
 import pytest
 from lines import until
 from simulated_bus import SimulatedBus, one
+from stop_frames import che_drives
 
 from multidrop.core import Message
 from multidrop.drive import Drive
@@ -27,14 +28,8 @@ class RunningPair:
     """A simulated bus with two drives whose motors turn."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
-        self.line = SimulatedBus(monkeypatch, *self.sims)
+        self.line, self.drives, self.sims = che_drives(monkeypatch, 2, runs_s=10)
         self.bus = self.line.bus
-        self.drives = [self.line.attach(sim.drive) for sim in self.sims]
-        for drive in self.drives:
-            drive.set_frequency(20)
-            drive.start()
-        self.line.sleep(10)
         self.line.frames.clear()
 
     @property
@@ -178,10 +173,8 @@ def test_attaching_a_drive_of_another_open_bus_raises(monkeypatch: pytest.Monkey
     line.attach(drive)  # the other bus is closed
 
 
-def test_a_drive_can_be_attached_to_another_bus_while_its_bus_closes(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """When the first bus is closed completely, the drive stays on the next bus."""
+def test_a_drive_can_be_attached_to_another_bus_while_its_bus_closes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once the first bus is closed completely, the drive is still attached to the second bus."""
     line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     before = line.bus
     free = before._attached.free
@@ -198,9 +191,7 @@ def test_a_drive_can_be_attached_to_another_bus_while_its_bus_closes(
     assert len(after.written) == 1
 
 
-def test_a_drive_detached_by_another_thread_is_not_detached_twice(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_drive_detached_by_another_thread_is_not_detached_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1))
     latches = line.bus._latches
     await_stops = latches.await_stops
@@ -263,7 +254,7 @@ def test_threads_that_attach_concurrently_add_one_drive_at_a_time(monkeypatch: p
 
 
 def test_a_thread_does_not_wait_for_its_own_interrupted_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Otherwise leaving a `with` block by a signal's exception would never end."""
+    """Otherwise the exit from a `with` block, by an exception of a signal handler, would never end."""
     line, drive, _ = one(monkeypatch, InvtCHE(1))
     latches, stop = line.bus._latches, object()
     latches.begin(stop, [drive])
@@ -279,10 +270,8 @@ def test_a_thread_does_not_wait_for_its_own_interrupted_stop(monkeypatch: pytest
     assert latches.latch(drive).permit().is_good
 
 
-def test_a_drive_attached_after_leave_cannot_be_moved(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The process is ending and could not stop the drive. Drives attached before cannot be moved either."""
+def test_the_motor_of_a_drive_attached_after_leave_cannot_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After `leave`, the process is ending, and could not stop the motor."""
     line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     line.bus.leave()
     line.bus.detach(drive)

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 from kills import BoundProcess
@@ -22,9 +23,9 @@ from multidrop.drive import Drive
 from multidrop.drive.register import COIL, Kept, setting
 from multidrop.errors import WriteForbidden
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
-from multidrop.transport import port_identity, simulated_ports
+from multidrop.transport import port_identity
 from multidrop.transport.line import Line
-from multidrop.transport.simulated_ports import is_simulated
+from multidrop.transport.port_identity import is_simulated
 
 
 def toys(port: str = "pty") -> Simulator:
@@ -122,34 +123,29 @@ def test_a_port_without_a_device_is_identified_by_its_name() -> None:
     line.close()
 
 
-@pytest.mark.parametrize(
-    "old", ["link", "device", "socket://10.0.0.7:4001", "rfc2217://10.0.0.7:4001", "socket://hall:1"]
+@table(
+    ("old", "spelt"),
+    [
+        *((each, each) for each in ("link", "device", "socket://hall:1")),
+        *((each, each) for each in ("socket://10.0.0.7:4001", "rfc2217://10.0.0.7:4001")),
+        ("link", "device"),
+        ("socket://10.0.0.7:4001", "rfc2217://10.0.0.7:4001"),
+    ],
 )
-def test_entries_of_older_versions_count_towards_the_budget(tmp_path: Path, old: str) -> None:
-    (tmp_path / "device").touch()
-    (tmp_path / "link").symlink_to("device")
-    entered = old if "://" in old else f"{tmp_path}/{old}"
-    ledger = Ledger(tmp_path / "wear", budget=3)
-    for at in range(2):
-        assert ledger.enter(LedgerCell(entered, 1, "m", "r"), 1000.0 + at, 0.0) == ""
-    now = {"socket://hall:1": "10.0.0.9:1"}.get(old, port_identity.of_name(entered))
-    cell = LedgerCell(now, 1, "m", "r", entered)
-    assert ledger.enter(cell, 1002.0, 0.0) == ""
-    assert "written 3 times in a year" in ledger.enter(cell, 1003.0, 0.0)
-    if old != "socket://hall:1":
-        assert [(each.cell.port, each.writes) for each in ledger.wear(1003.0)] == [(now, 3)]
-
-
-@pytest.mark.parametrize("old", ["link", "socket://10.0.0.7:4001"])
-def test_entries_under_another_port_name_count_towards_the_budget(tmp_path: Path, old: str) -> None:
-    (tmp_path / "device").touch()
-    (tmp_path / "link").symlink_to("device")
-    entered = old if "://" in old else f"{tmp_path}/{old}"
-    spelt = "rfc2217://10.0.0.7:4001" if "://" in old else f"{tmp_path}/device"
-    ledger = Ledger(tmp_path / "wear", budget=1)
-    assert ledger.enter(LedgerCell(entered, 1, "m", "r"), 1000.0, 0.0) == ""
-    cell = LedgerCell(port_identity.of_name(spelt), 1, "m", "r", spelt)
-    assert "written 1 times in a year" in ledger.enter(cell, 1001.0, 0.0)
+def test_entries_of_older_versions_count_towards_the_budget_of_the_same_port(old: str, spelt: str) -> None:
+    with TemporaryDirectory() as folder:
+        Path(folder, "device").touch()
+        Path(folder, "link").symlink_to("device")
+        entered, present = (each if "://" in each else f"{folder}/{each}" for each in (old, spelt))
+        ledger = Ledger(Path(folder, "wear"), budget=3)
+        for at in range(2):
+            assert ledger.enter(LedgerCell(entered, 1, "m", "r"), 1000.0 + at, 0.0) == ""
+        now = {"socket://hall:1": "10.0.0.9:1"}.get(old, port_identity.of_name(present))
+        cell = LedgerCell(now, 1, "m", "r", present)
+        assert ledger.enter(cell, 1002.0, 0.0) == ""
+        assert "written 3 times in a year" in ledger.enter(cell, 1003.0, 0.0)
+        if old != "socket://hall:1":
+            assert [(each.cell.port, each.writes) for each in ledger.wear(1003.0)] == [(now, 3)]
 
 
 # ---- writes that wear an EEPROM ----
@@ -230,7 +226,7 @@ def test_a_port_counts_as_simulated_until_its_simulator_is_killed(tmp_path: Path
     with BoundProcess([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         device = process.stdout.readline().strip()
-        held = os.open(device, os.O_RDWR | os.O_NOCTTY)  # reserves it: no other test gets it
+        held = os.open(device, os.O_RDWR | os.O_NOCTTY)  # keeps the pty, so that no other test gets it
         try:
             assert is_simulated(device)
         finally:
@@ -240,7 +236,7 @@ def test_a_port_counts_as_simulated_until_its_simulator_is_killed(tmp_path: Path
     os.close(held)
 
 
-def test_a_real_port_is_not_a_simulated_one() -> None:
+def test_a_real_port_does_not_count_as_simulated() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         line = Line(f"socket://127.0.0.1:{listener.getsockname()[1]}").open()
         assert not is_simulated(line.identity)
@@ -252,7 +248,7 @@ def test_a_real_port_is_not_a_simulated_one() -> None:
 
 
 def test_a_system_that_cannot_mark_simulated_ports_counts_all_writes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(simulated_ports, "_HAS_NAMES", False)
+    monkeypatch.setattr(port_identity, "_HAS_NAMES", False)
     with toys() as sim:
         write(sim.wires[0].path, 12.0)
     assert len(Ledger().wear(0)) == 1

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from completions import new_completion
+from batches import new_completion
 from examples import usually
 from lines import PATIENCE, until
 from toy import Status, Toy
@@ -35,7 +35,7 @@ if sys.platform != "linux":
     pytest.skip("masterships are Linux's", allow_module_level=True)
 
 S = 1_000_000_000
-LISTENING = 256 * 10 / 9600  # s, the longest RTU frame at 9600 baud; the timeout comes in addition
+LISTENING = 256 * 10 / 9600  # s; duration of the longest RTU frame at 9600 baud; the timeout is added to it
 
 
 def now_ns() -> int:
@@ -49,7 +49,7 @@ class Brief(Toy):
 
 
 class Slow(Toy):
-    """A drive with a timeout that is longer than a busy computer delays another master."""
+    """A drive whose timeout is longer than any delay of the other master on a busy computer."""
 
     response_timeout = 1.5
 
@@ -173,7 +173,7 @@ def test_a_mastership_whose_deadline_has_passed_sends_nothing(scene: Scene) -> N
         with pytest.raises(NotMaster):
             deque(reads, maxlen=0)
         assert now_ns() >= until_ns
-        sent = bus.statistics().counters.sent  # one more than were answered if a reply was late
+        sent = bus.statistics().counters.sent  # includes a request whose reply was late
         for _ in range(3):
             with pytest.raises(NotMaster):
                 drive.read(Toy.output_current)
@@ -236,7 +236,7 @@ def test_commands_are_sent_again_after_the_mastership_returns(scene: Scene) -> N
 
 
 def hold_back(monkeypatch: pytest.MonkeyPatch, scene: Scene, *, sent_ns: int, after: int) -> None:
-    """Refuse all writes after the first `after` as NOT_MASTER; `sent_ns` is not 0 if a part was sent."""
+    """Let `after` writes pass, then refuse all as NOT_MASTER; `sent_ns` is not 0 if a part was sent."""
     carry_out, writes = scene.bus.line.carry_out, count()
 
     def held_back(exchange: Exchange, **details: Any) -> Completion:
@@ -300,7 +300,7 @@ def test_a_sent_stop_is_unconfirmed_if_the_mastership_ends(
 
 @pytest.fixture
 def shared() -> Iterator[tuple[int, Bus, Mastership]]:
-    """Yield the far end of a line without drives, its bus and its mastership."""
+    """Yield the far end of a line without drives, and the line's bus and mastership."""
     far, near = os.openpty()
     tty.setraw(near)
     os.set_blocking(far, False)
@@ -355,11 +355,9 @@ def waits(far: int, bus: Bus, drive: Slow) -> float:
 
 
 @pytest.mark.long
-def test_a_new_master_listens_before_its_first_request(
-    shared: tuple[int, Bus, Mastership],
-) -> None:
+def test_a_new_master_listens_before_its_first_request(shared: tuple[int, Bus, Mastership]) -> None:
     far, bus, mastership = shared
-    drives = [bus.attach(Slow(address)) for address in (1, 2, 3)]  # new drives have no late reply due
+    drives = [bus.attach(Slow(address)) for address in (1, 2, 3)]  # no late reply of a new drive is expected
     listening = LISTENING + Slow.response_timeout
     assert waits(far, bus, drives[0]) >= listening
     assert waits(far, bus, drives[1]) < listening
@@ -378,10 +376,7 @@ def test_bytes_of_another_master_raise_before_anything_is_sent(
     drive = bus.attach(Slow(1, name="pump"))
     other = Babbler(far)
     try:
-        for call in (
-            lambda: drive.read_raw(3, 1, 1, expiry=60),
-            lambda: drive.write(Toy.frequency, 5.0),
-        ):
+        for call in (lambda: drive.read_raw(3, 1, 1, expiry=60), lambda: drive.write(Toy.frequency, 5.0)):
             with pytest.raises(NotMaster) as failure:
                 call()
             assert failure.value.heard
@@ -402,7 +397,7 @@ def test_bytes_of_another_master_raise_before_anything_is_sent(
             return True
         return False
 
-    until(is_asked)  # once the other master has been silent
+    until(is_asked)  # the request is sent once the other master has been silent
     assert sent_on(far)
 
 
@@ -453,7 +448,7 @@ def test_a_stop_on_an_unopened_port_says_it_was_not_sent(scene: Scene) -> None:
         scene.drive.stop()
     assert scene.bus.line.is_lost
     scene.become_master()
-    scene.drive.stop()  # which reopens the port
+    scene.drive.stop()  # the stop reopens the port
     assert scene.requests > 0
 
 

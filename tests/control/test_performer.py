@@ -3,28 +3,35 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from examples import usually
 from motors import MAKE, STARTS
 from profile_families import MAKE as PROFILES
 from simulated_bus import SimulatedBus, is_write, one
 from stop_frames import Meanwhile, first, writes
+from tables import table
 
-from multidrop.control.audit_log import read_audit
-from multidrop.control.author import written_by
+from multidrop import DelixiNative, InnovertIBD
+from multidrop.control import records
+from multidrop.control.audit_log import read_audit, written_by
+from multidrop.control.call import written_before
 from multidrop.control.outcome import Effect, Seen, Stopped
 from multidrop.control.ramp import ramp
-from multidrop.control.time_limit import written_before
-from multidrop.core import Message
+from multidrop.core import Message, build_reply
 from multidrop.drive import Direction, Drive, Script, State, read, write
 from multidrop.drive.register import Kept, reading, setting
+from multidrop.drive.state import KnownSetpoint
 from multidrop.drive.verbs import verb
 from multidrop.errors import (
     BusError,
     CancelledByStop,
+    DriveException,
     Expired,
     LineError,
     NotVerified,
@@ -86,7 +93,7 @@ def test_a_verb_returns_the_result_of_its_script(monkeypatch: pytest.MonkeyPatch
     assert drive.start() == 7
 
 
-@pytest.mark.parametrize("model", MAKE)
+@table("model", MAKE)
 def test_verbs_without_a_result_return_a_command_result(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
     _, drive, _ = one(monkeypatch, MAKE[model](1))
     for result in (drive.set_frequency(20), drive.start(), drive.stop()):
@@ -170,7 +177,7 @@ def test_the_watchdog_is_logged_at_the_first_identity_check(
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.stop()
     caplog.clear()
-    line.queue = object()  # as after the port was reopened
+    line.queue = object()  # a new queue, as after the port was reopened
     drive.set_frequency(20)
     drive.start()
     drive.stop()
@@ -211,7 +218,7 @@ def test_a_reversal_returns_once_the_motor_is_seen_to_turn_in_reverse(
 
 
 @every_directed
-@pytest.mark.parametrize("options", [{}, {"stop_time": 5}])
+@pytest.mark.parametrize("options", usually({"stop_time": 5}, {}))
 def test_a_reversal_that_the_drive_ignores_is_unconfirmed(
     monkeypatch: pytest.MonkeyPatch, model: str, options: dict[str, float]
 ) -> None:
@@ -337,3 +344,164 @@ def test_a_drive_detached_during_read_back_makes_the_write_unconfirmed(
     Meanwhile(line, 1, lambda: line.bus.detach(drive))
     with pytest.raises(Unconfirmed, match=r"confirmed, but not read back: .*not attached"):
         drive.write(drive.setpoint, 10.0)
+
+
+# ---- the setpoint that the library believes the drive holds, after each possible outcome of a write ----
+
+
+UNREADABLE = [
+    pytest.param(lambda: InnovertIBD(1, maximum_frequency=50), id="innovert-ibd"),
+    pytest.param(lambda: DelixiNative(1), id="delixi-native"),
+]
+every_unreadable = pytest.mark.parametrize("make", UNREADABLE)
+Make = Callable[[], Drive]
+
+
+def told(monkeypatch: pytest.MonkeyPatch, make: Make) -> tuple[SimulatedBus, Drive]:
+    """Return a bus and its drive, whose setpoint was set to 20 Hz."""
+    bus, drive, _ = one(monkeypatch, make())
+    drive.set_frequency(20)
+    assert drive.commanded is not None
+    bus.frames.clear()
+    return bus, drive
+
+
+@every_unreadable
+def test_a_setpoint_that_the_library_refuses_does_not_change_the_known_setpoint(
+    monkeypatch: pytest.MonkeyPatch, make: Make
+) -> None:
+    bus, drive = told(monkeypatch, make)
+    known = drive.commanded
+    with pytest.raises((WriteForbidden, ValueError)):
+        drive.set_frequency(-1)
+    assert bus.written == []
+    assert drive.commanded == known
+    drive.start()
+
+
+@every_unreadable
+def test_an_unsent_setpoint_does_not_change_the_known_setpoint(
+    monkeypatch: pytest.MonkeyPatch, make: Make
+) -> None:
+    """The write expired in the queue. For a write that a stop cancelled, the core reports the same result."""
+    bus, drive = told(monkeypatch, make)
+    known = drive.commanded
+    bus.queue_time = 60.0
+    with pytest.raises(Expired):
+        drive.set_frequency(30)
+    assert bus.written == []
+    assert drive.commanded == known
+
+
+def refused(request: Message) -> bytes | None:
+    if not is_write(request):
+        return None
+    return bytes(build_reply(InnovertIBD(1).framing, replace(request, exception=4)))
+
+
+def test_a_setpoint_that_the_drive_refuses_does_not_change_the_known_setpoint(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bus, drive = told(monkeypatch, lambda: InnovertIBD(1, maximum_frequency=50))
+    known = drive.commanded
+    bus.answers = refused
+    with pytest.raises(DriveException):
+        drive.set_frequency(30)
+    bus.answers = lambda request: None
+    assert drive.commanded == known
+    drive.start()
+
+
+@every_unreadable
+@pytest.mark.parametrize("arrives", [True, False])
+def test_after_a_lost_reply_the_setpoint_is_unknown_and_a_start_is_refused(
+    monkeypatch: pytest.MonkeyPatch, make: Make, arrives: bool
+) -> None:
+    bus, drive = told(monkeypatch, make)
+    if arrives:
+        bus.loses = is_write
+    else:
+        bus.deafens = is_write
+    with pytest.raises(Unconfirmed):
+        drive.set_frequency(30)
+    bus.loses = bus.deafens = lambda request: False
+    bus.frames.clear()
+    assert drive.commanded is None
+    with pytest.raises(WriteForbidden, match="cannot report its setpoint: call set_frequency before start"):
+        drive.start()
+    assert bus.written == []
+
+
+def test_the_known_setpoint_is_forgotten_if_the_drive_keeps_another_value(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _, drive, sim = one(monkeypatch, ErmanERG220(1))
+    drive.set_frequency(20)
+    take = type(sim).answer
+
+    def held_back(sim: object, request: Message, seconds: float) -> Message | None:
+        """Confirm a write, but keep the previous value."""
+        if not is_write(request):
+            return take(sim, request, seconds)  # type: ignore[arg-type]
+        return request
+
+    monkeypatch.setattr(type(sim), "answer", held_back)
+    with pytest.raises(NotVerified):
+        drive.set_frequency(30)
+    assert drive.commanded is None
+
+
+def test_a_setpoint_that_eeprom_already_holds_becomes_known_without_a_write(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)
+    bus, drive, _ = one(monkeypatch, DelixiModbus(1))
+    drive.set_frequency(20)
+    drive.commanded = None  # unknown, as in a new process
+    bus.frames.clear()
+    drive.set_frequency(20)
+    assert bus.written == []
+    assert drive.commanded == 20
+
+
+def test_a_plain_write_sets_the_known_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus, drive = told(monkeypatch, lambda: InnovertIBD(1, maximum_frequency=50))
+    drive.write(drive.register("frequency"), 30)
+    assert drive.commanded == 30
+    bus.loses = is_write
+    with pytest.raises(BusError):
+        drive.write(drive.register("frequency"), 40)
+    assert drive.commanded is None
+
+
+# ---- writes on several threads ----
+
+
+def test_an_unsent_write_does_not_undo_the_setpoint_of_another_write() -> None:
+    setpoint = KnownSetpoint()
+    setpoint.value = 20.0
+    take_back = setpoint.begin_write()
+    setpoint.begin_write()
+    setpoint.value = 30.0
+    take_back()
+    assert setpoint.value == 30.0
+
+
+def test_an_unsent_write_does_not_restore_a_setpoint_that_a_pending_write_made_unknown() -> None:
+    setpoint = KnownSetpoint()
+    setpoint.value = 20.0
+    take_back = setpoint.begin_write()
+    setpoint.begin_write()  # this write never ends
+
+    take_back()
+    assert setpoint.value is None
+
+
+def test_after_two_unsent_writes_the_setpoint_from_before_both_is_known() -> None:
+    setpoint = KnownSetpoint()
+    setpoint.value = 20.0
+    first, second = setpoint.begin_write(), setpoint.begin_write()
+    second()
+    assert setpoint.value is None
+    first()
+    assert setpoint.value == 20.0

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from completions import completed
+from batches import completed
 from motors import MAKE
 from simulated_bus import EXCHANGE_TIME, SimulatedBus, is_write, one
 from stop_frames import starts
+from tables import table
 from toy import Toy
 
 from multidrop.bus import Bus
@@ -71,7 +72,7 @@ def test_a_plain_write_may_stop_the_motor(monkeypatch: pytest.MonkeyPatch) -> No
     assert drive.write(drive.control, CHEControl.STOP) is CHEControl.STOP
 
 
-@pytest.mark.parametrize(
+@table(
     ("drive", "name", "value", "sentence"),
     [
         (YD1000(1), "initialisation", 1, r"panel only.*TYP"),
@@ -121,9 +122,7 @@ def test_writes_allowed_only_at_rest_are_refused_while_the_motor_turns(
     drive.start()
     line.sleep(1)
     before = list(line.written)
-    with pytest.raises(
-        WriteForbidden, match=r"maximum_frequency .* only while the motor stands; state: running.*FH"
-    ):
+    with pytest.raises(WriteForbidden, match=r"maximum_frequency .* only at standstill; state: running.*FH"):
         drive.write(drive.maximum_frequency, 90)
     assert line.written == before
     drive.stop()
@@ -158,7 +157,7 @@ def test_only_the_first_write_is_preceded_by_an_identity_check(
     line.sleep(1)
     drive.set_frequency(25)
     assert looks == []
-    line.queue = object()  # as after the port was reopened, with perhaps other drives
+    line.queue = object()  # a new queue, as after the port was reopened, perhaps with other drives
     line.sleep(1)
     drive.set_frequency(30)
     assert looks == ["look"]
@@ -184,7 +183,7 @@ def test_an_ibd_that_cannot_be_identified_needs_its_owner_s_confirmation(
 # ---- outcomes ----
 
 
-def test_a_write_is_done_taken_as_another_value_refused_or_unconfirmed(
+def test_the_outcome_of_a_write_is_done_taken_as_refused_or_unconfirmed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     line, drive, _ = one(monkeypatch, InnovertIBD(1))
@@ -227,19 +226,6 @@ def test_only_stops_are_sent_while_a_late_reply_is_due(monkeypatch: pytest.Monke
     drive.stop()
     assert insisted
     assert all(insisted)
-
-
-def test_the_first_check_logs_the_watchdog_once(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    line, drive, _ = one(monkeypatch, YD1000(1))
-    assert not line.frames  # attaching sends nothing
-    with caplog.at_level("INFO", "multidrop"):
-        drive.set_frequency(20)
-        drive.start()
-    told = [record.getMessage() for record in caplog.records if "watchdog" in record.getMessage()]
-    off = "its watchdog (communication_timeout) is off: the motor runs on when the client dies"
-    assert told == [f"{drive.name}: {off}"]
 
 
 def test_an_exception_is_reported_with_the_family_s_meaning(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -291,7 +277,9 @@ class Tidy(Drive):
 
 
 @pytest.mark.parametrize("result", [Failure.EXPIRED, Failure.NOT_MASTER])
-def test_an_unsent_write_is_not_unconfirmed(monkeypatch: pytest.MonkeyPatch, result: Failure) -> None:
+def test_an_unsent_write_is_not_reported_as_unconfirmed(
+    monkeypatch: pytest.MonkeyPatch, result: Failure
+) -> None:
     """The write is not reported as unconfirmed even if a later read of the script fails."""
     line = SimulatedBus(monkeypatch, simulated(Tidy(1)))
     drive = line.attach(Tidy(1, confirmed=1))
@@ -422,19 +410,19 @@ def test_a_setpoint_loop_to_eeprom_is_refused_with_advice(monkeypatch: pytest.Mo
         line.sleep(1.0 - 0.04)
     assert sim.counters.eeprom_writes["frequency"] == 1
     for _ in range(100):
-        drive.set_frequency(10.0)  # the held value is not written again
+        drive.set_frequency(10.0)  # not written again, because the drive holds the value
     line.sleep(60)
     drive.set_frequency(12.0)
     assert sim.counters.eeprom_writes["frequency"] == 2
 
 
 def test_writes_beyond_the_yearly_budget_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    line, drive, sim = one(monkeypatch, ErmanERG220(1), ledger=Ledger(tmp_path / "wear", budget=20))
-    for step in range(20):  # unknown memory: the yearly budget applies, but not the interval of a minute
+    line, drive, sim = one(monkeypatch, ErmanERG220(1), ledger=Ledger(tmp_path / "wear", budget=5))
+    for step in range(5):  # unknown memory: the yearly budget applies, but not the interval of a minute
         drive.set_frequency(10 + step)
-    with pytest.raises(WriteForbidden, match=r'written 20 times in a year.*ram = \["frequency"\].*b\.007'):
+    with pytest.raises(WriteForbidden, match=r'written 5 times in a year.*ram = \["frequency"\].*b\.007'):
         drive.set_frequency(45)
-    assert sim.counters.eeprom_writes["frequency"] == 20
+    assert sim.counters.eeprom_writes["frequency"] == 5
     line.sleep(366 * 86400)
     drive.set_frequency(45)
 
@@ -445,7 +433,7 @@ def test_a_register_declared_as_ram_is_not_counted(monkeypatch: pytest.MonkeyPat
     for step in range(20):
         drive.set_frequency(10 + step)
     assert ledger.wear(line.seconds) == []
-    with pytest.raises(ValueError, match="in EEPROM, as its document says"):
+    with pytest.raises(ValueError, match="in EEPROM, according to its document"):
         DelixiModbus(1, ram=["frequency"])
     with pytest.raises(ValueError, match="no register 'frequenzy'"):
         ErmanERG220(1, ram=["frequenzy"])
@@ -470,6 +458,7 @@ def test_the_ram_alias_is_written_and_not_counted(monkeypatch: pytest.MonkeyPatc
 
 def test_the_watchdog_is_read_if_readable(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1))
+    assert not line.frames  # attaching sends nothing
     assert line.bus.watchdog(drive) == (
         "its watchdog (communication_timeout) is off: the motor runs on when the client dies"
     )
@@ -481,7 +470,7 @@ def test_the_watchdog_is_read_if_readable(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_harmless_counts_only_stop_or_take_a_command_back() -> None:
-    """Only raw counts that stop, or take a command back, are harmless, because they may be repeated."""
+    """A harmless raw count may be written repeatedly, so it may only stop a motor or withdraw a command."""
     for family in MODELS.values():
         for register in family.registers.values():
             if register.harmless is None:
@@ -554,7 +543,7 @@ def test_writes_allowed_only_at_rest_are_refused_if_the_state_is_unreadable(
     with pytest.raises(WriteForbidden) as refusal:
         drive.write(Mute.ratio, 3)
     assert str(refusal.value) == (
-        "ratio of mute is not written: it changes only while the motor stands, which the family cannot report"
+        "ratio of mute is not written: it can be written only at standstill, which the family cannot report"
     )
     assert line.written == []
 

@@ -31,7 +31,10 @@ def word(request: Message) -> int:
 
 
 def erman(message: Message) -> bool:
-    """Return True for an allowed write: no reserved coil (3 to 8, 10 to 12) or register, and not 0001H."""
+    """Return True for an allowed write: to no reserved coil (3 to 8, 10 to 12) and no reserved register.
+
+    Register 0001H is not reserved, but the meaning of its bits is not documented: it is not allowed either.
+    """
     if message.function == 5:
         return message.start in (0, 1, 2, 9)
     return message.function == 6 and message.start in (2, 3, 4, 0x0B, 0x0C, 0x0D, 0x15)
@@ -45,7 +48,7 @@ def che(message: Message) -> bool:
 
 
 def ibd(message: Message) -> bool:
-    """Return True for an allowed write: a control word of the list, three parameters within their limits."""
+    """Return True for an allowed write: a listed control word, register 107 or 108, or a setpoint."""
     if message.start == 0x2000:
         return message.function == 6 and word(message) in (0, 1, 2, 3, 0x10)
     return message.function == 6 and (
@@ -54,7 +57,11 @@ def ibd(message: Message) -> bool:
 
 
 def delixi(message: Message) -> bool:
-    """Return True for an allowed write: reserved bits are 0, no toggle (bits 4 and 5), run with direction."""
+    """Return True for an allowed write.
+
+    In a control word, reserved bits must be 0, bits 4 and 5 must not toggle the direction, and a run must
+    state its direction.
+    """
     if message.start == 0x2000:
         return message.function == 6 and word(message) in (0, 1, 0x12, 0x22, 0x13, 0x23)
     return message.function == 6 and message.start == 2
@@ -69,7 +76,7 @@ def native(message: Message) -> bool:
 
 
 def yd(message: Message) -> bool:
-    """Return True for an allowed write: bits 4 and 5 are 0, bit 15 is 1, resets are alone, no panel value."""
+    """Return True for an allowed write: bits 4 and 5 are 0, bit 15 is 1, no reset bit with run or jog."""
     if message.start == 0x1000:
         control = word(message)
         resets = control & 0x2000 and control & 0x0500

@@ -17,6 +17,7 @@ import pytest
 from examples import usually
 from kills import BoundProcess
 from simulated_bus import SimulatedBus, is_write, one
+from tables import table
 
 from multidrop.bus import Bus
 from multidrop.control.audit_log import AuditLog, read_audit
@@ -44,10 +45,10 @@ with Bus(sys.argv[1], expiry=60) as bus:
     print("running", flush=True)
     {then}
 """
-ENDINGS = {  # code that the client runs after its start, the signal that it is sent, its exit status
+ENDINGS = {  # code that the client runs after the motor's start, signal sent to it, exit status
     "SIGTERM": ("time.sleep(60)", signal.SIGTERM, -signal.SIGTERM),
     "SIGINT": ("time.sleep(60)", signal.SIGINT, 1),
-    "SIGHUP": ("time.sleep(60)", signal.SIGHUP, -signal.SIGHUP),  # as when its terminal is closed
+    "SIGHUP": ("time.sleep(60)", signal.SIGHUP, -signal.SIGHUP),  # sent when the client's terminal is closed
     "leaving": ("pass", None, 0),
     "error": ("raise RuntimeError", None, 1),
     "exit": ("sys.exit(3)", None, 3),
@@ -84,11 +85,11 @@ def test_motors_are_stopped_at_exit_only_with_stop_on_exit(ending: str, opted: s
         assert client.returncode in (status, -int(number or 0))
         written = [write.raw for write in sim.counters.writes if write.name == "control"]
         assert written[:2] == ([1, 5] if opted == "stop" else [1])
-        assert set(written[2:]) <= {5, 8}  # repeated if a reply was late; 8 ends a jog
+        assert set(written[2:]) <= {5, 8}  # 5 is a stop, repeated after a late reply; 8 ends a jog
         assert sim.motor.energised == (opted == "leave")
 
 
-def test_stop_on_exit_is_over_when_the_bus_is_closed() -> None:
+def test_closing_a_bus_with_stop_on_exit_stops_motors_and_restores_handlers() -> None:
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     with pump() as (sim, port):
         with Bus(port) as bus:
@@ -99,7 +100,7 @@ def test_stop_on_exit_is_over_when_the_bus_is_closed() -> None:
         assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
         written = [write.raw for write in sim.counters.writes]
         assert written[0] == 5
-        assert set(written) <= {5, 8}  # repeated if a reply was late on a busy computer
+        assert set(written) <= {5, 8}  # 5 is repeated if a busy computer gets a reply late
 
 
 # ---- the ledger ----
@@ -146,11 +147,11 @@ def test_a_ledger_keeps_its_entries_in_the_file(tmp_path: Path) -> None:
     assert [each.this_year for each in Ledger(path).wear(1061.0 + YEAR)] == [0, 0]
 
 
-def test_the_budget_spends_10_000_cycles_in_ten_years() -> None:
+def test_the_yearly_eeprom_budget_allows_10_000_writes_in_ten_years() -> None:
     assert BUDGET * 10 == 10_000
 
 
-def test_an_invalid_ledger_file_raises_one_sentence(tmp_path: Path) -> None:
+def test_an_invalid_ledger_file_raises_a_one_sentence_error(tmp_path: Path) -> None:
     path = tmp_path / "wear.sqlite"
     path.write_text("this is no database, and long enough to be looked at as one" * 20)
     with pytest.raises(OSError, match=r"the ledger of EEPROM writes .* cannot be kept"):
@@ -178,7 +179,7 @@ def test_processes_that_share_an_audit_log_do_not_mix_their_lines(tmp_path: Path
         assert [record["number"] for record in records if record["writer"] == name] == list(range(200))
 
 
-@pytest.mark.parametrize("torn_at", range(0, 120, 7))
+@table("torn_at", range(0, 120, 7))
 def test_a_truncated_line_of_the_audit_log_damages_no_other(tmp_path: Path, torn_at: int) -> None:
     path = tmp_path / "audit.jsonl"
     log = AuditLog(path)
@@ -271,7 +272,7 @@ def dies_and_echoes(line: SimulatedBus, drive: Drive) -> None:
     line.answers = lambda request: build_request(drive.framing, request) if is_write(request) else None
 
 
-@pytest.mark.parametrize("declared", DRIVES, ids=lambda drive: drive.model)
+@table("declared", DRIVES)
 def test_a_plain_stop_that_may_be_an_echo_is_not_confirmed(
     monkeypatch: pytest.MonkeyPatch, declared: Drive
 ) -> None:
@@ -295,7 +296,7 @@ def test_a_setpoint_that_may_be_an_echo_is_not_confirmed(
     for write in (lambda: drive.write(drive.frequency, 25.0), lambda: drive.set_frequency(25.0)):
         with pytest.raises(Unconfirmed, match="echo"):
             write()
-        assert drive.commanded is None  # so that no start or ramp relies on it
+        assert drive.commanded is None  # unknown, so that no start or ramp relies on it
 
 
 def test_a_write_is_unconfirmed_if_the_next_read_reveals_an_echo(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -325,9 +326,7 @@ def test_a_raw_request_that_may_be_an_echo_is_not_confirmed(
     assert [entry["outcome"] for entry in read_audit(tmp_path / "audit")] == ["done", "unconfirmed"]
 
 
-def test_confirmations_are_accepted_if_the_echo_is_known(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_confirmations_are_accepted_if_the_echo_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
     """If the echo is known, the core can distinguish the drive's reply from the echo."""
     line, drive, _ = one(monkeypatch, InnovertIBD(1))
     line.has_echo = True

@@ -1,4 +1,4 @@
-"""A stop always wins: no call from before a stop moves a motor after it.
+"""A stop always wins: no call that started before a stop moves a motor after the stop.
 
 The ports and threads are real, and the far ends record every frame. A line keeps the order of frames, so any
 frame after a stop's first frame was sent after the call of the stop. Threads that start motors are paused
@@ -36,6 +36,7 @@ from lines import plant, polled
 from motors import quick
 from responder import Responder, ResponderLine
 from responder_drives import KINDS, ResponderDrive
+from tables import table
 
 from multidrop.bus import Bus
 from multidrop.control.ramp import start_staggered
@@ -139,7 +140,7 @@ class Stops(RuleBasedStateMachine):
     def start_and_hold(self, number: int, name: str, after: int) -> None:
         """Start a motor in a thread; after `after` requests, hold replies until a stop is called.
 
-        A staggered start that fails also stops drives, so it ends the starts of this episode.
+        A staggered start that fails stops both drives, so other starts of this episode end too.
         """
         self.staggered = name == "staggered"
         self.line.hold(after)
@@ -220,7 +221,7 @@ class Stops(RuleBasedStateMachine):
         second.join()
 
     def _is_deaf_to_signals(self) -> bool:
-        """Ignore further signals; return False if another signal arrived meanwhile."""
+        """Ignore SIGNALS from now on; return False if a signal arrived before all of them were ignored."""
         try:
             for number in SIGNALS:
                 signal.signal(number, signal.SIG_IGN)
@@ -231,7 +232,7 @@ class Stops(RuleBasedStateMachine):
     @precondition(lambda self: self.threads)
     @rule(detaches=st.booleans())
     def part(self, detaches: bool) -> None:
-        """Close the bus, or detach the first drive: calls that started earlier write no frame afterwards."""
+        """Close the bus or detach the first drive; check that earlier calls then move no motor."""
         releasing = threading.Thread(target=self._release)
         releasing.start()
         if detaches and self.poller:
@@ -241,7 +242,6 @@ class Stops(RuleBasedStateMachine):
         else:
             self._close()
             releasing.join()  # a held reply must not reach the next client, which could misattribute it
-
             self._open()
         self._mark(self.drives[1])
         for thread in (releasing, *self.threads):
@@ -258,7 +258,7 @@ class Stops(RuleBasedStateMachine):
     @precondition(lambda self: self.threads and not self.staggered)
     @rule()
     def lose_the_port(self) -> None:
-        """Unplug the adapter and plug it in again: no earlier frame follows."""
+        """Unplug the adapter and plug it in again; check that earlier calls then move no motor."""
         self.far.lose(self.line)
         failures: list[BaseException] = []
         stopping = self._thread(self.drives[0].stop, failures)
@@ -271,7 +271,7 @@ class Stops(RuleBasedStateMachine):
         back = [each for each in self.line.log if each.connection == self.line.connection]
         assert [str(each) for each in back if each.what == "moves"] == []
         assert failures or not self.responders[0].runs
-        for drive in self.responders:  # resets them, because some may not have been stopped
+        for drive in self.responders:  # resets the motors, because some may not have been stopped
             drive.switch_on()
         self._open()
 
@@ -356,7 +356,7 @@ class Stops(RuleBasedStateMachine):
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", usually(*KINDS))
-def test_no_call_from_before_a_stop_moves_a_motor_after_it(kind: str) -> None:
+def test_no_call_that_started_before_a_stop_moves_a_motor_after_it(kind: str) -> None:
     machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})
     run_state_machine_as_test(
         machine,
@@ -373,7 +373,7 @@ def test_no_call_from_before_a_stop_moves_a_motor_after_it(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", usually(*KINDS))
 def test_a_stop_during_a_start_wins_at_each_of_its_first_exchanges(kind: str) -> None:
-    """The stop is called at each of the first exchanges of the start, with the machine's rules in order."""
+    """The stop is called after 0 to 5 exchanges of the start; the test calls the machine's rules itself."""
     machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})()
     machine.begin(polling=False, on_exit=False)
     try:
@@ -384,7 +384,7 @@ def test_a_stop_during_a_start_wins_at_each_of_its_first_exchanges(kind: str) ->
         machine.teardown()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@table("kind", KINDS)
 def test_a_start_that_no_stop_ends_turns_the_motor(kind: str) -> None:
     """Without this test, the tests above could pass although no start is ever sent."""
     machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})()

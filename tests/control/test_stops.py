@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from motors import MAKE, STARTS
 from simulated_bus import EXCHANGE_TIME, TIMEOUT, SimulatedBus, is_write, one
-from stop_frames import STOPS, Meanwhile, Own, first, plain_stop, started_while, writes
+from stop_frames import STOPS, Meanwhile, Own, che_drives, first, plain_stop, started_while, writes
 
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Seen
@@ -23,13 +23,7 @@ from multidrop.control.stops import AT_ONCE, LEAST_S, PAUSE_S
 from multidrop.core import Completion, Exchange, Message, build_reply
 from multidrop.drive import Condition, Drive, Script, read, wait, write
 from multidrop.drive.verbs import verb
-from multidrop.errors import (
-    CancelledByStop,
-    DriveException,
-    LineError,
-    PortLost,
-    Unconfirmed,
-)
+from multidrop.errors import CancelledByStop, DriveException, LineError, PortLost, Unconfirmed
 from multidrop.families import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.sim import simulated
 from multidrop.transport.aside_log import flush
@@ -49,7 +43,6 @@ ACTS: dict[str, Callable[[SimulatedBus, Any], object]] = {
     "detach": lambda line, drive: line.bus.detach(drive),
 }
 
-
 # The short run has each family with two acts, and each act with two families.
 EACH_AND_EACH = [
     pytest.param(model, act, marks=pytest.mark.long if (number + nth) % 3 else ())
@@ -59,7 +52,7 @@ EACH_AND_EACH = [
 
 
 @pytest.mark.parametrize(("model", "act"), EACH_AND_EACH)
-def test_a_stop_at_any_frame_of_a_start_wins(
+def test_a_stop_called_at_any_frame_of_a_start_wins(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str, act: str
 ) -> None:
     """A start that was sent is followed by the stop, and is never reported as unsent."""
@@ -83,7 +76,7 @@ def test_a_stop_at_any_frame_of_a_start_wins(
 
 @pytest.mark.parametrize("verb_name", ["coast", "emergency_stop"])
 @every_family
-def test_coast_and_emergency_stop_cancel_a_start_too(
+def test_coast_and_emergency_stop_also_cancel_a_start(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str, verb_name: str
 ) -> None:
     if getattr(type(MAKE[model](1)), verb_name) is getattr(Drive, verb_name):
@@ -109,9 +102,7 @@ def test_a_stop_does_not_delay_other_drives(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_start_during_a_stop_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    drive.set_frequency(20)
-    drive.start()
+    line, (drive,), (sim,) = che_drives(monkeypatch, runs_s=0)
     begun = len(line.frames)
     meanwhile = Meanwhile(line, 2, drive.start)
     drive.stop()
@@ -120,7 +111,7 @@ def test_a_start_during_a_stop_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> N
     assert not sim.motor.energised
 
 
-def test_a_stop_cancels_a_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_cancels_a_ramp_in_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
     drive.set_frequency(10)
     begun = len(line.frames)
@@ -136,11 +127,7 @@ def test_a_stop_cancels_a_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_stop_all_cancels_a_staggered_start(monkeypatch: pytest.MonkeyPatch) -> None:
     """A stop between two starts prevents the second start."""
-    sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
-    line = SimulatedBus(monkeypatch, *sims)
-    drives = [line.attach(sim.drive) for sim in sims]
-    for drive in drives:
-        drive.set_frequency(20)
+    line, drives, sims = che_drives(monkeypatch, 2)
     perform = drives[1].perform
 
     def stop_meanwhile(script: Script[Any]) -> Any:
@@ -170,12 +157,12 @@ def test_no_call_moves_a_motor_after_the_bus_is_closed(monkeypatch: pytest.Monke
     assert writes(line, begun) == []
 
 
-# ---- repeated until the motor stands ----
+# ---- repeated until the motor is at rest ----
 
 
 @every_family
 @pytest.mark.parametrize("seconds", [None, 12.0])
-def test_the_stop_of_a_silent_drive_leaves_others_more_than_half_of_the_line(
+def test_the_stop_of_a_silent_drive_leaves_other_drives_more_than_half_of_the_lines_time(
     monkeypatch: pytest.MonkeyPatch, model: str, seconds: float | None
 ) -> None:
     """Only the first frames of the stop are sent without delay. The total time of the stop stays the same."""
@@ -200,13 +187,8 @@ def test_the_stop_of_a_silent_drive_leaves_others_more_than_half_of_the_line(
 
 
 @pytest.mark.slow
-def test_a_stop_ends_after_its_time_and_reports_its_progress(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    drive.set_frequency(50)
-    drive.start()
-    line.sleep(20)
+def test_a_stop_ends_after_its_time_and_reports_its_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, (drive,), _ = che_drives(monkeypatch, hz=50, runs_s=20)
     begun = line.seconds
     with pytest.raises(Unconfirmed, match=r"it was not seen to stop within its 2 s"):
         drive.stop(seconds=2)
@@ -235,10 +217,7 @@ SENSELESS = [-1, float("nan"), float("-inf"), Decimal("sNaN"), True, "5", [5], 5
 def test_an_invalid_stop_time_is_ignored_with_a_warning(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, stops: str, seconds: Any
 ) -> None:
-    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    drive.set_frequency(50)
-    drive.start()
-    line.sleep(20)
+    line, (drive,), (sim,) = che_drives(monkeypatch, hz=50, runs_s=20)
     deaf_until = line.seconds + LEAST_S - 5
     line.deafens = lambda request: line.seconds < deaf_until
     if stops == "stop_all":
@@ -247,7 +226,10 @@ def test_an_invalid_stop_time_is_ignored_with_a_warning(
         getattr(drive, stops)(seconds=seconds)
     assert not sim.motor.energised
     flush(60)
-    assert "is not a time for a stop: it is repeated for 30 s at least, as without one" in caplog.text
+    assert (
+        "is not a time for a stop: the stop is repeated for at least 30 s, as without this argument"
+        in caplog.text
+    )
 
 
 def test_a_stop_with_wrong_arguments_is_sent_before_type_error_is_raised(
@@ -310,17 +292,9 @@ def test_stop_all_stops_repeating_after_seconds(monkeypatch: pytest.MonkeyPatch)
     }
 
 
-def test_a_stop_that_waits_for_its_drive_does_not_delay_another_stop(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_stop_that_waits_for_its_drive_does_not_delay_another_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     """The other motor ramps down and is read in the meantime."""
-    sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
-    line = SimulatedBus(monkeypatch, *sims)
-    for sim in sims:
-        drive = line.attach(sim.drive)
-        drive.set_frequency(50)
-        drive.start()
-    line.sleep(20)
+    line, _, sims = che_drives(monkeypatch, 2, hz=50, runs_s=20)
     ready_at = line.seconds + 3
     line.bus.peer(sims[0].drive).c.ready_ns = round(ready_at * 1e9)
     asked: list[tuple[int, float]] = []
@@ -336,9 +310,7 @@ def test_a_stop_that_waits_for_its_drive_does_not_delay_another_stop(
     assert of_others[0] < ready_at - 2 < ready_at <= rested[0] < ready_at + 0.5 < of_others[-1]
 
 
-def test_a_lost_read_is_not_repeated_before_the_stop_is_sent_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_lost_read_is_not_repeated_before_the_stop_is_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
     line.bus.check_identity(drive)
     begun = len(line.frames)
@@ -347,10 +319,8 @@ def test_a_lost_read_is_not_repeated_before_the_stop_is_sent_again(
     assert [is_write(request) for request, _ in line.frames[begun : begun + 3]] == [True, False, True]
 
 
-def test_only_later_writes_of_a_stop_wait_for_late_replies(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Waiting lets a stop be confirmed on a line with late replies, without delaying others' first writes."""
+def test_only_later_writes_of_a_stop_wait_for_late_replies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Waiting lets a stop be confirmed if replies are late. It does not delay other drives' first stops."""
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     line.bus.check_identity(drive)
     carry_out, waits = line.carry_out, list[float]()
@@ -384,9 +354,7 @@ def test_the_repetition_and_the_end_of_a_stop_are_logged_once(
     assert ends[0].startswith("invt-che@1: stopped after 2")
 
 
-def test_an_emergency_stop_that_trips_the_drive_is_sent_only_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_emergency_stop_that_trips_the_drive_is_sent_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1))
     drive.set_frequency(20)
     drive.start()
@@ -403,9 +371,7 @@ def test_an_emergency_stop_that_trips_the_drive_is_sent_only_once(
 def test_a_stop_reopens_a_lost_port_unless_a_poller_does(
     monkeypatch: pytest.MonkeyPatch, tended: bool
 ) -> None:
-    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
-    drive.set_frequency(20)
-    drive.start()
+    line, (drive,), (sim,) = che_drives(monkeypatch, runs_s=0)
     back_at = line.seconds + 5
     opened: list[float] = []
 
@@ -426,7 +392,7 @@ def test_a_stop_reopens_a_lost_port_unless_a_poller_does(
     line.bus.tended(tended)
     with pytest.raises(LineError):
         drive.read(drive.status)
-    opened.clear()  # a read has reopened the port too
+    opened.clear()  # forget that the read tried to open the port
     with pytest.raises(LineError):
         drive.stop(seconds=1)
     drive.stop()
@@ -451,7 +417,7 @@ def test_a_stop_on_a_closed_port_raises_immediately(monkeypatch: pytest.MonkeyPa
 # ---- a user's own drive ----
 
 
-def test_an_unwritable_ledger_prevents_no_stop(
+def test_a_stop_is_sent_although_the_ledger_cannot_be_written(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "file").write_text("")
@@ -466,9 +432,7 @@ def test_an_unwritable_ledger_prevents_no_stop(
     assert "stops were not counted" in caplog.text
 
 
-def test_a_stop_whose_reply_is_lost_is_sent_again_before_anything_is_read(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_stop_whose_reply_is_lost_is_sent_again_before_any_read(monkeypatch: pytest.MonkeyPatch) -> None:
     """Although the value could be read back, the stop is sent again first."""
     line = SimulatedBus(monkeypatch, simulated(Own(1)))
     drive = line.attach(Own(1))
@@ -550,7 +514,9 @@ def test_stop_all_stops_other_drives_if_a_script_raises(monkeypatch: pytest.Monk
     assert "division by zero" in found["breaks"].why
 
 
-def test_a_stop_that_is_a_plain_write_is_sent_once_the_drive_hears(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plain_write_that_stops_is_repeated_until_the_drive_hears_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line = SimulatedBus(monkeypatch, simulated(Own(1)))
     drive = line.attach(Own(1))
     line.deafens = lambda request: line.seconds < 1010
@@ -572,7 +538,7 @@ class Hanging(logging.Handler):
         self._hang()
 
 
-def test_a_hung_log_prevents_no_stop(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_stop_is_sent_if_the_log_hangs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A locked ledger prevents no stop either, and one drive's records do not delay another drive's stop."""
     line = SimulatedBus(monkeypatch, *(simulated(Own(number)) for number in (1, 2)), audit=tmp_path / "audit")
     first, second = (line.attach(Own(address)) for address in (1, 2))
@@ -644,7 +610,7 @@ def test_a_stop_without_reply_is_reported_as_sent(monkeypatch: pytest.MonkeyPatc
     assert "it is not known whether" in told[2]
 
 
-def test_a_finished_stop_is_no_longer_under_way(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_finished_stop_is_no_longer_reported_as_in_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     line = SimulatedBus(monkeypatch, simulated(YD1000(1)), simulated(YD1000(2)))
     names = [line.attach(sim.drive).name for sim in line.sims]
     line.loses = lambda request: request.address == 2
@@ -660,9 +626,7 @@ def test_a_finished_stop_is_no_longer_under_way(monkeypatch: pytest.MonkeyPatch)
     assert under_way[-1] == {names[1]}
 
 
-def test_a_refused_stop_is_not_reported_as_unsent(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_refused_stop_is_not_reported_as_unsent(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InnovertIBD(1))
     told: list[str] = []
 

@@ -13,6 +13,7 @@ from examples import in_turn, usually
 from lines import PATIENCE, LateWire, plant, polled, until
 from lines import line as declared_line
 from motors import MAKE, ReceivedRequests
+from tables import table
 
 from multidrop.bus import Bus
 from multidrop.control.audit_log import read_audit
@@ -160,7 +161,7 @@ def test_a_stop_whose_replies_are_lost_is_repeated_unchanged(model: str, lost: i
         assert not received.sim.motor.energised
 
 
-def test_closing_waits_for_a_stop_that_is_under_way() -> None:
+def test_closing_waits_for_a_stop_in_progress() -> None:
     with line("invt-che") as (bus, drive, received, _):
         drive.set_frequency(20)
         drive.start()
@@ -185,7 +186,7 @@ def test_closing_waits_for_a_stop_that_is_under_way() -> None:
 
 
 class Pulled:
-    """A line whose port is pulled out while the motor turns, and is back at once under the same name."""
+    """A line whose port is unplugged while the motor turns, and immediately returns under the same name."""
 
     def __init__(self, link: Path) -> None:
         self.link = str(link)
@@ -216,7 +217,7 @@ def stands(drive: Any) -> bool:
         return False
 
 
-@pytest.mark.parametrize("ending", ["close", "stop", "stop_all", "write"])
+@table("ending", ["close", "stop", "stop_all", "write"])
 def test_a_stop_reopens_a_lost_port(tmp_path: Path, ending: str) -> None:
     pulled = Pulled(tmp_path / "port")
     drive: Any = pulled.drive
@@ -228,7 +229,7 @@ def test_a_stop_reopens_a_lost_port(tmp_path: Path, ending: str) -> None:
         pulled.until_lost(bus)
         with pytest.raises(LineError):
             drive.state()
-        with pytest.raises(LineError):  # while the adapter is unplugged
+        with pytest.raises(LineError):  # the adapter is still unplugged
             bus.line.regain()
         with pulled.plugged_in():
             with pytest.raises(LineError):
@@ -236,7 +237,7 @@ def test_a_stop_reopens_a_lost_port(tmp_path: Path, ending: str) -> None:
             if ending == "close":
                 bus.stop_on_exit()
             elif ending == "write":
-                with suppress(Unconfirmed):  # a busy machine may be late with the reply
+                with suppress(Unconfirmed):  # a busy machine may read the reply late
                     drive.write(drive.control, drive.control.values(5))
                 until(lambda: stands(drive))
             else:

@@ -12,23 +12,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from c_programs import preloaded
 from motors import MAKE, STARTS
+from peers import preloaded
 from simulated_bus import EXCHANGE_TIME, SimulatedBus, one
 from stop_frames import Own, first, started_while, writes
 from tables import table
 
 from multidrop.bus import Bus
+from multidrop.control.call import written_before
 from multidrop.control.ramp import ramp
-from multidrop.control.time_limit import written_before
 from multidrop.core import Message
 from multidrop.drive import Direction, Drive, Script, read, wait, write
 from multidrop.drive.register import Kept, reading, setting
 from multidrop.drive.verbs import verb
-from multidrop.errors import (
-    CancelledByStop,
-    Expired,
-)
+from multidrop.errors import CancelledByStop, Expired
 from multidrop.families import YD1000, InvtCHE
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
@@ -59,7 +56,7 @@ def test_a_call_within_its_time_limit_is_sent(line: SimulatedBus) -> None:
 
 @pytest.mark.parametrize("seconds", [0, 0.5, 0.9])
 def test_a_call_delayed_past_its_time_limit_raises_expired(line: SimulatedBus, seconds: float) -> None:
-    """Without the limit the call would send its request, because the bus's own expiry is 1 s."""
+    """The delay is shorter than the bus's own expiry of 1 s, so only the limit prevents the request."""
     before = len(written(line))
     with within(line, seconds):
         line.sleep(0.45)
@@ -70,7 +67,9 @@ def test_a_call_delayed_past_its_time_limit_raises_expired(line: SimulatedBus, s
 
 
 @pytest.mark.parametrize("slept_before", [0, 3600])
-def test_only_sleep_of_the_computer_within_the_block_counts(line: SimulatedBus, slept_before: float) -> None:
+def test_the_limit_counts_the_computers_sleep_only_within_the_block(
+    line: SimulatedBus, slept_before: float
+) -> None:
     line.slept += slept_before
     before = len(written(line))
     with within(line, 0.5):
@@ -128,7 +127,7 @@ def test_a_shorter_expiry_of_the_bus_applies(line: SimulatedBus) -> None:
         line.bus.drives[0].set_frequency(20)
 
 
-def test_a_limit_that_returns_nan_expires_immediately(line: SimulatedBus) -> None:
+def test_a_call_expires_immediately_if_the_limit_function_returns_nan(line: SimulatedBus) -> None:
     before = len(written(line))
     with written_before(lambda: float("nan")), pytest.raises(Expired):
         line.bus.drives[0].set_frequency(20)
@@ -144,7 +143,7 @@ def test_a_stop_is_sent_after_the_time_limit(line: SimulatedBus) -> None:
 
 
 def test_a_stop_called_by_the_limit_function_cancels_the_call(line: SimulatedBus) -> None:
-    """A `limit` that checks for announced stops therefore misses no stop."""
+    """A program can therefore check for stops in its `limit` function, and misses none."""
     drive = line.bus.drives[0]
     before = len(written(line))
 
@@ -205,7 +204,7 @@ class Resting(Own):
     least_interval = 5.0
 
 
-@pytest.mark.parametrize("model", MAKE)
+@table("model", MAKE)
 def test_a_start_delayed_during_its_checks_is_not_sent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str
 ) -> None:
@@ -213,7 +212,7 @@ def test_a_start_delayed_during_its_checks_is_not_sent(
     check_not_sent(monkeypatch, tmp_path, model, lambda line: line.sleep(5))
 
 
-@pytest.mark.parametrize("model", MAKE)
+@table("model", MAKE)
 def test_a_start_is_not_sent_if_the_computer_slept_during_its_checks(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str
 ) -> None:
@@ -246,7 +245,7 @@ def test_slow_reads_do_not_expire_a_start(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_start_does_not_expire_while_its_reads_take_their_allowed_time(
     monkeypatch: pytest.MonkeyPatch, more: float, is_sent: bool
 ) -> None:
-    """A read may take its timeout, two silences of 100 ms and 64 characters; twenty longer reads are late."""
+    """A read may take as long as its timeout, two silences and 64 characters together."""
     line = SimulatedBus(monkeypatch, simulated(Looking(1)))
     drive = line.attach(Looking(1, confirmed=1, silence=0.1))
     line.bus.check_identity(drive)
@@ -282,17 +281,16 @@ def test_slow_writes_do_not_expire_a_verb(monkeypatch: pytest.MonkeyPatch) -> No
     before = len(writes(line))
     ramp(drive, 51, rate=0.5, every=1)
     assert len(writes(line)) - before == 100
-    assert 100 * EXCHANGE_TIME > 1.0  # so that one call's expiry would be exceeded
+    assert 100 * EXCHANGE_TIME > 1.0  # the ramp takes longer than the expiry of one call
 
 
 @table("expiry", [0, -1, float("nan"), float("inf"), 10**30, True, "1"])
 def test_an_invalid_expiry_is_refused(expiry: Any) -> None:
-    with pytest.raises(ValueError, match=r"expiry = .* is not a number of s above 0"):
+    with pytest.raises(ValueError, match=r"expiry = .* must be a number of seconds above 0"):
         Bus("/dev/none", expiry=expiry)
 
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="CLOCK_BOOTTIME is Linux's")
-
 
 CLIENT = """
 import sys
@@ -322,7 +320,7 @@ def test_a_start_is_not_sent_when_the_computer_wakes(tmp_path: Path, sleeps: boo
     answer, begun, slept = sim.answer, tmp_path / "begun", tmp_path / "slept"
 
     def answer_and_sleep(request: Message, now: float) -> Message | None:
-        if sleeps and begun.exists():  # at the first read of the start
+        if sleeps and begun.exists():  # sleeps at the first read of the start
             slept.touch()
         return answer(request, now)
 

@@ -1,23 +1,32 @@
-"""Attached: the drives of a bus; the bus carries out their verbs. A drive is on one bus at a time."""
+"""The drives of a bus, and what happens when they leave it. A drive is on one bus at a time.
+
+`Attached` holds the drives. `Leaving` cancels their calls and stops their motors when drives are detached,
+the bus is closed or the process exits.
+"""
 
 from __future__ import annotations
 
+import logging
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
+from multidrop.control.call import MOST_EXPIRY_S, check_expiry
+from multidrop.control.exit_hook import LastAct, exit_hook
 from multidrop.control.latches import Latches
-from multidrop.control.outcome import Outcome
+from multidrop.control.outcome import Outcome, Stopped
 from multidrop.control.performer import Performer
 from multidrop.control.stops import Stopper
-from multidrop.control.time_limit import MOST_EXPIRY_S, check_expiry
 from multidrop.core import Latch, Message
 from multidrop.drive.family import Drive, check_own, check_own_text
 from multidrop.drive.register import Register
 from multidrop.drive.text import Text
+from multidrop.transport.aside_log import log_aside
 from multidrop.transport.exchange import Exchanges
 
 D = TypeVar("D", bound=Drive)
+
+_log = logging.getLogger("multidrop.bus")
 
 
 def made(drive: D | type[D], address: int | None, line: dict[str, Any], details: dict[str, Any]) -> D:
@@ -86,7 +95,7 @@ class Attached:
         self, bus: Any, exchanges: Exchanges, latches: Latches, performer: Performer, stopper: Stopper
     ) -> None:
         self.drives: list[Drive] = []
-        self.lock = threading.RLock()  # one drive is added or removed at a time
+        self.lock = threading.RLock()  # held while a drive is added or removed
         self._bus = bus
         self._exchanges = exchanges
         self._latches = latches
@@ -95,17 +104,18 @@ class Attached:
         self._link = BusLink(exchanges, performer)
 
     def forked(self) -> None:
-        """Release the drives in a forked child, so that a bus of the child can have them."""
+        """Release the drives in a forked child, so that they can be attached to a bus of the child."""
         self.lock = threading.RLock()
         self._free(self.drives)
 
     def add(self, drive: Drive) -> None:
-        """Attach a drive. Raises ValueError if its address is taken or it is on another bus."""
+        """Attach a drive. Raises ValueError if its address is taken, or if the drive is on another bus."""
         with self.lock:
             for other in self.drives:
                 if other.address == drive.address:
                     raise ValueError(f"address {drive.address} is taken by {other.name}")
-            owner = vars(drive).setdefault("bus", self._bus)  # atomic: two buses cannot both take the drive
+            # `setdefault` is atomic: two buses cannot both take the drive
+            owner = vars(drive).setdefault("bus", self._bus)
             if owner is not self._bus and owner.is_open:
                 raise ValueError(
                     f"{drive.name} is on the bus at {owner.line.port}: detach it there first, or create "
@@ -134,7 +144,7 @@ class Attached:
             self._free([drive])
 
     def free(self) -> None:
-        """Release the drives once this bus is closed, so that other buses can have them."""
+        """Release the drives once this bus is closed, so that they can be attached to other buses."""
         with self.lock:
             self._free(self.drives)
 
@@ -142,3 +152,82 @@ class Attached:
         for drive in drives:
             if drive.bus is self._bus:
                 del drive.bus
+
+
+# ---- leaving the bus ----
+
+
+class Leaving:
+    """Cancels all calls of a bus at its end, and stops its drives if `stop_on_exit` was called."""
+
+    def __init__(
+        self,
+        latches: Latches,
+        stopper: Stopper,
+        stop_all: Callable[[], Mapping[str, Stopped]],
+        drives: Callable[[], Sequence[Drive]],
+    ) -> None:
+        self._drives = drives
+        self._latches = latches
+        self._stopper = stopper
+        self._stop_all = stop_all
+        self._last_act: LastAct | None = None
+        self.found: Mapping[str, Stopped] = {}  # results of the stops by `stop_on_exit`
+
+    @property
+    def stops(self) -> bool:
+        """True once `stop_on_exit` was called."""
+        return self._last_act is not None
+
+    def stop_on_exit(self) -> None:
+        """Stop all drives when the bus is closed or the process ends.
+
+        The first call raises ValueError outside the main thread.
+        """
+        if self._last_act is None:
+            self._last_act = exit_hook().add(
+                self._latches.shut,
+                self._act,
+                lambda: [drive.name for drive in self._drives()],
+            )
+
+    def _act(self) -> None:
+        self.found = self._stop_all()
+        _warn_of(self.found)
+
+    def begin(self) -> None:
+        """Cancel all calls; if `stop_on_exit` was called, start stopping the drives without waiting."""
+        self._latches.shut()
+        if self._last_act is not None:
+            self._last_act.begin()
+
+    def finish(self) -> None:
+        """Cancel all calls and start the stops as `begin` does; then wait for all unfinished stops."""
+        self.begin()
+        if self._last_act is not None:
+            exit_hook().finish(self._last_act)
+        if self._last_act is None or not self._last_act.is_cut_short:
+            self._latches.await_stops()
+
+    def part_with(self, drives: Sequence[Drive], to_stop: Sequence[Drive]) -> None:
+        """Cancel the calls of drives that are about to be detached, and wait for their unfinished stops.
+
+        If `stop_on_exit` was called, stop the drives `to_stop` before that wait.
+        """
+        self._latches.end(drives)  # first, because a start that is sent after the stops would not be stopped
+        if to_stop and self.stops:
+            run = self._stopper.stop_all(to_stop, lambda: False, None)
+            try:
+                run.carry_out()
+            except BaseException as interruption:
+                run.interrupted(interruption)
+                raise
+            _warn_of(run.found())
+        self._latches.await_stops(drives)
+
+
+def _warn_of(found: Mapping[str, Stopped]) -> None:
+    """Log each drive whose motor was not seen to stop."""
+    for stopped in found.values():
+        if not stopped.ok:
+            log_aside(_log, logging.WARNING, "%s", stopped)

@@ -1,6 +1,6 @@
 """Broadcaster: write to all drives of a bus with one broadcast, if that is harmless to each drive.
 
-A register address means different things to different families: the stop of one may be the run of another.
+A register address means different things to different families: one family's stop may be another's start.
 So all drives must be of one family, and must have the same settings and framing.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, cast
 
-from multidrop.control.author import check_author
+from multidrop.control.audit_log import check_author
 from multidrop.control.call import Call
 from multidrop.control.latches import Latches
 from multidrop.control.performer import Performer
@@ -23,7 +23,7 @@ from multidrop.errors import BusError, Unconfirmed, WriteForbidden
 
 
 class Broadcaster:
-    """Broadcasts on one bus."""
+    """Sends broadcasts to all drives of one bus."""
 
     def __init__(self, writer: Writer, performer: Performer, latches: Latches) -> None:
         self._writer = writer
@@ -33,7 +33,7 @@ class Broadcaster:
     def write(
         self, drives: Sequence[Drive], register: Register[Any] | str, value: Any
     ) -> dict[str, State | BusError]:
-        """Broadcast a write; return each drive's state by name, or the error of reading the state.
+        """Broadcast a write; return by drive name the state read afterwards, or the error of that read.
 
         Raises WriteForbidden if the write must not be broadcast.
         """
@@ -43,15 +43,15 @@ class Broadcaster:
             register = drives[0].register(register)
         if drives and drives[0].framing is Framing.TCP:
             raise WriteForbidden(
-                f"{register.name} cannot be broadcast over Modbus TCP: unit id 0 is the gateway or the "
-                "device itself, and its maker decides what a write does; write to one drive after another",
+                f"{register.name} cannot be broadcast over Modbus TCP: there, unit id 0 is not a broadcast, "
+                f"but the gateway or the device itself; write to one drive after another",
                 register=register.name,
                 rule="Modbus TCP has no broadcast",
             )
         if not _are_alike(drives):
             raise WriteForbidden(
-                f"{register.name} cannot be broadcast: the drives on this line differ in family or settings, "
-                "and the same address means different things to them; write to one after another",
+                f"{register.name} cannot be broadcast: the drives on this line differ in family or "
+                f"settings, so an address may be another register on each; write to one drive after another",
                 register=register.name,
                 rule="the drives on the line differ",
             )
@@ -78,7 +78,7 @@ class Broadcaster:
         return {drive.name: self._state(drive) for drive in drives}
 
     def _checked_call(self, drives: Sequence[Drive], what: str) -> Call:
-        """Check each drive as for a write to that drive alone; return a new call of the first drive."""
+        """Run the checks of a single write for each drive; return a new call of the first drive."""
         check_author()
         calls = [self._performer.call(drive) for drive in drives]
         for call in calls:
@@ -94,7 +94,7 @@ class Broadcaster:
             return failure
 
     def stop(self, drives: Sequence[Drive]) -> bool:
-        """Broadcast a stop, if `identify` has confirmed each drive and their family has a broadcast stop.
+        """Broadcast a stop if `identify` has confirmed each drive and their family has a broadcast stop.
 
         Return True if the stop may have been sent.
         """

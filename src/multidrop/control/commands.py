@@ -1,4 +1,4 @@
-"""The command service of servers with many clients: carries out their verbs, writes and stops on drives.
+"""The command service of servers: carries out the verbs, writes and stops that many clients call.
 
 Each command has a thread of its own, so that a stop waits for no other command. The thread inherits its
 caller's context: the author (`written_by`) and the deadline (`written_before`). A command never raises; it
@@ -14,31 +14,32 @@ from functools import partial
 from math import isfinite
 from typing import Any, NamedTuple, TypeVar
 
-from multidrop.control.command_results import (
+from multidrop.control.call import written_before
+from multidrop.control.outcome import (
+    Outcome,
+    Stopped,
     result_of_failed_stop,
     result_of_failure,
     result_of_stop,
     result_of_write,
 )
-from multidrop.control.outcome import Outcome, Stopped
-from multidrop.control.time_limit import written_before
-from multidrop.drive.command_result import CommandOutcome, CommandResult
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
+from multidrop.drive.verbs import CommandOutcome, CommandResult
 from multidrop.errors import NotAttached
 from multidrop.supervisor import supervisor
 
 COMMAND_S = 60.0  # a command that takes longer is reported as hanging (a stop may take 30 s)
-AGAIN_S = 0.2  # s between the turns in which the event loop carries out stops, if no thread can be started
-TURN_S = 0.2  # s; length of such a turn, which blocks the event loop
-STOP_S = 30.0  # s; how long a stop without a thread is repeated
-REPEATED_S = 30.0  # least time in s after a stop's call in which the drive's stops are repeated
-BEGINNING_S = 0.25  # longest time from a stop's call until it is listed as under way
+TURN_S = 0.2  # s; how long a stop that has no thread blocks the event loop in one turn
+AGAIN_S = 0.2  # s; pause between two such turns, for the event loop's other work
+STOP_S = 30.0  # s; how long the event loop repeats a stop that has no thread
+REPEATED_S = 30.0  # s; a drive's stop is repeated for at least this long after each call of a stop
+BEGINNING_S = 0.25  # s; longest time from the call of a stop until `stops_under_way` lists it
 
 R = TypeVar("R")
 Results = dict[str, CommandResult]  # by drive name
 StopFuture = asyncio.Future[Results]
-StopWork = Callable[[float | None], Results]  # argument: how many seconds to repeat stops (None: the default)
+StopWork = Callable[[float | None], Results]  # argument: for how many s to repeat the stop (None: default)
 
 
 # ---- on a drive ----
@@ -54,7 +55,7 @@ def carry_out_verb(drive: Drive, verb: str, arguments: Mapping[str, Any]) -> Com
 
 
 def write_register(drive: Drive, name: str, value: float | str) -> CommandResult:
-    """Write a register, and return the result, never raise. A choice is given by name or raw count."""
+    """Write a register and return the result; never raise. A choice is given by its name or raw count."""
     try:
         register = drive.register(name)
         typed = typed_value(register, value)
@@ -70,23 +71,23 @@ def write_register(drive: Drive, name: str, value: float | str) -> CommandResult
 
 
 def typed_value(register: Register[Any], value: float | str) -> Any:
-    """Return a value in the register's type. Raises ValueError for a choice's number that is not whole."""
+    """Return a value in the register's type. Raises ValueError if a choice's number is not whole."""
     if isinstance(value, str):
         return register.parse(value)
     if register.values is None:
         return value
     if isinstance(value, float) and (not isfinite(value) or value != int(value)):
-        raise ValueError(f"{register.name} takes a choice's name or its whole number, not {value!r}")
+        raise ValueError(f"{register.name} takes the name or the number of a choice, not {value!r}")
     return register.decode(value)
 
 
 def stop_drive(drive: Drive, seconds: float | None) -> Results:
-    """Stop one drive; return the result by its name."""
+    """Stop one drive; return a dict of the result by the drive's name."""
     return stop_drive_by("stop", drive, seconds)
 
 
 def stop_drive_by(verb: str, drive: Drive, seconds: float | None) -> Results:
-    """Stop one drive with this verb, such as `coast`; return the result by its name."""
+    """Stop one drive with this verb, such as `coast`; return a dict of the result by the drive's name."""
     try:
         return {drive.name: getattr(drive, verb)(seconds=seconds)}
     except Exception as failure:  # any failure: the result reports it to the caller
@@ -153,15 +154,16 @@ def begin_stops(works: Sequence[StopWork]) -> list[asyncio.Future[Results]]:
     except (RuntimeError, MemoryError):
         left = works[len(begun) :]
         rest = supervisor().start("stop", _stop_without_threads(left))
-        begun += [asyncio.shield(rest) for _ in left]  # the task continues if its callers are cancelled
+        # shielded: the task continues if its callers are cancelled
+        begun += [asyncio.shield(rest) for _ in left]
     return begun
 
 
 async def _stop_without_threads(works: Sequence[StopWork]) -> Results:
-    """Send all stops once before waiting for any motor; then repeat them in turns.
+    """Send all stops once before waiting for any motor to stop; then repeat the stops in turns.
 
-    As soon as the system has a thread again, a stop continues in one. The event loop runs between the turns,
-    because a fleet's gateway must renew the lease without which it may not send a stop.
+    As soon as the system has a thread again, a stop continues in that thread. The event loop runs between the
+    turns, because a fleet's gateway must renew its lease: it may not send a stop without one.
     """
     loop = asyncio.get_running_loop()
     found: Results = {}
@@ -189,7 +191,7 @@ async def _stop_without_threads(works: Sequence[StopWork]) -> Results:
 
 
 class LineStop(NamedTuple):
-    """Drives of one line to stop. `whole` is a call that stops the whole line; None to stop only `drives`."""
+    """Drives of one line to stop. `whole` is a function that stops the whole line, or None."""
 
     drives: Sequence[Drive]
     whole: StopWork | None = None
@@ -198,9 +200,9 @@ class LineStop(NamedTuple):
 class RepeatedStops:
     """Repeats only one stop per drive at a time, however many clients of a server call stops.
 
-    The stop of a silent drive is repeated for 30 s, and each time its line waits for the reply. If the stop
-    of every call were repeated, this would delay the stops of other drives, and all reads. `stop` is the
-    function that stops one drive. Use this class only in the server's event loop.
+    The stop of a silent drive is repeated for 30 s, and each time its line waits for the reply. If every
+    client's stop were repeated, these waits would delay the stops of other drives, and all reads. `stop` is
+    the function that stops one drive. Use this class only in the server's event loop.
     """
 
     def __init__(
@@ -210,9 +212,10 @@ class RepeatedStops:
     ) -> None:
         self._stop = stop
         self._begin = begin
-        self._repeated: dict[Drive, tuple[StopFuture, float]] = {}  # newest repeated stop, time of its call
+        # by drive: the newest repeated stop, and the time of that stop's call
+        self._repeated: dict[Drive, tuple[StopFuture, float]] = {}
         self._sent: dict[Drive, StopFuture] = {}  # stops that are sent once, in flight
-        self._waiting: dict[Drive, StopFuture] = {}  # stops to send once after the one in flight
+        self._waiting: dict[Drive, StopFuture] = {}  # stops to send after the stop in flight
         self._tasks: set[StopFuture] = set()
 
     def begin(self, lines: Iterable[LineStop]) -> list[StopFuture]:
@@ -243,9 +246,9 @@ class RepeatedStops:
         self._repeated |= dict.fromkeys(drives, (stops, _now()))
 
     def of(self, drive: Drive) -> StopFuture | None:
-        """Return the future that is repeating this drive's stop; None if there is none.
+        """Return the future of the repeated stop of this drive; None if no stop is being repeated.
 
-        The stop of a whole line may be over for this drive and continue only for others; then return None.
+        Also return None if this drive's stop is over while the stop of its whole line continues.
         """
         stops, called = self._repeated.get(drive, (None, 0.0))
         if stops is None or stops.done():
@@ -255,7 +258,7 @@ class RepeatedStops:
         return stops if goes_on or _now() - called < BEGINNING_S else None
 
     def divided(self, drives: Iterable[Drive]) -> tuple[list[Drive], list[Drive]]:
-        """Divide drives into those whose stop must be started, and those whose stop is already repeated."""
+        """Return the drives whose stop must be started, and those whose stop is already being repeated."""
         drives = [*drives]
         again = [drive for drive in drives if self.of(drive) is not None]
         return [drive for drive in drives if drive not in again], again
@@ -263,7 +266,7 @@ class RepeatedStops:
     def send_once(self, drive: Drive) -> StopFuture:
         """Send a drive one more stop beside its repeated stop; return a future for the repeated stop.
 
-        If the repeated stop gives up before REPEATED_S after this call, start another one.
+        If the repeated stop gives up less than REPEATED_S after this call, start another one.
         """
         task = asyncio.ensure_future(self._send_and_await(drive))
         self._tasks.add(task)  # the task continues if its caller is cancelled
@@ -283,7 +286,7 @@ class RepeatedStops:
         return {drive.name: result}
 
     def _soon(self, drive: Drive) -> StopFuture:
-        """Send a stop now; if a stop is in flight, send only one after it for all waiting calls."""
+        """Send a stop now; during another stop, send one more after it, which serves all waiting calls."""
         if drive not in self._sent:
             return self._send(drive)
         if drive not in self._waiting:
@@ -298,7 +301,7 @@ class RepeatedStops:
 
     async def _send_after(self, before: StopFuture, drive: Drive) -> Results:
         await asyncio.wait([before])
-        del self._waiting[drive]  # a later call needs another stop, sent after this one
+        del self._waiting[drive]  # a call from now on needs another stop, sent after this stop
         return await self._send(drive)
 
     def _forget(self, drive: Drive, sent: StopFuture) -> None:

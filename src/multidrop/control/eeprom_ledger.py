@@ -1,7 +1,7 @@
-"""Ledger: count the writes of each register that a drive may keep in EEPROM, across restarts.
+"""Ledger: a file that counts the writes of each register that a drive may keep in EEPROM.
 
-Several processes share the file. In it a drive is identified by its port's identity and its address. An
-EEPROM survives about 10,000 writes; a yearly budget makes them last for ten years.
+Several processes share the file. It identifies a drive by its port's identity and its address. An
+EEPROM survives about 10,000 writes; a yearly budget makes these writes last for ten years.
 """
 
 from __future__ import annotations
@@ -13,22 +13,21 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from multidrop.transport.port_identity import of_name
-from multidrop.transport.simulated_ports import is_simulated, ledger_of
+from multidrop.transport.port_identity import is_simulated, ledger_of, of_name
 
 YEAR = 365 * 86400.0  # s
 CYCLES = 10_000  # writes that an EEPROM survives (Toshiba's figure for a relative of the YD1000)
 YEARS = 10
 BUDGET = CYCLES // YEARS  # limit of writes of one register in a year
-NO_HOME = Path("/nonexistent")  # the home of a user without one
-LATEST = 6e10  # UTC in s: a later time, or one as far before 1970, shows that the file is damaged
-YEARLY = "times in a year"  # words that only the refusal for a used-up yearly budget contains
+NO_HOME = Path("/nonexistent")  # used for a user without a home folder
+LATEST = 6e10  # s; the file is damaged if a time in it is further than this from 1970
+YEARLY = "times in a year"  # identifies the refusal for a used-up yearly budget
 LEAST_INTERVAL = 60.0  # s between two writes of a register that is kept in EEPROM
 
 
 @dataclass(frozen=True)
 class LedgerCell:
-    """One register of one drive in a ledger.
+    """A counter in a ledger: one register of one drive.
 
     `port` is the port's identity (see port_identity). `spelt` is the port's name, which older entries have
     instead of the identity.
@@ -80,14 +79,14 @@ class Ledger:
     def enter(self, cell: LedgerCell, now: float, least_interval: float) -> str:
         """Count a write that is about to be sent, and return "".
 
-        If the write must not be sent, return the reason and do not count it. `now` is UTC in s;
+        If the write must not be sent, return the reason, and do not count the write. `now` is UTC in s;
         `least_interval` is the shortest time in s between two writes. Check and count are one transaction, so
         two processes cannot both use the last of the budget. Raises OSError if the file cannot be written.
         """
         with self._opened() as ledger:
             ledger.execute("begin immediate")
             wear = _wear(ledger, cell, _names(ledger, cell), now)
-            since = now - wear.last  # below 0 if the clock was set back; the real time is unknown
+            since = now - wear.last  # negative if the clock was set back; then the true interval is unknown
             if wear.writes and 0 <= since < least_interval:
                 return (
                     f"it is kept in EEPROM, was written {since:.0f} s ago and is written once in "
@@ -125,7 +124,7 @@ class Ledger:
         return sorted(found, key=_by_wear)
 
     def wear_of(self, port: str, address: int, model: str, now: float) -> list[Wear]:
-        """Return the wear of one drive's cells.
+        """Return the wear of each counted register of one drive.
 
         `port` is the port's name or identity, `model` the drive's `ledger_name`, `now` UTC in s.
         """

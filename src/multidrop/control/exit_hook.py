@@ -25,7 +25,7 @@ from multidrop.core.fork import register_at_fork
 from multidrop.errors import BusError
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-IMPATIENT = 3  # number of signals within a second that end the wait for the stops
+IMPATIENT = 3  # this many signals within a second end the wait for the stops
 HANDLING_S = 0.05  # longest time until a signal is handled
 PACKAGE = __name__.partition(".")[0]
 MOST_NAMES = 20  # limit of drives named in a message
@@ -87,7 +87,7 @@ class LastAct:
         self._on_begin = begin
         self._work = work
         self._on_over = over
-        self._calls: SimpleQueue[None] = SimpleQueue()  # unlike an Event, safe in a signal handler
+        self._calls: SimpleQueue[None] = SimpleQueue()  # safe in a signal handler, unlike an Event
         self._over = threading.Event()
         self.is_cut_short = False  # whether a signal ended the wait for the work
         threading.Thread(target=self._run, name="multidrop exit", daemon=True).start()
@@ -108,7 +108,7 @@ class LastAct:
             self._over.wait(HANDLING_S)
 
     def forget(self) -> None:
-        """Mark the work as given up in a forked child; the parent does the work."""
+        """In a forked child, mark the work as given up, because the parent process does the work."""
         self._over = threading.Event()
         self.is_cut_short = True
 
@@ -126,15 +126,18 @@ class LastAct:
 class ExitHook:
     """Starts all last acts at exit or on a signal, and delays the signal's effect until they are over.
 
-    Standard error immediately says which drives are being stopped, and how to end the wait. After the stops
-    the signal has the effect it had before this hook. IMPATIENT signals within a second end the wait.
+    The hook immediately prints which drives are being stopped, and how to end the wait. After the stops the
+    signal has the effect that it would have without this hook. A third signal within a second (see IMPATIENT)
+    ends the wait.
     """
 
     def __init__(self) -> None:
-        self._acts: list[LastAct] = []  # changed atomically, because any thread may add and remove acts
-        self._before: dict[signal.Signals, Any] = {}  # the program's handlers before ours
+        # changed by atomic operations only, because any thread may add and remove acts
+        self._acts: list[LastAct] = []
+        # by signal: the program's handler before ours was installed
+        self._before: dict[signal.Signals, Any] = {}
         self._has_taken = False
-        self._held: int | None = None  # the first signal, while its effect is delayed
+        self._held: int | None = None  # number of the first signal, while the signal's effect is delayed
         self._came: list[float] = []  # times of recent signals
         self._passing = threading.Lock()
         self._has_passed = False
@@ -163,7 +166,7 @@ class ExitHook:
         act = LastAct(begin, work, self._one_is_over, drives)
         self._acts.append(act)
         try:
-            self.take_signals()  # another bus that was closed meanwhile may have restored the old handlers
+            self.take_signals()  # closing another bus may have restored the old handlers meanwhile
         except ValueError:
             self._acts.remove(act)
             raise
@@ -173,16 +176,17 @@ class ExitHook:
         return act
 
     def take_signals(self) -> None:
-        """Install our signal handlers; the earlier handlers are called after the stops.
+        """Install our signal handlers, which call the earlier handlers after the stops.
 
-        Raises ValueError outside the main thread, unless ours are already installed.
+        Raises ValueError outside the main thread, unless our handlers are already installed.
         """
         if self._has_taken and threading.current_thread() is not threading.main_thread():
             return
         for number in _ending():
             had = signal.getsignal(number)
             if had != self._on_signal:
-                self._before[number] = had  # before installing ours: the signal may arrive immediately
+                # stored before our handler is installed, because the signal may arrive immediately
+                self._before[number] = had
                 signal.signal(number, self._on_signal)
         self._has_taken = True
 
@@ -194,7 +198,7 @@ class ExitHook:
     def finish(self, act: LastAct) -> None:
         """Carry out a last act now, and remove it."""
         act.finish()
-        with suppress(ValueError):  # another thread has already removed it
+        with suppress(ValueError):  # another thread has already removed the act
             self._acts.remove(act)
         self.rest()
 
@@ -256,7 +260,7 @@ class ExitHook:
             time.sleep(HANDLING_S)
 
     def _pass_on(self, number: int, frame: FrameType | None) -> None:
-        """Give the signal the effect it had before this hook.
+        """Give the signal the effect that it would have without this hook.
 
         If the program has since installed a handler that calls ours, do not call that handler again.
         """
@@ -296,13 +300,13 @@ def without_internals(interruption: BaseException) -> None:
 
 
 def give_signals_back() -> None:
-    """If no bus has to be stopped at exit, restore the earlier signal handlers (main thread only)."""
+    """Restore the earlier signal handlers if no drives must be stopped at exit (main thread only)."""
     if _hook is not None:
         _hook.rest()
 
 
 def await_signal() -> None:
-    """Wait until a signal that started stops has its effect (main thread only)."""
+    """If a signal has started the stops, wait until the signal has its effect (main thread only)."""
     if _hook is not None:
         _hook.await_effect()
 

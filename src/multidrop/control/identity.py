@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import Any, NamedTuple
 
-from multidrop.core import PAUSE_NS
+from multidrop.core import PAUSE_NS, Peer
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.script import Read, Script, Step, Wait, carry_out
@@ -52,8 +52,9 @@ class EchoCheck:
         self._exchanges = exchanges
 
     def read_any(self, drive: Drive, attempts: int, *, insists: bool = False, timeout: float = 0.0) -> None:
-        """Read one register, to see whether the drive answers: a read's reply is never a copy of its request.
+        """Read one register, to find out whether the drive answers.
 
+        An adapter's echo cannot pass for the reply, because a read's reply is never a copy of its request.
         A Modbus exception counts as a reply. Does nothing if the drive has no readable register.
         """
         readable = (register for register in drive.registers.values() if register.readable)
@@ -65,8 +66,8 @@ class EchoCheck:
     def probe(self, drive: Drive, *, insists: bool = False) -> None:
         """Read a register once, so that the line learns whether a received copy of a request was an echo.
 
-        The same request from another client looks like an echo. Without this read, the line would then take
-        the drive's confirmations of writes, which are also copies, for echoes and ignore them.
+        If another client sends the same request, that request looks like our echo. Without this read, the
+        line would from then on ignore the drive's confirmations of writes, which are copies of requests too.
         """
         with suppress(NoReply, BadReply, LineError, NotAttached, NotMaster):
             self.read_any(drive, 1, insists=insists, timeout=WRITE_TIMEOUT)
@@ -88,13 +89,28 @@ class EchoCheck:
 
 
 class _Confirmed(NamedTuple):
-    """The state of line and drive when the drive's family was last confirmed."""
+    """The drive's state when its family was last confirmed."""
 
-    port: object  # the open port's object; reopening creates another one
-    silences: int  # number of unanswered requests until then
+    silences: int  # number of the drive's unanswered requests until then
     pauses: int  # number of pauses of PAUSE_NS or more between the drive's replies until then
     at_ns: int
-    slept_ns: int  # time that the computer had slept until then
+    slept_ns: int  # how long the computer had slept since it was started
+
+    def was_heard(self, peer: Peer) -> bool:
+        """Return True if the drive was never silent for PAUSE_NS or more since this confirmation."""
+        idle_ns = clock.now_ns() - max(self.at_ns, peer.answered_ns)
+        return self.pauses == peer.pauses and idle_ns + _slept_ns() - self.slept_ns < PAUSE_NS
+
+
+class _Findings:
+    """Results of a drive's checks since its port was opened."""
+
+    def __init__(self, port: object) -> None:
+        self.port = port  # the open port's object; reopening creates another one
+        self.confirmed: _Confirmed | None = None
+        self.stops: set[float] = set()  # raw counts of stops that were allowed
+        self.suspicion: Suspicion | None = None  # found by the previous check before a stop
+        self.doubt = ""  # why the drive may be of another family, although it was sent a stop
 
 
 class IdentityCheck:
@@ -103,36 +119,21 @@ class IdentityCheck:
     def __init__(self, exchanges: Exchanges, echo: EchoCheck) -> None:
         self._exchanges = exchanges
         self._echo = echo
-        self._known: dict[Drive, _Confirmed] = {}  # drives whose family was confirmed
-        self._stoppable: dict[
-            Drive, tuple[object, set[float]]
-        ] = {}  # the open port, and the raw counts of stops that were allowed
-        self._doubted: dict[Drive, tuple[object, str]] = {}  # the open port, and why it may be another make
-        self._suspected: dict[Drive, tuple[object, Suspicion]] = {}  # the open port, and the first suspicion
+        self._all_findings: dict[Drive, _Findings] = {}
+
+    def _findings(self, drive: Drive) -> _Findings:
+        """Return the results of this drive's checks since its port was opened."""
+        port = self._exchanges.line.queue
+        findings = self._all_findings.get(drive)
+        if findings is None or findings.port is not port:
+            findings = self._all_findings[drive] = _Findings(port)
+        return findings
 
     def is_known(self, drive: Drive) -> bool:
-        last = self._known.get(drive)
-        return last is not None and last.port is self._exchanges.line.queue
-
-    def _was_heard(self, drive: Drive) -> bool:
-        """Return True if the family was confirmed on this port, and no silence of PAUSE_NS came since."""
-        last = self._known.get(drive)
-        if last is None or last.port is not self._exchanges.line.queue:
-            return False
-        peer = self._exchanges.peer(drive)
-        idle_ns = clock.now_ns() - max(last.at_ns, peer.answered_ns)
-        return last.pauses == peer.pauses and idle_ns + _slept_ns() - last.slept_ns < PAUSE_NS
-
-    def _has_answered_all(self, drive: Drive) -> bool:
-        """Return True if the drive answered every request since its family was confirmed."""
-        last = self._known.get(drive)
-        return last is not None and last.silences == self._exchanges.peer(drive).silences
+        return self._findings(drive).confirmed is not None
 
     def forget(self, drive: Drive) -> None:
-        self._known.pop(drive, None)
-        self._stoppable.pop(drive, None)
-        self._doubted.pop(drive, None)
-        self._suspected.pop(drive, None)
+        self._all_findings.pop(drive, None)
 
     # ---- before a write that may move a motor ----
 
@@ -140,52 +141,54 @@ class IdentityCheck:
         """Check that the drive is of its declared family, unless the last check still holds.
 
         Raises WriteForbidden if the drive is of another family, NoReply if it does not answer. A check no
-        longer holds if the port was reopened, a reply was missing, or the drive was silent for PAUSE_NS: it
-        may have been replaced. Reads at least one value, so that an adapter's echo is detected before it
-        could pass for the drive's confirmation. Each read is within a block of `timed`.
+        longer holds if the port was reopened, a reply was missing, or the drive was silent for PAUSE_NS: then
+        the drive may have been replaced. Reads at least one value, so that an adapter's echo is detected
+        before it could pass for the drive's confirmation. Each read runs within its own `timed()` block.
         """
-        was_heard = self._was_heard(drive)
-        if was_heard and self._has_answered_all(drive):
+        findings = self._findings(drive)
+        last, peer = findings.confirmed, self._exchanges.peer(drive)
+        silences = peer.silences
+        was_heard = last is not None and last.was_heard(peer)
+        if last and was_heard and last.silences == silences:
             return  # the drive cannot have been replaced since its last check
 
         def do(step: Step) -> object:
             if isinstance(step, Wait):
-                return clock.sleep(step.seconds)
+                clock.sleep(step.seconds)
+                return None
             with timed():
                 return self._read(drive, step, READ_ATTEMPTS)
 
-        port, silences = self._exchanges.line.queue, self._exchanges.peer(drive).silences
         try:
             carry_out(drive.identify.script(), do)
         except WriteForbidden as refusal:
-            with timed():
-                make = self._shown(drive, _of_same_register(drive))
+            make = self._shown(drive, _of_same_register(drive), timed)
             if make is None:
                 raise
             raise WriteForbidden(f"{refusal}; {_declare(make)}", rule=refusal.rule) from refusal
         except DriveException as refusal:
             kind = drive.title or type(drive).__name__
             raise WriteForbidden(
-                f"nothing is written to {drive.name}: it refuses what every {kind} answers ({refusal})",
+                f"nothing is written to {drive.name}: it refuses a read that every {kind} answers "
+                f"({refusal})",
                 rule="it does not answer like its family",
             ) from refusal
         if drive.identity_is_weak and (rivals := easily_mistaken_for(drive)):
-            with timed():
-                make = self._shown(drive, rivals)
+            make = self._shown(drive, rivals, timed)
             if make is not None:
                 why = f"nothing is written to {drive.name}: {_declare(make)}"
                 raise WriteForbidden(why, rule="it shows another make")
         if not self._exchanges.has_answered(drive):
             with timed():
                 self._echo.read_any(drive, READ_ATTEMPTS)
-        self._know(drive, port, silences, was_heard=was_heard)
+        self._know(drive, findings, silences, was_heard=was_heard)
 
-    def _know(self, drive: Drive, port: object, silences: int, *, was_heard: bool) -> None:
-        """Record that the family was confirmed; `was_heard` is False if the drive was silent before."""
-        before, pauses = self._known.get(drive), self._exchanges.peer(drive).pauses
+    def _know(self, drive: Drive, findings: _Findings, silences: int, *, was_heard: bool) -> None:
+        """Record that the family was confirmed; `was_heard` is False if the drive had been silent before."""
+        before, pauses = findings.confirmed, self._exchanges.peer(drive).pauses
         if not was_heard or before is None or before.pauses != pauses:
             _forget_setpoint(drive)
-        self._known[drive] = _Confirmed(port, silences, pauses, clock.now_ns(), _slept_ns())
+        findings.confirmed = _Confirmed(silences, pauses, clock.now_ns(), _slept_ns())
 
     def _read(self, drive: Drive, step: Step, attempts: int, *, insists: bool = False) -> object:
         if not isinstance(step, Read):
@@ -195,54 +198,56 @@ class IdentityCheck:
     # ---- before a stop ----
 
     def check_before_stop(self, drive: Drive, register: Register[Any], count: float) -> None:
-        """Check the family once per open port, without waits. Raises WriteForbidden on proof of another make.
+        """Check the family once per open port, without waits.
 
-        Raises CheckAgain after the first suspicion: call this again after the stops of other drives.
+        Raises WriteForbidden if the drive is surely of another make. Raises CheckAgain after the first
+        suspicion: call this again after the stops of other drives.
 
-        The raw count that stops one family may run the motor of another. But a failed check is not proof: a
-        parameter such as an address or a baud rate may hold a value that is not in force yet, and a reply may
-        belong to an earlier request. In such a case the stop is sent. The stop is withheld only if `identify`
-        fails SURE times in a row, every request was answered so far, and one of these conditions is true:
-        another built-in family recognises the drive; the drive answers as a make whose motor this raw count
-        would run; or `identify` is certain (it raised WriteForbidden with the rule ANOTHER_FAMILY).
+        The raw count that stops one family may run the motor of another. But a failed check does not prove
+        that the drive is of another family. A parameter such as an address or a baud rate may hold a value
+        that is not in force yet, and a reply may belong to an earlier request. In such a case the stop is
+        sent. The stop is withheld only if `identify` fails SURE times in a row, every request was answered so
+        far, and there is more evidence. Any one of these is enough: another built-in family recognises the
+        drive; the drive answers as a make whose motor this raw count would run; `identify` raised
+        WriteForbidden with the rule ANOTHER_FAMILY.
         """
-        port = self._exchanges.line.queue
-        on_port, allowed = self._stoppable.get(drive, (None, set()))
-        if self.is_known(drive) or (on_port is port and count in allowed):
+        findings = self._findings(drive)
+        if findings.confirmed or count in findings.stops:
             return
         rivals = run_by(register, count)
         suspicion = self._suspicion(drive, rivals) if self._is_in_step(drive) else None
-        on, before = self._suspected.pop(drive, (port, None))
-        if suspicion is not None and suspicion.make is not None:  # it answered as this make several times
+        before, findings.suspicion = findings.suspicion, None
+        # the drive has answered SURE times as this make
+        if suspicion is not None and suspicion.make is not None:
             raise _withheld(drive, suspicion.why, suspicion.make)
-        if suspicion is not None and (before is None or on is not port):
-            self._suspected[drive] = port, suspicion
+        if suspicion is not None and before is None:
+            findings.suspicion = suspicion
             raise CheckAgain
         if suspicion is not None and suspicion == before:
             other = self._lookalike(drive, register, count) or self._shown(drive, rivals)
             if other is not None or suspicion.is_certain:
                 raise _withheld(drive, suspicion.why, other)  # the next stop checks the drive again
         if suspicion is not None:
-            self._doubted[drive] = port, suspicion.why
-        self._stoppable[drive] = port, (allowed if on_port is port else set()) | {count}
+            findings.doubt = suspicion.why
+        findings.stops.add(count)
 
     def doubt(self, drive: Drive) -> str:
-        """Return why a drive that was sent a stop may be of another family; "" if nothing suggests it."""
-        port, why = self._doubted.get(drive, (None, ""))
-        return why if port is self._exchanges.line.queue and not self.is_known(drive) else ""
+        """Return why a drive that was sent a stop may be of another family; "" without a suspicion."""
+        findings = self._findings(drive)
+        return "" if findings.confirmed else findings.doubt
 
     def _is_in_step(self, drive: Drive) -> bool:
-        """Return True if a reply from the drive's address can only belong to the present request."""
+        """Return True if a late reply to an earlier request cannot be taken for the present reply."""
         peer = self._exchanges.peer(drive)
         return not (peer.counters().late or peer.silences or peer.late_until_ns)
 
     def _suspicion(self, drive: Drive, rivals: Sequence[Make]) -> Suspicion | None:
-        """Run the family's `identify` once; return None unless it, or evidence, suggests another family.
+        """Run the family's `identify` once; return a suspicion if the drive seems to be of another family.
 
-        Evidence of `rivals` is read only if the family's identity is weak.
+        Registers that show a make in `rivals` are read only if the family's identity is weak.
         """
-        port, refused = self._exchanges.line.queue, None
-        silences = self._exchanges.peer(drive).silences
+        findings, silences = self._findings(drive), self._exchanges.peer(drive).silences
+        refused = None
 
         def do(step: Step) -> object:
             nonlocal refused
@@ -268,7 +273,8 @@ class IdentityCheck:
         except Exception:  # no reply, or an error in the family's own code: the stop is sent
             return self._rival(drive, rivals)
         if self._is_in_step(drive):
-            self._know(drive, port, silences, was_heard=False)  # a known drive is not checked before a stop
+            # only drives whose family is not confirmed are checked here
+            self._know(drive, findings, silences, was_heard=False)
         return None
 
     def _rival(self, drive: Drive, rivals: Sequence[Make]) -> Suspicion | None:
@@ -276,8 +282,8 @@ class IdentityCheck:
         make = self._shown(drive, rivals) if drive.identity_is_weak else None
         return None if make is None else Suspicion(_declare(make), make=make)
 
-    def _shown(self, drive: Drive, makes: Iterable[Make]) -> Make | None:
-        """Return the first of these makes that the drive answers as, SURE times; None if there is none.
+    def _shown(self, drive: Drive, makes: Iterable[Make], timed: Timed = nullcontext) -> Make | None:
+        """Return the first of these makes that the drive's registers show SURE times; None if there is none.
 
         After a request without a reply, only makes that may leave a request unanswered are still tried.
         """
@@ -295,7 +301,7 @@ class IdentityCheck:
             if is_silent and not make.may_be_silent:
                 continue
             try:
-                if all(self._reads_as(probe, drive, make.shows(drive)) for _ in range(SURE)):
+                if all(self._reads_as(probe, drive, make.shows(drive), timed) for _ in range(SURE)):
                     return make
             except NoReply:
                 is_silent = True
@@ -312,7 +318,7 @@ class IdentityCheck:
         for family in MODELS.values():
             if isinstance(drive, family) or not family.identify_recognises or _stops(family, register, count):
                 continue
-            with suppress(ValueError):  # a drive of that family cannot be on this line
+            with suppress(ValueError):  # raised if no drive of `other` can be on this line
                 other = family(
                     drive.address, framing=drive.framing, baudrate=settings.baudrate, format=settings.format
                 )
@@ -328,8 +334,8 @@ class IdentityCheck:
         except NoReply:
             return False
 
-    def _reads_as(self, other: Drive, drive: Drive, script: Script[Any]) -> Any:
-        """Return the result of a script that reads registers of `other` from this drive; False if it fails.
+    def _reads_as(self, other: Drive, drive: Drive, script: Script[Any], timed: Timed = nullcontext) -> Any:
+        """Run a script that reads registers of `other` from this drive; return its result, False if it fails.
 
         Raises NoReply if the drive does not answer.
         """
@@ -337,7 +343,8 @@ class IdentityCheck:
         def do(step: Step) -> object:
             if not isinstance(step, Read):
                 return None
-            return self._exchanges.value_as(other, drive, step.register)
+            with timed():
+                return self._exchanges.value_as(other, drive, step.register)
 
         try:
             return carry_out(script, do)
@@ -348,13 +355,13 @@ class IdentityCheck:
 
 
 def _of_same_register(drive: Drive) -> list[Make]:
-    """Return the makes whose control register has the same address as this drive's."""
+    """Return the makes whose control register has the same address as this drive's control register."""
     control = drive.registers.get("control")
     return [make for make in MAKES if control is not None and make.control == control.address]
 
 
 def _stops(family: type[Drive], register: Register[Any], count: float) -> bool:
-    """Return True if a raw count at this register is harmless in the family, such as its own stop."""
+    """Return True if a raw count at this register is harmless in the family, such as the family's stop."""
     control = family.registers.get("control")
     return (
         control is not None
@@ -388,7 +395,7 @@ def _withheld(drive: Drive, why: str, other: Drive | Make | None) -> WriteForbid
             f"first, and attach {attach}"
         )
     return WriteForbidden(
-        f"no stop was sent to {drive.name}: at its address is another drive, as it said twice ({why}), "
-        f"which may run at this family's stop. {way}",
+        f"no stop was sent to {drive.name}: another drive is at its address, as two reads showed ({why}); "
+        f"this family's stop may start it. {way}",
         rule=ANOTHER_FAMILY,
     )

@@ -1,4 +1,4 @@
-"""Latches: a stop of a drive cancels calls that may move its motor, and blocks new calls until it ends."""
+"""Latches: a drive's stop cancels calls that may move its motor, and blocks new calls until the stop ends."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Latches:
         self._forget_stops()
 
     def _forget_stops(self) -> None:
-        # for each unfinished stop: the identifier of its thread, and its drives
+        # by unfinished stop: the identifier of the stop's thread, and the stop's drives
         self._stops: dict[object, tuple[int, frozenset[Drive]]] = {}
 
     def forked(self) -> None:
@@ -65,7 +65,7 @@ class Latches:
             thread != own and (asked is None or not asked.isdisjoint(stopped))
             for thread, stopped in self._stops.copy().values()
         ):
-            time.sleep(POLL_S)  # a Condition's lock could stay locked after a signal's exception
+            time.sleep(POLL_S)  # no Condition: an exception of a signal handler could leave its lock locked
 
     def latch(self, drive: Drive) -> Latch:
         """Return a drive's latch. Raises NotAttached if the drive is not on this bus."""
@@ -76,15 +76,15 @@ class Latches:
         return latch
 
     def rise(self, drives: Sequence[Drive]) -> None:
-        """Cancel all calls that move these drives: a stop is about to be written."""
+        """Cancel all calls that move these drives. Called right before a stop is written."""
         for drive in drives:
             self.latch(drive).rise(STOPPED)
 
     def begin(self, stop: object, drives: Sequence[Drive]) -> None:
-        """Start a stop: until `over`, cancel and refuse calls of these drives, and keep the drives attached.
+        """Start a stop: until `over(stop)`, cancel and refuse moves of these drives, and keep them attached.
 
-        May be repeated. Neither `begin` nor `over` takes a lock. Each step of them is atomic, so an exception
-        that a signal handler raises leaves no step half done.
+        `begin` may be called repeatedly. Neither `begin` nor `over` takes a lock. Each of their steps is
+        atomic, so an exception that a signal handler raises leaves no step half done.
         """
         self._stops[stop] = threading.get_ident(), frozenset(drives)
         for drive in drives:
@@ -92,7 +92,10 @@ class Latches:
                 latch.hold(stop, STOPPED)
 
     def over(self, stop: object) -> None:
-        """End a stop, and accept calls of its drives again. May be repeated, and called without `begin`."""
+        """End a stop, and accept calls of its drives again.
+
+        Repeated calls, and calls without `begin`, are harmless.
+        """
         for latch in [*self._latches.values()]:
             latch.let_go(stop)
         self._stops.pop(stop, None)

@@ -1,4 +1,4 @@
-"""Outcome and Stopped: the known effect of a write, and of a stop."""
+"""Outcome and Stopped: the known effect of a write and of a stop; conversion of both to CommandResult."""
 
 from __future__ import annotations
 
@@ -7,7 +7,21 @@ from enum import Enum
 from typing import Any
 
 from multidrop.drive.register import Register
-from multidrop.errors import BusError
+from multidrop.drive.verbs import CommandOutcome, CommandResult
+from multidrop.errors import (
+    BadReply,
+    BusError,
+    CancelledByStop,
+    DriveException,
+    Expired,
+    LineError,
+    NoReply,
+    NotAttached,
+    NotMaster,
+    NotVerified,
+    Unsupported,
+    WriteForbidden,
+)
 
 
 class Effect(Enum):
@@ -34,7 +48,7 @@ class Outcome:
 
     @property
     def ok(self) -> bool:
-        """True if the drive took the value."""
+        """True if the drive has accepted the value."""
         return self.effect is Effect.DONE
 
     @property
@@ -56,9 +70,9 @@ class Outcome:
 
 
 class Seen(Enum):
-    STOPPED = "stopped"  # the motor was seen to stand
+    STOPPED = "stopped"  # the motor was seen to be at rest
     SENT = "sent but unknown"
-    REFUSED = "refused by the drive"  # each time that the stop was sent
+    REFUSED = "refused by the drive"  # the drive refused every repetition of the stop
     FAILED = "failed"  # no stop was sent
 
 
@@ -73,9 +87,85 @@ class Stopped:
 
     @property
     def ok(self) -> bool:
-        """True if the motor is seen to stand."""
+        """True if the motor was seen to be at rest."""
         return self.seen is Seen.STOPPED
 
     def __str__(self) -> str:
         why = f": {self.why}" if self.why else ""
         return f"{self.drive}: {self.seen.value} after {self.seconds:.1f} s{why}"
+
+
+# ---- results of commands ----
+
+
+_OUTCOMES: tuple[tuple[type[BaseException], CommandOutcome], ...] = (  # the first match counts
+    (WriteForbidden, CommandOutcome.REFUSED),
+    (Unsupported, CommandOutcome.REFUSED),
+    (NotAttached, CommandOutcome.NOT_SENT),
+    (Expired, CommandOutcome.NOT_SENT),
+    (CancelledByStop, CommandOutcome.NOT_SENT),
+    (DriveException, CommandOutcome.FAILED),
+    (NotVerified, CommandOutcome.FAILED),
+    (NoReply, CommandOutcome.NOT_SENT),  # raised only by a read before the first write
+    (BadReply, CommandOutcome.NOT_SENT),
+)
+_STOP_OUTCOMES = {
+    Seen.STOPPED: CommandOutcome.DONE,
+    Seen.SENT: CommandOutcome.UNKNOWN,
+    Seen.REFUSED: CommandOutcome.FAILED,
+    Seen.FAILED: CommandOutcome.NOT_SENT,
+}
+SURE_OF_A_STOP = (WriteForbidden, NotMaster, Unsupported)
+
+
+def result_of_failure(failure: BaseException) -> CommandResult:
+    """Return the result of a command that raised `failure`; UNKNOWN unless the error shows what happened."""
+    return _failed(failure, _outcome_of(failure))
+
+
+def result_of_failed_stop(failure: BaseException) -> CommandResult:
+    """Return the result of a stop that raised `failure`.
+
+    A stop is repeated, so its last error says little about the frames before it.
+    """
+    if isinstance(failure, DriveException):  # the drive refused the stop each time
+        return _failed(failure, CommandOutcome.FAILED)
+    is_certain = isinstance(failure, SURE_OF_A_STOP)
+    return _failed(failure, _outcome_of(failure) if is_certain else CommandOutcome.UNKNOWN)
+
+
+def result_of_stop(stopped: Stopped) -> CommandResult:
+    """Return the result of one drive's stop."""
+    outcome = _STOP_OUTCOMES[stopped.seen]
+    if outcome is CommandOutcome.DONE:
+        return CommandResult(outcome, f"stopped: seen to stand after {stopped.seconds:.1f} s")
+    return CommandResult(outcome, f"{stopped.seen.value}: {stopped.why}", BusError(stopped.why))
+
+
+def result_of_write(outcome: Outcome) -> CommandResult:
+    """Return the result of a plain write."""
+    text = str(outcome)
+    if outcome.failure is not None:
+        return CommandResult(_outcome_of(outcome.failure), text, outcome.failure)
+    held = outcome.register.format(outcome.asked if outcome.held is None else outcome.held)
+    if outcome.effect is Effect.DONE:
+        return CommandResult(CommandOutcome.DONE, text, held=held)
+    return CommandResult(CommandOutcome.FAILED, text, BusError(text), held)
+
+
+def with_name(drive: str, text: str) -> str:
+    """Return a result's text with the drive's name in front, unless the text already starts with it."""
+    return text if text.startswith(f"{drive}: ") else f"{drive}: {text}"
+
+
+def _failed(failure: BaseException, outcome: CommandOutcome) -> CommandResult:
+    if not isinstance(failure, (BusError, ValueError)):
+        failure = ValueError(str(failure) or type(failure).__name__)
+    return CommandResult(outcome, str(failure) or type(failure).__name__, failure)
+
+
+def _outcome_of(failure: BaseException) -> CommandOutcome:
+    if isinstance(failure, (LineError, NotMaster)):  # their `is_sent`: whether a frame may have been sent
+        return CommandOutcome.UNKNOWN if failure.is_sent else CommandOutcome.NOT_SENT
+    found = (outcome for kind, outcome in _OUTCOMES if isinstance(failure, kind))
+    return next(found, CommandOutcome.UNKNOWN)

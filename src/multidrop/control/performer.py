@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
+from contextlib import AbstractContextManager
 from typing import Any
 
-from multidrop.control import time_limit
-from multidrop.control.call import Call
+from multidrop.control.call import Call, present_limit_ns
 from multidrop.control.exit_hook import await_signal
 from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome
@@ -33,8 +33,7 @@ from multidrop.transport.exchange import Exchanges
 
 _log = logging.getLogger("multidrop.control")
 
-
-# if a read fails with one of these, the effect of the write before that read is unknown
+# if a script's read fails with one of these errors, the effect of the write before that read is unknown
 _ENDING = (NoReply, BadReply, DriveException, LineError, NotAttached, NotMaster)
 
 
@@ -58,14 +57,14 @@ class Performer:
         self._expiry = expiry
 
     def call(self, drive: Drive, verb: str = "", seen: int | None = None) -> Call:
-        """Return a new call that expires from now on, and that any stop of the drive from now on cancels.
+        """Return a new call, whose expiry starts now, and which any later stop of the drive cancels.
 
         For a call that started earlier, `seen` is the drive's number of stops at that time.
         """
         permit = self._latches.latch(drive).permit(seen)
         if self._latches.is_shut:
             await_signal()
-        return Call(drive, permit, self._expiry, verb, time_limit.present_limit_ns())
+        return Call(drive, permit, self._expiry, verb, present_limit_ns())
 
     def move(self, script: Script[Any], call: Call) -> Any:
         """Carry out the script of a verb that may move the motor; return the script's result.
@@ -109,21 +108,29 @@ class Performer:
                 return self._writer.verified(drive, outcome)
 
     def raw(self, drive: Drive, request: Message) -> bytes:
-        """Send any request once; return the reply's data. Raises ValueError if it is a Modbus read."""
+        """Send a request once; return the reply's data. Raises ValueError for a Modbus read."""
         check_no_read(drive, request)
         call = self.call(drive)
         with call.noted():
             return self._writer.raw(drive, request, call)
 
-    def check_identity(self, drive: Drive) -> None:
-        """Check that a drive is of its declared family and log its watchdog, unless this was done before."""
-        if not self._writer.identity_check.is_known(drive):
-            self._look_at_identity(drive, self.call(drive))
+    def check_identity(self, drive: Drive, rest_s: float = 0.0) -> None:
+        """Check that a drive is of its declared family and log its watchdog, unless this was done before.
 
-    def _look_at_identity(self, drive: Drive, call: Call) -> None:
+        `rest_s` is a pause in s before each read.
+        """
+        if not self._writer.identity_check.is_known(drive):
+            self._look_at_identity(drive, self.call(drive), rest_s)
+
+    def _look_at_identity(self, drive: Drive, call: Call, rest_s: float = 0.0) -> None:
         identity_check = self._writer.identity_check
         is_first = not identity_check.is_known(drive)
-        identity_check.check(drive, call.look)
+
+        def look() -> AbstractContextManager[None]:
+            clock.sleep(rest_s)
+            return call.look()
+
+        identity_check.check(drive, look if rest_s else call.look)
         if is_first:
             with call.look():
                 _log.info("%s: %s", drive.name, self.watchdog(drive))
@@ -150,7 +157,7 @@ class Performer:
         Raises Unconfirmed if a read fails after a write. The read's own error would mislead: NoReply means
         that the write was not sent, and DriveException that the drive refused the write.
         """
-        unseen: list[Exception] = []  # failures of steps other than writes
+        unseen: list[Exception] = []  # failures of steps that are not writes
         cancelled: list[CancelledByStop] = []
 
         def do(step: Step) -> Any:

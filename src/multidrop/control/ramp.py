@@ -15,6 +15,7 @@ from multidrop.drive.register import Kept, Register
 from multidrop.drive.script import Script, Write, read, wait
 from multidrop.drive.state import Direction
 from multidrop.errors import WriteForbidden
+from multidrop.transport import clock
 
 # s between reads of waiting drives: a drive silent for PAUSE_NS may have lost its power (identity.py)
 HEARD_S = PAUSE_NS / 2e9
@@ -23,10 +24,10 @@ HEARD_S = PAUSE_NS / 2e9
 def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | None = None) -> None:
     """Start drives one after another, `gap` seconds apart.
 
-    If a start fails, stop that drive and all started before it, and raise the failure. That drive itself is
-    sent no stop if its identity is not confirmed and nothing was sent to it: the stop of its declared family
-    may start a drive of another family. A drive whose stop is called on any thread during this call is not
-    started. Drives that wait for their turn are read regularly, because after a silence a setpoint that
+    If a start fails, stop that drive and all started before it, and raise the failure. If the failing drive's
+    identity is not confirmed and nothing was sent to it, it gets no stop, because the stop of its declared
+    family may start a drive of another family. A drive whose stop is called on any thread during this call
+    is not started. Drives that wait for their turn are read regularly: if a drive was silent, a setpoint that
     cannot be read back is assumed lost.
     """
     if not 0 <= gap < inf:
@@ -56,7 +57,7 @@ def _await_turn(waiting: Sequence[Drive], gap: float, unheard_s: float) -> float
         if unheard_s >= HEARD_S:
             unheard_s = 0.0
             for drive in waiting:
-                with suppress(Exception):  # the drive's start will report the failure
+                with suppress(Exception):  # the later start of the drive will report the failure
                     drive.identify()
     return unheard_s
 
@@ -107,29 +108,44 @@ def _ramp(drive: Drive, hz: float, rate: float | None, every: float) -> Script[N
         raise ValueError(f"every = {every:g} s is not above 0")
     drive.check_confirmed("set_frequency")
     register = drive.register(drive.setpoint_name)
-    if wears(drive, register) is not Kept.RAM:
-        raise WriteForbidden(
-            f"the setpoint of {drive.name} may be kept in EEPROM, which a ramp would wear out"
-        )
+    check_worn(drive, "a ramp")
+    step = (yield from checked_rate(drive, rate)) * every
+    at = yield from _present(drive, register)
+    yield from check_setpoint(drive, hz)
+    while at != hz:
+        at = min(at + step, hz) if hz > at else max(at - step, hz)
+        begun_ns = clock.now_ns()
+        yield from drive.set_frequency.script(at)
+        if at != hz:  # if a step took longer than `every`, later steps do not catch up
+            yield from wait(max(0.0, every - (clock.now_ns() - begun_ns) / 1e9))
+
+
+def checked_rate(drive: Drive, rate: float | None) -> Script[float]:
+    """Return `rate` in Hz/s, or the rate of the drive's own ramp if `rate` is None.
+
+    Raises WriteForbidden if neither is known. Raises ValueError if `rate` is not above 0, or is faster than
+    the drive's own ramp.
+    """
     own = yield from _own_rate(drive)
     if rate is None and own is None:
         raise WriteForbidden(f"the acceleration of {drive.name} cannot be read: give a rate in Hz/s")
     if rate is not None and not rate > 0:
         raise ValueError(f"rate = {rate:g} Hz/s is not above 0")
     if rate is not None and own is not None and rate > own:
-        raise ValueError(f"rate = {rate:g} Hz/s is more than the drive's own, {own:g} Hz/s")
-    step = (rate or own or 0.0) * every
-    at = yield from _present(drive, register)
-    yield from _check(drive, hz)
-    while at != hz:
-        at = min(at + step, hz) if hz > at else max(at - step, hz)
-        yield from drive.set_frequency.script(at)
-        if at != hz:
-            yield from wait(every)
+        raise ValueError(f"rate = {rate:g} Hz/s is faster than {drive.name} itself can ramp, {own:g} Hz/s")
+    return rate or own or 0.0
 
 
-def _check(drive: Drive, hz: float) -> Script[None]:
-    """Raise if this setpoint is not allowed; without this check, the ramp would first run up to the limit."""
+def check_worn(drive: Drive, what: str) -> None:
+    """Raise WriteForbidden if the drive may store its setpoint in EEPROM, which `what` would wear out."""
+    if wears(drive, drive.register(drive.setpoint_name)) is not Kept.RAM:
+        raise WriteForbidden(
+            f"the setpoint of {drive.name} may be kept in EEPROM, which {what} would wear out"
+        )
+
+
+def check_setpoint(drive: Drive, hz: float) -> Script[None]:
+    """Raise if this setpoint is not allowed; without this check, a ramp would first run up to the limit."""
     script = drive.set_frequency.script(hz)
     try:
         step = next(script)

@@ -1,7 +1,7 @@
 """WriteRecords: the audit log and the EEPROM ledger of one line's writes.
 
 A write is counted before it is sent. A stop is recorded on separate threads, because a disk may hang and a
-ledger may be locked; the stop does not wait for them.
+ledger may be locked; the stop does not wait for these threads.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ from contextvars import ContextVar
 from functools import partial
 from typing import Any
 
-from multidrop.control.audit_log import AuditLog
-from multidrop.control.author import Author, is_noted_first, present_author
+from multidrop.control.audit_log import AuditLog, Author, is_noted_first, present_author
 from multidrop.control.eeprom_ledger import LEAST_INTERVAL, YEARLY, Ledger, LedgerCell
 from multidrop.control.outcome import Effect, Stopped
 from multidrop.control.rules import refused
@@ -28,7 +27,8 @@ from multidrop.transport.aside_log import AsideThread, log_aside
 from multidrop.transport.line import Line
 
 CALLED = "called"  # outcome in the record of a stop that is about to be sent
-CALLED_S = 0.05  # longest time that a stop waits for its record
+REFUSED = "refused"  # outcome in the record of a write that was not sent
+CALLED_S = 0.05  # s; longest time that a stop waits for its record
 CLOSING_NS = 1_000_000_000  # longest time that closing waits for other threads' records
 
 _log = logging.getLogger("multidrop.control")
@@ -39,7 +39,7 @@ _ledger_thread = AsideThread("multidrop ledger")
 
 @contextmanager
 def commissioning() -> Iterator[None]:
-    """Within the block, do not apply LEAST_INTERVAL: a person sets a drive up.
+    """Within the block, do not apply LEAST_INTERVAL, because a person is setting up a drive.
 
     Each write is still counted in the ledger, the yearly budget still applies, and the audit record has
     `commissioning`. The block applies to this thread or task.
@@ -61,7 +61,7 @@ class WriteRecords:
         self._ledger = ledger
         self._uncounted: deque[LedgerCell] = deque()
         self._unlogged: deque[tuple[int, dict[str, Any]]] = deque()  # records, each with its UTC in ns
-        self._writers: list[None] = []  # threads in `catch_up`; a list needs no lock
+        self._writers: list[None] = []  # one item for each thread in `catch_up`; a list needs no lock
 
     def count(self, drive: Drive, register: Register[Any], kept: Kept) -> None:
         """Count a write in the ledger before it is sent. Raises WriteForbidden if the budget is used up.
@@ -107,7 +107,7 @@ class WriteRecords:
     def note_stops_called(self, verb: str, drives: Sequence[Drive]) -> None:
         """Record that these drives are about to be stopped, and wait up to CALLED_S for the record.
 
-        After a wait that timed out, do not wait again while the disk hangs.
+        Once such a wait has timed out because the disk hangs, later calls do not wait while it still hangs.
         """
         of_one = {"model": drives[0].model, "address": drives[0].address} if len(drives) == 1 else {}
         names = ", ".join(drive.name for drive in drives)
@@ -122,6 +122,12 @@ class WriteRecords:
         """Record the result of one drive's stop, and how many frames it took."""
         record = self._record(drive, newest, verb, stopped.seen.value, stopped.why, None)
         self._put({**record, "frames": frames}, partial(log_aside, _log), str(stopped))
+        self.catch_up_aside()
+
+    def note_refused(self, drive: str, what: str, why: str) -> None:
+        """Record a write that was refused before a request was made. Does not wait for the disk."""
+        record = {"drive": drive, "write": what, "outcome": REFUSED, "why": why}
+        self._put(record, partial(log_aside, _log))
         self.catch_up_aside()
 
     def _record(
@@ -177,7 +183,7 @@ class WriteRecords:
                 self.catch_up()  # the system has no thread left
 
     def _write_queued(self) -> None:
-        self._writers.append(None)  # before taking a record, so that `close` waits for this thread
+        self._writers.append(None)  # entered before a record is taken, so that `close` waits for this thread
         try:
             with suppress(IndexError):  # the queue is empty; other threads may empty it too
                 while True:
@@ -200,14 +206,14 @@ class WriteRecords:
         try:
             audit.add(at_ns, record)
             self.audit_trouble = ""
-        except (OSError, ValueError) as failure:  # ValueError: the file was closed
+        except (OSError, ValueError) as failure:  # ValueError is raised if the file was closed
             self.audit_trouble = getattr(failure, "strerror", None) or str(failure)
             log_aside(_log, logging.WARNING, "the audit log cannot be written: %s", self.audit_trouble)
 
     def _note(self, cells: list[LedgerCell]) -> None:
         try:
             self._ledger.at(cells[0].port).note(cells, clock.utc_ns() / 1e9)
-        except (OSError, ValueError) as failure:  # ValueError: a port's name may not be valid text
+        except (OSError, ValueError) as failure:  # ValueError is raised if a port's name is not valid text
             log_aside(_log, logging.WARNING, "stops were not counted: %s", failure)
 
     def _cell(self, drive: Drive, register: Register[Any]) -> LedgerCell:
@@ -229,7 +235,7 @@ class WriteRecords:
 def _way_out(
     drive: Drive, register: Register[Any], kept: Kept, *, is_yearly: bool
 ) -> tuple[str, Advice | None]:
-    """Return what the caller can do instead of a write that the ledger refuses."""
+    """Return a hint for the caller of a write that the ledger refuses, and Advice if there is any."""
     if kept is Kept.UNKNOWN:
         declared = f'ram = ["{register.name}"]'
         written = f"write {declared} below its [[line.drive]]"

@@ -33,7 +33,8 @@ def _refusal(
 def raw_count(drive: Drive, register: Register[T], value: T) -> float:
     """Return the raw count to send for `value`.
 
-    Raises WriteForbidden if the register or the value cannot be written, TypeError for a value's wrong type.
+    Raises WriteForbidden if the register or the value cannot be written, and TypeError if the value has the
+    wrong type.
     """
     check_own(drive, register)
     if register.never:
@@ -49,9 +50,10 @@ def raw_count(drive: Drive, register: Register[T], value: T) -> float:
 def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
     """Raise WriteForbidden if this write may command the motor and the owner must still confirm the class.
 
-    A stop needs no confirmation. In a family file, all other raw counts need it, even harmless ones.
+    A stop needs no confirmation. If the class is from a family file, all other raw counts need the owner's
+    confirmation, even harmless ones.
     """
-    is_unproven = bool(drive.declared_in) and "confirmed" in drive.options  # its addresses may be wrong
+    is_unproven = bool(drive.declared_in) and "confirmed" in drive.options  # its file may be wrong
     if is_harmless(register, raw):
         if is_unproven and not is_stop(drive, register, raw):
             drive.check_confirmed(register.name)
@@ -74,7 +76,7 @@ def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
         ", ".join(f"`multidrop {name.replace('_', '-')}`" for name in verbs),
     )
     value = register.format(register.decode(raw))
-    way = f"which verbs alone do: use {advice.program}"
+    way = f"which only verbs may do: use {advice.program}"
     if not verbs:
         way = (
             "and its class does not say that it is harmless: declare harmless = (…), moves = False, or a verb"
@@ -132,16 +134,16 @@ def _must_stand(drive: Drive, register: Register[Any]) -> Script[None]:
         state = yield from drive.state.script()
     except Unsupported:
         raise _not_now(
-            drive, register, "it changes only while the motor stands, which the family cannot report"
+            drive, register, "it can be written only at standstill, which the family cannot report"
         ) from None
     if state.condition not in (Condition.STOPPED, Condition.FAULT):
-        raise _not_now(drive, register, f"it changes only while the motor stands; state: {state}")
+        raise _not_now(drive, register, f"it can be written only at standstill; state: {state}")
 
 
 def _not_now(drive: Drive, register: Register[Any], rule: str) -> WriteForbidden:
     """Return the error for a rule that depends on the drive's state.
 
-    The manual may not state the rule itself, so the error names the register's place.
+    The error names the register's place in the manual, which may contain no such rule.
     """
     where = f" (in the manual, {register.name} is {register.place})" if register.place else ""
     sentence = f"{register.name} of {drive.name} is not written: {rule}{where}"
@@ -151,11 +153,11 @@ def _not_now(drive: Drive, register: Register[Any], rule: str) -> WriteForbidden
 def wears(drive: Drive, register: Register[Any]) -> Kept:
     """Return where the drive keeps a value written to this register: RAM, EEPROM or unknown.
 
-    Treat unknown like EEPROM, which a write wears.
+    Callers treat an unknown place like EEPROM, which each write wears.
     """
     if register.ram_address is not None or register.name in drive.ram or register.kept is Kept.RAM:
         return Kept.RAM
     is_bit = register.table.carrier is Carrier.BIT
     if register.kept is Kept.UNKNOWN and (register.access is Access.COMMAND or is_bit):
-        return Kept.RAM  # neither a command nor a coil is a parameter
+        return Kept.RAM  # commands and coils are not parameters, and a drive keeps only parameters
     return register.kept

@@ -1,4 +1,4 @@
-"""Stopper: stop one drive or all drives of a bus, and repeat each stop until the motor is seen to stand.
+"""Stopper: stop one drive or all drives of a bus, and repeat each stop until the motor is seen at rest.
 
 Several stops take turns step by step, so that no stop waits for another motor's ramp.
 """
@@ -14,14 +14,13 @@ from math import inf
 from numbers import Real
 from typing import Any
 
-from multidrop.control.command_results import result_of_stop
 from multidrop.control.latches import Latches
-from multidrop.control.outcome import Outcome, Seen, Stopped
+from multidrop.control.outcome import Outcome, Seen, Stopped, result_of_stop
 from multidrop.control.writer import Writer
 from multidrop.core import Message
-from multidrop.drive.command_result import CommandResult
 from multidrop.drive.family import Drive
 from multidrop.drive.script import Pulse, Read, Script, Step, Wait, Write
+from multidrop.drive.verbs import CommandResult
 from multidrop.errors import (
     BadReply,
     BusError,
@@ -42,17 +41,16 @@ from multidrop.transport.exchange import WRITE_TIMEOUT, Exchanges
 
 LEAST_S = 30.0  # s; how long a stop is repeated by default
 PAUSE_S = 0.2  # s; pause before a repetition
-AT_ONCE = 8  # number of steps without a good reply until the line is shared with polling
-SHARE = 1.5  # time left to polling after such a step, as a multiple of the step's duration
-MOST_STEPS = 8  # limit of steps when a stop is sent again after an interruption
+AT_ONCE = 8  # after this many steps without a good reply, the stop shares the line with polling
+SHARE = 1.5  # after a step without a good reply, polling gets this multiple of the step's duration
+MOST_STEPS = 8  # limit of the script's steps when a stop is sent again after an interruption
 UNSENT = (WriteForbidden, LineError, NotMaster, ValueError)
 WORTH_REPEATING = (Unconfirmed, NotVerified, NoReply, BadReply, DriveException, PortLost, NotMaster)
 UNANSWERED = (Unconfirmed, NoReply, BadReply)
 NO_ROOM = (MemoryError, OSError)  # temporary: the system may soon have memory or descriptors again
-REGAIN_NS = 500_000_000  # interval between attempts of stops to reopen a lost port
+REGAIN_NS = 500_000_000  # interval at which stops try to reopen a lost port
 
 _log = logging.getLogger("multidrop.control")
-
 
 Do = Callable[["StopAttempt", Step], Any]
 
@@ -60,10 +58,10 @@ Do = Callable[["StopAttempt", Step], Any]
 class StopAttempt:
     """One drive's stop, repeated until the drive confirms it and the motor is seen to stop.
 
-    The stop is repeated for `seconds`. With None it is repeated for LEAST_S, and a repetition that started by
-    then may last as long as the motor's ramp. After AT_ONCE steps without a good reply, it leaves more than
-    half of the line's time to others. `ready` returns the time (in s) before which no request may be sent to
-    the drive.
+    The stop is repeated for `seconds`. If `seconds` is None, the stop is repeated for LEAST_S, and a
+    repetition that started by then may last as long as the motor's ramp. After AT_ONCE steps without a good
+    reply, the stop leaves more than half of the line's time to polling and other stops. `ready` returns the
+    time (in s) before which no request may be sent to the drive.
     """
 
     def __init__(
@@ -86,8 +84,8 @@ class StopAttempt:
         self._unanswered = 0  # steps without a good reply
         self.is_over = False
         self.ended = begun  # time in s at which the attempt ended
-        self.interruption: BaseException | None = None  # raised by the script to end the program
-        self.frame: Message | None = None  # the latest request that was sent
+        self.interruption: BaseException | None = None  # SystemExit or the like, if the script raised it
+        self.frame: Message | None = None  # the newest request of this stop
         self._times_in_doubt = 0  # number of frames that may or may not have been sent
         self._is_confirmed = False
         self._pulses: set[tuple[str, Any]] = set()
@@ -125,7 +123,7 @@ class StopAttempt:
             else:
                 begun = now()
                 is_answered = self._carry_out(step, do)
-                self.due = max(self.due, now())  # the other due stops go first
+                self.due = max(self.due, now())  # due now at the earliest, so that overdue stops go first
                 if not is_answered:
                     self._share_line(begun, now())
         except StopIteration:
@@ -137,20 +135,20 @@ class StopAttempt:
         return False
 
     def _unproven(self) -> Unconfirmed | None:
-        """Return Unconfirmed if the drive may be of another make and showed nothing but zeros; else None."""
+        """Return Unconfirmed if the drive may be of another make and all reads returned 0; else None."""
         if not self.doubt or self._shows_more_than_zeros:
             return None
         reason = (
-            f"it was sent, but {self.doubt}; the registers that would show the motor at rest all read 0, "
-            "as unused registers of another make do: look at the motor"
+            f"it was sent, but {self.doubt}; the registers that would show the motor at rest are all 0, and "
+            "so may be unused registers of another make: look at the motor"
         )
         return Unconfirmed(self.drive.name, "the stop", reason)
 
     def _next_step(self) -> Step:
         """Resume the script; return its next step.
 
-        If the script raises SystemExit or the like, raise Unconfirmed instead, and keep that exception until
-        all stops are over.
+        If the script raises SystemExit or the like, raise Unconfirmed instead. The script's exception is kept
+        until all stops are over.
         """
         try:
             return self._resume()
@@ -231,7 +229,7 @@ class StopAttempt:
         return True
 
     def _log_unsent(self, failure: NotMaster) -> None:
-        """Log immediately, as critical, that no stop was sent: no other process stops this motor."""
+        """Log as critical, without waiting, that no stop was sent: no other process will stop the motor."""
         if not self.is_sent:
             log_aside(_log, logging.CRITICAL, "%s", failure.of_a_stop())
 
@@ -242,7 +240,7 @@ class StopAttempt:
         """
         self._begin()
         is_written = False
-        with suppress(Exception):  # also StopIteration, the script's end
+        with suppress(Exception):  # includes StopIteration, the script's end
             for _ in range(MOST_STEPS):
                 step = self._next_step()
                 if isinstance(step, Wait):
@@ -259,7 +257,7 @@ class StopAttempt:
 
     @property
     def known(self) -> Exception | None:
-        """The failure of the whole stop; None if the motor was seen to stop."""
+        """Return the failure of the whole stop; None if the motor was seen to stop."""
         failure = self.failure
         if failure is None or isinstance(failure, (Unsupported, WriteForbidden)):
             return failure
@@ -324,7 +322,7 @@ def _is_worth_repeating(failure: Exception) -> bool:
 
 
 class StopRun:
-    """The stops of one call, for one drive or several.
+    """The stops of one or several drives that one call carries out.
 
     The caller repeats `carry_out` after MemoryError or OSError, and calls `interrupted` after other failures.
     """
@@ -391,7 +389,8 @@ class StopRun:
         latest = interruption
         try:
             self._begin()
-            for attempt in sorted(self._left(), key=StopAttempt.is_in_doubt):  # the interrupted attempt last
+            # the attempt that was interrupted comes last
+            for attempt in sorted(self._left(), key=StopAttempt.is_in_doubt):
                 attempt.once_more(self._stopper.do)
         except BaseException as another:
             latest = another
@@ -416,7 +415,7 @@ class StopRun:
         return found
 
     def result(self) -> CommandResult:
-        """Return the result of one drive's stop. Raises its failure if the motor was not seen to stop."""
+        """Return the result of one drive's stop. Raises the failure if the motor was not seen to stop."""
         (stopped,) = self.found().values()
         if (failure := self.attempts[0].known) is not None:
             raise failure
@@ -426,7 +425,8 @@ class StopRun:
 class Stopper:
     """Stops the drives of one bus.
 
-    If `is_tended` is set, a poller reopens a lost port and stops wait for that; otherwise stops reopen it.
+    If `is_tended` is set, a poller reopens a lost port, and stops wait until the port is open again.
+    Otherwise the stops reopen the port.
     """
 
     def __init__(self, exchanges: Exchanges, writer: Writer, latches: Latches) -> None:
@@ -441,7 +441,7 @@ class Stopper:
     def so_far(self) -> dict[str, str]:
         """Return the progress of the unfinished stops, by drive.
 
-        If a drive has several stops, the one that was sent most often counts.
+        For a drive with several stops, return the progress of the stop that was sent most often.
         """
         attempts = [
             each for stops in self.under_way.copy().values() for each in stops.copy() if not each.is_over
@@ -464,9 +464,9 @@ class Stopper:
         return StopRun(self, "stop", drives, lambda drive: drive.stop.script(), seconds, broadcast)
 
     def do(self, stop: StopAttempt, step: Step) -> Any:
-        """Carry out a step of a stop. Only writes after the first may wait for a late reply."""
+        """Carry out a step of a stop. The first write never waits for a late reply; later writes may."""
         self._regain()
-        if isinstance(step, Read):  # once: without a reply the stop is sent again
+        if isinstance(step, Read):  # a read has one attempt: without a reply, the stop is sent again instead
             return self._exchanges.value(stop.drive, step.register, 1)
         assert isinstance(step, Write)
         timeout = WRITE_TIMEOUT if stop.is_sent else 0.0
@@ -480,7 +480,7 @@ class Stopper:
         self._regain()
         try:
             return self._writer.insist(drive, step)
-        except CheckAgain:  # immediately, because no other stop waits
+        except CheckAgain:  # check again immediately, because no other stop waits
             return self._writer.insist(drive, step)
 
     def ready(self, drive: Drive) -> float:
@@ -496,7 +496,7 @@ class Stopper:
 
 
 def _due(stop: StopAttempt) -> float:
-    """Return when the stop's next step is due, including the pause that its drive needs."""
+    """Return the time (in s) of the stop's next step, including the pause that its drive needs."""
     return max(stop.due, stop.ready())
 
 
@@ -505,7 +505,7 @@ def _now() -> float:
 
 
 def _limit(seconds: float | None) -> float | None:
-    """Return a stop's time limit as a float, because a number of another type may not add to a float.
+    """Return a stop's time limit as a float: a Decimal, for example, cannot be added to a float.
 
     An invalid limit does not prevent the stop: log a warning and return None, which means no limit.
     """
@@ -519,7 +519,10 @@ def _limit(seconds: float | None) -> float | None:
                 limit = inf if seconds > 0 else -inf
             if limit >= 0:
                 return limit
-    sentence = "seconds = %.100r is not a time for a stop: it is repeated for %g s at least, as without one"
+    sentence = (
+        "seconds = %.100r is not a time for a stop: the stop is repeated for at least %g s, as without this "
+        "argument"
+    )
     log_aside(_log, logging.WARNING, sentence, seconds, LEAST_S)
     return None
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from typing import Any
 
-from multidrop.control.author import check_author
+from multidrop.control.audit_log import check_author
 from multidrop.control.call import Call
 from multidrop.control.identity import EchoCheck, IdentityCheck
 from multidrop.control.outcome import Effect, Outcome
@@ -70,11 +70,13 @@ class Writer:
                     if register.name == drive.setpoint_name:
                         drive.commanded = asked
                     return Outcome(drive.name, register, asked, Effect.DONE, held=asked)
-            call.check(_in_words(register, asked))  # do not count a write that will not be sent
+            # checked before counting: an unsent write must not be counted
+            call.check(_in_words(register, asked))
         self.records.note_called(drive, write_request(drive, register, raw), _in_words(register, asked))
         if kept is not Kept.RAM:
             self.records.count(drive, register, kept)
-        self.identity_check.check(drive, call.look)  # again, because the records may have taken long
+        # checked again, because counting the write may have taken long
+        self.identity_check.check(drive, call.look)
         return self._send(drive, register, raw, call, 0.0, self.records.log)
 
     def insist(
@@ -83,8 +85,8 @@ class Writer:
         """Write a stop, or a raw count that is harmless at any time, without checking rules or the budget.
 
         Raises WriteForbidden only on proof that the drive is of another family. On a line with late replies,
-        waits up to `timeout` seconds for its own reply. `log` records the write; by default, the record is
-        queued until `catch_up`.
+        waits up to `timeout` seconds for the write's own reply. `log` records the write; by default, the
+        record is queued until `catch_up`.
         """
         register = step.register
         raw = raw_count(drive, register, step.value)
@@ -166,7 +168,10 @@ class Writer:
         timeout: float,
         log: Callable[..., None],
     ) -> Outcome:
-        """Send a write once, and return its outcome. Without a call it is a stop, sent with `insists`."""
+        """Send a write once, and return its outcome.
+
+        Without a call, the write is a stop, sent with `insists`.
+        """
         request, asked = write_request(drive, register, raw), register.decode(raw)
         what = _in_words(register, asked)
         is_setpoint = register.name == drive.setpoint_name
@@ -231,7 +236,7 @@ class Writer:
             lost = failure
         except (NoReply, BadReply) as failure:
             lost = failure
-        if lost is None or call is not None:  # a stop without a reply is repeated instead
+        if lost is None or call is not None:  # a stop without a reply is repeated, not read back
             held, unread = self._held(drive, register, call)
         if held is not None and (held == asked or lost is None):
             effect = Effect.DONE if held == asked else Effect.TAKEN_AS
@@ -244,7 +249,7 @@ class Writer:
         return Outcome(drive.name, register, asked, Effect.UNCONFIRMED, held=held, failure=unknown)
 
     def _held(self, drive: Drive, register: Register[Any], call: Call | None) -> tuple[Any, Exception | None]:
-        """Return the value read back, or None and the failure of reading it."""
+        """Return the value read back and None, or None and the error of the read."""
         if not register.readable:
             return None, None
         try:
@@ -254,7 +259,7 @@ class Writer:
             return None, failure
 
     def _look(self, drive: Drive, step: Step, call: Call) -> Any:
-        """Carry out one step of checking a rule: a wait, or a read of a register."""
+        """Carry out one step of a rule's check, a wait or a read of a register; return its result."""
         if isinstance(step, Wait):
             with call.step(step.seconds):
                 return clock.sleep(step.seconds)
@@ -263,7 +268,7 @@ class Writer:
 
     @contextmanager
     def _logged(self, drive: Drive, request: Message, what: str, log: Callable[..., None]) -> Iterator[None]:
-        """If the block fails and the write may have been sent, record it as unconfirmed."""
+        """If the block fails and the write may have been sent, record the write as unconfirmed."""
         try:
             yield
         except BaseException as failure:
@@ -287,7 +292,7 @@ def _is_unsent(failure: BaseException) -> bool:
 
 
 def _is_under_way(failure: DriveException) -> bool:
-    """Return True for exception 05, accepted but not done yet (Modbus application protocol V1.1b3, 7)."""
+    """Return True for exception 05: accepted, but not done yet (application protocol V1.1b3, section 7)."""
     return failure.code == ACKNOWLEDGED and failure.meaning == Drive.exceptions[ACKNOWLEDGED]
 
 
