@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from multidrop.control.attached import Attached, made
+from multidrop.control.attached import Attached, Leaving, made
 from multidrop.control.audit_log import AuditLog
 from multidrop.control.broadcast import Broadcaster
+from multidrop.control.call import check_expiry
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.exit_hook import give_signals_back, without_internals
 from multidrop.control.latches import Latches
-from multidrop.control.leaving import Leaving
 from multidrop.control.outcome import Stopped
 from multidrop.control.performer import Performer
 from multidrop.control.records import WriteRecords
 from multidrop.control.stops import Stopper, StopRun
-from multidrop.control.time_limit import check_expiry
 from multidrop.control.writer import Writer
 from multidrop.core import RS485, Echo, Mastership, Peer, TransactionIds
 from multidrop.core.fork import register_at_fork
@@ -60,8 +59,8 @@ class Bus:
     - `transaction`: "ignore" if a Modbus TCP gateway replies with transaction ids of its own.
     - `rs485`: what switches the transceiver to sending and back if the adapter does not: the kernel's driver
       ("kernel"), or multidrop by the RTS line ("rts-up", "rts-down").
-    - `settle`: seconds without requests after the port opens, at most 10, for devices that restart when it
-      opens.
+    - `settle`: seconds without requests after the port opens, at most 10, for devices that restart when the
+      port opens.
     - `ledger`: the file that counts writes to EEPROM, shared by all processes. `audit`: the log of all
       writes.
     - `expiry`: seconds. A write that cannot be sent within this time of the call, not counting the verb's own
@@ -175,7 +174,7 @@ class Bus:
 
     @property
     def why_lost(self) -> str | None:
-        """The reason why the port is lost or stalled ("/dev/ttyUSB0: unplugged"); None while it works."""
+        """Why the port is lost or stalled ("/dev/ttyUSB0: unplugged"); None while the port works."""
         return self.line.why_lost
 
     def __enter__(self) -> Bus:
@@ -195,7 +194,7 @@ class Bus:
         self._leaving.begin()
 
     def part(self) -> None:
-        """Do the same as `leave`, then wait for all pending stops; the port stays open."""
+        """Cancel calls and start stops like `leave`, then wait for all pending stops. The port stays open."""
         self._leaving.finish()
 
     def close(self) -> None:
@@ -248,8 +247,8 @@ class Bus:
     def detach(self, drive: Drive) -> None:
         """Take a drive off the bus: its reads, writes and verbs raise NotAttached from then on.
 
-        The motor continues as it is. The drive's pending verbs raise CancelledByStop, or Unconfirmed if they
-        were sent already. Waits for the drive's pending stops.
+        The motor keeps running or standing. The drive's pending verbs raise CancelledByStop, or Unconfirmed
+        if they were sent already. Waits for the drive's pending stops.
 
         """
         self._latches.remove(drive)
@@ -258,18 +257,18 @@ class Bus:
             self._writer.identity_check.forget(drive)
 
     def remember(self, before: Bus) -> None:
-        """Take over what a closed bus has learned about the drives of the same serial line.
+        """Take over the drives' timing and outstanding requests from a closed bus on the same line.
 
-        The new bus must know them, because late replies to the closed bus's requests may still arrive.
+        The new bus must know the outstanding requests, because late replies to them may still arrive.
         """
         self._exchanges.remember(before._exchanges)
 
     def peer(self, drive: Drive) -> Peer:
-        """Return a drive's peer: its learnt timing and late replies. Raises NotAttached."""
+        """Return the Peer with the drive's learnt timing and late replies. Raises NotAttached."""
         return self._exchanges.peer(drive)
 
     def is_asking(self, peer: Peer) -> bool:
-        """Return True while an exchange with this peer is queued, in flight or about to be."""
+        """Return True while an exchange with this peer is about to start, queued or in flight."""
         return self._exchanges.is_asking(peer)
 
     @property
@@ -279,16 +278,16 @@ class Bus:
 
     # ---- commands ----
 
-    def check_identity(self, drive: Drive) -> None:
+    def check_identity(self, drive: Drive, *, rest_s: float = 0.0) -> None:
         """Check that the drive at this address is of its declared family, as far as its registers show it.
 
-        The check only reads, and is done only once until the port is reopened. The first write to a drive
-        makes the same check.
-        The first check also logs the drive's watchdog. Raises WriteForbidden for a drive of another family,
-        and NoReply.
+        The check only reads. It is made once, and again after the port is reopened. The first write to a
+        drive makes the same check. A pause of `rest_s` s before each read leaves the line to polling. The
+        first check also logs the drive's watchdog. Raises WriteForbidden for a drive of another family, and
+        NoReply for a silent drive.
         """
         check_drive(drive)
-        self._performer.check_identity(drive)
+        self._performer.check_identity(drive, rest_s)
 
     def knows_identity(self, drive: Drive) -> bool:
         """Return True if `check_identity` has already passed on this port."""
@@ -308,21 +307,21 @@ class Bus:
     def broadcast(self, register: Register[Any] | str, value: Any) -> dict[str, State | BusError]:
         """Broadcast a write to all drives of the line; return each drive's state, or its error, by name.
 
-        Drives do not answer a broadcast, so each state is read afterwards. All drives must be of one family
-        and share their settings, because an address means different things to different families; the
-        family's document must have this broadcast. Raises WriteForbidden.
+        Drives do not answer a broadcast, so each drive's state is read afterwards. All drives must be of one
+        family, because an address means different things to different families. They must share their
+        settings, and the family's document must have this broadcast. Otherwise raises WriteForbidden.
         """
         return self._broadcaster.write(self.drives, register, value)
 
     def stop_all(self, seconds: float | None = None) -> dict[str, Stopped]:
         """Stop every drive, before all queued requests; return the results by drive name.
 
-        If `identify` has confirmed that all drives are of one family with a stop broadcast, that is sent
-        first. Then the drives are sent their stops in turn, until each motor is seen to stand. Stops are
-        repeated for `seconds`; by default for at least 30 s, and as long as the ramp may take. An invalid
-        `seconds` is logged and ignored. The failure of one drive's stop is in its result, and never ends the
-        other stops. Calls that move a motor, made before or during this call, raise CancelledByStop. If this
-        call is interrupted, the stop is sent once more to each drive that is not seen to stand.
+        If `identify` has confirmed that all drives are of one family with a stop broadcast, that broadcast is
+        sent first. Then each drive in turn is sent its stop. A stop is repeated until the motor is seen to
+        stand still, for at most `seconds`; by default for at least 30 s, and as long as the ramp may take. An
+        invalid `seconds` is logged and ignored. The failure of one drive's stop is in its result, and never
+        ends the other stops. Calls that move a motor, made before or during this call, raise CancelledByStop.
+        If this call is interrupted, each drive whose motor is not seen to stand still gets one more stop.
         """
         run: StopRun | None = None
         tried = 0
@@ -349,21 +348,23 @@ class Bus:
         """Return the state of each pending stop in a sentence, by the drive's name.
 
         The sentence says whether the stop was sent and confirmed, and why it is repeated. Any thread may call
-        this; it does not wait.
+        this; the call does not wait for a stop.
         """
         return self._stopper.so_far()
 
     def stop_on_exit(self) -> None:
         """From now on, stop all drives when the `with` block is left or the process ends.
 
-        SIGINT and SIGTERM also stop them immediately, with the drives of all other buses with `stop_on_exit`;
-        so does SIGHUP of a closed terminal, unless the program handles or ignores it. Standard error names
-        the drives that are being stopped. After the stops, the signal has its previous effect: Ctrl-C raises
-        KeyboardInterrupt. Three signals within a second end the wait for the stops. After the signal, no call
-        that moves a motor is sent; such a call waits for the signal's effect. Python handles signals in the
-        main thread: if that thread waits for a reply, the stops start when the reply has come or timed out. A
-        handler that the program installs later replaces this one, until another bus calls `stop_on_exit`.
-        Call it from the main thread; it raises ValueError on any other.
+        SIGINT and SIGTERM also stop these drives immediately, and the drives of all other buses with
+        `stop_on_exit`. So does the SIGHUP of a closed terminal, unless the program handles or ignores it.
+        Standard error names the drives that are being stopped. After the stops, the signal has its previous
+        effect: Ctrl-C raises KeyboardInterrupt. Three signals within a second end the wait for the stops.
+        After the signal, no call that moves a motor is sent; such a call waits for the signal's effect.
+
+        Python handles signals in the main thread: if that thread waits for a reply, the stops start when the
+        reply has come or timed out. A handler that the program installs later replaces this one, until
+        another bus calls `stop_on_exit`. Call this method from the main thread; on any other thread, it
+        raises ValueError.
         """
         self._leaving.stop_on_exit()
 
@@ -371,6 +372,11 @@ class Bus:
     def stops_on_exit(self) -> bool:
         """True if `stop_on_exit` is set."""
         return self._leaving.stops
+
+    @property
+    def stopped(self) -> Mapping[str, Stopped]:
+        """The results of the stops by `stop_on_exit`, by the drive's name; empty until they have ended."""
+        return self._leaving.found
 
     def part_with(self, drives: Sequence[Drive], to_stop: Sequence[Drive]) -> None:
         """Cancel all calls that move `drives`, which are about to be detached, and wait for their stops.
@@ -387,8 +393,12 @@ class Bus:
         """Why the newest write is not in the audit log; "" if it is, or if there is no log."""
         return self._records.audit_trouble
 
+    def note_refused(self, drive: str, what: str, why: str) -> None:
+        """Record in the audit log that a program's write to a drive was refused and not sent."""
+        self._records.note_refused(drive, what, why)
+
     def statistics(self) -> LineStatistics:
-        """Return the statistics of the line and its drives since the bus was opened or `reset_statistics`.
+        """Return the statistics of the line and its drives since the opening or the last `reset_statistics`.
 
         Any thread may call this at any time; it does not delay the line.
         """

@@ -9,7 +9,7 @@ from typing import Literal
 from multidrop.core import Framing, NumberFormat
 from multidrop.drive import Drive
 from multidrop.drive.number_format import FLOATS, ORDERS, WORDS, Coding
-from multidrop.drive.request import function_limit
+from multidrop.drive.request import DEVICE_ID, function_limit
 from multidrop.errors import (
     Advice,
     BadReply,
@@ -21,12 +21,14 @@ from multidrop.errors import (
     Unconfirmed,
     WriteForbidden,
 )
+from multidrop.printable import is_number, is_whole
 
 Format = Literal["U16", "I16", "I8", "U32", "I32", "U64", "I64", "F16", "F32", "F64", "BCD16", "BCD32"]
 Order = Literal["AB", "BA", "ABCD", "CDAB", "BADC", "DCBA"]
 
 _FORMATS = {each.name: each for each in WORDS if each is not NumberFormat.U32_EITHER}
 _MOST_WORDS, _MOST_COILS = 123, 1968  # limits of one write (application protocol V1.1b3, 6.11 and 6.12)
+_BASIC_OBJECTS = 0x0100  # code of the basic objects in a device's identification (6.21)
 _CONFIRM = "pass confirm=True"
 
 
@@ -47,7 +49,7 @@ class ModbusDevice(Drive):
     def read_holding(
         self, start: int, count: int = 1, format: Format = "U16", *, order: Order = "ABCD"
     ) -> list[float]:
-        """Return `count` numbers from the holding registers from address `start`.
+        """Return `count` numbers from the holding registers that start at address `start`.
 
         Raises NoReply, BadReply, DriveException or LineError if the read fails, and NoValue if a number is
         NaN or invalid BCD.
@@ -57,7 +59,7 @@ class ModbusDevice(Drive):
     def read_input(
         self, start: int, count: int = 1, format: Format = "U16", *, order: Order = "ABCD"
     ) -> list[float]:
-        """Return `count` numbers from the input registers from `start`; raises as `read_holding`."""
+        """Return `count` numbers from the input registers that start at `start`; raises as `read_holding`."""
         return self._numbers(4, "input register", start, count, format, order)
 
     def read_coils(self, start: int, count: int = 1) -> list[bool]:
@@ -68,6 +70,21 @@ class ModbusDevice(Drive):
         """Return `count` discrete inputs from `start`; raises as `read_holding`."""
         return self._bits(2, start, count)
 
+    def read_identification(self) -> dict[int, bytes]:
+        """Return the device's basic identification by function 43: its objects by number.
+
+        Object 0 is the vendor's name, 1 the product code, and 2 the revision. Raises as `read_holding`.
+        """
+        found: dict[int, bytes] = {}
+        first = 0
+        while True:
+            data = self.link.read_raw(self, DEVICE_ID, _BASIC_OBJECTS | first, 0, attempts=3)
+            has_more, following = data[3] == 0xFF, data[4]
+            found |= _objects_of(data[6:])
+            if not has_more or following <= first:
+                return found
+            first = following
+
     def write_holding(
         self,
         start: int,
@@ -76,35 +93,57 @@ class ModbusDevice(Drive):
         *,
         order: Order = "ABCD",
         confirm: bool = False,
+        multiple: bool = False,
     ) -> list[float]:
-        """Write numbers to the holding registers from `start`; return the numbers that the device then holds.
+        """Write numbers to the holding registers that start at `start`; return what the device then holds.
 
-        One register is written by function 6, several by function 16. The registers are then read back; if
-        the device refuses that read, the written numbers are returned. Raises WriteForbidden without
-        `confirm=True`, ValueError for a number that does not fit, NotVerified if the device holds other
-        numbers, and Unconfirmed if the write may have happened.
+        One register is written by function 6, several by function 16, which `multiple` uses for one register
+        too. The registers are then read back; if the device refuses that read, the written numbers are
+        returned. Raises WriteForbidden without `confirm=True`, and ValueError for a number that does not fit.
+        Raises NotVerified if the device holds other numbers, and Unconfirmed if the write may have happened.
         """
         coding = _coding(format, order)
         data = b"".join(coding.pack(_raw(value, format, coding)) for value in values)
         words = len(data) // 2
-        what = (
-            f"holding registers {start} to {start + words - 1}" if words > 1 else f"holding register {start}"
-        )
+        what = _named("holding register", start, words)
         self._check_write(what, words, _MOST_WORDS, confirm)
-        if words == 1:
+        if words == 1 and not multiple:
             self.send_raw(6, start, data)
         else:
             self.send_raw(16, start, data, count=words)
-        held = self._read_back(what, 3, start, words, data)
+        held = self._read_back(what, 3, start, words) or data
         found = list(_decoded(held, coding, len(values)))
         if held != data:
             raise NotVerified(self.name, what, f"the device holds {found}")
         return [float("nan") if number is None else number for number in found]
 
-    def write_coils(self, start: int, values: Sequence[bool], *, confirm: bool = False) -> list[bool]:
-        """Write coils from `start`, and return what the device then holds; raises as `write_holding`.
+    def mask_holding(self, start: int, and_mask: int, or_mask: int, *, confirm: bool = False) -> int:
+        """Set bits of the holding register `start`; return the number that the device then holds.
 
-        One coil is written by function 5, several by function 15.
+        By function 22 the device keeps the bits of `and_mask`, and sets the others as in `or_mask`. Raises as
+        `write_holding`, and Unconfirmed if the device refuses to be read back: its number is then unknown.
+        """
+        what = f"holding register {start}"
+        self._check_write(what, 1, _MOST_WORDS, confirm)
+        coding = _coding("U16", "ABCD")
+        masks = b"".join(coding.pack(_raw(mask, "U16", coding)) for mask in (and_mask, or_mask))
+        self.send_raw(0x16, start, masks)
+        found = self._read_back(what, 3, start, 1)
+        if not found:
+            raise Unconfirmed(self.name, what, "the device refuses the read that would confirm the write")
+        held = int.from_bytes(found)
+        if (held ^ or_mask) & ~and_mask & 0xFFFF:
+            raise NotVerified(self.name, what, f"the device holds {held}")
+        return held
+
+    def write_coils(
+        self, start: int, values: Sequence[bool], *, confirm: bool = False, multiple: bool = False
+    ) -> list[bool]:
+        """Write coils from `start`, and return the coils that the device then holds.
+
+        If the device refuses to be read back, the written coils are returned. Raises as `write_holding`.
+
+        One coil is written by function 5, several by function 15, which `multiple` uses for one coil too.
         """
         for value in values:
             if value not in (True, False):
@@ -113,11 +152,11 @@ class ModbusDevice(Drive):
         what = _named("coil", start, count)
         self._check_write(what, count, _MOST_COILS, confirm)
         bits = sum(bool(value) << at for at, value in enumerate(values)).to_bytes((count + 7) // 8, "little")
-        if count == 1:
+        if count == 1 and not multiple:
             self.send_raw(5, start, b"\xff\x00" if values[0] else b"\x00\x00")
         else:
             self.send_raw(15, start, bits, count=count)
-        held = [*_bits_of(self._read_back(what, 1, start, count, bits), count)]
+        held = [*_bits_of(self._read_back(what, 1, start, count) or bits, count)]
         if held != [bool(value) for value in values]:
             raise NotVerified(self.name, what, f"the device holds {held}")
         return held
@@ -156,15 +195,15 @@ class ModbusDevice(Drive):
                 advice=Advice(_CONFIRM, "declare its family"),
             )
 
-    def _read_back(self, what: str, function: int, start: int, count: int, written: bytes) -> bytes:
-        """Return the data that the device holds after a write; `written` if the device refuses the read.
+    def _read_back(self, what: str, function: int, start: int, count: int) -> bytes:
+        """Return the data that the device holds after a write; b"" if the device refuses the read.
 
         This read is needed because the reply to the write may have been only an adapter's echo.
         """
         try:
             return self.link.read_raw(self, function, start, count, attempts=3)
         except DriveException:  # the device answers, but these registers cannot be read
-            return written
+            return b""
         except (NoReply, BadReply, LineError) as failure:
             raise Unconfirmed(self.name, what, f"it could not be read back: {failure}") from failure
 
@@ -175,7 +214,7 @@ def _named(kind: str, start: int, count: int) -> str:
 
 def _parts(start: int, count: int, most: int, words: int) -> Iterator[tuple[int, int]]:
     """Yield the start address and the number of values of each request that reads `count` values."""
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+    if not is_whole(count) or count < 1:
         raise ValueError(f"count = {count!r} is not 1 or more")
     for done in range(0, count, most):
         yield start + done * words, min(most, count - done)
@@ -191,7 +230,7 @@ def _coding(format: str, order: str) -> Coding:
 
 def _raw(value: float, format: str, coding: Coding) -> float:
     """Return the number to encode for `value`. Raises TypeError or ValueError if it does not fit `format`."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
+    if not is_number(value):
         raise TypeError(f"{value!r} is not a number")
     if not abs(value) < float("inf"):
         raise ValueError(f"{value!r} is not a finite number")
@@ -208,6 +247,17 @@ def _decoded(data: bytes, coding: Coding, count: int) -> Iterator[float | None]:
     for at in range(0, count * words, words):
         raw = coding.raw_in(data, at)
         yield raw if raw is None or coding.number_format in FLOATS else int(raw)
+
+
+def _objects_of(data: bytes) -> dict[int, bytes]:
+    """Return objects' contents by their number; `data` has the number, length and content of each object."""
+    found: dict[int, bytes] = {}
+    at = 0
+    while at < len(data):
+        number, length = data[at : at + 2]
+        found[number] = data[at + 2 : at + 2 + length]
+        at += 2 + length
+    return found
 
 
 def _bits_of(data: bytes, count: int) -> Iterator[bool]:

@@ -76,7 +76,9 @@ WRONG: dict[str, dict[str, Any]] = {
     "span = (60, 0) is not the smallest and the largest value, such as (0, 50)": {"span": (60, 0)},
     "span = 60 is not the smallest and the largest value": {"span": 60},
     "span = (0, inf) is not the smallest and the largest value": {"span": (0, float("inf"))},
-    "an end of its span cannot be written: speed = 70000 does not fit: 0 to 65535 rpm": {"span": (0, 70000)},
+    "an end of its span cannot be written: speed = 70000 does not fit: the register holds 0 to 65535 rpm": {
+        "span": (0, 70000)
+    },
     "default = 70 is outside its span of 0 to 60": {"span": (0, 60), "default": 70},
     "default = 'slow' is not a number": {"default": "slow"},
     "table = 'coil' is not a table": {"table": "coil"},
@@ -84,6 +86,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "kept = 'RAM' is not one of": {"kept": "RAM"},
     "harmless = <Run.STOP: 0> is not a tuple of raw counts": {"harmless": Run.STOP},
     "never = True is not a text": {"never": True},
+    "titles = {'de': 'Strom'} is not texts by ('ru', 'zh')": {"titles": {"de": "Strom"}},
     "while_running = 'no' is neither True nor False": {"while_running": "no"},
     "its bound fastest is neither an option nor a number that can be read": {"at_most": "fastest"},
     "function 15 cannot write a word: its table has 06H or 10H for it": {"table": Table("relay", 3, 0x0F)},
@@ -109,10 +112,7 @@ PARTS: dict[str, dict[str, Any]] = {
         "number_format": NumberFormat.F32,
     },
     "FAR is bit 17, and its number has bits 0 to 15": {"what": IntFlag("Bits", {"FAR": 1 << 17})},
-    "HIGH is bit 4, and its number has bits 0 to 3": {
-        "what": IntFlag("Bits", {"HIGH": 16}),
-        "part": (4, 7),
-    },
+    "HIGH is bit 4, and its number has bits 0 to 3": {"what": IntFlag("Bits", {"HIGH": 16}), "part": (4, 7)},
     "LOW = -1 is not within 0 to 15, which its number can be": {
         "what": IntEnum("Names", {"LOW": -1}),
         "part": (4, 7),
@@ -149,25 +149,24 @@ WRITTEN: dict[str, dict[str, Any]] = {
     "never_together = 0009H forbids nothing": {"what": Run, "never_together": (9,)},
     "never_together = 0H is not a mask of its bits": {"what": BITS, "never_together": (0,)},
     "never_together = 10009H is not a mask of its bits": {"what": BITS, "never_together": (0x10009,)},
-    "its default cannot be: level = 70000 does not fit: 0 to 65535": {"default": 70000},
+    "its default cannot be: level = 70000 does not fit: the register holds 0 to 65535": {"default": 70000},
 }
 
 
 @table("mistake", WRITTEN)
-def test_count_that_no_write_can_send_is_reported(mistake: str) -> None:
+def test_a_declared_raw_count_that_no_write_can_send_is_reported(mistake: str) -> None:
     details = dict(WRITTEN[mistake])
     (sentence,) = mistakes_in(level=setting(5, details.pop("what", ""), **details))
     assert sentence.startswith(f"level: {mistake}")
 
 
-def test_counts_that_a_write_can_send_are_accepted() -> None:
+def test_declared_raw_counts_that_a_write_can_send_are_accepted() -> None:
     assert declare(
         level=setting(5, harmless=(-1, 0), number_format=NumberFormat.I16, default=-3),
         control=command(6, BITS, harmless=(0, 0x8000), never_together=(9,), broadcast=(0,)),
     )
 
 
-POWER = reading(12, number_format=NumberFormat.I16)
 SCALED: dict[str, dict[str, Register[Any]]] = {
     "its scale register power is not a readable I16: it holds a power of ten": {"power": reading(12)},
     "its scale register power is not a plain count: it holds a power of ten": {
@@ -191,7 +190,7 @@ def test_scale_register_outside_the_request_is_reported(mistake: str) -> None:
     assert sentence.startswith(f"level: {mistake}")
 
 
-def test_scaled_register_is_a_plain_reading() -> None:
+def test_a_register_with_a_scale_register_must_be_a_plain_reading() -> None:
     power = reading(6, number_format=NumberFormat.I16)
     (sentence,) = mistakes_in(level=setting(5, scale_register="power"), power=power)
     assert sentence.startswith("level: a register with a scale register is never written")
@@ -376,7 +375,7 @@ WRONG_FACTS: list[tuple[str, Any, str]] = [
 
 
 @table(("name", "value", "expected"), WRONG_FACTS)
-def test_wrong_fact_is_reported(name: str, value: Any, expected: str) -> None:
+def test_invalid_fact_of_a_family_is_reported(name: str, value: Any, expected: str) -> None:
     (mistake,) = mistakes_in(speed=reading(1), **{name: value})
     assert mistake.startswith(expected)
 
@@ -395,7 +394,7 @@ def test_facts_and_registers_are_reported_together() -> None:
     ]
 
 
-@pytest.mark.parametrize("name", [*VERBS, "identify"])
+@table("name", [*VERBS, "identify"])
 def test_method_without_verb_decorator_is_reported(name: str) -> None:
     """Without the decorator, a call would only create a generator and send no request."""
 

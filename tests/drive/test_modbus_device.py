@@ -6,11 +6,13 @@ import struct
 
 import pytest
 from checksums import rtu
-from simulated_bus import SimulatedBus
+from simulated_bus import SimulatedBus, one
 
 from multidrop.drive import Drive
 from multidrop.drive.register import COIL, DISCRETE, INPUT, reading, setting
-from multidrop.errors import DriveException, NotVerified, NoValue, Unconfirmed, WriteForbidden
+from multidrop.drive.text import text
+from multidrop.errors import DriveException, NotAttached, NotVerified, NoValue, Unconfirmed, WriteForbidden
+from multidrop.families import InnovertIBD
 from multidrop.modbus_device import ModbusDevice
 from multidrop.sim import SimulatedDrive
 
@@ -75,6 +77,52 @@ def test_written_registers_are_read_back(meter: tuple[SimulatedBus, ModbusDevice
     assert [request.function for request, _ in line.frames] == [6, 3, 16, 3]
 
 
+def test_with_multiple_one_number_is_written_by_the_function_for_several(
+    meter: tuple[SimulatedBus, ModbusDevice],
+) -> None:
+    line, device = meter
+    assert device.write_holding(5, [7], confirm=True, multiple=True) == [7]
+    assert device.write_coils(3, [True], confirm=True, multiple=True) == [True]
+    assert [request.function for request, _ in line.frames] == [16, 3, 15, 1]
+
+
+def test_a_mask_sets_the_bits_that_it_does_not_keep(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+    line, device = meter
+    held = ["12 34"]
+    answers = {0x16: "07 16 00 05 FF F0 00 04", 3: "07 03 02 "}
+    line.answers = lambda request: rtu(
+        answers[request.function] + (held.pop(0) if request.function == 3 else "")
+    )
+    assert device.mask_holding(5, 0xFFF0, 0x0004, confirm=True) == 0x1234
+    held[:] = ["12 35"]
+    with pytest.raises(NotVerified, match="the device holds 4661"):
+        device.mask_holding(5, 0xFFF0, 0x0004, confirm=True)
+    with pytest.raises(WriteForbidden, match="pass confirm=True"):
+        device.mask_holding(5, 0xFFF0, 0x0004)
+    with pytest.raises(ValueError, match="65536 does not fit into U16"):
+        device.mask_holding(5, 65536, 0, confirm=True)
+
+
+def test_a_mask_is_unconfirmed_if_the_register_cannot_be_read(
+    meter: tuple[SimulatedBus, ModbusDevice],
+) -> None:
+    line, device = meter
+    answers = {0x16: "07 16 00 05 FF F0 00 04", 3: "07 83 02"}
+    line.answers = lambda request: rtu(answers[request.function])
+    with pytest.raises(
+        Unconfirmed, match=r"register 5 took effect: .* refuses the read that would confirm the write"
+    ):
+        device.mask_holding(5, 0xFFF0, 0x0004, confirm=True)
+
+
+def test_an_identification_in_two_replies_is_returned_whole(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+    line, device = meter
+    parts = {0: "07 2B 0E 01 01 FF 01 01 00 04 41 63 6D 65", 1: "07 2B 0E 01 01 00 00 01 01 04 50 43 2D 31"}
+    line.answers = lambda request: rtu(parts[request.data[2]])
+    assert device.read_identification() == {0: b"Acme", 1: b"PC-1"}
+    assert [request.data.hex() for request, _ in line.frames] == ["0e0100", "0e0101"]
+
+
 def test_a_write_that_cannot_be_read_back_is_unconfirmed(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
     """The reply to a write is a copy of the request, so it may be an adapter's echo."""
     line, device = meter
@@ -125,3 +173,91 @@ def test_many_registers_take_several_requests(meter: tuple[SimulatedBus, ModbusD
     line.frames.clear()
     assert device.read_holding(0, 70, "F64") == [0.0] * 70
     assert [(request.start, request.count) for request, _ in line.frames] == [(0, 124), (124, 124), (248, 32)]
+
+
+# ---- `Drive.read`, `write` and similar methods of attached and unattached drives ----
+
+
+class Tank(Drive):
+    """A device with two neighbouring readings, a setting, and a text."""
+
+    level = reading(0, "m", step=0.1)
+    flow = reading(1, "l/s")
+    limit = setting(5, "m", step=0.1, span=(0, 100), moves=False)
+    serial = text(20, 4)
+    door = reading(3, table=DISCRETE)
+    lamp = setting(4, table=COIL, moves=False)
+
+
+@pytest.fixture
+def metered(monkeypatch: pytest.MonkeyPatch) -> tuple[SimulatedBus, Tank]:
+    sim = SimulatedDrive(Tank(1, name="tank"))
+    sim["level"], sim["flow"], sim["limit"], sim["serial"] = 2.5, 7, 4.0, "AB12"
+    line = SimulatedBus(monkeypatch, sim)
+    return line, line.attach(Tank(1, name="tank"))
+
+
+def test_reading_one_register_returns_its_value_and_several_a_dict(
+    metered: tuple[SimulatedBus, Tank],
+) -> None:
+    line, tank = metered
+    assert tank.read(tank.level) == tank.read("level") == 2.5
+    sent = len(line.frames)
+    assert tank.read("level", tank.flow) == {"level": 2.5, "flow": 7}
+    assert len(line.frames) == sent + 1
+    assert tank.read("flow", "level") == {"flow": 7, "level": 2.5}
+    assert list(tank.read("flow", "level")) == ["flow", "level"]
+    assert tank.read_many(["level"]) == {"level": 2.5}
+    assert tank.read_all() == {"level": 2.5, "flow": 7, "door": False}
+
+
+def test_reads_of_the_same_names_are_planned_once(
+    metered: tuple[SimulatedBus, Tank], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, tank = metered
+    tank.read("level", "flow")
+    monkeypatch.delattr(Drive, "register")
+    assert tank.read("level", "flow") == {"level": 2.5, "flow": 7}
+
+
+def test_texts_are_read_like_registers(metered: tuple[SimulatedBus, Tank]) -> None:
+    _, tank = metered
+    assert tank.read(tank.serial) == tank.read("serial") == "AB12"
+    assert tank.read("serial", tank.level) == {"serial": "AB12", "level": 2.5}
+
+
+def test_coils_and_discrete_inputs_are_bool(metered: tuple[SimulatedBus, Tank]) -> None:
+    line, tank = metered
+    line.sims[0]["door"] = 1
+    assert tank.read("door") is True
+    assert tank.read("door", "lamp", "flow") == {"door": True, "lamp": False, "flow": 7}
+    assert tank.read("lamp", "door")["lamp"] is False
+    assert tank.write("lamp", True) is True
+    assert line.sims[0]["lamp"] == 1
+
+
+def test_a_setting_is_written_by_its_name(metered: tuple[SimulatedBus, Tank]) -> None:
+    line, tank = metered
+    assert tank.write("limit", 6.5) == tank.read(tank.limit) == line.sims[0]["limit"] == 6.5
+    with pytest.raises(ValueError, match="has no register 'limits'; did you mean limit"):
+        tank.write("limits", 6.5)
+
+
+def test_calls_of_a_drive_that_is_not_attached_raise_not_attached(monkeypatch: pytest.MonkeyPatch) -> None:
+    pump = InnovertIBD(1, name="pump-1")
+    sentence = r"^pump-1 is not attached to a bus: use bus\.attach\(\.\.\.\)$"
+    for call in (
+        lambda: pump.read("output_current"),
+        lambda: pump.read("output_current", "output_frequency"),
+        pump.read_all,
+        lambda: pump.write("acceleration_time", 5.0),
+        lambda: pump.read_raw(3, 0, 1),
+        lambda: pump.send_raw(6, 0, b"\0\1"),
+        pump.start,
+    ):
+        with pytest.raises(NotAttached, match=sentence):
+            call()
+    line, attached, _ = one(monkeypatch, InnovertIBD(1, name="pump-1"))
+    line.bus.detach(attached)
+    with pytest.raises(NotAttached, match="pump-1 is not attached to this bus"):
+        attached.read("output_current")

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import pytest
 from simulated_bus import SimulatedBus
+from tables import table
 
 from multidrop.control.ramp import ramp, start_staggered
 from multidrop.core import Message
@@ -91,9 +92,9 @@ def test_plain_setting_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) ->
     assert "confirmed" not in Fan.options
 
 
-@pytest.mark.parametrize("confirmed", [0, 1])
-@pytest.mark.parametrize("word", Word)
-def test_command_is_left_to_verbs_by_default(
+@table("confirmed", [0, 1])
+@table("word", Word)
+def test_a_plain_write_to_a_command_is_refused_by_default(
     monkeypatch: pytest.MonkeyPatch, confirmed: int, word: Word
 ) -> None:
     line = SimulatedBus(monkeypatch, simulated(Pump(1)))
@@ -101,7 +102,7 @@ def test_command_is_left_to_verbs_by_default(
     with pytest.raises(WriteForbidden) as refusal:
         pump.write(pump.control, word)
     assert str(refusal.value) == (
-        f"control of pump is not written: {word.name} commands the motor, which verbs alone do: "
+        f"control of pump is not written: {word.name} commands the motor, which only verbs may do: "
         "use start(), stop()"
     )
     assert line.frames == []
@@ -138,7 +139,7 @@ def test_harmless_counts_need_no_confirmation(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("name", ["start", "set_frequency", "target"])
-def test_moving_a_drive_without_identify_needs_confirmation(
+def test_starting_the_motor_of_a_drive_without_identify_needs_confirmation(
     monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     def command_it(line: SimulatedBus, pump: Pump) -> None:
@@ -195,17 +196,11 @@ def test_ramps_and_sequences_need_confirmation_too(monkeypatch: pytest.MonkeyPat
     assert line.written
 
 
-@pytest.mark.parametrize("name", ["stop", "coast"])
+@pytest.mark.parametrize("name", ["stop", "coast", "stop_all"])
 def test_a_stop_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     line = SimulatedBus(monkeypatch, simulated(Pump(1)))
-    getattr(line.attach(Pump(1)), name)()
-    assert written(line) == [STOP]
-
-
-def test_stop_all_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = SimulatedBus(monkeypatch, simulated(Pump(1)))
-    line.attach(Pump(1))
-    line.bus.stop_all()
+    pump = line.attach(Pump(1))
+    getattr(line.bus if name == "stop_all" else pump, name)()
     assert written(line) == [STOP]
 
 

@@ -2,18 +2,36 @@
 
 from __future__ import annotations
 
+import json
+import math
 from enum import IntEnum, IntFlag
+from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from commands import Run as RunCommand
+from examples import examples
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from lines import ANY_PORT
+from simulated_bus import SimulatedBus
 from tables import table
 
-from multidrop.core import NumberFormat
-from multidrop.drive import Drive
+from multidrop import Condition
+from multidrop.core import Message, NumberFormat
+from multidrop.drive import Drive, StateReader, WriteForbidden, chosen_language
+from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.line_settings import Settings
-from multidrop.drive.register import COIL, Kept, Register, command, reading, setting
+from multidrop.drive.register import COIL, INPUT, Kept, Register, command, reading, setting
+from multidrop.drive.script import Script, read
+from multidrop.drive.state import State
+from multidrop.drive.text import Text, text
+from multidrop.drive.titles import LANGUAGES, catalogue
+from multidrop.drive.verbs import verb
+from multidrop.families import MODELS
+from multidrop.families.registry import SHIPPED, shipped_family
+from multidrop.scan.identify import _read
+from multidrop.sim import SimulatedDrive, Simulator, Wire
 
 
 class Run(IntEnum):
@@ -76,7 +94,7 @@ def test_a_raw_count_without_a_member_decodes_to_its_number() -> None:
         (Example.choice, 1.5, ValueError),
     ],
 )
-def test_values_that_a_register_refuses(
+def test_encoding_an_invalid_value_raises_an_error_that_names_the_register(
     register: Register[Any], value: object, error: type[Exception]
 ) -> None:
     with pytest.raises(error, match=register.name):
@@ -111,7 +129,7 @@ def test_format_returns_values_with_their_unit(register: Register[Any], value: o
     assert register.format(value) == text
 
 
-def test_typed_text_becomes_a_value() -> None:
+def test_a_typed_text_is_parsed_to_a_value() -> None:
     assert Example.frequency.parse("25.5") == 25.5
     assert Example.run.parse("go") is Run.GO
     assert Example.word.parse("run|fault") == Bits.RUN | Bits.FAULT
@@ -173,7 +191,7 @@ def test_the_duration_of_a_character_includes_start_parity_and_stop_bits(
         (115200, "8N1", 1.75e-3),
     ],
 )
-def test_t3_5(baudrate: int, format: str, seconds: float) -> None:
+def test_t3_5_is_the_standards_silence_in_seconds(baudrate: int, format: str, seconds: float) -> None:
     assert Settings(baudrate, format).t3_5 == pytest.approx(seconds, rel=1e-4)
 
 
@@ -183,7 +201,309 @@ def test_invalid_format_is_refused(format: str) -> None:
         Settings(9600, format)
 
 
-@pytest.mark.parametrize("baudrate", [0, -9600, 10**9])
+@table("baudrate", [0, -9600, 10**9])
 def test_invalid_baud_rate_is_refused(baudrate: int) -> None:
     with pytest.raises(ValueError, match="baud rate"):
         Settings(baudrate, "8N1")
+
+
+# ---- a drive's state from known values, computed again only if it may have changed ----
+
+
+RUNS, STANDS = State(Condition.RUNNING), State(Condition.STOPPED)
+
+
+class Counting(Drive):
+    """A drive that records each computation of its state, in all copies."""
+
+    looks: list[float] = []
+    speed = reading(0x10)
+    temperature = reading(0x11)
+
+    @verb
+    def state(self) -> Script[State]:
+        """Return running if the speed is not 0."""
+        speed = yield from read(self.speed)
+        self.looks.append(speed)
+        return RUNS if speed else STANDS
+
+
+class Noting(Drive):
+    """A drive that stores an attribute while its state is computed, so each call must compute the state."""
+
+    speed = reading(0x10)
+
+    def __init__(self, address: int) -> None:
+        super().__init__(address)
+        self.zeros = 0
+
+    @verb
+    def state(self) -> Script[State]:
+        """Return the state `stopped` after two successive readings of output frequency 0."""
+        speed = yield from read(self.speed)
+        self.zeros = 0 if speed else self.zeros + 1
+        return STANDS if self.zeros > 1 else RUNS
+
+
+def test_the_state_of_equal_values_is_computed_once() -> None:
+    Counting.looks.clear()
+    reader = StateReader(Counting(1))
+    for temperature in range(5):
+        assert reader.state({"speed": 25.0, "temperature": float(temperature)}) == RUNS
+    assert Counting.looks == [25.0]
+    assert reader.state({"speed": 0.0}) == STANDS
+    assert reader.state({}) is None
+    assert reader.state({"speed": 0.0}) == STANDS
+    assert reader.state({"speed": 25.0}) == RUNS
+    assert Counting.looks[-1] == 25.0
+
+
+def test_the_state_of_nan_is_computed_again() -> None:
+    Counting.looks.clear()
+    reader = StateReader(Counting(1))
+    assert [reader.state({"speed": math.nan}) for _ in range(2)] == [RUNS, RUNS]
+    assert len(Counting.looks) == 2
+
+
+def test_the_state_of_a_family_with_attributes_is_computed_each_time() -> None:
+    reader = StateReader(Noting(1))
+    shown = [reader.state({"speed": speed}) for speed in (25.0, 0.0, 0.0, 0.0, 25.0, 0.0, 0.0)]
+    assert shown == [RUNS, RUNS, STANDS, STANDS, RUNS, RUNS, STANDS]
+
+
+# Status words from the manuals. A Delixi with Modbus has none: only its fault code shows a fault.
+@table(
+    ("model", "values", "condition"),
+    [
+        ("invt-che", {"status": 4.0}, Condition.FAULT),
+        ("invt-che", {"status": 3.0}, Condition.STOPPED),
+        ("delixi-native", {"status": 4.0}, Condition.FAULT),
+        ("delixi-modbus", {"output_frequency": 25.0}, None),
+    ],
+)
+def test_a_fault_is_detected_from_the_status_alone(
+    model: str, values: dict[str, float], condition: Condition | None
+) -> None:
+    found = StateReader(MODELS[model](1)).state(values)
+    assert (found and found.condition) == condition
+    assert found is None or found.fault is None
+
+
+def test_a_fault_gets_its_name_when_its_code_arrives() -> None:
+    reader = StateReader(MODELS["invt-che"](1))
+    assert reader.state({"status": 4.0}) == State(Condition.FAULT)
+    assert reader.state({"status": 4.0}) == State(Condition.FAULT)
+    named = reader.state({"status": 4.0, "fault": 4.0})
+    assert named == State(Condition.FAULT, fault="overcurrent while accelerating (OC1)")
+    assert reader.state({"status": 4.0}) == State(Condition.FAULT)
+
+
+# ---- texts: characters in registers, read on demand ----
+
+
+METER = """\
+from multidrop import Drive, reading, text
+from multidrop.drive import INPUT
+
+class Meter(Drive):
+    model = "meter"
+    most_registers = {INPUT: 10}
+    level = reading(3, "m", table=INPUT, invalid=0x7FFF)
+    speed = reading(4, "rpm", table=INPUT)
+    serial = text(20, 4, table=INPUT, place="section 2")
+"""
+
+
+class Meter(Drive):
+    """A drive with a text that is longer than its limit for one request."""
+
+    most_registers = {INPUT: 5}
+    level = reading(0, table=INPUT)
+    serial = text(20, 12, table=INPUT)
+    maker = text(40, 3, order="BA")
+
+
+def test_a_text_is_read_as_the_document_prints_it() -> None:
+    assert Meter.serial.decode(b"EM3-0042\0\0\0\0 rubbish") == "EM3-0042"
+    assert Meter.maker.decode(b"BAB ") == "AB B"
+    assert Meter.maker.decode(bytes.fromhex("42 41 00 42 00 00")) == "ABB"
+    assert Meter.serial.decode(b"  v1.2   ") == "  v1.2"
+
+
+@given(st.binary(max_size=24))
+def test_decoded_texts_have_no_control_characters(data: bytes) -> None:
+    found = Meter.serial.decode(data)
+    assert found.isprintable()
+    assert Meter.serial.decode(b"\x1b[2J\x07") == "?[2J?"
+
+
+@settings(max_examples=examples(20))
+@given(st.text(st.characters(min_codepoint=33, max_codepoint=126), max_size=6))
+@pytest.mark.parametrize("declared", [Meter.serial, Meter.maker], ids=str)
+def test_a_text_of_a_simulated_drive_is_read_over_the_line(declared: Text, value: str) -> None:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        sim = SimulatedDrive(Meter(1))
+        line = SimulatedBus(monkeypatch, sim)
+        drive = line.attach(Meter(1))
+        sim[declared.name] = value
+        assert drive.read(declared) == value == sim[declared.name]
+        counts = [request.count for request, _ in line.frames]
+        assert counts == ([5, 5, 2] if declared is Meter.serial else [3])
+
+
+class Known(Meter):
+    """A drive that is identified by the text `maker`."""
+
+    limit = setting(1, "m", span=(0, 10), kept=Kept.RAM)
+
+    @verb
+    def identify(self) -> Script[None]:
+        """Check that the text `maker` is ABB."""
+        if (found := (yield from read(self.maker))) != "ABB":
+            raise WriteForbidden(f"{self.name} is of {found}")
+
+
+@pytest.mark.parametrize("maker", ["ABB", "ABC"])
+def test_identify_can_read_a_text(monkeypatch: pytest.MonkeyPatch, maker: str) -> None:
+    sim = SimulatedDrive(Known(1))
+    sim["maker"] = maker
+    line = SimulatedBus(monkeypatch, sim)
+    drive = line.attach(Known(1, name="em-1"))
+    if maker == "ABB":
+        assert drive.write(drive.limit, 3) == 3
+    else:
+        with pytest.raises(WriteForbidden, match="em-1 is of ABC"):
+            drive.write(drive.limit, 3)
+    assert (line.written != []) == (maker == "ABB")
+
+
+def test_scan_reads_texts_to_identify_families() -> None:
+    sim = SimulatedDrive(Known(1))
+    sim["maker"] = "ABB"
+
+    def ask(drive: Drive, request: Message) -> Message:
+        reply = sim.answer(request, 0.0)
+        assert reply is not None
+        return reply
+
+    assert _read(Known(1), Known.maker, ask) == "ABB"
+
+
+def test_polling_a_text_or_reading_another_family_s_text_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Other(Drive):
+        """Another family, with a text at the same address."""
+
+        serial = text(20, 12)
+
+    line = SimulatedBus(monkeypatch, SimulatedDrive(Meter(1)))
+    drive = line.attach(Meter(1, name="em-1"))
+    assert [register.name for register in Meter.readings()] == ["level"]
+    assert list(Meter.texts) == ["serial", "maker"]
+    with pytest.raises(ValueError, match=r"^this serial is not a text of em-1"):
+        drive.read(Other.serial)
+    with pytest.raises(AttributeError, match=r"serial is a text; read it with drive.read"):
+        drive.serial = "x"
+    with pytest.raises(ValueError, match="maker holds 6 characters, not 7"):
+        line.sims[0]["maker"] = "1234567"
+
+
+@table(
+    ("details", "sentence"),
+    [
+        ((1, 0), "a text of 0 registers"),
+        ((1, 126), "a text of 126 registers: it must have 1 to 125"),
+        ((0xFFFF, 2), "its registers are not within 0 to FFFFH"),
+        ((-1, 2), "its registers are not within 0 to FFFFH"),
+    ],
+)
+def test_text_longer_than_a_request_is_refused(details: tuple[int, int], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        text(*details)
+
+
+def test_invalid_texts_are_refused() -> None:
+    with pytest.raises(ValueError, match="order = 'CDAB' of a text is not 'AB', 'BA' or 'B'"):
+        text(1, 2, order="CDAB")
+    with pytest.raises(ValueError, match="a text is in holding or input registers, and 'coil' is neither"):
+        text(1, 2, table=COIL)
+    with pytest.raises(DeclarationError, match="bus: reserved name"):
+        type("Wrong", (Drive,), {"bus": text(1, 2)})
+    with pytest.raises(DeclarationError, match="second: this is the text serial already"):
+        type("Wrong", (Drive,), {"second": Meter.serial})
+
+
+def test_command_line_prints_texts_and_missing_values(run: RunCommand, tmp_path: Path) -> None:
+    path = tmp_path / "meter.py"
+    path.write_text(METER)
+    model = f"{path}:Meter"
+    namespace: dict[str, type[Drive]] = {}
+    exec(METER, namespace)
+    sim = SimulatedDrive(namespace["Meter"](1))
+    sim["level"], sim["speed"], sim["serial"] = None, 1440, "EM3-0042"
+    with Simulator([Wire([sim], port=ANY_PORT, unpaced=True)]) as simulator:
+        port = simulator.wires[0].path
+        status, out, _ = run("read", port, model, 1)
+        assert (status, out) == (0, "level        no valid value\nspeed  1440  rpm\nserial  EM3-0042\n")
+        assert run("read", port, model, 1, "serial")[1] == "serial  EM3-0042\n"
+        shown = json.loads(run("read", port, model, 1, "--json")[1])["values"]
+    assert shown == {
+        "level": {"value": None, "reason": "no valid value"},
+        "speed": {"value": 1440.0, "unit": "rpm"},
+        "serial": {"value": "EM3-0042"},
+    }
+    told = run("models", model)[1]
+    assert "0014H  serial  input register  8 characters  section 2" in told
+    assert "no value: 7FFFH" in told
+
+
+# ---- titles of registers in Russian and Chinese, and the choice of a language ----
+
+
+OURS = {"signature", "station", "display_frequency"}  # names given by this library, or of unclear meaning
+UNTRANSLATED = {"ru": OURS | {"automatic_environment", "ramp_time", "wake_difference"}, "zh": OURS}
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_catalogue_has_each_register_of_the_built_in_families(language: str) -> None:
+    families = [*MODELS.values(), *map(shipped_family, SHIPPED)]
+    names = {name for family in families for name in family.registers}
+    titles = catalogue(language)
+    assert names - titles.keys() == UNTRANSLATED[language]
+    assert titles.keys() <= names
+    assert all(
+        title.strip() == title and title.isprintable() and not title.isascii() for title in titles.values()
+    )
+
+
+def test_declared_title_precedes_the_catalogue_and_english() -> None:
+    registers = {
+        "output_current": reading(1, "A", titles={"ru": "ток"}),
+        "outdoor_temperature": reading(2, titles={"zh": "室外温度"}),
+    }
+    for name, register in registers.items():
+        register.__set_name__(object, name)
+    current, outdoor = registers.values()
+    assert [current.title_in(one) for one in ("ru", "zh", "en", "de")] == [
+        "ток",
+        "输出电流",
+        "output current",
+        "output current",
+    ]
+    assert [outdoor.title_in(one) for one in ("ru", "zh")] == ["outdoor temperature", "室外温度"]
+    assert outdoor.title == "outdoor temperature"
+
+
+@table(
+    ("tags", "language"),
+    [
+        (["ru_RU.UTF-8"], "ru"),
+        (["zh-Hant-TW", "en"], "zh"),
+        (["de-DE", "ru"], "ru"),
+        (["en-GB", "ru"], "en"),
+        (["RU"], "ru"),
+        (["rus", "C", "", "*"], "en"),
+        ([], "en"),
+    ],
+)
+def test_first_known_language_is_chosen(tags: list[str], language: str) -> None:
+    assert chosen_language(tags) == language

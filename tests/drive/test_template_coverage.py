@@ -112,7 +112,7 @@ def test_missing_facts_are_counted_with_their_reasons(bench: Any, tmp_path: Path
     }
 
 
-def test_parameters_devices_within_and_comments_are_read(bench: Any, tmp_path: Path) -> None:
+def test_parameters_nested_devices_and_comments_are_read(bench: Any, tmp_path: Path) -> None:
     parameters = {"p": {"title": "p", "address": 5, "condition": "q==1"}}
     within = [{"device_type": "y", "device": {"channels": [HELD[0]], "parameters": [{"address": 6}]}}]
     used = {"name": "inner", "device_type": "y", "shift": 100}
@@ -129,7 +129,7 @@ def test_parameters_devices_within_and_comments_are_read(bench: Any, tmp_path: P
     }
 
 
-def test_entries_that_no_single_class_holds_are_reported(bench: Any, tmp_path: Path) -> None:
+def test_entries_that_do_not_fit_into_one_class_are_reported(bench: Any, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(wb([{"address": 5, "scale": 0.1}, {"address": 5, "scale": 1}]))
     coverage = covered(bench, tmp_path)
     assert (coverage.whole, coverage.refused.total()) == (0, 1)

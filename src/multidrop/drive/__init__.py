@@ -18,9 +18,14 @@ from multidrop.drive.register import Access as Access
 from multidrop.drive.register import Carrier as Carrier
 from multidrop.drive.register import Kept as Kept
 from multidrop.drive.register import Table as Table
+from multidrop.drive.request import DEVICE_ID as DEVICE_ID
+from multidrop.drive.request import MEI_DEVICE_ID as MEI_DEVICE_ID
+from multidrop.drive.request import SERVER_ID as SERVER_ID
+from multidrop.drive.request import STATUS as STATUS
 from multidrop.drive.script import Read, Script, Wait, carry_out, insist, read, until, wait, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.text import Text as Text
+from multidrop.drive.titles import chosen_language as chosen_language
 from multidrop.drive.verbs import verb
 from multidrop.errors import (
     ANOTHER_FAMILY,

@@ -1,4 +1,4 @@
-"""Check a drive's class when it is defined, with tables of rules for its facts and its registers."""
+"""Check a drive's class when it is defined, with tables of rules for its facts (attributes) and registers."""
 
 from __future__ import annotations
 
@@ -16,17 +16,19 @@ from multidrop.drive.options import Option
 from multidrop.drive.register import Access, Carrier, Kept, Register, Table
 from multidrop.drive.request import LONGEST_INTERVAL, STANDARD_LIMITS, may_be_crossed, read_limit
 from multidrop.drive.text import Text
+from multidrop.drive.titles import LANGUAGES
+from multidrop.printable import is_whole
 
 LAST_ADDRESS = 0xFFFF
 LONGEST_TIME = 60.0  # s; larger numbers are probably ms
 MOST_CHARACTERS = 1000
-UNIT_IDS = range(256)  # addresses on Modbus TCP; a serial line has fewer
+UNIT_IDS = range(256)  # addresses on Modbus TCP; a serial line has fewer addresses
 EXCEPTION_CODES = range(1, 256)
-# Function codes that write the same items: from the code for a single item to the code for several.
+# Function codes that write the same items: the code for one item, and the code for several.
 _SAME_SPACE = {0x05: 0x0F, 0x06: 0x10}
 _TAKEN = "reserved name; every drive has it for something else"
 
-# A fact's name, the test of its value, and the end of the sentence "FACT = VALUE …" if the test fails.
+# A fact's name, the test of its value, and the end of the error "FACT = VALUE …" for a failed test.
 Rules = tuple[tuple[str, Callable[[Any], Any], str], ...]
 
 
@@ -43,10 +45,6 @@ class DeclarationError(ValueError):
 
 def _is_a(kind: type | tuple[type, ...]) -> Callable[[Any], bool]:
     return lambda value: isinstance(value, kind)
-
-
-def _is_whole(number: object) -> bool:
-    return isinstance(number, int) and not isinstance(number, bool)
 
 
 def _is_real(number: object) -> bool:
@@ -90,7 +88,7 @@ def _is_settings(baudrate: Any, format: Any) -> bool:
 
 
 def _wrong_facts(owner: Any, rules: Rules) -> dict[str, str]:
-    """Return the sentence for each wrong fact, by its name."""
+    """Return a sentence for each wrong fact, by the fact's name."""
     facts = ((name, getattr(owner, name), is_right, rest) for name, is_right, rest in rules)
     return {
         name: f"{name} = {value!r} {rest}" for name, value, is_right, rest in facts if not is_right(value)
@@ -134,12 +132,12 @@ _CLASS_RULES: Rules = (
     ),
     (
         "addresses",
-        _is_sequence(lambda each: _is_whole(each) and each in UNIT_IDS),
+        _is_sequence(lambda each: is_whole(each) and each in UNIT_IDS),
         "is not a range of addresses, such as range(1, 248)",
     ),
     (
         "baudrates",
-        _is_sequence(lambda each: _is_whole(each) and _is_settings(each, "8N1")),
+        _is_sequence(lambda each: is_whole(each) and _is_settings(each, "8N1")),
         "is not a tuple of baud rates, such as (9600, 19200)",
     ),
     ("framings", _is_sequence(_is_a(Framing)), "is not a tuple of framings, such as (Framing.RTU,)"),
@@ -150,11 +148,11 @@ _CLASS_RULES: Rules = (
     ),
     (
         "exceptions",
-        _is_mapping(lambda code: _is_whole(code) and code in EXCEPTION_CODES, _is_a(str)),
+        _is_mapping(lambda code: is_whole(code) and code in EXCEPTION_CODES, _is_a(str)),
         'is not a mapping of codes, such as {1: "illegal function"}',
     ),
     *(
-        (name, lambda given: _is_set(given, _is_whole), "is not a set of codes, such as frozenset({6})")
+        (name, lambda given: _is_set(given, is_whole), "is not a set of codes, such as frozenset({6})")
         for name in ("damaged", "later")
     ),
     ("most_registers", _is_mapping(_is_a(Table), _is_a(object)), "is not a mapping, such as {HOLDING: 16}"),
@@ -186,7 +184,7 @@ def fact_errors(family: Any) -> list[str]:
                 wrong["options"] = (
                     f"options[{name!r}]: span = {option.span!r} is not the smallest and the largest value"
                 )
-    registers = {*family.registers, *family.texts}  # a register with a fact's name is reported as a register
+    registers = {*family.registers, *family.texts}  # errors in their names are reported elsewhere
     return [sentence for name, sentence in wrong.items() if name not in registers]
 
 
@@ -208,7 +206,7 @@ def _or_none(right: Callable[[Any], bool]) -> Callable[[Any], bool]:
 
 
 def _is_address(at: object) -> bool:
-    return _is_whole(at) and at in range(LAST_ADDRESS + 1)
+    return is_whole(at) and at in range(LAST_ADDRESS + 1)
 
 
 def _is_names(values: object) -> bool:
@@ -235,7 +233,7 @@ _REGISTER_RULES: Rules = (
     ),
     (
         "part",
-        _or_none(lambda value: _is_pair(value, _is_whole) and value[0] >= 0),
+        _or_none(lambda value: _is_pair(value, is_whole) and value[0] >= 0),
         "is not the lowest and the highest bit, such as (0, 7)",
     ),
     (
@@ -250,11 +248,12 @@ _REGISTER_RULES: Rules = (
         (name, _is_a(str), "is not a text")
         for name in ("unit", "scale_register", "at_least", "at_most", "never", "place", "outside", "note")
     ),
+    ("titles", _is_mapping(LANGUAGES.__contains__, _is_a(str)), f"is not texts by {LANGUAGES}"),
     *((name, _or_none(_is_truth), "is neither True nor False") for name in ("while_running", "moves")),
     *(
         (
             name,
-            _or_none(lambda value: _is_set(value, _is_whole)),
+            _or_none(lambda value: _is_set(value, is_whole)),
             "is not a tuple of raw counts, such as (0,)",
         )
         for name in ("broadcast", "harmless", "never_together")
@@ -278,13 +277,13 @@ def _errors_together(
             yield f"its bound {name} is neither an option nor a number that can be read"
 
 
-# The function codes that read and write bits, and words (application protocol V1.1b3, section 6).
+# By carrier (bit or word): the function codes that read or write it (application protocol V1.1b3, 6).
 _READS = {Carrier.BIT: (0x01, 0x02), Carrier.WORD: (0x03, 0x04)}
 _WRITES = {Carrier.BIT: (0x05, 0x0F), Carrier.WORD: (0x06, 0x10)}
 
 
 def _table_errors(register: Register[Any]) -> Iterator[str]:
-    """Find a number format, a function code or an access that does not fit the table."""
+    """Yield a sentence for each number format, function code and access that does not fit the table."""
     table, access = register.table, register.access
     if not _fits_table(register):
         yield f"number_format = NumberFormat.{register.number_format.name} does not fit a {table.name}"
@@ -308,19 +307,19 @@ def _fits_table(register: Register[Any]) -> bool:
     return register.number_format is wanted
 
 
-# Formats of whole numbers, of which a register may be a part (a range of bits).
+# Formats of whole numbers. A register may be only a part (a range of bits) of such a number.
 _PARTED = frozenset(
     {
         *(NumberFormat.U16, NumberFormat.U32, NumberFormat.U64),
         *(NumberFormat.I16, NumberFormat.I32, NumberFormat.I64),
     }
 )
-# Facts that only registers of 16-bit words may have, with their defaults.
+# Facts that only registers of 16-bit words may have, not bits, each with its default.
 _OF_WORDS = {"part": None, "invalid": (), "order": "ABCD", "scale_register": ""}
 
 
 def _number_errors(register: Register[Any]) -> Iterator[str]:
-    """Yield a sentence for each fact that does not fit the number format, which itself fits the table."""
+    """Yield a sentence for each fact that does not fit the number format. The format must fit the table."""
     number_format, is_reading = register.number_format, register.access is Access.READING
     for name, at in (("address", register.address), ("ram_address", register.ram_address)):
         if at is not None and at + register.words - 1 > LAST_ADDRESS:
@@ -361,7 +360,7 @@ def _is_flags(register: Register[Any]) -> bool:
 
 def _counts(register: Register[Any]) -> tuple[Fraction, Fraction]:
     """Return the least and the greatest raw count; flags are never negative."""
-    if _is_flags(register):  # also in a signed format, whose highest bit may have a name
+    if _is_flags(register):  # even in a signed format, because the highest bit may be a named flag
         return Fraction(0), Fraction((1 << register.coding.mask.bit_count()) - 1)
     return register.coding.raw_span
 
@@ -410,7 +409,7 @@ def _invalid_errors(register: Register[Any]) -> Iterator[str]:
 
 
 def _name_errors(register: Register[Any]) -> Iterator[str]:
-    """Yield a sentence for each named count that the register cannot hold, and so would never show."""
+    """Yield a sentence for each named count that the register can never hold."""
     if register.values is None or (register.part is not None and register.number_format not in _PARTED):
         return
     least, most = _counts(register)
@@ -450,11 +449,11 @@ def declaration_errors(
 
 
 def _sharing_errors(registers: list[Register[Any]]) -> Iterator[str]:
-    """Find registers that are written at the same address with different meanings.
+    """Yield a sentence for each pair of registers that are written at one address with different meanings.
 
     A reading may share its address with any register, and different tables may use the same addresses. A
-    register that commands the motor shares its address neither with a RAM alias nor with a register that has
-    other harmless counts: a plain write would send what only verbs may send.
+    register that commands the motor must not share its address with a RAM alias, or with a register that has
+    other harmless counts. Otherwise a plain write could send a count that only verbs may send.
     """
     written = [one for one in registers if one.access is not Access.READING and one.table.write is not None]
     at: dict[tuple[object, int], list[Register[Any]]] = {}
@@ -504,7 +503,7 @@ def _meaning(register: Register[Any]) -> object:
 
 
 def request_errors(family: Any) -> list[str]:
-    """Connect registers with their scale registers; return a sentence for each error in the requests."""
+    """Connect scale registers; return a sentence for each wrong scale, limit or group of registers."""
     wrong = list(_scale_errors(family)) or list(_limit_errors(family))
     if wrong:
         return wrong
@@ -565,7 +564,7 @@ def _reach_errors(register: Register[Any], family: Any) -> Iterator[str]:
 def _limit_errors(family: Any) -> Iterator[str]:
     for table, most in family.most_registers.items():
         standard = STANDARD_LIMITS[table.carrier]
-        if not _is_whole(most) or not 1 <= most <= standard:
+        if not is_whole(most) or not 1 <= most <= standard:
             yield f"most_registers[{table.name}] = {most!r} is not a number from 1 to {standard}"
     groups = family.read_together
     if not isinstance(groups, (tuple, list)) or not all(isinstance(group, (tuple, list)) for group in groups):

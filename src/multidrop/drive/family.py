@@ -6,7 +6,6 @@ run by the bus that the drive is attached to.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
 
@@ -28,6 +27,7 @@ from multidrop.drive.state import Condition, Direction, KnownSetpoint, State
 from multidrop.drive.text import Text
 from multidrop.drive.verbs import MOVING, CalledStop, UnattachedStop, verb, verb_errors
 from multidrop.errors import Advice, NotVerified, Unconfirmed, Unsupported, WriteForbidden
+from multidrop.printable import did_you_mean
 
 START_TIME = 5.0  # s within which a started motor must be seen to run
 REVERSAL_TIME = 60.0  # s for the ramps of a reversal if the option `stop_time` is not given
@@ -40,13 +40,13 @@ A = TypeVar("A")
 class Drive(RegisterAccess):
     """One drive on a line; its class is the family, with the manual's tables in the manual's order.
 
-    `address` is 1 to 247, or a smaller range in some families; on a tcp:// port it is a unit id, 0 to 255 in
-    some families. Baud rate, format and framing default to the family's. On a tcp:// port the framing is TCP,
-    and baud rate and format are those of the wire behind the gateway. `silence`, in s, replaces the
-    standard's t3.5; use it only if all drives on the line tolerate it. A longer silence in the family's
-    document still applies. Options are facts that only the owner knows (see `options`). `ram` names registers
-    that the owner knows to be kept in RAM although the document does not say so. Raises ValueError for values
-    that the family's document does not allow.
+    `address` is 1 to 247, or less in some families. On a tcp:// port it is a unit id, in some families 0 to
+    255. Baud rate, format and framing default to the family's. On a tcp:// port the framing is TCP, and baud
+    rate and format are those of the wire behind the gateway. `silence`, in s, replaces the standard's t3.5;
+    use it only if all drives on the line tolerate it. A longer silence in the family's document still
+    applies. Options are facts that only the owner knows (see `options`). `ram` names registers that the owner
+    knows to be kept in RAM although the document does not say so. Raises ValueError for values that the
+    family's document does not allow.
     """
 
     title: ClassVar[str] = ""
@@ -63,21 +63,24 @@ class Drive(RegisterAccess):
     line_terminals: ClassVar[str] = ""  # the drive's two terminals for the line
     most_devices: ClassVar[int] = 0  # limit of devices on a line with such a drive; 0: not stated
 
-    silence: ClassVar[float] = 0.0  # s of silence before and after a frame; with RTU at least t3.5
-    silence_characters: ClassVar[float] = 0.0  # the same silence, in characters
-    response_delay: float = 0.005  # typical s from the request's end to the reply's start
-    response_delay_characters: ClassVar[float] = 0.0  # the same delay in characters; the longer delay applies
-    response_timeout: ClassVar[float] = 0.3  # s without a reply before an exchange fails
-    answering_time: ClassVar[float] = 0.0  # s that the document gives the drive for a reply; 0: not stated
+    silence: ClassVar[float] = 0.0  # s of silence before and after a frame; with RTU, at least t3.5 is kept
+    # `silence` in characters; the longer of the two applies
+    silence_characters: ClassVar[float] = 0.0
+    response_delay: float = 0.005  # s from the request's end to the reply's start, typically
+    # `response_delay` in characters; the longer of the two applies
+    response_delay_characters: ClassVar[float] = 0.0
+    response_timeout: ClassVar[float] = 0.3  # s without a reply after which an exchange fails
+    answering_time: ClassVar[float] = 0.0  # s within which the drive replies, by its document; 0: not stated
     turnaround_delay: ClassVar[float] = 0.1  # s without requests after a broadcast
     least_interval: ClassVar[float] = 0.0  # s, from the end of an exchange to the next request to the drive
     # True if the drive answers every read in its tables with a value or an exception. A late reply could then
-    # pass for another register's reply, so a register with a known value is read before the first value.
+    # be taken for another register's. So a register of known value is read before the first reply counts.
     answers_every_read: ClassVar[bool] = False
 
     # ---- registers, exceptions and commands ----
 
-    most_registers: ClassVar[Mapping[Table, int]] = {}  # limit in one read; by default the standard's
+    # limit of registers in one read; default: the standard's limit
+    most_registers: ClassVar[Mapping[Table, int]] = {}
     readable_gaps: ClassVar[Mapping[Table, range]] = {}  # reserved addresses that one read may include
     read_together: ClassVar[tuple[tuple[str, ...], ...]] = ()  # registers that share a request, in this order
     exceptions: ClassVar[Mapping[int, str]] = {
@@ -88,14 +91,14 @@ class Drive(RegisterAccess):
         5: "acknowledged, still working",
         6: "busy",
     }
-    damaged: ClassVar[frozenset[int]] = frozenset()  # exception codes for a request that arrived damaged
+    damaged: ClassVar[frozenset[int]] = frozenset()  # exception codes for a damaged request
     later: ClassVar[frozenset[int]] = frozenset({5, 6})  # exception codes of a drive that is busy for now
     broadcasts: ClassVar[bool] = False  # whether the document defines broadcasts
     identify_recognises: ClassVar[bool] = False  # True if a drive of another make never passes `identify`
     identity_proofs: ClassVar[tuple[Any, ...]] = ()  # from a family file: registers with known values
     options: ClassVar[Mapping[str, Option]] = {}
-    setpoint_name: ClassVar[str] = "frequency"  # the register that set_frequency writes
-    remote: ClassVar[str] = "the drive must take its commands from the line"  # what to set on its keypad
+    setpoint_name: ClassVar[str] = "frequency"  # name of the register that set_frequency writes
+    remote: ClassVar[str] = "the drive must take its commands from the line"  # what must be set on the keypad
     line_parameters: ClassVar[str] = ""  # names of the parameters for address, baud rate and format
     parameter_space: ClassVar[ParameterSpace | None] = None  # None: no known rule for addresses
     no_broadcasts: ClassVar[str] = "none documented"  # why there are no broadcasts
@@ -150,7 +153,7 @@ class Drive(RegisterAccess):
 
     @classmethod
     def _kind(cls) -> str:
-        """Return the family's title, or its class name."""
+        """Return the family's title; without one, its class name."""
         return cls.title or cls.__name__
 
     @classmethod
@@ -166,8 +169,7 @@ class Drive(RegisterAccess):
                 raise ValueError(
                     f"{name!r} of {cls._kind()} is a text: texts are read, but neither polled nor written"
                 ) from None
-            near = difflib.get_close_matches(name, cls.registers, n=3)
-            hint = f"did you mean {' or '.join(near)}?" if near else f"see `multidrop models {cls.model}`"
+            hint = did_you_mean(name, cls.registers, f"see `multidrop models {cls.model}`", 3)
             raise ValueError(f"{cls._kind()} has no register {name!r}; {hint}") from None
 
     @classmethod
@@ -181,7 +183,7 @@ class Drive(RegisterAccess):
 
     @classmethod
     def speaks(cls, framing: Framing) -> bool:
-        """Return True for the document's framings, and for TCP if any of them is a Modbus framing."""
+        """Return True for a framing of the document, and for TCP if the document has any Modbus framing."""
         return framing in cls.framings or (
             framing is Framing.TCP and any(one in MODBUS for one in cls.framings)
         )
@@ -231,7 +233,8 @@ class Drive(RegisterAccess):
         self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
         self.link: Link = NO_LINK
         self.stops_called: Sequence[int] = (0,)  # the first item is the number of stops called so far
-        # A function of a verb's name and the stops so far; it returns a call that a later stop cancels.
+        # A function that takes a verb's name and the number of stops so far, and returns a call that a later
+        # stop cancels.
         self.begin_call: Callable[[str, int], Any] = lambda verb, seen: None
         self.carry_out_move: Callable[[Script[Any], Any], Any] = self._move_nowhere
         self.begin_stop: Callable[[str, Callable[[], Script[Any]], float | None], CalledStop] = (
@@ -240,14 +243,14 @@ class Drive(RegisterAccess):
 
     @classmethod
     def _one_of(cls, what: str, value: Any, allowed: Any) -> Any:
-        if value in allowed and not isinstance(value, bool | float):  # True equals 1, and so does 1.0
+        if value in allowed and not isinstance(value, bool | float):  # in Python, True and 1.0 equal 1
             return value
         choices = (
             f"{allowed[0]} to {allowed[-1]}"
             if isinstance(allowed, range)
             else ", ".join(str(choice) for choice in allowed)
         )
-        raise ValueError(f"{what} {value!r} is not one of {cls._kind()}: {choices}")
+        raise ValueError(f"{what} {value!r} is not supported by {cls._kind()}; choose {choices}")
 
     @classmethod
     def _framing(cls, framing: Framing | str | None) -> Framing:
@@ -259,7 +262,9 @@ class Drive(RegisterAccess):
             return Framing(framing)
         known = ", ".join(str(one) for one in cls.framings)
         hint = f"; write {known}, or leave it out" if len(cls.framings) == 1 else ""
-        raise ValueError(f"framing {str(framing)!r} is not one of {cls._kind()}: {known}{hint}")
+        raise ValueError(
+            f"framing {str(framing)!r} is not supported by {cls._kind()}, which has {known}{hint}"
+        )
 
     @classmethod
     def _in_ram(cls, name: str) -> str:
@@ -267,7 +272,7 @@ class Drive(RegisterAccess):
             raise TypeError(f"ram takes names of registers, not {name!r}")
         register = cls.register(name)
         if register.kept is Kept.EEPROM:
-            raise ValueError(f"{name} of {cls._kind()} is in EEPROM, as its document says")
+            raise ValueError(f"{name} of {cls._kind()} is kept in EEPROM, according to its document")
         return register.name
 
     def take_framing_of(self, port: str) -> None:
@@ -286,7 +291,7 @@ class Drive(RegisterAccess):
 
     def needed_silence(self) -> float:
         """Return the silence in s that this drive needs before a request and after its reply."""
-        if self.framing is Framing.TCP:  # the gateway keeps the silence
+        if self.framing is Framing.TCP:  # on Modbus TCP, the gateway keeps the silence
             return 0.0
         if self.framing is not Framing.RTU:
             return self._own_silence()
@@ -298,9 +303,9 @@ class Drive(RegisterAccess):
 
     def __setattr__(self, name: str, value: object) -> None:
         if name in self.registers:
-            raise AttributeError(f"{name} is a register, which drive.write({name!r}, VALUE) writes")
+            raise AttributeError(f"{name} is a register; write it with drive.write({name!r}, VALUE)")
         if name in self.texts:
-            raise AttributeError(f"{name} is a text, which drive.read({name!r}) reads")
+            raise AttributeError(f"{name} is a text; read it with drive.read({name!r})")
         super().__setattr__(name, value)
 
     def __repr__(self) -> str:
@@ -310,14 +315,14 @@ class Drive(RegisterAccess):
 
     @property
     def ledger_name(self) -> str:
-        """Name under which EEPROM writes are counted; for a family file it includes the file's title."""
+        """Name under which EEPROM writes are counted; the name of a family from a file includes its title."""
         if self.declared_in:
             return f"{self.model}: {self.title}"
         return self.model or type(self).__name__
 
     @property
     def identity_is_weak(self) -> bool:
-        """True if `identify` may pass on another make, so that `families.makes` is checked too."""
+        """True if `identify` may accept a drive of another make, so that `families.makes` is checked too."""
         return False
 
     @property
@@ -329,10 +334,10 @@ class Drive(RegisterAccess):
         return None
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
-        """Return registers whose raw counts lie in a known range, each with its least and greatest raw count.
+        """Return registers of known ranges, each with its least and greatest raw count.
 
-        The ranges must not overlap: if a family reads one register at a time, only the value in a reply shows
-        which register it belongs to.
+        The ranges must not overlap. If a family reads one register at a time, only the value in a reply shows
+        which register the reply belongs to.
         """
         return {}
 
@@ -345,10 +350,10 @@ class Drive(RegisterAccess):
         return code in self.exceptions and code in self.damaged | self.later
 
     def check_confirmed(self, what: str) -> None:
-        """Raise WriteForbidden if the owner must confirm the drive's class and has not.
+        """Raise WriteForbidden if the owner must confirm the drive's class and has not confirmed it.
 
-        Two kinds of families need confirmation: those without `identify`, because the same write may start
-        the motor of another make; and those from a file, which are untested.
+        Two kinds of families need confirmation: a family without `identify`, because the same write may start
+        a motor of another make, and a family from a file, because it is untested.
         """
         if "confirmed" not in self.options or self.option.get("confirmed"):
             return
@@ -421,9 +426,9 @@ class Drive(RegisterAccess):
     def _started(self, direction: Direction | None = None) -> Script[None]:
         """Wait until the drive shows that the motor runs, and in `direction` if that is given.
 
-        The direction is ignored if the drive does not show one. A motor that turned in reverse gets more time
-        for its ramps. Raises NotVerified if the drive trips, and Unconfirmed if the motor is not seen to run
-        in time.
+        The direction is ignored if the drive does not show one. A motor that turned in the other direction
+        gets more time for its ramps. Raises NotVerified if the drive trips, and Unconfirmed if the motor is
+        not seen to run in time.
         """
         if not (yield from until(self._runs, limit=START_TIME)):
             seen = f"after {START_TIME:g} s it is not seen to run; stop it, or it may start later"
@@ -457,14 +462,14 @@ class Drive(RegisterAccess):
 
     @verb
     def identify(self) -> Script[None]:
-        """Check by reading that this is a drive of the family. Raises WriteForbidden if it is of another one.
+        """Check by reading that this is a drive of the family. Raises WriteForbidden if not.
 
-        Passing the check is not proof, because few families identify themselves.
+        A drive that passes may still be of another family, because few drives identify themselves.
         """
         yield from ()
 
     def resembles(self) -> Script[bool]:
-        """Return True if a drive that failed `identify` still resembles the family enough for a guess."""
+        """Return True if a scan should report a drive that failed `identify` as possibly of this family."""
         yield from ()
         return False
 
@@ -540,9 +545,9 @@ def check_drive(drive: Drive) -> None:
 
 
 def check_own(drive: Drive, register: Register[Any]) -> None:
-    """Raise ValueError for another family's register, because addresses mean something else there.
+    """Raise ValueError for another family's register, whose address means something else in this family.
 
-    Raises TypeError if `register` is not a register, such as a name.
+    Raises TypeError if `register` is not a Register, but for example a name.
     """
     check_drive(drive)
     if not isinstance(register, Register):

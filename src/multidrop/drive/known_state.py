@@ -13,20 +13,20 @@ from multidrop.drive.state import Condition, State
 from multidrop.errors import BusError
 
 MOST_STEPS = 20
-FAULT = "fault"  # the register of a fault's code, in every family that has one
-FAULT_RECORDS = ("last_fault", "fault_record_1")  # registers of the newest fault, which may be over
+FAULT = "fault"  # name of the register with the fault's code, in every family that has one
+FAULT_RECORDS = ("last_fault", "fault_record_1")  # names of registers with the newest fault, active or not
 
 
 class StateReader:
     """Computes a drive's state by its family's rules, from values such as those of polled rows.
 
-    No request is sent. Attributes that the family's script sets on the drive are kept in this reader's copy.
+    No request is sent. Attributes that the family's script sets are kept in this reader's copy of the drive.
     """
 
     def __init__(self, drive: Drive) -> None:
         self._drive = copy(drive)
         self._shown: tuple[dict[str, float | None], State | None] | None = (
-            None  # the values used by the last call, and the state that it returned
+            None  # the values that the last call used, and the state that it returned
         )
         self.has_state = type(drive).state is not Drive.state
         """True if the family's document defines a state."""
@@ -50,7 +50,7 @@ class StateReader:
         return found
 
     def _look(self, values: Mapping[str, float], read: dict[str, float | None]) -> State | None:
-        """Return the state, or None if a value is missing; store the values used in `read`."""
+        """Return the state, or None if a value is missing. Store the used values in `read`."""
         try:
             script = self._drive.state.script()
             step = next(script)
@@ -63,7 +63,7 @@ class StateReader:
                     if register.name != FAULT:
                         self.lacks = register.name
                         return None
-                    value = 0.0  # no fault code: families read it only if the status shows a fault
+                    value = 0.0  # used instead of the fault's code, which families read only in a fault
                 step = script.send(value if register.values is None else register.decode(value))
         except StopIteration as end:
             return _known(end.value, read)
@@ -73,7 +73,7 @@ class StateReader:
 
 
 def _known(state: object, read: Mapping[str, float | None]) -> State | None:
-    """Return the state. If the fault's code was missing, return a fault without a name, or None."""
+    """Return the state. Without the fault's code, return None unless the state is a fault."""
     if not isinstance(state, State) or read.get(FAULT, 0) is not None:
         return state if isinstance(state, State) else None
     return State(Condition.FAULT) if state.condition is Condition.FAULT else None
@@ -82,7 +82,7 @@ def _known(state: object, read: Mapping[str, float | None]) -> State | None:
 def can_show_fault(drive: Drive, polled: Collection[str]) -> bool:
     """Return True if a fault of the drive can be detected from the registers with these names.
 
-    A register with a record of the newest fault is enough, because a new fault changes its value.
+    A register with a record of the newest fault is enough: a new fault changes the register's value.
     """
     if {FAULT, *FAULT_RECORDS} & {*polled}:
         return True
@@ -100,6 +100,6 @@ def can_show_fault(drive: Drive, polled: Collection[str]) -> bool:
 
 
 def _choices(register: Register[Any]) -> list[float]:
-    """Return the values of a register on which a state may depend."""
+    """Return the values to try for a register: 0, 1 and all of its named values."""
     members: list[Any] = [] if register.values is None else list(cast(Any, register.values))
     return [0.0, 1.0, *(float(member.value) for member in members)]

@@ -10,7 +10,7 @@ from urllib.parse import SplitResult, urlsplit
 
 from multidrop.core import Framing
 from multidrop.errors import NoSuchPort
-from multidrop.printable import masked
+from multidrop.printable import is_number, masked
 
 BAUDRATES = (50, 4_000_000)  # lowest and highest
 FORMAT = "[78][NEO][12]"
@@ -51,7 +51,10 @@ class Settings:
 
     @cached_property
     def t3_5(self) -> float:
-        """Silence between RTU frames, s: 3.5 characters, fixed above 19200 (serial-line guide 2.5.1.1)."""
+        """Silence between RTU frames in s: 3.5 characters, or above 19200 baud a fixed time.
+
+        See the serial-line guide V1.02, 2.5.1.1.
+        """
         return 1.75e-3 if self.baudrate > 19200 else 3.5 * self.character
 
     @property
@@ -104,13 +107,12 @@ def url_of(port: str) -> SplitResult:
     return url
 
 
-MOST_SETTLE = 10.0  # s; limited, because a process that ends may have to wait this long
+MOST_SETTLE = 10.0  # s; limit of `settle`, because an exiting process may have to wait this long
 
 
 def check_settle(settle: float) -> None:
     """Raise ValueError unless a line may wait this many seconds after its port is opened."""
-    is_number = isinstance(settle, int | float) and not isinstance(settle, bool)
-    if not (is_number and 0 <= settle <= MOST_SETTLE):
+    if not (is_number(settle) and 0 <= settle <= MOST_SETTLE):
         raise ValueError(f"settle = {settle!r} is not a number of seconds from 0 to {MOST_SETTLE:g}")
 
 
@@ -131,13 +133,13 @@ def framing_on(
     if speaks_tcp(port):
         if declared not in (None, Framing.TCP):
             raise ValueError(
-                f"framing {wanted} is a serial line's, and {port} speaks Modbus TCP: leave "
-                "framing out, or name the port socket:// if the far end passes serial bytes on"
+                f"framing {wanted} is for serial lines, but {port} speaks Modbus TCP: remove framing, or "
+                f"write socket:// if the far end forwards serial bytes"
             )
         if not speaks_modbus:
             raise ValueError(
-                f"{family} does not speak Modbus, and {port} carries "
-                "nothing else: name the port socket://, and have the far end pass serial bytes on"
+                f"{family} does not speak Modbus, and a tcp:// port such as {port} carries nothing else: "
+                f"write socket://, and set the far end to forward serial bytes"
             )
         return Framing.TCP
     if wanted is Framing.TCP:
@@ -153,15 +155,14 @@ def framing_on(
 def check_agreed_silence(agreed: float, settings: Settings, own: float | None) -> None:
     """Raise ValueError unless `agreed` is a valid silence in s.
 
-    `own` is the silence in s that an RTU drive's document requires, else None. Also raises ValueError if both
-    silences are shorter than 1.5 characters, because such a silence may occur within a frame.
+    `own` is the silence in s that an RTU drive's document requires; None for other framings. Also raises
+    ValueError if both silences are shorter than 1.5 characters, because a frame may contain such pauses.
     """
-    is_number = isinstance(agreed, (int, float)) and not isinstance(agreed, bool)
-    if not (is_number and 0 <= agreed <= LONGEST_SILENCE):
+    if not (is_number(agreed) and 0 <= agreed <= LONGEST_SILENCE):
         raise ValueError(f"silence {agreed!r} is not a time from 0 to {LONGEST_SILENCE:g} s")
     least = 1.5 * settings.character
     if own is not None and max(agreed, own) < least:
         raise ValueError(
-            f"silence {agreed * 1e6:g} us is shorter than 1.5 characters at {settings}, which may "
-            f"pass within a frame: it must be {math.ceil(least * 1e6)} us or more"
+            f"silence {agreed * 1e6:g} us is shorter than 1.5 characters at {settings}, and a frame may "
+            f"contain pauses as long: it must be {math.ceil(least * 1e6)} us or more"
         )

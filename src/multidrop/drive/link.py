@@ -1,4 +1,4 @@
-"""RegisterAccess: the read and write methods of a drive. Link: the methods of a bus that they call."""
+"""RegisterAccess: a drive's methods that read and write. Link: the bus's methods that these call."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Link(Protocol):
 
     @property
     def values(self) -> Any:
-        """A function of a drive and a sequence of registers or names that returns their values by name.
+        """A function that takes a drive and registers or their names, and returns the values by name.
 
         The function raises TextWanted if one of the registers is a text.
         """
@@ -128,8 +128,8 @@ class RegisterAccess:
         The write is sent once, or skipped if the register may be in EEPROM and already holds the value.
         The identity of the drive is checked before the first write to it.
 
-        Raises WriteForbidden (also a ValueError) for a write that the library does not send, TypeError for an
-        invalid value, and Expired if the write cannot be sent within the bus's `expiry`. Raises
+        Raises WriteForbidden (also a ValueError) for a write that the library does not send, and TypeError
+        for an invalid value. Raises Expired if the write cannot be sent within the bus's `expiry`. Raises
         DriveException if the drive refuses the write, and Unconfirmed if there is no reply, so that the write
         may have happened.
         """
@@ -146,12 +146,14 @@ class RegisterAccess:
         `function` is 1 (coils), 2 (discrete inputs), 3 (holding registers) or 4 (input registers). `start` is
         the address on the wire, from 0. `count` is the number of words or bits: at most 125 words or 2000
         bits, or the family's limit for one request. Words are returned as two bytes, most significant first;
-        bits fill whole bytes from the least significant bit of the first byte.
+        bits fill whole bytes from the least significant bit of the first byte. The functions 7 (exception
+        status), 17 (server id) and 43 (device identification) read no addresses: `count` is 0, and so is
+        `start`, except with 43: there it is the device id code times 256 plus the id of the first object.
 
         The request is sent once, before queued polling. A late reply to another request is never returned. If
         there is no reply, the call waits for the timeout, and this counts as a failure of the drive. Raises
-        Expired if the request cannot be sent within `expiry` seconds, NoReply, BadReply, DriveException or
-        LineError if it fails, and ValueError or TypeError if it is invalid.
+        Expired if the request cannot be sent within `expiry` seconds. Raises NoReply, BadReply,
+        DriveException or LineError if it fails, and ValueError or TypeError if an argument is invalid.
         """
         return self.link.read_raw(self, function, start, count, expiry)
 
@@ -160,7 +162,7 @@ class RegisterAccess:
 
         This deliberately bypasses the rules: no identity check, no limits, no EEPROM budget. It may start a
         motor. Raises Unconfirmed if there is no reply, DriveException if the drive refuses, and
-        CancelledByStop or Expired if the request was not sent. Raises ValueError for functions 1 to 4, which
-        `read_raw` sends.
+        CancelledByStop or Expired if the request was not sent. Raises ValueError for functions that
+        `read_raw` sends, such as 1 to 4.
         """
         return self.link.send_raw(self, function, start, data, count)

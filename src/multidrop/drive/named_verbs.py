@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from math import isfinite
+from sys import float_info
 from typing import Any
 
 from multidrop.drive.family import Drive
 from multidrop.drive.state import Direction
+from multidrop.printable import is_number
 
 
 def _direction(value: object) -> Direction:
@@ -18,16 +19,9 @@ def _direction(value: object) -> Direction:
 
 
 def _hertz(value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not _is_finite(value):
+    if not is_number(value) or not abs(value) <= float_info.max:
         raise ValueError(f"hz = {value!r} is not a number")
     return float(value)
-
-
-def _is_finite(value: float) -> bool:
-    try:
-        return isfinite(value)
-    except OverflowError:  # an int too large for a float
-        return False
 
 
 _OPTIONS: Mapping[str, Mapping[str, Callable[[object], Any]]] = {
@@ -35,19 +29,20 @@ _OPTIONS: Mapping[str, Mapping[str, Callable[[object], Any]]] = {
     "jog": {"direction": _direction},
     "reset_fault": {},
     "set_frequency": {"hz": _hertz},
-    "coast": {},  # a hoist drops its load
+    "coast": {},  # not part of "stop", because coasting lets a hoist drop its load
     "emergency_stop": {},
     "stop": {},
 }
+LISTED_VERBS = tuple(name for name in _OPTIONS if name != "stop")  # verbs that a plant's list `may` can allow
 
 
 def verbs_of(drive: Drive) -> list[str]:
-    """Return the names of the drive's verbs that command it."""
+    """Return the names of the verbs that command this drive."""
     return [name for name in _OPTIONS if getattr(type(drive), name) is not getattr(Drive, name)]
 
 
 def verb_arguments(verb: str, options: Mapping[str, object]) -> dict[str, Any]:
-    """Return a verb's arguments for these options.
+    """Convert options with JSON values into the keyword arguments of a verb.
 
     `{"direction": "reverse"}` becomes Direction.REVERSE; `hz` is in Hz. An option that is None is omitted.
     Raises ValueError for an unknown, missing or invalid option, KeyError for an unknown verb.

@@ -41,7 +41,7 @@ ORDERS = {
     "BADC": LOW_BYTE_FIRST,
     "DCBA": LOW_WORD_FIRST | LOW_BYTE_FIRST,
 }
-MOST_DIGITS = 9  # enough to distinguish any two float32 values
+MOST_DIGITS = 9  # decimal digits that are enough to distinguish any two float32 values
 SIGNED = frozenset({NumberFormat.I8, NumberFormat.I16, NumberFormat.I32, NumberFormat.I64})
 DECIMAL = frozenset({NumberFormat.BCD16, NumberFormat.BCD32})
 _LARGEST = {
@@ -82,7 +82,10 @@ def arranged(data: bytes, order: str) -> bytes:
 
 
 def bits_in(data: bytes, at: int, number_format: NumberFormat, order: str) -> int | None:
-    """Return the bits of the number at word (BIT: bit) `at` of a reply's data; None if data is missing."""
+    """Return the bits of the number that starts at word `at` of a reply's data; None if data is missing.
+
+    In the format BIT, `at` counts bits instead of words.
+    """
     if number_format is NumberFormat.BIT:
         return data[at // 8] >> at % 8 & 1 if at // 8 < len(data) else None
     size = 2 * WORDS[number_format]
@@ -112,7 +115,7 @@ def signed(bits: int, count: int) -> int:
 
 
 def bits_of(number: float, number_format: NumberFormat) -> int:
-    """Return the bits of this number; high bits (decimal: digits) that do not fit are cut off."""
+    """Return the bits that encode this number, without the high bits or BCD digits that do not fit."""
     if number_format in FLOATS:
         number = nearest_or_infinite(number, number_format)
         return int.from_bytes(struct.pack(FLOATS[number_format], number))
@@ -126,7 +129,7 @@ def bits_of(number: float, number_format: NumberFormat) -> int:
 
 
 def nearest(value: float | Fraction, number_format: NumberFormat) -> float:
-    """Return the nearest float of this format. Raises OverflowError beyond the largest."""
+    """Return the nearest float of this format. Raises OverflowError if `value` is beyond the largest one."""
     code = FLOATS[number_format]
     (found,) = struct.unpack(code, struct.pack(code, value))
     return float(found)
@@ -141,9 +144,9 @@ def nearest_or_infinite(value: float, number_format: NumberFormat) -> float:
 
 
 def shortest(value: float, scale: Fraction, number_format: NumberFormat) -> str:
-    """Return the shortest decimal text of `value` for which the drive would hold the same F16 or F32.
+    """Return the shortest decimal text that a drive would store as the same F16 or F32 as `value`.
 
-    The drive holds `value / scale`.
+    The stored number is the value divided by `scale`.
     """
     if not math.isfinite(value):
         return str(value)
@@ -175,8 +178,13 @@ class Coding:
 
     @cached_property
     def core_format(self) -> int:
-        """The number format and byte order as the core takes them."""
+        """The number format and byte order as one number, as the C core expects it."""
         return self.number_format + (0 if self.number_format is NumberFormat.BIT else ORDERS[self.order])
+
+    @property
+    def wire_order(self) -> str:
+        """The order of the number's bytes on the wire, A the most significant, such as "BA" or "CDAB"."""
+        return arranged(b"ABCDEFGH"[: 2 * WORDS[self.number_format]], self.order).decode()
 
     @cached_property
     def factors(self) -> tuple[int, int, int]:
@@ -200,7 +208,7 @@ class Coding:
 
     @cached_property
     def mask(self) -> int:
-        """A mask of the number's bits that belong to the part; all bits if there is no part."""
+        """A mask of the number's bits that belong to the part (bit range); all bits if there is no part."""
         return ((1 << self._part_width) - 1) << (self.part[0] if self.part else 0)
 
     @cached_property
@@ -208,7 +216,7 @@ class Coding:
         """Mask and bit pattern of each invalid raw count, without NaN, which is always invalid.
 
         A raw count that fits into the part is compared with the part, a larger raw count with the whole
-        number. A raw count outside the format's span gives the bits themselves, such as 8000H of an I16.
+        number. A raw count outside the format's span is itself the bit pattern, such as 8000H of an I16.
         """
         return tuple(self._pattern(count) for count in self.invalid if count == count)
 
@@ -226,7 +234,10 @@ class Coding:
     # ---- reading ----
 
     def raw_in(self, data: bytes, at: int) -> float | None:
-        """Return the raw count at word (BIT: bit) `at` of a reply's data; None if invalid or missing."""
+        """Return the raw count that starts at word `at` of a reply's data (at bit `at` for BIT).
+
+        Return None if the count is invalid or missing.
+        """
         bits = bits_in(data, at, self.number_format, self.order)
         return None if bits is None else self.raw_of(bits)
 
@@ -264,8 +275,8 @@ class Coding:
     def exact_count(self, value: float) -> Fraction:
         """Return the raw count of a value, unrounded.
 
-        A float is read as its shortest decimal: 0.3 is three tenths. But if the raw count is a whole number
-        without this, it is used, because the shortest decimal may be inexact for 64-bit numbers.
+        A float is read as its shortest decimal: 0.3 is three tenths. But if the float's exact value gives a
+        whole raw count, that count is returned: the shortest decimal may be inexact for 64-bit numbers.
         """
         count = (Fraction(value) - self.offset) / self.step
         return count if count.denominator == 1 else (Fraction(str(value)) - self.offset) / self.step

@@ -1,9 +1,11 @@
-"""Options: facts about one drive that only its owner knows, such as that its make is `confirmed`."""
+"""Options: facts about one drive that only its owner knows. `confirmed` confirms the drive's make."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+
+from multidrop.printable import is_number
 
 
 @dataclass(frozen=True)
@@ -25,13 +27,13 @@ _CHECKED = Option("", (0, 1), "1: its name plate says what it is, and `multidrop
 def checked_options(
     family: str, options: Mapping[str, Option], given: Mapping[str, float]
 ) -> Mapping[str, float]:
-    """Return `given`. Raises ValueError for an unknown option, or for a value outside its span."""
+    """Return the options `given`. Raises ValueError for an unknown option or a value outside its span."""
     for name, value in given.items():
         if name not in options:
             known = ", ".join(options) or "none"
             raise ValueError(f"{family} has no option {name!r}; its options: {known}")
         low, high = options[name].span
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+        if not is_number(value) or not low <= value <= high:
             raise ValueError(
                 f"{name} = {value!r} is outside {low:g} to {high:g} {options[name].unit}".rstrip()
             )
@@ -41,7 +43,7 @@ def checked_options(
 
 
 def confirmation(declared_in: str, *, identifies: bool) -> Mapping[str, Option]:
-    """Return the option `confirmed` by its name if the class is untested or cannot identify its drives."""
+    """Return {"confirmed": option} if the class is untested or cannot identify its drives, else {}."""
     if declared_in:
         return {"confirmed": _CHECKED}
     return {} if identifies else {"confirmed": _CONFIRMED}

@@ -23,7 +23,7 @@ PASSWORD = "it is a password"
 
 @dataclass(frozen=True)
 class ParameterGroup:
-    """Parameters with consecutive addresses: `prefix` and an index of at least `digits` digits.
+    """Parameters with consecutive addresses. A code is `prefix` and an index of at least `digits` digits.
 
     With `as_hex`, the index's decimal digits are sent as hex digits: F170 is at `start` + 0170H.
     """
@@ -78,7 +78,7 @@ class ParameterSpace:
         return _matches(code, self.monitors)
 
     def reason(self, code: str) -> str:
-        """Return why this code is never written; "" if no field forbids it."""
+        """Return why this code is never written; "" if no field of the parameter space forbids the write."""
         if _matches(code, self.line):
             return LINE_PARAMETER
         if _matches(code, self.passwords):
@@ -94,13 +94,13 @@ def _matches(code: str, patterns: tuple[str, ...]) -> bool:
 class Parameter(Register[Any]):
     """A parameter as a register of its family: declared, or known only by the family's address rule.
 
-    A parameter is always written to the memory that keeps it, even if the setting has a RAM address.
+    A parameter is always written to its permanent memory, even if the setting has a RAM address.
     """
 
     code: str = ""
     family: Any = None
     is_declared: bool = False
-    is_line: bool = False  # the drive's address, baud rate, format or protocol
+    is_line: bool = False  # True for the drive's address, baud rate, format or protocol
 
     def changed(self, **facts: Any) -> Parameter:
         """Return a copy of the parameter with these facts changed."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
 from enum import Enum, Flag, IntEnum, IntFlag
@@ -27,6 +27,7 @@ from multidrop.drive.number_format import (
     bits_of,
     shortest,
 )
+from multidrop.drive.titles import catalogue
 from multidrop.printable import plain_number, plain_whole
 
 
@@ -63,23 +64,23 @@ class Table:
 
     @property
     def read_space(self) -> tuple[Carrier, int | None]:
-        """Key of the tables with the same function code for reads; their registers may share a request."""
+        """Key that is equal for tables with the same read function; their registers may share a request."""
         return self.carrier, self.read
 
 
 HOLDING = Table("holding register", 0x03, 0x06)
-HOLDING_MULTIPLE = Table("holding register", 0x03, 0x10)  # 10H is used even for a single register
+# writes use function 10H, even for a single register
+HOLDING_MULTIPLE = Table("holding register", 0x03, 0x10)
 INPUT = Table("input register", 0x04, None)
 COIL = Table("coil", 0x01, 0x05, Carrier.BIT)
 DISCRETE = Table("discrete input", 0x02, None, Carrier.BIT)
 
-
 T = TypeVar("T", bound=float)
-ACRONYMS = frozenset({"DC", "EEPROM", "PID", "PWM"})  # words in the names of values that stay in capitals
+ACRONYMS = frozenset({"DC", "EEPROM", "PID", "PWM"})  # words that keep their capitals in the names of values
 
 
 class Worded(IntEnum):
-    """Named numbers. If the name is only a code of the manual, such as E07, `words` explains it."""
+    """Named numbers. If a name is only a code of the manual, such as E07, `words` explains the code."""
 
     words: str
 
@@ -128,11 +129,13 @@ class Register(Generic[T]):
     place: str = ""
     outside: str = ""
     note: str = ""
+    titles: Mapping[str, str] = field(default_factory=dict)
     name: str = field(default="", init=False)
-    scaled_by: Register[float] | None = field(default=None, init=False)  # register of its power of ten
+    # the register that holds the power of ten
+    scaled_by: Register[float] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        carrier = getattr(self.table, "carrier", Carrier.WORD)  # the class reports a wrong table
+        carrier = getattr(self.table, "carrier", Carrier.WORD)  # a wrong type of table is reported later
         if self.number_format == NumberFormat.U16 and carrier is not Carrier.WORD:
             object.__setattr__(
                 self, "number_format", NumberFormat.BIT if carrier is Carrier.BIT else NumberFormat.U32
@@ -145,11 +148,23 @@ class Register(Generic[T]):
             object.__setattr__(self, "kept", table_kept)
 
     def __set_name__(self, owner: type, name: str) -> None:
-        if not self.name:  # a second attribute for the same register must not rename it
+        if not self.name:  # if two attributes share a register, the first one names it
             object.__setattr__(self, "name", name)
 
     def __str__(self) -> str:
         return self.name
+
+    @property
+    def title(self) -> str:
+        """The English title: the name with spaces."""
+        return self.name.replace("_", " ")
+
+    def title_in(self, language: str) -> str:
+        """Return the title in a language such as "ru".
+
+        This is the declared title, else the catalogue's, else the English one.
+        """
+        return self.titles.get(language) or catalogue(language).get(self.name) or self.title
 
     @cached_property
     def words(self) -> int:
@@ -158,7 +173,7 @@ class Register(Generic[T]):
 
     @cached_property
     def reach(self) -> range:
-        """Addresses that a request reads for the value, including those of the scale register."""
+        """Addresses that one request reads for the value; they include the scale register's."""
         own = range(self.address, self.address + self.words)
         if self.scaled_by is None:
             return own
@@ -209,7 +224,7 @@ class Register(Generic[T]):
 
     @property
     def value_unit(self) -> str:
-        """The unit of the values: `unit`, or "raw count" if the manual does not state the scale."""
+        """The unit of the values in Python: `unit`, or "raw count" if the manual does not state the scale."""
         return self.unit if self.values is not None or self.step is not None else "raw count"
 
     @property
@@ -271,14 +286,17 @@ class Register(Generic[T]):
         if not bottom <= raw <= top:
             least, most = sorted(float(end * self.scale + self.coding.offset) for end in (bottom, top))
             raise ValueError(
-                f"{self.name} = {_short(value)} does not fit: {least:g} to {most:g} {self.unit}".rstrip()
+                f"{self.name} = {_short(value)} does not fit: the register holds {least:g} to {most:g} "
+                f"{self.unit}".rstrip()
             )
         self._check_valid(raw, value)
         return raw
 
     def _check_valid(self, raw: float, value: float) -> None:
         if self.invalid and self.coding.raw_of(bits_of(raw, self.number_format)) is None:
-            raise ValueError(f"{self.name} = {_short(value)} is the count that means no value")
+            raise ValueError(
+                f"{self.name} = {_short(value)} is the raw count that stands for a missing value"
+            )
 
     def _raw(self, value: float) -> float:
         if abs(value) > sys.float_info.max:
@@ -294,7 +312,8 @@ class Register(Generic[T]):
         if self.span is None:
             return True
         low, high = self.span
-        if self.is_float:  # at a limit the drive holds the nearest float, which may be outside the span
+        # for a limit of the span, the drive holds the nearest float, which may lie outside the span
+        if self.is_float:
             low, high = (self.coding.value_of(self.coding.count_of(end)) for end in self.span)
         return low <= value <= high
 
@@ -372,7 +391,7 @@ class Register(Generic[T]):
 
 
 def unnamed_bits(value: Flag) -> list[str]:
-    """Return a word for each bit of flags that has no name, such as "bit 8"."""
+    """Return a text such as "bit 8" for each set bit that has no name."""
     rest = int(value.value)
     for member in value:
         rest &= ~int(member.value)
@@ -384,7 +403,7 @@ def _spaced(name: str) -> str:
 
 
 def _number_in(text: str) -> float:
-    """Return the number in a text, whole numbers exactly. Raises ValueError if it has none."""
+    """Return the number that a text spells, whole numbers exactly. Raises ValueError if it spells none."""
     try:
         return plain_whole(text)
     except ValueError:
@@ -404,22 +423,22 @@ class Details(TypedDict, total=False):
 
     step: float | None  #: value of one raw count; None if the document does not state it
     offset: float  #: value of the raw count 0: value = raw * step + offset
-    #: Raw counts that mean "no value". A count outside the format's span gives the bits: 0x8000 of an I16.
+    #: Raw counts that mean "no value". A count outside the format's span is a bit pattern: 0x8000 of an I16.
     invalid: float | tuple[float, ...]
     #: Lowest and highest bit of a reading that is only a part of the number in its words. `invalid` counts
     #: that do not fit into the part are compared with the whole number.
     part: tuple[int, int]
     order: str  #: order of the bytes on the wire, A the most significant: ABCD, CDAB, BADC, DCBA; AB, BA
-    scale_register: str  #: reading whose signed count is this one's power of ten; one request reads both
+    scale_register: str  #: reading whose signed count is this register's power of ten; one request reads both
     span: tuple[float, float]  #: smallest and largest value that may be written
-    at_least: str  #: register or option whose present value is the smallest that may be written
-    at_most: str  #: register or option whose present value is the largest that may be written
+    at_least: str  #: register or option whose present value is the lower limit of writes
+    at_most: str  #: register or option whose present value is the upper limit of writes
     number_format: NumberFormat  #: width, sign and kind of the number in the frame
     table: Table  #: address space and function codes
     kept: Kept  #: RAM or EEPROM; by default the table's
     ram_address: int  #: address at which the same quantity is written without wearing the EEPROM
     default: float  #: value from the factory
-    while_running: bool  #: whether it may be changed while the motor turns; None if not stated
+    while_running: bool  #: whether the register may be changed while the motor turns; None if not stated
     broadcast: tuple[int, ...]  #: raw counts that are documented and harmless as a broadcast
     #: True if a write may start, stop or reset something, so that only verbs write it. The default is True
     #: for commands, and for settings that have `harmless`.
@@ -430,8 +449,9 @@ class Details(TypedDict, total=False):
     never: str  #: reason why the library never writes the register
     never_together: tuple[int, ...]  #: masks of bits that are never set in one write
     place: str  #: section of the manual
-    outside: str  #: source, if it is not the family's own document
+    outside: str  #: the source of these facts, if it is not the family's own document
     note: str  #: further facts for users
+    titles: Mapping[str, str]  #: titles in other languages, by the language: `{"ru": "выходной ток"}`
 
 
 class Declaration(Protocol):
@@ -444,7 +464,7 @@ class Declaration(Protocol):
 
 
 def declaration(declare: Callable[..., Register[Any]]) -> Declaration:
-    """Decorator that types a function which takes an address, a unit or an enumeration, and details."""
+    """Decorator that gives a declaring function its type: address, unit or enumeration, and details."""
     return cast(Declaration, declare)
 
 
@@ -476,7 +496,10 @@ def _declare(access: Access, address: int, what: Any, given: Details) -> Registe
 
 
 def row_field(register: Register[Any], at: int, code: int) -> Field:
-    """Return the field of a register at word (coils: bit) `at` of a reply; `code` is its name's number."""
+    """Return the Field that decodes a register at word (coils: bit) `at` of a reply.
+
+    `code` is the number that stands for the register's name in rows.
+    """
     multiplier, _, divisor = register.coding.factors
     return Field(at, register.coding.core_format, code, multiplier, divisor, _extra(register, at))
 

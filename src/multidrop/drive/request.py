@@ -12,15 +12,21 @@ from typing import Any
 
 from multidrop.core import Framing, Message
 from multidrop.drive.register import Carrier, Register, Table
+from multidrop.printable import is_whole
 
-# Registers in one read (application protocol V1.1b3, 6.1 to 6.4); a frame of Delixi's protocol holds one.
+# Limit of the registers in one read (application protocol V1.1b3, 6.1 to 6.4). A frame of Delixi's protocol
+# holds one.
 STANDARD_LIMITS = {Carrier.BIT: 2000, Carrier.WORD: 125, Carrier.LONG: 1, Carrier.NUMBER: 1}
 FUNCTIONS = {1: Carrier.BIT, 2: Carrier.BIT, 3: Carrier.WORD, 4: Carrier.WORD}  # function codes that read
+# functions that read no addresses (application protocol V1.1b3, 6.7, 6.13, 6.21)
+STATUS, SERVER_ID, DEVICE_ID = 0x07, 0x11, 0x2B
+READS = frozenset({*FUNCTIONS, STATUS, SERVER_ID, DEVICE_ID})
+MEI_DEVICE_ID = 0x0E  # the first data byte of a DEVICE_ID request
 LONGEST_INTERVAL = 10.0  # s
 
 
 def stated_limit(family: Any, table: Table) -> int | None:
-    """Return the stated limit of registers in one read of this table; None if none is stated."""
+    """Return the family's limit of registers in one read of this table; None if the family states none."""
     stated = [most for other, most in family.most_registers.items() if other.read_space == table.read_space]
     return min(stated, default=None)
 
@@ -32,7 +38,7 @@ def read_limit(family: Any, table: Table) -> int:
 
 
 def function_limit(family: Any, function: int) -> int:
-    """Return how many addresses, declared or not, one read by this function code may have.
+    """Return how many addresses, declared or not, one read with this Modbus function code may span.
 
     This is the smallest limit that the family states, but at least the length of its longest register.
     """
@@ -69,8 +75,8 @@ def may_be_crossed(family: Any, table: Table, addresses: Iterable[int]) -> bool:
 
 # ---- requests ----
 
-_WRITE_COILS, _WRITE_WORDS = 0x0F, 0x10  # multiple coils, multiple registers
-_ADDRESSES = 0x10000  # in each of the four tables (application protocol V1.1b3, 4.3)
+_WRITE_COILS, _WRITE_WORDS = 0x0F, 0x10  # function codes: write multiple coils, write multiple registers
+_ADDRESSES = 0x10000  # number of addresses in each of the four tables (application protocol V1.1b3, 4.3)
 
 
 def read_request(drive: Any, table: Table, start: int, count: int) -> Message:
@@ -114,7 +120,7 @@ def write_request(drive: Any, register: Register[Any], raw: float, address: int 
 
 def check_no_read(drive: Any, request: Message) -> None:
     """Raise ValueError for a Modbus read, because a raw read could return another read's late reply."""
-    if drive.framing is not Framing.DELIXI and request.function in FUNCTIONS:
+    if drive.framing is not Framing.DELIXI and request.function in READS:
         asked = f"{request.function}, {request.start}, {request.count}"
         raise ValueError(
             f"function {request.function:02X}H is a read, which send_raw does not send: call "
@@ -123,23 +129,32 @@ def check_no_read(drive: Any, request: Message) -> None:
 
 
 def any_read(drive: Any, function: int, start: int, count: int) -> Message:
-    """Return the request that reads addresses, declared or not, by one of the Modbus functions 01 to 04.
+    """Return the request of a read by a Modbus function. The addresses need not be declared.
+
+    The functions 01 to 04 read addresses. The functions 07, 11H and 2BH do not, so `count` must be 0.
+    With 07 and 11H `start` must be 0 too. With 2BH it is the device id code times 256 plus the id of the
+    first object.
 
     Raises TypeError unless all three are whole numbers. Raises ValueError for another function, a drive that
     does not speak Modbus, and more addresses than one request to this family may read.
     """
     for name, number in (("function", function), ("start", start), ("count", count)):
-        if isinstance(number, bool) or not isinstance(number, int):
+        if not is_whole(number):
             raise TypeError(f"{name} = {number!r} is not a whole number")
     if drive.framing is Framing.DELIXI:
         raise ValueError(f"{drive.name} speaks Delixi's own protocol, which has no Modbus functions")
-    if function not in FUNCTIONS:
-        raise ValueError(f"function = {function} does not read; 1, 2, 3 and 4 do")
+    if function not in READS:
+        raise ValueError(f"function = {function} does not read; use 1, 2, 3, 4, 7, 17 or 43")
     if not 0 <= start < _ADDRESSES:
         raise ValueError(f"start = {start} is not an address from 0 to {_ADDRESSES - 1}")
+    if function not in FUNCTIONS:
+        if count or (start and function != DEVICE_ID):
+            raise ValueError(f"start = {start}, count = {count}: function {function} reads no addresses")
+        data = bytes([MEI_DEVICE_ID]) + start.to_bytes(2) if function == DEVICE_ID else b""
+        return Message(drive.address, function, data=data)
     most = function_limit(drive, function)
     if not 1 <= count <= most:
-        raise ValueError(f"count = {count} is not from 1 to {most}, which {drive.name} reads in one request")
+        raise ValueError(f"count = {count} is outside 1 to {most}, the limit of one request to {drive.name}")
     if start + count > _ADDRESSES:
         raise ValueError(f"start + count = {start + count}: the last address is {_ADDRESSES - 1}")
     return Message(drive.address, function, start, count)

@@ -1,9 +1,4 @@
-"""Scripts: generators that yield the steps of a verb. No I/O.
-
-
-
-A script yields steps (read, write, wait) and receives their results.
-"""
+"""Scripts: generators that yield the steps of a verb (read, write, wait) and receive the results. No I/O."""
 
 from __future__ import annotations
 
@@ -15,7 +10,7 @@ from multidrop.drive.register import Register
 from multidrop.drive.text import Text
 from multidrop.errors import BadReply, BusError, DriveException, NoReply, Unconfirmed
 
-MOST_UNANSWERED = 3  # consecutive checks without a valid reply until the error is raised
+MOST_UNANSWERED = 3  # number of checks in a row without a valid reply after which `until` raises the error
 
 T = TypeVar("T", bound=float)
 R = TypeVar("R")
@@ -61,7 +56,7 @@ def read(register: Register[Any] | Text) -> Script[Any]:
 
 
 def write(register: Register[T], value: T) -> Script[T]:
-    """Write once; return the value read back, or `value` if the register cannot be read."""
+    """Write a value once; return the value read back, or `value` if the register cannot be read."""
     return cast(T, (yield Write(register, value)))
 
 
@@ -72,7 +67,7 @@ def wait(seconds: float) -> Script[None]:
 def carry_out(script: Script[R], do: Callable[[Step], Any]) -> R:
     """Run a script, calling `do` for each step, and return the script's result.
 
-    If `do` raises BusError or ValueError, that is raised in the script.
+    A BusError or ValueError that `do` raises is raised in the script.
     """
     try:
         step = next(script)
@@ -88,7 +83,7 @@ def carry_out(script: Script[R], do: Callable[[Step], Any]) -> R:
 
 
 def insist(register: Register[T], value: T, attempts: int = 3) -> Script[None]:
-    """Write a harmless value, such as a stop; repeat it if the reply is lost or an exception."""
+    """Write a harmless value, such as a stop; repeat the write if the reply is lost or is an exception."""
     for attempt in range(1, attempts + 1):
         try:
             yield Insist(register, value)

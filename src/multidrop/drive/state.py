@@ -18,7 +18,7 @@ class Condition(Enum):
     ACCELERATING = "accelerating"
     DECELERATING = "decelerating"
     FAULT = "fault"
-    UNKNOWN = "unknown"  # the drive cannot say; never treat it as stopped
+    UNKNOWN = "unknown"  # the drive cannot report its state; never treat it as stopped
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ class KnownSetpoint:
     def begin_write(self) -> Callable[[], None]:
         """Forget the setpoint until the write ends; return a function that restores it.
 
-        Call the function if the write was not sent or was refused. It does nothing if another thread has
-        written a setpoint since.
+        The caller calls that function if the write was not sent or was refused. The function does nothing if
+        another thread has written a setpoint since.
         """
         write = self._held = _PendingWrite(self._held)
 

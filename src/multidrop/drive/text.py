@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from multidrop.drive.register import HOLDING, Table
+from multidrop.printable import is_whole
 
 _LAST_ADDRESS = 0xFFFF
 MOST_WORDS = 125  # limit of one request, in registers
-_ORDERS = ("AB", "BA", "B")  # B: one character a register, in its low byte
+_ORDERS = ("AB", "BA", "B")  # orders of characters; B: one character in each register, in its low byte
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +27,9 @@ class Text:
     name: str = field(default="", init=False)
 
     def __post_init__(self) -> None:
-        if not _is_whole(self.length) or not 1 <= self.length <= MOST_WORDS:
-            raise ValueError(f"a text of {self.length!r} registers: one request reads 1 to {MOST_WORDS}")
-        if not _is_whole(self.address) or not 0 <= self.address <= _LAST_ADDRESS + 1 - self.length:
+        if not is_whole(self.length) or not 1 <= self.length <= MOST_WORDS:
+            raise ValueError(f"a text of {self.length!r} registers: it must have 1 to {MOST_WORDS}")
+        if not is_whole(self.address) or not 0 <= self.address <= _LAST_ADDRESS + 1 - self.length:
             raise ValueError(f"a text at {self.address!r}: its registers are not within 0 to FFFFH")
         if self.order not in _ORDERS:
             raise ValueError(f"order = {self.order!r} of a text is not 'AB', 'BA' or 'B'")
@@ -76,7 +77,3 @@ def text(address: int, length: int, *, table: Table = HOLDING, order: str = "AB"
     character, in its low byte.
     """
     return Text(address, length, table, order, place)
-
-
-def _is_whole(number: object) -> bool:
-    return isinstance(number, int) and not isinstance(number, bool)

@@ -3,20 +3,61 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from enum import StrEnum
 from inspect import Signature, signature
 from numbers import Real
-from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar, cast, overload
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Concatenate,
+    Generic,
+    NamedTuple,
+    ParamSpec,
+    Protocol,
+    TypeVar,
+    cast,
+    overload,
+)
 
-from multidrop.drive.command_result import CommandOutcome, CommandResult
 from multidrop.drive.script import Script
 from multidrop.drive.state import Direction
+from multidrop.errors import BusError
 
 if TYPE_CHECKING:
     from multidrop.drive.family import Drive
 
+
+class CommandOutcome(StrEnum):
+    """The outcome of a command; UNKNOWN unless its effect is certain."""
+
+    DONE = "done"
+    FAILED = "failed"  # sent, but the drive refused it, or was seen not to do it
+    REFUSED = "refused"  # forbidden by the library's rules or the plant's lists; not sent
+    NOT_SENT = "not sent"  # it is certain that nothing was sent
+    UNKNOWN = "unknown"  # the command may have been carried out
+    UNDER_WAY = "under way"  # not over yet: ask again later
+
+
+class CommandResult(NamedTuple):
+    """The result of a command.
+
+    `text` is one sentence for a person. `error` is the library's error if a server's command failed; a verb
+    raises its error instead. `held` is the value that the drive holds after a write, as text with its unit.
+    """
+
+    outcome: CommandOutcome
+    text: str
+    error: BusError | ValueError | None = None
+    held: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """True if the command was carried out; for a stop, if the motor was seen at rest."""
+        return self.outcome is CommandOutcome.DONE
+
+
 R = TypeVar("R")
 P = ParamSpec("P")
-
 
 # Verbs that are sent only to an identified drive, and not after a stop was called.
 MOVING = ("start", "jog", "reset_fault", "set_frequency", "release_control")
@@ -29,13 +70,13 @@ VERBS = (
     *("release_control", "state"),
 )
 
-# Each verb's argument, its types, and a description. Unchecked, the string "reverse" would mean forward.
+# By verb: its argument, the argument's types, and a description. Without the check of types, the text
+# "reverse" would count as forward.
 _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
     "start": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
     "jog": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
     "set_frequency": ("hz", (Real,), "a number in Hz"),
 }
-
 
 TRIES = 150  # attempts of a stop while the system has no memory or file descriptors left
 
@@ -72,8 +113,8 @@ class _BoundVerb(Generic[P, R]):
     The call returns what the script returns, or if that is None, a CommandResult.
 
     A stop takes `seconds`: it is repeated for that long, or until the motor is seen to be at rest. Without a
-    valid `seconds` it is repeated for the duration of the motor's ramp, and at least 30 s. A stop that is
-    called with wrong arguments is carried out before TypeError is raised.
+    valid `seconds`, it is repeated for the duration of the motor's ramp, but for at least 30 s. A stop that
+    is called with wrong arguments is carried out before TypeError is raised.
     """
 
     def __init__(self, name: str, drive: Drive, script: Callable[..., Script[R]]) -> None:
@@ -112,7 +153,7 @@ class _BoundVerb(Generic[P, R]):
 
 
 class _BoundMove(_BoundVerb[P, R]):
-    """A verb that may move the motor. A stop that is called after the start of the call cancels the call."""
+    """A verb that may move the motor. Any later stop of the drive cancels the call."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         # Read the number of stops first, without calling a Python function. Then a signal handler that stops
