@@ -17,7 +17,6 @@ from multidrop.drive import (
     NotVerified,
     State,
     Unconfirmed,
-    Unsupported,
     WriteForbidden,
 )
 from multidrop.drive.register import Carrier, Kept, setting
@@ -117,7 +116,7 @@ def test_start_without_a_known_setpoint_is_refused() -> None:
     [
         (DelixiNativeStatus.UNDERVOLTAGE, r"a fault, UNDERVOLTAGE: .*reset_fault\(\)"),
         (DelixiNativeStatus.FAULT, r"a fault, FAULT: .*reset_fault\(\)"),
-        (9, "says 0009H to K = 03, which is not explained"),
+        (9, "says 0009H in reply to K = 03, a state that the manual does not explain"),
     ],
 )
 def test_start_is_refused_if_the_motor_could_start_later(status: int, sentence: str) -> None:
@@ -130,11 +129,11 @@ def test_start_is_refused_if_the_motor_could_start_later(status: int, sentence: 
     assert wire.sent == [FIFTY]
 
 
-@pytest.mark.parametrize(
+@table(
     ("says", "sentence"),
     [
-        ({"run_source": DelixiRunSource.KEYPAD}, "is not commanded by the line"),
-        ({"fault": DelixiFault.OC_OVERCURRENT}, "has a fault, overcurrent .OC.: see to it"),
+        ({"run_source": DelixiRunSource.KEYPAD}, "does not take its commands from the line"),
+        ({"fault": DelixiFault.OC_OVERCURRENT}, "has a fault, overcurrent .OC.: remove its cause"),
     ],
 )
 def test_start_is_refused_in_a_fault_or_without_line_control(says: dict[str, object], sentence: str) -> None:
@@ -207,7 +206,7 @@ def test_faults_are_read_as_decimal_and_as_hex_digits(raw: int, fault: int) -> N
             State(Condition.RUNNING, Direction.REVERSE),
         ),
         (
-            {"status": DelixiNativeStatus.FORWARD, "output_frequency": 0.0},  # at 0 Hz, but not stopped
+            {"status": DelixiNativeStatus.FORWARD, "output_frequency": 0.0},  # 0 Hz, but not stopped
             State(Condition.RUNNING, Direction.FORWARD, note="output frequency 0"),
         ),
         (
@@ -279,13 +278,7 @@ def test_only_stored_writes_are_counted_and_limited(monkeypatch: pytest.MonkeyPa
     assert sim.counters.eeprom_writes == {"stored_ramp": 1}
 
 
-@pytest.mark.parametrize("name", ["coast", "emergency_stop", "jog"])
-def test_undocumented_verbs_are_unsupported(name: str) -> None:
-    with pytest.raises(Unsupported, match="Delixi"):
-        getattr(Wire(DelixiNative(1)).drive, name)()
-
-
-@pytest.mark.parametrize("status", [DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE])
+@table("status", [DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE])
 def test_fault_that_remains_after_reset_is_reported(status: DelixiNativeStatus) -> None:
     wire = Wire(DelixiNative(1), {**STANDING, "status": status, "fault": DelixiFault.OC_OVERCURRENT})
     with pytest.raises(NotVerified, match=r"the fault reset.*the fault remains: overcurrent"):

@@ -1,4 +1,4 @@
-"""Hazards: the frames of a naive client, and this library's safe frames or refusal.
+"""Hazards: frames that a naive client would send, and what this library sends or refuses instead.
 
 There is a row for each address collision between families, and for each error or gap in a family's document
 that concerns a client. The frame `naive`, printed in the document if possible, must never be sent. `sends`
@@ -15,6 +15,7 @@ from typing import Any
 import checksums
 import pytest
 from simulated_bus import SimulatedBus, one, text
+from tables import table
 
 from multidrop.core import Framing, Message, NumberFormat, build_reply, build_request, parse_reply
 from multidrop.drive import Condition, Direction, Drive
@@ -54,9 +55,11 @@ def yd() -> Drive:
 
 @dataclass(frozen=True)
 class Hazard:
-    """A hazard: `do(line, drive, sim)` is the user's action; `shows` is set on the simulated drive before."""
+    """A hazard: `do(line, drive, sim)` is the user's action.
 
-    place: str
+    Before the action, the simulated drive gets the register values `shows`.
+    """
+
     drive: Callable[[], Drive]
     do: Callable[[SimulatedBus, Any, Any], object]
     naive: str
@@ -64,7 +67,7 @@ class Hazard:
     refuses: str = ""  # text of the error with which the action is refused
     error: type[Exception] = WriteForbidden
     shows: Mapping[str, Any] = field(default_factory=dict)
-    turning: bool = False  # before the action, the drive was started and has run for a second
+    turning: bool = False  # if True, the drive is started and runs for a second before the action
 
 
 def start(line: SimulatedBus, drive: Any, sim: Any) -> None:
@@ -100,113 +103,67 @@ def broadcast(name: str, value: Any) -> Callable[[SimulatedBus, Any, Any], objec
     return lambda line, drive, sim: line.bus.broadcast(drive.register(name), value)
 
 
-HAZARDS = [
+HAZARDS = {
     # ---- section 0: one address with several meanings ----
-    Hazard(
-        "0.1: 2000H, Delixi's run forward is run and fault reset on an IBD",
-        ibd,
-        run,
-        naive="01 06 20 00 00 12",
-        sends=("01 06 20 01 07 D0", "01 06 20 00 00 02"),
+    "0.1: 2000H, Delixi's run forward is run and fault reset on an IBD": Hazard(
+        ibd, run, naive="01 06 20 00 00 12", sends=("01 06 20 01 07 D0", "01 06 20 00 00 02")
     ),
-    Hazard(
-        "0.1: 2000H, IBD's fault reset is a direction on a Delixi",
-        delixi,
-        reset,
-        naive="01 06 20 00 00 10",
-        refuses="no fault reset",
-        error=Unsupported,
+    "0.1: 2000H, IBD's fault reset is a direction on a Delixi": Hazard(
+        delixi, reset, naive="01 06 20 00 00 10", refuses="no fault reset", error=Unsupported
     ),
-    Hazard(
-        "0.1: 1000H, YD1000's words are no command of a CHE",
-        che,
-        stop,
-        naive="01 06 10 00 80 00",
-        sends=("01 06 10 00 00 05", "01 06 10 00 00 08"),
-        turning=True,
+    "0.1: 1000H, YD1000's words are no command of a CHE": Hazard(
+        che, stop, naive="01 06 10 00 80 00", sends=("01 06 10 00 00 05", "01 06 10 00 00 08"), turning=True
     ),
-    Hazard(
-        "0.1: 1000H, CHE's stop does not stop a YD1000",
-        yd,
-        stop,
-        naive="01 06 10 00 00 05",
-        sends=("01 06 10 00 C0 00",),
-        turning=True,
+    "0.1: 1000H, CHE's stop does not stop a YD1000": Hazard(
+        yd, stop, naive="01 06 10 00 00 05", sends=("01 06 10 00 C0 00",), turning=True
     ),
-    Hazard(
-        "0.1: 2000H, Goodrive's control is CHE's setpoint: identity first",
-        che,
-        frequency(25),
-        naive="01 06 20 00 13 88",
-        refuses="010AH",
-        shows={"device": 0x010A},
+    "0.1: 2000H, Goodrive's control is CHE's setpoint: identity first": Hazard(
+        che, frequency(25), naive="01 06 20 00 13 88", refuses="010AH", shows={"device": 0x010A}
     ),
-    Hazard(
-        "0.1: stop is 5 and coast 6 on a CHE, and elsewhere the other way round",
+    "0.1: stop is 5 and coast 6 on a CHE, and elsewhere the other way round": Hazard(
         che,
         lambda line, drive, sim: drive.coast(),
         naive="01 06 10 00 00 05",
         sends=("01 06 10 00 00 06",),
         turning=True,
     ),
-    Hazard(
-        "0.1: 0001H and 0002H are EEPROM parameters of a YD1000",
-        yd,
-        frequency(28.5),
-        naive="01 06 00 02 01 1D",
-        sends=("01 06 10 01 0B 22",),
+    "0.1: 0001H and 0002H are EEPROM parameters of a YD1000": Hazard(
+        yd, frequency(28.5), naive="01 06 00 02 01 1D", sends=("01 06 10 01 0B 22",)
     ),
-    Hazard(
-        "0.2: change of direction is a toggle (IBD, bits 2 and 3)",
-        ibd,
-        direct(Direction.REVERSE),
-        naive="01 06 20 00 00 0E",
-        refuses="ambiguous",
+    "0.2: change of direction is a toggle (IBD, bits 2 and 3)": Hazard(
+        ibd, direct(Direction.REVERSE), naive="01 06 20 00 00 0E", refuses="ambiguous"
     ),
-    Hazard(
-        "0.6: reset and start in one frame (YD1000)",
+    "0.6: reset and start in one frame (YD1000)": Hazard(
         yd,
         write("control", YD1000Control.COMMAND_VALID | YD1000Control.RESET | YD1000Control.RUN),
         naive="01 06 10 00 A4 00",
         refuses="never written together",
     ),
-    Hazard(
-        "0.7: only a stop and a setpoint of zero are broadcast",
-        ibd,
-        broadcast("frequency", 50.0),
-        naive="00 06 20 01 13 88",
-        refuses="no harmless broadcast",
+    "0.7: only a stop and a setpoint of zero are broadcast": Hazard(
+        ibd, broadcast("frequency", 50.0), naive="00 06 20 01 13 88", refuses="no harmless broadcast"
     ),
     # ---- 1: ERMAN ----
-    Hazard(
-        "E3: the example of 06 writes the setpoint to 0001H",
-        erman,
-        frequency(28.5),
-        naive="01 06 00 01 01 1D",
-        sends=("01 06 00 02 01 1D",),
+    "E3: the example of 06 writes the setpoint to 0001H": Hazard(
+        erman, frequency(28.5), naive="01 06 00 01 01 1D", sends=("01 06 00 02 01 1D",)
     ),
-    Hazard(
-        "E3: 0001H is the control register",
+    "E3: 0001H is the control register": Hazard(
         erman,
         write("control_register", Modes.CONTROL_TYPE),
         naive="01 06 00 01 00 10",
         refuses="never|not written",
     ),
-    Hazard(
-        "E4, E6: the example of 0F resets and starts, and sets a reserved coil",
+    "E4, E6: the example of 0F resets and starts, and sets a reserved coil": Hazard(
         erman,
         reset,
         naive="01 0F 00 00 00 09 02 01 01",
         sends=("01 05 00 00 00 00", "01 05 00 09 FF 00", "01 05 00 09 00 00"),
     ),
-    Hazard(
-        "E5: the order of bytes in a reply to 01 is doubtful, so that one byte at most is asked for",
+    "E5: the order of bytes in a reply to 01 is doubtful, so a read covers one byte at most": Hazard(
         erman,
         lambda line, drive, sim: drive.read(drive.start_held, drive.fault_reset_held),
         naive="01 01 00 00 00 0C",
     ),
-    Hazard(
-        "E11: the last fault may be past or present: no start before it was seen to",
+    "E11: the last fault may be past or present: no start before a reset": Hazard(
         erman,
         run,
         naive="01 05 00 00 FF 00",
@@ -214,28 +171,16 @@ HAZARDS = [
         refuses=r"overheat.*reset_fault",
         shows={"last_fault": ErmanFault.OVERHEAT},
     ),
-    Hazard(
-        "E17: start clears both stops first, and is one coil",
+    "E17: a start first clears both stop coils, and sets one coil": Hazard(
         erman,
         run,
         naive="01 0F 00 00 00 0A 02 01 02",
-        sends=(
-            "01 06 00 02 00 C8",
-            "01 05 00 01 00 00",
-            "01 05 00 02 00 00",
-            "01 05 00 00 FF 00",
-        ),
+        sends=("01 06 00 02 00 C8", "01 05 00 01 00 00", "01 05 00 02 00 00", "01 05 00 00 FF 00"),
     ),
-    Hazard(
-        "E17: stop is stop on and start off, and is looked at",
-        erman,
-        stop,
-        naive="01 05 00 01 00 00",
-        sends=("01 05 00 01 FF 00", "01 05 00 00 00 00"),
-        turning=True,
+    "E17: a stop sets STOP and clears START, and is verified": Hazard(
+        erman, stop, naive="01 05 00 01 00 00", sends=("01 05 00 01 FF 00", "01 05 00 00 00 00"), turning=True
     ),
-    Hazard(
-        "E17: a motor that runs on after its ramp is stopped by the emergency stop",
+    "E17: a motor that runs on after its ramp is stopped by the emergency stop": Hazard(
         erman,
         stop,
         naive="01 05 00 00 FF 00",
@@ -244,60 +189,40 @@ HAZARDS = [
         error=Unconfirmed,
         shows={"status": ErmanStatus.RUNNING},
     ),
-    Hazard(
-        "E18: nothing is broadcast, whose answers are doubtful",
-        erman,
-        broadcast("frequency", 0.0),
-        naive="00 06 00 02 00 00",
-        refuses="no harmless broadcast",
+    "E18: nothing is broadcast, because drives may reply": Hazard(
+        erman, broadcast("frequency", 0.0), naive="00 06 00 02 00 00", refuses="no harmless broadcast"
     ),
     # ---- 2: CHE ----
-    Hazard(
-        "I1: no ordinal is computed: P0.07 has no address here",
+    "I1: no ordinal is computed: P0.07 has no address here": Hazard(
         che,
         lambda line, drive, sim: drive.register("acceleration_time"),
         naive="01 06 80 0C 00 C8",
         refuses="no register",
         error=ValueError,
     ),
-    Hazard(
-        "I5: the address of RAM keeps its bit 15",
+    "I5: the address of RAM keeps its bit 15": Hazard(
         lambda: Mine(1),
         write("acceleration_time", 20.0),
         naive="01 06 00 0C 00 C8",
         sends=("01 06 80 0C 00 C8",),
     ),
-    Hazard(
-        "2.7: the setpoint is per cent of the maximum frequency: 50 Hz of 50 Hz is not 5000",
-        che,
-        frequency(50),
-        naive="01 06 20 00 13 88",
-        sends=("01 06 20 00 27 10",),
+    "2.7: the setpoint is per cent of the maximum frequency: 50 Hz of 50 Hz is not 5000": Hazard(
+        che, frequency(50), naive="01 06 20 00 13 88", sends=("01 06 20 00 27 10",)
     ),
-    Hazard(
-        "2.7: a negative setpoint likely reverses",
-        che,
-        write("setpoint", -50.0),
-        naive="01 06 20 00 EC 78",
-        refuses="outside 0 to 100",
+    "2.7: a negative setpoint likely reverses": Hazard(
+        che, write("setpoint", -50.0), naive="01 06 20 00 EC 78", refuses="outside 0 to 100"
     ),
-    Hazard(
-        "2.7: the setpoint goes before the start",
-        che,
-        start,
-        naive="01 06 10 00 00 01",
-        refuses="set_frequency",
+    "2.7: the setpoint goes before the start": Hazard(
+        che, start, naive="01 06 10 00 00 01", refuses="set_frequency"
     ),
     # ---- 3: IBD ----
-    Hazard(
-        "N1: what Prb.01 means is contradictory",
+    "N1: what Prb.01 means is contradictory": Hazard(
         ibd,
         write("frequency_source", FrequencySource.LINE),
         naive="01 06 00 65 00 05",
         refuses="contradictory",
     ),
-    Hazard(
-        "N1: a drive that does not follow the line is not started",
+    "N1: a drive that does not follow the line is not started": Hazard(
         ibd,
         run,
         naive="01 06 20 00 00 02",
@@ -305,46 +230,34 @@ HAZARDS = [
         refuses=r"Prb\.01 to 5",
         shows={"frequency_source": 3},
     ),
-    Hazard(
-        "N2: which bit is forward is ambiguous",
-        ibd,
-        direct(Direction.FORWARD),
-        naive="01 06 20 00 00 0A",
-        refuses="ambiguous",
+    "N2: which bit is forward is ambiguous": Hazard(
+        ibd, direct(Direction.FORWARD), naive="01 06 20 00 00 0A", refuses="ambiguous"
     ),
-    Hazard(
-        "N7: the setpoint's range knows nothing of the drive's maximum",
+    "N7: the setpoint's range ignores the drive's maximum": Hazard(
         lambda: ibd(maximum_frequency=60),
         frequency(60.01),
         naive="01 06 20 01 17 71",
         refuses="above maximum_frequency",
     ),
-    Hazard(
-        "N8: 2000H and 2001H may only be written",
+    "N8: 2000H and 2001H may only be written": Hazard(
         ibd,
         lambda line, drive, sim: drive.read(drive.control),
         naive="01 03 20 00 00 01",
         refuses="cannot be read",
         error=ValueError,
     ),
-    Hazard(
-        "N10: a run turns the motor in the direction in force, and says no other",
-        ibd,
-        run,
-        naive="01 06 20 00 00 0A",
-        sends=("01 06 20 01 07 D0", "01 06 20 00 00 02"),
+    "N10: a run word has no direction bit": Hazard(
+        ibd, run, naive="01 06 20 00 00 0A", sends=("01 06 20 01 07 D0", "01 06 20 00 00 02")
     ),
     # ---- 4: Delixi ----
-    Hazard(
-        "D4, D5: the only setpoint is in EEPROM: on change, and once a minute",
+    "D4, D5: the only setpoint is in EEPROM: on change, and once a minute": Hazard(
         delixi,
         lambda line, drive, sim: [drive.set_frequency(50), drive.set_frequency(50), drive.set_frequency(49)],
         naive="01 06 00 02 13 24",
         sends=("01 06 00 02 13 88",),
         refuses="once in 60 s",
     ),
-    Hazard(
-        "D5: no start when the setpoint is not taken from P00.02",
+    "D5: no start when the setpoint is not taken from P00.02": Hazard(
         delixi,
         run,
         naive="01 06 20 00 00 12",
@@ -352,119 +265,68 @@ HAZARDS = [
         refuses=r"P00\.01",
         shows={"frequency_source": 0},
     ),
-    Hazard(
-        "D12: standard Modbus has no fault reset, and reserved bits are not tried",
-        delixi,
-        reset,
-        naive="01 06 20 00 00 04",
-        refuses="no fault reset",
-        error=Unsupported,
+    "D12: standard Modbus has no fault reset, and reserved bits are not tried": Hazard(
+        delixi, reset, naive="01 06 20 00 00 04", refuses="no fault reset", error=Unsupported
     ),
-    Hazard(
-        "D14: run goes with its direction, and never with the toggle",
-        delixi,
-        run,
-        naive="01 06 20 00 00 32",
-        sends=("01 06 00 02 07 D0", "01 06 20 00 00 12"),
+    "D14: a run word has a direction, and never the toggle": Hazard(
+        delixi, run, naive="01 06 20 00 00 32", sends=("01 06 00 02 07 D0", "01 06 20 00 00 12")
     ),
-    Hazard(
-        "D14: run without a direction may keep the old one or not",
+    "D14: run without a direction may keep the old one or not": Hazard(
         delixi,
         direct(Direction.REVERSE),
         naive="01 06 20 00 00 02",
         sends=("01 06 20 00 00 22",),
         shows={"frequency": 20.0},
     ),
-    Hazard(
-        "D17: a stored write is not broadcast",
-        native,
-        broadcast("stored_frequency", 0.0),
-        naive=":0006000200000000",
-        refuses="no harmless broadcast",
+    "D17: a stored write is not broadcast": Hazard(
+        native, broadcast("stored_frequency", 0.0), naive=":0006000200000000", refuses="no harmless broadcast"
     ),
-    Hazard(
-        "4.4: the setpoint in RAM, not the stored one",
-        native,
-        frequency(50),
-        naive=":0106000200001388",
-        sends=(":0104000100001388",),
+    "4.4: the setpoint in RAM, not the stored one": Hazard(
+        native, frequency(50), naive=":0106000200001388", sends=(":0104000100001388",)
     ),
     # ---- 5: YD1000 ----
-    Hazard(
-        "Y1: register numbers are hex digits: DEC is 0010H, not 000AH",
-        yd,
-        write("deceleration_time", 20.0),
-        naive="01 06 00 0A 00 C8",
-        sends=("01 06 00 10 00 C8",),
+    "Y1: register numbers are hex digits: DEC is 0010H, not 000AH": Hazard(
+        yd, write("deceleration_time", 20.0), naive="01 06 00 0A 00 C8", sends=("01 06 00 10 00 C8",)
     ),
-    Hazard(
-        "Y1: a drive whose 0802H is not its address is none",
-        yd,
-        run,
-        naive="01 06 10 00 C4 00",
-        refuses="0802H",
-        shows={"address_setting": 7},
+    "Y1: a drive whose 0802H is not its address is not a YD1000": Hazard(
+        yd, run, naive="01 06 10 00 C4 00", refuses="0802H", shows={"address_setting": 7}
     ),
-    Hazard(
-        "Y7: 0007H initialises",
-        yd,
-        write("initialisation", 1),
-        naive="01 06 00 07 00 01",
-        refuses="panel only",
+    "Y7: 0007H initialises": Hazard(
+        yd, write("initialisation", 1), naive="01 06 00 07 00 01", refuses="panel only"
     ),
-    Hazard(
-        "Y10: 0000H gives the command back to the panel, which may run it",
-        yd,
-        stop,
-        naive="01 06 10 00 00 00",
-        sends=("01 06 10 00 C0 00",),
-        turning=True,
+    "Y10: 0000H gives the command back to the panel, which may run it": Hazard(
+        yd, stop, naive="01 06 10 00 00 00", sends=("01 06 10 00 C0 00",), turning=True
     ),
-    Hazard(
-        "Y10: nor can that be written plainly",
-        yd,
-        write("control", YD1000Control(0)),
-        naive="01 06 10 00 00 00",
-        refuses="commands the motor",
+    "Y10: 0000H is refused as a plain write": Hazard(
+        yd, write("control", YD1000Control(0)), naive="01 06 10 00 00 00", refuses="commands the motor"
     ),
-    Hazard(
-        "Y11: a reset never runs, is sent once and followed by the stop",
-        yd,
-        reset,
-        naive="01 06 10 00 E4 00",
-        sends=("01 06 10 00 E0 00", "01 06 10 00 C0 00"),
+    "Y11: a reset never runs, is sent once and followed by the stop": Hazard(
+        yd, reset, naive="01 06 10 00 E4 00", sends=("01 06 10 00 E0 00", "01 06 10 00 C0 00")
     ),
-    Hazard(
-        "Y13: 0802H acts on the line at once",
-        yd,
-        write("address_setting", 2.0),
-        naive="01 06 08 02 00 02",
-        refuses="drive's end of the line",
+    "Y13: 0802H acts on the line at once": Hazard(
+        yd, write("address_setting", 2.0), naive="01 06 08 02 00 02", refuses="drive's end of the line"
     ),
-    Hazard(
-        "0008H may be changed while the motor runs, and has the panel's direction",
+    "0008H may be changed while the motor runs, and has the panel's direction": Hazard(
         yd,
         write("panel_direction", 1.0),
         naive="01 06 00 08 00 01",
         refuses="belongs to the command over the motor",
     ),
-    Hazard(
-        "what the bits of the preset speeds select is seen before the motor is started",
+    "the selected preset speed is verified before the motor is started": Hazard(
         lambda: YD1000(1, preset_speed=4),
         start,
         naive="01 06 10 00 C4 01",
         sends=("01 06 10 00 C0 00", "01 06 10 00 C0 02", "01 06 10 00 C0 00"),
-        refuses="does not take 12.5 Hz, preset speed 4",
+        refuses="preset speed 4 was selected, its frequency command did not become 12.5 Hz",
         shows={"preset_speed_4": 12.5, "reference_frequency": 0.0},
     ),
-    Hazard(
-        "Y14: the emergency stop is not broadcast",
+    "Y14: the emergency stop is not broadcast": Hazard(
         yd,
         broadcast("control", YD1000Control.COMMAND_VALID | YD1000Control.EMERGENCY_STOP),
         naive="00 06 10 00 90 00",
         refuses="no harmless broadcast",
     ),
-]
+}
 
 
 class Mine(InvtCHE):
@@ -473,7 +335,7 @@ class Mine(InvtCHE):
     acceleration_time = parameter(12, "s", step=0.1, place="P0.07")
 
 
-@pytest.mark.parametrize("hazard", HAZARDS, ids=lambda each: each.place)
+@pytest.mark.parametrize("hazard", HAZARDS.values(), ids=HAZARDS)
 def test_action_sends_only_the_safe_frames_or_is_refused(
     monkeypatch: pytest.MonkeyPatch, hazard: Hazard
 ) -> None:
@@ -525,8 +387,8 @@ def test_e2_reply_with_another_byte_count_is_rejected(monkeypatch: pytest.Monkey
         drive.read(drive.output_frequency, drive.output_current, drive.dc_bus_voltage)
 
 
-@pytest.mark.parametrize("code", [2, 3, 4])
-def test_e12_bad_address_is_not_a_device_failure(code: int) -> None:
+@table("code", [2, 3, 4])
+def test_e12_an_exception_for_a_bad_address_is_not_reported_as_a_failure(code: int) -> None:
     assert "address" in ErmanERG220(1).exception(code)
     assert "fail" not in ErmanERG220(1).exception(code)
 
@@ -544,7 +406,7 @@ def test_e13_e16_diagnostics_and_unknown_addresses_are_not_used() -> None:
     )
 
 
-def test_i4_request_refused_as_damaged_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_i4_a_request_that_the_drive_refused_as_damaged_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1))
     damaged = build_reply(Framing.RTU, Message(1, 3, exception=0x11))
     line.answers = lambda request: damaged if len(line.frames) == 1 else None
@@ -621,7 +483,7 @@ def test_d1_d3_d6_d9_line_settings_correct_the_misprints() -> None:
     assert DelixiModbus.response_timeout >= 0.08
 
 
-def test_d8_fault_04_is_ou() -> None:
+def test_d8_fault_04_is_decoded_as_ou() -> None:
     (ou,) = {drive.fault.decode(4) for drive in (DelixiModbus, DelixiNative)}
     assert ou.name == "OU_OVERVOLTAGE"
 
@@ -664,14 +526,12 @@ def test_y8_frozen_state_is_not_reported_as_running(monkeypatch: pytest.MonkeyPa
     drive.state()
     sim.pass_time(line.seconds)
     sim.trip(5)
-    assert drive.read(drive.status)  # the frozen register still shows a run
+    assert drive.read(drive.status)  # the frozen register still shows a running motor
     assert drive.state().condition is Condition.FAULT
     drive.stop()
 
 
-def test_y12_watchdog_setting_is_readable(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_y12_watchdog_setting_is_readable(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1))
     assert "off" in line.bus.watchdog(drive)
     sim["communication_timeout"] = 7
@@ -680,7 +540,7 @@ def test_y12_watchdog_setting_is_readable(
     assert drive.communication_timeout.default is None
 
 
-def test_0_8_registers_kept_in_eeprom_are_declared_so() -> None:
+def test_0_8_registers_kept_in_eeprom_are_declared_as_eeprom() -> None:
     for register in YD1000.registers.values():
         in_ram = 0x1000 <= register.address <= 0x12FF
         assert (register.kept is Kept.EEPROM) == (not in_ram) or register.access.value == "reading"
@@ -709,15 +569,13 @@ OF_PRINT_ALONE = {
     "N5": "the name of a row",
     "D10": "the texts of two rows; the document's examples show the usual frames, which tests/data holds",
     "D11": "a skipped number, a lost letter, names that run together",
-    "D16": "a case that the document does not tell and no client can bring about",
+    "D16": "a case that the document does not describe, and that no client can cause",
     "Y9": "references to sections that are missing, and spellings",
 }
 
 
 def test_every_erratum_has_a_test_or_a_reason_for_having_none() -> None:
-    told = [hazard.place for hazard in HAZARDS] + [
-        name.upper() for name in globals() if name.startswith("test_")
-    ]
+    told = [*HAZARDS, *(name.upper() for name in globals() if name.startswith("test_"))]
     for family, last in FAMILIES.items():
         for number in range(1, last + 1):
             erratum = f"{family}{number}"

@@ -14,7 +14,6 @@ from multidrop.drive import (
     DriveException,
     Framing,
     Unconfirmed,
-    Unsupported,
     WriteForbidden,
 )
 from multidrop.drive.register import HOLDING
@@ -102,7 +101,7 @@ def test_terminal_bits_have_the_documented_names() -> None:
     assert InnovertIBD.terminals.format(printed) == "bit 11, bit 12"
 
 
-@pytest.mark.parametrize("framing", InnovertIBD.framings)
+@table("framing", InnovertIBD.framings)
 def test_each_verb_sends_the_printed_frame(framing: Framing) -> None:
     wire = Wire(InnovertIBD(1, framing=framing), {**STANDING, "terminals": Terminals(0)}, turns=TURNS)
     wire.drive.set_frequency(50)
@@ -119,7 +118,7 @@ def test_reset_and_a_setpoint_of_0_send_the_documented_frames() -> None:
 
 
 def test_stop_is_sent_before_the_fault_reset() -> None:
-    """In table 3 the reset word has no action in bits 1 and 0, so an earlier run may still be in force."""
+    """By table 3 the reset word leaves the run command unchanged, so an earlier run may still be active."""
     stop = STOP[Framing.RTU]
     lost = [Unconfirmed("drive", "stop", "no reply")] * 3
     wire = Wire(InnovertIBD(1), STANDING, {stop: lost})
@@ -133,7 +132,7 @@ def test_stop_is_sent_before_the_fault_reset() -> None:
         assert wire.sent == []
 
 
-@pytest.mark.parametrize("direction", Direction)
+@table("direction", Direction)
 def test_direction_without_forward_bit_is_refused(direction: Direction) -> None:
     wire = Wire(InnovertIBD(1))
     for verb in (wire.drive.start, wire.drive.jog):
@@ -142,7 +141,7 @@ def test_direction_without_forward_bit_is_refused(direction: Direction) -> None:
     assert wire.sent == []
 
 
-@pytest.mark.parametrize(("forward_bit", "forward", "reverse"), [(2, "06", "0A"), (3, "0A", "06")])
+@table(("forward_bit", "forward", "reverse"), [(2, "06", "0A"), (3, "0A", "06")])
 def test_forward_bit_option_selects_the_direction_word(forward_bit: int, forward: str, reverse: str) -> None:
     says = {**STANDING, "terminals": Terminals(0)}
     drive = InnovertIBD(1, forward_bit=forward_bit)
@@ -164,7 +163,7 @@ def test_jog_sends_the_word_of_table_3() -> None:
     assert wire.sent == [JOG]
 
 
-@pytest.mark.parametrize(
+@table(
     "turning",
     [{"motor_speed": 120.0}, {"output_current": 0.4}, {**PROGRAMMED, "terminals": Terminals.M01}],
     ids=["speed", "current", "outputs"],
@@ -175,7 +174,7 @@ def test_start_and_jog_of_a_turning_motor_are_refused(turning: dict[str, object]
     wire.drive.set_frequency(50)
     for verb in (wire.drive.start, wire.drive.jog):
         with pytest.raises(
-            WriteForbidden, match=r"turns, and a jog would go on through this: call stop\(\) first"
+            WriteForbidden, match=r"turns, and would continue to turn during a jog: call stop\(\) first"
         ):
             verb()
     assert wire.sent == [FIFTY[Framing.RTU]]
@@ -239,8 +238,8 @@ SEEN = {
 }
 
 
-@pytest.mark.parametrize("name", SEEN)
-def test_drive_without_all_named_registers_does_not_resemble(name: str) -> None:
+@table("name", SEEN)
+def test_a_drive_that_lacks_a_named_register_does_not_resemble_the_family(name: str) -> None:
     def resembles(says: dict[str, object]) -> bool:
         wire = Wire(InnovertIBD(1), says)
         found = wire.run(wire.drive.resembles())
@@ -253,8 +252,7 @@ def test_drive_without_all_named_registers_does_not_resemble(name: str) -> None:
 
 def test_stop_waits_until_neither_speed_nor_current_is_shown() -> None:
     wire = Wire(
-        InnovertIBD(1),
-        {**STANDING, "motor_speed": [900.0, 300.0, 0.0], "output_current": [1.2, 0.0]},
+        InnovertIBD(1), {**STANDING, "motor_speed": [900.0, 300.0, 0.0], "output_current": [1.2, 0.0]}
     )
     wire.drive.stop()
     assert wire.reads.count("motor_speed") == 4
@@ -313,9 +311,3 @@ def test_registers_never_written_are_inferred_or_select_the_source() -> None:
     inferred = {name for name, each in InnovertIBD.registers.items() if 200 <= each.address < 0x2000}
     assert inferred <= never
     assert never - inferred == {"frequency_source", "run_source", "stored_frequency"}
-
-
-@pytest.mark.parametrize("name", ["coast", "emergency_stop"])
-def test_undocumented_verbs_are_unsupported(name: str) -> None:
-    with pytest.raises(Unsupported, match="IBD"):
-        getattr(Wire(InnovertIBD(1)).drive, name)()

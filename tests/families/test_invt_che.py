@@ -19,7 +19,6 @@ from multidrop.drive import (
     NotVerified,
     State,
     Unconfirmed,
-    Unsupported,
     WriteForbidden,
 )
 from multidrop.drive.register import HOLDING, Kept
@@ -136,9 +135,9 @@ def test_start_without_a_direction_keeps_a_running_motors_direction() -> None:
 @table(
     ("status", "sentence"),
     [
-        (CHEStatus.FORWARD, r"turns, and may go on through a jog: call stop\(\) first"),
-        (CHEStatus.REVERSE, r"turns, and may go on through a jog: call stop\(\) first"),
-        (5, "has 0005H at 1001H, which is not explained"),
+        (CHEStatus.FORWARD, r"turns, and may continue to turn during a jog: call stop\(\) first"),
+        (CHEStatus.REVERSE, r"turns, and may continue to turn during a jog: call stop\(\) first"),
+        (5, "has 0005H at 1001H, a state that the manual does not explain"),
     ],
 )
 @pytest.mark.parametrize("direction", [None, *Direction])
@@ -151,11 +150,11 @@ def test_jog_is_refused_if_the_motor_may_turn(
     assert wire.sent == []
 
 
-@pytest.mark.parametrize("direction", [None, *Direction])
+@table("direction", [None, *Direction])
 def test_start_is_refused_in_an_undocumented_state(direction: Direction | None) -> None:
     """The manual documents 1 to 4 for 1001H; with any other value the motor may turn the other way."""
     wire = Wire(InvtCHE(1), {**STANDBY, "status": 5})
-    with pytest.raises(WriteForbidden, match="has 0005H at 1001H, which is not explained"):
+    with pytest.raises(WriteForbidden, match="has 0005H at 1001H, a state that the manual does not explain"):
         wire.drive.start(direction)
     assert wire.sent == []
 
@@ -169,11 +168,7 @@ def test_stop_waits_for_standby() -> None:
 
 def test_stop_jog_follows_immediately_if_a_jog_continues() -> None:
     """STOP_JOG is sent without waiting for `stop_time`."""
-    wire = Wire(
-        InvtCHE(1),
-        {"status": CHEStatus.FORWARD},
-        turns={STOP_JOG: {"status": CHEStatus.STANDBY}},
-    )
+    wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, turns={STOP_JOG: {"status": CHEStatus.STANDBY}})
     wire.drive.stop()
     assert wire.sent == [STOP, STOP_JOG]
     assert wire.seconds < 1
@@ -201,7 +196,7 @@ def test_stop_jog_follows_a_refused_stop() -> None:
 def test_stop_jog_follows_an_unconfirmed_stop() -> None:
     """A drive whose replies are lost may still receive the stop, which may not end a jog."""
     lost = Unconfirmed("drive", "control = STOP", "no reply")
-    for of_a_jog in ([], [lost] * 3):  # STOP_JOG is tried once: the caller repeats the whole stop
+    for of_a_jog in ([], [lost] * 3):  # STOP_JOG is sent only once: the caller repeats the whole stop
         wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [lost] * 3, STOP_JOG: of_a_jog})
         with pytest.raises(Unconfirmed, match="control = STOP"):
             wire.drive.stop()
@@ -229,7 +224,7 @@ def test_stop_jog_is_not_sent_to_another_make() -> None:
     assert wire.sent == [STOP]
 
 
-def test_refused_stop_jog_does_not_end_the_watch() -> None:
+def test_after_a_refused_stop_jog_the_state_is_still_read() -> None:
     refusal = DriveException("drive", 0x12, "")
     says = {"status": [CHEStatus.FORWARD] * 4 + [CHEStatus.STANDBY]}
     wire = Wire(InvtCHE(1), says, {STOP_JOG: [refusal] * 3})
@@ -401,10 +396,5 @@ def test_start_after_a_jog_requires_a_stop() -> None:
         wire.drive.start()
     wire.drive.stop()
     wire.drive.start()
-    wire.drive.start()  # while the motor runs
+    wire.drive.start()  # the motor already runs
     assert wire.sent == [jog, STOP, FORWARD, FORWARD]
-
-
-def test_emergency_stop_is_unsupported() -> None:
-    with pytest.raises(Unsupported, match="emergency stop"):
-        Wire(InvtCHE(1)).drive.emergency_stop()

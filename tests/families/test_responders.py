@@ -1,4 +1,4 @@
-"""Each of the 25 families commands a responder typed from its sources, and its own simulation.
+"""Each of the 25 families commands two drives: a responder typed from its sources, and its simulation.
 
 The responder shares no code and no table with the library: it splits, checks and builds frames itself.
 """
@@ -22,7 +22,7 @@ from multidrop.families import MODELS
 from multidrop.families.registry import SHIPPED, find_model
 
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, FAULT = 1, 2, 4
-INPUT, COIL, ON = 0x10000, 0x20000, 0xFF00  # added to the addresses of other tables than holding registers
+INPUT, COIL, ON = 0x10000, 0x20000, 0xFF00  # INPUT and COIL are added to the addresses of these tables
 Word = tuple[int, int]  # address and value
 
 
@@ -42,9 +42,9 @@ class Sheet:
     after_reset: tuple[Word, ...] = ()  # words that follow the reset
     write: int = 6
     shows_setpoint: int = 0  # address of a register that repeats the setpoint
-    passes: Mapping[Word, Mapping[int, int]] = field(default_factory=dict)  # effects of other words
-    standing: Condition = Condition.STOPPED  # what the document lets a program know of a motor at rest
-    failed: Condition = Condition.FAULT  # and of a fault
+    passes: Mapping[Word, Mapping[int, int]] = field(default_factory=dict)  # by word: register values then
+    standing: Condition = Condition.STOPPED  # condition that the drive's state shows at rest
+    failed: Condition = Condition.FAULT  # condition that the state shows in a fault
 
 
 # ER-G-220-01(02) protocol 1.4, section 10. Reads across reserved registers are answered with 0 (section 6).
@@ -91,7 +91,7 @@ SHEETS = {
     "erman-er-g-220": ERMAN,
     # wb-community: input register 26 is the water pressure, holding register 98 its setpoint.
     "erman-er-g-220-02": with_registers(ERMAN, {98: 300}, {}, water_pressure=2.5, pressure_setpoint=3),
-    # ERMANGIZER protocol of 2026, p. 2: register 5 has 0.01 bar, 14 the letter of the carrier frequency.
+    # ERMANGIZER protocol of 2026, p. 2: register 5 counts 0.01 bar; register 14 is a letter.
     "erman-er-g-220-03": Sheet(
         {1: 350, 3: 230, 5: 305, 14: 72, 17: 250, 0x1000: 300},
         {"output_frequency": 35, "input_voltage": 230, "pressure": 3.05, "pressure_setpoint": 3},
@@ -241,7 +241,8 @@ SHEETS = {
         after_reset=((1, 0),),
         write=16,
     ),
-    # C2000 Plus manual p. A-12: 2200H has 0.01 A; VFD-EL-W p. 4-84: 2104H 0.1 A; MS300 p. 790: 2105H 0.1 V.
+    # C2000 Plus manual p. A-12: 2200H counts 0.01 A. VFD-EL-W p. 4-84: 2104H counts 0.1 A.
+    # MS300 p. 790: 2105H counts 0.1 V.
     "delta-cp2000": with_registers(DELTA, {0x2200: 0}, {0x2200: 840}, output_current=8.4),
     "delta-vfd-el": with_registers(DELTA, {0x2104: 0}, {0x2104: 84}, output_current=8.4),
     "delta-ms300": with_registers(DELTA, {0x2105: 5401}, {}, dc_bus_voltage=540.1),
@@ -314,7 +315,7 @@ COMMANDED = [name for name in SHEETS if name not in READ_ONLY]
 
 
 class Responder:
-    """A drive with registers and a motor that hears frames and replies; it knows only its sheet."""
+    """A drive with registers and a motor, which replies to frames. It knows only its sheet."""
 
     def __init__(self, sheet: Sheet) -> None:
         self.sheet = sheet
@@ -425,7 +426,7 @@ def test_start_stop_and_reset_send_the_documented_words_and_readings_match(name:
             return
         driven.reset_fault()
         before = sheet.stops if sheet.before_reset is None else sheet.before_reset
-        assert there.words == [*before, sheet.reset, *sheet.after_reset]  # no further word may run the motor
+        assert there.words == [*before, sheet.reset, *sheet.after_reset]  # any other word could run the motor
         assert driven.state().condition is sheet.standing
 
 
@@ -438,6 +439,7 @@ def test_readings_of_a_family_without_commands_match(name: str) -> None:
         assert there.words == []
 
 
+@pytest.mark.long
 @table("name", COMMANDED)
 def test_simulation_of_each_family_starts_stops_resets_and_is_read(name: str) -> None:
     sheet = SHEETS[name]

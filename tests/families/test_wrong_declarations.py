@@ -32,10 +32,7 @@ BUILT_IN: dict[str, Callable[[int], Drive]] = {
 }
 DECLARED = {**BUILT_IN, **{name: partial(shipped, name) for name in COMMANDED}}
 every_declaration = pytest.mark.parametrize("declared", [*BUILT_IN, *usually(*COMMANDED)])
-THERE: dict[str, Callable[[int], Any]] = {
-    **DECLARED,
-    **{name: shipped_family(name) for name in READ_ONLY},
-}
+THERE: dict[str, Callable[[int], Any]] = {**DECLARED, **{name: shipped_family(name) for name in READ_ONLY}}
 # Families with the same registers and words: each can command the other's drives.
 SAME_WORDS = (
     {"delta-vfd-el", "delta-ms300", "delta-cp2000"},
@@ -47,7 +44,7 @@ SAME_WORDS = (
 SAME_STOP = {"invt-che", "invt-chf100a", "fuling-dzb"}
 
 AT_2000 = ("invt-goodrive", "powtran-pi130")
-# Stops that would run another make's motor; withheld if the make is proven. See docs/reference/profiles.md.
+# Stops that would run another make's motor; withheld if that make is proven. See docs/reference/profiles.md.
 RUNS_AT_A_STOP = {
     **dict.fromkeys(("innovert-ibd", "innovert-idd-mini-plus", "delixi-modbus"), AT_2000),
     **dict.fromkeys(("delta-vfd-el", "delta-ms300", "delta-cp2000"), AT_2000),
@@ -97,7 +94,7 @@ def test_no_command_is_sent_to_another_make(
     assert not pair.turns
 
 
-@pytest.mark.parametrize("turns", [False, True], ids=["at rest", "turning"])
+@pytest.mark.parametrize("turns", usually(True, False), ids=["turning", "at rest"])
 @every_declaration
 @table("there", THERE)
 def test_stop_never_runs_another_make_or_reports_done_while_it_turns(
@@ -127,7 +124,7 @@ def test_stop_never_runs_another_make_or_reports_done_while_it_turns(
     if {declared, there} <= SAME_STOP:
         assert pair.bus.written != []
         return
-    assert failure is not None  # registers that just read 0 do not prove standstill
+    assert failure is not None  # registers that are 0 do not prove a standstill
 
 
 @table(("declared", "there"), [(one, other) for one, others in RUNS_AT_A_STOP.items() for other in others])
@@ -158,8 +155,8 @@ def replace_data(request: Any, value: int) -> Any:
     return type(request)(request.address, request.function, data=value.to_bytes(2))
 
 
-def test_confirmed_ibd_family_does_not_run_a_goodrive(monkeypatch: pytest.MonkeyPatch) -> None:
-    """This happens after a replacement: the owner has confirmed the former drive as an IBD."""
+def test_a_goodrive_declared_as_a_confirmed_ibd_is_not_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The owner has confirmed the drive as an IBD, and a Goodrive has replaced it since."""
     sim: Any = simulated(shipped("invt-goodrive", 1))
     bus = SimulatedBus(monkeypatch, sim)
     drive = bus.attach(InnovertIBD(1, confirmed=1))
@@ -171,7 +168,7 @@ def test_confirmed_ibd_family_does_not_run_a_goodrive(monkeypatch: pytest.Monkey
     assert not sim.motor.energised
 
 
-def test_goodrive_family_stops_a_delta_and_sends_it_no_coast(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_delta_declared_as_a_goodrive_is_stopped_and_gets_no_coast(monkeypatch: pytest.MonkeyPatch) -> None:
     """0005H stops both; 0006H, which coasts a Goodrive, would run a Delta."""
     pair = Pair(monkeypatch, "invt-goodrive", "delta-vfd-el", turns=True)
     with pytest.raises(WriteForbidden, match="multidrop stop PORT delta-vfd-el 1"):
@@ -191,15 +188,15 @@ def test_chf100a_declared_as_a_che_is_stopped_and_its_model_is_named(monkeypatch
     assert not pair.turns
 
 
-def test_optidrive_family_at_an_erman_reports_an_unknown_state(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_erman_declared_as_an_optidrive_has_an_unknown_state(monkeypatch: pytest.MonkeyPatch) -> None:
     pair = Pair(monkeypatch, "optidrive-e3", "erman-er-g-220", turns=True)
-    with pytest.raises(Unconfirmed, match=r"all read 0, as unused registers .*: look at the motor"):
+    with pytest.raises(Unconfirmed, match=r"are all 0, and so may be unused registers .*: look at the motor"):
         pair.drive.stop()
     assert pair.turns
 
 
-@pytest.mark.parametrize("declared", COMMANDED)
-def test_gateway_that_answers_ffff_for_a_drive_prevents_no_stop(
+@table("declared", COMMANDED)
+def test_a_stop_is_sent_although_a_gateway_answers_ffff_for_the_drive(
     monkeypatch: pytest.MonkeyPatch, declared: str
 ) -> None:
     bus = SimulatedBus(monkeypatch)

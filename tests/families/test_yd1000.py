@@ -182,7 +182,7 @@ def test_line_parameters_are_read_only() -> None:
 
 
 def test_extended_parameter_address_follows_from_its_name() -> None:
-    """The letter F becomes the digit 0 (section 6.2), as in the table itself."""
+    """The letter F of the name becomes the digit 0 of the address (section 6.2)."""
 
     class Mine(YD1000):
         """A user's family with a parameter from the drive's manual."""
@@ -195,7 +195,9 @@ def test_extended_parameter_address_follows_from_its_name() -> None:
         if register.place.startswith("6.2, "):
             name = register.place.removeprefix("6.2, ")
             assert f"F{register.address:03X}" == name
-            with pytest.raises(ValueError, match=f"^{name} is declared by every YD1000, as {register.name}$"):
+            with pytest.raises(
+                ValueError, match=f"^{name} is already declared for every YD1000, as {register.name}$"
+            ):
                 extended(name)  # a register with `never` cannot be redeclared as writable
     for wrong in ("F1000", "F24A", "f240", "240", "F24"):
         with pytest.raises(ValueError, match="F and three digits"):
@@ -337,8 +339,8 @@ def test_start_waits_until_1202h_shows_the_preset_speed(number: int, bits: int) 
 @table(
     ("says", "sent", "sentence"),
     [
-        ({}, [STOP, yd_word(0xC00C), STOP], "does not take 15 Hz, preset speed 3"),
-        ({"reference_frequency": 15.0}, [STOP], "nothing would show the wrong bits"),
+        ({}, [STOP, yd_word(0xC00C), STOP], "speed 3 was selected, its frequency command did not become 15"),
+        ({"reference_frequency": 15.0}, [STOP], "wrong bits could not be detected"),
         ({"preset_speed_3": 0.0}, [], "is 0: set preset_speed_3 first"),
         ({**TURNS[FORWARD]}, [], r"turns: .*call stop\(\) first"),
         ({"held_frequency": 30.0}, [], r"has a fault.*reset_fault\(\)"),
@@ -400,9 +402,7 @@ def test_emergency_stop_bit_is_cleared_once_it_is_confirmed() -> None:
     assert wire.sent[-1] == STOP
 
 
-@pytest.mark.parametrize(
-    "failure", [Unconfirmed("drive", "stop", "no reply"), DriveException("drive", 4, "")]
-)
+@table("failure", [Unconfirmed("drive", "stop", "no reply"), DriveException("drive", 4, "")])
 def test_emergency_stop_is_a_pulse_and_sent_once(failure: Exception) -> None:
     pulse = frame(YD1000(1), YD1000.control, YD1000Control(0xD000))
     wire = Wire(YD1000(1), STANDING, {pulse: [failure]})
@@ -414,7 +414,7 @@ def test_coast_sends_its_bit_and_waits_for_two_zero_readings() -> None:
     wire = Wire(YD1000(1), STANDING)
     wire.drive.coast()
     assert [each[:17] for each in wire.sent] == ["01 06 10 00 C8 00"]
-    assert wire.seconds == 0.1  # between two readings, because one may show 0 by chance
+    assert wire.seconds == 0.1  # the pause between the two readings that must both be 0
     wire = Wire(YD1000(1), {**STANDING, "output_frequency": 3.0})
     with pytest.raises(Unconfirmed, match="5 s"):
         wire.drive.coast()
@@ -477,20 +477,20 @@ FUNCTIONS = {f"input_{at}_function": factory for at, factory in enumerate((2.0, 
 def test_reset_is_refused_while_a_terminal_says_run(says: dict[str, object], terminal: str) -> None:
     """A restart may clear bit 15, as a power-on does (section 8.1); then the terminals are in control."""
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, **says})
-    with pytest.raises(WriteForbidden, match=f"^{terminal}.* says run, and may start its motor"):
+    with pytest.raises(WriteForbidden, match=f"^{terminal}.* is set to run, and may start the motor"):
         wire.drive.reset_fault()
     assert wire.sent == []
 
 
-@pytest.mark.parametrize("closed", [Inputs.RST | Inputs.S1, Inputs(0)])
+@table("closed", [Inputs.RST | Inputs.S1, Inputs(0)])
 def test_other_terminals_do_not_block_a_reset(closed: Inputs) -> None:
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, "inputs": closed})
     wire.drive.reset_fault()
     assert wire.sent == [frame(YD1000(1), YD1000.control, YD1000Control(0xE000)), STOP]
 
 
-def test_limit_from_outside_the_notes_names_its_source() -> None:
-    """The notes limit UL to 0.5 .. FH, but FH only to 30.0 .. 320.0; so UL as FH's limit is inferred."""
+def test_a_limit_that_the_notes_do_not_state_names_its_source() -> None:
+    """The notes limit UL to FH, but not FH to UL. The library infers that FH must not be below UL."""
     wire = Wire(YD1000(1), {**STANDING, "upper_limit_frequency": 60.0})
     with pytest.raises(
         WriteForbidden, match=r"50\.00 Hz is below upper_limit_frequency, which is 60 Hz"
@@ -524,7 +524,7 @@ def test_release_control_is_refused_unless_the_motor_is_at_rest() -> None:
 def test_release_control_is_refused_while_a_terminal_says_run(says: dict[str, object], terminal: str) -> None:
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, **says})
     with pytest.raises(
-        WriteForbidden, match=f"^{terminal}.* says run, .* once the line no longer commands it"
+        WriteForbidden, match=f"^{terminal}.* is set to run, .* once the line no longer commands it"
     ):
         wire.drive.release_control()
     assert wire.sent == []
@@ -540,7 +540,7 @@ def test_motor_that_turns_after_release_control_is_stopped_again() -> None:
     assert wire.sent == [RELEASE, STOP]
 
 
-@pytest.mark.parametrize("is_sent", [True, False])
+@table("is_sent", [True, False])
 def test_stop_is_written_again_if_release_control_is_unconfirmed(is_sent: bool) -> None:
     lost = Unconfirmed("drive", "control", "no reply") if is_sent else Expired("drive", "control", 1.0)
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS}, loses={RELEASE: [lost]})
@@ -557,7 +557,7 @@ def test_panel_can_run_the_motor_after_release_control(monkeypatch: pytest.Monke
     _, drive, sim = one(monkeypatch, YD1000(1))
     assert isinstance(sim, SimulatedYD1000)
     drive.write(drive.panel_frequency, 20.0)
-    drive.stop()  # the stop takes control from the panel
+    drive.stop()  # the stop takes control away from the panel
     sim.panel_runs = True
     assert not sim.motor.energised
     with pytest.raises(NotVerified, match="started the motor"):
@@ -628,7 +628,7 @@ def test_trip_is_detected_by_the_frozen_registers() -> None:
 
 
 def test_start_after_emergency_stop_advises_reset_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also with a new drive object, as every command-line call creates."""
+    """This holds for a new drive object too, such as each call of the command line creates."""
     line, drive, sim = one(monkeypatch, YD1000(1))
     drive.set_frequency(30)
     drive.start()
@@ -646,10 +646,8 @@ def test_start_after_emergency_stop_advises_reset_fault(monkeypatch: pytest.Monk
     assert sim.motor.energised
 
 
-def test_start_after_an_emergency_stop_at_rest_advises_reset_fault(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Then no register is frozen; only an object that had read the fault record could see a new entry."""
+def test_start_after_an_emergency_stop_at_rest_advises_reset_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No register is frozen then. Only an object that had read the fault record could see a new entry."""
     _, drive, _ = one(monkeypatch, YD1000(1))
     drive.emergency_stop()
     drive.set_frequency(30)
@@ -666,11 +664,11 @@ def test_watchdog_write_is_refused_while_the_motor_turns(monkeypatch: pytest.Mon
             drive.write(drive.communication_timeout, wrong)
     drive.set_frequency(30)
     drive.start()
-    with pytest.raises(WriteForbidden, match="only while the motor stands"):
+    with pytest.raises(WriteForbidden, match="only at standstill"):
         drive.write(drive.communication_timeout, 2)
 
 
-@pytest.mark.parametrize("speed", range(1, 8))
+@table("speed", range(1, 8))
 def test_simulated_drive_runs_at_the_preset_speed(monkeypatch: pytest.MonkeyPatch, speed: int) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1, preset_speed=speed))
     sim[f"preset_speed_{speed}"] = 12.5

@@ -40,24 +40,24 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     """Delixi 9200 (RTU firmware) and 9100-SC; RS-485 communication protocol, part 2, standard Modbus.
 
     P04.29 selects RTU or ASCII on a 9200; a 9100-SC has ASCII only. For other models use `delixi-native`.
-    Where the document errs or is silent, the safest reading is taken:
+    Where the document errs or is silent, the safest interpretation applies:
 
     - The address of the setpoint in RAM is printed "xxH". The only known setpoint is 0002H (P00.02), which
       wears the EEPROM. It is written on change only, so do not ramp with it.
     - Whether a run command without a direction keeps the previous direction is not stated, so every run
       command has a direction. `start` without a direction goes forward from rest. It is refused while the
       motor turns, because the direction cannot be read. The word that toggles the direction is never sent.
-    - Whether a start ends a jog, and a jog a run, is not stated: after a jog a stop is required before a
-      start, and a turning motor must be stopped before a jog.
+    - It is not stated whether a start ends a jog, or whether a jog ends a run. So after a jog a stop is
+      required before a start, and a turning motor must be stopped before a jog.
     - No fault reset is documented, and reserved bits are not tried.
     - No state word is documented: an output frequency of 0 may mean a stop, or a run at a setpoint of 0.
     - "3800" bit/s is a misprint of 4800. The fault "0C-xx" is OC-2, and 04 is OU.
-    - How many registers one request may read is not stated, so one is read. Exception codes are not stated
-      either, so any exception counts as a refusal.
-    - Timing is taken from part 3.
+    - How many registers one request may read is not stated, so each request reads one. Exception codes are
+      not stated either, so any exception counts as a refusal.
+    - Timing is taken from part 3 of the document.
 
-    With P00.00 = 2 the drive takes commands from the line, with P00.01 = 1 the setpoint from P00.02. Only
-    functions 03 and 06 are used. Only run commands may be broadcast.
+    With P00.00 = 2 the drive takes commands from the line; with P00.01 = 1 it takes the setpoint from P00.02.
+    Only functions 03 and 06 are used. Only run commands may be broadcast.
     """
 
     model = "delixi-modbus"
@@ -95,7 +95,10 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     _jogged = False  # True if this object has sent a jog since it last saw the motor at rest
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
-        """Return the ranges of P04.30 (address), P04.28 (baud rate) and a bus voltage that is no address."""
+        """Return the known counts of P04.30 (address) and P04.28 (baud rate), and those of the bus voltage.
+
+        Only a bus voltage of 32 or more counts as known: addresses end at 31, so the ranges do not overlap.
+        """
         known = {self.address_setting: (self.address, self.address), self.dc_bus_voltage: (32, 0xFFFF)}
         code = DelixiBaudrate.__members__.get(f"B{self.settings.baudrate}", self.address)
         return known if code == self.address else known | {self.baudrate_setting: (code, code)}
@@ -107,15 +110,15 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         fault = yield from read(self.fault)
         if not isinstance(fault, type(self.fault.decode(0))):
             raise WriteForbidden(
-                f"{self.name} has {int(fault):04X}H as its present fault (P05.31), which no list explains: "
-                "it may be another make; look at its name plate"
+                f"{self.name} has {int(fault):04X}H as its present fault (P05.31), a code that the manual "
+                f"does not list: it may be another make; look at its name plate"
             )
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start at the setpoint in force. Without a direction: forward, and only from rest."""
         if self._jogged and not (yield from self._stands()):
-            raise self._stop_first("may still jog, which a start may not end:")
+            raise self._stop_first("may still jog, and a start may not end the jog:")
         forward = yield from self._forward(direction)
         if (yield from read(self.frequency_source)) != 1:
             raise WriteForbidden(f"{self.name} takes no setpoint from P00.02: set P00.01 to 1 on the keypad")
@@ -131,7 +134,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         """Turn slowly from rest until stopped; without a direction, forward."""
         forward = yield from self._forward(direction)
         if not (yield from self._stands()):
-            raise self._stop_first("turns, and may go on through a jog:")
+            raise self._stop_first("turns, and may continue to turn during a jog:")
         self._jogged = True
         yield from write(
             self.control, DelixiModbusControl.JOG_FORWARD if forward else DelixiModbusControl.JOG_REVERSE
@@ -141,7 +144,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     def _forward(self, direction: Direction | None) -> Script[bool]:
         yield from self._may_start()
         if direction is None and not (yield from self._stands()):
-            raise WriteForbidden(f"{self.name} turns, and cannot say which way: name the direction")
+            raise WriteForbidden(f"{self.name} turns, and cannot report which way: give the direction")
         return direction is not Direction.REVERSE
 
     @verb
@@ -157,7 +160,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
 
     @verb
     def state(self) -> Script[State]:
-        """Return the fault by name, or that the motor turns; at 0 Hz the state is unknown."""
+        """Return a fault by its name, or `running` above 0 Hz; at 0 Hz the state is unknown."""
         fault = yield from read(self.fault)
         if fault:
             return State(Condition.FAULT, fault=self.fault.in_words(fault))

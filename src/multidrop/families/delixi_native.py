@@ -50,18 +50,18 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
     subclass, such as `setting(parameter(0, 17), "s", table=PARAMETER_RAM)`. The table determines the memory:
     06 writes to EEPROM, and 02, 04 and 05 do not.
 
-    Where the document errs or is silent, the safest reading is taken:
+    Where the document errs or is silent, the safest interpretation applies:
 
     - The replies 0002 and 0003 to K = 03 are printed as "forward (stopped)" and "reverse (stopped)". They
       count as running, and are never reported as stopped.
-    - The faults 10 to 14 are printed as if in hex: both 0AH-0EH and 10H-14H are accepted for them. Any other
-      code except 0 is a fault too.
+    - The faults 10 to 14 are printed as if in hex, so 0AH-0EH and 10H-14H are both decoded as these faults.
+      Any other code except 0 is a fault too.
     - "K = FOH" is F0H, "3800" bit/s is 4800, and "<80m" is 80 ms.
-    - What P00.01 must be for K = 04 to be used is not stated.
+    - Which value of P00.01 makes the drive use the setpoint of K = 04 is not stated.
     - K = 03 may report a fault or undervoltage while P05.31 is 0. What a run command does then is not stated
       (it may wait for the mains), so `start` is refused, as in any unexplained state.
     - The checksum does not detect swapped bytes, so a reply is compared with its request field by field.
-    - A drive rejects K = F0 to FF from another master, so none is sent.
+    - K = F0 to FF occur only in a drive's replies, so they are never sent.
 
     Less than 10 ms may pass between two characters. Only run commands (K = 02) may be broadcast.
     """
@@ -106,7 +106,7 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
 
     @property
     def echo_probe(self) -> Register[Any]:
-        """The run state, which is never 0, so that its reply differs from an echo (part 3, section 5)."""
+        """The run state. It is never 0, so its reply differs from an echo (document, part 3, section 5)."""
         return self.status
 
     @verb
@@ -116,13 +116,19 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start at the setpoint in force. Without a direction: as the motor turns, or forward from rest."""
+        """Start at the setpoint in force.
+
+        Without a direction, a turning motor keeps its direction, and a resting motor turns forward.
+        """
         yield from self._may_start()
         status = yield from read(self.status)
         if status in (DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE):
             raise self._reset_first(status.name)
         if status not in CONDITIONS:
-            raise WriteForbidden(f"{self.name} says {int(status):04X}H to K = 03, which is not explained")
+            raise WriteForbidden(
+                f"{self.name} says {int(status):04X}H in reply to K = 03, a state that the manual does not "
+                f"explain"
+            )
         yield from self._setpoint_in_force()
         if direction is None and status == DelixiNativeStatus.REVERSE:
             direction = Direction.REVERSE
@@ -158,7 +164,7 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
-        """Write the setpoint in RAM, which cannot be read back."""
+        """Write the setpoint to RAM; it cannot be read back."""
         yield from self._hold(self.frequency, hz)
 
     @verb

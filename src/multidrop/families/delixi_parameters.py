@@ -64,7 +64,7 @@ class DelixiBaudrate(IntEnum):
 
 
 class DelixiParameters(Drive):
-    """The parameters of Delixi's inverters; a subclass for a protocol passes the table that holds them.
+    """The parameters of Delixi's inverters; each protocol's subclass passes the table that holds them.
 
     P04.29, the format, has different codes in each protocol, so subclasses declare it.
 
@@ -159,7 +159,8 @@ class DelixiParameters(Drive):
         named = f", {held.name[1:]} bit/s" if isinstance(held, DelixiBaudrate) else ""
         raise WriteForbidden(
             f"{self.name} has {int(held)} as P04.28{named}, and is declared with {declared} bit/s: declare "
-            "its baud rate, behind a converter too; if its keypad shows another P04.28, it is another make"
+            f"the drive's own baud rate, even behind a converter; if its keypad shows another P04.28, it is "
+            f"another make"
         )
 
     def _may_start(self) -> Script[None]:
@@ -167,10 +168,10 @@ class DelixiParameters(Drive):
         fault = yield from read(self.fault)
         if fault:
             raise WriteForbidden(
-                f"{self.name} has a fault, {self.fault.in_words(fault)}: see to it and reset it first"
+                f"{self.name} has a fault, {self.fault.in_words(fault)}: remove its cause and reset it first"
             )
         if (yield from read(self.run_source)) != DelixiRunSource.LINE:
-            raise WriteForbidden(f"{self.name} is not commanded by the line: {self.remote}")
+            raise WriteForbidden(f"{self.name} does not take its commands from the line: {self.remote}")
 
     def _limit(self) -> float:
         return self.option.get("stop_time", STOP_TIME)

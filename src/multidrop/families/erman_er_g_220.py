@@ -24,8 +24,8 @@ from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import verb
 
-STOP_MARGIN = 5.0  # s, on top of the deceleration time
-UNKNOWN_RAMP = 30.0  # s for a stop if the deceleration time is unreadable; no document states a maximum
+STOP_MARGIN = 5.0  # s; a stop may take this much longer than the deceleration time
+UNKNOWN_RAMP = 30.0  # s; allowed time of a stop if the deceleration time cannot be read
 
 
 class Coil(IntEnum):
@@ -100,10 +100,10 @@ def _control(number: int, what: Any, /, **details: Unpack[Details]) -> Register[
 class ErmanERG220(Drive):
     """ERMAN ER-G-220-01(02); MODBUS communication protocol, document 1.4 of 30.03.2021.
 
-    Where the document errs or is silent, the safest reading is taken:
+    Where the document errs or is silent, the safest interpretation applies:
 
-    - The example of function 04 has the checksum of function 03's, and its reply a byte count of
-      10H for 5 registers: a reply must have the byte count of the request.
+    - The example of function 04 has the checksum of function 03's example. Its reply has a byte count of 10H
+      for 5 registers: the library requires the byte count that fits the request.
     - The example of function 06 writes the setpoint to 0001H. That is a misprint, the setpoint is
       0002H; 0001H is never written.
     - The example of function 0F resets a fault and starts in one frame, and sets a reserved coil.
@@ -111,17 +111,18 @@ class ErmanERG220(Drive):
     - The byte order of a reply to function 01 is doubtful, so coils are read only within one byte. They show
       the last command, and are polled only if a plant names them. Whether the motor runs is read from 0400H,
       whose bits 0 and 1 are one number and not two flags.
-    - Of diagnostics (function 08) only the example of subfunction 0 is described, and its error reply
-      has the code 89H instead of 88H. `drive.send_raw(0x08, 0x0000, b"\\xa5\\x37")` sends it. The reply is
-      a copy of the request, like an adapter's echo, so it does not prove that a drive is there.
+    - Diagnostics (function 08) are described by one example, of subfunction 0, and its error reply
+      has the code 89H instead of 88H. `drive.send_raw(0x08, 0x0000, b"\\xa5\\x37")` sends this example. The
+      reply is a copy of the request, like an adapter's echo, so it does not prove that a drive is there.
     - The order of the two words at 0400H and 0402H is not stated, but one word is always 0.
-    - 0402H is the last fault. The document does not say whether a reset clears it, or whether it is still
-      active. `start` is refused until that fault has been reset with this object's `reset_fault`, or
-      acknowledged with the option `acknowledged_fault`.
+    - 0402H is the last fault. The document does not say whether a reset clears this register, or whether
+      the fault is still active. `start` is refused until the fault was reset with this object's
+      `reset_fault`, or acknowledged with the option `acknowledged_fault`.
     - Whether START and STOP are levels or pulses is not stated. `stop` sets STOP and clears START. It also
       sets EMERGENCY STOP if the motor still runs after the deceleration time, or after 30 s if that time is
       unreadable. Both stop coils stay set until `start` clears them, because clearing them earlier could let
-      a latched START take effect. START is cleared even if STOP is not confirmed: either write may arrive.
+      a latched START take effect. START is cleared even if STOP is not
+      confirmed, because the drive may receive one of the two writes although the other is lost.
     - Exception 03 is used for any wrong address, and 04 is described as "on write": neither means a device
       failure.
     - The models -03 and -04 of this make have a different register map: see `identify`.
@@ -210,14 +211,14 @@ class ErmanERG220(Drive):
     deceleration_time = _control(0x000D, "s", step=0.1, place="b.004")
     braking_threshold = _control(0x0015, "V", place="E.06", note="Of dynamic braking.")
 
-    # The command coils as read back: they show the last command (sections 6 and 10). Reads do not span gaps,
-    # so that all coils of a read lie in one byte.
+    # The command coils as read back: they show the last command (sections 6 and 10). One read
+    # includes only the wanted coils, so that all coils in its reply lie in one byte.
     start_held = _held(0x0000, Coil)
     stop_held = _held(0x0001, Coil)
     emergency_stop_held = _held(0x0002, Coil)
     fault_reset_held = _held(0x0009, Coil)
 
-    _reset_fault = ErmanFault(0)  # the last fault when this object reset it
+    _reset_fault = ErmanFault(0)  # the last fault at the time when this object reset it
 
     @classmethod
     def readings(cls) -> tuple[Register[Any], ...]:
@@ -250,7 +251,7 @@ class ErmanERG220(Drive):
             )
             shown = self.last_fault.in_words(fault)
             raise WriteForbidden(
-                f"{self.name} may have a fault, {shown}: see to it, then {way.program}", advice=way
+                f"{self.name} may have a fault, {shown}: remove its cause, then {way.program}", advice=way
             )
         yield from self._setpoint_in_force()
         yield from write(self.stop_coil, Coil.OFF)
@@ -260,7 +261,7 @@ class ErmanERG220(Drive):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop along the ramp; if refused, or if the motor still runs afterwards, use the emergency stop."""
+        """Stop along the ramp; if that is refused, or the motor then still runs, use the emergency stop."""
         try:
             yield from self._hold_back(self.stop_coil)
         except DriveException:
@@ -289,7 +290,7 @@ class ErmanERG220(Drive):
         yield from insist(self.start_coil, Coil.OFF)
 
     def _longest_ramp(self) -> Script[float]:
-        """Return the seconds after which a motor that still runs counts as not stopping."""
+        """Return for how many seconds after a stop the motor may still run."""
         try:
             return (yield from read(self.deceleration_time)) + STOP_MARGIN
         except BusError:  # a drive that does not answer this read may not obey a stop either
@@ -321,7 +322,7 @@ class ErmanERG220(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Return the phase of the ramp; the last fault becomes a note, because it may be over."""
+        """Return the phase of the ramp as the state, and the last fault as a note, because it may be over."""
         status = yield from read(self.status)
         fault = yield from read(self.last_fault)
         notes = ["motor overloaded"] if status & OVERLOAD else []

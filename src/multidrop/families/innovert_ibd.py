@@ -12,9 +12,9 @@ from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import verb
 
-STOP_MARGIN = 5.0  # s, on top of the deceleration time
+STOP_MARGIN = 5.0  # s; a stop may take this much longer than the deceleration time
 
-SEEN_AS_1, NEVER_ELSE = 0x1800, 0xD800  # masks of PrA.22: bits 11 and 12; bits 11, 12, 14 and 15
+UNNAMED, UNNAMED_AS_1 = 0xD800, 0x1800  # the unnamed bits of PrA.22, and those that are 1 in the example
 
 INFERRED = "the address is inferred: the table of letters is lost"
 OTHER_MAKE = "code: Delta VFD-B and DEMA D5M manuals; the document itself has 1 = 9600 bit/s"
@@ -30,7 +30,7 @@ def parameter(name: str) -> int:
 
 
 class IBDControl(IntEnum):
-    """The control words that this library sends: at most one direction bit, never the toggle."""
+    """The control words that this library sends: at most one direction bit, and never the reversing bit."""
 
     NOTHING = 0x00
     STOP = 0x01
@@ -95,29 +95,29 @@ class IBDFormat(IntEnum):
 class InnovertIBD(Drive):
     """INNOVERT IBD series; operating manual, appendix 2, pp. 128-134.
 
-    Where the document errs or is silent, the safest reading is taken:
+    Where the document errs or is silent, the safest interpretation applies:
 
-    - The meaning of Prb.01 is contradictory (5 is the line in the text, the potentiometer in an
-      example): it is never written. Set it to 5, and Prb.02 to 2, on the keypad.
+    - The meaning of Prb.01 is contradictory (by the text, 5 selects the line; in an example,
+      5 selects the potentiometer): it is never written. Set it to 5, and Prb.02 to 2, on the keypad.
     - The two direction bits are ambiguous: they are printed in the opposite order to all other bits. A
       direction is refused, unless the option `forward_bit` says which bit was seen on site to turn the motor
       forward. Without a direction both bits are 0, and `start` turns the motor in the last direction. The
       word that toggles the direction is never sent.
-    - A jog ends with a stop and a new start (table 3). No register shows whether a turning motor jogs:
-      `start` and `jog` are refused while it turns, and need a stop first.
+    - A jog ends only with a stop, after which a start is possible (table 3). No register shows whether a
+      turning motor jogs: `start` and `jog` are refused while it turns, and need a stop first.
     - A reset has "no action" in bits 1 and 0, so a run from before the fault may stay in force. A reset is
       sent only after a confirmed stop.
-    - A family file that extends this one may declare `run_state` (0 at rest), `output_frequency` and `fault`,
-      as siblings have them. `state`, `stop` and `start` then read these, and not the outputs.
+    - A sibling, a family file that extends this family, may declare `run_state` (0 at rest),
+      `output_frequency` and `fault`. `state`, `stop` and `start` then read these, and not the outputs.
     - No state word is documented. `state` and `stop` use the outputs if these are programmed as in the
       example (Prd.23 = 1, Prd.24 = 7, Prd.25 = 8, Prd.28 = 3). Otherwise the state is unknown, and `stop`
       uses current and speed.
     - 2000H and 2001H are marked "write": they are not read.
     - A value above a parameter's maximum is silently stored as the maximum: settings are read back.
-      The setpoint's range, 0 to 400 Hz, ignores the drive's maximum frequency: declare it
-      as the option `maximum_frequency`.
-    - The table of letters is lost. The digits of A and b are known from examples. Those of C to H are
-      inferred: these parameters are read, but never written.
+      The setpoint's range, 0 to 400 Hz, ignores the drive's maximum frequency: declare that
+      frequency as the option `maximum_frequency`.
+    - The manual's table of the letters' digits is missing. The digits of A and b are known from examples.
+      Those of C to H are inferred: these parameters are read, but never written.
     - No register identifies an IBD: see `identify`, and the option `confirmed`.
     - The "ordinal of the register" in a reply is the byte count. At most 4 registers are read.
 
@@ -135,7 +135,7 @@ class InnovertIBD(Drive):
     line_terminals = "RS+ and RS-"
     addresses = range(1, 241)
     answers_every_read = True
-    silence = 10e-3  # s before and after an RTU frame (table "message in RTU mode")
+    silence = 10e-3  # s of silence before and after an RTU frame (table "message in RTU mode")
     most_registers = {HOLDING: 4}
     exceptions = {}
     broadcasts = True
@@ -223,8 +223,8 @@ class InnovertIBD(Drive):
     def identify(self) -> Script[None]:
         """Check that PrH.00 and PrH.02 hold the drive's baud rate and address; their addresses are inferred.
 
-        A drive with other values there may still be an IBD: its owner then declares confirmed = 1 in the
-        plant file. A sibling with a state of its own may show that instead.
+        A drive with other values in these parameters may still be an IBD: its owner then declares confirmed =
+        1 in the plant file. A sibling with a valid run state that takes commands from the line passes too.
         """
         if self.identity_is_weak or (yield from self._shows_its_line()):
             return
@@ -237,7 +237,7 @@ class InnovertIBD(Drive):
 
     @property
     def identity_is_weak(self) -> bool:
-        """True if the owner has confirmed the family, because no register shows it."""
+        """True if only the owner's confirmation shows that the drive is an IBD, because no register does."""
         return bool(self.option.get("confirmed")) and not self.declared_in
 
     def _shows_its_state(self) -> Script[bool]:
@@ -262,19 +262,19 @@ class InnovertIBD(Drive):
         return baudrate == IBDBaudrate[f"B{self.settings.baudrate}"] and address == self.address
 
     def resembles(self) -> Script[bool]:
-        """Return True if bits 11 to 15 of PrA.22 are as in the example, and the named registers exist."""
+        """Return True if the unnamed bits of PrA.22 are as in the example, and four other registers exist."""
         try:
             yield from read(self.output_current)
             yield from read(self.motor_speed)
             yield from read(self.acceleration_time)
             yield from read(self.run_source)
-            return (yield from read(self.terminals)) & NEVER_ELSE == SEEN_AS_1
+            return (yield from read(self.terminals)) & UNNAMED == UNNAMED_AS_1
         except BusError:
             return False
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start from rest in the last direction; another needs the option `forward_bit`."""
+        """Start from rest in the last direction; another direction needs the option `forward_bit`."""
         yield from self._command(IBDControl.RUN, direction)
 
     @verb
@@ -293,7 +293,7 @@ class InnovertIBD(Drive):
         if word is IBDControl.RUN:
             yield from self._setpoint_in_force()
         if (yield from self._runs()):
-            raise self._stop_first("turns, and a jog would go on through this:")
+            raise self._stop_first("turns, and would continue to turn during a jog:")
         yield from write(self.control, sent)
         yield from self._started(direction)
 
@@ -312,14 +312,14 @@ class InnovertIBD(Drive):
         if (yield from read(self.frequency_source)) != FrequencySource.LINE or (
             yield from read(self.run_source)
         ) != IBDRunSource.LINE:
-            raise WriteForbidden(f"{self.name} is not commanded by the line: {self.remote}")
+            raise WriteForbidden(f"{self.name} does not take its commands from the line: {self.remote}")
 
     def _runs(self) -> Script[bool]:
         return (yield from super()._runs()) or not (yield from self._stands())
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop along the ramp, until the programmed outputs say so, or else current and speed are 0."""
+        """Stop along the ramp; wait until the outputs, or else current and speed, show that it stopped."""
         yield from insist(self.control, IBDControl.STOP)
         limit = (yield from read(self.deceleration_time)) + STOP_MARGIN
         look = self._stands
@@ -332,7 +332,7 @@ class InnovertIBD(Drive):
 
     @property
     def _has_state(self) -> bool:
-        """True for a sibling with registers for run state, output frequency and fault."""
+        """True if this is a sibling whose file declares run state, output frequency and fault."""
         return {"run_state", "output_frequency", "fault"} <= self.registers.keys()
 
     def _code(self) -> Script[int]:

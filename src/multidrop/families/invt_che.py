@@ -1,4 +1,4 @@
-"""INVT CHE: its registers and verbs, and how to declare function codes of one's own model."""
+"""INVT CHE: its registers and verbs, and functions that declare the parameters of one's own model."""
 
 from __future__ import annotations
 
@@ -65,7 +65,8 @@ class Device(IntEnum):
 
 
 OTHER_SERIES = {0x010A: "Goodrive300L", 0x010C: "Goodrive200L"}  # values of 3016H in their manuals
-CHF = 0x02  # the high byte of 3016H in the CHF series (CHE100 manual v1.4, p. 119), with the same words
+# high byte of 3016H in the CHF series, which has the same control words (CHE100 manual v1.4, p. 119)
+CHF = 0x02
 
 
 class CHEFault(Worded):
@@ -144,27 +145,28 @@ def _in_section_11_6_4(ordinal: int, details: Details) -> None:
 class InvtCHE(Drive):
     """INVT CHE series; manual, chapter 11 "communication protocol".
 
-    The chapter's register table is lost. All registers here, the meaning of exceptions and the PC
-    group are from outside it: the CHE100 manual v1.4; scales, if given, from the Goodrive300L
-    manual; names of faults from the CHE100's relatives, for display only.
+    The chapter's register table is lost. All registers here, the meaning of exceptions and the PC group are
+    from the CHE100 manual v1.4. Scales, if given, are from the Goodrive300L manual. The names of faults are
+    those of the CHE100's relatives, for display only.
 
-    The safest readings taken:
+    Where the sources err or are silent, the safest interpretation applies:
 
-    - A function code's address is its ordinal number, but the two examples contradict each other
-      (P5.05 is 003AH by counting, P0.07 is said to be 000CH): no ordinal is computed. A model's own
-      codes are declared in a subclass, with `parameter` or `stored_parameter`.
+    - The address of a function code, as INVT calls a parameter, is its ordinal number. The two examples
+      contradict each other (P5.05 is 003AH by counting, P0.07 is said to be 000CH), so no ordinal is
+      computed. A model's own codes are declared in a subclass, with `parameter` or `stored_parameter`.
     - Addresses with bit 15 set write to RAM only and cannot be read.
     - 2000H is a percentage of the maximum frequency (P0.04), so `set_frequency` needs that as the
-      option `maximum_frequency`. It may be negative, which likely reverses: 0 to 100 % is written.
+      option `maximum_frequency`. A negative percentage probably reverses the motor, so only 0 to 100 % is
+      written.
     - Newer INVT families have the control word at 2000H: see `identify`.
     - Two scales are not stated, because sources differ: GD200L and GD300L print the DC bus voltage (3002H)
       with and without a decimal; the output power (3006H) is 0.1 % in the Goodrive300L manual, and 0.01 kW
-      on a CHF100A, as its owner compared it with the keypad.
+      on a CHF100A, whose owner compared the register with the keypad.
     - The example that writes 5000 to 0008H does not say what that register is: do not repeat it.
-    - STOP may not end a jog: if the motor still turns after it, or its state is unknown, STOP_JOG follows at
-      once. A start may not end a jog either: after a jog a stop is required before a start. Whether a jog
-      ends a run is not stated: `jog` is refused while the motor turns.
-    - A state word other than 1 to 4 is not explained: `start` and `jog` are refused then.
+    - STOP may not end a jog: if the motor still turns after STOP, or the motor's state is unknown, STOP_JOG
+      follows at once. A start may not end a jog either: after a jog a stop is required before a start.
+      Whether a jog ends a run is not stated: `jog` is refused while the motor turns.
+    - State words other than 1 to 4 are not explained: while one is shown, `start` and `jog` are refused.
     - Exception 03 is a malformed frame; a value out of range is 12H.
 
     The drive may also speak ASCII (CHE100 manual); the chapter has RTU only. P0.01 = 2 takes
@@ -178,7 +180,7 @@ class InvtCHE(Drive):
     formats = dict.fromkeys(Drive.framings, ("8N1", "8E1", "8O1", "8N2", "8E2", "8O2"))  # PC.02
     baudrates = (9600, 1200, 2400, 4800, 19200, 38400)  # PC.01
     addresses = range(1, 248)
-    response_timeout = 0.4  # s; PC.03 delays the reply by up to 200 ms, by 5 ms from the factory
+    response_timeout = 0.4  # s; PC.03 is the delay of a reply: 5 ms by default, at most 200 ms
     answers_every_read = True
     most_registers = {HOLDING: 16}
     readable_gaps = {HOLDING: range(0x3000, 0x3017)}  # reserved registers are documented as readable
@@ -278,7 +280,7 @@ class InvtCHE(Drive):
 
     @verb
     def identify(self) -> Script[None]:
-        """Check that 3016H is 0101H or 0102H; a stop is withheld only if it shows another INVT series."""
+        """Check that 3016H is 0101H or 0102H; a stop is withheld only if 3016H shows another INVT series."""
         device = yield from read(self.device)
         if isinstance(device, Device):
             return
@@ -287,15 +289,18 @@ class InvtCHE(Drive):
         if int(device) >> 8 == CHF:
             known = ", a CHF100A: declare model invt-chf100a"
         raise WriteForbidden(
-            f"{self.name} says that it is device {int(device):04X}H{known}; a CHE is 0101H or 0102H",
+            f"{self.name} reports device code {int(device):04X}H{known}; a CHE reports 0101H or 0102H",
             rule=ANOTHER_FAMILY if series else "",
         )
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start at the setpoint in force. Without a direction: as the motor turns, or forward from rest."""
+        """Start at the setpoint in force.
+
+        Without a direction, a turning motor keeps its direction, and a resting motor turns forward.
+        """
         if self._jogged and not (yield from self._stands()):
-            raise self._stop_first("may still jog, which a start may not end:")
+            raise self._stop_first("may still jog, and a start may not end the jog:")
         forward = yield from self._forward(direction)
         yield from self._setpoint_in_force()
         self._jogged = False
@@ -307,7 +312,7 @@ class InvtCHE(Drive):
         """Turn slowly from rest until stopped; without a direction, forward."""
         forward = yield from self._forward(direction)
         if not (yield from self._stands()):
-            raise self._stop_first("turns, and may go on through a jog:")
+            raise self._stop_first("turns, and may continue to turn during a jog:")
         self._jogged = True
         yield from write(self.control, CHEControl.JOG_FORWARD if forward else CHEControl.JOG_REVERSE)
         yield from self._started(direction)
@@ -318,21 +323,23 @@ class InvtCHE(Drive):
             fault = self.fault.in_words((yield from read(self.fault)))
             raise self._reset_first(fault)
         if status not in STATES:
-            raise WriteForbidden(f"{self.name} has {int(status):04X}H at 1001H, which is not explained")
+            raise WriteForbidden(
+                f"{self.name} has {int(status):04X}H at 1001H, a state that the manual does not explain"
+            )
         if direction is None:
             return status != CHEStatus.REVERSE
         return direction is Direction.FORWARD
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop along the ramp; if the motor still turns, also send STOP_JOG, because a jog is not shown."""
+        """Stop along the ramp; if the motor still turns, also send STOP_JOG: no register shows a jog."""
         refusals: list[DriveException] = []
         try:
             if (yield from self._stands_by(CHEControl.STOP, refusals)):
                 return
         except WriteForbidden:  # the drive is of another family
             raise
-        except BusError:  # a drive that does not reply may still receive, and jog
+        except BusError:  # a drive that does not reply may be jogging, and may still receive
             with suppress(BusError):
                 yield from insist(self.control, CHEControl.STOP_JOG, attempts=1)
             raise
@@ -346,7 +353,7 @@ class InvtCHE(Drive):
         """Write a stop word; return True if the motor is then at rest. A refusal is added to `refusals`."""
         try:
             yield from insist(self.control, word)
-        except DriveException as refusal:  # some drives refuse it in a fault, or without a jog
+        except DriveException as refusal:  # some drives refuse this word in a fault, or without a jog
             refusals.append(refusal)
         return (yield from self._stands())
 

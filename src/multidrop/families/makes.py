@@ -1,9 +1,9 @@
 """Makes (brands) of drives that their registers identify, and the control words that run their motors.
 
 Two families may have their control words at the same address with different meanings, so that one family's
-stop runs another make's motor. A stop is withheld only if the drive's registers show that it is such another
-make. The table lists these registers for each make. A drive of the declared family refuses to read these
-registers, or holds other values there.
+stop runs another make's motor. A stop is withheld only if the drive's registers show that it is of such a
+make. The table lists these registers for each make. A drive of the declared family answers a read of these
+registers with an exception, or with other values.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from multidrop.families.innovert_ibd import IBDBaudrate
 
 
 class Evidence(Drive):
-    """The registers by which makes are recognised, each at the address of its manual."""
+    """The registers by which makes are recognised, each at the address that its make's manual states."""
 
     goodrive_state = reading(0x2100, place="Goodrive200A manual p. 140")
     goodrive_device = reading(0x2103, place="Goodrive200A manual p. 140 to 142")
@@ -47,9 +47,9 @@ class Make:
     model: str
     title: str
     control: int  # address of the make's control word, a holding register
-    runs: Callable[[float], bool]  # returns True for a control word that runs the motor
+    runs: Callable[[float], bool]  # function that returns True for a control word that runs the motor
     evidence: tuple[tuple[Register[Any], Test], ...]
-    may_be_silent: bool = False  # True if such a drive may not reply to reads of registers that it lacks
+    may_be_silent: bool = False  # True if such a drive may leave reads of missing registers unanswered
     copies: tuple[str, ...] = ()  # models that these registers do not distinguish from this make
 
     def shows(self, drive: Drive) -> Script[bool]:
@@ -155,8 +155,8 @@ def run_by(register: Register[Any], count: float) -> list[Make]:
 def easily_mistaken_for(drive: Drive) -> list[Make]:
     """Return the makes to exclude before writing to a drive whose identity is weak.
 
-    These are the makes whose motors one of the drive's harmless control words would run, and those that their
-    registers do not distinguish from the drive's model.
+    These are the makes whose motors one of the drive's harmless control words would run. Makes whose
+    registers do not distinguish them from the drive's model are included too.
     """
     control = drive.registers.get("control")
     harmless = control.harmless or () if control is not None else ()

@@ -11,7 +11,6 @@ never imported from that directory.
 from __future__ import annotations
 
 import builtins
-import difflib
 import importlib.util
 import logging
 import sys
@@ -24,6 +23,7 @@ from typing import TYPE_CHECKING
 
 from multidrop.drive import Drive
 from multidrop.families import MODELS
+from multidrop.printable import did_you_mean
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -32,12 +32,12 @@ GROUP = "multidrop.families"  # entry point group of other packages; built-in na
 _SHIPPED = Path(__file__).parent / "shipped"
 SHIPPED = tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))  # names; each file is read on demand
 
-# Shipped families for which a scan may look, because more than the status identifies their drives.
+# Shipped families that a scan looks for: their drives are identified by more than a status register.
 RECOGNISABLE = ("delixi-e", "invt-chf100a", "invt-goodrive", "powtran-pi130", "yaskawa-a1000")
 
 
 def shipped_family(name: str) -> type[Drive]:
-    """Return the shipped family of this name; its `model` is this name instead of the file's."""
+    """Return the shipped family of this name, with this name as its `model`."""
     family = _family_of(_SHIPPED / f"{name}.toml")
     family.model = family.declared_in = name
     return family
@@ -55,15 +55,14 @@ def find_model(text: str, relative_to: Path | None = None) -> type[Drive]:
         return shipped_family(text)
     if text.endswith(".toml"):
         return _family_of((relative_to or Path()) / text)
-    if found := installed_family(text):
-        return found
     path, colon, name = text.rpartition(":")
     if not colon and text.endswith(".py"):
         path = text
     if not path.endswith(".py"):
+        if found := installed_family(text):  # not tried for paths, because it reads the list of all packages
+            return found
         known = (*MODELS, *SHIPPED, *installed_models())
-        near = difflib.get_close_matches(text.lower(), known, n=2)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(known)}"
+        hint = did_you_mean(text.lower(), known)
         raise ValueError(f"there is no model {text!r}; {hint} (or write path/to/file.toml or file.py:Class)")
     return _drive(_load((relative_to or Path()) / path), path, name if colon else "")
 
@@ -98,19 +97,20 @@ def installed_family(name: str) -> type[Drive] | None:
         )
     if found.model != name:
         raise ValueError(
-            f"model {name!r} of package {packages[0]} has model = {found.model!r}: name its entry point so"
+            f"model {name!r} of package {packages[0]} has model = {found.model!r}: give its entry point "
+            f"that name"
         )
     return found
 
 
 def _entry_points() -> Iterable[EntryPoint]:
-    from importlib.metadata import entry_points  # imported here: it takes 2 MB, and few plants need it
+    from importlib.metadata import entry_points  # imported here, because it takes 2 MB of memory
 
     return entry_points(group=GROUP)
 
 
 def is_users_own(family: type[Drive]) -> bool:
-    """Return True if the family is a user's and does not derive from one of this package."""
+    """Return True if the family is from a user's code and derives from no family of this package."""
     return family.model not in SHIPPED and not any(base in MODELS.values() for base in family.__mro__)
 
 
@@ -141,13 +141,13 @@ def _load(path: Path) -> ModuleType:
     try:
         is_there = path.is_file()
     except OSError as failure:
-        raise ValueError(f"no model can be taken from {path}: {failure.strerror}") from failure
+        raise ValueError(f"no model can be read from {path}: {failure.strerror}") from failure
     if not is_there:
         raise ValueError(f"there is no file {path} to take a model from")
     return load_model_file(path)
 
 
-_KEPT = {*sys.stdlib_module_names, "multidrop"}  # never imported from a model's folder
+_KEPT = {*sys.stdlib_module_names, "multidrop"}  # modules that are never imported from a model file's folder
 _running = RLock()  # held while a model file runs
 
 _log = logging.getLogger("multidrop.families.registry")
@@ -192,7 +192,7 @@ def _module(path: Path) -> ModuleType:
 
 
 def _import_beside(directory: Path) -> Callable[..., object]:
-    """Return a replacement for `__import__` that first finds the modules in this directory."""
+    """Return a replacement for `__import__` that searches this directory first."""
 
     def import_module(
         name: str,

@@ -16,10 +16,10 @@ from multidrop.drive.script import Pulse, Script, insist, read, until, wait, wri
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import verb
 
-STOP_MARGIN = 5.0  # s, on top of the deceleration time
+STOP_MARGIN = 5.0  # s; a stop may take this much longer than the deceleration time
 SELECTION_TIME = 1.0  # s within which 1202H shows a newly selected preset speed
 RELEASE_TIME = 2.0  # s within which a motor started by panel or terminals shows that it turns
-RESET_TIME = 3.0  # s for which the restarting drive may not reply
+RESET_TIME = 3.0  # s; the restarting drive may be silent for this long
 
 PANEL = "it is effective from the panel only"
 LINE = "it changes the drive's end of the line; set it on the panel"
@@ -33,8 +33,8 @@ AFTER_RESET = "Takes effect after a reset or at the next power-on."
 class YD1000Control(IntFlag):
     """The control word 1000H. Bits 15 and 14 latch until 0 is written to them or the power fails."""
 
-    COMMAND_VALID = 1 << 15  # this word commands the motor, instead of the source in CNOD
-    FREQUENCY_VALID = 1 << 14  # 1001H is the setpoint, instead of the source in FNOD
+    COMMAND_VALID = 1 << 15  # this word, and not CNOD's source, commands the motor
+    FREQUENCY_VALID = 1 << 14  # the setpoint is 1001H, and not FNOD's source
     RESET = 1 << 13
     EMERGENCY_STOP = 1 << 12
     COAST = 1 << 11
@@ -93,7 +93,7 @@ class Parity(IntEnum):
 
 
 def choice(number: int, place: str, most: int | None = None, /, **more: Unpack[Details]) -> Register[float]:
-    """Declare a parameter with values from 0 to `most`; None: of unknown range."""
+    """Declare a parameter with values from 0 to `most`; None means that the range is unknown."""
     if most is not None:
         more["span"] = (0, most)
     return setting(number, **_parameter(place, more))
@@ -107,7 +107,7 @@ def seconds(number: int, place: str, /, **more: Unpack[Details]) -> Register[flo
 
 
 def hertz(number: int, place: str, least: float = 0, /, **more: Unpack[Details]) -> Register[float]:
-    """Declare a frequency in Hz, at most the highest FH; the document does not state the unit."""
+    """Declare a frequency of up to 320 Hz, the limit of FH; the document does not state the unit."""
     more["step"], more["span"] = 0.01, (least, 320)
     more["outside"] = "unit: Toshiba IPE002Z manual, p. 35"
     return setting(number, "Hz", **_parameter(place, more))
@@ -121,17 +121,17 @@ def preset(number: int, place: str, /) -> Register[float]:
 def extended(name: str, unit: str = "", /, **details: Unpack[Details]) -> Register[float]:
     """Declare an extended parameter by its name in your manual: F800 is 0800H (section 6.2).
 
-    It is kept in EEPROM. This library knows only the numbers, so declare the parameter in a subclass:
+    The parameter is kept in EEPROM. Only the rule for its address is known, so declare it in a subclass:
 
         class MyYD1000(YD1000):
             start_frequency = extended("F240", "Hz", step=0.01)
     """
     if not re.fullmatch(r"F[0-9]{3}", name):
-        raise ValueError(f"{name!r} is no extended parameter, which is F and three digits, such as F170")
+        raise ValueError(f"{name!r} is not an extended parameter: write F and three digits, such as F170")
     address = int(name[1:], 16)
     for known in YD1000.registers.values():
         if known.address == address:
-            raise ValueError(f"{name} is declared by every YD1000, as {known.name}")
+            raise ValueError(f"{name} is already declared for every YD1000, as {known.name}")
     details["kept"] = Kept.EEPROM
     details.setdefault("place", f"6.2, {name}")
     return setting(address, unit, **details)
@@ -144,47 +144,48 @@ def _parameter(place: str, more: Details) -> Details:
 class YD1000(Drive):
     """YD1000; communication notes (MODBUS).
 
-    Where the document errs or is silent, the safest reading is taken:
+    Where the document errs or is silent, the safest interpretation applies:
 
-    - Register numbers are hex digits that are sent as they are: dEC, number 0010, is 0010H. The source of
-      this rule, and of the units of ACC, FH and similar, is not the document but Toshiba's relatives.
-      `identify` checks it: 0802H must be the drive's own address.
-    - The table heads have the checksum's high byte first. The low byte comes first, as everywhere.
-    - The text mentions other functions than 03 (one register) and 06, but the function table has only these.
+    - Register numbers are hex digits that are sent as they are: dEC, number 0010, is 0010H. This rule,
+      and the units of ACC, FH and similar, are those of Toshiba's related drives; the document does not state
+      them. `identify` checks the rule: 0802H must be the drive's own address.
+    - The tables of frames print the checksum's high byte first. As in all of Modbus, it is sent last.
+    - The text mentions more functions, but the function table has only 03 (one register) and 06.
     - 0000H in the control word does not stop: without bit 15 the panel or the terminals command the drive,
-      and may run it. A stop keeps bit 15, as does every other command.
+      and may run it. Every command except `release_control` sets bit 15.
     - Bits 15 and 14 latch until they are written 0 or the power fails: until then panel and terminals have
       no effect. `release_control` writes 0000H, only at rest, and only if no terminal commands a run. The
       panel's command cannot be read: if the motor then turns, the stop is written again.
-    - Bit 14 should keep its value, but it cannot be read reliably: every command has it set. So the setpoint
+    - Bit 14 should keep its value, but it cannot be read reliably, so every command sets it. So the setpoint
       is 1001H after the first verb, which is 0 Hz until set_frequency is called. With the option
-      `setpoint_by_fnod` a start has it off, as the document's 8400H and 8600H.
+      `setpoint_by_fnod` a start clears bit 14, as the document's examples 8400H and 8600H do.
     - Bits 3 to 0 are called preset speed 1 to 4, but there are seven preset speeds, Sr1 to Sr7. The bits are
-      read as a number, 1, 2, 4 and 8, as in relatives. With the option `preset_speed` they are
-      written without the run bit first, from rest, and the motor is started only if 1202H changes to
-      that speed.
+      taken for the binary number of a speed, as in related drives. With the option `preset_speed`, `start`
+      first writes the bits without the run bit, at rest. It runs the motor only if 1202H then changes to that
+      speed.
     - The effect of bit 7, the direct-current brake, during run and stop is not stated: it is never set.
-    - Bit 13 (reset) and 12 (emergency stop) are held for a moment only: relatives restart again and
-      again while they are set. A reset has bit 15 and not the run bit; its reply may be cut off, and 3 s
-      later the stop is written again. A restart may take bit 15 back, as power-on does (section 8.1), so
-      that the terminals command the motor until then: a reset is refused while a terminal says run. The
-      table of functions is missing: 2 and 3 are taken for run, which the terminals F and R have.
+    - Bit 13 (reset) and 12 (emergency stop) are held for a moment only: related drives restart
+      repeatedly while a bit is set. A reset has bit 15 and not the run bit; its reply may be cut off, and 3 s
+      later the stop is written again. A restart may clear bit 15, as power-on does (section 8.1). Then the
+      terminals command the motor until the stop is written: a reset is refused while a terminal says run. The
+      table of functions is missing: the functions 2 and 3, which the terminals F and R have, count as run.
     - Jog is written without the run bit, which would turn the motor at the setpoint if jog is not obeyed.
-    - 1200H and 1201H are called present values, but are frozen in a trip: only 1100H is live. A motor
-      has stopped when it is 0 twice. A trip shows as a 1200H that is not 0 while 1100H is; a trip at
-      rest, as an emergency stop may be, only as a change in the fault record.
+    - 1200H and 1201H are called present values, but are frozen in a trip: only 1100H is live. The motor
+      counts as stopped when 1100H is 0 twice. After a trip 1100H is 0, and 1200H is not. A trip at rest, such
+      as after an emergency stop, shows only as a change in the fault record.
     - Registers marked "panel only" are never written, although section 8.1 writes 0007H to initialise.
-      0800H to 0802H neither: they are the drive's end of the line. 0800H and 0801H take effect after a
-      reset or at the next power-on, 0802H and 0803H at once (section 7).
-    - CNOD, FNOD, FR, F103, F104 and F110 to F115 belong to the command over the motor, and what AU3
-      sets by itself is not stated: they are read and never written.
+      0800H to 0802H are not written either: they set baud rate, format and address. 0800H and 0801H take
+      effect after a reset or at the next power-on, 0802H and 0803H at once (section 7).
+    - CNOD, FNOD, FR, F103, F104 and F110 to F115 decide what commands the motor, and it is not stated what
+      AU3 sets by itself. All of these are read and never written.
     - 0803H, the watchdog, is written only while the motor is at rest (the document does not require that): a
-      time shorter than the gap between two polls trips the drive.
-    - The table of faults is missing: codes are shown as they are. Exceptions are a relative's, VF-S15's.
-    - Addresses above 31 need a version above V104. The stop bits are not stated: 1.
+      time shorter than the pause between two polls trips the drive.
+    - The table of faults is missing: codes are shown as they are. The meanings of exceptions are those of a
+      relative, the VF-S15.
+    - Addresses above 31 need a version above V104. The number of stop bits is not stated: 1 is used.
 
-    All but 1000H to 12FFH is kept in EEPROM. The number of any other extended parameter is its name's
-    with 0 for F (section 6.2): declare those of one's own manual in a subclass, with `extended`.
+    All registers except 1000H to 12FFH are kept in EEPROM. The number of any other extended parameter is its
+    name with 0 in place of F (section 6.2): declare your manual's parameters in a subclass, with `extended`.
     F800 = 3 and F801 = 1 are required: 9600 8E1. An S7e has no F800 and is fixed at 1200 bit/s.
     """
 
@@ -371,10 +372,10 @@ class YD1000(Drive):
         note=f"0 is off. {AT_ONCE}",
     )
 
-    _record: float | None = None  # the newest entry of the fault record at the last check
+    _record: float | None = None  # the newest entry of the fault record when it was last read
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
-        """Return the ranges of 0802H, the drive's own address, and 0011H, a maximum of 30 to 320 Hz."""
+        """Return the ranges of 0802H (the drive's own address) and 0011H (FH, from 30 to 320 Hz)."""
         return {self.address_setting: (self.address, self.address), self.maximum_frequency: (3000, 32000)}
 
     @verb
@@ -395,7 +396,7 @@ class YD1000(Drive):
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start at the setpoint 1001H. Without a direction: as the motor turns, or forward from rest.
+        """Start at the setpoint 1001H; without a direction, keep turning as before, or forward from rest.
 
         The options `preset_speed` and `setpoint_by_fnod` select another setpoint, `second_ramp` the second
         ramp. A stop always uses the first ramp.
@@ -425,8 +426,8 @@ class YD1000(Drive):
         yield from insist(self.control, STOP)
         if (yield from read(self.reference_frequency)) == hz:
             raise WriteForbidden(
-                f"{self.name} has {hz:g} Hz as its frequency command without preset speed {number} too, so "
-                "that nothing would show the wrong bits: write another frequency to 1001H first"
+                f"{self.name} already has {hz:g} Hz as its frequency command, like preset speed {number}: "
+                "wrong bits could not be detected; write another frequency to 1001H first"
             )
         bits = YD1000Control(0)
         for at, bit in enumerate(PRESET_SPEEDS):
@@ -436,8 +437,8 @@ class YD1000(Drive):
         if not (yield from until(lambda: self._is_commanded(hz), limit=SELECTION_TIME)):
             yield from insist(self.control, STOP)
             raise WriteForbidden(
-                f"{self.name} does not take {hz:g} Hz, preset speed {number}, as its frequency command when "
-                "the bits for it are set: it is not started"
+                f"{self.name} is not started: after preset speed {number} was selected, "
+                f"its frequency command did not become {hz:g} Hz"
             )
         return bits
 
@@ -446,7 +447,7 @@ class YD1000(Drive):
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
-        """Turn slowly until stopped. Without a direction: as the motor turns, or forward from rest."""
+        """Turn slowly until stopped; without a direction, keep turning as before, or forward from rest."""
         yield from self._turn(YD1000Control.JOG, direction)
 
     def _turn(self, how: YD1000Control, direction: Direction | None) -> Script[None]:
@@ -458,7 +459,7 @@ class YD1000(Drive):
         yield from self._started(direction)
 
     def _valid(self) -> YD1000Control:
-        """Return bit 15, and bit 14 unless FNOD selects the setpoint."""
+        """Return bit 15, and also bit 14 unless FNOD selects the setpoint's source."""
         return YD1000Control.COMMAND_VALID if self._by_fnod() else STOP
 
     def _without_fault(self) -> Script[State]:
@@ -488,7 +489,7 @@ class YD1000(Drive):
     def emergency_stop(self) -> Script[None]:
         """Stop the motor with the drive's own emergency stop, which is a fault.
 
-        It is a pulse that is sent once. If it is not confirmed, the stop along the ramp follows immediately.
+        The command is sent once. If it is not confirmed, the stop along the ramp follows immediately.
         """
         try:
             yield Pulse(self.control, STOP | YD1000Control.EMERGENCY_STOP)
@@ -537,7 +538,8 @@ class YD1000(Drive):
         for what, function in functions.items():
             if (yield from read(function)) in RUN_FUNCTIONS:
                 raise WriteForbidden(
-                    f"{what} of {self.name} says run, and may start its motor {when}: take that back first"
+                    f"{what} of {self.name} is set to run, and may start the motor {when}: change that "
+                    f"function, or open that terminal, first"
                 )
 
     @verb
@@ -573,13 +575,13 @@ class YD1000(Drive):
         for name in ("preset_speed", "setpoint_by_fnod"):
             if self.option.get(name):
                 raise WriteForbidden(
-                    f"{self.name} takes no setpoint from 1001H: its option {name} gives it another"
+                    f"{self.name} takes no setpoint from 1001H: its option {name} selects another source"
                 )
         yield from self._hold(self.frequency, hz)
 
     @verb
     def state(self) -> Script[State]:
-        """Return whether the motor turns, or a fault: 1200H is frozen, or the fault record changed."""
+        """Return whether the motor turns. A frozen 1200H, or a change in the fault record, shows a fault."""
         if not (yield from self._stands()):
             return State(Condition.RUNNING, (yield from self._direction()))
         record = yield from read(self.fault_record_1)
@@ -587,7 +589,9 @@ class YD1000(Drive):
             self._record = record
         if record != self._record or (yield from self._is_frozen()):
             return State(Condition.FAULT, fault=f"code {int(record):02X}H")
-        return State(Condition.STOPPED, note="a trip at rest before the first look would not show")
+        return State(
+            Condition.STOPPED, note="a trip at rest before the first read of the state would not show"
+        )
 
     def _is_frozen(self) -> Script[bool]:
         """Return True if 1200H is frozen while 1100H is 0 (section 8.2), as in a trip or during a start."""

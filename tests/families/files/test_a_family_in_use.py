@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 from commands import Run
-from families import Meter, write_meter
 from lines import ANY_PORT
 from peers import require_module
+from profile_families import Meter, write_meter
 from simulated_bus import SimulatedBus
+from tables import table
 
 from multidrop import Bus, Drive, Plant, WriteForbidden, load_family
 from multidrop.control.eeprom_ledger import Ledger
-from multidrop.drive import INPUT
 from multidrop.families.registry import find_model
 from multidrop.planning.blocks import blocks
 from multidrop.recording import open_recording
@@ -196,7 +196,7 @@ def test_family_file_without_commands_needs_no_confirmation(plant: Path) -> None
     assert "confirmed" not in family.options
 
 
-@pytest.mark.parametrize(
+@table(
     ("proof", "value", "is_one"),
     [
         ("is = [250, 300]", 300, True),
@@ -219,7 +219,7 @@ def test_identify_section_recognises_drives_by_register_values(
     if is_one:
         drive.perform(drive.identify.script())
         return
-    with pytest.raises(WriteForbidden, match=f"shows device = {value}: it is no Meter"):
+    with pytest.raises(WriteForbidden, match=f"shows device = {value}, so it is not a Meter"):
         drive.perform(drive.identify.script())
 
 
@@ -246,8 +246,3 @@ def test_eeprom_writes_of_two_files_with_the_same_name_are_counted_separately(pl
 
 def simulated_writes(line: Simulator) -> list[str]:
     return [written.name for drive in line.wires[0].drives for written in drive.counters.writes]
-
-
-def test_unknown_section_is_reported(plant: Path) -> None:
-    family = load_family(plant.parent / "families" / "meter.toml")
-    assert {each.table for each in family.registers.values() if each.name == "voltage"} == {INPUT}

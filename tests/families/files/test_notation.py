@@ -31,11 +31,11 @@ from multidrop.families.files.notation import Counting, sent_as
         ("00001", None, None, (0, "coil")),
         ("000065", None, "coil", (64, "coil")),
         (50200, 1, None, (50199, "holding")),  # Danfoss' status word; no table has the digit 5
-        (16130, 1, None, (16129, "holding")),  # its output frequency; 1 is another table's digit
+        (16130, 1, None, (16129, "holding")),  # Danfoss' output frequency; the digit 1 is another table's
         (40001, 0, "input", (40001, "input")),
     ],
 )
-def test_toml_address_gives_the_address_on_the_wire(
+def test_an_address_in_toml_is_converted_to_the_address_on_the_wire(
     given: Any, counts_from: int | None, table: str | None, sent: tuple[int, str]
 ) -> None:
     assert Counting(counts_from).address(given, table, "holding") == sent
@@ -54,7 +54,7 @@ def test_toml_address_gives_the_address_on_the_wire(
         ("0016", 0, (16, "holding")),
     ],
 )
-def test_csv_cell_gives_the_address_on_the_wire(
+def test_an_address_in_csv_is_converted_to_the_address_on_the_wire(
     cell: str, counts_from: int | None, sent: tuple[int, str]
 ) -> None:
     assert Counting(counts_from).address_in_cell(cell, None, "holding") == sent
@@ -86,7 +86,7 @@ def test_invalid_addresses_are_refused(given: Any, sentence: str) -> None:
 
 
 @table("table", ["holding", "input", "coil", "discrete"])
-def test_every_address_has_a_notation_with_counts_from_0(table: str) -> None:
+def test_with_counts_from_0_every_address_can_be_written(table: str) -> None:
     for address in (0, 9, 10_000, 10_001, 19_999, 30_001, 39_999, 40_000, 40_017, 49_999, 0xFFFF):
         written = tomllib.loads(f"at = {sent_as(address, table)}")["at"]
         assert Counting(0).address(written, table, "holding") == (address, table)
@@ -94,7 +94,7 @@ def test_every_address_has_a_notation_with_counts_from_0(table: str) -> None:
 
 def test_address_digit_that_contradicts_its_table_is_refused() -> None:
     with pytest.raises(
-        ValueError, match='"30001" begins with 3, which is table input, and table is "holding"'
+        ValueError, match='"30001" begins with 3, which is table input, but table is "holding"'
     ):
         Counting(0).address("30001", "holding", "holding")
 
@@ -102,7 +102,7 @@ def test_address_digit_that_contradicts_its_table_is_refused() -> None:
 @table(
     ("cell", "sentence"),
     [
-        ("1E10", "1E10 is a power of ten, which a spreadsheet makes of hex; write 1E10H"),
+        ("1E10", "1E10 is a power of ten, into which a spreadsheet has converted a hex number; write 1E10H"),
         ("1.00E+10", "is a power of ten"),
         ("40001", "40001 may be the number 40001, or register 1 of table holding"),
         ("4x0001", '"4x0001" is not an address'),

@@ -7,6 +7,7 @@ from contextlib import suppress
 import pytest
 from profile_families import ALL, MAKE, STARTS
 from simulated_bus import is_write, one
+from tables import table
 
 from multidrop.control.ramp import ramp
 from multidrop.core import Framing, Message, build_reply
@@ -66,7 +67,7 @@ def test_start_runs_the_motor_and_stop_ends_the_run(line: Line) -> None:
     line.drive.stop()
     assert not line.sim.motor.energised
     assert line.drive.state().condition is Condition.STOPPED
-    line.drive.start()  # the setpoint is still in force
+    line.drive.start()  # the drive still has the setpoint
     assert len(line.starts) == 2
     assert line.sim.motor.energised
 
@@ -93,7 +94,7 @@ def test_trip_during_a_start_is_reported(line: Line, monkeypatch: pytest.MonkeyP
 
 
 def test_reset_never_starts_the_motor(line: Line) -> None:
-    """Not even if the run command was active at the trip and the drive obeys the level of the run bit."""
+    """This holds even if the run command was active at the trip, and the drive obeys the run bit's level."""
     line.runs()
     line.sim.trip(FAULT)
     begun = len(line.writes)
@@ -182,7 +183,7 @@ LOCAL = {
 }
 
 
-@pytest.mark.parametrize("model", LOCAL)
+@table("model", LOCAL)
 def test_start_in_local_control_is_refused(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, model)
     line.drive.set_frequency(20)
@@ -208,10 +209,10 @@ def test_direction_is_sent_or_refused(line: Line, model: str) -> None:
     assert line.drive.state().condition is Condition.RUNNING
     assert line.sim.motor.frequency == pytest.approx(-20, abs=0.01)
     if model in ("danfoss-fc51", "schneider-atv320"):  # their status shows no direction
-        with pytest.raises(WriteForbidden, match="cannot say which way"):
+        with pytest.raises(WriteForbidden, match="cannot report which way"):
             line.drive.start()
     else:
-        line.drive.start()  # keeps the direction
+        line.drive.start()  # without a direction: the present one is kept
         line.bus.sleep(3)
         line.drive.state()
         assert line.sim.motor.frequency == pytest.approx(-20, abs=0.01)
@@ -220,14 +221,12 @@ def test_direction_is_sent_or_refused(line: Line, model: str) -> None:
 
 def test_write_of_a_start_word_is_refused(line: Line) -> None:
     control = line.drive.control
-    for count in range(0x10000):
-        request = Message(1, 6, control.address, data=count.to_bytes(2))
-        if not line.is_start(request):
-            continue
+    requests = {count: Message(1, 6, control.address, data=count.to_bytes(2)) for count in range(0x900)}
+    starts = [count for count, request in requests.items() if line.is_start(request)]
+    assert starts
+    for count in starts:
         with pytest.raises((WriteForbidden, TypeError)):
             line.drive.write(control, control.decode(count))
-        if count > 0x900:
-            break
     assert line.writes == []
 
 
@@ -367,19 +366,19 @@ def test_start_of_an_optidrive_of_the_first_guide_is_refused(monkeypatch: pytest
     assert line.starts == []
 
 
-OF_ANOTHER = {  # values of another make; this family could show at most one, for instance before a restart
+OF_ANOTHER = {  # values of another make; a drive of the family may show one of them, as before a restart
     "status": 0x0241,  # not a state of PROFIdrive
     "station": 7,
     "signature": 1,
 }
 
 
-@pytest.mark.parametrize("first", OF_ANOTHER)
-@pytest.mark.parametrize("second", OF_ANOTHER)
+@table("first", OF_ANOTHER)
+@table("second", OF_ANOTHER)
 def test_stop_is_withheld_only_if_status_and_a_second_value_show_another_make(
     monkeypatch: pytest.MonkeyPatch, first: str, second: str
 ) -> None:
-    """One make's stop word may run another's motor; but one value, or two stale settings, prove nothing."""
+    """The stop word of one make may run another make's motor. One value, or two settings, prove nothing."""
     line = Line(monkeypatch, "abb-acs355")
     shown = {line.drive.register(name).address: OF_ANOTHER[name] for name in (first, second)}
 
@@ -399,7 +398,7 @@ def test_stop_is_withheld_only_if_status_and_a_second_value_show_another_make(
         assert line.writes == []
 
 
-def test_stop_of_a_drive_that_was_identified_before_is_always_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_of_a_drive_that_was_once_identified_is_always_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, "invt-goodrive")
     line.runs()
     line.sim["device"] = 0

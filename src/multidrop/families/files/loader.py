@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -33,6 +32,7 @@ from multidrop.families.files.sections import (
     proofs_of,
     texts_of,
 )
+from multidrop.printable import did_you_mean
 from multidrop.toml_check import TomlPlace, parse_document
 
 SECTIONS = (
@@ -92,10 +92,10 @@ def _same(file: Path, data: bytes) -> bool:
 
 
 def _bytes(path: Path, what: str) -> bytes:
-    """Return a file's bytes. Raises ValueError, whose text lacks the path, if it is missing or too long."""
+    """Return a file's bytes. Raises ValueError if the file is missing or too long; the text has no path."""
     try:
         if not path.is_file():
-            other = "is no file, but a directory or a device; name a file" if path.exists() else ""
+            other = "is not a file, but a directory or a device; name a file" if path.exists() else ""
             raise ValueError(other or "there is no such file")
         with path.open("rb") as file:
             data = file.read(MOST_BYTES + 1)
@@ -176,25 +176,19 @@ def _base(given: Mapping[str, Any], place: TomlPlace) -> type[Drive]:
         place.wrong("has profile and extends; name one of them")
     for key in ("profile", "extends"):
         if key in given:
-            classes = _bases(key)
+            classes = bases(key)
             if given[key] in classes:
                 return classes[given[key]]
-            near = difflib.get_close_matches(given[key], classes, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(classes)}"
-            place.wrong(f"{key} = {shown(given[key])} is not known; {hint}")
+            place.wrong(f"{key} = {shown(given[key])} is not known; {did_you_mean(given[key], classes)}")
     return Drive
 
 
 def _check_inherited(
-    base: type[Drive],
-    document: Mapping[str, Any],
-    declared: Declared,
-    texts: Iterable[str],
-    place: TomlPlace,
+    base: type[Drive], document: Mapping[str, Any], declared: Declared, texts: Iterable[str], place: TomlPlace
 ) -> None:
     """Report each declaration that would replace a part of the built-in family that this file extends.
 
-    The part may be a limit, or may keep a motor from being started.
+    Such a part may be a limit, or may prevent a motor from being started.
     """
     if base not in MODELS.values():
         return
@@ -214,7 +208,7 @@ def _inherited_errors(
 ) -> Iterator[str]:
     """Yield a sentence for each register that would be written at an address of an inherited register.
 
-    Such a register would bypass what the inherited register forbids. `title` is that of the extended family.
+    Writes of such a register would bypass the limits of the inherited one. `title` names the extended family.
     """
     owners = {place: one for one in inherited.values() for place in written_places(one)}
     for register in registers.values():
@@ -226,7 +220,8 @@ def _inherited_errors(
             )
 
 
-def _bases(key: str) -> Mapping[str, type[Drive]]:
+def bases(key: str) -> Mapping[str, type[Drive]]:
+    """Return the classes that the key "profile" or "extends" can name."""
     if key == "extends":
         return MODELS
     from multidrop.families.profiles import PROFILES  # imported here, because few files use a profile

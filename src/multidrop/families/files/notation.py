@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +11,7 @@ from multidrop.drive.register import COIL, DISCRETE, HOLDING, INPUT, Table
 
 TABLES: Mapping[str, Table] = {"holding": HOLDING, "input": INPUT, "coil": COIL, "discrete": DISCRETE}
 _TABLE_OF_DIGIT = {"0": "coil", "1": "discrete", "3": "input", "4": "holding"}
-_DIGIT_OF_TABLE = {table: digit for digit, table in _TABLE_OF_DIGIT.items()}
+DIGIT_OF_TABLE = {table: digit for digit, table in _TABLE_OF_DIGIT.items()}
 LAST_ADDRESS = 0xFFFF
 
 _HEX = re.compile(r"0[xX]([0-9a-fA-F]{1,8})|([0-9a-fA-F]{1,8})[hH]")
@@ -23,9 +23,11 @@ _EXPONENT = re.compile(r"\d+([.]\d+)?[eE][+-]?\d+", re.ASCII)
 
 @dataclass(frozen=True)
 class Counting:
-    """Converts a manual's addresses, given its number for the wire's address 0 (None: not stated).
+    """Converts a manual's addresses to addresses as sent.
 
-    `assumed` lists the addresses for which 0 was assumed, so that other mistakes can still be found.
+    `counts_from` is the manual's number for the address 0 on the wire; None if the file does not state it.
+    The number is then assumed to be 0, so that other mistakes can still be found. `assumed` lists the
+    addresses that were converted with this assumption.
     """
 
     counts_from: int | None
@@ -51,10 +53,11 @@ class Counting:
         raise ValueError(f'"{text}" is not an address; write 0x2000, 8192, "2000H" or "40001"')
 
     def address_in_cell(self, text: str, table: str | None, default: str) -> tuple[int, str]:
-        """Return the same as `address` for a CSV cell, where a number such as 40001 has no quotes.
+        """Return the same as `address` for a CSV cell, in which a number such as 40001 has no quotes.
 
-        If the file states `counts_from`, such a number is a plain address, unless its first digit is that
-        of its table.
+        If the file states `counts_from`, a number is an address, counted from `counts_from`. Raises
+        ValueError for a number such as 40001 whose first digit is that of the register's table: the number
+        may be an address, or may mean the first register of the table.
         """
         text = text.strip()
         if text.isascii() and text.isdecimal():
@@ -67,11 +70,14 @@ class Counting:
             return self._sent(int(text), text), table or default
         if _EXPONENT.fullmatch(text):
             digits = text.upper().replace("+", "")
-            raise ValueError(f"{text} is a power of ten, which a spreadsheet makes of hex; write {digits}H")
+            raise ValueError(
+                f"{text} is a power of ten, into which a spreadsheet has converted a hex number; write "
+                f"{digits}H"
+            )
         return self.address(text, table, default)
 
     def _number(self, number: int, table: str) -> int:
-        digit = _DIGIT_OF_TABLE[table]
+        digit = DIGIT_OF_TABLE[table]
         if digit != "0" and str(number).startswith(digit) and _NUMBERED.fullmatch(str(number)):
             raise ValueError(_ambiguous(str(number), number))
         return self._sent(number, number)
@@ -105,8 +111,8 @@ def _numbered(text: str, table: str | None) -> tuple[int, str]:
     named, number = _TABLE_OF_DIGIT[text[0]], int(text[1:])
     if table is not None and table != named:
         raise ValueError(
-            f'"{text}" begins with {text[0]}, which is table {named}, and table is "{table}"; '
-            "leave table out, or write the number that its table has"
+            f'"{text}" begins with {text[0]}, which is table {named}, but table is "{table}"; '
+            "remove table, or write a number of that table"
         )
     if not 1 <= number <= LAST_ADDRESS + 1:
         raise ValueError(f'"{text}" is outside "{text[0]}{1:0{len(text) - 1}}" to "{text[0]}65536"')
@@ -147,7 +153,7 @@ def numbers(cell: str) -> list[int | float | str]:
 
 
 def whole(cell: str) -> int:
-    """Parse a whole number; 1E10 is refused, because a spreadsheet may have made it of a hex number."""
+    """Parse a whole number; refuse 1E10, which may be a hex number that a spreadsheet has converted."""
     if _NUMBER.fullmatch(cell) and not _WHOLE.fullmatch(cell):
         right = f"0x{cell}" if cell.isalnum() else "it as 10 or 0x7FFF"
         raise ValueError(f"{cell!r} is not a whole number; write {right}")
@@ -164,15 +170,24 @@ def counts(cell: str) -> list[int]:
 
 def named(cell: str) -> dict[str, Any]:
     """Parse "off=0 | on=1" into numbers by name. Raises ValueError whose text has a valid example."""
-    found: dict[str, Any] = {}
+    return {name: whole(given) for name, given in _pairs(cell, "no name with its number; write off=0 | on=1")}
+
+
+def titles(cell: str) -> dict[str, Any]:
+    """Parse "ru=ток | zh=电流" into texts by language. Raises ValueError whose text has a valid example."""
+    return dict(_pairs(cell, "no language with its title; write ru=ток | zh=电流"))
+
+
+def _pairs(cell: str, wrong: str) -> Iterator[tuple[str, str]]:
+    found: set[str] = set()
     for part in cell.split("|"):
         name, equals, given = (piece.strip() for piece in part.partition("="))
         if not equals or not name or not given:
-            raise ValueError(f"{part.strip()!r} is no name with its number; write off=0 | on=1")
+            raise ValueError(f"{part.strip()!r} is {wrong}")
         if name in found:
-            raise ValueError(f"{name} is there twice; each name has one number")
-        found[name] = whole(given)
-    return found
+            raise ValueError(f"{name} is given twice; give each only once")
+        found.add(name)
+        yield name, given
 
 
 def truth(cell: str) -> bool:

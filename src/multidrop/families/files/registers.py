@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import csv
-import difflib
 import io
 import keyword
 import math
 import re
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
+from functools import partial
 from pathlib import Path, PureWindowsPath
 from typing import Any, cast
 
 from multidrop.core import NumberFormat
+from multidrop.drive.declaration_check import MOST_COUNTS
 from multidrop.drive.family import TAKEN_NAMES
 from multidrop.drive.register import (
     HOLDING_MULTIPLE,
@@ -26,9 +28,11 @@ from multidrop.drive.register import (
     reading,
     setting,
 )
+from multidrop.drive.titles import LANGUAGES
 from multidrop.families.files import notation
 from multidrop.families.files.notation import TABLES, Counting
-from multidrop.toml_check import TomlPlace
+from multidrop.printable import did_you_mean, is_number, is_whole
+from multidrop.toml_check import ASCENDING, TomlPlace
 
 LONGEST_NAME = 60
 MOST_VALUES = 500
@@ -79,13 +83,13 @@ def _mistakes(key: str, given: Mapping[str, Any], most: int, allowed: range, rig
     numbered: dict[int, str] = {}
     for name, number in given.items():
         if why := unusable(name):
-            yield f"{key}: {name!r} is no name: {why}"
+            yield f"{key}: {name!r} is not a name: {why}"
         elif name in OF_ENUMERATIONS:
             yield f"{key}: {name!r} is a name that all enumerations have; write {name}_"
         elif name.lower() in spelt:
             yield f"{key}: {name} and {spelt[name.lower()]} differ in capitals alone; call one otherwise"
         spelt[name.lower()] = name
-        if isinstance(number, bool) or not isinstance(number, int) or number not in allowed:
+        if not is_whole(number) or number not in allowed:
             yield f"{key}: {name} = {number!r} is not {right}"
         elif number in numbered:
             yield f"{key}: {name} and {numbered[number]} are both {number}; each has its own"
@@ -94,6 +98,7 @@ def _mistakes(key: str, given: Mapping[str, Any], most: int, allowed: range, rig
 
 
 LONGEST_TEXT = 1000
+LONGEST_TITLE = 100
 MOST_LISTED = 100  # limit of raw counts listed in one key
 NOT_STATED = "unknown"
 ORDERS = ("ABCD", "CDAB", "BADC", "DCBA", "AB", "BA")
@@ -110,10 +115,23 @@ class RegisterKey:
     example: str
     cell: Callable[[str], Any] = notation.text
 
+    @property
+    def schema(self) -> dict[str, Any]:
+        """The JSON Schema of the key's values."""
+        if isinstance(self.convert, partial):
+            found: Mapping[str, Any] = {"enum": [*dict.fromkeys(_spellings(*self.convert.args), 0)]}
+        else:
+            found = _SCHEMAS[self.convert]
+        return {**found, "description": self.example}
+
+
+def _any(value: Any) -> Any:
+    return value
+
 
 def _text(value: Any) -> str:
     if not isinstance(value, str):
-        raise ValueError("is no text")
+        raise ValueError("is not a text")
     if not value.isprintable():
         raise ValueError("has characters that do not print; leave them out")
     if len(value) > LONGEST_TEXT:
@@ -122,8 +140,8 @@ def _text(value: Any) -> str:
 
 
 def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError("is no number")
+    if not is_number(value):
+        raise ValueError("is not a number")
     if not math.isfinite(value):
         raise ValueError("is no finite number")
     return value
@@ -148,15 +166,13 @@ def _span(value: Any) -> tuple[float, float]:
         raise ValueError("is not two numbers")
     low, high = map(_number, value)
     if low > high:
-        raise ValueError("is the wrong way round: the smallest comes first")
+        raise ValueError("is in the wrong order: give the smallest first")
     return low, high
 
 
 def _counts(value: Any) -> tuple[int, ...]:
-    if not isinstance(value, list) or not all(
-        isinstance(each, int) and not isinstance(each, bool) for each in value
-    ):
-        raise ValueError("is no list of raw counts")
+    if not isinstance(value, list) or any(type(each) is not int for each in value):
+        raise ValueError("is not a list of raw counts")
     if len(value) > MOST_LISTED:
         raise ValueError(f"has more than {MOST_LISTED} counts")
     return tuple(value)
@@ -173,23 +189,27 @@ def _part(value: Any) -> tuple[int, int]:
     first, dash, last = str(value).partition("-")
     ends = [end.strip() for end in (first, last if dash else first)]
     if isinstance(value, (bool, float)) or not all(end.isascii() and end.isdecimal() for end in ends):
-        raise ValueError("is no bit, nor its first and last")
+        raise ValueError("is neither a bit nor the first and the last of several bits")
     low, high = (int(end[:4]) for end in ends)
     if low > high:
-        raise ValueError("is the wrong way round: the lowest bit comes first")
+        raise ValueError("is in the wrong order: give the lowest bit first")
     return low, high
 
 
 def _one_of(known: Mapping[str, Any], spelling: Callable[[str], str] = str) -> Callable[[Any], Any]:
-    def convert(value: Any) -> Any:
-        name = spelling(value) if isinstance(value, str) else ""
-        if name in known:
-            return known[name]
-        near = difflib.get_close_matches(str(name), known, n=1) if name else []
-        hint = f"did you mean {near[0]}?" if near else f"it is one of {', '.join(known)}"
-        raise ValueError(f"is not known: {hint}")
+    return partial(_named_one, known, spelling)
 
-    return convert
+
+def _named_one(known: Mapping[str, Any], spelling: Callable[[str], str], value: Any) -> Any:
+    name = spelling(value) if isinstance(value, str) else ""
+    if name in known:
+        return known[name]
+    raise ValueError(f"is not known: {did_you_mean(name, known)}")
+
+
+def _spellings(known: Mapping[str, Any], spelling: Callable[[str], str]) -> list[str]:
+    """Return the names; if `spelling` ignores case, also in lower case and in capitals."""
+    return [*known] if spelling is str else [*known, *map(str.lower, known), *map(str.upper, known)]
 
 
 def _named(value: Any) -> Mapping[str, Any]:
@@ -198,8 +218,60 @@ def _named(value: Any) -> Mapping[str, Any]:
     return value
 
 
+def _titles(value: Any) -> Mapping[str, str]:
+    if not isinstance(value, dict) or not value:
+        raise ValueError("is not a table of titles by language")
+    for language, title in value.items():
+        if language not in LANGUAGES:
+            raise ValueError(f"has the unknown language {language[:20]}, not one of {', '.join(LANGUAGES)}")
+        if not 1 <= len(_text(title)) <= LONGEST_TITLE:
+            raise ValueError(f"has a title of {len(title)} characters, not 1 to {LONGEST_TITLE}")
+    return value
+
+
+_HEX = "0*([0-9A-Fa-f]{1,4}|10000)"
+ADDRESS: Mapping[str, Any] = {
+    "anyOf": [
+        {"type": "integer", "minimum": 0, "maximum": notation.LAST_ADDRESS + 1},
+        {"type": "string", "pattern": rf"^\s*(0[xX]{_HEX}|{_HEX}[hH]|[0134]([0-9]{{4}}|[0-9]{{5}}))\s*$"},
+    ]
+}
+NAME: Mapping[str, Any] = {"maxLength": LONGEST_NAME, "pattern": f"^{_NAME.pattern}$"}
+_COUNT = {"type": "integer"}
+_COUNTS = {"type": "array", "items": _COUNT, "maxItems": MOST_LISTED}
+_FINITE = {"type": "number", "minimum": -sys.float_info.max, "maximum": sys.float_info.max}
+_NUMBER_OR_NAN = {"anyOf": [_FINITE, {"enum": ["NaN", "nan"]}]}
+_NUMBERS = {"type": "array", "items": _NUMBER_OR_NAN, "minItems": 1, "maxItems": MOST_COUNTS}
+_TEXT = {"type": "string", "maxLength": LONGEST_TEXT, "pattern": r"^[^\x00-\x1f\x7f]*$"}
+_SCHEMAS: Mapping[Callable[[Any], Any], Mapping[str, Any]] = {  # JSON Schemas, by conversion function
+    _any: ADDRESS,
+    _text: _TEXT,
+    _number: _FINITE,
+    _truth: {"type": "boolean"},
+    _step: {"anyOf": [{**_FINITE, "not": {"const": 0}}, {"const": NOT_STATED}]},
+    _span: {"type": "array", "items": _FINITE, "minItems": 2, "maxItems": 2, **ASCENDING},
+    _counts: _COUNTS,
+    _invalid: {"anyOf": [_NUMBER_OR_NAN, _NUMBERS]},
+    _part: {
+        "anyOf": [
+            {"type": "integer", "minimum": 0},
+            {"type": "string", "pattern": r"^\s*[0-9]+\s*(-\s*[0-9]+\s*)?$"},
+        ]
+    },
+    _named: {
+        "type": "object",
+        "propertyNames": {**NAME, "not": {"enum": [*sorted(OF_ENUMERATIONS), *keyword.kwlist]}},
+        "additionalProperties": _COUNT,
+        "minProperties": 1,
+        "maxProperties": MOST_VALUES,
+    },
+    _titles: {
+        **{"type": "object", "minProperties": 1, "additionalProperties": False},
+        "properties": {key: {**_TEXT, "minLength": 1, "maxLength": LONGEST_TITLE} for key in LANGUAGES},
+    },
+}
 REGISTER_KEYS: Mapping[str, RegisterKey] = {
-    "at": RegisterKey(lambda value: value, 'at = 0x2000, 8192, "2000H" or "40001"'),
+    "at": RegisterKey(_any, 'at = 0x2000, 8192, "2000H" or "40001"'),
     "unit": RegisterKey(_text, 'unit = "Hz"'),
     "values": RegisterKey(_named, "values = { off = 0, on = 1 }", notation.named),
     "bits": RegisterKey(_named, "bits = { ready = 0, tripped = 3 }", notation.named),
@@ -216,7 +288,7 @@ REGISTER_KEYS: Mapping[str, RegisterKey] = {
     "table": RegisterKey(_one_of({name: name for name in TABLES}, str.lower), 'table = "input"'),
     "write": RegisterKey(_one_of(dict(zip(WRITES, WRITES, strict=True))), 'write = "multiple"'),
     "kept": RegisterKey(_one_of(_KEPT, str.lower), 'kept = "ram", "eeprom" or "unknown"'),
-    "ram_address": RegisterKey(lambda value: value, "ram_address = 0x1005"),
+    "ram_address": RegisterKey(_any, "ram_address = 0x1005"),
     "default": RegisterKey(_number, "default = 50", notation.number),
     "at_least": RegisterKey(_text, 'at_least = "minimum_frequency"'),
     "at_most": RegisterKey(_text, 'at_most = "maximum_frequency"'),
@@ -229,8 +301,9 @@ REGISTER_KEYS: Mapping[str, RegisterKey] = {
     "place": RegisterKey(_text, 'place = "table 12"'),
     "outside": RegisterKey(_text, 'outside = "another document"'),
     "note": RegisterKey(_text, 'note = "Of the motor."'),
+    "title": RegisterKey(_titles, 'title.ru = "ток двигателя"', notation.titles),
 }
-NOT_DETAILS = frozenset({"at", "unit", "values", "bits", "table", "write", "ram_address"})
+NOT_DETAILS = frozenset({"at", "unit", "values", "bits", "table", "write", "ram_address", "title"})
 DEFAULT_KEYS = ("table", "unit", "step", "number_format", "order", "invalid", "write", "kept")
 
 
@@ -255,7 +328,7 @@ _DECLARE: Mapping[Access, Callable[..., Register[Any]]] = {
     Access.SETTING: setting,
     Access.COMMAND: command,
 }
-_WITHOUT_BITS = ("number_format", "order", "invalid", "step", "unit")  # defaults that do not apply to a bit
+_WITHOUT_BITS = ("number_format", "order", "invalid", "step", "unit")  # keys of [default] that bits ignore
 
 ReadAddress = Callable[[Any, str | None, str], tuple[int, str]]
 
@@ -273,12 +346,14 @@ class Declared:
     def section(self, access: Access, table: Any, place: TomlPlace) -> None:
         """Declare the registers in a [reading], [setting] or [command] section."""
         if not isinstance(table, dict):
-            place.wrong(f"[{access.value}] is no table; write [{access.value}] and NAME = {{ at = 0x0010 }}")
+            place.wrong(
+                f"[{access.value}] is not a table; write [{access.value}] and NAME = {{ at = 0x0010 }}"
+            )
             return
         for name, given in table.items():
             at = place.within(f"[{access.value}] {name[:60]}")
             if not isinstance(given, dict):
-                at.wrong(f'{shown(given)} is no register; write {{ at = 0x0010, unit = "Hz" }}')
+                at.wrong(f'{shown(given)} is not a register; write {{ at = 0x0010, unit = "Hz" }}')
                 self._reserve(name, at)
                 continue
             self.add(name, access, given, at, self.counting.address)
@@ -296,6 +371,8 @@ class Declared:
         details, table = self._details(access, good, address[1])
         if "ram_address" in good:
             details["ram_address"] = good["ram_address"]
+        if "title" in good:
+            details["titles"] = good["title"]
         register = place.attempt(_made, access, address[0], what, {**details, "table": table})
         if register is not None:
             register.__set_name__(type(self), name)
@@ -306,14 +383,12 @@ class Declared:
         if why := unusable(name):
             place.wrong(f"{shown(name)} cannot be a register's name: {why}")
             return False
-        if name in TAKEN_NAMES:  # a verb of the file would silently replace it
+        if name in TAKEN_NAMES:  # a verb of the family would silently replace a register of this name
             place.wrong("reserved name; every drive has it for something else; rename the register")
             return False
-        if name in self.places:
-            first = self.places[name]
-            where = (
-                ", ".join(first.labels) if first.path == place.path else f"{first.path}, {first.labels[0]}"
-            )
+        if first := self.places.get(name):
+            is_here = first.path == place.path
+            where = ", ".join(first.labels) if is_here else f"{first.path}, {first.labels[0]}"
             place.wrong(f"{name} is declared twice, first in {where}; every register has its own name")
             return False
         self.places[name] = place
@@ -335,7 +410,7 @@ class Declared:
     def _addresses(
         self, given: Mapping[str, Any], good: dict[str, Any], place: TomlPlace, read: ReadAddress
     ) -> tuple[int, str] | None:
-        """Return the address as sent and the table, or None after a mistake; add ram_address to `good`."""
+        """Return the address as sent and the table; None after a mistake. Store a `ram_address` in `good`."""
         if "at" not in given or ("table" in given and "table" not in good):
             good.pop("ram_address", None)
             return None
@@ -349,12 +424,7 @@ class Declared:
         return found
 
     def _address(
-        self,
-        key: str,
-        given: Mapping[str, Any],
-        table: str | None,
-        place: TomlPlace,
-        read: ReadAddress,
+        self, key: str, given: Mapping[str, Any], table: str | None, place: TomlPlace, read: ReadAddress
     ) -> tuple[int, str] | None:
         try:
             return read(given[key], table, self.defaults.get("table", "holding"))
@@ -367,7 +437,9 @@ class Declared:
         named = [key for key in ("values", "bits") if key in good]
         if len(named) == 2 or (named and good.get("unit")):
             other = "bits" if len(named) == 2 else "unit"
-            place.wrong(f"{named[0]} and {other} are both given; a register has one of unit, values and bits")
+            place.wrong(
+                f"{named[0]} and {other} are both given; a register has only one of unit, values and bits"
+            )
         if not named:
             return good.get("unit", self.defaults.get("unit", ""))
         make = enumeration if named[0] == "values" else flags
@@ -377,7 +449,8 @@ class Declared:
         space = TABLES[table]
         defaults = {key: value for key, value in self.defaults.items() if key not in NOT_DETAILS}
         if "number_format" in good:
-            defaults.pop("invalid", None)  # these counts are in the default number format
+            # the counts in `invalid` are in the default number format, which this register does not use
+            defaults.pop("invalid", None)
         if space.carrier is Carrier.BIT:
             defaults = {key: value for key, value in defaults.items() if key not in _WITHOUT_BITS}
         if access is Access.READING:
@@ -395,7 +468,7 @@ def _made(access: Access, address: int, what: Any, details: dict[str, Any]) -> R
 def defaults_of(table: Any, place: TomlPlace) -> dict[str, Any]:
     """Return the valid keys of a [default] section."""
     if not isinstance(table, dict):
-        place.wrong('is no table; write [default] and table = "input"')
+        place.wrong('is not a table; write [default] and table = "input"')
         return {}
     keys = {key: REGISTER_KEYS[key] for key in DEFAULT_KEYS}
     if table.keys() - keys.keys():
@@ -503,17 +576,24 @@ def _declare(columns: list[str], row: list[str], declared: Declared, place: Toml
             given[key] = REGISTER_KEYS[key].cell(cell)
         except ValueError as mistake:
             place.within(f"column {key}").wrong(mistake)
-    at = place.within(name[:60])
-    declared.add(name, ACCESSES[access], given, at, declared.counting.address_in_cell)
+    declared.add(name, ACCESSES[access], given, place.within(name[:60]), declared.counting.address_in_cell)
+
+
+BESIDE: Mapping[str, Any] = {  # JSON Schema
+    "type": "string",
+    "pattern": r"^(?![/\\]|[A-Za-z]:|(.*[/\\])?\.\.([/\\]|$)).*\.([Cc][Ss][Vv]|[Tt][Ss][Vv])$",
+}
 
 
 def beside(path: Path, name: Any) -> Path:
     """Return the path of a CSV file in the family file's folder. Raises ValueError if it is elsewhere."""
     if not isinstance(name, str) or not name.lower().endswith((".csv", ".tsv")):
         raise ValueError(
-            f'registers has {shown(name)}, which is no CSV file; write registers = ["meter.csv"]'
+            f'registers has {shown(name)}, which is not a CSV file; write registers = ["meter.csv"]'
         )
     place = PureWindowsPath(name)  # recognises drive letters, roots and both separators on every system
     if place.anchor or ".." in place.parts or not name.isprintable():
-        raise ValueError(f"registers has {shown(name)}; a CSV file is beside the family's, or below it")
+        raise ValueError(
+            f"registers has {shown(name)}; a CSV file must be in the family file's folder, or below it"
+        )
     return path.parent / name

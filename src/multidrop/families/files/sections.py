@@ -1,4 +1,7 @@
-"""Parse the other sections of a family file: [family], [option], [text], [parameters], [[identify]]."""
+"""Parse the sections of a family file that declare no registers.
+
+These are [family], [option], [text], [parameters] and [[identify]].
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from typing import Any
 from multidrop.core import Framing
 from multidrop.drive.declaration_check import UNIT_IDS
 from multidrop.drive.family import TAKEN_NAMES, Drive
-from multidrop.drive.line_settings import LONGEST_SILENCE, Settings
+from multidrop.drive.line_settings import BAUDRATES, FORMAT, LONGEST_SILENCE, Settings
 from multidrop.drive.options import Option
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace
 from multidrop.drive.register import Register, Table
@@ -20,31 +23,94 @@ from multidrop.drive.text import Text, text
 from multidrop.drive.verbs import Verb, verb
 from multidrop.errors import WriteForbidden
 from multidrop.families.files.notation import TABLES, Counting
-from multidrop.families.files.registers import WRITES, converted, shown, unusable
-from multidrop.toml_check import Key, TomlPlace, duration_of
+from multidrop.families.files.registers import ADDRESS, BESIDE, WRITES, converted, shown, unusable
+from multidrop.printable import is_number, is_whole
+from multidrop.toml_check import ASCENDING, Key, TomlPlace, duration_of, duration_up_to, json_schema
+
+MOST_TOGETHER = {name: STANDARD_LIMITS[table.carrier] for name, table in TABLES.items()}
+_FORMATS = {"type": "array", "minItems": 1, "items": {"type": "string", "pattern": f"^{FORMAT}$"}}
+_HEX_CODE = "0*[1-9A-Fa-f][0-9A-Fa-f]?"
+_CODE = f"^([1-9][0-9]?|1[0-9]{{2}}|2[0-4][0-9]|25[0-5]|0[xX]{_HEX_CODE}|{_HEX_CODE}[hH])$"
+_PAIR = {"minItems": 2, "maxItems": 2, **ASCENDING}
+_STRINGS = {"items": {"type": "string"}}
 
 FAMILY_KEYS = {
     "title": Key(str, 'title = "Eastron SDM630"', needed=True),
     "manual": Key(str, 'manual = "SDM630 Modbus protocol, version 2"', needed=True),
-    "counts_from": Key(int, "counts_from = 0, or 1 where the manual's register 1 is sent as 0"),
-    "addresses": Key(list, "addresses = [1, 247]"),
-    "baudrates": Key(list, "baudrates = [9600, 19200]"),
-    "formats": Key((list, dict), 'formats = ["8N1", "8E1"], or { rtu = ["8N1"], ascii = ["7E1"] }'),
-    "framings": Key(list, 'framings = ["rtu"]'),
-    "together": Key(dict, "together = { holding = 80, input = 80 }"),
-    "gaps": Key(dict, "gaps = { input = [0x0000, 0x017F] }"),
-    "read_together": Key(list, 'read_together = [["energy_high", "energy_low"]]'),
-    "silence": Key(str, 'silence = "5 ms"'),
-    "least_interval": Key(str, 'least_interval = "100 ms"'),
-    "response_delay": Key(str, 'response_delay = "10 ms"'),
-    "response_timeout": Key(str, 'response_timeout = "500 ms"'),
-    "turnaround_delay": Key(str, 'turnaround_delay = "100 ms"'),
+    "counts_from": Key(
+        int,
+        "counts_from = 0, or 1 where the manual's register 1 is sent as 0",
+        keywords={"enum": [0, 1]},
+    ),
+    "addresses": Key(
+        list,
+        "addresses = [1, 247]",
+        keywords={
+            "items": {"type": "integer", "minimum": UNIT_IDS[0], "maximum": UNIT_IDS[-1]},
+            **_PAIR,
+        },
+    ),
+    "baudrates": Key(
+        list,
+        "baudrates = [9600, 19200]",
+        keywords={"items": {"type": "integer", "minimum": BAUDRATES[0], "maximum": BAUDRATES[1]}},
+    ),
+    "formats": Key(
+        (list, dict),
+        'formats = ["8N1", "8E1"], or { rtu = ["8N1"], ascii = ["7E1"] }',
+        keywords={
+            "anyOf": [
+                _FORMATS,
+                {
+                    "type": "object",
+                    "properties": {"rtu": _FORMATS, "ascii": _FORMATS},
+                    "additionalProperties": False,
+                },
+            ]
+        },
+    ),
+    "framings": Key(
+        list, 'framings = ["rtu"]', keywords={"items": {"enum": ["rtu", "ascii", "RTU", "ASCII"]}}
+    ),
+    "together": Key(
+        dict,
+        "together = { holding = 80, input = 80 }",
+        keywords={
+            "properties": {
+                name: {"type": "integer", "minimum": 1, "maximum": most}
+                for name, most in MOST_TOGETHER.items()
+            },
+            "additionalProperties": False,
+        },
+    ),
+    "gaps": Key(
+        dict,
+        "gaps = { input = [0x0000, 0x017F] }",
+        keywords={
+            "properties": {name: {"type": "array", "items": ADDRESS, **_PAIR} for name in TABLES},
+            "additionalProperties": False,
+        },
+    ),
+    "read_together": Key(
+        list,
+        'read_together = [["energy_high", "energy_low"]]',
+        keywords={"items": {"type": "array", "minItems": 1, **_STRINGS}},
+    ),
+    "silence": Key(str, 'silence = "5 ms"', keywords=duration_up_to(0)),
+    "least_interval": Key(str, 'least_interval = "100 ms"', keywords=duration_up_to(1)),
+    "response_delay": Key(str, 'response_delay = "10 ms"', keywords=duration_up_to(1)),
+    "response_timeout": Key(str, 'response_timeout = "500 ms"', keywords=duration_up_to(1)),
+    "turnaround_delay": Key(str, 'turnaround_delay = "100 ms"', keywords=duration_up_to(1)),
     "remote": Key(str, 'remote = "F0-02 must be 2"'),
     "line_parameters": Key(str, 'line_parameters = "F8-00 baud rate, F8-02 address"'),
     "watchdog": Key(str, 'watchdog = "F8-04: stops after 5 s without a request; off from the factory"'),
-    "exceptions": Key(dict, 'exceptions = { 1 = "illegal function", 0x80 = "locked" }'),
-    "write": Key(str, 'write = "single" (function 06H) or "multiple" (10H)'),
-    "registers": Key(list, 'registers = ["meter.csv"]'),
+    "exceptions": Key(
+        dict,
+        'exceptions = { 1 = "illegal function", 0x80 = "locked" }',
+        keywords={"propertyNames": {"pattern": _CODE}, "additionalProperties": {"type": "string"}},
+    ),
+    "write": Key(str, 'write = "single" (function 06H) or "multiple" (10H)', keywords={"enum": [*WRITES]}),
+    "registers": Key(list, 'registers = ["meter.csv"]', keywords={"items": BESIDE}),
     "profile": Key(str, 'profile = "profidrive"'),
     "extends": Key(str, 'extends = "innovert-ibd", a built-in family whose registers and verbs it has too'),
     "note": Key(str, 'note = "Further facts."'),
@@ -52,7 +118,6 @@ FAMILY_KEYS = {
 _TEXTS = {"title": "title", "manual": "manual", "remote": "remote", "watchdog": "watchdog"}
 _TEXTS |= {"line_parameters": "line_parameters", "note": "__doc__"}
 _DURATIONS = ("silence", "least_interval", "response_delay", "response_timeout", "turnaround_delay")
-MOST_TOGETHER = {name: STANDARD_LIMITS[table.carrier] for name, table in TABLES.items()}
 LONGEST_WAIT = 10.0  # s; limit of waits, because a stop of another drive may have to wait as long
 _LONGEST = {"silence": LONGEST_SILENCE, "least_interval": LONGEST_INTERVAL}  # s
 
@@ -85,23 +150,19 @@ def _made(make: Callable[[Any], Any], key: str, value: Any) -> Any:
         raise ValueError(f"{key} = {shown(value)}: {mistake}; write {FAMILY_KEYS[key].example}") from None
 
 
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
 def _unit_addresses(value: list[Any]) -> range:
     least, most = UNIT_IDS[0], UNIT_IDS[-1]
-    if len(value) != 2 or not all(map(_is_whole, value)) or not least <= value[0] <= value[1] <= most:
+    if len(value) != 2 or not all(map(is_whole, value)) or not least <= value[0] <= value[1] <= most:
         raise ValueError(
-            f"not the first and the last address, from 1 to 247 ({least} to {most} on Modbus TCP)"
+            f"must be the first and the last address, from 1 to 247 ({least} to {most} on Modbus TCP)"
         )
     return range(value[0], value[1] + 1)
 
 
 def _baudrates(value: list[Any]) -> tuple[int, ...]:
     for each in value:
-        if not _is_whole(each):
-            raise ValueError(f"{shown(each)} is no baud rate")
+        if not is_whole(each):
+            raise ValueError(f"{shown(each)} is not a baud rate")
         Settings(each, "8N1")
     return tuple(dict.fromkeys(value))
 
@@ -110,10 +171,10 @@ def _formats(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _formats(formats) for name, formats in value.items()}
     if not isinstance(value, list) or not value:
-        raise ValueError(f"{shown(value)} is no list of formats")
+        raise ValueError(f"{shown(value)} is not a list of formats")
     for each in value:
         if not isinstance(each, str):
-            raise ValueError(f"{shown(each)} is no format")
+            raise ValueError(f"{shown(each)} is not a format")
         Settings(9600, each)
     return tuple(dict.fromkeys(value))
 
@@ -149,9 +210,9 @@ def _exceptions(value: dict[str, Any]) -> dict[int, str]:
         try:
             number = int(digits, 16 if digits != code else 0) if code.isalnum() and code.isascii() else 0
         except ValueError:
-            raise ValueError(f"{code!r} is no exception code") from None
+            raise ValueError(f"{code!r} is not an exception code") from None
         if not 1 <= number <= 255 or not isinstance(meaning, str) or not meaning.isprintable():
-            raise ValueError(f"{code} = {shown(meaning)} is no code from 1 to 255 with its meaning")
+            raise ValueError(f"{code} = {shown(meaning)} is not a code from 1 to 255 with its meaning")
         found[number] = meaning
     return found
 
@@ -159,7 +220,7 @@ def _exceptions(value: dict[str, Any]) -> dict[int, str]:
 def _read_together(value: list[Any]) -> tuple[tuple[str, ...], ...]:
     for group in value:
         if not isinstance(group, list) or not group or not all(isinstance(name, str) for name in group):
-            raise ValueError(f"{shown(group)} is no list of registers' names")
+            raise ValueError(f"{shown(group)} is not a list of registers' names")
     return tuple(map(tuple, value))
 
 
@@ -174,15 +235,15 @@ _MAKERS: Mapping[str, Callable[[Any], Any]] = {
 
 
 def _by_table(given: Mapping[str, Any], counting: Counting, place: TomlPlace) -> dict[str, Any]:
-    """Return by table how many registers one read may have, and which gaps a read may span."""
+    """Return, by table, how many registers and which reserved addresses one read may include."""
     most: dict[Table, int] = {}
     gaps: dict[Table, range] = {}
     for key in ("together", "gaps"):
         for table, value in given.get(key, {}).items():
             if table not in TABLES:
-                place.wrong(f"{key} has {table!r}, which is no table; write {', '.join(TABLES)}")
+                place.wrong(f"{key} has {table!r}, which is not a table; write {', '.join(TABLES)}")
             elif key == "together":
-                if _is_whole(value) and 1 <= value <= MOST_TOGETHER[table]:
+                if is_whole(value) and 1 <= value <= MOST_TOGETHER[table]:
                     most[TABLES[table]] = value
                 else:
                     most_of = f"1 to {MOST_TOGETHER[table]}"
@@ -201,55 +262,62 @@ def _gap(table: str, value: Any, counting: Counting) -> range | None:
     except ValueError as mistake:
         raise ValueError(f"gaps: {table}: {mistake}") from None
     if first > last:
-        raise ValueError(f"gaps: {table} = {shown(value)} is the wrong way round: the lowest comes first")
+        raise ValueError(f"gaps: {table} = {shown(value)} is in the wrong order: give the lowest first")
     return range(first, last + 1)
 
 
-_OPTION_KEYS = {
+OPTION_KEYS = {
     "unit": Key(str, 'unit = "Hz"'),
-    "span": Key(list, "span = [1, 600]", needed=True),
+    "span": Key(list, "span = [1, 600]", needed=True, keywords={"items": {"type": "number"}, **_PAIR}),
     "meaning": Key(str, 'meaning = "parameter 1105, of which 20000 is 100 %"', needed=True),
 }
 # Reserved names: keys of a drive in a plant file, and options of its class.
-_NOT_OPTIONS = frozenset(
+NOT_OPTIONS = frozenset(
     {"name", "model", "address", "framing", "baudrate", "format", "silence", "ram", "every", "poll"}
-    | {"confirmed"}
+    | {"channel", "confirmed"}
 )
 
 
 def options_of(table: Any, registers: Collection[str], place: TomlPlace) -> dict[str, Option]:
     """Return the options declared in the [option] section; report mistakes at `place`."""
     if not isinstance(table, dict):
-        place.wrong("[option] is no table; write [option] and NAME = { unit, span, meaning }")
+        place.wrong("[option] is not a table; write [option] and NAME = { unit, span, meaning }")
         return {}
     options = {}
     for name, given in table.items():
         at = place.within(f"[option] {name[:60]}")
         why = unusable(name)
-        if why or name in _NOT_OPTIONS:
+        if why or name in NOT_OPTIONS:
             reason = why or "reserved name; every drive has it for something else"
             at.wrong(f"{shown(name)} cannot be an option's name: {reason}")
         if name in registers:
             at.wrong("a register has this name too; call one of the two otherwise")
-        good = at.check(given, _OPTION_KEYS)
+        good = at.check(given, OPTION_KEYS)
         span = good.get("span", [])
-        if span and (len(span) != 2 or not all(map(_is_number, span)) or span[0] > span[1]):
+        if span and (len(span) != 2 or not all(map(_is_finite, span)) or span[0] > span[1]):
             at.wrong(f"span = {shown(span)} is not right; write the least and the most, span = [1, 600]")
         elif span and "meaning" in good:
             options[name] = Option(good.get("unit", ""), (span[0], span[1]), good["meaning"])
     return options
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < float("inf")
+def _is_finite(value: Any) -> bool:
+    return is_number(value) and abs(value) < float("inf")
 
 
 MOST_TEXTS = 100
 TEXT_KEYS = {
-    "at": Key((int, str), 'at = 0xFC00, 8192, "2000H" or "40001"', needed=True),
-    "length": Key(int, "length = 8, registers of two characters", needed=True),
-    "table": Key(str, 'table = "input"'),
-    "order": Key(str, 'order = "BA", where the second character comes first'),
+    "at": Key((int, str), 'at = 0xFC00, 8192, "2000H" or "40001"', needed=True, keywords=ADDRESS),
+    "length": Key(
+        int,
+        "length = 8, registers of two characters",
+        needed=True,
+        keywords={"minimum": 1, "maximum": MOST_TOGETHER["holding"]},
+    ),
+    "table": Key(str, 'table = "input"', keywords={"enum": ["holding", "input"]}),
+    "order": Key(
+        str, 'order = "BA", where the second character comes first', keywords={"enum": ["AB", "BA", "B"]}
+    ),
     "place": Key(str, 'place = "table 9"'),
 }
 
@@ -259,7 +327,7 @@ def texts_of(
 ) -> dict[str, Text]:
     """Return the texts declared in the [text] section, by name; report mistakes at `place`."""
     if not isinstance(section, dict):
-        place.wrong("[text] is no table; write [text] and NAME = { at = 0xFC00, length = 8 }")
+        place.wrong("[text] is not a table; write [text] and NAME = { at = 0xFC00, length = 8 }")
         return {}
     if len(section) > MOST_TEXTS:
         place.wrong(f"[text] has {len(section)} texts, and {MOST_TEXTS} are the most")
@@ -296,19 +364,36 @@ def _text(good: dict[str, Any], counting: Counting, place: TomlPlace) -> Text | 
 
 
 MOST_PARAMETERS = 10_000
-PARAMETER_KEYS = {
-    "groups": Key(list, 'groups = [{ code = "P00.", at = "0000H", count = 30 }]', needed=True),
-    "monitors": Key(list, 'monitors = ["P17.*"], codes of values that the drive changes itself'),
-    "line": Key(list, 'line = ["P14.02", "P14.01", "P14.00"], in the order of writing'),
-    "passwords": Key(list, 'passwords = ["P07.00"]'),
-    "never": Key(dict, 'never = { "P00.18" = "it restores the factory values" }'),
-    "firmware": Key(str, 'firmware = "software_version", a register'),
-}
+_ADDRESSES = 0x10000
 GROUP_KEYS = {
     "code": Key(str, 'code = "P00.", the part of a code before its last digits', needed=True),
-    "at": Key((int, str), 'at = "0000H", the address of the index 0', needed=True),
-    "count": Key(int, "count = 30, the last index plus 1", needed=True),
+    "at": Key((int, str), 'at = "0000H", the address of the index 0', needed=True, keywords=ADDRESS),
+    "count": Key(
+        int,
+        "count = 30, the last index plus 1",
+        needed=True,
+        keywords={"minimum": 1, "maximum": MOST_PARAMETERS},
+    ),
     "digits": Key(int, "digits = 2, of the index"),
+}
+PARAMETER_KEYS = {
+    "groups": Key(
+        list,
+        'groups = [{ code = "P00.", at = "0000H", count = 30 }]',
+        needed=True,
+        keywords={"items": json_schema(GROUP_KEYS)},
+    ),
+    "monitors": Key(
+        list, 'monitors = ["P17.*"], codes of values that the drive changes itself', keywords=_STRINGS
+    ),
+    "line": Key(list, 'line = ["P14.02", "P14.01", "P14.00"], in the order of writing', keywords=_STRINGS),
+    "passwords": Key(list, 'passwords = ["P07.00"]', keywords=_STRINGS),
+    "never": Key(
+        dict,
+        'never = { "P00.18" = "it restores the factory values" }',
+        keywords={"additionalProperties": {"type": "string"}},
+    ),
+    "firmware": Key(str, 'firmware = "software_version", a register'),
 }
 
 
@@ -353,11 +438,10 @@ def _group(table: Any, counting: Counting, place: TomlPlace) -> ParameterGroup |
     return ParameterGroup(good["code"], address[0], range(good["count"]), good.get("digits", 2))
 
 
-_ADDRESSES = 0x10000
 MOST_PROOFS = 20
 PROOF_KEYS = {
     "register": Key(str, 'register = "device"', needed=True),
-    "is": Key(list, "is = [0x010A]"),
+    "is": Key(list, "is = [0x010A]", keywords={"items": {"type": "number"}}),
     "above": Key((int, float), "above = 71.5"),
     "below": Key((int, float), "below = 76.5"),
 }
@@ -385,7 +469,7 @@ class Proof:
 
 
 def proofs_of(section: Any, registers: Mapping[str, Register[Any]], place: TomlPlace) -> tuple[Proof, ...]:
-    """Return the proofs declared in [[identify]] tables, except those with a mistake."""
+    """Return the registers that identify the family, from the valid [[identify]] tables."""
     tables = section if isinstance(section, list) else [section]
     if len(tables) > MOST_PROOFS:
         place.wrong(f"[[identify]] has {len(tables)} tables, at most {MOST_PROOFS} are allowed")
@@ -402,7 +486,7 @@ def _proof(table: Any, registers: Mapping[str, Register[Any]], place: TomlPlace)
     if name not in registers or not registers[name].readable:
         place.wrong(f"register = {name!r} is not a readable register of this file")
         return None
-    if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
+    if not all(map(is_number, values)):
         place.wrong(f"is = {values!r} is not right; write {PROOF_KEYS['is'].example}")
         return None
     if not good.keys() & {"is", "above", "below"}:
@@ -423,7 +507,7 @@ def identify_by(proofs: Sequence[Proof]) -> Verb[[], None]:
             if not proof.holds(value):
                 shown = f"{register.name} = {register.format(value)}"
                 raise WriteForbidden(
-                    f"{self.name} shows {shown}: it is no {self.title or type(self).__name__}"
+                    f"{self.name} shows {shown}, so it is not a {self.title or type(self).__name__}"
                 )
 
     return identify

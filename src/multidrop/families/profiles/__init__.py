@@ -1,4 +1,4 @@
-"""Profiles: drive state machines that many makes share; a family adds its register addresses.
+"""Profiles: state machines of drives that many makes share; a family adds its register addresses.
 
 A family is a class that derives from a profile and declares its registers, or a file with
 `profile = "…"`.

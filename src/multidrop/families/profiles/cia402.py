@@ -57,12 +57,12 @@ class CiA402(Profile):
     """CiA 402: the words 6, 7, 15 start the motor, 7 stops it along the ramp, 0 lets it coast; bit 7 resets.
 
     - The stop is "disable operation", 0007H. With factory settings it ramps down. It never starts the motor:
-      a drive that is ready to be switched on is only switched on by it. "Shutdown", 0006H, coasts or ramps,
+      it only switches on a drive that is ready to be switched on. "Shutdown", 0006H, coasts or ramps,
       depending on a setting.
-    - The reset is 0087H: bit 7 and the stop word. Without bit 3 it does not enable operation.
+    - The reset is 0087H: bit 7 and the stop word. Because bit 3 is 0, the reset does not enable operation.
     - The standard has no direction for frequency drives. A family may declare a bit of its own,
       `bits = { reverse = 11 }`; without it a direction is refused.
-    - The remote bit 9 of the status must be set: it means that the drive obeys the line.
+    - For a start, the remote bit 9 of the status must be set: it means that the drive obeys the line.
     """
 
     stop_word: ClassVar[int] = SWITCH_ON
@@ -106,7 +106,7 @@ class CiA402(Profile):
                 "start without a direction"
             )
         if direction is None and reverse and self._turns(status):
-            raise WriteForbidden(f"{self.name} turns, and cannot say which way: name the direction")
+            raise WriteForbidden(f"{self.name} turns, and cannot report which way: give the direction")
         return ENABLE | reverse if direction is Direction.REVERSE else ENABLE
 
     def _prepare(self, status: int) -> Script[None]:

@@ -14,7 +14,7 @@ from multidrop.families.profiles.profile import COMMON, Profile, Role
 class DanfossControl(IntFlag):
     """The control word CTW (FC 300 design guide MG.33.B6, p. 277; FC 51 manual p. 29, coils 1 to 16)."""
 
-    RAMP = 1 << 2  # 0: brake with direct current
+    RAMP = 1 << 2  # 0 means: brake with direct current
     NO_COAST = 1 << 3
     NO_QUICK_STOP = 1 << 4
     NO_FREEZE = 1 << 5
@@ -54,8 +54,8 @@ class DanfossFC(Profile):
     - Bit 6 acts by its level: a drive that is reset while bit 6 is set starts immediately. So a stop is
       confirmed before a reset, and no word has both bits.
     - A locked trip ends only when the mains are switched off (VT2800 guide, p. 115): the reset is refused.
-    - The status shows no direction. A start without one goes forward from rest, and is refused while the
-      motor turns. Bit 15 counts only if 8-54 lets the line reverse.
+    - The status shows no direction. A start without a direction goes forward from rest, and is refused while
+      the motor turns. Bit 15 has an effect only if parameter 8-54 allows it.
     - Jog (bit 8), the preset references, the relays and the set-ups are not sent.
     """
 
@@ -98,5 +98,5 @@ class DanfossFC(Profile):
 
     def _start_word(self, direction: Direction | None, status: int) -> int:
         if direction is None and self._turns(status):
-            raise WriteForbidden(f"{self.name} turns, and cannot say which way: name the direction")
+            raise WriteForbidden(f"{self.name} turns, and cannot report which way: give the direction")
         return START | DanfossControl.REVERSE if direction is Direction.REVERSE else START

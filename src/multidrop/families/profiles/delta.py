@@ -64,9 +64,9 @@ class Delta(Profile):
       byte of newer drives is a warning.
     - The direction is sent with every run. The word that toggles it is never sent.
     - 2002H keeps its bits. The library writes 2 once and then 0, because a 2 left there would immediately
-      reset a later fault. Clearing bit 2, the base block, lets the motor continue, so a stop is sent before.
+      reset a later fault. Clearing bit 2, the base block, lets the motor continue, so a stop is sent first.
     - Bit 10 of the status says that the drive takes its commands from the line; a start requires it.
-    - No word coasts.
+    - No control word lets the motor coast.
     """
 
     stop_word: ClassVar[int] = DeltaControl.STOP
@@ -108,7 +108,7 @@ class Delta(Profile):
         return Direction.REVERSE if shown in (TO_REVERSE, REVERSE) else Direction.FORWARD
 
     def _turns_in(self, direction: Direction) -> Script[bool]:
-        """Return True if the motor turns in this direction, and the change to it is complete."""
+        """Return True if the motor turns in this direction, and is no longer reversing."""
         shown = (yield from self._status()) >> 3 & 3
         return shown in (FORWARD, REVERSE) and (yield from super()._turns_in(direction))
 

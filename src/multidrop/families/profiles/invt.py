@@ -49,8 +49,8 @@ class Invt(Profile):
 
     - Other makes have copied the words with 5 and 6 exchanged (both stop), and some with 5 for reverse. Such
       a family names its own numbers in `control`: `{ forward = 1, stop = 6, coast = 5, reset_fault = 7 }`. A
-      word that it leaves out is never sent. Compare them with the manual's list, word by word.
-    - A stop may not end a jog: if the motor still turns after it, the stop is refused, or the state is
+      word that it leaves out is never sent. Compare each of the numbers with the manual's list.
+    - A stop may not end a jog. If the stop is refused, the motor still turns after it, or the state is
       unknown, STOP_JOG follows immediately. A start may not end a jog either: after a jog a stop is required.
     """
 
@@ -106,7 +106,7 @@ class Invt(Profile):
     def _may_start(self, status: int) -> Script[None]:
         yield from super()._may_start(status)
         if self._jogged and not (yield from self._stands()):
-            raise self._stop_first("may still jog, which a start may not end:")
+            raise self._stop_first("may still jog, and a start may not end the jog:")
         self._jogged = False
 
     @verb
@@ -126,13 +126,13 @@ class Invt(Profile):
             may_jog = self._turns((yield from self._status()))
         except WriteForbidden:  # the drive is of another family
             raise
-        except BusError:  # a drive that does not reply may still receive, and jog
+        except BusError:  # a drive that does not reply may be jogging, and may still receive
             if self._has(InvtControl.STOP_JOG):
                 with suppress(BusError):
                     yield from insist(self.control, self._word(InvtControl.STOP_JOG), attempts=1)
             raise
         if may_jog and self._has(InvtControl.STOP_JOG):
-            with suppress(DriveException):  # some drives refuse it without a jog
+            with suppress(DriveException):  # some drives refuse STOP_JOG without a jog
                 yield from insist(self.control, self._word(InvtControl.STOP_JOG))
         yield from self._watch_stop()
 
@@ -155,7 +155,7 @@ class InovanceControl(IntEnum):
 
 
 class InovanceStatus(IntEnum):
-    """The status at 3000H (PI130 manual p. 122). The 0, "none", of a Delixi E (at B000H) is refused."""
+    """The status at 3000H (PI130 manual p. 122). A Delixi E's 0, "none", counts as an unknown state."""
 
     FORWARD = 1
     REVERSE = 2
@@ -194,5 +194,5 @@ class Inovance(Invt):
 
     @property
     def identity_is_weak(self) -> bool:
-        """True: the stop word runs makes with Delta's words, which may not reply to this profile's reads."""
+        """True, because a drive with Delta's words would run at a stop, and may not answer `identify`."""
         return True

@@ -50,9 +50,10 @@ class Optidrive(Profile):
 
     - An Optidrive Plus 3GV has bit 1 for the reset and bit 2 for the second ramp. Bit 1 is never sent.
     - The first guide (1.00) prints the two bytes of register 6 in the opposite order to later guides. A start
-      needs bit 6, ready, which such a drive never shows. A drive counts as stopped only if its output
-      frequency is 0.
-    - No guide says whether the reset bit acts on its edge, so a stop is sent first; the bit is cleared after.
+      needs bit 6, ready, which a drive of the first guide never shows. A drive counts as stopped only if its
+      output frequency is 0.
+    - No guide says whether the reset bit acts on its edge. So a stop is sent before the reset, and the bit
+      is cleared after it.
     - The direction is the sign of the setpoint. No negative setpoint is written.
     """
 
@@ -89,5 +90,7 @@ class Optidrive(Profile):
 
     def _start_word(self, direction: Direction | None, status: int) -> int:
         if direction is not None:
-            raise WriteForbidden(f"{self.name}: no bit of its control word is a direction; start without one")
+            raise WriteForbidden(
+                f"{self.name}: its control word has no bit for the direction; start without a direction"
+            )
         return START

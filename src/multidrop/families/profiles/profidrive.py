@@ -12,7 +12,7 @@ from multidrop.drive.state import Condition, Direction
 from multidrop.families.profiles.profile import COMMON, Profile, Role
 
 READY_TIME = 1.0  # s within which the drive must become ready to switch on
-BETWEEN = 0.1  # least s between "ready to switch on" and the next word (ACS550-02/U2 manual, p. 246)
+BETWEEN = 0.1  # s; least pause between "ready to switch on" and the next word (ACS550-02/U2 manual, p. 246)
 
 
 class ProfidriveControl(IntFlag):
@@ -51,20 +51,21 @@ class ProfidriveStatus(IntFlag):
 
 
 STOP, COAST, RESET, START = 0x047E, 0x047C, 0x04FE, 0x047F
-SWITCH_OFF, SWITCH_ON = 0x0476, 0x0477  # the motor turns with neither: operation is not enabled
+SWITCH_OFF, SWITCH_ON = 0x0476, 0x0477  # neither word turns the motor, because operation is not enabled
 
 
 class Profidrive(Profile):
     """PROFIdrive: OFF1 stops along the ramp, OFF2 coasts, a rising bit 7 resets.
 
-    A start follows the ACS550's manual (p. 246): 0476H until the drive is ready to be switched on, 100 ms,
-    0477H until it is ready to operate, 047FH. The last two are sent once each. A start is refused in local
-    control, and while OFF2 or OFF3 is active from elsewhere, or a trip or the power-up inhibits switching on.
+    A start follows the ACS550's manual (p. 246): 0476H until the drive is ready to be switched on, a pause of
+    100 ms, 0477H until it is ready to operate, then 047FH. 0477H and 047FH are sent once each. A start is
+    refused in local control, while OFF2 or OFF3 is active from another source, and while a trip or the
+    power-up inhibits switching on.
 
-    - The stop is 047EH, OFF1 alone: bit 3, which the manual's first word lacks too, would let the motor
-      coast if it carries the run enable (ACS550, 1601 = COMM).
-    - The direction is the sign of the reference, or a bit that each make has elsewhere (SINAMICS has bit 11;
-      on an ABB this bit selects EXT2). References are written from 0 up, and a start names no direction.
+    - The stop is 047EH, which only clears bit 0 (OFF1). The manual's 0476H clears bit 3 too, which would let
+      the motor coast if bit 3 carries the run enable (ACS550, 1601 = COMM).
+    - The direction is the sign of the reference, or a bit that differs between makes (bit 11 on a SINAMICS;
+      on an ABB bit 11 selects EXT2). No negative reference is written, and a start has no direction.
     - Each make has its own jog, so none is sent.
     """
 
@@ -107,8 +108,8 @@ class Profidrive(Profile):
     def _start_word(self, direction: Direction | None, status: int) -> int:
         if direction is not None:
             raise WriteForbidden(
-                f"{self.name}: no bit of this profile is a direction, which is the sign of the reference or "
-                "set on the drive; start without a direction"
+                f"{self.name}: this profile has no bit for the direction, which depends on the reference's "
+                f"sign or the drive's settings; start without a direction"
             )
         return START
 

@@ -33,7 +33,7 @@ class Role:
     """One register of a profile's state machine; the profile, not the family, sets `values` and `harmless`.
 
     `needed` is False if a family may omit the register. `extra` names bits that a family may add to `values`,
-    because makes differ in them.
+    because makes differ in these bits.
     """
 
     access: tuple[Access, ...]
@@ -43,7 +43,7 @@ class Role:
     moves: bool | None = None
     units: tuple[str, ...] = ()  # allowed units; empty: any
     extra: tuple[str, ...] = ()  # names of bits that a family may add
-    renumbered: tuple[str, ...] = ()  # control words that a family with its own numbers must define
+    renumbered: tuple[str, ...] = ()  # control words that a family must define if it has its own numbers
     needed: bool = True
 
     @property
@@ -73,13 +73,13 @@ def own_errors(
     elif name in taken:
         yield f"{name}: reserved name; every profile has it for something else; rename the register"
     elif register.harmless:
-        yield f"{name}: harmless counts are those of its control, which the profile says; leave it out"
+        yield f"{name}: only control has harmless counts, and the profile states them; leave them out"
     if name == "reference" and register.span is not None and register.span[0] < 0:
         yield f"{name}: a reference below 0 may turn the motor the other way; its span begins at 0"
     if name == "reference" and ((register.step or 0) < 0 or register.offset):
-        yield f"{name}: a greater count is more of it: its step is above 0, and it has no offset"
+        yield f"{name}: a greater count must mean more: its step must be above 0, and it has no offset"
     if name == "output_frequency" and (register.part or register.offset or register.scale_register):
-        yield f"{name}: it is 0 where the motor stands alone: it has no part, offset and scale_register"
+        yield f"{name}: it is 0 only at rest: it has no part, offset or scale_register"
 
 
 def errors_together(roles: Mapping[str, Role], found: Mapping[str, Any]) -> Iterator[str]:
@@ -92,14 +92,14 @@ def errors_together(roles: Mapping[str, Role], found: Mapping[str, Any]) -> Iter
         yield f"reference_in_force: its unit is not that of reference, {reference.unit!r}"
     signature = found.get("signature")
     if signature is not None and signature.values is None:
-        yield "signature: it needs names for the values that tell the family"
+        yield "signature: it needs names for the values that identify the family"
 
 
 def role_errors(name: str, role: Role, register: Register[Any]) -> Iterator[str]:
     """Yield an error for each fact of a role that the family must omit or declare differently."""
     if register.access not in role.access:
         wanted = " or a ".join(access.value for access in role.access)
-        yield f"{name}: in this profile it is a {wanted}, and not a {register.access.value}"
+        yield f"{name}: in this profile it is a {wanted}, not a {register.access.value}"
     for fact in ("harmless", "never_together", "moves", "never"):
         if getattr(register, fact) not in (None, ()) and getattr(register, fact) != "":
             yield f"{name}: {fact} is {_CODED}"
@@ -129,7 +129,7 @@ def _word_errors(name: str, role: Role, register: Register[Any]) -> Iterator[str
     elif not role.extra:
         yield f"{name}: its values are {_CODED}"
     elif unknown := [member.name for member in register.values if member.name.lower() not in role.extra]:
-        yield f"{name}: bits may only add {known}, and not {', '.join(unknown)}"
+        yield f"{name}: bits may only add {known}, not {', '.join(unknown)}"
     else:
         yield from _extra_errors(name, role, register.values)
 
@@ -190,15 +190,16 @@ def _enumeration(kind: Any, name: str, members: dict[str, int]) -> type[Any]:
 
 
 STOP_TIME = 60.0  # s; profiles have no role for the deceleration time
-UNUSED = (0, 0xFFFF)  # values of unused registers, and of gateways that answer for an absent drive
+UNUSED = (0, 0xFFFF)  # read from an unused register, or from a gateway if the drive is absent
 RESET_TIME = 2.0  # s within which a reset fault must disappear
 
 
 class Profile(Drive):
     """Base of the profiles: the verbs use roles; a family derives from a profile and declares the roles.
 
-    A role is a register with a fixed name. The family says its address, table, unit, step, memory and place
-    in the manual; the profile says its bits, and which of its counts are harmless. Every profile has these:
+    A role is a register with a fixed name. The family declares the register's address, table, unit, step,
+    memory and place in the manual. The profile declares its bits, and which of its counts are harmless. Every
+    profile has these:
 
     - `control` (a command), `status` (a reading), `reference` (a setting, or a command if it cannot be
       read), in Hz, or in % of the option `maximum_frequency`; `output_frequency` (a reading);
@@ -209,10 +210,11 @@ class Profile(Drive):
 
     The verbs guarantee the same as those of the built-in families. A stop is always sent, repeated until it
     is confirmed, and observed until the drive is at rest. A start or a reset is written once. A start is
-    refused in a fault, in local control, and without a setpoint in force. A reset is refused while the
-    motor turns, never has a bit that runs it, and comes after a stop. `identify` only reads. It withholds a
-    stop only if the status is another profile's, neither 0 nor FFFFH, and `station` or `signature` another
-    drive's: these two are settings, and may not be in force yet.
+    refused in a fault, in local control, and without a setpoint in force. A reset is refused while the motor
+    turns, never has a bit that runs it, and comes after a stop. `identify` only reads. A stop is withheld
+    only if the status is impossible in this profile and neither 0 nor FFFFH, and another check fails too. A
+    wrong `station` or `signature` alone is no proof of another family: these are settings, and may not be in
+    force yet.
     """
 
     roles: ClassVar[Mapping[str, Role]] = {}
@@ -247,7 +249,7 @@ class Profile(Drive):
 
     @classmethod
     def role_mistakes(cls, own: Mapping[str, Register[Any]]) -> list[str]:
-        """Return a sentence for each mistake in a family's registers, alone or with the profile."""
+        """Return a sentence for each mistake in a family's registers, including those in profile roles."""
         taken = {*dir(Profile), *Profile.__annotations__} - {*dir(Drive)}
         found = {name: own.get(name, getattr(cls, name, None)) for name in cls.roles}
         singly = (own_errors(name, one, cls.roles, taken) for name, one in own.items())
@@ -260,13 +262,13 @@ class Profile(Drive):
 
     @property
     def identity_is_weak(self) -> bool:
-        """True if there is neither `signature` nor [[identify]]: status and address may match by chance."""
+        """True without `signature` and [[identify]], because status and address may match by chance."""
         return "signature" not in self.registers and not self.identity_proofs
 
     # ---- overridden by profiles ----
 
     def _impossible(self, status: int) -> str:
-        """Return why no drive of this profile can have this status; "" if the status is possible."""
+        """Return a reason why no drive of this profile can have this status; "" if the status is possible."""
         return ""
 
     def _is_tripped(self, status: int) -> bool:
@@ -310,7 +312,7 @@ class Profile(Drive):
         return "" if register is None else register.format((yield from read(register)))
 
     def _tripped(self, status: int) -> Script[bool]:
-        """Return True if the drive has a fault; by default the status shows it."""
+        """Return True if the drive has a fault; by default, if the status shows a fault."""
         return self._is_tripped(status)
         yield
 
@@ -363,11 +365,14 @@ class Profile(Drive):
         if wrong:
             kind = self.title or type(self).__name__
             rule = ANOTHER_FAMILY if impossible and status not in UNUSED and len(wrong) > 1 else ""
-            raise WriteForbidden(f"{self.name} is not known as {kind}: {'; '.join(wrong)}", rule=rule)
+            raise WriteForbidden(f"{self.name} is not recognised as {kind}: {'; '.join(wrong)}", rule=rule)
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start at the setpoint in force. Without a direction: as the motor turns, or forward from rest."""
+        """Start at the setpoint in force.
+
+        Without a direction, a turning motor keeps its direction, and a resting motor turns forward.
+        """
         status = yield from self._status()
         yield from self._may_start(status)
         word = self._start_word(direction, status)
@@ -388,7 +393,7 @@ class Profile(Drive):
         """Raise WriteForbidden as before a start, or if the motor turns: no manual defines a jog then."""
         yield from self._may_start(status)
         if self._turns(status):
-            raise self._stop_first("turns, and may go on through a jog:")
+            raise self._stop_first("turns, and may continue to turn during a jog:")
 
     def _word(self, count: int, role: str = "control") -> Any:
         """Decode one of the profile's words to a value of the role's register."""
@@ -415,7 +420,7 @@ class Profile(Drive):
     def _send_stop(self, word: int) -> Script[None]:
         try:
             yield from insist(self.control, self._word(word))
-        except DriveException:  # some drives refuse it in a fault, when already at rest
+        except DriveException:  # some drives refuse this word in a fault, when they are already at rest
             if not (yield from self._stands()):
                 raise
 
@@ -435,7 +440,7 @@ class Profile(Drive):
             return
         if why := self._cannot_reset(status):
             raise WriteForbidden(f"{self.name} {why}")
-        yield from insist(self.control, self._word(self.stop_word))  # no run command may outlast the fault
+        yield from insist(self.control, self._word(self.stop_word))  # ends an earlier run command
         yield from self._pulse()
         if not (yield from until(self._is_reset, limit=RESET_TIME)):
             fault = (yield from self._fault()) or "it shows a fault"

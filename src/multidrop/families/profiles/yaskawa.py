@@ -44,12 +44,12 @@ FORWARD, REVERSE = YaskawaControl.FORWARD, YaskawaControl.REVERSE
 
 
 class Yaskawa(Profile):
-    """Yaskawa: while bit 0 is 1 the motor runs forward, while bit 1 is 1 in reverse; bit 3 resets.
+    """Yaskawa: bit 0 runs the motor forward, bit 1 in reverse, while the bit is 1; bit 3 resets.
 
     - Bits 0 and 1 are those of H5-12 = 0, the factory setting. With H5-12 = 1 bit 1 is the direction, and a
       start in reverse has no effect: `start` raises NotVerified.
-    - No word coasts, and no jog is sent.
-    - A status of 0 is impossible: at rest "zero speed" is set, else "during run".
+    - No control word lets the motor coast, and no jog is sent.
+    - A status of 0 is impossible: the bit "zero speed" is set at rest, the bit "during run" otherwise.
     - Bit 15 of the status says that the drive takes its commands from the line; a start requires it.
     """
 
