@@ -41,6 +41,7 @@ struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, in
     port->must_take = must_take;
     port->turn.line.transactions = (uint8_t)transactions;
     port->is_watched = 1;
+    port->doubts = MD_WRONG_COUNTS;
     /* Make the port raw before the first read: with VMIN 0, an empty read returns 0, as after a hang-up. */
     struct md_settings settings;
     if (must_take >= 0 && md_port_get(fd, &settings) == 0)
@@ -104,7 +105,7 @@ void md_port_fence(struct md_port *port, struct md_mastership *mastership)
     md_engine_enter(port->engine);
     __atomic_store_n(&mastership->engine, port->engine, __ATOMIC_SEQ_CST);
     port->mastership = mastership;
-    port->heard_term = 0; /* the stored term may belong to another mastership */
+    port->heard_term = 0; /* the stored number may belong to another mastership: listen to the line again */
     md_engine_leave(port->engine);
 }
 
@@ -173,7 +174,8 @@ const struct md_progress *md_port_progress(struct md_port *port)
 }
 
 /* Return 1 if the thread will serve the port before the next request can leave, so that the client need not
- * wake the thread. Return 0 while the port listens for another master, because stops do not wait for that. */
+ * wake the thread. Return 0 while the port listens for another master: a stop does not wait for the end of
+ * listening, so the client must wake the thread. */
 static int is_attended(const struct md_port *port)
 {
     if (port->turn.line.listened_ns)
@@ -185,7 +187,7 @@ static int is_attended(const struct md_port *port)
 int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                       int64_t expires_ns, struct md_completion *completion, double *values)
 {
-    struct md_engine *engine = port->engine; /* read now: another thread may free the port meanwhile */
+    struct md_engine *engine = port->engine; /* kept here: during the wait another thread may free the port */
     struct md_urgent urgent = {.exchange = exchange, .not_before_ns = not_before_ns, .expires_ns = expires_ns,
                                .completion = completion};
     md_engine_enter(engine);

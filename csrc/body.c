@@ -1,31 +1,48 @@
 /* Bodies of frames: read and write the content of requests and replies in any framing, and check whether a
  * reply confirms its request.
  *
- * The Modbus framings wrap the same bytes, address + PDU (application protocol V1.1b3). Delixi's body is A
- * K P1 P0 D3 D2 D1 D0. */
+ * The Modbus framings wrap the same bytes, address + PDU (application protocol V1.1b3). Delixi's body is A K
+ * P1 P0 D3 D2 D1 D0 (address, function, parameter, data). */
 #include "internal.h"
 
 #include <string.h>
 
-/* The fields behind address and function code. */
+/* The fields after address and function code. */
 enum layout {
     NONE,       /* the framing has no such function */
     RANGE,      /* start, count */
     DATA,       /* byte count, data */
     ECHO,       /* start, two bytes */
     RANGE_DATA, /* start, count, byte count, data */
-    LONG        /* start, four bytes: every Delixi body */
+    LONG,       /* start, four bytes: every Delixi body */
+    BARE,       /* no fields */
+    STATUS,     /* one byte */
+    COUNTERS,   /* four bytes */
+    MASK,       /* start, four bytes */
+    POINTER,    /* start */
+    QUEUE,      /* byte count of two bytes, data; the request does not determine the count */
+    COUNTED,    /* byte count, data; the request does not determine the count */
+    IDENTITY,   /* MEI type, code, object */
+    OBJECTS /* MEI type, code, conformity, more, next object, number of objects; each: id, length, text */
 };
 
 static const struct fields {
     uint8_t start, count, byte_count; /* 1: the layout has the field, 0: not */
-    uint8_t data_len;                 /* data bytes of a layout without a byte count */
+    uint8_t data_len;                 /* number of data bytes, if byte_count is 0 */
 } fields_of[] = {
     [RANGE] = {.start = 1, .count = 1},
     [DATA] = {.byte_count = 1},
     [ECHO] = {.start = 1, .data_len = 2},
     [RANGE_DATA] = {.start = 1, .count = 1, .byte_count = 1},
     [LONG] = {.start = 1, .data_len = 4},
+    [STATUS] = {.data_len = 1},
+    [COUNTERS] = {.data_len = 4},
+    [MASK] = {.start = 1, .data_len = 4},
+    [POINTER] = {.start = 1},
+    [QUEUE] = {.data_len = 2}, /* the byte count */
+    [COUNTED] = {.byte_count = 1},
+    [IDENTITY] = {.data_len = 3},
+    [OBJECTS] = {.data_len = 6},
 };
 
 enum { BIT = 1, WORD = 16 };
@@ -45,26 +62,35 @@ static const struct function {
     [0x04] = {RANGE, DATA, WORD, 125, NO_BROADCAST},
     [MD_WRITE_COIL] = {.request = ECHO, .reply = ECHO, .may_be = BROADCAST},
     [MD_WRITE_ONE] = {.request = ECHO, .reply = ECHO, .may_be = BROADCAST},
+    [MD_READ_STATUS] = {.request = BARE, .reply = STATUS},
     [MD_LOOPBACK] = {.request = ECHO, .reply = ECHO},
+    [0x0B] = {.request = BARE, .reply = COUNTERS}, /* event counter */
+    [0x0C] = {.request = BARE, .reply = COUNTED},  /* event log */
     [0x0F] = {RANGE_DATA, RANGE, BIT, 1968, BROADCAST},
     [0x10] = {RANGE_DATA, RANGE, WORD, 123, BROADCAST},
+    [MD_REPORT_ID] = {.request = BARE, .reply = COUNTED},
+    [MD_MASK_WRITE] = {.request = MASK, .reply = MASK},
+    [0x18] = {.request = POINTER, .reply = QUEUE},
+    [MD_READ_IDENTITY] = {.request = IDENTITY, .reply = OBJECTS},
 };
 
 enum {
     EXCEPTION_BODY = 3,
     NO_PATH = 0x0A, /* a gateway's exceptions: no path to the unit, no reply from it */
     NO_TARGET = 0x0B,
-    DELIXI_BODY = 8
+    DELIXI_BODY = 8,
+    MEI_IDENTITY = 0x0E, /* the MEI type of MD_READ_IDENTITY; other types have other layouts */
+    MOST_DATA_BODY = 2 + MD_MOST_DATA
 };
 
-/* Delixi's function codes K that only a drive sends (part 3). */
+/* Delixi's function codes K that only a drive sends (Delixi's manual, part 3). */
 enum { CANNOT_EXECUTE = 0xF0, FIRST_REFUSAL = 0xFC };
 
 static const struct function *find_function(int framing, uint8_t code)
 {
     static const struct function none, delixi = {.request = LONG, .reply = LONG};
     static const struct function delixi_run = {.request = LONG, .reply = LONG, .may_be = BROADCAST};
-    if (framing == MD_DELIXI) /* part 3: only a run command may be broadcast */
+    if (framing == MD_DELIXI) /* Delixi's manual, part 3: only a run command may be broadcast */
         return code == MD_DELIXI_RUN ? &delixi_run : &delixi;
     return code < sizeof functions / sizeof *functions ? &functions[code] : &none;
 }
@@ -107,6 +133,24 @@ static size_t put_body(int layout, const struct md_message *message, uint8_t *bo
     return (size_t)(at - body) + message->data_len;
 }
 
+/* Return the length of a device identification (V1.1b3, 6.21). It depends on the lengths of its objects. */
+static int objects_length(const uint8_t *body, size_t have)
+{
+    size_t at = (size_t)head_length(OBJECTS);
+    if (have >= 3 && body[2] != MEI_IDENTITY)
+        return MD_BAD_FUNCTION;
+    if (have < at)
+        return MD_INCOMPLETE;
+    for (unsigned left = body[at - 1]; left > 0; left--) {
+        if (have < at + 2)
+            return MD_INCOMPLETE;
+        at += 2U + body[at + 1];
+        if (at > MOST_DATA_BODY)
+            return MD_BAD_LENGTH;
+    }
+    return (int)at;
+}
+
 /* Write only the data bytes that the body has: clearing the unused bytes takes longer than parsing. */
 static void get_body(int layout, const uint8_t *body, struct md_message *message)
 {
@@ -121,6 +165,10 @@ static void get_body(int layout, const uint8_t *body, struct md_message *message
         at += 2;
     }
     message->data_len = fields->byte_count ? *at++ : fields->data_len;
+    if (layout == QUEUE)
+        message->data_len = (uint16_t)(2 + md_get16(at));
+    if (layout == OBJECTS)
+        message->data_len = (uint16_t)(objects_length(body, MOST_DATA_BODY) - 2);
     memcpy(message->data, at, message->data_len);
 }
 
@@ -131,8 +179,8 @@ static void begin_message(struct md_message *message, uint8_t address, uint8_t f
     message->function = function;
 }
 
-/* Return the length of a request's body by its first bytes; MD_INCOMPLETE while they do not determine it.
- * A request with an invalid count is still a request if its length does not depend on the count: the drive
+/* Return the length of a request's body from its first bytes; MD_INCOMPLETE if more bytes are needed. A
+ * request with an invalid count is still a request if its length does not depend on the count: the drive
  * answers it with an exception. */
 static int request_length(int framing, const uint8_t *body, size_t have)
 {
@@ -142,6 +190,8 @@ static int request_length(int framing, const uint8_t *body, size_t have)
     if (function->request == NONE || (framing == MD_DELIXI && body[1] >= CANNOT_EXECUTE))
         return MD_BAD_FUNCTION;
     int head = head_length(function->request);
+    if (function->request == IDENTITY && have >= 3 && body[2] != MEI_IDENTITY)
+        return MD_BAD_FUNCTION;
     if (function->request != RANGE_DATA)
         return head;
     if (have < (size_t)head)
@@ -158,7 +208,8 @@ static int is_answered(int framing, uint8_t address)
     return address != 0 || framing == MD_TCP;
 }
 
-/* Return the length of the body of the reply to `request`; an error once the bytes rule that reply out. */
+/* Return the length of the body of the reply to `request`; an enum md_frame_fault if the bytes cannot start
+ * that reply. */
 static int reply_length(int framing, const uint8_t *body, size_t have, const struct md_message *request)
 {
     const struct function *function = find_function(framing, request->function);
@@ -170,17 +221,24 @@ static int reply_length(int framing, const uint8_t *body, size_t have, const str
         return MD_INCOMPLETE;
     if (framing == MD_DELIXI && is_delixi_refusal(body[1]))
         return DELIXI_BODY;
-    /* ERMAN's manual, section 8, shows an exception to function 08 with 89H (as Yaskawa's manuals do). */
+    /* ERMAN's manual, section 8, shows function code 89H in an exception to function 08 (as Yaskawa's manuals
+     * do). */
     if (framing != MD_DELIXI && (body[1] == (request->function | MD_EXCEPTION_BIT) ||
                                  (request->function == MD_LOOPBACK && body[1] == 0x89)))
         return have >= EXCEPTION_BODY && body[2] == 0 ? MD_BAD_FUNCTION : EXCEPTION_BODY;
     if (body[1] != request->function || function->reply == NONE)
         return MD_BAD_FUNCTION;
     int head = head_length(function->reply);
-    if (function->reply != DATA)
+    if (function->reply == OBJECTS)
+        return objects_length(body, have);
+    if (function->reply != DATA && function->reply != COUNTED && function->reply != QUEUE)
         return head;
     if (have < (size_t)head)
         return MD_INCOMPLETE;
+    if (function->reply == QUEUE)
+        return md_get16(body + 2) <= MD_MOST_DATA - 2 ? head + md_get16(body + 2) : MD_BAD_LENGTH;
+    if (function->reply == COUNTED)
+        return body[2] >= 1 && body[2] <= MD_MOST_DATA ? head + body[2] : MD_BAD_LENGTH;
     unsigned count = request->count;
     if (count == 0 || count > function->most || body[2] != data_bytes(function, count))
         return MD_BAD_LENGTH;
@@ -190,6 +248,13 @@ static int reply_length(int framing, const uint8_t *body, size_t have, const str
 int md_body_length(int framing, const uint8_t *body, size_t have, const struct md_message *request)
 {
     return request ? reply_length(framing, body, have, request) : request_length(framing, body, have);
+}
+
+int md_body_longest_reply(int framing, const struct md_message *request)
+{
+    int layout = find_function(framing, request->function)->reply;
+    int is_open = layout == COUNTED || layout == QUEUE || layout == OBJECTS;
+    return is_open ? MD_MOST_BODY : md_body_reply_length(framing, request);
 }
 
 int md_body_reply_length(int framing, const struct md_message *request)
@@ -207,6 +272,13 @@ static int is_range(const struct function *function, const struct md_message *me
     return count >= 1 && count <= function->most && message->start + count <= 0x10000;
 }
 
+static int is_identification(const struct md_message *message)
+{
+    uint8_t body[MOST_DATA_BODY];
+    memcpy(body + 2, message->data, message->data_len);
+    return objects_length(body, 2U + message->data_len) == 2 + message->data_len;
+}
+
 /* Check that the message fits a body of this layout. */
 static int fits(int layout, const struct function *function, const struct md_message *message)
 {
@@ -220,8 +292,16 @@ static int fits(int layout, const struct function *function, const struct md_mes
                8 * message->data_len % function->unit_bits == 0;
     case LONG:
         return message->data_len == 4 && is_delixi_command(message->function);
+    case COUNTED:
+        return message->data_len >= 1;
+    case QUEUE:
+        return message->data_len >= 2 && message->data_len == 2 + md_get16(message->data);
+    case IDENTITY:
+        return message->data_len == 3 && message->data[0] == MEI_IDENTITY;
+    case OBJECTS:
+        return is_identification(message);
     default:
-        return layout == ECHO && message->data_len == 2;
+        return layout != NONE && message->data_len == fields_of[layout].data_len;
     }
 }
 
@@ -255,20 +335,28 @@ static int is_reply(int framing, const struct md_message *message)
     return fits(function->reply, function, message);
 }
 
-/* Check that the reply confirms its request. A write's reply repeats address and value, or address and
- * count. With Delixi (part 3, note 1) a query is answered in P1P0 or in D3..D0, all other requests with a
- * copy. */
+/* Check that the reply confirms its request. A write's reply repeats address and value, or address and count.
+ * A Delixi drive (Delixi's manual, part 3, note 1) puts the value of a query into P1P0 or into D3..D0. It
+ * answers all other requests with a copy of the request. */
 static int confirms(int framing, const uint8_t *body, const struct md_message *request)
 {
+    int layout = find_function(framing, request->function)->reply;
+    if (layout == STATUS) /* its body is too short to have a start field */
+        return 1;
     uint16_t start = md_get16(body + 2);
-    switch (find_function(framing, request->function)->reply) {
+    switch (layout) {
     case RANGE:
         return start == request->start && md_get16(body + 4) == request->count;
-    case ECHO:
-        return start == request->start && memcmp(body + 4, request->data, 2) == 0;
-    case LONG: /* value 0 does not exist: that reply would equal the query */
+    case ECHO: /* diagnostics: only subfunction 0, the loopback, repeats the request's data */
+        return start == request->start && ((request->function == MD_LOOPBACK && start != 0) ||
+                                           memcmp(body + 4, request->data, 2) == 0);
+    case MASK:
+        return start == request->start && memcmp(body + 4, request->data, 4) == 0;
+    case LONG: /* the value is never 0: such a reply would equal the query */
         return (request->function == MD_DELIXI_STATE_QUERY ? start != 0 : start == request->start) &&
                (request->function == MD_DELIXI_PARAMETER_QUERY || memcmp(body + 4, request->data, 4) == 0);
+    case OBJECTS:
+        return body[3] == request->data[1];
     default:
         return 1;
     }
@@ -289,7 +377,7 @@ int md_body_put_reply(int framing, const struct md_message *message, uint8_t *bo
         return MD_BAD_REQUEST;
     if (!message->exception)
         return (int)put_body(find_function(framing, message->function)->reply, message, body);
-    if (framing == MD_DELIXI) { /* the other bytes are 0: "no meaning" in the document */
+    if (framing == MD_DELIXI) { /* the other bytes have "no meaning" in the manual: they stay 0 */
         body[1] = message->exception;
         return DELIXI_BODY;
     }

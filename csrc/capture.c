@@ -1,9 +1,10 @@
-/* Captures: packets of capture files, frames of both directions and all framings, and rows.
+/* Read captures: take packets from capture files, then frames (requests and replies in all framings) from
+ * packets, and then rows from frames.
  *
- * The splitter knows no drives, only the table of functions in body.c. A frame is a byte sequence with a good
- * checksum at a place that allows one. Bytes after a request are tried as the reply to it, then as a request,
- * then as a reply without its request. At most three frames are tried at a byte, so the cost is linear in the
- * length of garbage. */
+ * The splitter knows no drives, only the table of functions in body.c. Bytes count as a frame if a frame may
+ * start there and its checksum is good. The splitter parses bytes after a request as the reply to it, then as
+ * a request, then as a reply without its request. It parses at most three frames at each byte, so the cost is
+ * linear in the length of garbage. */
 #include "internal.h"
 
 #include <string.h>
@@ -132,9 +133,9 @@ int md_unpack(struct md_capture *capture)
 
 /* ---- frames of sniffed bytes ---- */
 
-enum { MOST_NOISE = 3 }; /* most bytes between a request and its reply; more may be a damaged request */
+enum { MOST_NOISE = 3 }; /* limit of noise bytes between request and reply; more may be a damaged request */
 
-/* Return the index of the first byte that comes after a pause, and after this piece. */
+/* Return the start of the next piece that comes after a pause; the stream's length if there is none. */
 static size_t end_of_run(const struct md_stream *stream, size_t piece)
 {
     while (++piece < stream->count)
@@ -150,14 +151,15 @@ static int is_start(int framing, uint8_t first)
     return framing == MD_RTU ? first <= MD_MOST_ADDRESS : first == ':';
 }
 
-/* Return 1 if a good reply to such a request is a copy of the request, or looks like one. */
+/* Return 1 if a good reply to a request of this function is a copy of the request, or looks like one. */
 static int is_echoed(int framing, uint8_t function)
 {
-    int is_write = function == MD_WRITE_COIL || function == MD_WRITE_ONE;
+    int is_write = function == MD_WRITE_COIL || function == MD_WRITE_ONE || function == MD_MASK_WRITE;
     return framing == MD_DELIXI || is_write || function == MD_LOOPBACK;
 }
 
-/* Return 1 for a Delixi request. A reply has the same form, but only a query always has the value 0. */
+/* Return 1 if the message may be a Delixi request. A query and its reply have the same form, but the value
+ * in a query is always 0. */
 static int is_delixi_request(const struct md_message *message)
 {
     static const uint8_t zeros[4];
@@ -275,7 +277,7 @@ static int is_ruled_out(const struct md_piece *piece)
     return piece->side == MD_FAILED || piece->side == MD_NOISE;
 }
 
-/* Parse the frame at `at` in the splitter's piece; `end` is the index of the byte after the next pause. */
+/* Parse the frame at index `at`, which is in the splitter's piece. The next pause is before index `end`. */
 static int look_at(const struct md_splitter *splitter, const struct md_stream *stream, size_t at, size_t end,
                    struct md_span *span)
 {
@@ -311,7 +313,7 @@ int md_split(struct md_splitter *splitter, const struct md_stream *stream, struc
     span->at = splitter->at;
     span->len = at - splitter->at;
     if (!span->len && is_junk) {
-        span->kind = MD_JUNK; /* do not pass(): the frames around these bytes are parsed as if adjacent */
+        span->kind = MD_JUNK; /* pass() is not called: frames before and after count as adjacent */
         size_t next = splitter->piece + 1;
         splitter->at = next < stream->count ? pieces[next].at : stream->len;
         span->len = splitter->at - span->at;
@@ -353,7 +355,7 @@ void md_stream_forget(struct md_stream *stream, struct md_splitter *splitter)
     memmove(stream->pieces, stream->pieces + first, stream->count * sizeof *stream->pieces);
     for (size_t i = 0; i < stream->count; i++) {
         struct md_piece *piece = &stream->pieces[i];
-        if (piece->at < gone) /* the pause was before the discarded bytes */
+        if (piece->at < gone) /* the start of this piece, after the pause, is discarded */
             piece->is_after_pause = 0;
         piece->at = piece->at < gone ? 0 : piece->at - gone;
     }
@@ -442,7 +444,8 @@ static int take_request(struct md_decoder *decoder, struct md_columns *columns)
     return MD_ALL_DECODED;
 }
 
-/* Add the span to the bytes received instead of a reply, and derive the failure from all these bytes. */
+/* Append the span to the bytes that came instead of a reply, and set `failure` to the reason why all these
+ * bytes are not a reply. */
 static void explain(struct md_decoder *decoder, const struct md_stream *stream)
 {
     const struct md_span *span = &decoder->span;
@@ -469,7 +472,7 @@ static int take(struct md_decoder *decoder, const struct md_stream *stream, stru
     case MD_REQUEST:
     case MD_EITHER:
         if (!decoder->is_sure)
-            decoder->block = NULL; /* the "request" may be a reply to a write: then no further reply comes */
+            decoder->block = NULL; /* the frame may be the reply to a write: then no reply follows */
         int undone = take_request(decoder, columns);
         if (undone)
             return undone;

@@ -1,19 +1,21 @@
-/* Captures: bytes of a line, put into packets and taken out again. Python calls these functions. */
+/* Captures: write the bytes of a line as packets of a capture file, and read them back. Python calls these
+ * functions. */
 #ifndef MULTIDROP_CAPTURE_H
 #define MULTIDROP_CAPTURE_H
 
 #include "multidrop.h"
 
 /* cdef: start */
-/* ---- tap.c: return a length in bytes ---- */
+/* ---- tap.c: functions return a length in bytes ---- */
 
-/* The sender of bytes. A capturing master uses the last two values for bytes that are not frames. */
+/* The sender of captured bytes. MD_FAILED and MD_NOISE mark bytes that are not a frame; only a capture by
+ * multidrop has these two marks. */
 enum md_side {
     MD_EITHER_SIDE, /* unknown sender */
-    MD_ASKING,
-    MD_ANSWERING,
-    MD_FAILED, /* bytes that came instead of a good reply */
-    MD_NOISE,  /* stray bytes, echoes, late replies */
+    MD_ASKING,      /* the master: a request */
+    MD_ANSWERING,   /* a drive: a reply */
+    MD_FAILED,      /* bytes that came instead of a good reply */
+    MD_NOISE,       /* stray bytes, echoes, late replies */
     MD_SIDES
 };
 
@@ -21,9 +23,9 @@ enum md_side {
 struct md_tap {
     uint8_t *ring;
     uint32_t room;       /* bytes, a power of two */
-    uint32_t put, taken; /* bytes written and read so far, modulo 2^32; one thread changes each */
+    uint32_t put, taken; /* bytes written and read so far, modulo 2^32; each is changed by one thread */
     uint64_t lost;       /* bytes dropped because the ring was full */
-    int64_t ahead_ns;    /* UTC - CLOCK_MONOTONIC for the next bytes; 0: the reader's value */
+    int64_t ahead_ns;    /* UTC - CLOCK_MONOTONIC for the next bytes; 0: use md_tap_take()'s argument */
 };
 
 /* Header and trailer of a packet. Each side has two such pairs: one for bytes that start with ':', one for
@@ -33,15 +35,16 @@ struct md_wrapping {
     uint32_t head_len, tail_len; /* tail_len is a multiple of 4 */
 };
 
-/* Write whole pcapng packets to `out` while there is room. */
+/* Move bytes from the ring to `out` as whole pcapng packets, as many as fit; return their length. */
 size_t md_tap_take(struct md_tap *tap, const struct md_wrapping *wrappings, uint32_t interface,
                    int64_t utc_minus_monotonic_ns, uint8_t *out, size_t room);
-/* Return the length in the file of a packet with `len` bytes. Its wrapping depends on the `first` byte. */
+/* Return how many bytes of the file a packet with `len` bytes takes. Its wrapping depends on its `first`
+ * byte. */
 size_t md_packet_length(const struct md_wrapping *wrappings, int side, uint8_t first, size_t len);
 void md_put_packet(const struct md_wrapping *wrappings, uint32_t interface, int side, int64_t time_ns,
                    const uint8_t *bytes, size_t len, uint8_t *out);
 
-/* ---- capture.c: return 1; 0 without room (md_stream_put), or without enough bytes (md_split) ---- */
+/* ---- capture.c: return 1 on success; 0 if the buffer is full, or if a span needs more bytes ---- */
 
 /* Bytes that were received together, from index `at` to the start of the next piece. */
 struct md_piece {
@@ -55,7 +58,7 @@ struct md_piece {
 struct md_stream {
     uint8_t *bytes;
     struct md_piece *pieces;
-    size_t len, room, count, most; /* bytes, and room for bytes; pieces, and room for pieces */
+    size_t len, room, count, most; /* number and limit of bytes; number and limit of pieces */
     int is_all;                    /* no more bytes will come */
     int is_tcp;                    /* 1: all frames are Modbus TCP; 0: no frame is */
 };
@@ -63,7 +66,7 @@ struct md_stream {
 enum md_kind {
     MD_JUNK,    /* not a frame */
     MD_REQUEST,
-    MD_EITHER,  /* a request, or the reply that repeats it; the bytes before were not a frame */
+    MD_EITHER,  /* a request, or the reply that repeats it; unknown which, because junk came before */
     MD_REPLY,   /* the reply to the previous request */
     MD_STRAY    /* a reply without its request */
 };
@@ -81,17 +84,17 @@ struct md_span {
 struct md_splitter {
     size_t at, piece;          /* index of the next byte, and of its piece */
     size_t junk;               /* bytes since the last frame */
-    int is_in_step;            /* whether a frame ended at `at`; after junk, a "request" may be a reply */
+    int is_in_step;            /* 1: a frame ended at `at`; 0: junk: an apparent request may be a reply */
     int awaited, framing;      /* `awaited`: the reply to `request` is due, in this framing */
     struct md_message request; /* the last request */
 };
 
-/* Append these bytes as a piece; 0: no room. */
+/* Append these bytes as a piece; return 0 if there is no room. */
 int md_stream_put(struct md_stream *stream, const uint8_t *bytes, size_t len, struct md_piece piece);
 /* Discard the bytes before the splitter's position. */
 void md_stream_forget(struct md_stream *stream, struct md_splitter *splitter);
-/* Find the next span; every byte is part of one. Pauses and sides influence the result, the other borders of
- * pieces do not. Junk may be split into several spans. */
+/* Find the next span. Every byte becomes part of a span; junk may be split into several spans. Cuts between
+ * pieces matter only if there is a pause, or if the side changes. */
 int md_split(struct md_splitter *splitter, const struct md_stream *stream, struct md_span *span);
 
 /* ---- capture.c: return an enum md_decoded ---- */
@@ -110,19 +113,20 @@ struct md_decoder {
     size_t places, taken;
     const struct md_block *block; /* fields in the reply to the last request */
     int64_t asked_ns;
-    int is_sure, failure;         /* 1: the last frame was surely a request; the result if no reply comes */
+    int is_sure, failure;         /* 1: the last frame was surely a request; its result if no reply comes */
     int is_due;                   /* `span` is not processed yet */
     uint64_t frames, exchanges, junk, strays;
     struct md_completion completion;
 };
 
 enum md_decoded {
-    MD_ALL_DECODED, /* except an incomplete frame at the end */
+    MD_ALL_DECODED, /* all but an incomplete frame at the end is decoded */
     MD_NO_ROOM,     /* the columns are full */
     MD_UNKNOWN      /* unknown request in `span`: call md_know() and repeat */
 };
 
-/* Set the fields in replies to this request (`block` NULL: no rows). Return 0 if the table is full. */
+/* Store which fields the replies to this request contain (`block` NULL: none, so no rows). Return 0 if the
+ * table of requests is full. */
 int md_know(struct md_decoder *decoder, int framing, const struct md_message *request,
             const struct md_block *block);
 /* Add rows to `columns` for all sniffed exchanges, including requests without a reply. */

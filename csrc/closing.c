@@ -1,8 +1,8 @@
 /* Close a serial port in bounded time.
  *
- * On Linux close(2) waits up to 30 s until the adapter has taken the driver's bytes (closing_wait, which only
- * root may change). A signal to the closing thread ends the wait, and the driver then discards the bytes. The
- * signal is one that the program does not use. A timer sends it to the closing thread only. */
+ * On Linux close(2) waits up to 30 s for the adapter to take the driver's bytes (closing_wait, which only
+ * root may change). A signal to the closing thread ends the wait, and the driver then discards the bytes. A
+ * timer sends this signal to the closing thread only. The program does not otherwise use the signal. */
 #define _GNU_SOURCE
 #include "internal.h"
 
@@ -18,14 +18,15 @@
 #define sigev_notify_thread_id _sigev_un._tid
 #endif
 
-static const int64_t AGAIN_NS = 20000000; /* the first signal may come before the wait starts */
+static const int64_t AGAIN_NS = 20000000; /* repeat the signal: the first may come before close(2) */
 
 static void interrupt(int number)
 {
     (void)number;
 }
 
-/* Return 1 if the signal has no handler, or this file's, and is not blocked, as for sigwait(2). */
+/* Return 1 if the program does not use the signal: it is not blocked, as for sigwait(2), and has no handler
+ * but this file's. */
 static int is_free(int number, const sigset_t *blocked)
 {
     struct sigaction now;

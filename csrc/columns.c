@@ -7,10 +7,10 @@
 
 enum {
     FORMAT = MD_LOW_WORD_FIRST - 1, /* mask: the format without its byte order */
-    DECIMALS = 22                   /* 10^22 is the last power that a double holds exactly */
+    DECIMALS = 22                   /* 10^22 is the greatest power of ten that a double holds exactly */
 };
 
-static const uint8_t words_of[FORMAT + 1] = { /* number of 16-bit words; 0: a bit, or no such format */
+static const uint8_t words_of[FORMAT + 1] = { /* number of 16-bit words; 0: a bit, or no format */
     [MD_U16] = 1, [MD_I16] = 1, [MD_U32] = 2, [MD_I32] = 2, [MD_U32_EITHER] = 2,
     [MD_F32] = 2, [MD_BIT] = 0, [MD_I8] = 1, [MD_U64] = 4, [MD_I64] = 4,
     [MD_F64] = 4, [MD_BCD16] = 1, [MD_BCD32] = 2, [MD_F16] = 1,
@@ -87,7 +87,7 @@ static double number_of(uint64_t bits, int format)
     case MD_I16: return (int16_t)bits;
     case MD_I32: return (int32_t)bits;
     case MD_I64: return (double)(int64_t)bits;
-    case MD_U32_EITHER: return (double)((bits >> 16 | bits) & 0xFFFF); /* any order: one word is 0 */
+    case MD_U32_EITHER: return (double)((bits >> 16 | bits) & 0xFFFF); /* one of the two words is 0 */
     case MD_F32: return of_float((uint32_t)bits);
     case MD_F64: return of_double(bits);
     case MD_F16: return of_half((uint32_t)bits);
@@ -97,7 +97,7 @@ static double number_of(uint64_t bits, int format)
     }
 }
 
-static int bit_at(const uint8_t *data, size_t at) /* the first coil is the first byte's least bit */
+static int bit_at(const uint8_t *data, size_t at) /* coils start at the least significant bit */
 {
     return data[at / 8] >> at % 8 & 1;
 }
@@ -139,7 +139,7 @@ static int is_any(uint64_t bits, const struct md_invalid *invalid, int count)
     return 0;
 }
 
-/* Return the number in a field's part of the bits; in a signed format the part's highest bit is its sign. */
+/* Return the number in the field's bits; in a signed format the highest bit is the sign. */
 static double part_of(uint64_t bits, int format, const struct md_extra *extra)
 {
     uint64_t mask = extra->bits < 64 ? (UINT64_C(1) << extra->bits) - 1 : UINT64_MAX;
@@ -176,7 +176,7 @@ static double value_with(const struct md_message *reply, const struct md_field *
     return scaled(raw, field, extra->addend, power);
 }
 
-/* Return the row's status; if it is MD_OK, set its value. */
+/* Return the row's status; if it is MD_OK, set `value`. */
 static uint16_t find_value(const struct md_message *reply, const struct md_block *block,
                            const struct md_field *field, double *value)
 {
@@ -214,7 +214,7 @@ int md_values(const struct md_block *block, const struct md_message *reply, doub
 
 struct md_columns *md_columns_new(size_t room)
 {
-    enum { WIDE = 4, NARROW = 3 }; /* number of columns with 8 and with 2 bytes a row */
+    enum { WIDE = 4, NARROW = 3 }; /* numbers of columns with 8 bytes, and with 2 bytes, for each row */
     struct md_columns *columns = malloc(sizeof *columns + room * (WIDE * 8 + NARROW * 2) + (room + 7) / 8);
     if (!columns)
         return NULL;

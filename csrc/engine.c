@@ -81,8 +81,8 @@ static void bring_rest(const struct md_port *port)
         bring((*next_pointer(port))->drive, offsetof(struct md_drive, counters));
 }
 
-/* Each step reads memory that the next step in this list has prefetched earlier: the last step runs for the
- * port farthest ahead. */
+/* In each round, each port ahead gets one step. The port farthest ahead gets the last step of this list, and
+ * its next step is the one before it. Each step reads memory that the previous round prefetched. */
 static void (*const steps[STEPS_AHEAD])(const struct md_port *port) = {
     bring_rest, bring_drives, bring_exchanges, bring_port,
 };
@@ -101,7 +101,7 @@ static void prefetch(struct md_port *const *ports, int n, int next)
 #include <sys/prctl.h>
 #endif
 
-enum { READY = 256 }; /* most ports handled between two waits */
+enum { READY = 256 }; /* limit of the ports handled between two waits */
 
 static int64_t earliest(const struct md_engine *engine)
 {
@@ -120,7 +120,7 @@ static int wait_until(struct md_engine *engine, void **ready, int64_t until_ns)
     if (n > 0)
         return n;
     int64_t late = md_now_ns() - until_ns;
-    if (left > 0 && late >= 0) { /* only if the thread did sleep */
+    if (left > 0 && late >= 0) { /* the thread did sleep */
         late = sooner(late, MD_MOST_LATENESS);
         engine->lateness_ns += (late - engine->lateness_ns) / (late > engine->lateness_ns ? 4 : 16);
     }
@@ -164,7 +164,7 @@ static void open_ports(struct md_engine *engine)
     engine->arriving = NULL;
 }
 
-/* Remove the closing ports, for which their clients wait. */
+/* Remove the closing ports. Their clients wait until this is done. */
 static void close_ports(struct md_engine *engine)
 {
     for (unsigned i = engine->count; i-- > 0;) {
@@ -232,7 +232,8 @@ static void ignore_broken_pipes(void)
 #endif
 }
 
-/* Let this thread's sleeps end in time. */
+/* Let this thread's sleeps end on time: Linux may delay them by the timer slack, so make it as short as
+ * possible. */
 static void make_punctual(void)
 {
 #ifdef __linux__

@@ -10,11 +10,13 @@
 #include <stdint.h>
 #include <sys/types.h>
 
+enum { MD_WRONG_COUNTS = 3 }; /* ignore the driver's count of unsent bytes after so many wrong counts */
+
 /* The state of the transceiver's direction. */
 struct md_rs485 {
     int mode;        /* enum md_rs485_mode */
-    int reports_end; /* the driver reports when the last bit has left */
-    int is_sending;  /* RTS now makes the transceiver send */
+    int reports_end; /* 1: the driver reports when the last bit has left */
+    int is_sending;  /* 1: RTS now switches the transceiver to sending */
     int64_t sent_ns; /* when the last bit leaves, if the UART sends without delay */
     int64_t look_ns; /* time of the next check whether the last bit has left */
     int64_t empty_ns; /* when the driver's queue was found empty; 0: not found yet */
@@ -22,13 +24,14 @@ struct md_rs485 {
 };
 
 struct md_port {
-    /* fields for every exchange */
+    /* fields that every exchange uses */
     int fd;
-    int must_take;     /* mask of refused settings that are failures; -1: a port without settings */
+    int must_take;     /* mask of the settings whose refusal is a failure; -1: the port has no settings */
     unsigned index;    /* index among the engine's ports */
-    int is_blind;      /* no useful bytes come before the port's wake time */
+    int is_blind;      /* 1: the port is not watched, because no useful bytes come before its wake time */
     int is_watched;    /* the waiter reports when the port is readable */
-    int is_empty;      /* the last read left no bytes */
+    int is_empty;      /* 1: the last read left no bytes in the driver */
+    int doubts;        /* after so many wrong counts of unsent bytes, ignore the driver's count; 0: trust */
     int is_closing;
     struct md_settings settings; /* the port's present settings; baudrate 0: unknown */
     struct md_engine *engine;
@@ -36,35 +39,37 @@ struct md_port {
     struct md_rs485 rs485;
     struct md_turn turn;
 
-    uint32_t heard_term;  /* term of the mastership that last listened to the line; 0: none */
+    int64_t taken_ns;     /* time at which a stalled adapter had taken all bytes; MD_NEVER: not yet */
+    uint32_t heard_term;  /* number of the term in which the port last listened to the line; 0: none */
     struct md_port *next; /* next port in the engine's list of arriving ports */
     int is_opened, open_error, is_closed;
 };
 
 struct md_engine {
     pthread_t thread;
-    pthread_mutex_t mutex;  /* the thread releases it only while it waits; guards all below, and the ports */
+    pthread_mutex_t mutex;  /* guards the fields below and the ports; the thread unlocks it only to wait */
     atomic_int callers;     /* clients that want the mutex */
     pthread_cond_t changed; /* signals: an urgent request is done, a port opened or closed */
-    int has_news;           /* `changed` must be signalled */
+    int has_news;           /* 1: `changed` must be signalled */
     struct md_waiter *waiter;
     struct md_wakeup wakeup;
     struct md_port *arriving; /* ports to be added; their clients wait */
     struct md_port **ports;
-    int64_t *wakes; /* latest wake time for each port */
+    int64_t *wakes; /* for each port, the time by which the thread must wake */
     unsigned count, room;
     int64_t lateness_ns; /* how late the thread usually wakes from a sleep */
     struct md_realtime realtime;
     int wants_realtime;      /* 1: start realtime scheduling, 0: end it */
     int realtime_failure;    /* 0 or -errno */
-    int is_realtime_changed; /* 1: no client waits for a change */
+    int is_realtime_changed; /* 1: the change is done */
 };
 
-/* This process's right to send on its lines, which ends at a deadline. */
+/* This process's right to send on its lines, which ends at a deadline. Each time that the process gets the
+ * right again, a new term starts. */
 struct md_mastership {
     int64_t until_ns;         /* deadline by CLOCK_BOOTTIME; accessed atomically; 0: no right to send */
     int64_t guard_ns;         /* least time between the requests of two masters */
-    uint32_t term;            /* terms so far; another process may be master between two terms */
+    uint32_t term;            /* number of the latest term; between two terms another process may be master */
     struct md_engine *engine; /* the engine whose ports check it; NULL: no port yet */
 #ifdef __linux__
     timer_t timer;
@@ -99,7 +104,7 @@ ssize_t md_rs485_write(struct md_port *port, const uint8_t *bytes, size_t len);
 /* Switch the transceiver to receiving if the last bit has left; return 0, or -errno if the port is lost. */
 int md_rs485_look(struct md_port *port, int64_t now_ns);
 
-/* ---- system calls on a descriptor; on Windows it is a handle, and windows/ has these functions ---- */
+/* ---- system calls on a descriptor; windows/ implements them on a handle ---- */
 
 #ifdef _WIN32
 

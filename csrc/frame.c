@@ -6,8 +6,8 @@
 
 /* ---- checksums ---- */
 
-/* CRC-16/MODBUS, polynomial A001H (8005H reversed), of every byte value followed by 0 to 3 zero bytes: the
- * CRC of a byte is the sum, without carry, of the CRCs of its bits, which are the arguments of ALL. */
+/* CRC-16/MODBUS, polynomial A001H (8005H reversed), of every byte value followed by 0 to 3 zero bytes. The
+ * CRC of a byte is the XOR of the CRCs of its bits, which are the arguments of ALL. */
 #define BYTE(n, a, b, c, d, e, f, g, h) \
     ((n) & 1 ? a : 0) ^ ((n) & 2 ? b : 0) ^ ((n) & 4 ? c : 0) ^ ((n) & 8 ? d : 0) ^ \
     ((n) & 16 ? e : 0) ^ ((n) & 32 ? f : 0) ^ ((n) & 64 ? g : 0) ^ ((n) & 128 ? h : 0)
@@ -135,7 +135,7 @@ static int open_tcp(const uint8_t *bytes, size_t len, const struct md_message *r
     if (md_tcp_is_exception(bytes, len, request))
         whole = MD_TCP_EXCEPTION;
     else if (whole == MD_NO_START && request && len < MD_TCP_HEAD + 2 && (len < 4 || !md_get16(bytes + 2)))
-        return MD_INCOMPLETE; /* the frame may become an exception with a wrong length in its header */
+        return MD_INCOMPLETE; /* with one more byte it may be an exception whose header has a wrong length */
     if (whole <= 0)
         return whole;
     size_t have = len < (size_t)whole ? len : (size_t)whole;
@@ -242,9 +242,8 @@ int md_parse_reply(int framing, const uint8_t *bytes, size_t len, const struct m
     return used;
 }
 
-int md_reply_length(int framing, const struct md_message *request)
+static int frame_length(int framing, int body)
 {
-    int body = md_body_reply_length(framing, request);
     if (body == 0)
         return 0;
     if (framing == MD_RTU)
@@ -252,10 +251,20 @@ int md_reply_length(int framing, const struct md_message *request)
     return framing == MD_TCP ? MD_TCP_HEAD + body : 2 * body + 5;
 }
 
+int md_reply_length(int framing, const struct md_message *request)
+{
+    return frame_length(framing, md_body_reply_length(framing, request));
+}
+
+int md_longest_reply(int framing, const struct md_message *request)
+{
+    return frame_length(framing, md_body_longest_reply(framing, request));
+}
+
 /* ---- why a request has no reply ---- */
 
-/* Rank reasons by how specific they are. The most specific reason is reported; among equals, the first. The
- * search continues inside a frame from another address, because the expected frame may start there. */
+/* Rank reasons by how specific they are. The most specific reason is reported; among equally specific ones,
+ * the first. The search continues inside a frame from another address: the expected frame may start there. */
 static int weight(int reason)
 {
     static const uint8_t weights[] = {

@@ -1,5 +1,5 @@
-/* The functions that only C calls, except those of a line and its turns (line.h). Tests see the marked part,
- * too. */
+/* The functions that only C calls, except those of a line and its turns (line.h). Python tests can also call
+ * the functions between the `cdef` marks. */
 #ifndef MULTIDROP_INTERNAL_H
 #define MULTIDROP_INTERNAL_H
 
@@ -18,7 +18,7 @@ void md_counters_end(const struct md_exchange *exchange, const struct md_complet
 /* Count a reply with its delay and the least time that its exchange needs on the line. */
 void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_ns);
 uint64_t md_replies(const struct md_drive *drive);
-const uint64_t *md_usual_delays(const struct md_drive *drive); /* counter of the usual delay's bucket */
+const uint64_t *md_usual_delays(const struct md_drive *drive); /* the counter for the usual delay */
 
 /* ---- clock.c ---- */
 
@@ -32,23 +32,26 @@ int md_columns_add(struct md_columns *columns, const struct md_block *block,
                    const struct md_completion *completion, int64_t utc_minus_monotonic_ns);
 /* Return the number of the block's fields that have no value in a good reply. */
 uint64_t md_count_lacking(const struct md_block *block, const struct md_message *reply);
-/* Keep the queue until it is released, even if its client frees it. */
+/* Keep the queue in memory until md_row_queue_release(), even if its client frees it. */
 void md_row_queue_hold(struct md_row_queue *row_queue);
 void md_row_queue_release(struct md_row_queue *row_queue);
-/* Append the exchange's rows to the newest chunk; `block` NULL: it has no rows. */
+/* Append the exchange's rows to the newest chunk; do nothing if `block` is NULL. */
 void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *block,
                       const struct md_completion *completion);
 /* cdef: end */
 
 /* ---- body.c: the content of frames, from the address on ---- */
 
-enum { MD_MOST_BODY = 253 }; /* 125 registers read; the standard has room for 254 */
+enum { MD_MOST_BODY = 253 }; /* a reply with 125 registers; the standard has room for 254 bytes */
 
-/* Return the length of the body at `body`: a request's, or that of the reply to `request`; MD_INCOMPLETE
- * while its first bytes do not determine it. */
+/* Return the length of a body: of a request if `request` is NULL, otherwise of the reply to `request`. Return
+ * MD_INCOMPLETE while the first bytes do not determine the length. */
 int md_body_length(int framing, const uint8_t *body, size_t have, const struct md_message *request);
-/* Return the length of the good reply's body; 0 after a broadcast. */
+/* Return the body length of a good reply to `request`; 0 if the request is a broadcast. */
 int md_body_reply_length(int framing, const struct md_message *request);
+/* Return the body length of the longest possible reply, for requests that do not determine their reply's
+ * length. */
+int md_body_longest_reply(int framing, const struct md_message *request);
 /* Write the fields after address and function; return the body's length, MD_BAD_REQUEST if a field is out of
  * bounds. */
 int md_body_put_request(int framing, const struct md_message *message, uint8_t *body);
@@ -66,9 +69,18 @@ enum {
     MD_TCP_EXCEPTION = MD_TCP_HEAD + 3
 };
 
-enum { MD_WRITE_COIL = 0x05, MD_WRITE_ONE = 0x06, MD_LOOPBACK = 0x08, MD_EXCEPTION_BIT = 0x80 };
+enum {
+    MD_WRITE_COIL = 0x05,
+    MD_WRITE_ONE = 0x06,
+    MD_READ_STATUS = 0x07, /* read exception status (V1.1b3, 6.7) */
+    MD_LOOPBACK = 0x08,
+    MD_REPORT_ID = 0x11,     /* report server id (6.13) */
+    MD_MASK_WRITE = 0x16,
+    MD_READ_IDENTITY = 0x2B, /* read device identification (6.21) */
+    MD_EXCEPTION_BIT = 0x80
+};
 
-/* Delixi's K (part 3): a master sends K = 2 to 7. */
+/* Delixi's function code K (Delixi's manual, part 3): a master sends K = 2 to 7. */
 enum { MD_DELIXI_RUN = 2, MD_DELIXI_STATE_QUERY = 3, MD_DELIXI_PARAMETER_QUERY = 7 };
 
 /* Numbers in frames are big-endian. */
@@ -92,25 +104,27 @@ int md_tcp_length(const uint8_t *bytes, size_t len);
 /* Return 1 if the bytes start an exception to this request. An exception's length is fixed, although some
  * devices put another length into the header. */
 int md_tcp_is_exception(const uint8_t *bytes, size_t len, const struct md_message *request);
-/* Return 1 if a gateway reports that the drive is unreachable or silent. */
+/* Return 1 if the reply is a gateway's exception, which reports that the drive is unreachable or silent. */
 int md_is_from_gateway(int framing, const struct md_message *reply);
-/* Return why these bytes are not the reply: an enum md_frame_fault, MD_CUT_SHORT or MD_NO_REPLY. */
+/* Return the length of the longest possible reply's frame, for requests that do not determine their reply's
+ * length; 0 for a broadcast. */
+int md_longest_reply(int framing, const struct md_message *request);
+/* Return the reason why these bytes are not the reply: enum md_frame_fault, MD_CUT_SHORT or MD_NO_REPLY. */
 int md_reason(int framing, const struct md_message *request, const uint8_t *bytes, size_t len);
 
 /* ---- stats.c: delays and timeouts ---- */
 
-/* Return the delay from the end of a request to the read of the port, not counting the reply's time on the
- * wire. */
+/* Return how long after the end of a request to read the port, not counting the reply's time on the wire. */
 int64_t md_look_ns(const struct md_exchange *exchange);
 int64_t md_timeout_ns(const struct md_exchange *exchange);
-/* Return the time after a request by which its reply starts, with a margin; 0 if the drive's delays vary too
- * much or are not known well enough. */
+/* Return the time, with a margin, within which a reply starts after its request; 0 if the drive's delays vary
+ * too much or are not known well enough. */
 int64_t md_reply_due_ns(const struct md_exchange *exchange);
-/* Learn from a reply's delay (an upper bound if the first read found the reply whole); return the best
- * estimate of the delay. */
+/* Learn from a reply's delay and return the best estimate of it. With `is_whole`, the first read found the
+ * whole reply, so `delay_ns` is only an upper bound. */
 int64_t md_learn_delay(const struct md_exchange *exchange, int64_t delay_ns, int is_whole);
 /* Use a longer timeout, because a late reply came `delay_ns` after its request. If the request was sent
- * several times, `delay_ns` counts from the last one and `is_exact` is 0. */
+ * several times, `delay_ns` counts from the last time and `is_exact` is 0. */
 void md_learn_lateness(struct md_drive *drive, int64_t delay_ns, int is_exact);
 /* After a timeout, halve the longer timeout that md_learn_lateness() set. */
 void md_learn_silence(struct md_drive *drive);
@@ -152,7 +166,7 @@ int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t tim
 
 /* ---- termios.c ---- */
 
-int md_port_keep_rts(int fd); /* let closing the port leave RTS unchanged; 0, -errno */
+int md_port_keep_rts(int fd); /* leave RTS unchanged when the port is closed; return 0 or -errno */
 
 /* ---- wakeup.c ---- */
 
@@ -180,8 +194,8 @@ struct md_realtime {
 
 int md_realtime_start(struct md_realtime *realtime); /* 0, -errno */
 void md_realtime_end(struct md_realtime *realtime);
-/* End realtime scheduling if the thread used more than half of a processor. Call this at least twice a second
- * of the thread's CPU time. */
+/* End realtime scheduling if the thread used more than half of a processor. Call this at least twice in each
+ * second of the thread's CPU time. */
 void md_realtime_check(struct md_realtime *realtime, int64_t now_ns);
 
 /* ---- mutexes ---- */

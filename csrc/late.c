@@ -1,13 +1,15 @@
-/* Replies after their timeout: no late reply is ever mistaken for another request's.
+/* Replies after their timeout: no late reply is ever mistaken for the reply to another request.
  *
- * A drive that is a little late may answer in any order. For some time after a timeout, the window, no
- * request leaves that such a reply could be mistaken for. A path that delays all bytes (a modem, a gateway, a
- * stalled network) keeps the order: a reply that fits no outstanding request proves that all earlier replies
- * have come, or never will. Therefore outstanding requests are kept beyond the window, and a proof is sent
- * first: a request whose reply differs from all outstanding ones in function, length or value.
+ * A drive that is a little late may answer in any order. For some time after a timeout (the window), a
+ * request is not sent if a late reply could be mistaken for its reply.
+ *
+ * A path that delays all bytes (a modem, a gateway, a stalled network) keeps their order. A reply that fits
+ * no outstanding request shows that all earlier replies have come, or never will. Therefore outstanding
+ * requests are kept beyond the window, and a proof is sent before a new request. A proof is a read whose
+ * reply differs from all outstanding replies in function, length or value.
  *
  * A reply that fits an outstanding request counts as the reply to that request. It settles the earliest
- * request that it fits, and all requests before that request. */
+ * request that it fits, and all requests sent before that request. */
 #include "line.h"
 
 #include <string.h>
@@ -51,12 +53,13 @@ int md_is_read(int framing, uint8_t function)
 {
     if (framing == MD_DELIXI)
         return function == MD_DELIXI_STATE_QUERY || function == MD_DELIXI_PARAMETER_QUERY;
-    return function <= LAST_READ;
+    return function <= LAST_READ || function == MD_READ_STATUS || function == MD_REPORT_ID ||
+           function == MD_READ_IDENTITY;
 }
 
-/* Return 1 if a reply to the outstanding request could be mistaken for the exchange's. That includes
- * exceptions: they do not name the write that they refuse. A start wrongly reported as refused would be a
- * running motor reported as stopped. */
+/* Return 1 if a reply to the outstanding request could be mistaken for the exchange's reply. Exceptions count
+ * too, because they do not name the write that they refuse: a start could be reported as refused while the
+ * motor runs. */
 static int is_mistakable(const struct md_owed *owed, const struct md_exchange *exchange)
 {
     const struct md_message *request = &exchange->request;
@@ -78,7 +81,7 @@ int md_is_in_range(const struct md_message *reply, uint16_t least, uint32_t end)
     return end == 0 || reply->exception || reply->data_len < 2 || (value >= least && value < end);
 }
 
-/* Return the length of the reply at `bytes`, MD_INCOMPLETE, or why the bytes are not a reply to `owed`. */
+/* Parse `bytes` as the reply to `owed`. Return the reply's length or an enum md_frame_fault. */
 static int parse_owed(const struct md_owed *owed, const uint8_t *bytes, size_t len)
 {
     struct md_message request = {.address = owed->address, .function = owed->function, .start = owed->start,
@@ -119,11 +122,12 @@ static void drop_time(struct md_owed *owed)
 
 /* Some proofs may not work: a device may be silent to registers that it lacks, and a document may be wrong
  * about a register's range. A proof that was never answered is removed after MOST_FAILURES failures. A
- * missing reply counts only if the drive has replied to another request since the last failure. */
+ * missing reply counts as a failure only if the drive has replied to another request since the last
+ * failure. */
 enum { MOST_FAILURES = 2, ANSWERED = 0xFF };
 
-/* Return the index of this exchange in the drive's list of proofs, or proof_count if it is not a proof. In
- * that usual case do not read the list, because its memory is rarely cached. */
+/* Return the index of this exchange in the drive's list of proofs, or proof_count if it is not a proof.
+ * Usually it is not, and the list is not read, because its memory is rarely cached. */
 static uint32_t proof_at(const struct md_exchange *exchange)
 {
     const struct md_drive *drive = exchange->drive;
@@ -138,7 +142,7 @@ int md_proof_is(const struct md_exchange *exchange)
     return proof_at(exchange) < exchange->drive->proof_count;
 }
 
-/* Remove a proof. If only one is left, remove it too: it cannot be distinguished from its own late reply. */
+/* Remove a proof. If only one proof is left, remove it too: a late reply to it would look like a new one. */
 static void drop_proof(struct md_drive *drive, uint32_t at)
 {
     drive->proof_count--;
@@ -220,7 +224,7 @@ static void forget_settled(struct md_drive *drive, int64_t now_ns)
 static int has_mistakable(const struct md_exchange *exchange, int own)
 {
     const struct md_drive *drive = exchange->drive;
-    int is_crowded = drive->owed_count > MD_MOST_OWED - MD_MOST_PROOFS; /* leave room for the proofs */
+    int is_crowded = drive->owed_count > MD_MOST_OWED - MD_MOST_PROOFS; /* last places: for proofs */
     for (uint32_t i = 0; i < drive->owed_count; i++) {
         const struct md_owed *owed = &drive->history->owed[i];
         int counts = is_open(drive, owed) && (own || !is_same(owed, exchange));
@@ -230,8 +234,8 @@ static int has_mistakable(const struct md_exchange *exchange, int own)
     return 0;
 }
 
-/* Return 1 if a late exception within the window could be mistaken for the exchange's: an exception names
- * only the function, with Delixi not even that. */
+/* Return 1 if a late exception within the window could be mistaken for the exchange's reply: an exception
+ * names only the function, with Delixi not even that. */
 static int is_in_window(const struct md_exchange *exchange, int64_t now_ns)
 {
     const struct md_drive *drive = exchange->drive;
@@ -243,7 +247,7 @@ static int is_in_window(const struct md_exchange *exchange, int64_t now_ns)
     return 0;
 }
 
-/* Return 1 if no late reply delays the request: a stop must leave, and a broadcast has no reply. */
+/* Return 1 if the request does not wait for late replies: a stop must leave, and a broadcast has no reply. */
 static int is_exempt(const struct md_exchange *exchange)
 {
     return exchange->insists || md_reply_length(exchange->framing, &exchange->request) == 0;
@@ -281,8 +285,8 @@ int md_late_bars(const struct md_exchange *exchange, int64_t now_ns)
     return !md_proof_is(exchange) && has_mistakable(exchange, 0);
 }
 
-/* The last proof is reserved for a drive that answers again after a silence. During the silence this proof
- * was not sent, so the second reply to it, at the latest, settles all outstanding requests. */
+/* The last proof is held back while the drive is silent, and sent once the drive answers again. It was not
+ * sent during the silence. So at the latest the second reply to it settles all outstanding requests. */
 static const struct md_exchange *last_proof(const struct md_drive *drive)
 {
     return drive->proof_count ? drive->proofs[drive->proof_count - 1] : NULL;
@@ -336,7 +340,7 @@ const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int6
     return is_answering ? last_proof(drive) : latest;
 }
 
-/* ---- changes of the list ---- */
+/* ---- add and settle outstanding requests ---- */
 
 void md_late_link(struct md_line *line, struct md_drive *drive)
 {
@@ -361,7 +365,7 @@ void md_late_expect(struct md_line *line, int64_t window_ns)
 {
     const struct md_exchange *exchange = line->exchange;
     struct md_drive *drive = exchange->drive;
-    int64_t reply_ns = md_reply_length(exchange->framing, &exchange->request) * exchange->character_ns;
+    int64_t reply_ns = md_longest_reply(exchange->framing, &exchange->request) * exchange->character_ns;
     int64_t until_ns = window_ns ? line->quiet_ns + window_ns + reply_ns : 0;
     forget_settled(drive, line->quiet_ns);
     struct md_owed *owed = place_of(drive, exchange);

@@ -1,5 +1,5 @@
-/* One line as a state machine: silence, request, reply or timeout. Bytes and times are arguments; it uses
- * neither a descriptor nor a clock.
+/* One line as a state machine: silence, request, reply or timeout. It gets bytes and times as arguments, and
+ * uses neither a descriptor nor a clock.
  *
  * On real lines junk, an echo, or another station's frame may come before the reply. Neither such bytes nor
  * a damaged frame end the exchange: the timeout keeps running (serial-line guide V1.02, 2.4.1). */
@@ -13,7 +13,8 @@
 enum { IDLE = MD_IDLE, SILENCE, CHECK, READY, WRITING, AWAITING, LAST_LOOK, NONE = -1 };
 
 const int8_t md_line_follows[MD_LINE_STATES][MD_LINE_EVENTS] = {
-    /*              begun    silent  nothing stray    part     sent      timeout    in time   ended */
+    /* Columns are events: MD_BEGUN, FELL_SILENT, NOTHING_CAME, STRAY_BYTES, PART_LEFT, ALL_LEFT, TIME_OUT,
+     * BYTES_IN_TIME, ENDED. */
     [IDLE]      = { SILENCE, NONE,   NONE,   IDLE,    NONE,    NONE,     NONE,      NONE,     NONE },
     [SILENCE]   = { NONE,    CHECK,  NONE,   SILENCE, NONE,    NONE,     NONE,      NONE,     IDLE },
     [CHECK]     = { NONE,    NONE,   READY,  SILENCE, NONE,    NONE,     NONE,      NONE,     IDLE },
@@ -28,7 +29,7 @@ const int8_t md_line_follows[MD_LINE_STATES][MD_LINE_EVENTS] = {
 /* Before its first request a new master listens, because a line has only one master. Unexpected bytes are
  * another master's requests, or replies to them. They restart the wait, so that the first request leaves
  * after a long enough silence. The wait lasts at least for the guard time, in which the kernel's timer kills
- * a suspended former master. On Modbus TCP, which shows no other master's frames, only the guard time counts.
+ * a suspended former master. A network shows no other master's frames, so there only the guard time counts.
  *
  * A stop does not wait: the motor must stop, even beside another master. */
 
@@ -50,11 +51,6 @@ int md_listen_begin(struct md_line *line, int64_t now_ns, int64_t guard_ns)
     return 1;
 }
 
-void md_listen_put_back(struct md_line *line)
-{
-    md_line_go(line, MD_ENDED);
-}
-
 void md_listen_receive(struct md_line *line, size_t len, int64_t now_ns)
 {
     if (line->transactions) /* on a network, only replies to this process arrive */
@@ -65,7 +61,7 @@ void md_listen_receive(struct md_line *line, size_t len, int64_t now_ns)
 
 static int end_listening(struct md_line *line, int64_t now_ns)
 {
-    if (!md_listen_is_held(line)) /* a stop does not wait; later exchanges still listen */
+    if (!md_listen_is_held(line)) /* a stop is sent now, but later exchanges still listen */
         return 1;
     if (now_ns < line->listened_ns)
         return 0;
@@ -89,6 +85,7 @@ static int is_failure(int result)
     case MD_POLL_ENDED:
     case MD_NOT_MASTER:
     case MD_OTHER_MASTER:
+    case MD_STALLED:
         return 0;
     default:
         return result < 0;
@@ -100,7 +97,7 @@ static void count_reply(struct md_block *block, uint8_t exception)
     if (exception) {
         block->refusals++;
         block->refusal = exception;
-    } else if (block->refusals || !block->is_answered) { /* write only changed memory */
+    } else if (block->refusals || !block->is_answered) { /* write only if a field changes */
         block->refusals = 0;
         block->is_answered = 1;
     }
@@ -114,7 +111,7 @@ static void count(const struct md_exchange *exchange, const struct md_completion
     struct md_block *block = exchange->block;
     md_counters_end(exchange, completion);
     md_proof_end(exchange, completion->result);
-    int is_alive = completion->result == MD_BAD_ECHO && md_proof_is(exchange); /* value outside its range */
+    int is_alive = completion->result == MD_BAD_ECHO && md_proof_is(exchange); /* a reply, out of range */
     if (is_failure(completion->result)) {
         md_count_failures(drive, is_alive ? 0 : drive->failures + 1);
         if (block)
@@ -129,12 +126,12 @@ static void count(const struct md_exchange *exchange, const struct md_completion
 
 static void tap_bytes(const struct md_line *line, int side, int64_t time_ns, const uint8_t *bytes, size_t len)
 {
-    if (line->tap && md_line_is_under_way(line)) /* bytes before the request went to the tap as they came */
+    if (line->tap && md_line_is_under_way(line)) /* bytes before the request already went to the tap */
         md_tap_put(line->tap, side, time_ns ? time_ns : line->completion->sent_ns, bytes, len);
 }
 
-/* Pass to the tap all bytes that came since the request was sent: the reply or the bytes that came instead of
- * it, and all others. */
+/* Pass to the tap all bytes that came since the request was sent: the reply, or the bytes that came instead
+ * of it, and all bytes before and after. */
 static void tap_received(const struct md_line *line, struct md_ending ending)
 {
     const struct md_completion *completion = line->completion;
@@ -166,13 +163,24 @@ static void complete(struct md_line *line, struct md_ending ending)
 
 static const int64_t WORTH_WAITING = 250000; /* ns; a shorter sleep costs more than reading the port */
 
-/* Return the silence around an exchange, in ns. A network needs no silence. If a gateway's replies have no
- * matching ids, a silence separates them: a second copy of a reply could be mistaken for the next reply. */
+/* Return the silence in ns that is required before and after an exchange; 0 on a network. But if a gateway's
+ * replies do not have their requests' ids, a silence separates the exchanges: a second copy of a reply could
+ * be mistaken for the next reply. */
 static int64_t silence_of(const struct md_line *line, const struct md_exchange *exchange)
 {
     enum { CHARACTERS = 4 };
     int64_t least_ns = line->transactions == MD_IGNORED ? CHARACTERS * exchange->character_ns : 0;
     return later(least_ns, exchange->silence_ns);
+}
+
+/* Return 1 if the reply must be to the last request: no earlier request to the drive lacks its reply, and no
+ * other bytes came before the request. */
+static int is_surely_answered(const struct md_line *line, int result)
+{
+    const struct md_drive *drive = line->exchange->drive;
+    if (result <= 0 || drive->owed_count || line->completion->stale)
+        return 0;
+    return drive->proof_count || drive->counters.sent == drive->counters.answered;
 }
 
 static void finish(struct md_line *line, struct md_ending ending)
@@ -183,8 +191,10 @@ static void finish(struct md_line *line, struct md_ending ending)
     line->quiet_ns = later(line->quiet_ns, completion->last_ns);
     if (line->transactions && completion->last_ns) /* a network needs no silence */
         line->quiet_ns = completion->last_ns;
-    if (completion->sent_ns) /* otherwise the previous exchange's silence still holds */
+    if (completion->sent_ns) { /* otherwise the previous exchange's silence is still required */
         line->silence_ns = silence_of(line, line->exchange);
+        line->is_answered = (uint8_t)is_surely_answered(line, ending.result);
+    }
     md_line_go(line, MD_ENDED);
 }
 
@@ -199,7 +209,7 @@ void md_line_abandon(struct md_line *line, int result, int error)
     if (line->state == MD_IDLE)
         return;
     if (line->state >= MD_AWAITING && line->transactions != MD_MATCHED)
-        md_late_expect(line, md_window_ns(line->exchange)); /* its reply may come on the reopened port */
+        md_late_expect(line, md_window_ns(line->exchange)); /* the reply may come on the reopened port */
     line->completion->error = error;
     fail(line, result);
 }
@@ -235,27 +245,44 @@ static int load(struct md_line *line, const struct md_exchange *exchange)
 void md_line_begin(struct md_line *line, const struct md_exchange *exchange, struct md_completion *completion,
                    int64_t now_ns)
 {
-    memset(completion, 0, offsetof(struct md_completion, reply.data)); /* the arrays behind have lengths */
+    /* reply.data and raw are read only up to their lengths, so they are not cleared. */
+    memset(completion, 0, offsetof(struct md_completion, reply.data));
     completion->begun_ns = now_ns;
     completion->stale = line->rx_len;
     line->exchange = exchange;
     line->completion = completion;
     line->tx_at = 0;
+    line->is_held = 0;
     line->silence_ns = later(line->silence_ns, silence_of(line, exchange));
     line->give_up_ns = later(now_ns, md_line_silent_ns(line)) + exchange->drive->most_timeout_ns;
     md_line_go(line, MD_BEGUN);
     if (md_listen_is_held(line))
         line->give_up_ns = later(line->give_up_ns, line->listened_ns + exchange->drive->most_timeout_ns);
-    if (exchange->drive->owed_count) /* requests from another line, or from before the port was reopened */
+    if (exchange->drive->owed_count) /* sent on another line, or before this port was reopened */
         md_late_link(line, exchange->drive);
     int refused = md_late_bars(exchange, now_ns) ? MD_LATE_ANSWER_DUE : load(line, exchange);
     if (refused)
         finish(line, (struct md_ending){refused, 0, 0});
 }
 
+void md_line_put_back(struct md_line *line)
+{
+    md_line_go(line, MD_ENDED);
+}
+
 int64_t md_line_silent_ns(const struct md_line *line)
 {
     return line->quiet_ns + line->silence_ns;
+}
+
+/* Hold a read of a silent drive for longer than others: in that time another drive's reply can show that the
+ * driver's count of unsent bytes is wrong. A silent drive cannot show that. */
+int64_t md_line_hold_ns(const struct md_line *line, int was_wrong)
+{
+    enum { WRONG_S = 1, SECONDS = 30, SILENT_S = 40 };
+    if (was_wrong)
+        return WRONG_S * MD_SECOND_NS;
+    return (line->exchange->drive->failures ? SILENT_S : SECONDS) * MD_SECOND_NS;
 }
 
 /* Return the earliest time at which the request may be sent. */
@@ -285,10 +312,10 @@ int md_line_want(struct md_line *line, int64_t now_ns)
             now_ns + line->exchange->drive->most_timeout_ns + md_wire_ns(line->exchange, line->tx_len);
         return MD_WRITE;
     case MD_READY:
-    case MD_WRITING: /* a port that takes no bytes for so long is broken */
+    case MD_WRITING: /* a port that takes no bytes until wake_ns is broken */
         if (now_ns < line->wake_ns)
             return MD_WRITE;
-        md_line_abandon(line, MD_LINE_LOST, ETIMEDOUT);
+        md_line_abandon(line, md_line_is_held(line) ? MD_STALLED : MD_LINE_LOST, ETIMEDOUT);
         return MD_DONE;
     case MD_AWAITING:
         if (line->ready_ns - now_ns > WORTH_WAITING && line->ready_ns < line->give_up_ns) {
@@ -300,7 +327,7 @@ int md_line_want(struct md_line *line, int64_t now_ns)
         if (line->looks++ && line->rx_len < line->tx_len)
             line->missing_ns = line->looked_ns;
         line->looked_ns = now_ns;
-        if (now_ns >= line->wake_ns) /* maybe only this call is late: read once more */
+        if (now_ns >= line->wake_ns) /* the reply may be waiting in the driver: read once more */
             md_line_go(line, MD_TIME_OUT);
         else if (now_ns < line->copy_by_ns)
             line->wake_ns = sooner(line->wake_ns, line->copy_by_ns);
@@ -344,7 +371,7 @@ void md_line_sent(struct md_line *line, size_t len, int64_t begun_ns, int64_t no
 
 /* ---- received bytes ---- */
 
-/* Make room by discarding the older half of rx. A reply that started in it would be complete by now. */
+/* Make room by discarding the older half of rx: a reply that started there would be complete by now. */
 static void forget(struct md_line *line)
 {
     enum { GONE = sizeof line->rx / 2 };
@@ -371,7 +398,7 @@ static size_t keep(struct md_line *line, const uint8_t *bytes, size_t len)
 /* Process stray bytes. They delay the next request, which needs a silent line. */
 static void take_stray(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
 {
-    line->quiet_ns = later(line->quiet_ns, now_ns); /* the port may still be sending the last request */
+    line->quiet_ns = later(line->quiet_ns, now_ns); /* quiet_ns is in the future while a request is leaving */
     if (line->listened_ns)
         md_listen_receive(line, len, now_ns);
     if (line->state != MD_IDLE)
@@ -385,7 +412,7 @@ static void take_stray(struct md_line *line, const uint8_t *bytes, size_t len, i
     md_reply_find_late(line, line->rx_from, now_ns);
 }
 
-/* Take frames of Modbus TCP. If replies have their requests' ids, unexpected frames delay no request. */
+/* Process Modbus TCP frames. If replies have their requests' ids, other frames do not delay a request. */
 static void take_frames(struct md_line *line, const uint8_t *bytes, size_t len, int64_t now_ns)
 {
     struct md_ending ending;

@@ -75,8 +75,8 @@ int64_t md_mastership_until_ns(const struct md_mastership *mastership)
     return __atomic_load_n(&mastership->until_ns, __ATOMIC_SEQ_CST);
 }
 
-/* Read the deadline before the clock: if the process is suspended between the two reads, the check only gets
- * stricter. */
+/* Read the deadline before the clock: if the process is suspended between the two reads, the deadline counts
+ * as passed rather than as still valid. */
 int md_mastership_holds(const struct md_mastership *mastership)
 {
     int64_t until_ns = md_mastership_until_ns(mastership);

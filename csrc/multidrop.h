@@ -1,8 +1,9 @@
-/* The functions of the C core that Python calls: frames, drives, ports and rows. Those of captures are in
- * capture.h, and those that only C calls in internal.h, line.h and engine.h.
+/* The functions of the C core that Python calls: frames, drives, ports and rows. The functions of captures
+ * are in capture.h; functions that only C calls are in internal.h, line.h and engine.h.
  *
- * Each section starts with the return rule of its functions. Times are in ns; moments are of CLOCK_MONOTONIC.
- * Functions are pure (no I/O, callbacks or globals), except those of ports, engine, row queue and clock. */
+ * The headings of sections say what functions return, unless a function's own comment does. Times are in ns;
+ * points in time are by CLOCK_MONOTONIC. Functions are pure (no I/O, callbacks or globals), except those of
+ * ports, engine, row queue and clock. */
 #ifndef MULTIDROP_H
 #define MULTIDROP_H
 
@@ -12,15 +13,15 @@
 /* cdef: start */
 enum {
     MD_MOST_DATA = 250,       /* data bytes of a frame: 125 registers */
-    MD_MOST_FRAME = 513,      /* ':', 2 * 255 hex digits, CR, LF */
+    MD_MOST_FRAME = 513,      /* longest frame: of Modbus ASCII, ':', 2 * 255 hex digits, CR, LF */
     MD_MOST_TCP = 260,        /* longest frame of Modbus TCP */
     MD_KEPT_FRAME = 24,       /* longest frame that an exchange stores; every read fits */
-    MD_STATUSES = 22,         /* row statuses below MD_EXCEPTION */
+    MD_STATUSES = 23,         /* all row statuses are below this number, except those from MD_EXCEPTION on */
     MD_EXCEPTION_CODES = 256,
     MD_DELAY_BUCKETS = 128,
-    MD_MOST_OWED = 12,        /* most outstanding requests of a drive */
+    MD_MOST_OWED = 12,        /* limit of the outstanding requests of a drive */
     MD_MOST_PROOFS = 4,
-    MD_PAUSE_S = 10,          /* after so long a silence another drive may have the address */
+    MD_PAUSE_S = 10,          /* s; after a longer silence another drive may have the address */
     MD_TIMES_KEPT = 6         /* send times stored for one outstanding request */
 };
 
@@ -52,6 +53,8 @@ enum md_frame_fault {
  *   05, 06    request and reply start, data (2 bytes)
  *   08        request and reply start (the subfunction), data (2 bytes)
  *   0F, 10    request start, count, data   reply start, count
+ *   16        request and reply start, data (4 bytes)
+ *   18        request start                reply data, from its byte count on
  *   Delixi    function is K, start is P1P0, data is D3..D0 (4 bytes); a reply to K = 03 carries
  *             its value in P1P0, and the parser copies it to data
  * `exception` is 0, or the code of an exception reply (Delixi: K = F0, FC..FF). `transaction` is the id in a
@@ -69,10 +72,10 @@ int md_build_request(int framing, const struct md_message *message, uint8_t *out
 int md_build_reply(int framing, const struct md_message *message, uint8_t *out, size_t room);
 /* Parse the request, to any address, at the start of `bytes`. */
 int md_parse_request(int framing, const uint8_t *bytes, size_t len, struct md_message *message);
-/* Parse the reply to `request` at the start of `bytes`; its transaction id may differ. */
+/* Parse the reply to `request` at the start of `bytes`; the transaction ids may differ. */
 int md_parse_reply(int framing, const uint8_t *bytes, size_t len, const struct md_message *request,
                    struct md_message *reply);
-/* Return the length of the good reply to `request`; 0 after a broadcast. */
+/* Return the length of a good reply to `request`; 0 if the request is a broadcast. */
 int md_reply_length(int framing, const struct md_message *request);
 
 /* ---- termios.c: return 0, -errno, or a mask of enum md_refusal ---- */
@@ -92,7 +95,8 @@ enum md_refusal {
     MD_REFUSED_DIVISOR = 16 /* no whole divisor of the UART's clock yields the baud rate */
 };
 
-/* Make the port raw with these settings, read them back, and return those that the port did not take. */
+/* Put the port into raw mode with these settings and read them back. Return the mask of settings that the
+ * port did not take. */
 int md_port_set(int fd, const struct md_settings *settings);
 int md_port_get(int fd, struct md_settings *settings);
 /* Return the baud rate of divisor 1, from which the UART derives all others; 0: unknown. */
@@ -100,7 +104,7 @@ uint32_t md_port_baud_base(int fd);
 
 /* ---- closing.c: return 0 or -errno ---- */
 
-/* Close the descriptor. The driver's unsent bytes may leave for `most_ns`; then the driver discards them. */
+/* Close the descriptor. The driver has `most_ns` to send its remaining bytes; then it discards them. */
 int md_port_close(int fd, int64_t most_ns);
 
 /* ---- clock.c: return a time ---- */
@@ -117,20 +121,20 @@ struct md_counters {
     uint64_t exchanges, answered, values;
     uint64_t sent;        /* requests of which at least one byte was sent */
     uint64_t stray_bytes; /* bytes outside of replies */
-    uint64_t ideal_ns;    /* total of the least times that the answered exchanges need on the line */
+    uint64_t ideal_ns;    /* sum of the shortest possible line times of the answered exchanges */
     int64_t longest_ns;   /* longest response delay */
 };
 
 /* An outstanding request: its replies may still come. */
 struct md_owed {
-    int64_t sent_ns[MD_TIMES_KEPT]; /* earliest first; the last element is the latest time */
+    int64_t sent_ns[MD_TIMES_KEPT]; /* send times, earliest first; the last one is the latest */
     uint32_t times;
     uint32_t end;   /* `least` and `end`: range of the reply, as in md_exchange */
     uint16_t least;
     uint16_t start, count, reply_len;
     uint8_t framing, address, function, data_len;
     uint8_t data[4];
-    uint8_t is_doubtful; /* another process may have got its reply */
+    uint8_t is_doubtful; /* 1: a reply came that may be to this request, or to one of another process */
 };
 
 /* An outstanding request of Modbus TCP. */
@@ -144,17 +148,17 @@ struct md_unanswered {
 struct md_history {
     uint64_t ended[MD_STATUSES];       /* exchanges without a reply, by status; MD_OK: broadcasts */
     uint64_t missed[MD_STATUSES];      /* missing values, by status */
-    uint64_t late;                     /* replies after their timeout */
-    uint64_t exceptions, naks, busies; /* replies with any exception; with code 7; with code 6 */
+    uint64_t late;                     /* replies that came after their request's timeout */
+    uint64_t exceptions, naks, busies; /* all exceptions; those with code 7; those with code 6 */
     uint32_t refused[MD_EXCEPTION_CODES]; /* missing values, by exception code */
-    uint64_t pauses;                      /* replies MD_PAUSE_S or more after the previous reply */
+    uint64_t pauses;                      /* replies that came MD_PAUSE_S or more after the previous one */
     struct md_owed owed[MD_MOST_OWED];
     struct md_unanswered unanswered[MD_MOST_OWED]; /* the oldest request first */
 };
 
-/* A drive. The caller sets the bounds of its timeout and its interval; the core learns the other fields,
- * which start as 0. A timeout runs from the request's last bit to the reply's first. The start of a
- * request accesses only the first cache line, its end also the second line. */
+/* A drive. The caller sets interval_ns and the bounds of the timeout; the core learns the other fields, which
+ * start as 0. A timeout runs from the request's last bit to the reply's first. Starting an exchange accesses
+ * only the first cache line of this struct; ending it also accesses the second. */
 struct md_drive {
     int64_t least_timeout_ns, most_timeout_ns;
     int64_t delay_ns, deviation_ns;    /* smoothed response delay, and its mean deviation */
@@ -163,14 +167,14 @@ struct md_drive {
     int64_t ready_ns;                  /* earliest time of the next request */
     uint32_t failures;                 /* number of consecutive failures */
     uint8_t owed_count, proof_count;
-    uint8_t is_doubted;                /* the drive's first reply may answer another process */
-    uint8_t sure_looks;                /* number of coming replies that are read only when whole */
+    uint8_t is_doubted;                /* 1: the drive's first reply may answer another process's request */
+    uint8_t sure_looks;                /* how many of the next replies are read only when complete */
     struct md_counters counters;
-    int64_t answered_ns;               /* replies to requests sent before this time cannot come */
+    int64_t answered_ns;               /* requests sent before this time get no further reply */
     int64_t late_until_ns;             /* late replies may come in any order until then */
-    uint64_t failed_at;                /* the drive's reply count when a proof last failed */
-    uint8_t proof_failures[MD_MOST_PROOFS]; /* 255: the proof was answered once */
-    uint32_t doubtful;                 /* number of replies that may have answered another process */
+    uint64_t failed_at;                /* the drive's count of replies when a proof last failed */
+    uint8_t proof_failures[MD_MOST_PROOFS]; /* for each proof; 255: it was answered once */
+    uint32_t doubtful;                 /* number of replies that may have been to another process's request */
     uint32_t unanswered_count;
     const struct md_exchange **proofs; /* reads whose replies cannot be mistaken for late replies */
     struct md_drive *next_late;        /* next in the line's list of drives with late replies due */
@@ -179,83 +183,84 @@ struct md_drive {
 };
 
 int64_t md_present_timeout_ns(const struct md_drive *drive); /* usual timeout of a read */
-int64_t md_next_timeout_ns(const struct md_drive *drive);    /* timeout of the next read, maybe longer */
+int64_t md_next_timeout_ns(const struct md_drive *drive); /* timeout of the next read; see stats.c */
 int64_t md_delay_edge(int bucket); /* least delay of a bucket; the bucket's width is 1/8 of that delay */
-/* Copy to `drive` the outstanding requests of `before`, the drive that it replaces. */
+/* Copy the outstanding requests of `before` to `drive`, which replaces `before`. */
 void md_late_inherit(struct md_drive *drive, const struct md_drive *before);
 
-/* ---- engine.c, api.c: return NULL and set errno on failure; otherwise counts and flags ---- */
+/* ---- engine.c, api.c: functions that return a pointer return NULL and set errno on failure ---- */
 
 enum md_echo { MD_ECHO_UNKNOWN, MD_ECHO, MD_NO_ECHO };
 
-/* The transaction ids of a port. */
+/* How a port uses transaction ids. */
 enum md_transactions {
     MD_NO_TRANSACTIONS, /* every framing except MD_TCP */
     MD_MATCHED,         /* MD_TCP: a reply has the id of its request */
     MD_IGNORED          /* MD_TCP through a gateway that replies with its own transaction ids */
 };
 
-/* The owner of the transceiver's direction. */
+/* Who switches the transceiver between sending and receiving. */
 enum md_rs485_mode {
     MD_RS485_OFF,     /* the adapter itself */
     MD_RS485_KERNEL,  /* the kernel's driver, as it is configured */
-    MD_RS485_RTS_UP,  /* this port: RTS is on while a request leaves */
-    MD_RS485_RTS_DOWN /* this port: RTS is off while a request leaves, otherwise on */
+    MD_RS485_RTS_UP,  /* this port, by RTS: on while it sends, otherwise off */
+    MD_RS485_RTS_DOWN /* this port, by RTS: off while it sends, otherwise on */
 };
 
 /* A request with its drive, timing and settings; constant while in use. Fields that every exchange needs come
- * first, in two cache lines: with many lines the processor reads each from memory. */
+ * first, in two cache lines. With many serial lines, the processor must read these fields from memory. */
 struct md_exchange {
     struct md_drive *drive;
     struct md_block *block;        /* fields for rows; NULL: no rows */
-    const struct md_block *values; /* fields for md_port_carry_out(); NULL: none */
+    const struct md_block *values; /* fields whose values md_port_carry_out() returns; NULL: none */
     int64_t character_ns;          /* duration of a character on the wire */
     int64_t silence_ns;            /* silence kept before the request and after its reply */
-    /* The least timeout, for writes; 0: as learnt. With `insists` it is the limit of the wait for late
-     * replies instead. */
+    /* Lower bound of a write's timeout; 0: use the learnt timeout. With `insists`: instead, how long a stop
+     * may wait for a late reply. */
     int64_t timeout_ns;
-    int64_t period_ns; /* time between its slots in the queue; 0: it has no slots */
-    /* Send this exchange first while it is unknown whether the adapter echoes. Its reply is never a copy of
+    int64_t period_ns; /* time between the exchange's slots in the queue; 0: no fixed period */
+    /* An exchange to send first while it is unknown whether the adapter echoes. Its reply is never a copy of
      * its request. NULL: none. */
     const struct md_exchange *echo_probe;
     struct md_settings settings;
     int framing;
-    int insists;          /* a stop: sent even if a late reply may be mistaken for its own */
+    int insists;          /* 1: a stop, sent even if a late reply may be mistaken for its reply */
     uint32_t end;         /* upper bound (exclusive) of the reply's only register; 0: no range */
-    uint16_t least;       /* lower bound of the same register */
-    uint8_t is_proof;     /* it is a proof of its drive */
+    uint16_t least;       /* lower bound (inclusive) of the reply's only register */
+    uint8_t is_proof;     /* 1: the exchange is in its drive's list of proofs */
     uint8_t frame_len;    /* 0: the frame is not stored, but built at each turn */
     uint8_t frame[MD_KEPT_FRAME];
     struct md_message request;
     int64_t turnaround_ns; /* silence after a broadcast */
-    const uint32_t *stops; /* its drive's stop counter: send only while it equals stops_seen; NULL: always */
+    const uint32_t *stops; /* the drive's stop counter: send only while it equals stops_seen; NULL: always */
     uint32_t stops_seen;
 };
 
-/* The reasons why an exchange has no reply; if other bytes came, the reason is an enum md_frame_fault. */
+/* The reasons why an exchange has no reply. If bytes came that are not a reply, see enum md_frame_fault. */
 enum md_failure {
     MD_CUT_SHORT = -9,         /* the reply was incomplete at the timeout */
     MD_NO_REPLY = -10,         /* no byte within the timeout except the request's echo */
     MD_LINE_LOST = -11,        /* the port failed; `error`: errno, 0 at end of file, EPROTO: no Modbus TCP */
     MD_SETTINGS_REFUSED = -12, /* the port did not take baud rate or format */
-    MD_LATE_ANSWER_DUE = -13,  /* not sent: a late reply could be mistaken for its own */
-    MD_EXPIRED = -14,          /* not sent: its latest time was over, or a stop came first */
+    MD_LATE_ANSWER_DUE = -13,  /* not sent, or its reply rejected: the reply may be to an earlier request */
+    MD_EXPIRED = -14,          /* not sent: its latest time had passed, or a stop came first */
     MD_POLL_ENDED = -16,       /* polling ended before this exchange's turn or reply */
     MD_MAYBE_ECHO = -17,       /* the bytes may be the reply or the adapter's echo */
     MD_NOT_MASTER = -19,       /* this process lost the right to send; part of the request may have left */
     MD_OTHER_MASTER = -20,     /* not sent: another master uses the line */
-    MD_POLLING_FAILED = -21    /* not sent: the client that queues requests failed */
+    MD_POLLING_FAILED = -21,   /* not sent: the client that queues requests failed */
+    MD_STALLED = -22           /* not sent: the adapter has not taken the bytes of earlier requests */
 };
 
 /* The result of an exchange. first_ns and last_ns are 0 if no byte came. */
 struct md_completion {
-    int result;                /* > 0: length of the reply; 0: a broadcast, sent; < 0: see enum md_failure */
+    int result;                /* > 0: length of the reply; 0: a broadcast was sent; < 0: enum md_failure */
     int error;                 /* MD_LINE_LOST: errno; MD_SETTINGS_REFUSED: enum md_refusal */
-    int64_t begun_ns;          /* start of its turn, maybe during the silence before it */
+    int64_t begun_ns; /* start of the exchange's turn, which includes the silence before its request */
     int64_t sent_ns;           /* when the first byte of the request left; 0: never */
     int64_t utc_ahead_ns;      /* UTC - CLOCK_MONOTONIC at sent_ns; 0: unknown */
     int64_t first_ns, last_ns; /* arrival of the first and the last byte after the request */
-    int64_t late_until_ns;     /* of urgent exchanges: the drive's late_until_ns at the call */
+    int64_t late_until_ns;     /* of an urgent exchange: the drive's late_until_ns at the client's call */
     uint32_t stale;            /* bytes discarded before the request: late replies, noise */
     uint32_t skipped;          /* bytes after the request that are not part of the reply */
     uint16_t raw_len;
@@ -263,19 +268,20 @@ struct md_completion {
     uint8_t raw[MD_MOST_FRAME]; /* the reply; after a failure the last bytes received */
 };
 
-/* Progress of a port. Each number only grows, and wraps around. */
+/* Progress of a port. Its counters only grow, and wrap around. */
 struct md_progress {
     uint32_t submitted, done;
     uint32_t lost;        /* the descriptor failed: all later urgent exchanges end as MD_LINE_LOST */
-    uint32_t cut_off;     /* the polled exchange in flight was lost too, on a port that had worked */
+    uint32_t cut_off;     /* the loss interrupted a polled exchange, on a port that had worked before */
     uint32_t repeating;   /* 1: the port repeats exchanges */
     uint32_t switches;    /* number of changes of baud rate or format */
     uint32_t echo;        /* enum md_echo: whether the adapter echoes */
     uint32_t foreign;     /* another master's bytes, received while listening */
     uint32_t stalled;     /* 1: at the last timeout the driver still held the request */
-    uint32_t called_off;  /* 1: a command ended, and the driver may still hold its bytes */
+    uint32_t miscounts;   /* 1: the driver's count of unsent bytes is wrong, and is ignored */
+    uint32_t called_off;  /* 1: the driver may still hold bytes of a command that has ended */
     int32_t lost_error;   /* errno of the loss; 0: the far end hung up */
-    int64_t switching_ns; /* total time spent on switches, in ns */
+    int64_t switching_ns; /* total duration of these changes, in ns */
 };
 
 struct md_engine;
@@ -284,23 +290,23 @@ struct md_row_queue;
 struct md_tap;
 struct md_mastership;
 
-struct md_engine *md_engine_start(void); /* the thread of all lines; it lives as long as the process */
-/* Start or end realtime scheduling of the thread; return 0 or -errno. The thread ends it by itself if the
- * thread uses too much of a processor. One client at a time may call this. */
+struct md_engine *md_engine_start(void); /* start the thread of all lines, which ends with the process */
+/* Start or end realtime scheduling of the thread; return 0 or -errno. If the thread uses too much of a
+ * processor, it returns to normal scheduling by itself. One client at a time may call this. */
 int md_engine_realtime(struct md_engine *engine, int wanted);
 int md_engine_is_realtime(struct md_engine *engine); /* 1: under realtime scheduling now */
-/* Sleep `n` times for `period_ns` on the calling thread, as the engine's thread does. Write to `late_ns` by
- * how much each sleep was too long; return 0 or -errno. */
+/* Sleep `n` times for `period_ns` on the calling thread, in the way in which the engine's thread sleeps.
+ * Write to `late_ns` how late each sleep ended; return 0 or -errno. */
 int md_wake_lateness(int is_realtime, int64_t period_ns, int64_t *late_ns, int n);
 
-/* Open a port on a descriptor. `must_take`: mask of the refusals (enum md_refusal) that are failures; -1:
- * a port without settings. `transactions`: enum md_transactions. `room`: most queued exchanges, a
- * power of two. */
+/* Open a port on a descriptor. `must_take`: mask of the settings whose refusal is a failure (enum
+ * md_refusal); -1: the port has no settings. `transactions`: enum md_transactions. `room`: the queue's length
+ * in exchanges, a power of two. */
 struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, int transactions,
                              unsigned room);
 /* Send only while this process is master, which is checked right before each write(2). The mastership must
- * outlive the port. Before the first request, and after any gap in the mastership, the port first listens to
- * the line, at least for the mastership's guard time. Stops do not wait for the end of listening. */
+ * outlive the port. Before the first request, and after any gap in the mastership, the port listens to the
+ * line. It listens at least for the mastership's guard time. Stops do not wait for the end of listening. */
 void md_port_fence(struct md_port *port, struct md_mastership *mastership);
 /* Set who switches the transceiver (enum md_rs485_mode), before the first request; return 0 or -errno. A USB
  * adapter cannot report when the last bit of a request has left. */
@@ -312,7 +318,8 @@ void md_port_tap(struct md_port *port, struct md_tap *tap);
 int md_port_end(struct md_port *port);
 /* Return 1 while an exchange with this drive is queued, repeated, urgent or in flight. */
 int md_port_is_asking(struct md_port *port, const struct md_drive *drive);
-/* Return the time up to which all line use has been counted: the start of the exchange in flight, if any. */
+/* Return the time up to which all line use has been counted. If an exchange is in flight, that is its
+ * start. */
 int64_t md_port_counted_ns(struct md_port *port);
 /* Call md_late_inherit() under the engine's lock. */
 void md_port_inherit(struct md_port *port, struct md_drive *drive, const struct md_drive *before);
@@ -324,24 +331,24 @@ void md_port_stop(struct md_port *port);
 void md_port_free(struct md_port *port, void *memory);
 /* Set whether the adapter echoes: MD_ECHO is final, MD_NO_ECHO holds until an echo comes. */
 void md_port_set_echo(struct md_port *port, int echo);
-/* Deliver rows to `row_queue`, and call its client with `number` when the port needs attention. */
+/* Deliver rows to `row_queue`, and wake its client with `number` when the port needs attention. */
 void md_port_report(struct md_port *port, struct md_row_queue *row_queue, uint32_t number);
 /* Queue exchanges, each with its earliest time; return how many fitted. Only one client at a time may call
- * this. A slot that is late by a period ends as MD_EXPIRED if the same exchange's next slot is due. */
+ * this. A slot ends as MD_EXPIRED if it is a period late and the next slot of the same exchange is due. */
 int md_port_submit(struct md_port *port, const struct md_exchange *const *exchanges,
                    const int64_t *not_before_ns, int n);
-/* Repeat these exchanges in turn whenever no queued one is due. Repetition ends when the exchanges are
- * replaced, the port is lost, or an exchange could not be sent. Return the index of the exchange that the
- * replaced round would have sent next. */
+/* Repeat these exchanges in turn whenever no queued exchange is due. Repetition ends when the next call
+ * replaces them, the port is lost, or an exchange could not be sent. Return the index of the replaced
+ * exchange that would have been sent next. */
 unsigned md_port_repeat(struct md_port *port, const struct md_exchange *const *exchanges, unsigned n);
 const struct md_progress *md_port_progress(struct md_port *port);
-/* Count a stop: urgent exchanges with an older count are not sent. */
+/* Count a stop: from now on, urgent exchanges that were created with an older count are not sent. */
 void md_count_stop(uint32_t *stops);
-/* Carry out an urgent exchange ahead of the queue and wait for it; one with `insists` precedes all others.
- * After `expires_ns` (of CLOCK_BOOTTIME; 0: never), or after a stop, it is not sent (MD_EXPIRED). Endless
- * urgent exchanges leave the queue a 20th of the line, except while one with `insists` waits. Write the
- * exchange's values, NaN for a missing one, and return how many exist; -1 without a good reply, or after an
- * exception. */
+/* Carry out an urgent exchange ahead of the queue and wait for it; an exchange with `insists` precedes all
+ * others. After `expires_ns` (of CLOCK_BOOTTIME; 0: never), or after a stop, it is not sent (MD_EXPIRED). If
+ * urgent exchanges never pause, the queue still gets a 20th of the line's time, except while an exchange with
+ * `insists` waits. Write the exchange's values, NaN for a missing one, and return how many exist; -1 without
+ * a good reply, or after an exception. */
 int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, int64_t not_before_ns,
                       int64_t expires_ns, struct md_completion *completion, double *values);
 
@@ -350,9 +357,9 @@ int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, 
 /* Write the values of the block's fields in a good reply, NaN for a missing value; return how many exist. */
 int md_values(const struct md_block *block, const struct md_message *reply, double *values);
 
-/* ---- mastership.c, api.c: return NULL or -1 and set errno on failure; otherwise a time, or a flag ---- */
+/* ---- mastership.c, api.c: on failure, set errno and return NULL (md_mastership_new) or -1 (_extend) ---- */
 
-int64_t md_boottime_ns(void); /* the time of CLOCK_BOOTTIME, which all times below use */
+int64_t md_boottime_ns(void); /* the time of CLOCK_BOOTTIME, which all times of this section use */
 /* Return a mastership that has not started yet; ENOSYS if the kernel lacks the timer. Ports listen to their
  * line for at least `guard_ns` before they send. */
 struct md_mastership *md_mastership_new(int64_t guard_ns);
@@ -368,11 +375,11 @@ int md_mastership_holds(const struct md_mastership *mastership);
 /* ---- rows ---- */
 
 enum {
-    MD_MOST_NUMBERS = 65536, /* most ports of a row queue */
-    MD_MOST_INVALID = 8      /* most raw values of a register that mean "no value" */
+    MD_MOST_NUMBERS = 65536, /* limit of the ports that report to one row queue */
+    MD_MOST_INVALID = 8      /* limit of the raw values of a register that mean "no value" */
 };
 
-/* ---- columns.c: return NULL without memory; md_value returns a number, NaN without one ---- */
+/* ---- columns.c: md_columns_new() returns NULL if memory is short ---- */
 
 enum md_number_format {
     MD_U16, MD_I16, MD_U32, MD_I32, MD_U32_EITHER, MD_F32, MD_BIT,
@@ -403,10 +410,10 @@ struct md_invalid {
 struct md_extra {
     double addend;         /* value = (raw * multiplier + addend) / divisor */
     uint8_t low, bits;     /* raw is `bits` bits of the number, from bit `low` on; bits 0: all of them */
-    uint8_t scale_format;  /* format of the decimal exponent at the word scale_at; */
-    uint8_t has_scale;     /* outside of 10^-22 to 10^22 the field has no value */
+    uint8_t scale_format;  /* format of the decimal exponent, which is the word scale_at */
+    uint8_t has_scale;     /* 1: multiply by 10^exponent; no value outside of 10^-22 to 10^22 */
     uint16_t scale_at;
-    uint8_t invalid_count, scale_invalid_count; /* elements of `invalid`: number, then exponent */
+    uint8_t invalid_count, scale_invalid_count; /* patterns in `invalid`: for number, exponent */
     struct md_invalid invalid[MD_MOST_INVALID];
 };
 
@@ -423,21 +430,22 @@ struct md_block {
     uint16_t drive;    /* code of the drive's name */
 };
 
-/* A row's status. Other values are reasons: -enum md_failure or -enum md_frame_fault. */
+/* The status of a row. If the exchange had no good reply, the status is the reason, an enum md_failure or
+ * enum md_frame_fault, with its sign changed. */
 enum md_status {
     MD_OK = 0,
-    MD_NOT_ASKED = 15, /* the poller temporarily skips a silent drive */
+    MD_NOT_ASKED = 15, /* not requested: the poller temporarily skips a silent drive */
     MD_NO_VALUE = 18,  /* the reply holds the device's mark for "no value": NaN, an invalid count */
     MD_EXCEPTION = 256 /* + the exception's code */
 };
 
 /* Rows. All arrays have `room` elements. */
 struct md_columns {
-    int64_t *time, *sent;           /* UTC and monotonic time of sending, or else of the request's turn */
+    int64_t *time, *sent; /* UTC and monotonic time of sending; for an unsent request, of its turn */
     int64_t *uncertainty;           /* time between the request and the reply's first byte */
     uint16_t *drive, *reg, *status; /* enum md_status */
     double *value;
-    uint8_t *valid;                 /* bitmap, least significant bit first: value and uncertainty exist */
+    uint8_t *valid;                 /* bitmap, least significant bit first; 1: value and uncertainty exist */
     size_t rows, room;
 };
 
@@ -450,24 +458,24 @@ void md_columns_free(struct md_columns *columns);
 int64_t md_spell(const uint16_t *codes, size_t n, const uint8_t *bytes, const int32_t *offsets, size_t names,
                  int32_t *out_offsets, uint8_t *out, size_t room);
 
-/* ---- columns.c, columns in the format of recordings: return 0 or -1, an index, or a code ---- */
+/* ---- columns.c: columns in the format of recordings ---- */
 
 /* Convert to floats, rounded up. */
 void md_narrow_up(const int64_t *numbers, size_t n, float *out);
-/* Convert floats to whole numbers, and those that the bitmap `valid` (NULL: all valid) excludes to 0; return
- * -1 if a number does not fit. */
+/* Convert floats to whole numbers. Write 0 for each float whose bit in `valid` is 0 (NULL: all are valid).
+ * Return -1 if a number does not fit. */
 int md_widen(const float *numbers, const uint8_t *valid, size_t n, int64_t *out);
-/* Replace codes by their numbers; return the index of the first code that is not below `known` or has a
- * negative number, otherwise n. */
+/* Replace codes by their entries in `numbers`; return the index of the first code that is not below `known`
+ * or has a negative entry; n: there is none. */
 size_t md_narrow_codes(const uint16_t *codes, size_t n, const int16_t *numbers, size_t known, uint8_t *out);
 void md_widen_codes(const uint8_t *codes, size_t n, uint16_t *out);
 uint16_t md_greatest_code(const uint16_t *codes, size_t n);
-/* Write the indexes of the rows of a drive's register to `places`, which has room for `n`; return their
- * number. */
+/* Write the indexes of the rows with this drive and register to `places`, which has room for `n`; return how
+ * many. */
 size_t md_find_codes(const uint16_t *drives, const uint16_t *registers, size_t n, uint16_t drive,
                      uint16_t reg, uint32_t *places);
 
-/* ---- row_queue.c: return NULL without rows or memory; otherwise a number ---- */
+/* ---- row_queue.c: functions that return a pointer return NULL without rows, or without memory ---- */
 
 /* Return a queue of up to `most_chunks` chunks of rows. While all chunks are full, new rows are dropped and
  * counted. */
@@ -483,7 +491,8 @@ void md_row_queue_give_back(struct md_row_queue *row_queue, struct md_columns *c
 size_t md_row_queue_chunks(struct md_row_queue *row_queue);
 uint64_t md_row_queue_dropped(struct md_row_queue *row_queue); /* number of dropped rows */
 void md_row_queue_call(struct md_row_queue *row_queue, uint32_t number); /* wake the client */
-/* Wait for a call, at most `timeout_ns`; write each called number once, and return how many were called. */
+/* Wait for calls of md_row_queue_call(), at most `timeout_ns`. Write their numbers to `numbers`, each only
+ * once, and return how many. */
 int md_row_queue_await(struct md_row_queue *row_queue, int64_t timeout_ns, uint32_t *numbers, int room);
 /* cdef: end */
 

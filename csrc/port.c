@@ -3,10 +3,11 @@
 #include "engine.h"
 
 enum {
-    WORTH_BLINDNESS = 200000, /* ns; a shorter wait is not worth the system calls to stop watching */
-    HELD_UP_NS = 200000,      /* a longer write means that the thread was suspended */
-    MOST_SPINNING = 4,        /* most ports with spinning; with more, the processor has other work */
-    NO_SLEEP_NS = 1000        /* a shorter sleep costs more than spinning */
+    WORTH_BLINDNESS = 200000, /* ns; in a shorter wait, go on watching the port to save system calls */
+    HELD_UP_NS = 200000,      /* ns; a longer write(2) means that the thread was suspended */
+    MOST_SPINNING = 4,        /* with more ports, do not spin: the processor has other work */
+    NO_SLEEP_NS = 1000,       /* ns; a shorter sleep costs more than spinning */
+    COUNT_LAG_NS = 100000000  /* ns; how late a driver may report that its bytes have left */
 };
 static const int64_t RETRY_WRITE_NS = 1000000;
 
@@ -18,15 +19,41 @@ static void watch(struct md_port *port, int is_watched)
     port->is_watched = is_watched;
 }
 
-/* Return 1 if the driver holds bytes that the adapter has not taken. A network's bytes do not count: there
+/* Return 1 if the driver holds bytes that the adapter has not taken. On a network such bytes do not count:
  * they are unconfirmed, not unsent. */
 static int is_holding(const struct md_port *port)
 {
-    return port->must_take >= 0 && md_descriptor_is_queued(port->fd);
+    return port->must_take >= 0 && !port->turn.progress.miscounts && md_descriptor_is_queued(port->fd);
 }
 
-/* Lose the port. A command that the driver holds is called off: the client closes the port, and the driver
- * discards the command. */
+/* Check the driver's count of unsent bytes after the next replies: it may be wrong. */
+static void doubt_count(struct md_port *port)
+{
+    if (!port->doubts)
+        port->doubts = MD_WRONG_COUNTS;
+}
+
+/* Return 1 while the driver may still count bytes as unsent although they have left: the reply to the last
+ * request shows that they have. If the count stays above 0 after MD_WRONG_COUNTS such replies, ignore it. */
+static int is_count_late(struct md_port *port, int64_t now_ns)
+{
+    struct md_line *line = &port->turn.line;
+    if (!port->doubts || !line->is_answered)
+        return 0;
+    if (!is_holding(port)) {
+        port->doubts = 0;
+        return 0;
+    }
+    if (now_ns - line->quiet_ns < COUNT_LAG_NS)
+        return 1;
+    line->is_answered = 0; /* each reply counts once */
+    if (--port->doubts == 0)
+        md_store(&port->turn.progress.miscounts, 1);
+    return 0;
+}
+
+/* Give up a port that failed. A command that the driver still holds is called off: the client closes the
+ * port, and the driver then discards the command. */
 static void lose(struct md_port *port, int error)
 {
     struct md_line *line = &port->turn.line;
@@ -84,17 +111,63 @@ static int is_expired(const struct md_turn *turn)
 }
 
 /* Note at a timeout whether the adapter has taken the request. If it has not, and the request is a command,
- * lose the port: the client closes it, and the driver discards the command. */
+ * give up the port: the client closes it, and the driver then discards the command. */
 static void check_stall(struct md_port *port)
 {
     struct md_turn *turn = &port->turn;
     int is_stalled = is_holding(port);
     if (turn->progress.stalled != (uint32_t)is_stalled)
         md_store(&turn->progress.stalled, (uint32_t)is_stalled);
+    port->taken_ns = is_stalled ? MD_NEVER : 0;
+    if (is_stalled)
+        doubt_count(port);
     if (!is_stalled || !md_is_command(turn->line.exchange))
         return;
     md_store(&turn->progress.called_off, 1);
     lose(port, ETIMEDOUT);
+}
+
+/* Return 1 until a stalled adapter has taken all bytes, and then until all replies to them must have come:
+ * such a reply could be mistaken for the reply to the next read. A stop's reads do not wait for replies. */
+static int is_recovering(struct md_port *port, int64_t now_ns)
+{
+    const struct md_exchange *exchange = port->turn.line.exchange;
+    if (is_holding(port))
+        port->taken_ns = MD_NEVER;
+    else if (port->taken_ns == MD_NEVER)
+        port->taken_ns = now_ns;
+    if (port->taken_ns == MD_NEVER)
+        return 1;
+    return !exchange->insists && now_ns - port->taken_ns < exchange->drive->most_timeout_ns;
+}
+
+/* Return 1 if the read must wait for a stalled adapter. */
+static int must_recover(struct md_port *port, int64_t now_ns)
+{
+    const struct md_line *line = &port->turn.line;
+    int was_wrong = port->doubts > 0 && port->doubts < MD_WRONG_COUNTS;
+    return port->turn.progress.stalled && now_ns - line->quiet_ns <= md_line_hold_ns(line, was_wrong) &&
+           is_recovering(port, now_ns);
+}
+
+/* Return 1 if the request must wait until the adapter has taken earlier bytes. Otherwise a command could
+ * leave too late, and a read could delay a stop that comes later. The check is a system call. It is only made
+ * for commands, during a stall, and while the driver's count is in doubt. */
+static int must_wait(struct md_port *port, int64_t now_ns)
+{
+    struct md_line *line = &port->turn.line;
+    const struct md_exchange *exchange = line->exchange;
+    if (line->tx_at > 0)
+        return 0;
+    int is_late = !exchange->insists && is_count_late(port, now_ns);
+    if (md_is_read(exchange->framing, exchange->request.function)) {
+        line->is_held = (uint8_t)(is_late || must_recover(port, now_ns));
+        return line->is_held;
+    }
+    int is_held = !exchange->insists && is_holding(port);
+    if (is_held)
+        doubt_count(port);
+    return is_held;
 }
 
 /* Write the request; return 1 if the port took bytes or has other work. The send time is the start of the
@@ -109,8 +182,8 @@ static int write_request(struct md_port *port, int64_t begun_ns)
     }
     if (port->mastership && !may_send(port))
         return 1;
-    if (line->tx_at == 0 && md_is_command(line->exchange) && is_holding(port))
-        return 0; /* behind bytes that the adapter has not taken, the command could leave too late */
+    if (must_wait(port, begun_ns))
+        return 0;
     ssize_t written = md_rs485_write(port, line->tx + line->tx_at, (size_t)(line->tx_len - line->tx_at));
     int64_t done_ns = md_now_ns();
     if (written > 0) {
@@ -142,7 +215,7 @@ static int64_t apply(struct md_port *port, const struct md_settings *settings)
     md_store(&progress->switches, progress->switches + 1);
     port->settings = *settings;
     if (refused < 0 || (refused & port->must_take))
-        port->settings = (struct md_settings){0}; /* unknown: some may have been taken by the port */
+        port->settings = (struct md_settings){0}; /* unknown: the port may have taken some of the settings */
     if (refused < 0)
         lose(port, -refused);
     else if (refused & port->must_take)
@@ -156,10 +229,10 @@ static int is_sent(const struct md_port *port)
     return port->turn.source != MD_NO_SOURCE && port->turn.line.completion->sent_ns;
 }
 
-/* A sleeping processor always wakes late, by about the same time. Therefore the thread sleeps that much
- * shorter before a request and spins for the rest: with few lines some 20 us of each exchange. Spinning is
- * not worth it for a client that waits, because the client's own delays are longer and vary more. The
- * thread does not spin before the read of a reply either, because that read may be early. */
+/* Return 1 if the thread should spin before a request. Every wake-up is late, by about the same time. So the
+ * thread wakes earlier by that time, and spins until the request is due, for some 20 us of each exchange. It
+ * spins only with few ports, and not for a client that waits: the client's own delays are longer and vary
+ * more. It does not spin before the read of a reply either, because that read may be early. */
 static int is_worth_spinning(const struct md_port *port)
 {
     return port->engine->count <= MOST_SPINNING && port->turn.source != MD_URGENT;
@@ -170,7 +243,7 @@ static int spin_until(struct md_port *port, int64_t until_ns, int64_t *now_ns)
     int64_t most_ns = is_worth_spinning(port) ? MD_MOST_LATENESS : NO_SLEEP_NS;
     if (until_ns - *now_ns > most_ns || port->turn.progress.lost)
         return 0;
-    if (!port->is_empty) /* read the port before the request must leave */
+    if (!port->is_empty) /* the driver may hold bytes: read them while there is time */
         *now_ns = md_port_receive(port);
     while (*now_ns < until_ns)
         *now_ns = md_now_ns();
@@ -182,7 +255,7 @@ static int act(struct md_port *port, int want, int64_t *wake_ns, int64_t *now_ns
 {
     const struct md_exchange *exchange = port->turn.line.exchange;
     switch (want) {
-    case MD_WRITE: /* after a change of settings check again: a stop may have come */
+    case MD_WRITE: /* return after a change of settings: a stop may have come meanwhile */
         if (!is_in_force(port, &exchange->settings)) {
             *now_ns = apply(port, &exchange->settings);
             return 1;
@@ -207,8 +280,8 @@ static int act(struct md_port *port, int want, int64_t *wake_ns, int64_t *now_ns
     }
 }
 
-/* Return 1 if a client that reads repeatedly will be back before the line's silence is over. The thread wakes
- * at the end of the silence, so the client need not wake it. */
+/* Return 1 if a client that reads repeatedly will read again before the line's silence is over. The thread
+ * wakes at the end of the silence, so the client need not wake it. */
 static int is_client_expected(const struct md_turn *turn, int64_t now_ns)
 {
     return turn->source == MD_NO_SOURCE && turn->last == MD_URGENT &&

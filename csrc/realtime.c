@@ -19,10 +19,10 @@
 
 enum {
     PRIORITY = 1,    /* the lowest of SCHED_FIFO, so that the threads of drivers come first */
-    STACK = 64 << 10 /* bytes of its stack that the thread may use */
+    STACK = 64 << 10 /* bytes of the thread's stack to lock in memory */
 };
 static const int64_t CHECK_NS = 500000000; /* time between two checks */
-/* Long, because a virtual machine's pause may count as the thread's CPU time. */
+/* This limit is long, because a virtual machine's pause may count as the thread's CPU time. */
 static const int64_t MOST_CPU_NS = 10000000000;
 
 /* ---- memory ---- */
@@ -34,7 +34,7 @@ static int is_loaded(const ElfW(Phdr) *segment)
     return segment->p_type == PT_LOAD;
 }
 
-/* Change an object's segments if it is the core: if it contains this file's constants. */
+/* If this loaded object is the core, lock or unlock its segments. The core is the object with CHECK_NS. */
 static int change_own(struct dl_phdr_info *object, size_t size, void *argument)
 {
     change_function **change = argument;
@@ -130,7 +130,7 @@ void md_realtime_check(struct md_realtime *realtime, int64_t now_ns)
 
 #elif defined _WIN32
 
-/* The multimedia class scheduler itself leaves a fifth of the processors' time to other threads. */
+/* No limit is needed: Windows' multimedia class scheduler leaves a fifth of the CPU time to other threads. */
 #include <windows.h>
 
 #include <avrt.h>

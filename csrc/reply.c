@@ -1,5 +1,5 @@
-/* Find the reply among the bytes since the request: when to read the port, where the reply starts, and what
- * the reply shows about drive and adapter.
+/* Find the reply among the bytes since the request. Decide when to read the port, where the reply starts, and
+ * what the reply shows about drive and adapter.
  *
  * The reply may start at any byte. Late replies may precede or replace it. frame.c and body.c check the
  * reply against its request. */
@@ -9,16 +9,16 @@
 
 /* ---- adapters that echo ---- */
 
-/* Some adapters echo the bytes that they send. Whether an adapter echoes is learnt from a reply that
- * differs from its request, or from a copy of the request and no other bytes before a timeout. As long as
- * it is unknown, no copy counts as the reply. body.c checks that a reply repeats the written address and
- * value. */
+/* Some adapters echo the bytes that they send. A reply that differs from its request shows whether the
+ * adapter echoes. So does a timeout if only a copy of the request came. While it is unknown whether the
+ * adapter echoes, a copy of the request does not count as the reply. body.c checks that the reply to a write
+ * repeats the address and the value. */
 
 enum { MOST_LONE_COPIES = 2 }; /* copies accepted as replies before the next echo probe */
 
-/* An adapter may start to echo at any time. If a copy confirms a write, the library reads the register back.
- * If the reply to a read may equal its request, wait for the reply after the copy, unless the copy is too
- * late for an echo. */
+/* An adapter may start to echo at any time. If a copy of the request confirms a write, the library also reads
+ * the register back. If the reply to a read may equal its request, wait for the reply after the copy, unless
+ * the copy is too late for an echo. */
 int md_echo_is_due(const struct md_line *line, int reply_len)
 {
     const struct md_exchange *exchange = line->exchange;
@@ -45,23 +45,24 @@ static void learn(struct md_line *line, int echo)
         line->echo = (uint8_t)echo;
 }
 
-/* Return the time by which an echo of the request in flight would be whole, if the line is known not to echo;
- * 0 if the drive's delay is not known well enough. */
+/* Return the time by which an echo of the request in flight would be whole. Return 0 unless the line is known
+ * not to echo and the drive's delay is known well enough. */
 static int64_t echo_whole_ns(const struct md_line *line)
 {
     int64_t due_ns = line->echo == MD_NO_ECHO ? md_reply_due_ns(line->exchange) : 0;
     return due_ns ? line->quiet_ns + due_ns : 0;
 }
 
-/* Return 1 if the copy of the request is the reply: it was incomplete when an echo would have been whole. */
+/* Return 1 if the copy of the request is the reply: it was still incomplete when an echo would have been
+ * complete. */
 static int is_timely_copy(const struct md_line *line)
 {
     return line->copy_by_ns && line->missing_ns >= line->copy_by_ns;
 }
 
-/* Learn from a reply whether the adapter echoes. A copy of the request before the reply shows an echo. So do
- * two copies, unless the adapter did not echo so far: then the reply may have come twice. A few stray bytes
- * are no echo, but if the adapter echoes, they may be the rest of one. */
+/* Learn from a reply whether the adapter echoes. A copy of the request before the reply shows an echo. Two
+ * copies show one too, unless the adapter is known not to echo: then the reply may have come twice. A few
+ * stray bytes before the reply show no echo. But if the adapter echoes, they may be the rest of one. */
 static void learn_echo(struct md_line *line, size_t reply_at)
 {
     int is_copy = md_echo_is_copy(line, reply_at);
@@ -78,8 +79,8 @@ static void learn_echo(struct md_line *line, size_t reply_at)
 
 enum copy { IS_ECHO, MAY_BE_REPLY, IS_REPLY };
 
-/* Classify a copy of the request without other bytes: it is the adapter's echo, or the drive's reply if that
- * may equal the request. */
+/* Classify a copy of the request without other bytes: it is the adapter's echo, or the drive's reply if the
+ * reply may equal the request. */
 static enum copy learn_lone_copy(struct md_line *line, int may_be_reply)
 {
     if (!may_be_reply || line->echo == MD_ECHO) {
@@ -111,8 +112,8 @@ void md_echo_keep(struct md_line *line)
 
 /* ---- replies ---- */
 
-enum { MOST_BURST = 16 }; /* most characters that a UART collects before it delivers them */
-static const int64_t OLDEST_IN_DOUBT = INT64_C(2000000000); /* ns; an older request's value makes no row */
+enum { MOST_BURST = 16 }; /* limit of the characters that a UART collects before it delivers them */
+static const int64_t OLDEST_IN_DOUBT = INT64_C(2000000000); /* ns; values of older requests make no row */
 
 int md_reply_parse(const struct md_line *line, size_t at, struct md_message *reply)
 {
@@ -128,7 +129,8 @@ void md_reply_await(struct md_line *line, int reply_len)
     const struct md_exchange *exchange = line->exchange;
     const struct md_drive *drive = exchange->drive;
     int64_t reply_ns = md_wire_ns(exchange, reply_len), timeout_ns = md_timeout_ns(exchange);
-    line->give_up_ns = line->quiet_ns + timeout_ns + reply_ns;
+    int longest = md_longest_reply(exchange->framing, &exchange->request);
+    line->give_up_ns = line->quiet_ns + timeout_ns + md_wire_ns(exchange, longest);
     line->ready_ns = 0;
     line->begun_by_ns = line->give_up_ns;
     if (line->burst > 0 && drive->delay_ns) /* otherwise the adapter may deliver whole replies */
@@ -173,7 +175,7 @@ void md_reply_foresee(struct md_line *line, int64_t now_ns)
 void md_reply_extend(struct md_line *line)
 {
     const struct md_exchange *exchange = line->exchange;
-    int64_t reply_ns = md_wire_ns(exchange, md_reply_length(exchange->framing, &exchange->request));
+    int64_t reply_ns = md_wire_ns(exchange, md_longest_reply(exchange->framing, &exchange->request));
     line->give_up_ns = later(line->give_up_ns, line->quiet_ns + md_timeout_ns(exchange) + reply_ns);
     line->begun_by_ns = line->give_up_ns;
 }
@@ -198,7 +200,8 @@ static void measure(struct md_line *line, int reply_len)
     int is_whole = line->waited && line->looks == 1;
     int64_t delay_ns = md_learn_delay(exchange, later(begun_ns - left_ns, 0), is_whole);
     int64_t ideal_ns = line->silence_ns + request_ns + delay_ns + reply_ns;
-    /* On a port that is faster than its settings, such as a network's, count at most the time taken. */
+    /* On a port that is faster than its settings, such as a network's, count at most the time that the
+     * exchange took. */
     int64_t ended_ns = line->transactions ? completion->last_ns : later(completion->last_ns, left_ns);
     int64_t took_ns = line->silence_ns + ended_ns - completion->sent_ns;
     md_counters_answer(drive, delay_ns, sooner(ideal_ns, took_ns));
@@ -255,9 +258,9 @@ void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns)
     }
 }
 
-/* End the exchange with a reply to this request or to an earlier one; a second reply may still come. If the
- * earlier request is the same, a row can hold the value, with an uncertainty that covers both requests. A
- * client that waits needs the present value: read it again. */
+/* End the exchange with a reply that answers either its request or an earlier one; a second reply may still
+ * come. If the earlier request was the same, a row can hold the value, with an uncertainty that covers both
+ * requests. A client that waits needs the present value, so the value is read again. */
 static struct md_ending end_in_doubt(struct md_line *line, size_t at, int used,
                                      const struct md_message *reply, int64_t now_ns, int64_t since_ns)
 {
@@ -381,7 +384,7 @@ int md_reply_find(struct md_line *line, int64_t now_ns, struct md_ending *ending
 /* ---- no reply ---- */
 
 /* Return 1 if the bytes start with a damaged frame of the drive: then the drive has answered. Foreign frames,
- * echo and noise do not count, and later bytes may be the inside of another frame. */
+ * echo and noise do not count. Later bytes are not checked, because they may be inside another frame. */
 static int is_damaged_answer(const struct md_line *line, size_t begin, int found)
 {
     if (begin == 0 && line->echo == MD_ECHO)
@@ -410,7 +413,7 @@ struct md_ending md_reply_missed(struct md_line *line, int64_t now_ns)
         is_doubtful = copy == MAY_BE_REPLY;
     }
     int first = begin == line->rx_len ? MD_NO_REPLY : md_reply_parse(line, begin, &reply);
-    /* If other requests are outstanding, the damaged frame may answer one of them. */
+    /* If other requests are outstanding, the damaged frame may be the reply to such a request. */
     if (exchange->drive->owed_count || !is_damaged_answer(line, begin, first))
         md_late_expect(line, md_window_ns(exchange));
     if (!is_doubtful)

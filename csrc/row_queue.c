@@ -25,13 +25,13 @@ struct md_row_queue {
     uint32_t calls;             /* number of bits that are set in `called` */
 };
 
-#if defined __APPLE__ || defined _WIN32 /* their conditions do not support CLOCK_MONOTONIC */
+#if defined __APPLE__ || defined _WIN32 /* their condition variables do not support CLOCK_MONOTONIC */
 #define RELATIVE_TIMES 1
 #else
 #define RELATIVE_TIMES 0
 #endif
 
-/* Initialise a condition with timeouts by CLOCK_MONOTONIC. */
+/* Initialise a condition variable with timeouts by CLOCK_MONOTONIC. */
 static void init_condition(pthread_cond_t *condition)
 {
 #if RELATIVE_TIMES

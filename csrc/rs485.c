@@ -1,9 +1,9 @@
-/* The direction of an RS-485 transceiver that the port must switch: by the driver's RS-485 mode, or by RTS
- * around each request.
+/* Switch an RS-485 transceiver between sending and receiving: by the driver's RS-485 mode, or by RTS around
+ * each request.
  *
- * RTS must fall after the last stop bit, and before a drive answers, 3.5 characters later. No function
- * waits: the thread checks repeatedly. A UART reports that its last bit has left (TIOCSERGETLSR), and that
- * report decides.
+ * RTS must fall after the last stop bit and before the drive's reply, which may start 3.5 characters later.
+ * No function waits: the thread checks repeatedly. If a UART can report that its last bit has left
+ * (TIOCSERGETLSR), this report decides.
  *
  * A USB adapter's report may be older than the request. The driver's queue is empty once the adapter has the
  * bytes, but then these bytes still take their whole time on the wire. */
@@ -11,9 +11,9 @@
 #include "engine.h"
 
 static const int64_t LOOK_AGAIN_NS = 200000;
-static const int64_t ADAPTER_NS = 1000000; /* one USB frame: the adapter may start to send so much later */
+static const int64_t ADAPTER_NS = 1000000; /* one USB frame: the adapter may start to send so late */
 enum { CLOCK_DEVIATION = 50 };             /* 1/50: the adapter's baud rate may be 2 % too low */
-static const int64_t MOST_HELD_NS = 1000000000; /* if sending takes longer, the port is broken */
+static const int64_t MOST_HELD_NS = 1000000000; /* if sending takes longer than this, the port is broken */
 
 static int is_by_rts(const struct md_rs485 *rs485)
 {
@@ -52,7 +52,7 @@ int md_rs485_begin(struct md_port *port, int mode, int is_usb)
     else if (is_by_rts(&port->rs485)) {
         port->rs485.reports_end = !is_usb && md_descriptor_is_shifted_out(port->fd) >= 0;
         failure = set_direction(port, 0);
-        if (!failure && mode == MD_RS485_RTS_DOWN) /* RTS off after closing would mean sending forever */
+        if (!failure && mode == MD_RS485_RTS_DOWN) /* RTS off after closing would leave it sending */
             failure = md_port_keep_rts(port->fd);
     }
     if (failure)

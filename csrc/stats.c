@@ -13,9 +13,9 @@ static int64_t early_look_ns(const struct md_exchange *exchange)
     return later(0, drive->delay_ns - drive->deviation_ns - exchange->character_ns / 2);
 }
 
-/* For a client that waits for values each wake-up is expensive, because caches are cold, and its own
- * delays are longer than the variation of a steady drive's delays. Therefore the port is read when the
- * reply must be complete. Only one read in SURE is early, to detect that replies have become faster. */
+/* If a client waits for values, each wake-up is expensive, because caches are cold. The client's own delays
+ * are longer than the variation of a steady drive's delays. Therefore the port is read when the reply must
+ * be complete. Only one read in SURE is early, to detect that replies have become faster. */
 enum { SURE = 8 };
 
 static int is_sure(const struct md_exchange *exchange)
@@ -53,11 +53,11 @@ static int64_t usual_timeout_ns(const struct md_drive *drive)
     return sooner(usual_ns, drive->most_timeout_ns);
 }
 
-/* The first request after a failure gets the longest timeout that the document allows, because the drive
- * may have become slower. While the drive stays silent, only one request in RARELY gets that timeout, because
- * the other drives lose that time. A stop must be repeated sooner: its timeout doubles after each failure
- * except the first, which is that of the identity check. If replies are known to be late, a stop may wait as
- * long as its sender allows. */
+/* The first request after a failure gets the longest timeout that the drive's document allows, because the
+ * drive may have become slower. While the drive stays silent, only one request in RARELY gets that timeout,
+ * because it takes line time from the other drives. A stop must be repeated sooner. Its timeout doubles after
+ * each failure except the first one, because that belongs to the identity check. If replies are known to be
+ * late, a stop may wait as long as its sender allows. */
 enum { RARELY = 16, MOST_DOUBLINGS = 8 };
 static const int64_t MOST_PATIENCE = INT64_C(20000000000);
 
@@ -105,9 +105,9 @@ static void smooth(struct md_drive *drive, int64_t delay_ns)
     learn(&drive->delay_ns, later(drive->delay_ns + off_ns / 8, 1));
 }
 
-/* md_reply_due_ns() serves only to accept a copy of the request as the reply; a stop's reads do not need
- * it. */
-enum { WELL_KNOWN = 8 }; /* replies */
+/* md_reply_due_ns() is only used to accept a copy of the request as the reply. It returns 0 for a stop's
+ * reads, for which that is not needed. */
+enum { WELL_KNOWN = 8 }; /* number of replies after which the delay is known well enough */
 
 int64_t md_reply_due_ns(const struct md_exchange *exchange)
 {
@@ -160,11 +160,11 @@ void md_learn_silence(struct md_drive *drive)
 /* ---- counters ---- */
 
 /* Counters only grow, so the counts of a time span are the difference of two readings. Response delays are
- * counted in buckets, PARTS to each doubling. */
+ * counted in buckets, PARTS for each doubling of the delay. */
 enum { FIRST_DOUBLING = 16, PARTS = 8, PART_BITS = 3 }; /* the second bucket starts near 2^16 ns */
 enum { NAK = 7, BUSY = 6 };                                /* Modbus exception codes */
 
-_Static_assert(MD_STATUSES == 1 - MD_POLLING_FAILED, "every status has a place");
+_Static_assert(MD_STATUSES == 1 - MD_STALLED, "every status has a place");
 
 static int bucket(int64_t ns)
 {

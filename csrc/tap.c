@@ -24,8 +24,8 @@ static void set(uint32_t *counter, uint32_t value)
     __atomic_store_n(counter, value, __ATOMIC_RELEASE);
 }
 
-/* Return the address of a position in the ring buffer; set `first` to how many of `len` bytes fit before its
- * end. */
+/* Return the address of a position in the ring buffer. Set `first` to the number of the `len` bytes that fit
+ * before the end of the buffer. */
 static uint8_t *place(const struct md_tap *tap, uint32_t at, size_t len, size_t *first)
 {
     uint32_t offset = at & (tap->room - 1);

@@ -6,7 +6,7 @@
  *
  * Only the header gives a frame's length. If a device sends more or fewer bytes, the header of the awaited
  * reply is found by its id, unit and function. If the first bytes on a port are not a header, the far end
- * speaks another protocol: the connection is given up. */
+ * speaks another protocol, and the port is given up. */
 #include "line.h"
 
 #include <string.h>
@@ -18,7 +18,7 @@ void md_tcp_begin(struct md_line *line)
 
 /* ---- whole frames ---- */
 
-enum { KNOWN_HEAD = MD_TCP_HEAD + 2 /* with the unit id and the function code */ };
+enum { KNOWN_HEAD = MD_TCP_HEAD + 2 /* the header, the unit id and the function code */ };
 
 static int is_ours(const struct md_line *line)
 {
@@ -42,8 +42,8 @@ static int may_be_awaited(const struct md_line *line, const uint8_t *bytes, size
     return 1;
 }
 
-/* Return the length of the current frame, as md_tcp_length(). If the frame is the awaited reply, an exception
- * has its fixed length, and an impossible length counts as that of the header alone. */
+/* Return the length of the current frame, like md_tcp_length(). If the frame may be the awaited reply, do not
+ * trust its header: return the fixed length for an exception, and KNOWN_HEAD for an impossible length. */
 static int frame_length(const struct md_line *line)
 {
     int whole = md_tcp_length(line->frame, line->frame_len);

@@ -1,7 +1,8 @@
 /* Set a port's speed and character format, then read back the values that the driver took.
  *
- * tcsetattr() fails with EINVAL if no requested change took effect: a pty could not be reopened at even
- * parity. Linux's ioctl does not fail then, and takes any speed; other systems take the speeds in termios. */
+ * tcsetattr() fails with EINVAL if no requested change took effect: for example, a pty could not be reopened
+ * with even parity. On Linux ioctl() is used instead, which does not fail then and takes any speed. On other
+ * systems the speed is set in the termios structure. */
 #include "internal.h"
 
 #include <errno.h>

@@ -1,16 +1,17 @@
 /* The order of exchanges on a line: first urgent ones, then queued ones that are due, then repeated ones.
- * Queued and repeated exchanges keep a share of the line beside endless urgent ones, but not beside stops.
+ * Even if urgent exchanges never pause, queued and repeated ones get a share of the line, except while a stop
+ * waits.
  *
- * The caller passes the time, moves the bytes, and holds the engine's lock; only md_turn_submit() needs
- * none. */
+ * The caller passes the time, moves the bytes, and holds the engine's lock; only md_turn_submit() needs no
+ * lock. */
 #include "line.h"
 
 /* ---- requests before an exchange ---- */
 
-enum { MOST_PROOFS_SENT = 12 }; /* most proofs sent before one exchange */
+enum { MOST_PROOFS_SENT = 12 }; /* limit of the proofs sent before one exchange */
 
 /* Return the request to send before the exchange: an echo probe, or a proof, so that no late reply is
- * mistaken for the exchange's. NULL: send the exchange itself. */
+ * mistaken for the exchange's reply. NULL: send the exchange itself. */
 static const struct md_exchange *find_before(struct md_before *before, const struct md_exchange *exchange,
                                              int is_echo_in_doubt, int64_t now_ns)
 {
@@ -77,10 +78,10 @@ uint32_t md_turn_repeat(struct md_turn *turn, const struct md_exchange *const *e
 void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent)
 {
     struct md_urgent **at = &turn->urgent;
-    if (*at && turn->source == MD_URGENT) /* the first urgent request is in flight: stay behind it */
+    if (*at && turn->source == MD_URGENT) /* the first request is in flight: stay behind it */
         at = &(*at)->next;
     for (struct md_urgent **waiting = at; *waiting; waiting = &(*waiting)->next)
-        if (!urgent->exchange->insists || (*waiting)->exchange->insists) /* a stop goes before others */
+        if (!urgent->exchange->insists || (*waiting)->exchange->insists) /* stops precede other requests */
             at = &(*waiting)->next;
     urgent->next = *at;
     *at = urgent;
@@ -89,14 +90,14 @@ void md_turn_add_urgent(struct md_turn *turn, struct md_urgent *urgent)
 void md_turn_set_echo(struct md_turn *turn, int echo)
 {
     turn->line.echo = (uint8_t)echo;
-    turn->line.echo_is_configured = echo == MD_ECHO; /* MD_NO_ECHO is not final: an echo changes it */
+    turn->line.echo_is_configured = echo == MD_ECHO; /* MD_NO_ECHO is not final: an echo may still come */
     md_store(&turn->progress.echo, (uint32_t)echo);
 }
 
 int md_turn_end(struct md_turn *turn)
 {
     turn->is_ending = 1;
-    int is_waiting = turn->source == MD_NO_SOURCE || md_listen_is_held(&turn->line);
+    int is_waiting = turn->source == MD_NO_SOURCE || md_line_is_postponed(&turn->line);
     return !is_waiting && turn->source != MD_URGENT;
 }
 
@@ -134,7 +135,7 @@ void md_count_stop(uint32_t *stops)
 
 enum {
     POLLED = 20,            /* polling gets 1/20 of a line that urgent requests keep busy */
-    MOST_OWED_NS = 50000000 /* most line time that may be owed to polling */
+    MOST_OWED_NS = 50000000 /* limit of owed_ns, the line time that polling may catch up on */
 };
 
 static uint32_t pending(const struct md_turn *turn)
@@ -238,7 +239,7 @@ static int take_queued(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 
 static int take_polled(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 {
-    if (turn->is_ending || turn->progress.lost) /* the client takes its queued exchanges back */
+    if (turn->is_ending || turn->progress.lost) /* the client takes the queued exchanges back */
         return 0;
     if (pending(turn) && take_queued(turn, wake_ns, now_ns))
         return 1;
@@ -366,11 +367,11 @@ static void finish(struct md_turn *turn)
     }
 }
 
-/* If the exchange in flight is still listening, put it back, because a stop must not wait for it. */
+/* Put the postponed exchange back, because a stop must not wait for it. */
 static void give_way(struct md_turn *turn)
 {
     int source = turn->source;
-    md_listen_put_back(&turn->line);
+    md_line_put_back(&turn->line);
     turn->source = MD_NO_SOURCE;
     if (source == MD_URGENT) {
         struct md_urgent *urgent = turn->urgent;
@@ -387,7 +388,7 @@ int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
     for (;;) {
         if (turn->source == MD_NO_SOURCE && !take(turn, wake_ns, now_ns))
             return MD_DONE;
-        if (md_listen_is_held(line) && is_stop_waiting(turn)) {
+        if (md_line_is_postponed(line) && is_stop_waiting(turn)) {
             give_way(turn);
             continue;
         }

@@ -12,7 +12,7 @@
 #define SYS_epoll_pwait2 (-1) /* headers before Linux 5.11 lack it; system call -1 always fails */
 #endif
 
-enum { EVENTS = 256 }; /* most events fetched by a system call */
+enum { EVENTS = 256 }; /* limit of the events fetched by a system call */
 
 typedef int wait_function(int epoll, struct epoll_event *events, int most, int64_t timeout_ns);
 

@@ -61,7 +61,7 @@ static ssize_t write_port(struct md_file *file, const void *bytes, size_t len)
     return (ssize_t)most;
 }
 
-/* Remove the timeouts: a read ends only when its byte has come, a write only when its last byte has left. */
+/* Disable timeouts: a read then ends when its byte has come, a write when its last byte has left. */
 int md_port_prepare(HANDLE handle)
 {
     COMMTIMEOUTS none = {0};
@@ -98,7 +98,7 @@ uint32_t md_port_baud_base(int fd)
     return 0;
 }
 
-/* RTS and DTR fall when a port is closed; Windows cannot keep them up. */
+/* Windows clears RTS and DTR when a port is closed, and cannot keep them set. */
 int md_port_keep_rts(int fd)
 {
     (void)fd;
@@ -175,7 +175,7 @@ int md_port_set(int fd, const struct md_settings *settings)
 
 /* ---- the direction of a transceiver ---- */
 
-/* The direction of an RS-485 transceiver that a COM port's RTS controls. */
+/* Switch an RS-485 transceiver by a COM port's RTS. */
 
 /* The driver raises RTS while it has bytes to send: Windows' own RS-485 mode. */
 int md_descriptor_take_rs485(int fd)

@@ -112,8 +112,8 @@ static void begin(struct md_file *file)
 
 /* ---- for port.c ---- */
 
-/* Complete the pending read if a byte has come. Windows completes the read immediately, Wine later, in
- * another process: until then the byte is in the queue, and must not count as missing. */
+/* Complete the pending read if a byte has come. Windows completes the read immediately. Wine completes it
+ * later, in another process. So wait if the driver's queue has the byte, because it has come in time. */
 static void complete(struct md_file *file)
 {
     if (file->is_reading)
@@ -229,7 +229,7 @@ void md_file_remove(int fd)
     for (int ms = 0; ms < MOST_CANCELLED_MS && (file->is_reading || file->is_writing); ms++)
         SleepEx(1, TRUE);
     unlist(file);
-    if (!file->is_reading && !file->is_writing) /* otherwise the system may still use its memory */
+    if (!file->is_reading && !file->is_writing) /* the system no longer uses the file's memory */
         free(file);
 }
 

@@ -26,7 +26,8 @@ struct md_file {
     uint8_t leaving[MD_MOST_FRAME];
 };
 
-/* The calls in which COM ports and sockets differ; the first and the last return -1 and set errno. */
+/* The calls that differ between COM ports and sockets. On failure, read() and write() return -1 and set
+ * errno. */
 struct md_file_kind {
     ssize_t (*read)(struct md_file *file, void *bytes, size_t room); /* the available bytes */
     int (*has_bytes)(struct md_file *file);
@@ -38,7 +39,7 @@ struct md_file_kind {
 
 extern const struct md_file_kind md_port_kind, md_socket_kind;
 
-int md_port_prepare(HANDLE handle); /* remove the timeouts of its reads and writes; 0 on failure */
+int md_port_prepare(HANDLE handle); /* remove the timeouts of reads and writes; 0 on failure */
 
 /* ---- file.c ---- */
 

@@ -1,5 +1,5 @@
-/* Counted checks; and copies of bytes that end at an unreadable page, so that an over-read crashes the test
- * even without sanitizers. */
+/* Count failed checks. Place copies of bytes directly before an unreadable page, so that an over-read crashes
+ * the test even without sanitizers. */
 #ifndef CHECKS_H
 #define CHECKS_H
 

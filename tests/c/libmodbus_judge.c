@@ -1,5 +1,5 @@
-/* Prints how libmodbus decodes frames: each line of standard input is a case, whose result is a line of
- * standard output.
+/* Print how libmodbus decodes frames. Each line of standard input is a case; its result is a line of standard
+ * output.
  *
  * libmodbus reads from a socket pair that ends after the frame, so that no read waits.
  *   "request FRAME"
@@ -9,8 +9,8 @@
  *   "reply ADDRESS FUNCTION START COUNT DATA FRAME"
  *       A client sends a request and receives FRAME. The result is "REQUEST VALUES" with the request and the
  *       values that it read (- for a write), or "REQUEST error ERRNO".
- * Frames and data are in hexadecimal, - if empty; numbers are decimal. An errno of libmodbus's own is printed
- * relative to MODBUS_ENOBASE, another one negated. */
+ * Frames and data are in hexadecimal, - if empty; numbers are decimal. libmodbus's own error numbers are
+ * printed relative to MODBUS_ENOBASE, those of the system as negative numbers. */
 #include <errno.h>
 #include <modbus.h>
 #include <stdio.h>
@@ -169,7 +169,7 @@ int main(void)
     map = modbus_mapping_new(CELLS, CELLS, CELLS, CELLS);
     if (!peer || !map)
         return 1;
-    modbus_set_response_timeout(peer, 0, 1000); /* it sleeps for this time before a reply with exception 03 */
+    modbus_set_response_timeout(peer, 0, 1000); /* libmodbus sleeps so long before exception 03 */
     fill();
     while (fgets(line, sizeof line, stdin)) {
         if (sscanf(line, "request %s", first) == 1)

@@ -12,7 +12,7 @@
 /* ---- frames printed in manuals ---- */
 
 struct frame {
-    int framing, is_reply, result; /* result: expected from parsing the whole frame */
+    int framing, is_reply, result; /* result: what the parser must return for the whole frame */
     uint8_t bytes[MD_MOST_FRAME];
     size_t len;
 };
@@ -26,7 +26,8 @@ static int parse(const struct frame *frame, const uint8_t *bytes, size_t len,
                            : md_parse_request(frame->framing, edge, len, &found);
 }
 
-/* Parse a frame whole, byte by byte, followed by other bytes, and with each of its bits inverted. */
+/* Parse a frame in several forms: whole, byte by byte, followed by other bytes, and with each of its bits
+ * inverted, one at a time. */
 static void check_parse(const struct frame *frame, const struct md_message *request)
 {
     uint8_t bytes[MD_MOST_FRAME + 3];
@@ -36,7 +37,7 @@ static void check_parse(const struct frame *frame, const struct md_message *requ
     for (size_t len = 0; len < frame->len; len++) {
         int used = parse(frame, bytes, len, request);
         CHECK(used == MD_INCOMPLETE || (used < 0 && used == frame->result));
-        CHECK(used || !refused); /* after a refusal, more bytes do not change it */
+        CHECK(used || !refused); /* once the parser has rejected the bytes, more bytes do not change that */
         refused = used;
     }
     for (size_t more = 0; more <= 3; more++)
@@ -92,7 +93,7 @@ static void check_behind_junk(const struct frame *frame, const struct md_message
     for (size_t junk_len = 0; junk_len <= sizeof junk; junk_len++)
         for (size_t step = 1; step <= 64; step *= 4)
             check_line(frame, request, junk, junk_len, step);
-    check_line(frame, request, frame->bytes, 2, 1); /* the junk is the start of a reply */
+    check_line(frame, request, frame->bytes, 2, 1); /* here the junk is the first two bytes of the frame */
 }
 
 /* Convert "01 03 ..." or ":0103...\r\n" (with escapes) to bytes. */
@@ -192,6 +193,12 @@ static const struct {
     {"a coil more than on", MD_RTU, 0, {.address = 1, .function = 5, .data_len = 2, .data = {0xFF, 0x01}}},
     {"more data than there is room for", MD_RTU, 0, {.address = 1, .function = 6, .data_len = 0xFFFF}},
     {"no function", MD_RTU, 0, {.address = 1, .count = 1}},
+    {"a mask", MD_RTU, 10, {.address = 1, .function = 0x16, .start = 4, .data_len = 4}},
+    {"half a mask", MD_RTU, 0, {.address = 1, .function = 0x16, .start = 4, .data_len = 2}},
+    {"a broadcast mask", MD_RTU, 0, {.function = 0x16, .start = 4, .data_len = 4}},
+    {"an event log", MD_RTU, 4, {.address = 1, .function = 0x0C}},
+    {"a queue", MD_RTU, 6, {.address = 1, .function = 0x18, .start = 5}},
+    {"a queue with data", MD_RTU, 0, {.address = 1, .function = 0x18, .data_len = 2}},
     {"a function that nobody here knows", MD_RTU, 0, {.address = 1, .function = 0x17, .count = 1}},
     {"an exception's function", MD_RTU, 0, {.address = 1, .function = 0x83, .count = 1}},
     {"a read over a network", MD_TCP, 12, {.address = 1, .function = 3, .count = 1}},
@@ -218,6 +225,9 @@ static const struct {
     {"a value written", MD_RTU, 8, {.address = 1, .function = 6, .data_len = 2}},
     {"half a value written", MD_RTU, 0, {.address = 1, .function = 6, .data_len = 1}},
     {"two values written by one's function", MD_RTU, 0, {.address = 1, .function = 6, .data_len = 4}},
+    {"a mask written", MD_RTU, 10, {.address = 1, .function = 0x16, .start = 4, .data_len = 4}},
+    {"an empty queue", MD_RTU, 6, {.address = 1, .function = 0x18, .data_len = 2}},
+    {"a queue of another length", MD_RTU, 0, {.address = 1, .function = 0x18, .data_len = 4}},
     {"an answer to what nobody here knows", MD_RTU, 0, {.address = 1, .function = 0x17, .data_len = 2}},
     {"an answer from a reserved address", MD_RTU, 0, {.address = 248, .function = 6, .data_len = 2}},
     {"a value", MD_DELIXI, 21, {.address = 1, .function = 7, .data_len = 4}},
@@ -245,15 +255,15 @@ static void check_builders(void)
     }
 }
 
-/* ---- the first byte at which the result is known ---- */
+/* ---- after which byte the parser knows the result ---- */
 
 static const struct {
-    const char *name, *bytes; /* the result is known at the last byte, not before */
+    const char *name, *bytes; /* the parser knows the result at the last byte, not earlier */
     int framing, result;
-    struct md_message request; /* empty: the bytes are a request */
+    struct md_message request; /* if empty, `bytes` are a request, otherwise a reply to it */
 } verdicts[] = {
-    {"no function", "01 2B", MD_RTU, MD_BAD_FUNCTION, {0}},
-    {"no function, as text", ":012B", MD_ASCII, MD_BAD_FUNCTION, {0}},
+    {"no function", "01 42", MD_RTU, MD_BAD_FUNCTION, {0}},
+    {"no function, as text", ":0142", MD_ASCII, MD_BAD_FUNCTION, {0}},
     {"an exception's function", "01 83", MD_RTU, MD_BAD_FUNCTION, {0}},
     {"what only the drive may say", ":01F0", MD_DELIXI, MD_BAD_FUNCTION, {0}},
     {"a word more than may be written", "01 10 00 00 00 7C F8", MD_RTU, MD_BAD_LENGTH, {0}},
@@ -273,7 +283,7 @@ static const struct {
     {"a head without a function", "00 01 00 00 00 01", MD_TCP, MD_NO_START, {0}},
     {"a head with a byte too much", "00 01 00 00 00 FF", MD_TCP, MD_NO_START, {0}},
     {"the longest head", "00 01 00 00 00 FE", MD_TCP, MD_INCOMPLETE, {0}},
-    {"no function, over a network", "00 01 00 00 00 06 01 2B", MD_TCP, MD_BAD_FUNCTION, {0}},
+    {"no function, over a network", "00 01 00 00 00 06 01 42", MD_TCP, MD_BAD_FUNCTION, {0}},
     {"a head that is shorter than its read", "00 01 00 00 00 05 01 03", MD_TCP, MD_BAD_LENGTH, {0}},
     {"a head that is longer than its read", "00 01 00 00 00 07 01 03", MD_TCP, MD_BAD_LENGTH, {0}},
     {"a head that ends before the count", "00 01 00 00 00 02 01 10", MD_TCP, MD_BAD_LENGTH, {0}},
@@ -290,7 +300,17 @@ static const struct {
     {"another byte count", "01 03 02", MD_RTU, MD_BAD_LENGTH, {.address = 1, .function = 3, .count = 2}},
     {"125 registers begin", "01 03 FA", MD_RTU, MD_INCOMPLETE, {.address = 1, .function = 3, .count = 125}},
     {"2000 bits begin", "01 01 FA", MD_RTU, MD_INCOMPLETE, {.address = 1, .function = 1, .count = 2000}},
-    {"an answer to no function", "01 2B", MD_RTU, MD_BAD_FUNCTION, {.address = 1, .function = 0x2B}},
+    {"an answer to no function", "01 42", MD_RTU, MD_BAD_FUNCTION, {.address = 1, .function = 0x42}},
+    {"an event log", "01 0C 02 00 00 BB 50", MD_RTU, 7, {.address = 1, .function = 0x0C}},
+    {"a queue", "01 18 00 F8", MD_RTU, MD_INCOMPLETE, {.address = 1, .function = 0x18}},
+    {"a queue that is too long", "01 18 00 F9", MD_RTU, MD_BAD_LENGTH, {.address = 1, .function = 0x18}},
+    {"no bytes of a server id", "01 11 00", MD_RTU, MD_BAD_LENGTH, {.address = 1, .function = 0x11}},
+    {"too many of them", "01 11 FB", MD_RTU, MD_BAD_LENGTH, {.address = 1, .function = 0x11}},
+    {"another MEI type", "01 2B 0D", MD_RTU, MD_BAD_FUNCTION, {.address = 1, .function = 0x2B}},
+    {"a long identification", "01 2B 0E 01 01 00 00 01 00 F2", MD_RTU, MD_INCOMPLETE, {.address = 1,
+                                                            .function = 0x2B}},
+    {"one that is too long", "01 2B 0E 01 01 00 00 01 00 F3", MD_RTU, MD_BAD_LENGTH, {.address = 1,
+                                                            .function = 0x2B}},
     {"another command", ":0106", MD_DELIXI, MD_BAD_FUNCTION, {.address = 1, .function = 7, .data_len = 4}},
     {"no state", ":010300000000000004\\r\\n", MD_DELIXI, MD_BAD_ECHO, {.address = 1, .function = 3,
                                                             .data_len = 4}},
@@ -316,7 +336,7 @@ static void check_verdicts(void)
 /* For a request with an impossible count, parsing a reply must not write beyond the message's data. */
 static void check_impossible_counts(void)
 {
-    static const uint8_t functions[] = {1, 2, 3, 4, 5, 6, 8, 0x0F, 0x10, 0x17, 0x83};
+    static const uint8_t functions[] = {1, 2, 3, 4, 5, 6, 7, 8, 0x0C, 0x0F, 0x10, 0x11, 0x16, 0x17, 0x18, 0x2B, 0x83};
     uint8_t reply[257] = {1};
     struct md_message found;
     row = "impossible count";

@@ -1,4 +1,5 @@
-/* Check which baud rates the clock of a UART can yield. This test replaces the driver, which accepts any. */
+/* Check which baud rates the clock of a UART can yield. This test replaces the driver, which accepts any
+ * baud rate. */
 #define _GNU_SOURCE
 #include "checks.h"
 #include "multidrop.h"

@@ -31,7 +31,7 @@ static void make(struct subject *subject)
     subject->exchange.request = (struct md_message){.address = 1, .function = 3, .start = 1, .count = 1};
 }
 
-/* Repeatedly open a port, carry out exchanges, replace the drive by a second one, and close the port. */
+/* Repeat these steps: open a port, carry out exchanges, replace the drive by a second one, close the port. */
 static void *come_and_go(void *argument)
 {
     uint32_t number = *(uint32_t *)argument;
@@ -71,7 +71,7 @@ static void *come_and_go(void *argument)
     return NULL;
 }
 
-/* The thread that takes rows, as a poller's consumer does, at the same time. */
+/* Take rows on another thread at the same time, as a poller's consumer does. */
 static void *take_calls(void *argument)
 {
     (void)argument;

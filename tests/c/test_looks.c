@@ -38,7 +38,8 @@ static void *answer(void *argument)
         ssize_t put = write(fd, frame, (size_t)length);
         assert(got == REQUEST && put == length);
     }
-    ssize_t got = recv(fd, request, sizeof request, MSG_WAITALL); /* now the client has all replies */
+    /* The client sends one more request only when it has all replies. */
+    ssize_t got = recv(fd, request, sizeof request, MSG_WAITALL);
     assert(got == REQUEST);
     return NULL;
 }
@@ -68,7 +69,7 @@ int main(void)
     md_port_repeat(ports[0], round, 1);
     pthread_join(drives, NULL);
     int found = atomic_load(&reads);
-    assert(found <= EXCHANGES + 1); /* and one read before the first request */
+    assert(found <= EXCHANGES + 1); /* one per exchange, and one before the first request */
 
     for (int i = 0; i < PORTS; i++) {
         md_port_stop(ports[i]);

@@ -30,7 +30,7 @@ static ssize_t noted_write(int fd, const void *bytes, size_t len);
 #include <sys/socket.h>
 
 enum { REQUEST = 8, MS = 1000000 };
-static const int64_t BEGIN_NS = INT64_C(5000) * MD_SECOND_NS; /* unlike the real clock's time */
+static const int64_t BEGIN_NS = INT64_C(5000) * MD_SECOND_NS; /* start of the test's clock */
 
 static _Atomic int64_t boottime_ns;
 static atomic_int looks, looks_written, written, most_written;
@@ -90,7 +90,7 @@ static void make(void)
 {
     reading.request = (struct md_message){.address = 1, .function = 3, .start = 1, .count = 1};
     stop = reading;
-    stop.drive = &other; /* a late reply of `other` delays no reading of `drive` */
+    stop.drive = &other; /* another drive: a late reply to the stop must not delay `reading` */
     stop.insists = 1;
     atomic_store(&boottime_ns, BEGIN_NS);
     atomic_store(&most_written, 1000);
@@ -132,7 +132,8 @@ static int64_t real_boottime_ns(void)
     return now.tv_sec * MD_SECOND_NS + now.tv_nsec;
 }
 
-/* Extend the mastership by `ns` of the test's clock; set the kernel's timer to an hour of the real clock. */
+/* Extend the mastership by `ns` of the test's clock. The kernel's timer uses the real clock, and is an hour
+ * away. */
 static void extend(int64_t ns)
 {
     int64_t kill_ns = real_boottime_ns() + 3600 * MD_SECOND_NS;
@@ -152,7 +153,7 @@ static void check_listens_no_more(void)
 {
     struct md_completion found;
     int tries = 0;
-    do /* a busy machine may delay an exchange as long as listening would */
+    do /* repeat: on a busy machine an exchange may be delayed for as long as by listening */
         found = carry_out(&reading);
     while (found.sent_ns - found.begun_ns >= 30 * MS && tries++ < 20);
     assert(found.sent_ns - found.begun_ns < 30 * MS);
@@ -166,7 +167,8 @@ static void check_listens_first(void)
     check_listens_no_more();
 }
 
-/* Listen again after a gap in mastership, even if it had no request: another process may have been master. */
+/* Listen again after a gap in mastership, even if no request was made in the gap: another process may have
+ * been master meanwhile. */
 static void check_listens_after_a_lapse(void)
 {
     extend(1000);
@@ -176,11 +178,11 @@ static void check_listens_after_a_lapse(void)
     md_mastership_end(mastership);
     extend(1000);
     check_listens_first();
-    extend(2000); /* extended before its end: no gap */
+    extend(2000); /* the mastership is extended before it ends: no gap */
     check_listens_no_more();
 }
 
-/* Wait for guard_ns before the first request, because the previous master may send for this time. */
+/* Wait for guard_ns before the first request, because the previous master may still send during that time. */
 static void check_guard_comes_first(void)
 {
     md_mastership_end(mastership);
@@ -225,7 +227,7 @@ static void check_all_foreign_bytes_are_counted(void)
     md_listen_receive(&line, 3, 10);
     md_listen_receive(&line, 4, 20);
     assert(line.foreign == 7 && line.listened_ns == 25);
-    line.transactions = 1; /* now foreign bytes may be a late reply to this process */
+    line.transactions = 1; /* on a network such bytes may be a late reply to this process */
     md_listen_receive(&line, 3, 30);
     assert(line.foreign == 7 && line.listened_ns == 25);
 }
@@ -263,7 +265,7 @@ static void check_other_master(void)
     pthread_t other, reader;
     struct md_completion found, stopped;
     extend(MD_SECOND_NS);
-    reading.character_ns = 2 * MS; /* it listens for half a second */
+    reading.character_ns = 2 * MS; /* so `reading` listens for half a second */
     atomic_store(&is_babbling, 1);
     pthread_create(&other, NULL, babble, NULL);
     found = carry_out(&reading);

@@ -1,4 +1,5 @@
-/* A row's time is that of its exchange, also if the wall clock is set. The clocks are the test's own. */
+/* A row has the time of its exchange even if the wall clock is changed in between. This test replaces the
+ * clocks. */
 #include "internal.h"
 
 #include <assert.h>

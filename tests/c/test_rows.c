@@ -105,7 +105,8 @@ static void check_spelling(void)
     CHECK(md_spell(codes, 4, names, offsets, NAMES - 1, ends, page_end() - 10, 10) == -1);
 }
 
-/* Check that packets match the pcapng draft, also across the ring's end, and that lost bytes are counted. */
+/* Check that packets match the pcapng draft, even if they wrap around the ring's end, and that lost bytes are
+ * counted. */
 static void check_tap(void)
 {
     enum { ROOM = 64, LEN = 5, SIZE = 28 + 8 + 4 + 4 }; /* a packet: 28 + 8 (head and bytes) + 4 (tail) + 4 */

@@ -15,7 +15,7 @@ enum { CHARACTER_NS = 1145833, USB_NS = 1200000, FD = 1000 }; /* 9600 8N1 */
 
 static struct {
     int64_t now_ns;
-    int64_t start_ns;   /* delay from a write to its first bit */
+    int64_t start_ns;   /* time from a write to the first bit on the wire */
     int64_t percent;    /* actual time of a character, relative to the nominal one */
     int64_t taken_ns;   /* when the adapter has taken all bytes */
     int64_t end_ns;     /* when the last bit has been sent */
@@ -130,7 +130,7 @@ static struct md_port *new_port(int mode, int is_usb)
     uart.takes = 1000;
     uart.sending_level = mode != MD_RS485_RTS_DOWN;
     uart.is_up = 1; /* open() raises RTS */
-    uart.reports_end = 1; /* also a USB driver: its last report says that the adapter was idle */
+    uart.reports_end = 1; /* of a USB driver too, but its report is older than the request */
     uart.is_usb = is_usb;
     CHECK(md_rs485_begin(&port, mode, is_usb) == 0);
     return &port;
@@ -154,7 +154,7 @@ static void check_direction(void)
     static const struct {
         const char *row;
         int mode, is_usb, len;
-        int64_t start_ns, percent, most_ns; /* most_ns: limit from the last bit to the change of RTS */
+        int64_t start_ns, percent, most_ns; /* most_ns: limit from the last bit to the fall of RTS */
     } rows[] = {
         {"a UART", MD_RS485_RTS_UP, 0, 8, 0, 100, 0},
         {"RTS off while sending", MD_RS485_RTS_DOWN, 0, 8, 0, 100, 0},
@@ -198,7 +198,7 @@ static void check_parts(void)
     int before = uart.changes;
     for (int at = 0; at < 64;) {
         at += (int)md_rs485_write(port, frame + at, (size_t)(64 - at));
-        uart.now_ns = uart.end_ns + 5 * CHARACTER_NS; /* late, but RTS must not change */
+        uart.now_ns = uart.end_ns + 5 * CHARACTER_NS; /* the next part is late: keep RTS on */
         CHECK(md_rs485_look(port, uart.now_ns) == 0 && uart.is_up);
     }
     port->turn.line.state = MD_AWAITING;

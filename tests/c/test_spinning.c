@@ -1,4 +1,5 @@
-/* The engine's thread spins at the end of a silence before a queued request, and sleeps before a client's. */
+/* At the end of a silence, the engine's thread spins if a queued request is next. If a client's request is
+ * next, it sleeps. */
 #include "internal.h"
 
 #include <assert.h>
@@ -14,7 +15,7 @@ enum {
 };
 static const int64_t SILENCE_NS = 3000000, TIMEOUT_NS = INT64_C(5000000000);
 
-/* ---- replaces clock.c ---- */
+/* ---- these functions replace clock.c ---- */
 
 static atomic_int looks;
 

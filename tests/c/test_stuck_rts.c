@@ -1,5 +1,5 @@
-/* A command that the driver still holds is called off when RTS can no longer wait for it, and when its port
- * closes meanwhile. This test simulates a driver that has RTS and never sends. */
+/* A command that the driver still holds is called off in two cases: the wait for its last bit takes too long
+ * (RTS is switched after it), or its port is closed. The simulated driver has RTS, and never sends. */
 #define _GNU_SOURCE
 #include <asm/ioctls.h>
 #include <sys/syscall.h>

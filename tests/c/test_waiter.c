@@ -1,4 +1,5 @@
-/* The core passes waits to the system exactly, in nanoseconds: this program intercepts the calls. */
+/* The core passes the duration of a wait to the system without rounding. This program intercepts the system
+ * calls. */
 #define _GNU_SOURCE
 #include "internal.h"
 
@@ -32,7 +33,7 @@ long syscall(long number, ...)
 int ppoll(struct pollfd *fds, nfds_t count, const struct timespec *span, const sigset_t *signals)
 {
     (void)fds, (void)count, (void)signals;
-    assert(!has_pwait2); /* epoll_pwait2() makes another call unnecessary */
+    assert(!has_pwait2); /* poll() is not called if epoll_pwait2() exists */
     asked_ns = span ? span->tv_sec * INT64_C(1000000000) + span->tv_nsec : -1;
     return 0;
 }

@@ -1,4 +1,4 @@
-/* Waiting with epoll_pwait2(), and without it, as on old kernels and in some containers. */
+/* Waiting works with epoll_pwait2(), and without it, as on old kernels and in some containers. */
 #define _GNU_SOURCE
 #include "internal.h"
 

@@ -1,4 +1,4 @@
-/* A client wakes the engine's thread only if the thread would not serve the port by itself in time. */
+/* A client wakes the engine's thread only if the thread would otherwise serve the port too late. */
 #include "internal.h"
 
 #include <assert.h>
@@ -13,7 +13,7 @@ static const int64_t SILENCE_NS = 50000000, EARLY_NS = 80000, TIMEOUT_NS = INT64
 
 static atomic_int rings;
 
-/* ---- replaces wakeup.c ---- */
+/* ---- these functions replace wakeup.c ---- */
 
 int md_wakeup_make(struct md_wakeup *wakeup)
 {

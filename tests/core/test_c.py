@@ -7,8 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from c_programs import ROOT, SANITIZERS, build_and_run
 from examples import usually
+from peers import ROOT, SANITIZERS, build_and_run
+
+pytestmark = pytest.mark.long
+WAITS_BY_EPOLL = pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
+
+
+def core_without(*replaced: str) -> list[str]:
+    """Return the names of the core's C files, without those that the test program replaces."""
+    return [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
 
 
 @pytest.fixture
@@ -24,104 +32,80 @@ def build(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[
     return build
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_core(build: Callable[..., None]) -> None:
     core = ("body", "frame", "tap", "line", "reply", "tcp", "late", "stats", "columns")
     build("test_core", *core, arguments=["tests/data/frames.csv"])
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_rows(build: Callable[..., None]) -> None:
     build("test_rows", "columns", "tap", "body", "frame")
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_utc_offset_is_read_for_each_batch_of_rows(build: Callable[..., None]) -> None:
     build("test_row_queue", "row_queue", "columns", "body", "frame")
 
 
-@pytest.mark.long
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
+@WAITS_BY_EPOLL
 @pytest.mark.parametrize(
     "sanitizers", usually([*SANITIZERS], ["-fsanitize=thread"]), ids=["memory", "threads"]
 )
 def test_threads_can_open_and_close_ports_concurrently(
     build: Callable[..., None], sanitizers: list[str]
 ) -> None:
-    core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem != "waiter_poll"]
-    build("test_engine", *core, sanitizers=sanitizers)
+    build("test_engine", *core_without("waiter_poll"), sanitizers=sanitizers)
 
 
-@pytest.mark.long
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
+@WAITS_BY_EPOLL
 def test_a_client_that_returns_within_the_silence_does_not_wake_the_thread(
     build: Callable[..., None],
 ) -> None:
-    replaced = ("waiter_poll", "wakeup")
-    core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
-    build("test_wakings", *core)
+    build("test_wakings", *core_without("waiter_poll", "wakeup"))
 
 
-@pytest.mark.long
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
+@WAITS_BY_EPOLL
 def test_the_thread_does_not_spin_for_a_waiting_client(build: Callable[..., None]) -> None:
-    replaced = ("waiter_poll", "clock")
-    core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
-    build("test_spinning", *core)
+    build("test_spinning", *core_without("waiter_poll", "clock"))
 
 
-@pytest.mark.long
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
+@WAITS_BY_EPOLL
 def test_an_exchange_of_a_steady_drive_reads_the_port_once(build: Callable[..., None]) -> None:
-    replaced = ("waiter_poll", "port")
-    core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
-    build("test_looks", *core)
+    build("test_looks", *core_without("waiter_poll", "port"))
 
 
-@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="others have no RS-485 mode")
 def test_a_transceiver_sends_until_the_last_bit_has_left(build: Callable[..., None]) -> None:
     build("test_rs485", "rs485")
 
 
-@pytest.mark.long
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
-def test_a_command_that_rts_cannot_wait_for_is_called_off(build: Callable[..., None]) -> None:
-    build(
-        "test_stuck_rts", *[path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem != "waiter_poll"]
-    )
+@WAITS_BY_EPOLL
+def test_a_command_that_waits_too_long_for_rts_is_called_off(build: Callable[..., None]) -> None:
+    build("test_stuck_rts", *core_without("waiter_poll"))
 
 
-@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="the driver is Linux's")
 def test_a_baud_rate_without_a_whole_divisor_is_refused(build: Callable[..., None]) -> None:
     build("test_divisors", "termios")
 
 
-@pytest.mark.long
-@pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")
+@WAITS_BY_EPOLL
 @pytest.mark.parametrize("program", ["test_waiter", "test_waiter_refused"])
 def test_waits_are_exact_to_the_nanosecond(build: Callable[..., None], program: str) -> None:
     build(program, "waiter_epoll")
 
 
-@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="masterships are Linux's")
 def test_the_mastership_deadline_is_checked_before_each_write(build: Callable[..., None]) -> None:
-    replaced = ("waiter_poll", "port", "rs485", "mastership")
-    core = [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
-    build("test_mastership", *core)
+    build("test_mastership", *core_without("waiter_poll", "port", "rs485", "mastership"))
 
 
-@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="realtime scheduling is limited by Linux's timers")
 def test_realtime_scheduling_ends_before_it_starves_the_computer(build: Callable[..., None]) -> None:
     build("test_realtime", "clock")

@@ -34,10 +34,10 @@ from multidrop.core import (
 
 Pair = tuple[Printed, Printed]
 REPLIES = [each for each in PRINTED if each.request is not None and isinstance(each.says, Message)]
-WRITE = bytes.fromhex("01 06 20 01 13 88 DE 9C")  # a write, whose reply is a copy
+WRITE = bytes.fromhex("01 06 20 01 13 88 DE 9C")  # a write; its reply is a copy of it
 READ, ANSWER = bytes.fromhex("01 03 00 16 00 01 65 CE"), bytes.fromhex("01 03 02 18 00 B2 44")
 OTHER_READ = bytes.fromhex("01 03 01 F4 00 01 C4 04")
-ALSO_ANSWER = bytes.fromhex("01 03 02 13 88 B5 12")  # as long as ANSWER
+ALSO_ANSWER = bytes.fromhex("01 03 02 13 88 B5 12")  # another reply with the length of ANSWER
 
 
 def split(*pieces: bytes) -> list[FrameSpan]:
@@ -67,7 +67,7 @@ def test_a_printed_exchange_is_split_into_a_request_and_its_reply(reply: Printed
 
 
 @given(st.lists(st.sampled_from(REPLIES), max_size=30), st.data())
-def test_frames_are_found_alike_however_the_bytes_are_divided_into_pieces(
+def test_the_same_frames_are_found_however_the_bytes_are_divided(
     line: list[Printed], data: st.DataObject
 ) -> None:
     bytes_ = READ + ANSWER + b"".join(each.request_frame + each.frame for each in line)
@@ -164,7 +164,7 @@ def test_a_reply_is_found_after_noise() -> None:
 
 @pytest.mark.parametrize("first", ["", "FF"])
 def test_a_pause_ends_a_frame_that_starts_in_junk(first: str) -> None:
-    """The junk looks like the start of a long write, and the next frames like its rest."""
+    """The junk looks like the start of a long write, and the next frames look like the rest of that write."""
     junk = bytes.fromhex(first + "01 10 00 00 00 7B F6")
     stream, splitter = Stream(), Splitter()
     stream.put(READ + ANSWER[:2], 0)
@@ -190,7 +190,7 @@ def test_bytes_that_cannot_be_a_frame_are_reported_as_junk_immediately() -> None
     assert sum(len(span.raw) for span in splitter.spans(stream)) > 990
 
 
-def test_a_full_stream_raises() -> None:
+def test_putting_bytes_into_a_full_stream_raises() -> None:
     stream = Stream()
     stream.put(bytes(STREAM_ROOM), 0)
     with pytest.raises(BufferError, match="split it first"):
@@ -226,7 +226,7 @@ def test_every_exchange_that_is_not_next_to_damage_is_found(seed: int) -> None:
         assert (Kind.REQUEST, i, sent[i]) in spans
         assert (Kind.REPLY, i + 1, sent[i + 1]) in spans
     frames = [span for span in found if span.kind is not Kind.JUNK]
-    for asked, answered in pairwise(frames):  # and no reply is assigned to another request
+    for asked, answered in pairwise(frames):  # checks also that no reply is assigned to another request
         if answered.kind is Kind.REPLY:
             assert answered.time_ns == asked.time_ns + 1 or answered.raw == asked.raw
 
@@ -244,7 +244,7 @@ def test_the_framing_of_each_frame_is_detected() -> None:
 
 
 def test_an_interrupted_decoder_reads_no_freed_memory() -> None:
-    """The decoder continues with the known requests and the file's next bytes, under a memory sanitizer."""
+    """After an interruption, the decoder decodes the file's next bytes. A memory sanitizer checks this."""
 
     def act(nth: int) -> bool:
         decoder, stream, columns = Decoder(), Stream(), Columns(16)

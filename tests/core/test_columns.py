@@ -12,7 +12,7 @@ from struct import iter_unpack
 from typing import Any
 
 import pytest
-from completions import add_miss, add_rows
+from batches import add_miss, add_rows
 from frames import words
 from hypothesis import given
 from hypothesis import strategies as st
@@ -41,8 +41,7 @@ from multidrop.core import (
 )
 from multidrop.core.columns import CodeTable, find_codes, greatest_code, narrow_up, wide_codes, widen
 
-UTC = 1_700_000_000_000_000_000  # ns; UTC minus CLOCK_MONOTONIC
-
+UTC = 1_700_000_000_000_000_000  # ns; UTC - CLOCK_MONOTONIC
 
 NUMBERS = [
     (NumberFormat.U16, "FF FE", 65534),
@@ -76,7 +75,7 @@ NUMBERS = [
 
 
 @table(("wire", "data", "value"), NUMBERS)
-def test_raw_value_reads_each_number_format(wire: int, data: str, value: float) -> None:
+def test_raw_value_decodes_each_number_format(wire: int, data: str, value: float) -> None:
     assert raw_value(bytes.fromhex(data), 0, wire) == value
 
 
@@ -92,8 +91,8 @@ def test_every_number_format_is_tested() -> None:
     assert {wire & (LOW_WORD_FIRST - 1) for wire, _, _ in NUMBERS} == set(NumberFormat)
 
 
-def test_coils_count_from_the_least_significant_bit_of_the_first_byte() -> None:
-    """Application protocol V1.1b3, 6.1: the reply CD 6B 05 to a read of coils 20 to 38."""
+def test_the_first_coil_is_the_least_significant_bit_of_the_first_byte() -> None:
+    """In the example of the application protocol V1.1b3, 6.1, the reply for coils 20 to 38 is CD 6B 05."""
     coils = [raw_value(bytes.fromhex("CD 6B 05"), at, NumberFormat.BIT) for at in range(19)]
     assert coils == [1, 0, 1, 1, 0, 0, 1, 1, 1, 1, 0, 1, 0, 1, 1, 0, 1, 0, 1]
 
@@ -156,7 +155,7 @@ def test_a_block_makes_one_row_for_each_field() -> None:
 
 @table(("raw", "divisor"), [(3, 10), (7, 100), (5000, 100), (65535, 1000), (1, 3)])
 def test_scaling_gives_the_nearest_number(raw: int, divisor: int) -> None:
-    """3 steps of 0.1 are 0.3, not 0.30000000000000004."""
+    """Three steps of 0.1 give 0.3, not 0.30000000000000004."""
     columns = Columns(1)
     assert add_rows(columns, RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, divisor)]), reply(raw), 0)
     assert columns.array("value")[0] == raw / divisor
@@ -171,11 +170,7 @@ ONE = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1)])
         (b"", Status.NO_REPLY, "no reply"),
         (b"\x01\x03", Status.CUT_SHORT, "reply cut short"),
         (b"\x01\x03\x02\x00\x00\x00\x00", Status.BAD_CHECKSUM, "bad checksum"),
-        (
-            build_reply(Framing.RTU, Message(1, 0x03, exception=0x12)),
-            EXCEPTION_STATUS + 0x12,
-            "exception 12",
-        ),
+        (build_reply(Framing.RTU, Message(1, 0x03, exception=0x12)), EXCEPTION_STATUS + 0x12, "exception 12"),
     ],
 )
 def test_missing_value_has_a_row_with_its_status(received: bytes, status: int, text: str) -> None:
@@ -187,7 +182,7 @@ def test_missing_value_has_a_row_with_its_status(received: bytes, status: int, t
     assert (columns.array("time")[0], columns.array("uncertainty")[0]) == (UTC + 1000 * MS, 0)
 
 
-def test_a_value_that_was_due_but_not_requested_has_a_row() -> None:
+def test_a_due_value_that_was_not_requested_has_a_row() -> None:
     columns = Columns(2)
     assert add_miss(columns, ONE, Status.NOT_ASKED, 77 * MS, UTC)
     assert (columns.array("status")[0], columns.array("sent")[0]) == (Status.NOT_ASKED, 77 * MS)
@@ -244,7 +239,7 @@ def test_a_block_that_does_not_fit_into_the_columns_adds_no_row() -> None:
     assert list(columns.array("value")) == [1, 2, 1]
 
 
-def test_codes_become_names() -> None:
+def test_codes_of_a_column_are_converted_to_names() -> None:
     names = Names(["pump-1", "вентилятор", ""])
     offsets, text = spell(memoryview(array("H", [1, 0, 2, 1])), names)
     ends = list(offsets)
@@ -252,7 +247,7 @@ def test_codes_become_names() -> None:
     assert found == ["вентилятор", "pump-1", "", "вентилятор"]
 
 
-def test_codes_of_names_added_later_are_spelled_too() -> None:
+def test_codes_of_names_added_later_are_converted_too() -> None:
     names = Names()
     numbers = [names.number(name) for name in ("pump", "fan", "pump")]
     spell(memoryview(array("H", numbers)), names)
@@ -282,7 +277,7 @@ def test_rows_of_a_block_larger_than_a_chunk_are_counted_as_dropped() -> None:
 
 
 def test_more_chunks_than_the_queue_keeps_can_be_given_back() -> None:
-    """A reader returns more chunks of memory than the queue keeps for reuse; the queue frees the others."""
+    """A reader returns more chunks of memory than the queue keeps for reuse. The queue frees the rest."""
     row_queue = RowQueue(chunk_rows=3, most_chunks=100)
     for turn in (1, 2):
         for due in range(100):
@@ -294,7 +289,9 @@ def test_more_chunks_than_the_queue_keeps_can_be_given_back() -> None:
 
 
 def test_a_code_without_a_name_raises() -> None:
-    with pytest.raises(ValueError, match=r"^a code without a name, or more than 2 GiB of names"):
+    with pytest.raises(
+        ValueError, match=r"^a code has no name, or the names of one batch have more than 2 GiB"
+    ):
         spell(memoryview(array("H", [0, 1])), Names(["pump"]))
 
 
@@ -310,7 +307,7 @@ def as_float32(bits: int) -> Fraction:
 
 @given(st.lists(st.one_of(st.integers(-(2**63), 2**63 - 1), st.sampled_from(EDGES)), max_size=9))
 def test_a_bound_is_rounded_up_to_the_next_float(numbers: list[int]) -> None:
-    """The next float is the one whose bits, as an integer, are the next (IEEE 754)."""
+    """The bits of the next float, read as an integer, are greater by one (IEEE 754)."""
     narrow = bytes(narrow_up(memoryview(array("q", numbers))))
     for number, bits in zip(numbers, struct.unpack(f"<{len(numbers)}I", narrow), strict=True):
         found = as_float32(bits)
@@ -328,12 +325,12 @@ def test_widening_reads_only_valid_numbers() -> None:
     floats = struct.pack("<4f", 7.0, float("nan"), float("inf"), 1e30)
     assert list(widen(memoryview(floats), memoryview(b"\x01"), 4).cast("q")) == [7, 0, 0, 0]
     for bit in (2, 4, 8):
-        with pytest.raises(ValueError, match="an uncertainty is no number"):
+        with pytest.raises(ValueError, match="an uncertainty is not a number"):
             widen(memoryview(floats), memoryview(bytes([bit])), 4)
     for cut in (floats[:15], b""):
-        with pytest.raises(ValueError, match="lengths do not fit"):
+        with pytest.raises(ValueError, match="stated lengths do not match the data"):
             widen(memoryview(cut), None, 4)
-    with pytest.raises(ValueError, match="lengths do not fit"):
+    with pytest.raises(ValueError, match="stated lengths do not match the data"):
         widen(memoryview(floats), memoryview(b""), 4)
 
 
@@ -344,14 +341,14 @@ def test_one_byte_codes_are_assigned_in_the_order_of_use() -> None:
     assert table.narrow(memoryview(array("H", range(256)))) is None  # 257 codes, with "name 399"
     table.forget()
     assert bytes(table.narrow(memoryview(array("H", range(256)))) or b"") == bytes(range(256))
-    with pytest.raises(ValueError, match="a status 400 without a name"):
+    with pytest.raises(ValueError, match="status 400 has no name"):
         table.narrow(memoryview(array("H", [400])))
 
 
 def test_one_byte_codes_are_widened_to_two_bytes() -> None:
     assert list(wide_codes(memoryview(bytes([0, 255, 7])), 3, 1)) == [0, 255, 7]
     assert list(wide_codes(memoryview(b"x" + struct.pack("=2H", 1, 65535))[1:], 2, 2)) == [1, 65535]
-    with pytest.raises(ValueError, match="lengths do not fit"):
+    with pytest.raises(ValueError, match="stated lengths do not match the data"):
         wide_codes(memoryview(b"123"), 2, 2)
 
 

@@ -10,12 +10,12 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from completions import pending, status_of
+from batches import pending, status_of
 from frames import words
 from lines import until
 from multidrop._core import ffi
@@ -51,7 +51,6 @@ from multidrop.core import (
 PARITY = next(bit for bit, name in REFUSALS.items() if name == "parity")
 ANY_SETTINGS, NO_SETTINGS = 0, -1
 
-
 ONE_VALUE = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, 1)])
 
 
@@ -66,7 +65,7 @@ def read(
     echo_probe: Exchange | None = None,
     values: RowLayout | None = None,
 ) -> Exchange:
-    """Return a read of one register. Its `timeout` in s is so long that no passing test waits for it."""
+    """Return a read of one register. The default `timeout` (s) never ends in a passing test."""
     return Exchange(
         Framing.RTU,
         Message(1, 0x03, start, 1),
@@ -84,7 +83,7 @@ def read(
     )
 
 
-MINUTE_NS = 60_000_000_000  # how late a reply may be on a busy computer
+MINUTE_NS = 60_000_000_000  # no reply takes so long, even on a busy computer
 
 
 def wait_until(look: Callable[[], bool]) -> None:
@@ -115,6 +114,27 @@ def echo_start(request: Message) -> bytes:
     """Return the reply of a drive whose registers hold their own addresses."""
     data = words(request.start)
     return build_reply(Framing.RTU, Message(request.address, request.function, data=data))
+
+
+def noting(
+    requested: list[int], answer: Callable[[Message], bytes] = echo_start
+) -> Callable[[Message], bytes]:
+    """Return a drive that replies like `answer`, and appends the address of each request to `requested`."""
+
+    def note_and_answer(request: Message) -> bytes:
+        requested.append(request.start)
+        return answer(request)
+
+    return note_and_answer
+
+
+@contextmanager
+def opened(room: int = 256) -> Iterator[tuple[Port, socket.socket]]:
+    """Yield a port and the far end of its line; both are closed at the end of the block."""
+    near, far = socket.socketpair()
+    near.setblocking(False)
+    with near, far, closing(Port(near.fileno(), NO_SETTINGS, room=room)) as port:
+        yield port, far
 
 
 class Far:
@@ -242,7 +262,7 @@ def test_repeat_returns_the_index_of_the_exchange_that_was_next(drive: Drive) ->
         port.repeat([read(0), read(1), read(2)])
         rows.of("value", 20)
         following = port.repeat([])
-        port.carry_out(read(9))  # after the exchange in flight
+        port.carry_out(read(9))  # carried out after the exchange in flight
         assert following == (rows.of("value", 20)[-1] + 1) % 3
 
 
@@ -272,7 +292,7 @@ def test_repeating_stops_when_a_request_cannot_be_sent(drive: Drive) -> None:
         assert rows.of("status", 1) == [Status.LATE_ANSWER_DUE]
 
 
-def test_the_client_is_called_when_a_drive_fails_and_when_it_answers_again(drive: Drive) -> None:
+def test_the_client_is_called_when_a_drive_fails_and_when_it_recovers(drive: Drive) -> None:
     silent = threading.Event()
     silent.set()
     peer = Peer(least_timeout=0.01, most_timeout=0.3)
@@ -293,9 +313,7 @@ def test_the_client_is_called_when_a_drive_fails_and_when_it_answers_again(drive
 
 
 def test_the_client_is_called_when_a_drive_refuses_and_when_the_port_is_lost() -> None:
-    near, far = socket.socketpair()
-    near.setblocking(False)
-    with closing(Port(near.fileno(), NO_SETTINGS)) as port:
+    with opened() as (port, far):
         row_queue = RowQueue()
         port.report_to(row_queue, 3)
         queued = [read(0), read(1), read(2)]
@@ -306,7 +324,6 @@ def test_the_client_is_called_when_a_drive_refuses_and_when_the_port_is_lost() -
         far.close()
         wait_until(lambda: port.lost)
         assert row_queue.await_calls(60) == [3]
-    near.close()
 
 
 def test_dropped_rows_are_counted(drive: Drive) -> None:
@@ -321,7 +338,7 @@ def test_dropped_rows_are_counted(drive: Drive) -> None:
         assert [each for columns in kept for each in columns.array("value")] == [*range(10), *range(30, 35)]
 
 
-def test_a_view_of_rows_outlives_them(drive: Drive) -> None:
+def test_a_view_of_rows_outlives_the_rows_object(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         row_queue = RowQueue()
         port.report_to(row_queue, 0)
@@ -368,52 +385,37 @@ def test_an_echo_probe_is_sent_first_if_it_is_unknown_whether_the_adapter_echoes
     drive: Drive, way: str
 ) -> None:
     requested: list[int] = []
-
-    def answer(request: Message) -> bytes:
-        requested.append(request.start)
-        return echo_start(request)
-
-    with closing(Port(drive(answer), NO_SETTINGS)) as port:
+    with closing(Port(drive(noting(requested)), NO_SETTINGS)) as port:
         rows, asked = Rows(port), [read(7, echo_probe=read(99))]
         if way == "urgent":
             assert [port.carry_out(asked[0]).reply.data for _ in range(2)] == [words(7)] * 2
         else:
             port.submit(asked * 2, [0, 0]) if way == "queued" else port.repeat(asked)
-            assert rows.of("value", 2)[:2] == [7, 7]  # and the echo probe has no row
+            assert rows.of("value", 2)[:2] == [7, 7]  # the echo probe has no row
         assert requested[:3] == [99, 7, 7]
 
 
 def test_an_inconclusive_echo_probe_is_repeated(drive: Drive) -> None:
     requested: list[int] = []
-
-    def answer(request: Message) -> bytes:
-        requested.append(request.start)
-        return b""
-
-    with closing(Port(drive(answer), NO_SETTINGS)) as port:
+    with closing(Port(drive(noting(requested, lambda _: b"")), NO_SETTINGS)) as port:
         nobody = Peer(least_timeout=0.001, most_timeout=0.001)
         asked = read(7, peer=nobody, echo_probe=read(99, peer=nobody))
         asked.c.insists = asked.echo_probe.c.insists = 1
         for _ in range(2):
             assert port.carry_out(asked).result == Failure.NO_REPLY
-        until(lambda: requested == [99, 7, 99, 7])  # the far end may see the last request later
+        until(lambda: requested == [99, 7, 99, 7])  # wait until the far end has seen the last request
 
 
 @pytest.mark.parametrize("echo", [Echo.ON, Echo.OFF])
 def test_a_configured_echo_needs_no_probe(drive: Drive, echo: Echo) -> None:
     requested: list[int] = []
-
-    def answer(request: Message) -> bytes:
-        requested.append(request.start)
-        return echo_start(request)
-
-    with closing(Port(drive(answer), NO_SETTINGS)) as port:
+    with closing(Port(drive(noting(requested)), NO_SETTINGS)) as port:
         port.set_echo(echo)
         assert port.carry_out(read(7, echo_probe=read(99))).result == 7
     assert requested == [7]
 
 
-def test_an_urgent_exchange_goes_ahead_of_the_queue(drive: Drive) -> None:
+def test_an_urgent_exchange_is_sent_before_the_queue(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         waiting = [read(0)]
         port.submit(waiting, [now_ns() + 60_000_000_000])
@@ -447,12 +449,7 @@ def test_a_completion_without_room_for_the_values_is_not_reused(drive: Drive) ->
 
 def test_an_urgent_exchange_that_expired_is_not_sent(drive: Drive) -> None:
     requested: list[int] = []
-
-    def answer(request: Message) -> bytes:
-        requested.append(request.start)
-        return echo_start(request)
-
-    with closing(Port(drive(answer), NO_SETTINGS)) as port:
+    with closing(Port(drive(noting(requested)), NO_SETTINGS)) as port:
         found = port.carry_out(read(3), expires_ns=boottime_ns() - 1)
         assert (found.result, found.sent_ns) == (Failure.EXPIRED, 0)
         assert port.carry_out(read(4)).result == 7
@@ -460,12 +457,7 @@ def test_an_urgent_exchange_that_expired_is_not_sent(drive: Drive) -> None:
 
 
 def written(
-    address: int,
-    start: int,
-    *,
-    turnaround: float = 1e-4,
-    insists: bool = False,
-    permit: Permit | None = None,
+    address: int, start: int, *, turnaround: float = 1e-4, insists: bool = False, permit: Permit | None = None
 ) -> Exchange:
     return Exchange(
         Framing.RTU,
@@ -490,7 +482,7 @@ def test_an_urgent_exchange_that_expires_while_it_waits_is_not_sent(drive: Drive
 
 
 def test_a_stop_precedes_waiting_requests_and_cancels_earlier_ones_of_its_drive(drive: Drive) -> None:
-    """A start sent after the stop would undo the stop; a start sent before the stop would move the motor."""
+    """An earlier start of the drive must be sent neither after the stop, nor before it."""
     latch, other = Latch(), Latch()
     requested: list[int] = []
     found: dict[int, Completion] = {}
@@ -526,7 +518,7 @@ def test_a_stop_precedes_waiting_requests_and_cancels_earlier_ones_of_its_drive(
     assert (found[50].result, found[50].sent_ns) == (Failure.EXPIRED, 0)
 
 
-def test_a_permit_is_valid_until_its_latch_rises_and_never_during_a_hold() -> None:
+def test_a_write_permit_from_before_or_during_a_stop_is_never_valid_again() -> None:
     latch = Latch()
     before = latch.permit()
     assert before.is_good
@@ -535,13 +527,13 @@ def test_a_permit_is_valid_until_its_latch_rises_and_never_during_a_hold() -> No
     during = latch.permit()
     assert not during.is_good
     latch.let_go("stop")
-    assert not during.is_good
+    assert (before.is_good, during.is_good) == (False, False)
     assert latch.permit().is_good
     latch.shut("the bus was left")
     assert not latch.permit().is_good
 
 
-def test_no_new_permit_is_valid_until_the_last_of_several_stops_is_over() -> None:
+def test_no_new_write_permit_is_valid_until_the_last_of_several_stops_has_ended() -> None:
     latch = Latch()
     latch.hold(1, "a stop")
     latch.hold(2, "another stop")
@@ -551,7 +543,7 @@ def test_no_new_permit_is_valid_until_the_last_of_several_stops_is_over() -> Non
     assert latch.permit().is_good
 
 
-def test_a_permit_of_a_call_that_began_before_a_stop_is_invalid() -> None:
+def test_the_write_permit_of_a_call_that_began_before_a_stop_is_invalid() -> None:
     latch = Latch()
     seen = latch.c[0]
     assert latch.permit(seen).is_good
@@ -589,14 +581,12 @@ def test_closing_a_port_reports_whether_each_pending_request_was_sent(drive: Dri
     assert sorted(each.sent_ns > 0 for each in found) == [False, True]
 
 
-def test_exchanges_counted_before_closing_have_rows() -> None:
-    """The port is closed at the moment at which a reply comes."""
+def test_each_exchange_counted_before_its_port_closes_has_a_row() -> None:
+    """The port is closed at the moment when a reply comes."""
     values = 0
     for _ in range(60):
-        near, far = socket.socketpair()
-        near.setblocking(False)
         asked = read(7)
-        with near, far, closing(Port(near.fileno(), NO_SETTINGS)) as port:
+        with opened() as (port, far):
             rows = Rows(port)
             port.submit([asked], [0])
             _, request = parse_request(Framing.RTU, far.recv(100))
@@ -621,7 +611,7 @@ def wait_until_it_sleeps(thread: threading.Thread) -> None:
 
 
 @pytest.mark.parametrize("insists", [False, True], ids=["reads", "stops"])
-def test_polling_keeps_a_share_beside_urgent_exchanges_but_not_beside_stops(
+def test_polling_keeps_a_share_of_the_line_during_urgent_exchanges_but_not_during_stops(
     drive: Drive, insists: bool
 ) -> None:
     """Polling gets one exchange at a time, and never two in a row."""
@@ -667,7 +657,7 @@ def test_queued_exchanges_are_kept_alive_until_they_end(drive: Drive) -> None:
         assert rows.of("value", 2) == [1, 2]
 
 
-def test_a_drives_exception_is_a_completion_with_its_code(drive: Drive) -> None:
+def test_an_exception_reply_of_a_drive_gives_a_completion_with_its_code(drive: Drive) -> None:
     fd = drive(lambda _: build_reply(Framing.RTU, Message(1, 0x03, exception=2)))
     with closing(Port(fd, NO_SETTINGS)) as port:
         assert status_of(port.carry_out(read(0))) == EXCEPTION_STATUS + 2
@@ -724,23 +714,18 @@ def test_a_broadcast_waits_only_for_the_turnaround_delay(drive: Drive) -> None:
 
 def test_exchanges_queued_on_a_lost_port_stay_queued() -> None:
     """The client will queue them on the port that it opens next."""
-    near, far = socket.socketpair()
-    near.setblocking(False)
-    with closing(Port(near.fileno(), NO_SETTINGS)) as port:
+    with opened() as (port, far):
         far.close()
         until(lambda: port.lost)
         assert port.submit([read(0), read(1), read(2)], [0] * 3) == 3
         assert (port.done, port.cut_off) == (0, False)
         assert port.carry_out(read(0)).result == Failure.LINE_LOST
-    near.close()
 
 
-@pytest.mark.parametrize("way", ["queued", "repeated"])
-@pytest.mark.parametrize("answered", [0, 1])
-def test_cut_off_is_set_if_the_port_is_lost_after_a_reply(answered: int, way: str) -> None:
-    near, far = socket.socketpair()
-    near.setblocking(False)
-    with closing(Port(near.fileno(), NO_SETTINGS)) as port:
+@table("way", ["queued", "repeated"])
+@table("answered", [0, 1])
+def test_cut_off_is_true_if_the_port_is_lost_after_a_reply(answered: int, way: str) -> None:
+    with opened() as (port, far):
         todo = [read(0), read(1), read(2)]
         port.submit(todo, [0] * 3) if way == "queued" else port.repeat(todo)
         for _ in range(answered):
@@ -754,8 +739,7 @@ def test_cut_off_is_set_if_the_port_is_lost_after_a_reply(answered: int, way: st
         if way == "queued":
             until(lambda: port.done == answered + 1)
         else:
-            assert port.repeat([]) == 1  # index of the second exchange, which was next or cut off
-    near.close()
+            assert port.repeat([]) == 1  # the second exchange is next: it was not sent yet, or was cut off
 
 
 def test_a_pty_whose_far_end_hangs_up_is_lost() -> None:
@@ -807,7 +791,7 @@ def test_a_descriptor_without_settings_is_lost_if_settings_are_required(drive: D
 
 
 def test_an_invalid_descriptor_raises() -> None:
-    with pytest.raises(OSError, match="cannot be waited for"):
+    with pytest.raises(OSError, match="the core cannot watch the port"):
         Port(-1, NO_SETTINGS)
 
 
@@ -830,27 +814,24 @@ def test_closing_a_port_ends_the_wait_of_its_clients(drive: Drive) -> None:
 
 def test_is_asking_is_true_for_peers_of_queued_repeated_and_urgent_exchanges() -> None:
     """`is_asking` is true while the peer's exchanges wait or are in flight, but not for another peer."""
-    near, far = socket.socketpair()
-    with near, far:
-        near.setblocking(False)
-        with closing(Port(near.fileno(), NO_SETTINGS, room=4)) as port:
-            queued, repeated, other = (read(1, timeout=0.02) for _ in range(3))
-            assert not port.is_asking(queued.peer)
-            port.submit([queued], [now_ns() + 3600 * 10**9])
-            assert port.is_asking(queued.peer)
-            assert not port.is_asking(other.peer)
-            port.repeat([repeated])
-            assert far.recv(100)  # its request is in flight
-            port.repeat([])
-            assert port.is_asking(repeated.peer)
-            until(lambda: not port.is_asking(repeated.peer))
-            later = {"not_before_ns": now_ns() + 3600 * 10**9}
-            urgent = threading.Thread(target=port.carry_out, args=[other], kwargs=later)
-            urgent.start()
-            until(lambda: port.is_asking(other.peer))
-            assert port.is_asking(queued.peer)
-            port.stop()
-            urgent.join()
+    with opened(room=4) as (port, far):
+        queued, repeated, other = (read(1, timeout=0.02) for _ in range(3))
+        assert not port.is_asking(queued.peer)
+        port.submit([queued], [now_ns() + 3600 * 10**9])
+        assert port.is_asking(queued.peer)
+        assert not port.is_asking(other.peer)
+        port.repeat([repeated])
+        assert far.recv(100)  # its request is in flight
+        port.repeat([])
+        assert port.is_asking(repeated.peer)
+        until(lambda: not port.is_asking(repeated.peer))
+        later = {"not_before_ns": now_ns() + 3600 * 10**9}
+        urgent = threading.Thread(target=port.carry_out, args=[other], kwargs=later)
+        urgent.start()
+        until(lambda: port.is_asking(other.peer))
+        assert port.is_asking(queued.peer)
+        port.stop()
+        urgent.join()
 
 
 @pytest.mark.slow
@@ -858,13 +839,9 @@ def test_opening_and_closing_a_thousand_ports_leaks_no_descriptor(drive: Drive) 
     """The ports are opened and closed on one engine, with or without an exchange in flight."""
 
     def come_and_go(start: int) -> int:
-        near, far = socket.socketpair()
-        with near, far:
-            near.setblocking(False)
-            port = Port(near.fileno(), NO_SETTINGS, room=4)
+        with opened(room=4) as (port, _):
             queued = [read(start)]
             port.submit(queued, [0])
-            port.close()
         return len(list(Path("/dev/fd").iterdir()))
 
     before = come_and_go(0)  # the engine's own descriptors exist from now on

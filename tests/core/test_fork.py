@@ -1,4 +1,4 @@
-"""A forked process opens its own lines and does not touch its parent's; a sub-interpreter is rejected."""
+"""A forked process opens its own lines and does not touch its parent's. Sub-interpreters are rejected."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import toy
 from kills import BoundProcess
 from lines import PATIENCE, plant, polled, rows_of, until
 from lines import line as declared
-from serial_server import SerialServer
+from ptys import SerialServer
 from toy import Toy
 
 from multidrop.bus import Bus
@@ -30,7 +30,7 @@ from multidrop.poller import Poller
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore:.*fork:DeprecationWarning",  # it warns of held locks, which are tested here
+    "ignore:.*fork:DeprecationWarning",  # Python warns of held locks, which these tests need
     "ignore:set(Daemon|Name)\\(\\) is deprecated:DeprecationWarning",
 )
 
@@ -103,7 +103,7 @@ def current(bus: Bus) -> float:
 
 
 def is_polled(poller: Poller) -> bool:
-    """Return True once the poller has a value of the drive of `wire`."""
+    """Return True once the poller has a value of the drive on `wire`."""
     return any(row.value == 3.25 for row in rows_of(poller))
 
 
@@ -196,7 +196,7 @@ def test_a_child_that_closes_a_bridged_bus_does_not_hang_up_the_parents_port() -
             current(bus)
 
 
-def test_a_port_is_free_when_its_parent_closed_it_while_the_child_lives(port: str) -> None:
+def test_a_port_that_the_parent_closed_is_free_while_the_child_lives(port: str) -> None:
     bus = Bus(port)
     with child(lambda: None):
         bus.close()
@@ -212,7 +212,7 @@ def test_a_child_does_not_wait_for_a_bus_lock_held_in_the_parent(port: str) -> N
 
     with Bus(port) as bus:
         assert current(bus) == 3.25
-        # A stop of another thread, whose end the child must not await.
+        # Another thread's stop is in progress. The child must not wait for its end.
         stop = threading.Thread(target=bus._latches.begin, args=["stop", bus.drives])
         stop.start()
         stop.join()
@@ -256,7 +256,7 @@ def test_a_child_does_not_wait_for_a_poller_lock_held_in_the_parent(port: str) -
         until(lambda: is_polled(poller))
 
 
-def test_only_here_does_nothing_in_a_child() -> None:
+def test_a_function_wrapped_by_only_here_does_nothing_in_a_child_process() -> None:
     given: list[str] = []
     give_back = only_here(given.append)
 
@@ -311,7 +311,7 @@ with Bus(sys.argv[1]) as bus:
     bus.stop_on_exit()
     child = os.fork()
     if child == 0:
-        signal.alarm(30)  # where it hangs
+        signal.alarm(30)  # ends the child if it hangs
         {end}
         sys.exit(0)
     print(os.waitpid(child, 0)[1], flush=True)
@@ -327,7 +327,7 @@ ENDS = {
 @pytest.mark.long
 @pytest.mark.parametrize("end", ENDS)
 def test_the_end_of_a_child_does_not_stop_the_parents_motor(end: str) -> None:
-    """This holds however the child ends. The parent still stops the motor when it leaves the bus."""
+    """Only the parent stops the motor, when it leaves the bus."""
     sim = simulated(InvtCHE(1, maximum_frequency=50))
     assert isinstance(sim, MotorDrive)
     sim.motor.deceleration_time = 0.2

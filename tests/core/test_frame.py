@@ -37,7 +37,7 @@ RTU, ASCII, DELIXI = Framing.RTU, Framing.ASCII, Framing.DELIXI
 GOOD_REQUESTS = [each for each in PRINTED if each.direction == "request" and each.verdict != "bad checksum"]
 GOOD_REPLIES = [each for each in PRINTED if each.direction == "reply" and isinstance(each.says, Message)]
 REFUSED = [each for each in PRINTED if isinstance(each.says, FrameFault)]
-MISPRINTED = "01 89 01 86 50"  # E13: a drive may send this, but our simulators never do
+MISPRINTED = "01 89 01 86 50"  # E13: a drive may send this frame, but our simulators never do
 
 
 def parse(printed: Printed, received: bytes) -> tuple[int, Message | None]:
@@ -61,7 +61,7 @@ def exchange(framing: Framing, request: Message) -> Exchange:
 
 
 def carry_out(framing: Framing, request: Message, received: bytes, piece: int = 4096) -> Completion:
-    """Return the result of a request to which these bytes come back, through an adapter without echo."""
+    """Return the result of a request that is followed by these bytes, through an adapter without echo."""
     line = LineDriver()
     line.echo = lib.MD_NO_ECHO
     line.begin(exchange(framing, request))
@@ -81,18 +81,18 @@ def test_every_printed_frame_is_parsed() -> None:
     assert len(GOOD_REQUESTS) + len(GOOD_REPLIES) + len(REFUSED) == len(PRINTED)
 
 
-def test_printed_frames_have_their_documented_meaning() -> None:
+def test_printed_frames_are_parsed_to_their_documented_meaning() -> None:
     for printed in GOOD_REQUESTS + GOOD_REPLIES:
         assert parse(printed, printed.frame) == (len(printed.frame), printed.says)
 
 
-def test_request_is_built_as_printed() -> None:
+def test_a_request_is_built_as_printed() -> None:
     for printed in GOOD_REQUESTS:
         assert isinstance(printed.says, Message)
         assert build_request(printed.framing, printed.says) == printed.frame
 
 
-def test_reply_is_built_as_printed() -> None:
+def test_a_reply_is_built_as_printed() -> None:
     for printed in (reply for reply in GOOD_REPLIES if reply.text != MISPRINTED):
         assert isinstance(printed.says, Message)
         assert build_reply(printed.framing, printed.says) == printed.frame
@@ -112,7 +112,7 @@ def test_a_misprinted_frame_has_the_expected_fault() -> None:
         assert parse(printed, printed.frame) == (printed.says, None)
 
 
-def test_part_of_a_frame_is_incomplete() -> None:
+def test_part_of_a_frame_is_parsed_as_incomplete() -> None:
     for printed in GOOD_REQUESTS + GOOD_REPLIES:
         for length in range(len(printed.frame)):
             assert parse(printed, printed.frame[:length]) == (FrameFault.INCOMPLETE, None)
@@ -147,7 +147,7 @@ def test_reply_length_returns_the_length_of_a_good_reply() -> None:
             assert reply_length(printed.framing, printed.request) == len(printed.frame)
 
 
-@pytest.mark.parametrize(("framing", "finish"), [(RTU, checksums.rtu), (ASCII, checksums.ascii)])
+@table(("framing", "finish"), [(RTU, checksums.rtu), (ASCII, checksums.ascii)])
 def test_the_longest_reply_is_read(framing: Framing, finish: Callable[[str], bytes]) -> None:
     data = bytes(range(250))
     frame = finish(f"0103FA{data.hex().upper()}")
@@ -177,20 +177,8 @@ ASK_STATE = Message(1, 3, 0, data=words(0, 0))
 
 WRONG = [
     # pymodbus, modbus-tk and uModbus accept a reply with another function
-    (
-        "input registers for holding registers",
-        RTU,
-        READ_TWO,
-        rtu("01 04 04 11 11 22 22"),
-        FrameFault.BAD_FUNCTION,
-    ),
-    (
-        "one input register for two holding ones",
-        RTU,
-        READ_TWO,
-        rtu("01 04 02 11 11"),
-        FrameFault.BAD_FUNCTION,
-    ),
+    ("input for holding registers", RTU, READ_TWO, rtu("01 04 04 11 11 22 22"), FrameFault.BAD_FUNCTION),
+    ("one input register for two others", RTU, READ_TWO, rtu("01 04 02 11 11"), FrameFault.BAD_FUNCTION),
     ("coils for registers", RTU, READ_TWO, rtu("01 01 04 11 11 22 22"), FrameFault.BAD_FUNCTION),
     ("exception to another function", RTU, READ_TWO, rtu("01 84 02"), FrameFault.BAD_FUNCTION),
     ("exception without a code", RTU, READ_TWO, rtu("01 83 00"), FrameFault.BAD_FUNCTION),
@@ -208,24 +196,13 @@ WRONG = [
     ("another start confirmed", RTU, WRITE_TWO, rtu("01 10 00 11 00 02"), FrameFault.BAD_ECHO),
     ("fewer registers confirmed", RTU, WRITE_TWO, rtu("01 10 00 10 00 01"), FrameFault.BAD_ECHO),
     ("another loopback", RTU, LOOPBACK, rtu("01 08 00 00 A5 38"), FrameFault.BAD_ECHO),
-    # every library accepts a late reply of the right shape; these differ in function, address or length
-    (
-        "late reply to a longer read",
-        RTU,
-        READ_TWO,
-        rtu("01 03 08 00 00 00 00 00 00 00 00"),
-        FrameFault.BAD_LENGTH,
-    ),
-    ("late reply to a write", RTU, READ_TWO, rtu("01 06 00 10 12 34"), FrameFault.BAD_FUNCTION),
-    ("late reply of the drive before", RTU, READ_TWO, rtu("02 03 04 11 11 22 22"), FrameFault.BAD_ADDRESS),
+    # The late replies below have another function, address or length. If all three fit, every library accepts
+    # a late reply.
+    ("late, to a longer read", RTU, READ_TWO, rtu("01 03 08 00 00 00 00 00 00 00 00"), FrameFault.BAD_LENGTH),
+    ("late, to a write", RTU, READ_TWO, rtu("01 06 00 10 12 34"), FrameFault.BAD_FUNCTION),
+    ("late, of the drive before", RTU, READ_TWO, rtu("02 03 04 11 11 22 22"), FrameFault.BAD_ADDRESS),
     ("broadcast as a reply", RTU, READ_TWO, rtu("00 03 04 11 11 22 22"), FrameFault.BAD_ADDRESS),
-    (
-        "checksum's bytes swapped",
-        RTU,
-        READ_TWO,
-        bytes.fromhex("01 03 04 11 11 22 22 00 00"),
-        FrameFault.BAD_CHECKSUM,
-    ),
+    ("wrong checksum", RTU, READ_TWO, bytes.fromhex("0103041111222200 00"), FrameFault.BAD_CHECKSUM),
     # the text framings
     ("another value as text", ASCII, WRITE_ONE, b":010600101235A2\r\n", FrameFault.BAD_ECHO),
     ("wrong checksum as text", ASCII, WRITE_ONE, b":010600101234A4\r\n", FrameFault.BAD_CHECKSUM),
@@ -245,6 +222,7 @@ WRONG = [
 @table(
     ("framing", "request_", "received", "reason"),
     [each[1:] for each in WRONG],
+    ids=[each[0] for each in WRONG],
 )
 def test_a_wrong_reply_ends_with_its_fault_and_without_data(
     framing: Framing, request_: Message, received: bytes, reason: FrameFault
@@ -271,12 +249,78 @@ def test_a_stray_zero_before_each_reply_loses_no_value() -> None:
 def test_delixis_refusal_codes_are_exceptions(code: int) -> None:
     frame = build_reply(DELIXI, Message(1, RUN_FORWARD.function, exception=code))
     assert parse_reply(DELIXI, frame, RUN_FORWARD) == (21, Message(1, 2, exception=code))
-    assert parse_request(DELIXI, frame) == (FrameFault.BAD_FUNCTION, None)  # note 2: a master never sends it
+    assert parse_request(DELIXI, frame) == (FrameFault.BAD_FUNCTION, None)  # note 2: no master sends this
 
 
 def test_delixis_state_is_read_from_the_parameter_field_of_the_reply() -> None:
     used, reply = parse_reply(DELIXI, b":010300020000000006\r\n", ASK_STATE)
     assert (used, reply) == (21, Message(1, 3, 2, data=words(0, 2)))
+
+
+# ---- reads without addresses: the application protocol V1.1b3, 6.7, 6.13 and 6.21 ----
+
+IDENTITY = b"\x0e\x01\x01\x00\x00\x02\x00\x03ABB\x01\x02X1"  # two objects: maker and product
+
+
+@table(
+    ("function", "asked", "request", "data", "reply"),
+    [
+        (0x07, b"", "01 07", b"\x6d", "01 07 6D"),
+        (0x11, b"", "01 11", b"\x09\xffVFD", "01 11 05 09 FF 56 46 44"),
+        (0x2B, b"\x0e\x01\x00", "01 2B 0E 01 00", IDENTITY, f"01 2B {IDENTITY.hex()}"),
+    ],
+)
+def test_a_read_without_addresses_is_built_and_its_reply_parsed(
+    function: int, asked: bytes, request: str, data: bytes, reply: str
+) -> None:
+    message = Message(1, function, data=asked)
+    assert build_request(RTU, message) == rtu(request)
+    assert parse_request(RTU, rtu(request)) == (len(rtu(request)), message)
+    assert parse_reply(RTU, rtu(reply), message) == (len(rtu(reply)), Message(1, function, data=data))
+    assert build_reply(RTU, Message(1, function, data=data)) == rtu(reply)
+    for length in range(len(rtu(reply))):
+        assert parse_reply(RTU, rtu(reply)[:length], message) == (FrameFault.INCOMPLETE, None)
+
+
+def test_an_identification_of_another_kind_or_length_is_not_accepted_as_reply() -> None:
+    message = Message(1, 0x2B, data=b"\x0e\x01\x00")
+    other_code = bytes([*IDENTITY[:1], 2, *IDENTITY[2:]])
+    assert parse_reply(RTU, rtu(f"01 2B {other_code.hex()}"), message) == (FrameFault.BAD_ECHO, None)
+    long = bytes([0x0E, 1, 1, 0, 0, 1, 0, 243])
+    assert parse_reply(RTU, rtu(f"01 2B {long.hex()}"), message) == (FrameFault.BAD_LENGTH, None)
+
+
+# ---- the mask write and counters: the application protocol V1.1b3, 6.8 to 6.10, 6.16 and 6.18 ----
+
+MASK = Message(0x11, 0x16, 0x0004, data=b"\x00\xf2\x00\x25")
+
+
+@table("framing", [RTU, ASCII, Framing.TCP])
+def test_a_mask_write_and_its_confirmation_are_the_same_frame(framing: Framing) -> None:
+    frame = build_request(framing, MASK)
+    if framing is RTU:
+        assert frame == rtu("11 16 00 04 00 F2 00 25")
+    assert parse_request(framing, frame) == (len(frame), MASK)
+    assert parse_reply(framing, frame, MASK) == (len(frame), MASK)
+    other = Message(0x11, 0x16, 0x0004, data=b"\x00\xf2\x00\x24")
+    assert parse_reply(framing, frame, other) == (FrameFault.BAD_ECHO, None)
+
+
+@table(
+    ("request", "sent", "reply", "data"),
+    [
+        (Message(1, 0x08, 0x000B, data=b"\0\0"), "01 08 00 0B 00 00", "01 08 00 0B 01 08", b"\x01\x08"),
+        (Message(1, 0x0B), "01 0B", "01 0B FF FF 01 08", b"\xff\xff\x01\x08"),
+        (Message(1, 0x0C), "01 0C", "01 0C 08 00 00 01 08 01 21 20 00", b"\0\0\x01\x08\x01\x21\x20\0"),
+        (Message(1, 0x18, 0x04DE), "01 18 04 DE", "01 18 00 04 00 01 01 B8", b"\0\x04\0\x01\x01\xb8"),
+    ],
+)
+def test_counters_logs_and_queues_are_read(request: Message, sent: str, reply: str, data: bytes) -> None:
+    assert build_request(RTU, request) == rtu(sent)
+    length, found = parse_reply(RTU, rtu(reply), request)
+    assert (length, found and found.data) == (len(rtu(reply)), data)
+    for end in range(len(rtu(reply))):
+        assert parse_reply(RTU, rtu(reply)[:end], request) == (FrameFault.INCOMPLETE, None)
 
 
 # ---- messages that no frame can carry ----
@@ -293,7 +337,9 @@ def test_delixis_state_is_read_from_the_parameter_field_of_the_reply() -> None:
         Message(1, 0x05, 0, data=b"\x01\x00"),
         Message(1, 0x06, 0, data=b"\x01"),
         Message(1, 0x10, 0, 2, b"\x00" * 5),
-        Message(1, 0x2B, 0, 1),
+        Message(1, 0x42, 0, 1),
+        Message(1, 0x11, data=b"\0"),
+        Message(1, 0x2B, data=b"\x0d\0\0"),
     ],
 )
 def test_a_request_with_a_field_out_of_bounds_raises(message: Message) -> None:
@@ -310,7 +356,7 @@ def test_address_247_is_accepted_and_248_raises() -> None:
         build_reply(RTU, Message(248, 0x03, data=words(7)))
 
 
-@table("function", [0x00, 0x07, 0x2B, 0xFF])
+@table("function", [0x00, 0x09, 0x42, 0xFF])
 def test_building_a_reply_with_an_unknown_function_raises(function: int) -> None:
     reply = Message(1, function, data=words(7))
     with pytest.raises(ValueError, match=re.escape(f"out of bounds for a rtu frame: {reply}")):
@@ -336,7 +382,7 @@ def test_a_request_with_an_impossible_count_is_parsed() -> None:
     assert parse_request(RTU, frame) == (8, Message(1, 0x03, 0, 126))
 
 
-@table("function", [0x83, 0xFF, 0x2B])
+@table("function", [0x83, 0xFF, 0x42])
 @table("framing", [RTU, ASCII])
 def test_a_reply_to_an_unknown_function_has_the_fault_bad_function(framing: Framing, function: int) -> None:
     body = bytes([1, function, 1])
@@ -356,7 +402,7 @@ def test_a_number_too_large_for_its_field_raises(odd: dict[str, int]) -> None:
         build_request(Framing.RTU, Message(**({"address": 1, "function": 3, "start": 0, "count": 1} | odd)))
 
 
-@pytest.mark.parametrize("framing", [RTU, ASCII])
+@table("framing", [RTU, ASCII])
 def test_the_reply_length_of_a_broadcast_is_0(framing: Framing) -> None:
     assert reply_length(framing, Message(0, 6, 0x2000, 1, data=b"\0\1")) == 0
 
@@ -417,7 +463,7 @@ def test_delixis_checksum_equals_printed_checksums(data: bytes, checksum: int) -
 @table("at", range(4))
 @table("more", range(4))
 def test_crc16_equals_its_bitwise_definition(at: int, more: int) -> None:
-    """Test every byte value at each place of the four bytes processed together, and in the rest."""
+    """Every byte value is tested at each of the four places that are processed together, and after them."""
     for byte in range(256):
         data = bytes(at) + bytes([byte]) + bytes(3 - at) + bytes([byte] * more)
         assert data + crc(data).to_bytes(2, "little") == checksums.rtu(data)
@@ -428,7 +474,7 @@ frames = st.binary(min_size=1, max_size=255)
 
 @settings(deadline=None)
 @given(frames)
-def test_checksum_of_a_frame_with_its_checksum_is_zero(data: bytes) -> None:
+def test_checksum_over_a_frame_that_includes_its_checksum_is_zero(data: bytes) -> None:
     assert crc(data + crc(data).to_bytes(2, "little")) == 0
     assert sum8(data + bytes([lrc(data, len(data))]), len(data) + 1) == 0
 

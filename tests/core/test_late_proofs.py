@@ -1,4 +1,4 @@
-"""After the window of late replies, requests with ambiguous replies wait for the reply to a proof.
+"""If late replies are possible, a request whose reply would be ambiguous waits for the reply to a proof.
 
 A proof is a read whose reply no late reply can resemble.
 """
@@ -19,7 +19,7 @@ AGAIN = Message(1, 6, 9, data=words(1))
 
 @pytest.fixture
 def proof(line: LineDriver, drive: Peer) -> Exchange:
-    """Let READ get no reply and its window end; return the drive's proof, a longer read."""
+    """Let READ time out, and let the window of late replies end. Return the drive's proof, a longer read."""
     found = exchange(LONGER, drive)
     drive.prove_by([found])
     time_out(line, drive, READ)
@@ -44,7 +44,9 @@ def is_barred(line: LineDriver, drive: Peer, request: Message) -> bool:
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_read_of_the_same_length_waits_for_a_proof(line: LineDriver, drive: Peer) -> None:
+def test_a_read_that_a_late_reply_could_answer_waits_for_the_reply_to_a_proof(
+    line: LineDriver, drive: Peer
+) -> None:
     assert is_barred(line, drive, OTHER)
     ask(line, drive, Message(1, 4, 50, 1))  # a late reply to READ does not fit this request
 
@@ -56,7 +58,7 @@ def test_a_write_waits_for_the_reply_to_an_earlier_write(line: LineDriver, drive
     assert is_barred(line, drive, AGAIN)
 
 
-def test_after_the_reply_to_a_proof_earlier_replies_are_no_longer_expected(
+def test_after_the_reply_to_a_proof_no_late_reply_is_expected(
     line: LineDriver, drive: Peer, proof: Exchange
 ) -> None:
     send(line, proof)
@@ -92,7 +94,7 @@ def test_after_an_unanswered_proof_the_late_reply_is_still_expected(
 
 
 def ask_in_vain(line: LineDriver, drive: Peer, proof: Exchange) -> None:
-    """Let the drive answer another request, and then neither READ nor the proof in time."""
+    """Let the drive answer another request, but neither READ nor the proof in time."""
     ask(line, drive, Message(1, 4, 50, 1))
     line.receive(build_reply(Framing.RTU, Message(1, 4, data=words(2222))))
     assert line.completion.result > 0
@@ -134,7 +136,7 @@ def test_a_silent_drive_keeps_its_proofs(line: LineDriver, drive: Peer, proof: E
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_stop_is_sent_without_a_proof(line: LineDriver, drive: Peer) -> None:
+def test_a_stop_does_not_wait_for_the_reply_to_a_proof(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive, WRITE)
     stop = exchange(AGAIN, drive)
     stop.c.insists = 1
@@ -143,7 +145,7 @@ def test_a_stop_is_sent_without_a_proof(line: LineDriver, drive: Peer) -> None:
 
 @pytest.mark.usefixtures("proof")
 def test_a_late_reply_is_recognised_after_the_port_is_reopened(line: LineDriver, drive: Peer) -> None:
-    """The value may be the reply to the first request: outside of a poll it is read again."""
+    """The value may be the late reply to the first request, so outside of a poll it is read again."""
     line.lose(0)
     again = LineDriver()
     again.now = line.now
@@ -194,9 +196,41 @@ def test_a_reply_is_found_after_noise_before_its_request(line: LineDriver, drive
     assert (line.want, line.completion.reply.data) == ("done", words(2222))
 
 
+# ---- sure replies can only be to the last request: the core checks the driver's count of unsent bytes ----
+
+
+def has_sure_reply(line: LineDriver, drive: Peer) -> bool:
+    ask(line, drive, READ)
+    line.receive(reply(1))
+    assert line.completion.result > 0
+    return bool(line._line.is_answered)
+
+
+def test_a_reply_is_sure_unless_an_earlier_request_or_another_master_may_be_its_cause(
+    line: LineDriver, drive: Peer
+) -> None:
+    assert has_sure_reply(line, drive)
+    line.receive(b"\xff")  # perhaps another master's request
+    assert not has_sure_reply(line, drive)
+    assert has_sure_reply(line, drive)
+    time_out(line, drive, WRITE)
+    assert not line._line.is_answered
+    assert not has_sure_reply(line, drive)
+
+
+@pytest.mark.usefixtures("proof")
+def test_a_reply_is_sure_after_the_reply_to_a_proof(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+    send(line, proof)
+    line.receive(PROOF_REPLY)
+    assert has_sure_reply(line, drive)
+
+
+# ---- the first reply to this process ----
+
+
 @pytest.fixture
 def first(drive: Peer) -> Exchange:
-    """Return the proof of a drive whose first reply may be to a read by another process, as long as READ."""
+    """Return the proof of a drive whose first reply may be to another process's READ."""
     found = exchange(LONGER, drive)
     drive.prove_by([found, exchange(Message(1, 3, 0, 3), drive)])
     drive.doubt_first_reply()
@@ -262,7 +296,7 @@ def test_without_proofs_the_first_reply_is_accepted(line: LineDriver, drive: Pee
 
 @pytest.mark.parametrize("least", [0, 1, 0xFFFF])
 def test_a_known_value_of_any_size_identifies_a_reply(line: LineDriver, drive: Peer, least: int) -> None:
-    """Delixi's P04.28 is 0 at 1200 baud. Mistaken for "any value", it would block all reads."""
+    """Delixi's P04.28 is 0 at 1200 baud. If this 0 meant "any value", all reads would be blocked."""
     known = exchange(READ, drive, answer=(least, least))
     drive.prove_by([known, exchange(OTHER, drive, answer=(7, 7))])
     time_out(line, drive, Message(1, 3, 90, 1))

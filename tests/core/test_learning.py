@@ -41,6 +41,12 @@ from multidrop.core import (
 __all__ = ["drive", "line"]  # fixtures
 
 
+def is_barred(line: LineDriver, drive: Peer, request: Message) -> bool:
+    """Return True if the request is not sent, because a late reply could be mistaken for its reply."""
+    line.begin(exchange(request, drive))
+    return line.want == "done" and line.completion.result == Failure.LATE_ANSWER_DUE
+
+
 def test_the_response_delay_is_learnt_from_replies(line: LineDriver, drive: Peer) -> None:
     assert drive.response_delay == 0
     for _ in range(40):
@@ -48,7 +54,7 @@ def test_the_response_delay_is_learnt_from_replies(line: LineDriver, drive: Peer
     assert drive.response_delay == pytest.approx(15e-3, rel=0.01)
 
 
-def test_the_port_is_not_read_before_a_reply_can_be_whole(line: LineDriver, drive: Peer) -> None:
+def test_the_port_is_not_read_before_a_reply_can_be_complete(line: LineDriver, drive: Peer) -> None:
     for _ in range(40):
         answer(line, drive, 15 * MS)
     left = ask(line, drive)
@@ -57,27 +63,34 @@ def test_the_port_is_not_read_before_a_reply_can_be_whole(line: LineDriver, driv
     assert whole - 2 * CHARACTER <= line.wake <= whole
 
 
-def attend(line: LineDriver, drive: Peer, delay: int) -> int:
-    """Carry out an exchange as the engine does; return the ns from the reply's end to its last read."""
-    left = ask(line, drive)
+def looks(
+    line: LineDriver, drive: Peer, delay: int, details: dict[str, RowLayout] | None = None
+) -> tuple[int, int]:
+    """Carry out an exchange as the engine does; return the number of reads, and the last one's delay (ns)."""
+    line.begin(exchange(READ, drive, **(details or {})))
+    line.wait_until_write()
+    left = line.now + 8 * CHARACTER
     times = [left + delay + (at + 1) * CHARACTER for at in range(len(reply()))]
-    seen = 0
+    seen = found = 0
     while line.want != "done":
         line.wait_for_look()
-        if line.now < times[seen]:
+        if found and line.now < times[seen]:  # wait for the next character
             line.now = times[seen]
-        come = sum(1 for time in times if time <= line.now)
+        come = sum(time <= line.now for time in times)
         line.receive(reply()[seen:come])
         seen = come
-    return line.now - times[-1]
+        found += 1
+    return found, line.now - times[-1]
 
 
 def test_the_port_is_first_read_shortly_before_the_replys_end(line: LineDriver, drive: Peer) -> None:
     for _ in range(20):
-        assert attend(line, drive, 15 * MS) == attend(line, drive, 16 * MS) == 0
+        assert looks(line, drive, 15 * MS)[1] == looks(line, drive, 16 * MS)[1] == 0
 
 
-def test_the_wait_for_the_rest_of_a_reply_depends_on_its_length(line: LineDriver, drive: Peer) -> None:
+def test_the_wait_for_the_rest_of_a_reply_depends_on_the_missing_length(
+    line: LineDriver, drive: Peer
+) -> None:
     ask(line, drive)
     line.now += 60 * MS
     line.receive(reply()[:3])
@@ -103,7 +116,7 @@ def test_the_port_is_read_earlier_when_a_drive_becomes_quicker(line: LineDriver,
     for _ in range(40):
         answer(line, drive, 40 * MS)
     for _ in range(120):
-        attend(line, drive, 5 * MS)
+        looks(line, drive, 5 * MS)
     assert drive.response_delay < 10e-3
 
 
@@ -116,7 +129,10 @@ def given_up(line: LineDriver, drive: Peer, request: Message = READ) -> int:
 
 
 def time_out(line: LineDriver, drive: Peer, request: Message = READ) -> int:
-    """Return the time-out alone: `given_up` minus the time of a reply, awaited on an unknown adapter."""
+    """Return the timeout: the result of `given_up`, minus the duration of a reply's 7 characters.
+
+    The line waits so much longer because an adapter may deliver only whole replies.
+    """
     return given_up(line, drive, request) - 7 * CHARACTER
 
 
@@ -146,7 +162,7 @@ def test_a_silent_drive_gets_the_longest_timeout_once_and_then_rarely(line: Line
 
 
 def test_a_write_waits_at_least_its_own_timeout_for_its_reply(line: LineDriver, drive: Peer) -> None:
-    """This holds even if reads are quick: a write wrongly reported as unconfirmed costs more than waiting."""
+    """This holds even if reads are quick: a false report of an unconfirmed write is worse than waiting."""
     for _ in range(12):
         answer(line, drive, 2 * MS)
     assert given_up(line, drive) < 100 * MS
@@ -160,7 +176,7 @@ def test_a_write_waits_at_least_its_own_timeout_for_its_reply(line: LineDriver, 
 # ---- no byte within the timeout ----
 
 AWAITED = 3 * CHARACTER  # wait for the first character, plus two more
-LONG = Message(1, 3, 0, 100)  # with a reply of 205 characters
+LONG = Message(1, 3, 0, 100)  # its reply has 205 characters
 
 
 def gathered(line: LineDriver, drive: Peer, request: Message = READ) -> None:
@@ -233,8 +249,7 @@ def test_noise_does_not_count_as_a_burst_of_the_adapter(line: LineDriver, drive:
 def test_a_reply_after_a_shortened_wait_is_recognised_as_late(line: LineDriver, drive: Peer) -> None:
     answer(line, drive, 2 * MS)
     given_up(line, drive)
-    line.begin(exchange(OTHER, drive))
-    assert (line.want, line.completion.result) == ("done", Failure.LATE_ANSWER_DUE)
+    assert is_barred(line, drive, OTHER)
     line.receive(reply(1111))
     assert (drive.counters().late, drive.late_until_ns) == (1, 0)
 
@@ -242,12 +257,12 @@ def test_a_reply_after_a_shortened_wait_is_recognised_as_late(line: LineDriver, 
 # ---- late replies ----
 
 
-def test_no_request_is_sent_to_which_a_late_reply_could_belong(line: LineDriver, drive: Peer) -> None:
+def test_no_request_is_sent_that_a_late_reply_could_answer(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive)
     line.begin(exchange(OTHER, drive))
     assert line.want == "done"
     assert (line.completion.result, line.completion.sent_ns) == (Failure.LATE_ANSWER_DUE, 0)
-    assert drive.failures == 1  # no request was sent, so none failed
+    assert drive.failures == 1  # only the first request failed; no second one was sent
 
 
 def test_a_late_reply_is_expected_after_a_lost_port_is_reopened(line: LineDriver, drive: Peer) -> None:
@@ -261,7 +276,7 @@ def test_a_late_reply_is_expected_after_a_lost_port_is_reopened(line: LineDriver
     ask(again, drive, OTHER)
 
 
-@pytest.mark.parametrize("is_row", [True, False], ids=["for a row", "by hand"])
+@pytest.mark.parametrize("is_row", [True, False], ids=["for a row", "for a client"])
 def test_a_row_with_a_value_in_doubt_has_the_time_of_the_earlier_request(
     line: LineDriver, drive: Peer, is_row: bool
 ) -> None:
@@ -325,29 +340,25 @@ def test_a_request_is_sent_if_no_late_reply_could_be_mistaken_for_its_own(
 
 def test_a_read_waits_for_a_late_exception_to_another_read(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive)
-    line.begin(exchange(LONGER, drive))
-    assert line.completion.result == Failure.LATE_ANSWER_DUE
+    assert is_barred(line, drive, LONGER)
 
 
 def test_late_replies_to_several_requests_are_expected(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive)
     first_until = drive.late_until_ns
-    time_out(line, drive, WRITE)  # a late reply to the first request does not fit this write
+    time_out(line, drive, WRITE)  # the late reply to READ cannot be the reply to this write
     assert drive.late_until_ns > first_until
-    line.begin(exchange(OTHER, drive))
-    assert (line.want, line.completion.result) == ("done", Failure.LATE_ANSWER_DUE)
+    assert is_barred(line, drive, OTHER)
     line.receive(build_request(Framing.RTU, WRITE))  # the write's confirmation
     assert drive.counters().late == 1
-    line.begin(exchange(OTHER, drive))  # the reply to the first request may still come
-    assert line.completion.result == Failure.LATE_ANSWER_DUE
+    assert is_barred(line, drive, OTHER)  # the reply to the first request may still come
 
 
 def test_a_write_waits_for_a_late_exception_to_another_write(line: LineDriver, drive: Peer) -> None:
-    """Otherwise the second write, which has started a motor, would be reported as refused."""
+    """Otherwise a second write that started a motor could be reported as refused."""
     time_out(line, drive, WRITE)
-    line.begin(exchange(Message(1, 6, 9, data=words(1)), drive))
-    assert line.completion.result == Failure.LATE_ANSWER_DUE
-    ask(line, drive, READ)  # an exception to a write does not fit a read
+    assert is_barred(line, drive, Message(1, 6, 9, data=words(1)))
+    ask(line, drive, READ)  # an exception to a write cannot be the reply to a read
 
 
 def delixi(function: int, start: int, value: int = 0) -> Message:
@@ -378,13 +389,12 @@ def test_a_delixi_request_waits_for_a_late_reply_that_could_be_its_own(
 
 
 def test_a_late_reply_to_a_write_is_expected_after_the_writes_timeout(line: LineDriver, drive: Peer) -> None:
-    """Otherwise a late exception to it would be taken for a refusal of the next write."""
+    """Otherwise a late exception to this write would be taken for a refusal of the next write."""
     line.begin(exchange(WRITE, drive, timeout=5 * MOST / 1e9))
     line.wait_until_write()
     line.wait_until_done()
     line.now += 3 * LEAST
-    line.begin(exchange(Message(1, 6, 9, data=words(1)), drive))
-    assert (line.want, line.completion.result) == ("done", Failure.LATE_ANSWER_DUE)
+    assert is_barred(line, drive, Message(1, 6, 9, data=words(1)))
     line.now = drive.late_until_ns
     ask(line, drive, WRITE)
 
@@ -400,9 +410,10 @@ def test_a_stop_does_not_wait_for_late_replies(line: LineDriver, drive: Peer) ->
 def test_the_timeout_of_a_stop_doubles_after_each_failure_but_the_first(
     line: LineDriver, drive: Peer
 ) -> None:
-    """Before it is repeated, a stop must not wait for the longest documented timeout.
+    """A stop must be repeated before the longest documented timeout has passed.
 
-    The first failure, of the read before the stop, does not double the timeout, because other drives wait.
+    The first failure is that of the read before the stop. It does not double the timeout, because other
+    drives wait for their stops.
     """
     found = []
     for _ in range(5):
@@ -422,8 +433,7 @@ def test_a_damaged_reply_inside_another_frame_does_not_count(line: LineDriver, d
     line.receive(build_reply(Framing.RTU, Message(1, 4, data=bytes(1) + inside)))
     line.wait_until_done()
     assert line.completion.result == FrameFault.BAD_CHECKSUM
-    line.begin(exchange(OTHER, drive))
-    assert line.completion.result == Failure.LATE_ANSWER_DUE
+    assert is_barred(line, drive, OTHER)
 
 
 def test_a_late_reply_of_a_drive_does_not_delay_other_drives(line: LineDriver, drive: Peer) -> None:
@@ -478,7 +488,7 @@ def test_a_late_reply_is_recognised_during_another_drives_exchange(
     line.receive(answer_of(2, 5), piece)
     assert line.want == "done"
     assert (line.completion.reply.data, line.completion.skipped) == (words(5), len(junk) + 7)
-    ask(line, drive, OTHER)  # its late reply is no longer expected
+    ask(line, drive, OTHER)  # the late reply to READ is no longer expected
 
 
 def test_late_replies_of_several_drives_are_recognised(line: LineDriver) -> None:
@@ -502,7 +512,7 @@ def test_a_late_reply_is_recognised_during_another_exchange_of_the_same_drive(
     line.receive(reply(1111))
     assert line.listens
     assert (drive.counters().late, drive.late_until_ns) == (1, 0)
-    line.receive(build_request(Framing.RTU, WRITE) * 2)  # the confirmation, and before it its echo
+    line.receive(build_request(Framing.RTU, WRITE) * 2)  # the echo, then an equal confirmation
     assert line.completion.result == 8
 
 
@@ -516,7 +526,7 @@ def test_a_late_reply_is_not_reported_as_a_reply_from_another_address(line: Line
 
 
 def test_data_like_a_late_reply_stay_part_of_the_reply(line: LineDriver, drive: Peer) -> None:
-    """The reply comes whole or byte by byte; it is read, and the earlier late reply is still expected."""
+    """A good reply is accepted although it contains a copy of a late reply, which is still expected."""
     time_out(line, drive)
     until = drive.late_until_ns
     inside = reply(1111) + b"\x00"
@@ -561,26 +571,8 @@ def test_counters_include_every_exchange(line: LineDriver, drive: Peer) -> None:
 
 
 FIELDS = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1.0, 1.0)])
-BY_HAND, FOR_A_ROW = {"values": FIELDS}, {"block": FIELDS}
+FOR_A_CLIENT, FOR_A_ROW = {"values": FIELDS}, {"block": FIELDS}
 STEADY = 60 * [15 * MS]
-
-
-def looks(line: LineDriver, drive: Peer, delay: int, details: dict[str, RowLayout]) -> tuple[int, int]:
-    """Carry out an exchange as the engine does; return the number of reads, and the last one's delay (ns)."""
-    line.begin(exchange(READ, drive, **details))
-    line.wait_until_write()
-    left = line.now + 8 * CHARACTER
-    times = [left + delay + (at + 1) * CHARACTER for at in range(len(reply()))]
-    seen = found = 0
-    while line.want != "done":
-        line.wait_for_look()
-        if found and line.now < times[seen]:  # wait for the next character
-            line.now = times[seen]
-        come = sum(time <= line.now for time in times)
-        line.receive(reply()[seen:come])
-        seen = come
-        found += 1
-    return found, line.now - times[-1]
 
 
 def all_looks(
@@ -592,35 +584,35 @@ def all_looks(
 def test_seven_of_eight_reads_for_a_client_come_when_the_reply_is_whole(
     line: LineDriver, drive: Peer
 ) -> None:
-    all_looks(line, drive, STEADY, BY_HAND)
-    found = all_looks(line, drive, 80 * [15 * MS], BY_HAND)
+    all_looks(line, drive, STEADY, FOR_A_CLIENT)
+    found = all_looks(line, drive, 80 * [15 * MS], FOR_A_CLIENT)
     assert sum(times == 1 for times, _ in found) == 70
     assert max(late for _, late in found) <= CHARACTER
 
 
 def test_polled_replies_are_always_read_early(line: LineDriver, drive: Peer) -> None:
-    all_looks(line, drive, STEADY, BY_HAND)
+    all_looks(line, drive, STEADY, FOR_A_CLIENT)
     found = all_looks(line, drive, STEADY, FOR_A_ROW)
     assert min(times for times, _ in found) > 1
     assert {late for _, late in found} == {0}
 
 
 def test_replies_of_an_unsteady_drive_are_read_early(line: LineDriver, drive: Peer) -> None:
-    all_looks(line, drive, 20 * [15 * MS, 19 * MS], BY_HAND)
-    assert {late for _, late in all_looks(line, drive, 20 * [15 * MS, 19 * MS], BY_HAND)} == {0}
+    all_looks(line, drive, 20 * [15 * MS, 19 * MS], FOR_A_CLIENT)
+    assert {late for _, late in all_looks(line, drive, 20 * [15 * MS, 19 * MS], FOR_A_CLIENT)} == {0}
 
 
 def test_reads_for_a_client_come_earlier_when_a_steady_drive_becomes_quicker(
     line: LineDriver, drive: Peer
 ) -> None:
-    all_looks(line, drive, [*STEADY, *(120 * [5 * MS])], BY_HAND)
-    assert looks(line, drive, 5 * MS, BY_HAND)[1] <= CHARACTER
+    all_looks(line, drive, [*STEADY, *(120 * [5 * MS])], FOR_A_CLIENT)
+    assert looks(line, drive, 5 * MS, FOR_A_CLIENT)[1] <= CHARACTER
     assert drive.response_delay < 6e-3
 
 
 def test_reads_for_a_client_come_later_when_a_steady_drive_becomes_slower(
     line: LineDriver, drive: Peer
 ) -> None:
-    found = all_looks(line, drive, [*STEADY, *(120 * [18 * MS])], BY_HAND)
+    found = all_looks(line, drive, [*STEADY, *(120 * [18 * MS])], FOR_A_CLIENT)
     assert max(late for _, late in found) <= CHARACTER
     assert drive.response_delay > 17.5e-3

@@ -11,8 +11,10 @@ import pytest
 from frames import words
 from line_driver import MS, LineDriver
 from multidrop._core import lib
+from tables import table
 
 from multidrop.core import (
+    Completion,
     Exchange,
     Failure,
     FrameFault,
@@ -75,11 +77,18 @@ def answer(line: LineDriver, received: bytes, piece: int = 4096) -> None:
     line.wait_until_done()
 
 
+def exchanged(line: LineDriver, received: bytes, request: Message = READ, piece: int = 4096) -> Completion:
+    """Send the request, and return the result after these bytes were received."""
+    ask(line, request)
+    answer(line, received, piece)
+    return line.completion
+
+
 # ---- silence ----
 
 
 def test_the_time_of_a_value_is_never_after_its_reply(line: LineDriver) -> None:
-    """The port blocked the thread while it took the request, which may have been sent long before."""
+    """The write blocked the thread, perhaps for long after the request was sent."""
     line.begin(exchange(READ))
     while line.want != "write":
         line.now = max(line.now, line.wake)
@@ -90,9 +99,7 @@ def test_the_time_of_a_value_is_never_after_its_reply(line: LineDriver) -> None:
     assert (line.completion.sent_ns, line.completion.first_ns) == (begun, begun + 10 * MS)
 
 
-def test_on_a_port_faster_than_its_settings_the_first_byte_has_its_read_time(
-    line: LineDriver,
-) -> None:
+def test_on_a_port_faster_than_its_settings_the_first_byte_has_its_read_time(line: LineDriver) -> None:
     """A pseudo-terminal's replies come whole: its drive may have read the value just before."""
     ask(line)
     line.now += 1 * MS
@@ -115,7 +122,7 @@ def test_the_timeout_starts_after_a_write_that_was_held_up(line: LineDriver) -> 
     assert line.now == left + TIMEOUT + 7 * CHARACTER
 
 
-def test_no_request_is_sent_before_the_silence_is_over(line: LineDriver) -> None:
+def test_no_request_is_sent_before_the_required_silence_has_passed(line: LineDriver) -> None:
     opened = line.now
     line.begin(exchange(READ))
     for now in (opened, opened + SILENCE // 2, opened + SILENCE - 1):
@@ -123,11 +130,11 @@ def test_no_request_is_sent_before_the_silence_is_over(line: LineDriver) -> None
         assert line.listens
         assert line.wake == opened + SILENCE
     line.now = opened + SILENCE
-    assert [line.want, line.want] == ["read", "write"]  # one read, in case bytes came meanwhile
+    assert [line.want, line.want] == ["read", "write"]  # one more read, in case bytes have come
 
 
 @pytest.mark.parametrize(("before", "after"), [(4, 10), (10, 4), (7, 7)])
-def test_silence_is_the_longer_one_of_the_previous_and_the_next_exchange(
+def test_the_silence_is_the_longer_of_those_of_both_exchanges(
     line: LineDriver, before: int, after: int
 ) -> None:
     line.begin(exchange(READ, silence=before * MS))
@@ -162,7 +169,7 @@ def test_bytes_found_in_the_last_read_restart_the_silence(line: LineDriver) -> N
 
 
 def test_a_request_is_sent_after_a_timeout_even_if_the_line_is_never_silent(line: LineDriver) -> None:
-    """The request may be a stop, and maybe the noise is only in this computer's adapter."""
+    """The request may be a stop, and the noise may exist only in this computer's adapter."""
     opened = line.now
     line.begin(exchange(READ))
     reads = 0
@@ -188,16 +195,15 @@ def test_a_request_is_sent_after_the_timeout_even_if_the_flood_continues(line: L
 
 
 def test_a_flood_on_an_idle_line_belongs_to_no_exchange(line: LineDriver) -> None:
-    """A flood before the first exchange belongs to none either."""
+    """A flood before the first exchange belongs to no exchange either."""
     for value in range(3):
         line.receive(b"\xff" * 4000)
-        ask(line)
-        answer(line, reply_of(value))
-        assert (line.completion.reply.data, line.completion.skipped) == (words(value), 0)
+        found = exchanged(line, reply_of(value))
+        assert (found.reply.data, found.skipped) == (words(value), 0)
 
 
 def test_silence_starts_after_the_requests_last_bit(line: LineDriver) -> None:
-    """A reply that comes before the request's own time is over does not shorten the silence."""
+    """A reply that arrives before the request's last bit does not shorten the silence."""
     ask(line)
     sent = line.now
     answer(line, reply_of(1))
@@ -273,7 +279,7 @@ def test_a_failed_port_ends_the_exchange_as_line_lost(line: LineDriver, step: st
     found = line.completion
     assert (found.result, found.error) == (Failure.LINE_LOST, errno.EIO)
     assert found.raw == (b"\x01\x03" if step == "listening" else b"")
-    line.lose(errno.ENODEV)  # no exchange is in flight, so none ends
+    line.lose(errno.ENODEV)  # no exchange is in flight
     assert line.completion.error == errno.EIO
 
 
@@ -294,7 +300,7 @@ def test_a_reply_is_found_if_it_comes_in_pieces(line: LineDriver, piece: int) ->
     found = line.completion
     assert (found.result, found.raw, found.reply.data) == (7, frame, words(5000))
     last = sent + 15 * MS + (len(frame) - 1) // piece * MS
-    # Bytes that arrive in one piece are assumed to have taken the time of their characters on the wire.
+    # Bytes that are read together are assumed to have come one after another, at the speed of the wire.
     assert found.first_ns == min(sent + 15 * MS, last - (len(frame) - 1) * CHARACTER)
     assert (found.sent_ns, found.last_ns) == (sent, last)
     assert (found.stale, found.skipped) == (0, 0)
@@ -307,38 +313,63 @@ def test_an_exception_ends_the_exchange_immediately(line: LineDriver) -> None:
     assert (line.completion.result, line.completion.reply) == (5, Message(1, 0x03, exception=2))
 
 
-def test_time_out_counts_from_the_requests_last_bit_and_leaves_time_for_the_reply(line: LineDriver) -> None:
+NOISE = random.Random(3).randbytes(5)
+TWENTY_SIX = rtu("01 04 34 bf 31 5d 78 41 9a ed 42 47 bf f8 97")  # 15 bytes of a longer reply, and their CRC
+WHOLE = rtu((TWENTY_SIX + bytes(range(55 - len(TWENTY_SIX)))).hex())
+
+
+@table(
+    ("request_", "pieces", "reply"),
+    [
+        # pyhys/minimalmodbus#61, eModbus/eModbus#40, wirenboard/wb-mqtt-serial#650, ClassicDIY/ModbusTool#35
+        (READ, [b"\0" + rtu("01 83 02") + b"\0"], Message(1, 3, exception=2)),
+        (READ, [b"\0" + reply_of(7) + b"\0"], Message(1, 3, count=1, data=words(7))),
+        (READ, [reply_of(7) + NOISE], Message(1, 3, count=1, data=words(7))),
+        (Message(1, 4, 0, 26), [WHOLE[:17], WHOLE[17:]], Message(1, 4, count=26, data=WHOLE[3:-2])),
+    ],
+    ids=["exception between zeros", "reply between zeros", "reply before noise", "checksum inside the data"],
+)
+def test_replies_of_public_bug_reports_are_found(
+    line: LineDriver, request_: Message, pieces: list[bytes], reply: Message
+) -> None:
+    for _ in range(3):  # bytes after a reply must not disturb the next exchange
+        ask(line, request_)
+        for piece in pieces:
+            line.receive(piece)
+        line.wait_until_done()
+        assert line.completion.reply == reply
+
+
+def test_the_timeout_counts_from_the_requests_last_bit_and_includes_the_replys_time(line: LineDriver) -> None:
     ask(line)
     sent = line.now
     assert line.listens
     assert line.wake == sent + 8 * CHARACTER + TIMEOUT + 7 * CHARACTER
     line.now = line.wake
-    assert [line.want, line.want] == ["read", "done"]  # the host may be late
+    assert [line.want, line.want] == ["read", "done"]  # reads once more, because the host may have woken late
     found = line.completion
     assert (found.result, found.raw, found.first_ns, found.last_ns) == (Failure.NO_REPLY, b"", 0, 0)
 
 
-def test_reply_found_in_the_last_read_counts(line: LineDriver) -> None:
+def test_a_reply_in_the_last_read_is_accepted(line: LineDriver) -> None:
     ask(line)
     assert line.listens
     line.now = line.wake + 50 * MS
     assert line.listens
     line.receive(reply_of(3))
-    assert line.want == "done"
-    assert line.completion.reply.data == words(3)
+    assert (line.want, line.completion.reply.data) == ("done", words(3))
 
 
-def test_the_exchange_ends_after_the_last_read(line: LineDriver) -> None:
+def test_the_exchange_ends_after_the_read_at_its_timeout(line: LineDriver) -> None:
     ask(line)
     assert line.listens
     line.now = line.wake
     assert line.listens
     line.receive(b"\xff" * 1024)
-    assert line.want == "done"
-    assert line.completion.result == FrameFault.BAD_ADDRESS
+    assert (line.want, line.completion.result) == ("done", FrameFault.BAD_ADDRESS)
 
 
-def test_frame_from_another_address_does_not_end_the_exchange(line: LineDriver) -> None:
+def test_a_frame_from_another_address_does_not_end_the_exchange(line: LineDriver) -> None:
     ask(line)
     line.receive(reply_of(9, address=2))
     line.now += 30 * MS
@@ -389,7 +420,7 @@ def test_the_result_at_the_timeout_gives_the_reason(
 # ---- late replies, doubled replies, noise ----
 
 
-def test_late_reply_is_drained_before_the_next_request(line: LineDriver) -> None:
+def test_a_late_reply_is_drained_before_the_next_request(line: LineDriver) -> None:
     ask(line)
     line.wait_until_done()
     assert line.completion.result == Failure.NO_REPLY
@@ -406,8 +437,7 @@ def test_late_reply_is_drained_before_the_next_request(line: LineDriver) -> None
 
 
 def test_a_second_copy_of_a_reply_is_not_the_next_exchanges_reply(line: LineDriver) -> None:
-    ask(line)
-    answer(line, reply_of(1111))
+    exchanged(line, reply_of(1111))
     line.begin(exchange(READ))
     assert line.listens
     line.receive(reply_of(1111))
@@ -417,23 +447,21 @@ def test_a_second_copy_of_a_reply_is_not_the_next_exchanges_reply(line: LineDriv
 
 
 def test_bytes_after_the_reply_are_counted(line: LineDriver) -> None:
-    ask(line)
-    answer(line, reply_of(1) + reply_of(1) + bytes(2000))
-    assert (line.completion.raw, line.completion.skipped) == (reply_of(1), 2007)
+    found = exchanged(line, reply_of(1) + reply_of(1) + bytes(2000))
+    assert (found.raw, found.skipped) == (reply_of(1), 2007)
 
 
 @pytest.mark.parametrize("piece", [4096, 100, 1])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_reply_is_found_after_4096_bytes_of_noise(line: LineDriver, seed: int, piece: int) -> None:
     noise = random.Random(seed).randbytes(4096)
-    ask(line)
-    answer(line, noise + reply_of(77), piece)
+    exchanged(line, noise + reply_of(77), piece=piece)
     found = line.completion
     assert (found.reply.data, found.raw, found.skipped) == (words(77), reply_of(77), 4096)
 
 
 @pytest.mark.parametrize("received", [b"\x01\x03\xfa", b"\x01", b"\x01\x83", b"\x04\x04", b"\xff"])
-def test_in_endless_garbage_less_than_a_frame_is_searched_again(line: LineDriver, received: bytes) -> None:
+def test_each_search_of_endless_garbage_repeats_less_than_a_frame(line: LineDriver, received: bytes) -> None:
     ask(line, Message(1, 0x03, 0, 125))
     garbage = received * 20_000
     for at in range(0, len(garbage), 64):
@@ -447,7 +475,7 @@ def test_in_endless_garbage_less_than_a_frame_is_searched_again(line: LineDriver
 # ---- broadcasts ----
 
 
-def test_broadcast_is_over_when_sent_and_followed_by_the_turnaround_delay(line: LineDriver) -> None:
+def test_a_broadcast_ends_once_sent_and_the_turnaround_delay_follows(line: LineDriver) -> None:
     ask(line, BROADCAST)
     sent = line.now
     assert line.want == "done"
@@ -461,7 +489,7 @@ def test_noise_does_not_shorten_the_turnaround_delay(line: LineDriver) -> None:
     ask(line, BROADCAST)
     sent = line.now
     line.now += MS
-    line.receive(b"\xff")  # while the broadcast is still being sent
+    line.receive(b"\xff")  # noise while the broadcast is still being sent
     line.begin(exchange(READ))
     line.wait_until_write()
     assert line.now == sent + 8 * CHARACTER + TURNAROUND
@@ -481,9 +509,8 @@ def test_a_failed_unsent_exchange_does_not_cancel_the_turnaround_delay(line: Lin
 
 
 def teach_echo(line: LineDriver) -> None:
-    ask(line)
-    answer(line, rtu("01 03 00 00 00 01") + reply_of(1))
-    assert (line.completion.result, line.completion.skipped) == (7, 8)
+    found = exchanged(line, rtu("01 03 00 00 00 01") + reply_of(1))
+    assert (found.result, found.skipped) == (7, 8)
 
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
@@ -495,18 +522,15 @@ def test_a_reply_after_another_masters_read_is_not_accepted(line: LineDriver, pi
     line.receive(reply_of(7), piece)
     assert (line.want, line.completion.reply.data) == ("done", words(7))
     line.now += 10 * MS
-    ask(line)
-    answer(line, rtu("01 03 00 40 00 01") + reply_of(0x1234), piece)
-    assert line.completion.result == Failure.NO_REPLY
+    found = exchanged(line, rtu("01 03 00 40 00 01") + reply_of(0x1234), piece=piece)
+    assert found.result == Failure.NO_REPLY
 
 
 @pytest.mark.parametrize("before", ["02 03 00 40 00 01", "01 04 00 40 00 01", "01 06 00 40 00 01"])
 def test_a_reply_after_another_masters_write_or_other_request_is_accepted(
     line: LineDriver, before: str
 ) -> None:
-    ask(line)
-    answer(line, rtu(before) + reply_of(7))
-    assert line.completion.reply.data == words(7)
+    assert exchanged(line, rtu(before) + reply_of(7)).reply.data == words(7)
 
 
 def confirmation() -> bytes:
@@ -514,7 +538,7 @@ def confirmation() -> bytes:
 
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
-def test_echo_of_a_write_is_not_its_confirmation(line: LineDriver, piece: int) -> None:
+def test_the_echo_of_a_write_is_not_its_confirmation(line: LineDriver, piece: int) -> None:
     teach_echo(line)
     ask(line, WRITE)
     line.receive(confirmation(), piece)
@@ -527,16 +551,14 @@ def test_echo_of_a_write_is_not_its_confirmation(line: LineDriver, piece: int) -
 
 def test_an_echo_without_a_reply_does_not_confirm_a_write(line: LineDriver) -> None:
     teach_echo(line)
-    ask(line, WRITE)
-    answer(line, confirmation())
-    assert (line.completion.result, line.completion.reply) == (Failure.NO_REPLY, Message(0, 0))
+    found = exchanged(line, confirmation(), WRITE)
+    assert (found.result, found.reply) == (Failure.NO_REPLY, Message(0, 0))
 
 
 def test_an_exception_is_found_after_the_echo_of_a_write(line: LineDriver) -> None:
     teach_echo(line)
-    ask(line, WRITE)
-    answer(line, confirmation() + rtu("01 86 02"))
-    assert (line.completion.result, line.completion.reply) == (5, Message(1, 0x06, exception=2))
+    found = exchanged(line, confirmation() + rtu("01 86 02"), WRITE)
+    assert (found.result, found.reply) == (5, Message(1, 0x06, exception=2))
 
 
 def test_an_echo_that_starts_before_the_request_is_sent_is_recognised(line: LineDriver) -> None:
@@ -571,16 +593,14 @@ DAMAGED_ECHOES = {
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
 @pytest.mark.parametrize("echo", DAMAGED_ECHOES)
 def test_a_damaged_echo_of_a_write_confirms_nothing(line: LineDriver, echo: str, piece: int) -> None:
-    """A later copy confirms nothing either: it may be the echo, after noise. A read back is possible."""
+    """A later copy confirms nothing either: it may be the echo, after noise. The next read succeeds."""
     teach_echo(line)
     ask(line, WRITE)
     line.receive(DAMAGED_ECHOES[echo] + confirmation(), piece)
     line.wait_until_done()
     assert line.completion.result < 0
     line.now += 10 * TIMEOUT
-    ask(line)
-    answer(line, rtu("01 03 00 00 00 01") + reply_of(2))
-    assert line.completion.reply.data == words(2)
+    assert exchanged(line, rtu("01 03 00 00 00 01") + reply_of(2)).reply.data == words(2)
 
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
@@ -591,25 +611,19 @@ def test_a_reply_is_found_after_a_damaged_echo(line: LineDriver, cut: tuple[int,
     echo = rtu("01 03 00 00 00 01")[slice(*cut)]
     answer(line, echo + reply_of(2), piece)
     assert (line.completion.reply.data, line.completion.skipped) == (words(2), len(echo))
-    ask(line, WRITE)
-    answer(line, confirmation())  # the line is still known to echo
-    assert line.completion.result == Failure.NO_REPLY
+    # The confirmation came only once: it is the echo, because the line is still known to echo.
+    assert exchanged(line, confirmation(), WRITE).result == Failure.NO_REPLY
 
 
 def test_after_two_replies_without_echo_a_confirmation_is_accepted_again(line: LineDriver) -> None:
     """One reply without echo is not enough: the echo may have been lost."""
     teach_echo(line)
-    ask(line)
-    answer(line, reply_of(1))
-    ask(line, WRITE)
-    answer(line, confirmation())
-    assert line.completion.result == Failure.MAYBE_ECHO
+    exchanged(line, reply_of(1))
+    assert exchanged(line, confirmation(), WRITE).result == Failure.MAYBE_ECHO
     line.now += 10 * TIMEOUT
-    ask(line)
-    answer(line, reply_of(1))
-    ask(line, WRITE)
-    answer(line, confirmation())
-    assert (line.completion.result, line.completion.skipped) == (8, 0)
+    exchanged(line, reply_of(1))
+    found = exchanged(line, confirmation(), WRITE)
+    assert (found.result, found.skipped) == (8, 0)
 
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
@@ -617,34 +631,24 @@ def test_the_start_of_an_echo_is_not_a_reply(line: LineDriver, piece: int) -> No
     """The first seven of the echo's eight bytes are a good reply with one register."""
     echo = rtu("06 03 02 11 00 01")
     assert echo[:7] == rtu("06 03 02 11 00")
-    ask(line, Message(6, 3, 0x0211, 1))
-    answer(line, echo + reply_of(7, address=6), piece)
-    assert (line.completion.reply.data, line.completion.skipped) == (words(7), 8)
+    found = exchanged(line, echo + reply_of(7, address=6), Message(6, 3, 0x0211, 1), piece=piece)
+    assert (found.reply.data, found.skipped) == (words(7), 8)
 
 
-def test_confirmations_are_accepted_until_an_echo_is_found(
-    line: LineDriver,
-) -> None:
+def test_confirmations_are_accepted_until_an_echo_is_found(line: LineDriver) -> None:
     line.set_echo(lib.MD_NO_ECHO)
     for _ in range(2):
-        ask(line, WRITE)
-        answer(line, confirmation())
-        assert (line.completion.result, line.completion.skipped) == (8, 0)
+        found = exchanged(line, confirmation(), WRITE)
+        assert (found.result, found.skipped) == (8, 0)
     teach_echo(line)  # an echo is found although "no echo" was configured
-    ask(line, WRITE)
-    answer(line, confirmation())
-    assert line.completion.result == Failure.NO_REPLY
+    assert exchanged(line, confirmation(), WRITE).result == Failure.NO_REPLY
 
 
 def test_a_configured_echo_is_never_unlearnt(line: LineDriver) -> None:
     line.set_echo(lib.MD_ECHO)
     for _ in range(3):
-        ask(line)
-        answer(line, reply_of(1))  # the request's echo was lost
-        assert line.completion.result == 7
-    ask(line, WRITE)
-    answer(line, confirmation())
-    assert line.completion.result == Failure.NO_REPLY
+        assert exchanged(line, reply_of(1)).result == 7  # the request's echo was lost
+    assert exchanged(line, confirmation(), WRITE).result == Failure.NO_REPLY
 
 
 def test_with_a_configured_echo_the_echo_of_a_delixi_query_is_not_a_value(line: LineDriver) -> None:
@@ -658,47 +662,36 @@ def test_with_a_configured_echo_the_echo_of_a_delixi_query_is_not_a_value(line: 
 
 
 def test_a_lone_copy_is_rejected_while_it_is_unknown_whether_the_adapter_echoes(line: LineDriver) -> None:
-    ask(line, WRITE)
-    answer(line, confirmation())
-    assert (line.completion.result, line.completion.raw) == (Failure.MAYBE_ECHO, confirmation())
-    ask(line, WRITE)
-    answer(line, confirmation() + confirmation())  # two copies: the adapter echoes
-    assert (line.completion.result, line.completion.skipped) == (8, 8)
-    ask(line, WRITE)
-    answer(line, confirmation())
-    assert line.completion.result == Failure.NO_REPLY
+    found = exchanged(line, confirmation(), WRITE)
+    assert (found.result, found.raw) == (Failure.MAYBE_ECHO, confirmation())
+    found = exchanged(line, confirmation() + confirmation(), WRITE)  # two copies: the adapter echoes
+    assert (found.result, found.skipped) == (8, 8)
+    assert exchanged(line, confirmation(), WRITE).result == Failure.NO_REPLY
 
 
 def test_a_reply_without_an_echo_shows_that_the_adapter_does_not_echo(line: LineDriver) -> None:
-    ask(line)
-    answer(line, reply_of(1))
-    ask(line, WRITE)
-    answer(line, confirmation())
-    assert (line.completion.result, line.completion.skipped) == (8, 0)
+    exchanged(line, reply_of(1))
+    found = exchanged(line, confirmation(), WRITE)
+    assert (found.result, found.skipped) == (8, 0)
 
 
 @pytest.mark.parametrize(("stray", "told"), [(1, True), (3, True), (4, False), (8, False)])
-def test_a_few_stray_bytes_before_a_reply_are_no_echo(line: LineDriver, stray: int, told: bool) -> None:
-    """A stray zero before every reply, from a line driver, loses no confirmation."""
-    ask(line)
-    answer(line, bytes(stray) + reply_of(1))
-    assert line.completion.reply.data == words(1)
-    ask(line, WRITE)
-    answer(line, bytes(stray) + confirmation())
-    assert (line.completion.result == 8) is told
+def test_a_few_stray_bytes_before_a_reply_are_not_taken_for_an_echo(
+    line: LineDriver, stray: int, told: bool
+) -> None:
+    """A line driver may send a zero byte before every reply: confirmations are still accepted."""
+    assert exchanged(line, bytes(stray) + reply_of(1)).reply.data == words(1)
+    assert (exchanged(line, bytes(stray) + confirmation(), WRITE).result == 8) is told
 
 
-def test_an_echo_without_a_reply_shows_the_echo(line: LineDriver) -> None:
-    """A reply to a read is never a copy of its request, so the drive is dead."""
-    ask(line)
-    answer(line, rtu("01 03 00 00 00 01"))
-    ask(line, WRITE)
-    answer(line, confirmation())
-    assert line.completion.result == Failure.NO_REPLY
+def test_an_echo_without_a_reply_shows_that_the_adapter_echoes(line: LineDriver) -> None:
+    """A read's reply never equals its request. So two copies are an echo, and the drive is dead."""
+    exchanged(line, rtu("01 03 00 00 00 01"))
+    assert exchanged(line, confirmation(), WRITE).result == Failure.NO_REPLY
 
 
 def test_a_delixi_value_of_0_is_found_after_the_echo_of_its_query(line: LineDriver) -> None:
-    """A query's echo looks like a reply of 0. The state query has no such reply, so it shows the echo."""
+    """A query's echo equals a reply with the value 0. A state query has no such reply: it shows the echo."""
     state, ask_state = b":010300030000000007\r\n", b":010300000000000004\r\n"
     value, ask_value = b":010701F40000138898\r\n", b":010701F400000000FD\r\n"
     line.begin(exchange(Message(1, 3, 0, data=words(0, 0)), framing=Framing.DELIXI))
@@ -785,7 +778,7 @@ def make_steady(line: LineDriver, peer: Peer) -> None:
 
 
 def receive_at_pace(line: LineDriver, begin: int, frame: bytes) -> None:
-    """Pass to the line the characters that have arrived by each read, until the exchange ends."""
+    """At each read, pass to the line the characters that have arrived by then, until the exchange ends."""
     came = 0
     while (want := line.want) != "done":
         there = min(max(0, (line.now - begin) // CHARACTER), len(frame))
@@ -801,7 +794,7 @@ def receive_at_pace(line: LineDriver, begin: int, frame: bytes) -> None:
 
 
 def test_a_paced_value_of_0_ends_the_exchange_of_a_steady_drive(line: LineDriver, steady: Peer) -> None:
-    """An echo would have been whole before the reply's last character came."""
+    """An echo would have ended before the last character of the reply."""
     make_steady(line, steady)
     for _ in range(5):
         end = send_query(line, steady)
@@ -814,7 +807,7 @@ def test_a_paced_value_of_0_ends_the_exchange_of_a_steady_drive(line: LineDriver
 def test_a_copy_that_may_be_an_echo_waits_for_the_whole_time_out(
     line: LineDriver, steady: Peer, insists: bool
 ) -> None:
-    """The copy came earlier than a reply can come, or the read insists, which ignores arrival times."""
+    """The copy arrived earlier than a reply can, or the read has `insists`, and ignores arrival times."""
     make_steady(line, steady)
     end = send_query(line, steady, insists=insists)
     if insists:
@@ -848,9 +841,6 @@ def test_after_two_copies_of_a_value_of_0_it_is_unknown_whether_the_adapter_echo
 def test_coils_equal_to_their_request_are_accepted_at_the_timeout(line: LineDriver) -> None:
     """The reply to a read of 17 coils from 03xxH has its request's length and first three bytes."""
     copy = rtu("01 01 03 20 00 11")
-    ask(line)
-    answer(line, reply_of(1))
+    exchanged(line, reply_of(1))
     for reply in (copy, copy + rtu("01 01 03 55 55 01")):
-        ask(line, Message(1, 1, 0x320, 17))
-        answer(line, reply)
-        assert line.completion.reply.data == reply[-5:-2]
+        assert exchanged(line, reply, Message(1, 1, 0x320, 17)).reply.data == reply[-5:-2]

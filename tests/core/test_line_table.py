@@ -18,11 +18,11 @@ from multidrop.core import Exchange, Framing, Message, Peer, build_reply
 
 DRAWING = Path(__file__).parents[2] / "docs" / "diagrams" / "line_states.py"
 READ, WRITE, BROADCAST = Message(1, 3, 0, 2), Message(1, 6, 2, data=words(7)), Message(0, 6, 2, data=words(7))
-MOST_EVENTS = 2  # most events of one call: a broadcast is sent, and it ends
+MOST_EVENTS = 2  # limit of the events in one call: of a broadcast, two, as it ends once it is sent
 
 
 def numbers(kind: str) -> dict[str, int]:
-    """Return the members of a C enum by name, without the last one, which is their number."""
+    """Return the members of a C enum by name, without the last member, which is the count of the others."""
     elements = ffi.typeof(f"enum {kind}").relements
     return {name: number for name, number in elements.items() if number < len(elements) - 1}
 

@@ -1,4 +1,4 @@
-"""The size of the structs that the core uses in every exchange."""
+"""The places in memory of the structs that the core uses in every exchange."""
 
 from __future__ import annotations
 
@@ -85,14 +85,14 @@ def test_a_struct_larger_than_a_chunk_has_room(monkeypatch: pytest.MonkeyPatch) 
 
 
 def last_line(struct: str, *fields: str) -> int:
-    """Return the number of the struct's cache line in which the last field ends, from 1 on."""
+    """Return which of the struct's cache lines contains the end of the last field; the first line is 1."""
     places = dict(ffi.typeof(f"struct {struct}").fields)
     end = max(places[field].offset + ffi.sizeof(places[field].type) for field in fields)
     return -(-end // CACHE_LINE)
 
 
 def test_the_fields_that_every_exchange_uses_are_in_few_cache_lines() -> None:
-    """These are two of the drive and two of the exchange, and one of the next exchange's drive."""
+    """Two cache lines of the drive, two of the exchange, and one of the next exchange's drive."""
     assert last_line("md_drive", "most_timeout_ns", "ready_ns", "failures", "owed_count", "is_doubted") == 1
     assert last_line("md_drive", "counters", "answered_ns") == 2
     assert last_line("md_exchange", "values", "period_ns", "insists", "frame") == 2
@@ -100,7 +100,7 @@ def test_the_fields_that_every_exchange_uses_are_in_few_cache_lines() -> None:
 
 
 def test_polled_exchanges_of_a_drive_are_adjacent() -> None:
-    """Proofs, and reads outside of a poll, are in other memory."""
+    """Proofs, and exchanges outside of a poll, are elsewhere in memory."""
     peer = Peer(least_timeout=0.02, most_timeout=1.0)
     peer.prove_by([read_of(peer, None), read_of(peer, None)])
     rows = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, 1)])

@@ -53,13 +53,13 @@ def until_of(process: subprocess.Popen[str]) -> int:
     return int(process.stdout.readline())
 
 
-def test_a_new_mastership_does_not_hold() -> None:
+def test_a_new_mastership_is_invalid_until_it_is_extended() -> None:
     mastership = Mastership()
     assert (mastership.until_ns, mastership.holds, mastership.guard_s) == (0, False, 0.7)
     assert repr(mastership) == "<Mastership not held, guard 0.7 s>"
 
 
-def test_a_mastership_holds_until_its_deadline() -> None:
+def test_a_mastership_is_valid_until_its_deadline() -> None:
     mastership = Mastership(guard_s=100)
     until_ns = now_ns() + S // 20
     mastership.extend(until_ns)
@@ -112,10 +112,10 @@ def test_concurrent_extensions_keep_the_latest_deadline() -> None:
 def test_a_past_deadline_raises_and_arms_no_timer() -> None:
     """A kernel timer that is set to a past time would kill the process immediately."""
     mastership = Mastership(guard_s=1e-6)
-    with pytest.raises(ValueError, match=r"^until_ns = \d+ is past by 1\.\d+ s of CLOCK_BOOTTIME: "):
+    with pytest.raises(ValueError, match=r"^until_ns = \d+ is 1\.\d+ s in the past of CLOCK_BOOTTIME: "):
         mastership.extend(now_ns() - S)
     mastership.extend(until_ns := now_ns() + 100 * S)
-    with pytest.raises(ValueError, match="is past"):
+    with pytest.raises(ValueError, match="in the past"):
         mastership.extend(0)
     assert mastership.until_ns == until_ns
     mastership.end()
@@ -157,7 +157,7 @@ def test_a_process_that_extends_in_time_lives() -> None:
     then = (
         "for n in range(40):\n"
         " mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 4 * 10**9)\n"
-        "time.sleep(1.5)"  # longer than the first deadline plus guard time
+        "time.sleep(1.5)"  # longer than the time until the first deadline, plus the guard time
     )
     with keeper(1.0, 0.3, then) as process:
         assert until_of(process)
@@ -184,7 +184,7 @@ def test_a_forked_child_is_not_master() -> None:
             mastership.extend(now_ns() + 200 * S)
         except ValueError as refusal:
             held = mastership.holds or mastership.until_ns
-            found = 0 if "make another one" in str(refusal) and not held else 2
+            found = 0 if "create a new one" in str(refusal) and not held else 2
         finally:
             os._exit(found)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0

@@ -1,6 +1,6 @@
 """Serial settings on a descriptor, and the thread that drives all ports.
 
-A pty takes any baud rate, and stays 8 bits without parity.
+A pty accepts any baud rate, but always has 8 bits without parity.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def test_the_same_settings_can_be_set_repeatedly(pty: int, format: str) -> None:
 
 
 def test_a_port_is_set_to_raw_mode(pty: int) -> None:
-    """In raw mode there is no echo, no line editing, no flow control, and no signals."""
+    """Raw mode has no echo, no line editing, no flow control and no signals."""
     set_settings(pty, 9600, "8N1")
     iflag, oflag, cflag, lflag, *_ = termios.tcgetattr(pty)
     assert (iflag, oflag, lflag) == (0, 0, 0)

@@ -56,7 +56,7 @@ def test_only_the_cores_thread_is_scheduled_in_real_time(realtime: Realtime) -> 
     assert policies()[core] & os.SCHED_FIFO
     second.want(False)
     assert not policies()[core] & os.SCHED_FIFO
-    assert not second.has_ended()  # a client ended it, not the core after a flood
+    assert not second.has_ended()  # realtime scheduling was ended by a client, not by the core
 
 
 def locked_kb() -> int:

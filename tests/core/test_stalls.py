@@ -1,12 +1,14 @@
-"""An adapter that takes no bytes, and closing its port.
+"""An adapter that takes no bytes: commands, stops, and closing its port.
 
-The adapter is the far end of a socket pair, which does not read: the system reports its bytes as queued, as
-a serial driver does. A drive with baud rate 0 leaves the pair's settings alone.
+The adapter is the far end of a socket pair, and does not read: the system reports its bytes as queued, as
+a serial driver does. If the far end only peeks at the bytes, their count stays above 0 although it replies.
+An exchange with baud rate 0 leaves the pair's settings alone.
 """
 
 from __future__ import annotations
 
 import errno
+import os
 import select
 import signal
 import socket
@@ -15,9 +17,14 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import replace
 
 import pytest
+from line_driver import LineDriver
+from lines import PATIENCE, until
+from multidrop._core import lib
 
 from multidrop.core import (
     Completion,
@@ -37,11 +44,15 @@ READ = Message(1, 0x03, 0x10, 1)
 START = Message(1, 0x06, 0x20, data=b"\0\1")
 STOP = Message(1, 0x06, 0x20, data=b"\0\0")
 SET_ALL = Message(0, 0x06, 0x21, data=b"\0\1")
+OTHER = Message(1, 0x03, 0x11, 1)
+SILENT = Message(2, 0x03, 0x10, 1)
 TIMEOUT_S = 0.02
+Ends = tuple[socket.socket, socket.socket]
+SO_PEEK_OFF = 42  # of Linux: each peek continues where the last one ended
 
 
 @pytest.fixture
-def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
+def ends() -> Iterator[Ends]:
     ours, adapter = socket.socketpair()
     ours.setblocking(False)
     adapter.setblocking(False)
@@ -50,18 +61,36 @@ def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
 
 
 @pytest.fixture
-def port(ends: tuple[socket.socket, socket.socket]) -> Iterator[Port]:
+def port(ends: Ends) -> Iterator[Port]:
     made = Port(ends[0].fileno(), must_take=0)
     yield made
     made.stop()
 
 
+@pytest.fixture
+def free_port() -> Iterator[Port]:
+    """Return the port of an adapter that takes every frame and never replies: a pty counts no bytes."""
+    far_end, terminal = os.openpty()
+    os.set_blocking(terminal, False)
+    made = Port(terminal, must_take=0)
+    yield made
+    made.stop()
+    os.close(terminal)
+    os.close(far_end)
+
+
 def exchange(
-    message: Message, *, insists: bool = False, timeout: float = TIMEOUT_S, peer: Peer | None = None
+    message: Message,
+    *,
+    insists: bool = False,
+    timeout: float = TIMEOUT_S,
+    peer: Peer | None = None,
+    baudrate: int = 0,
 ) -> Exchange:
     peer = peer or Peer(least_timeout=timeout, most_timeout=timeout)
-    settings = {"baudrate": 0, "format": "0\0000"[:3], "character": 1e-5, "silence": 1e-4}
-    return Exchange(Framing.RTU, message, peer, insists=insists, **settings)
+    form = "8N1" if baudrate else "0\0000"[:3]
+    timing = {"character": 1e-5, "silence": 1e-4}
+    return Exchange(Framing.RTU, message, peer, insists=insists, baudrate=baudrate, format=form, **timing)
 
 
 def taken(adapter: socket.socket) -> list[bytes]:
@@ -74,9 +103,44 @@ def frame(message: Message) -> bytes:
     return build_request(Framing.RTU, message)
 
 
-def test_a_command_is_not_written_behind_held_bytes_but_a_stop_is(
-    ends: tuple[socket.socket, socket.socket], port: Port
-) -> None:
+REQUESTS = {frame(request): request for request in (READ, OTHER, START)}
+
+
+class Device:
+    """A device that takes and answers each request to drive 1, in a thread, until `count` requests have come.
+
+    Its driver still counts the bytes of a request for `lag` s after the reply. From the request with the
+    index `miscounted` on, it counts them for ever.
+    """
+
+    def __init__(
+        self, adapter: socket.socket, count: int = 1, *, miscounted: int = 100, lag: float = 0.0
+    ) -> None:
+        self.heard: list[bytes] = []
+        self._adapter, self._count, self._miscounted, self._lag = adapter, count, miscounted, lag
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> Device:
+        self._adapter.setblocking(True)
+        self._adapter.setsockopt(socket.SOL_SOCKET, SO_PEEK_OFF, 0)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self._thread.join(PATIENCE)
+        assert not self._thread.is_alive()
+
+    def _run(self) -> None:
+        for number in range(self._count):
+            self.heard.append(self._adapter.recv(8, socket.MSG_PEEK))
+            if request := REQUESTS.get(self.heard[-1]):
+                self._adapter.send(build_reply(Framing.RTU, replace(request, data=b"\0\1")))
+            if number < self._miscounted:
+                time.sleep(self._lag)
+                self._adapter.recv(8)
+
+
+def test_a_stop_is_written_behind_held_bytes_but_a_command_is_not(ends: Ends, port: Port) -> None:
     assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
     assert port.is_stalled
     start = port.carry_out(exchange(START))
@@ -86,70 +150,181 @@ def test_a_command_is_not_written_behind_held_bytes_but_a_stop_is(
     assert taken(ends[1]) == [frame(READ), frame(STOP)]
 
 
+@pytest.mark.parametrize("insists", [False, True], ids=["read", "read of a stop"])
+def test_a_stop_in_a_stall_follows_one_read_at_most(ends: Ends, port: Port, insists: bool) -> None:
+    peer = Peer(least_timeout=TIMEOUT_S, most_timeout=TIMEOUT_S)
+    assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
+    for _ in range(3):
+        read = port.carry_out(exchange(READ, insists=insists, peer=peer))
+        assert (read.result, read.sent_ns) == (Failure.STALLED, 0)
+    assert (peer.failures, peer.owes, port.miscounts) == (0, False, False)
+    assert port.carry_out(exchange(STOP, insists=True)).sent_ns > 0
+    assert not port.lost
+    assert taken(ends[1]) == [frame(READ), frame(STOP)]
+
+
+def test_a_stop_does_not_wait_for_a_read_that_waits_for_the_adapter(ends: Ends, port: Port) -> None:
+    """The read is sent after the stop, once the adapter has taken the stop and the earlier read."""
+    assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
+    port.submit([exchange(OTHER)] + [exchange(OTHER, timeout=0.2)] * 64, [0] * 65)
+    until(lambda: port.done > 0)  # the first read was not sent; the turn of the second read starts
+    assert port.carry_out(exchange(STOP, insists=True)).sent_ns > 0
+    assert taken(ends[1]) == [frame(READ), frame(STOP)]
+    select.select([ends[1]], [], [])
+    assert taken(ends[1])[0] == frame(OTHER)
+
+
+def test_a_reply_after_a_stall_is_not_taken_for_the_reply_to_the_next_read(ends: Ends, port: Port) -> None:
+    """The device has no proofs, and the stall is longer than the window of late replies."""
+    adapter, peer = ends[1], Peer(least_timeout=0.2, most_timeout=0.2)
+
+    def answer(value: bytes) -> bytes:
+        request = adapter.recv(8)
+        time.sleep(TIMEOUT_S / 4)  # the device's response delay
+        adapter.send(build_reply(Framing.RTU, replace(READ, data=value)))
+        return request
+
+    def read() -> Completion:
+        return port.carry_out(exchange(OTHER, peer=peer))
+
+    assert port.carry_out(exchange(READ, peer=peer)).result == Failure.NO_REPLY
+    while (held := read()).result == Failure.LATE_ANSWER_DUE:
+        time.sleep(TIMEOUT_S)
+    assert held.result == Failure.STALLED
+    adapter.setblocking(True)
+    with ThreadPoolExecutor(2) as pool:
+        reading = pool.submit(read)
+        time.sleep(TIMEOUT_S)
+        assert answer(b"\0\7") == frame(READ)
+        answering = pool.submit(answer, b"\0\x09")
+        completion = reading.result()
+        while not completion.sent_ns:
+            completion = read()
+        assert completion.reply.data == b"\0\x09"
+        assert answering.result() == frame(OTHER)
+
+
+def test_the_end_of_polling_does_not_wait_for_a_read_that_waits_for_the_adapter(port: Port) -> None:
+    assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
+    port.submit([exchange(READ), exchange(READ, timeout=30.0)], [0, 0])
+    until(lambda: port.done > 0)  # the first read was not sent; the turn of the second read starts
+    assert not port.end()
+
+
 def test_a_broadcast_command_is_not_written_behind_held_bytes(port: Port) -> None:
     assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
     held = port.carry_out(exchange(SET_ALL))
     assert (held.result, held.error, held.sent_ns) == (Failure.LINE_LOST, errno.ETIMEDOUT, 0)
 
 
-def test_a_broadcast_command_does_not_wait_for_late_replies(
-    ends: tuple[socket.socket, socket.socket], port: Port
-) -> None:
-    adapter = ends[1]
-    adapter.setblocking(True)
-    reader = threading.Thread(target=adapter.recv, args=(8,))
-    reader.start()
-    peer = Peer(least_timeout=TIMEOUT_S, most_timeout=TIMEOUT_S)
-    assert port.carry_out(exchange(START, peer=peer)).result == Failure.NO_REPLY
-    reader.join()
-    assert port.carry_out(exchange(START, peer=peer)).result == Failure.LATE_ANSWER_DUE
-    assert port.carry_out(exchange(SET_ALL, peer=peer)).sent_ns > 0
+def test_a_broadcast_command_does_not_wait_for_late_replies(free_port: Port) -> None:
+    peer = Peer(least_timeout=TIMEOUT_S, most_timeout=PATIENCE)  # PATIENCE is also the window of late replies
+    start, set_all = (exchange(message, peer=peer, baudrate=9600) for message in (START, SET_ALL))
+    assert free_port.carry_out(start).result == Failure.NO_REPLY
+    assert free_port.carry_out(start).result == Failure.LATE_ANSWER_DUE
+    assert free_port.carry_out(set_all).sent_ns > 0
 
 
-def test_a_held_command_loses_the_port_at_its_timeout(port: Port) -> None:
+def test_the_port_counts_as_lost_if_a_command_is_held_until_its_timeout(port: Port) -> None:
     start = port.carry_out(exchange(START))
     assert (start.result, start.error) == (Failure.LINE_LOST, errno.ETIMEDOUT)
     assert start.sent_ns > 0
     assert (port.lost, port.lost_error, port.called_off) == (True, errno.ETIMEDOUT, True)
 
 
-def test_a_command_that_the_adapter_took_does_not_lose_the_port(
-    ends: tuple[socket.socket, socket.socket], port: Port
-) -> None:
-    adapter = ends[1]
-    adapter.setblocking(True)
-    reader = threading.Thread(target=adapter.recv, args=(8,))
-    reader.start()
-    assert port.carry_out(exchange(START)).result == Failure.NO_REPLY
-    reader.join()
-    assert (port.is_stalled, port.lost, port.called_off) == (False, False, False)
+def test_a_command_that_the_adapter_took_does_not_lose_the_port(free_port: Port) -> None:
+    assert free_port.carry_out(exchange(START, baudrate=9600)).result == Failure.NO_REPLY
+    assert (free_port.is_stalled, free_port.lost, free_port.called_off) == (False, False, False)
 
 
-def test_a_reply_ends_a_stall(ends: tuple[socket.socket, socket.socket], port: Port) -> None:
+def test_a_reply_ends_a_stall(ends: Ends, port: Port) -> None:
     assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
-    adapter = ends[1]
-    adapter.recv(4096)
-    adapter.setblocking(True)
-
-    def answer() -> None:
-        adapter.recv(8)
-        adapter.send(build_reply(Framing.RTU, Message(1, 0x03, 0x11, 1, data=b"\0\7")))
-
-    drive = threading.Thread(target=answer)
-    drive.start()
-    assert port.carry_out(exchange(Message(1, 0x03, 0x11, 1), timeout=1.0)).result > 0
-    drive.join()
+    ends[1].recv(4096)
+    with Device(ends[1]):
+        read = exchange(OTHER, timeout=PATIENCE, insists=True)  # does not wait for late replies
+        assert port.carry_out(read).result > 0
     assert not port.is_stalled
 
 
-def test_closing_calls_off_a_command_in_flight(ends: tuple[socket.socket, socket.socket], port: Port) -> None:
+def test_closing_calls_off_a_command_in_flight(ends: Ends, port: Port) -> None:
     found: list[Completion] = []
     caller = threading.Thread(target=lambda: found.append(port.carry_out(exchange(START, timeout=30.0))))
     caller.start()
-    select.select([ends[1]], [], [])  # until the command is written
+    select.select([ends[1]], [], [])  # waits until the command is written
     port.stop()
     caller.join()
     assert (found[0].result, port.called_off) == (Failure.LINE_LOST, True)
+
+
+# ---- a driver that counts bytes as unsent although the adapter has sent them ----
+
+
+def patient(message: Message) -> Exchange:
+    return exchange(message, timeout=PATIENCE)
+
+
+def test_a_count_that_stays_above_0_although_replies_come_is_ignored(ends: Ends, port: Port) -> None:
+    requests = [READ, OTHER, READ, START, SILENT, OTHER]
+    with Device(ends[1], len(requests), miscounted=0) as device:
+        for request in requests[:4]:
+            assert port.carry_out(patient(request)).result > 0
+        assert port.miscounts
+        assert port.carry_out(exchange(SILENT)).result == Failure.NO_REPLY
+        assert not port.is_stalled
+        assert port.carry_out(patient(OTHER)).result > 0
+    assert device.heard == [frame(request) for request in requests]
+
+
+def test_a_silent_drive_does_not_hold_up_the_other_drives_of_a_port_with_a_wrong_count(
+    ends: Ends, port: Port
+) -> None:
+    requests = [READ, OTHER, SILENT, READ, SILENT]
+    with Device(ends[1], len(requests), miscounted=0):
+        for request in requests[:2]:
+            assert port.carry_out(patient(request)).result > 0
+        assert port.carry_out(exchange(SILENT, timeout=0.2)).result == Failure.NO_REPLY
+        assert port.carry_out(patient(READ)).result > 0  # sent after a second
+        assert port.carry_out(exchange(SILENT, timeout=0.2)).result == Failure.NO_REPLY
+    assert (port.miscounts, port.is_stalled) == (True, False)
+
+
+@pytest.mark.parametrize(("failures", "was_wrong", "seconds"), [(0, 0, 30), (1, 0, 40), (0, 1, 1), (1, 1, 1)])
+def test_after_a_long_stall_a_drive_that_answered_is_read_first(
+    failures: int, was_wrong: int, seconds: int
+) -> None:
+    peer, line = Peer(least_timeout=1, most_timeout=1), LineDriver()
+    peer.c.failures = failures
+    line.begin(exchange(READ, peer=peer))
+    assert lib.md_line_hold_ns(line._line, was_wrong) == seconds * 10**9
+
+
+def test_a_count_that_becomes_wrong_later_is_ignored_after_three_replies(ends: Ends, port: Port) -> None:
+    with Device(ends[1], 6, miscounted=2):
+        for _ in range(3):
+            assert port.carry_out(patient(READ)).result > 0
+        held = port.carry_out(exchange(START, timeout=0.2))
+        assert (held.result, held.sent_ns, port.miscounts) == (Failure.LINE_LOST, 0, False)
+        for _ in range(2):
+            assert port.carry_out(patient(READ)).result > 0
+        assert port.carry_out(patient(START)).result > 0
+    assert port.miscounts
+
+
+def test_a_count_that_falls_shortly_after_each_reply_is_not_ignored(ends: Ends, port: Port) -> None:
+    with Device(ends[1], 5, lag=TIMEOUT_S / 2):
+        for _ in range(5):
+            assert port.carry_out(patient(READ)).result > 0
+    assert port.carry_out(exchange(SILENT)).result == Failure.NO_REPLY
+    assert (port.miscounts, port.is_stalled) == (False, True)
+
+
+def test_a_stop_does_not_wait_for_a_count_that_may_be_late(ends: Ends, port: Port) -> None:
+    """The port ignores a wrong count after three requests that waited for it. The stop does not wait."""
+    stop = exchange(START, timeout=PATIENCE, insists=True)
+    with Device(ends[1], 4, miscounted=0):
+        for each in (patient(READ), stop, patient(READ), patient(READ)):
+            assert port.carry_out(each).result > 0
+    assert not port.miscounts
 
 
 def test_close_descriptor_does_not_wait_for_a_stalled_far_end() -> None:

@@ -10,11 +10,10 @@ from dataclasses import replace
 from random import Random
 
 import pytest
-from damage import frames
 from frames import words
 from hypothesis import given
 from hypothesis import strategies as st
-from judges import Pymodbus
+from judges import Pymodbus, frames
 from line_driver import CHARACTER, LEAST, MOST, MS, READ, WRITE, LineDriver
 from line_driver import exchange as over_rtu
 from tables import table
@@ -64,9 +63,9 @@ def test_printed_tcp_frames_are_built_and_parsed() -> None:
     assert parse_reply(TCP, said, write) == (12, replace(write, data=b""))
 
 
-@pytest.mark.parametrize("replies", [False, True])
+@table("replies", [False, True])
 def test_a_tcp_frame_is_parsed_like_the_rtu_frame_with_the_same_body(replies: bool) -> None:
-    """This holds for whole and damaged frames. Only a wrong length is found sooner, from the header."""
+    """Whole and damaged frames are tested. TCP's header shows a wrong length sooner; all else is the same."""
     seen = set()
     for number, said in enumerate(frames(11, Framing.RTU, NUMBER, replies=replies)):
         if said.damage in ("flipped on the line", "cut off", "followed") or len(said.frame) < 4:
@@ -94,7 +93,7 @@ def test_a_tcp_frame_is_parsed_like_the_rtu_frame_with_the_same_body(replies: bo
     assert seen == {True, False}
 
 
-@pytest.mark.parametrize("replies", [False, True])
+@table("replies", [False, True])
 def test_tcp_frames_equal_pymodbus_frames(replies: bool) -> None:
     pymodbus, chance, count = Pymodbus(TCP), Random(12), 0
     for said in frames(13, Framing.RTU, NUMBER, replies=replies):
@@ -188,8 +187,7 @@ def test_each_request_has_a_new_transaction_id(line: LineDriver, drive: Peer) ->
         transaction = ask(line, drive)
         seen.add(transaction)
         line.receive(value(transaction, raw))
-        assert line.want == "done"
-        assert line.completion.reply.data == words(raw)
+        assert (line.want, line.completion.reply.data) == ("done", words(raw))
     assert len(seen) == 300
 
 
@@ -204,8 +202,7 @@ def test_modbus_tcp_keeps_no_silence(line: LineDriver, drive: Peer) -> None:
 @pytest.mark.parametrize("piece", [1, 2, 5, 7, 4096])
 def test_a_reply_may_come_in_pieces(line: LineDriver, drive: Peer, piece: int) -> None:
     line.receive(value(ask(line, drive), 7), piece)
-    assert line.want == "done"
-    assert line.completion.reply.data == words(7)
+    assert (line.want, line.completion.reply.data) == ("done", words(7))
 
 
 @pytest.mark.parametrize("cut", range(1, 11))
@@ -227,8 +224,7 @@ def test_late_doubled_and_foreign_replies_are_never_accepted(line: LineDriver, d
     line.receive(value(late, 1) + value(late, 1) + value((own + 1) & 0xFFFF, 2))
     assert line.want == "read"
     line.receive(value(own, 3) + value(own, 4))
-    assert line.want == "done"
-    assert line.completion.reply.data == words(3)
+    assert (line.want, line.completion.reply.data) == ("done", words(3))
     assert drive.late == 1
     own = ask(line, drive)
     assert line.completion.stale == 0
@@ -244,8 +240,7 @@ def test_each_request_gets_its_own_reply_in_any_order(drive: Peer) -> None:
         came = [value(each, 1000 + at) for at, each in enumerate(missed)] * 2 + [value(own, 7)] * 2
         chance.shuffle(came)
         line.receive(b"".join(came), chance.choice([1, 3, 17, 4096]))
-        assert line.want == "done"
-        assert line.completion.reply.data == words(7)
+        assert (line.want, line.completion.reply.data) == ("done", words(7))
 
 
 def test_a_request_is_sent_immediately_although_a_late_reply_is_due(line: LineDriver, drive: Peer) -> None:
@@ -270,13 +265,12 @@ def test_the_lateness_of_a_reply_is_learnt_to_the_nanosecond(line: LineDriver, d
 
 
 @pytest.mark.parametrize("code", [0x0A, 0x0B])
-def test_a_gateways_exception_for_a_silent_drive_is_no_reply(
+def test_a_gateways_exception_for_a_silent_drive_is_not_the_drives_reply(
     line: LineDriver, drive: Peer, code: int
 ) -> None:
     for number in (1, 2):
         line.receive(tcp(ask(line, drive), bytes([1, 0x83, code])))
-        assert line.want == "done"
-        assert line.completion.result == Failure.NO_REPLY
+        assert (line.want, line.completion.result) == ("done", Failure.NO_REPLY)
         assert line.completion.raw[-1] == code
         assert drive.failures == number
     assert not drive.has_answered
@@ -380,6 +374,12 @@ def test_a_frame_that_started_before_the_request_is_not_its_reply(line: LineDriv
     assert (line.want, line.completion.reply.data) == ("done", words(9))
 
 
+def test_frames_sent_by_the_peer_when_it_is_connected_are_not_replies(line: LineDriver, drive: Peer) -> None:
+    """wills106/homeassistant-solax-modbus#2336: a registration and an exception with transaction id 1."""
+    line.receive(tcp(1, b"\0\6ABCDEFGHIJ") + tcp(1, b"\0\x86\3"))
+    assert is_read(line, drive, 7)
+
+
 def test_an_incomplete_reply_fails_two_exchanges_if_bytes_come_one_by_one(
     line: LineDriver, drive: Peer
 ) -> None:
@@ -402,7 +402,7 @@ def test_noise_after_good_replies_loses_neither_a_reply_nor_the_connection(
     assert not line.is_out_of_step
 
 
-def test_a_copy_of_a_tcp_write_confirms_it(line: LineDriver, drive: Peer) -> None:
+def test_a_copy_of_a_tcp_write_confirms_the_write(line: LineDriver, drive: Peer) -> None:
     transaction = ask(line, drive, WRITE)
     line.receive(tcp(transaction, build_request(TCP, WRITE)[6:]))
     assert line.want == "done"
@@ -466,8 +466,7 @@ def test_with_ids_ignored_a_reply_with_another_id_is_accepted(gateway: LineDrive
     for raw in range(10):
         line = gateway
         line.receive(value((ask(line, drive) + 1) & 0xFFFF, raw))
-        assert line.want == "done"
-        assert line.completion.reply.data == words(raw)
+        assert (line.want, line.completion.reply.data) == ("done", words(raw))
 
 
 def test_with_ids_ignored_a_late_reply_delays_the_next_request(gateway: LineDriver, drive: Peer) -> None:
@@ -510,7 +509,7 @@ def test_bytes_that_are_not_modbus_tcp_end_the_connection_as_lost(
     try:
         theirs.send(bytes.fromhex("01 03 02 00 07 F9 86"))
         found = port.carry_out(exchange(READ, drive))
-        while found.result != Failure.LINE_LOST:  # a request may be sent before the bytes are read
+        while found.result != Failure.LINE_LOST:  # requests may be sent before the bytes are read
             found = port.carry_out(exchange(READ, drive))
         assert found.error == errno.EPROTO, os.strerror(found.error)
         assert port.lost

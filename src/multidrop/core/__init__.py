@@ -1,155 +1,78 @@
 """Frames, exchanges and columns for Python. Only this package imports the compiled module."""
 
-from __future__ import annotations
-
-from multidrop.core.capture import (
-    STREAM_ROOM,
-    Decoded,
-    Decoder,
-    FrameSpan,
-    Kind,
-    Side,
-    Splitter,
-    Stream,
-    Tap,
-    Unpacked,
-    Unpacker,
-    Wrappings,
-)
-from multidrop.core.columns import (
-    COLUMNS,
-    LOW_BYTE_FIRST,
-    LOW_WORD_FIRST,
-    MOST_INVALID,
-    Columns,
-    Extra,
-    Field,
-    Names,
-    NumberFormat,
-    RowLayout,
-    raw_value,
-    spell,
-)
-from multidrop.core.exchange import DELAY_BUCKETS, PAUSE_NS, Completion, Counters, Exchange, Peer, delay_edge
-from multidrop.core.frame import (
-    MODBUS,
-    Framing,
-    Message,
-    build_reply,
-    build_request,
-    characters_on_wire,
-    crc16,
-    find_replies,
-    lrc,
-    parse_reply,
-    parse_request,
-    reply_length,
-    sum8,
-)
-from multidrop.core.permissions import Latch, Mastership, Permit, boottime_ns
-from multidrop.core.port import (
-    REALTIME_ENDED,
-    RS485,
-    Echo,
-    Port,
-    Realtime,
-    RowQueue,
-    TransactionIds,
-    Transactions,
-    now_ns,
-    utc_minus_monotonic_ns,
-    wake_lateness,
-    why_not_realtime,
-)
-from multidrop.core.port_settings import (
-    NO_DIVISOR,
-    REFUSALS,
-    CharacterFormat,
-    close_descriptor,
-    get_settings,
-    is_pseudo_terminal,
-    must_take,
-    possible_rates,
-    refused_names,
-    set_settings,
-)
-from multidrop.core.result import EXCEPTION_STATUS, STATUSES, UNASKED, Failure, FrameFault, Status
-
-__all__ = [
-    "COLUMNS",
-    "DELAY_BUCKETS",
-    "EXCEPTION_STATUS",
-    "LOW_BYTE_FIRST",
-    "LOW_WORD_FIRST",
-    "MODBUS",
-    "MOST_INVALID",
-    "NO_DIVISOR",
-    "PAUSE_NS",
-    "REALTIME_ENDED",
-    "REFUSALS",
-    "RS485",
-    "STATUSES",
-    "STREAM_ROOM",
-    "UNASKED",
-    "CharacterFormat",
-    "Columns",
-    "Completion",
-    "Counters",
-    "Decoded",
-    "Decoder",
-    "Echo",
-    "Exchange",
-    "Extra",
-    "Failure",
-    "Field",
-    "FrameFault",
-    "FrameSpan",
-    "Framing",
-    "Kind",
-    "Latch",
-    "Mastership",
-    "Message",
-    "Names",
-    "NumberFormat",
-    "Peer",
-    "Permit",
-    "Port",
-    "Realtime",
-    "RowLayout",
-    "RowQueue",
-    "Side",
-    "Splitter",
-    "Status",
-    "Stream",
-    "Tap",
-    "TransactionIds",
-    "Transactions",
-    "Unpacked",
-    "Unpacker",
-    "Wrappings",
-    "boottime_ns",
-    "build_reply",
-    "build_request",
-    "characters_on_wire",
-    "close_descriptor",
-    "crc16",
-    "delay_edge",
-    "find_replies",
-    "get_settings",
-    "is_pseudo_terminal",
-    "lrc",
-    "must_take",
-    "now_ns",
-    "parse_reply",
-    "parse_request",
-    "possible_rates",
-    "raw_value",
-    "refused_names",
-    "reply_length",
-    "set_settings",
-    "spell",
-    "sum8",
-    "utc_minus_monotonic_ns",
-    "wake_lateness",
-    "why_not_realtime",
-]
+from multidrop.core.capture import STREAM_ROOM as STREAM_ROOM
+from multidrop.core.capture import Decoded as Decoded
+from multidrop.core.capture import Decoder as Decoder
+from multidrop.core.capture import FrameSpan as FrameSpan
+from multidrop.core.capture import Kind as Kind
+from multidrop.core.capture import Side as Side
+from multidrop.core.capture import Splitter as Splitter
+from multidrop.core.capture import Stream as Stream
+from multidrop.core.capture import Tap as Tap
+from multidrop.core.capture import Unpacked as Unpacked
+from multidrop.core.capture import Unpacker as Unpacker
+from multidrop.core.capture import Wrappings as Wrappings
+from multidrop.core.columns import COLUMNS as COLUMNS
+from multidrop.core.columns import LOW_BYTE_FIRST as LOW_BYTE_FIRST
+from multidrop.core.columns import LOW_WORD_FIRST as LOW_WORD_FIRST
+from multidrop.core.columns import MOST_INVALID as MOST_INVALID
+from multidrop.core.columns import Columns as Columns
+from multidrop.core.columns import Extra as Extra
+from multidrop.core.columns import Field as Field
+from multidrop.core.columns import Names as Names
+from multidrop.core.columns import NumberFormat as NumberFormat
+from multidrop.core.columns import RowLayout as RowLayout
+from multidrop.core.columns import raw_value as raw_value
+from multidrop.core.columns import spell as spell
+from multidrop.core.exchange import DELAY_BUCKETS as DELAY_BUCKETS
+from multidrop.core.exchange import PAUSE_NS as PAUSE_NS
+from multidrop.core.exchange import Completion as Completion
+from multidrop.core.exchange import Counters as Counters
+from multidrop.core.exchange import Exchange as Exchange
+from multidrop.core.exchange import Peer as Peer
+from multidrop.core.exchange import delay_edge as delay_edge
+from multidrop.core.frame import MODBUS as MODBUS
+from multidrop.core.frame import Framing as Framing
+from multidrop.core.frame import Message as Message
+from multidrop.core.frame import build_reply as build_reply
+from multidrop.core.frame import build_request as build_request
+from multidrop.core.frame import characters_on_wire as characters_on_wire
+from multidrop.core.frame import crc16 as crc16
+from multidrop.core.frame import find_replies as find_replies
+from multidrop.core.frame import lrc as lrc
+from multidrop.core.frame import parse_reply as parse_reply
+from multidrop.core.frame import parse_request as parse_request
+from multidrop.core.frame import reply_length as reply_length
+from multidrop.core.frame import sum8 as sum8
+from multidrop.core.permissions import Latch as Latch
+from multidrop.core.permissions import Mastership as Mastership
+from multidrop.core.permissions import Permit as Permit
+from multidrop.core.permissions import boottime_ns as boottime_ns
+from multidrop.core.port import REALTIME_ENDED as REALTIME_ENDED
+from multidrop.core.port import RS485 as RS485
+from multidrop.core.port import Echo as Echo
+from multidrop.core.port import Port as Port
+from multidrop.core.port import Realtime as Realtime
+from multidrop.core.port import RowQueue as RowQueue
+from multidrop.core.port import TransactionIds as TransactionIds
+from multidrop.core.port import Transactions as Transactions
+from multidrop.core.port import now_ns as now_ns
+from multidrop.core.port import utc_minus_monotonic_ns as utc_minus_monotonic_ns
+from multidrop.core.port import wake_lateness as wake_lateness
+from multidrop.core.port import why_not_realtime as why_not_realtime
+from multidrop.core.port_settings import NO_DIVISOR as NO_DIVISOR
+from multidrop.core.port_settings import REFUSALS as REFUSALS
+from multidrop.core.port_settings import CharacterFormat as CharacterFormat
+from multidrop.core.port_settings import close_descriptor as close_descriptor
+from multidrop.core.port_settings import get_settings as get_settings
+from multidrop.core.port_settings import is_pseudo_terminal as is_pseudo_terminal
+from multidrop.core.port_settings import must_take as must_take
+from multidrop.core.port_settings import possible_rates as possible_rates
+from multidrop.core.port_settings import refused_names as refused_names
+from multidrop.core.port_settings import set_settings as set_settings
+from multidrop.core.result import EXCEPTION_STATUS as EXCEPTION_STATUS
+from multidrop.core.result import STATUSES as STATUSES
+from multidrop.core.result import UNASKED as UNASKED
+from multidrop.core.result import Failure as Failure
+from multidrop.core.result import FrameFault as FrameFault
+from multidrop.core.result import Status as Status

@@ -12,7 +12,7 @@ from multidrop.core.frame import Framing, Message, from_c
 
 
 class Side(IntEnum):
-    """The sender of captured bytes (enum md_side)."""
+    """The sender of captured bytes; FAILED and NOISE mark bytes that are not a frame (enum md_side)."""
 
     EITHER = lib.MD_EITHER_SIDE  # unknown
     ASKING = lib.MD_ASKING
@@ -46,15 +46,14 @@ _MOST_PIECES = 1 << 15
 
 
 class Stream:
-    """Bytes of one line in pieces (struct md_stream); `is_tcp` says whether all frames are Modbus TCP."""
+    """Bytes of one line in pieces (struct md_stream)."""
 
-    def __init__(self, place: Any = None, *, is_tcp: bool = False) -> None:
+    def __init__(self, place: Any = None) -> None:
         self.c = ffi.new("struct md_stream *") if place is None else place
         self._bytes = ffi.new("uint8_t[]", STREAM_ROOM)
         self._pieces = ffi.new("struct md_piece[]", _MOST_PIECES)
         self.c.bytes, self.c.room = self._bytes, STREAM_ROOM
         self.c.pieces, self.c.most = self._pieces, _MOST_PIECES
-        self.c.is_tcp = is_tcp or self.c.is_tcp
 
     def put(
         self, received: bytes, time_ns: int, *, side: Side = Side.EITHER, after_pause: bool = False
@@ -65,7 +64,7 @@ class Stream:
             raise BufferError("the stream is full: split it first")
 
     def end(self, is_end: bool) -> None:
-        """Set whether the stream is complete, so that an incomplete frame at its end is junk."""
+        """Set whether the stream is complete; if it is, an incomplete frame at its end becomes junk."""
         self.c.is_all = is_end
 
 
@@ -101,22 +100,22 @@ class Decoder:
         self._c.block = ffi.NULL
         ffi.buffer(self._known)[:] = bytes(ffi.sizeof(self._known))
         self._c.taken = 0
-        self._blocks.clear()  # last, because the core used them until now
+        self._blocks.clear()  # cleared last, because the core used them until here
 
     @property
     def asked(self) -> tuple[Framing, Message]:
-        """Framing and content of the request for which `decode` returned UNKNOWN; call `know` for it."""
+        """Framing and content of the request for which `decode` returned UNKNOWN; next, call `know`."""
         return Framing(self._c.span.framing), from_c(self._c.span.message)
 
     def know(self, block: RowLayout | None) -> bool:
-        """Set the layout of replies to `asked` (None: no rows); return False if the table is full."""
+        """Store the layout of replies to `asked` (None: no rows); return False if the table is full."""
         if block:
             self._blocks.append(block)
         c = block.c if block else ffi.NULL
         return bool(lib.md_know(self._c, self._c.span.framing, ffi.addressof(self._c.span, "message"), c))
 
     def decode(self, stream: Stream, columns: Columns) -> Decoded:
-        """Append the stream's rows to `columns`; discard the stream once all is decoded."""
+        """Append the stream's rows to `columns`; discard the stream's bytes once all are decoded."""
         done = Decoded(lib.md_decode(self._c, stream.c, columns.c))
         if done is Decoded.ALL:
             lib.md_stream_forget(stream.c, ffi.addressof(self._c, "splitter"))
@@ -158,7 +157,7 @@ class Unpacker:
 
     def look_at(self, piece: bytes, at: int) -> None:
         """Continue with this piece of the file, which starts at byte `at` of the file."""
-        self._c.len = self._c.at = 0  # before the assignment below frees the last piece
+        self._c.len = self._c.at = 0  # reset before the assignment below frees the previous piece
         self._piece, self._begin = ffi.from_buffer("uint8_t[]", piece), at
         self._c.bytes, self._c.len = self._piece, len(piece)
 
@@ -171,7 +170,7 @@ class Unpacker:
         self._c.at = at - self._begin
 
     def add_channel(self, link: int, *, has_sides: bool, ticks_per_s: int, offset_ns: int) -> None:
-        """Add the next interface of the file; `has_sides`: its packets name their senders."""
+        """Add the next interface of the file. If `has_sides`, its packets name their senders."""
         channel = self._channels[self._c.count]
         channel.link, channel.has_sides = link, has_sides
         channel.ticks_per_s, channel.offset_ns = ticks_per_s, offset_ns
@@ -183,12 +182,15 @@ class Unpacker:
         return Unpacked(lib.md_unpack(self._c))
 
 
-_RING = 1 << 18  # bytes; enough for some seconds of a fast line
-_TAKEN = 1 << 16  # bytes; most packets that are read together
+_RING = 1 << 18  # size of the ring in bytes; enough for some seconds of a fast line
+_TAKEN = 1 << 16  # limit of the bytes read from the ring in one call
 
 
 class Wrappings:
-    """Headers and trailers of a capture file's packets, by side and by whether a frame starts with ':'."""
+    """Headers and trailers of a capture file's packets.
+
+    Each key of `wrappings` is a pair: the sender, and True if the frame starts with ':'.
+    """
 
     def __init__(self, wrappings: Mapping[tuple[Side, bool], tuple[bytes, bytes]]) -> None:
         self._kept: list[Any] = []
@@ -224,7 +226,7 @@ class Tap:
         return int(self.c.lost)
 
     def take(self, wrappings: Wrappings, interface: int, utc_minus_monotonic_ns: int) -> Iterator[bytes]:
-        """Yield all bytes of the ring as pcapng packets of this interface, many packets in each piece."""
+        """Yield all bytes of the ring as pcapng packets of this interface; each item has many packets."""
         if self.c.put == self.c.taken:
             return
         out = self._out = self._out or ffi.new("uint8_t[]", _TAKEN)

@@ -139,7 +139,7 @@ class RowLayout:
 
     @property
     def refusal(self) -> int:
-        """The code of the last exception."""
+        """The code of the newest exception."""
         return int(self.c.refusal)
 
     @property
@@ -176,7 +176,10 @@ class Columns:
 
     @classmethod
     def lent(cls, made: Any, give_back: Callable[[Any], object]) -> Columns:
-        """Return columns over the core's memory `made`; after the last view, `give_back` gets that memory."""
+        """Return columns over the core's memory `made`.
+
+        Once the last view is freed, `give_back(made)` is called.
+        """
         columns = cls.__new__(cls)
         columns._own(made, give_back)
         return columns
@@ -208,7 +211,7 @@ class Columns:
 
 
 class Spelling(NamedTuple):
-    """Names joined into one text, from which the core builds Arrow columns."""
+    """Names joined into one text, from which the core builds Arrow utf8 columns."""
 
     names: int
     longest: int
@@ -271,11 +274,11 @@ def spell(codes: memoryview[Any], names: Names) -> tuple[memoryview[Any], memory
         ffi.from_buffer("uint16_t[]", codes), rows, known.text, known.ends, known.names, offsets, text, room
     )
     if used < 0:
-        raise ValueError("a code without a name, or more than 2 GiB of names in one batch")
+        raise ValueError("a code has no name, or the names of one batch have more than 2 GiB")
     return memoryview(ffi.buffer(offsets)).cast("i"), memoryview(ffi.buffer(text, used))
 
 
-MOST_NARROW = 256  # most names that codes of one byte can distinguish
+MOST_NARROW = 256  # limit of the names that codes of one byte can distinguish
 
 
 class CodeTable:
@@ -291,8 +294,18 @@ class CodeTable:
         self._numbers[0 : len(self._names)] = [-1] * len(self._names)
         self.used = ()
 
+    def know(self, names: Sequence[str]) -> None:
+        """Replace the known names by `names`, if `names` has more.
+
+        `names` starts with the known names, in the same order.
+        """
+        if len(names) > len(self._names):
+            known = [self._numbers[at] for at in range(len(self._names))]
+            self._numbers = ffi.new("int16_t[]", [*known, *[-1] * (len(names) - len(known))])
+            self._names = names
+
     def narrow(self, codes: memoryview[Any]) -> memoryview[Any] | None:
-        """Return the one-byte code for each two-byte code; None if a byte has too few values.
+        """Return the one-byte code for each two-byte code; None if one byte cannot number all used names.
 
         Raises ValueError if a code has no name.
         """
@@ -300,7 +313,7 @@ class CodeTable:
         out = ffi.new("uint8_t[]", max(rows, 1))
         while (at := lib.md_narrow_codes(given, rows, self._numbers, len(self._names), out)) < rows:
             if given[at] >= len(self._names):
-                raise ValueError(f"there is a status {given[at]} without a name")
+                raise ValueError(f"status {given[at]} has no name")
             if len(self.used) == MOST_NARROW:
                 return None
             self._numbers[given[at]] = len(self.used)
@@ -326,23 +339,23 @@ def narrow_up(numbers: memoryview[Any]) -> memoryview[Any]:
 def widen(
     numbers: bytes | memoryview[Any], valid: bytes | memoryview[Any] | None, rows: int
 ) -> memoryview[Any]:
-    """Return float32 numbers as int64; those that the bitmap `valid` excludes become 0.
+    """Return float32 numbers as int64. Numbers whose bit in the bitmap `valid` is 0 become 0.
 
     Raises ValueError if a number is not finite or too large.
     """
     if len(numbers) < 4 * rows or (valid is not None and len(valid) < (rows + 7) // 8):
-        raise ValueError("its lengths do not fit together")
+        raise ValueError("the stated lengths do not match the data")
     out = ffi.new("int64_t[]", max(rows, 1))
     bits = ffi.NULL if valid is None else ffi.from_buffer("uint8_t[]", valid)
     if lib.md_widen(_copy("float[]", numbers[: 4 * rows], 4), bits, rows, out):
-        raise ValueError("an uncertainty is no number")
+        raise ValueError("an uncertainty is not a number")
     return memoryview(ffi.buffer(out, 8 * rows))
 
 
 def wide_codes(codes: bytes | memoryview[Any], rows: int, size: int) -> memoryview[Any]:
     """Return codes of `size` bytes (1 or 2) as uint16."""
     if len(codes) < rows * size:
-        raise ValueError("its lengths do not fit together")
+        raise ValueError("the stated lengths do not match the data")
     if size == 2:
         out = _copy("uint16_t[]", codes[: 2 * rows], 2)
     else:

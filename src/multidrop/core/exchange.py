@@ -30,9 +30,9 @@ class Counters(NamedTuple):
     late: int = 0
     stray_bytes: int = 0
     ideal_ns: int = 0
-    longest_ns: int = 0  # longest response delay
-    timeout_ns: int = 0  # usual timeout of a read
-    ended: Counter[Status] = Counter()  # exchanges without a reply, by status; broadcasts are OK
+    longest_ns: int = 0  # ns; longest response delay
+    timeout_ns: int = 0  # ns; usual timeout of a read
+    ended: Counter[Status] = Counter()  # exchanges without a reply, by status; broadcasts count as OK
     missed: Counter[Status] = Counter()  # number of missing values, by status
     refused: Counter[int] = Counter()  # number of missing values, by exception code
     delays: Counter[int] = Counter()  # number of replies, by the bucket of their response delay
@@ -81,7 +81,7 @@ def _by_place(array: Any, kind: Literal["I", "Q"]) -> Counter[int]:
 
 
 def _number(path: str) -> int:
-    """Return a property that reads a number of the struct `c`, by attrgetter because it is fastest."""
+    """Return a property that reads a number of the struct `c`. It uses attrgetter, which is fastest."""
     return cast(int, property(attrgetter(path)))
 
 
@@ -95,8 +95,8 @@ class Completion:
 
     Times are CLOCK_MONOTONIC, in ns. `numbers` are the values of the exchange's fields, NaN for a missing
     value. `count` is the number of values that exist; -1 without a good reply and after an exception. A
-    successful read uses only these two attributes, because with cold caches each further field and call costs
-    microseconds. An exchange with the same number of values (`room`) can reuse a completion.
+    successful read uses only `numbers` and `count`, because with cold caches each further field and call
+    costs microseconds. An exchange with the same number of values (`room`) can reuse a completion.
     """
 
     __slots__ = ("c", "count", "numbers", "room", "values")
@@ -109,12 +109,12 @@ class Completion:
         self.numbers = memoryview(ffi.buffer(self.values)).cast("d") if room else _NO_NUMBERS
 
     result = _number("c.result")  # > 0: length of the reply; 0: a broadcast; < 0: a Failure or FrameFault
-    error = _number("c.error")  # the errno of a lost line, or the mask of REFUSALS of settings
-    begun_ns = _number("c.begun_ns")  # when the exchange's turn came
+    error = _number("c.error")  # the errno of a lost line, or the mask of refused settings (REFUSALS)
+    begun_ns = _number("c.begun_ns")  # start of the exchange's turn
     sent_ns = _number("c.sent_ns")  # when the request was sent; 0: never
     first_ns = _number("c.first_ns")  # when the first byte after the request arrived; 0: none came
     last_ns = _number("c.last_ns")  # when the last byte arrived; 0: none came
-    late_until_ns = _number("c.late_until_ns")  # the drive's `late_until_ns` at the time of the call
+    late_until_ns = _number("c.late_until_ns")  # the peer's `late_until_ns` when the exchange was requested
     stale = _number("c.stale")  # number of bytes discarded before the request was sent
     skipped = _number("c.skipped")  # number of bytes after the request that are not part of the reply
 
@@ -141,7 +141,7 @@ class Completion:
         return bytes(ffi.buffer(self.c.raw, self.c.raw_len))
 
     def unanswered(self) -> Completion:
-        """Return a copy of this completion without a reply, because the reply was only the request's echo."""
+        """Return a copy that reports NO_REPLY, because the apparent reply was only the request's echo."""
         found = ffi.new("struct md_completion *", self.c[0])
         found.result, found.raw_len = lib.MD_NO_REPLY, 0
         return Completion(found)
@@ -156,8 +156,8 @@ class Peer:
     """A drive's state and statistics (struct md_drive), shared by all its exchanges.
 
     `least_timeout` and `most_timeout`, in s, bound the timeout, which runs from the request's last bit to the
-    reply's first. Between them the core learns it from the drive's response delays. At least `interval`, in
-    s, passes between the end of an exchange and the next request.
+    reply's first. Between these bounds, the core learns the timeout from the drive's response delays. At
+    least `interval`, in s, passes between the end of an exchange and the next request.
     """
 
     def __init__(self, *, least_timeout: float, most_timeout: float, interval: float = 0.0) -> None:
@@ -191,19 +191,21 @@ class Peer:
         """True while replies to earlier requests may still come through a slow gateway or network."""
         return bool(self.c.owed_count)
 
-    answered_ns = _number("c.answered_ns")  # approximate time of the last reply; 0 before the first reply
-    pauses = _number("c.history.pauses")  # replies PAUSE_NS or more after the previous reply
-    ready_ns = _number("c.ready_ns")  # earliest time of the next request
+    answered_ns = _number("c.answered_ns")  # ns; approximate time of the last reply; 0 before the first
+    # number of replies that came PAUSE_NS or more after the previous reply
+    pauses = _number("c.history.pauses")
+    ready_ns = _number("c.ready_ns")  # ns; earliest time of the next request
 
     def inherit(self, before: Peer) -> None:
         """Take over the outstanding requests of `before`, the peer that this peer replaces at its address."""
         lib.md_late_inherit(self.c, before.c)
 
     def prove_by(self, proofs: Sequence[Exchange]) -> None:
-        """Set the proofs: if a late reply could be mistaken for a new one, the core sends a proof first.
+        """Set the proofs, reads whose replies show that no earlier reply can still come.
 
-        A proof is a read. Only the first MOST_PROOFS are used; their replies must all differ. Call this once,
-        before the first exchange, because the core reads the list from then on.
+        If a late reply could be mistaken for a new one, the core sends a proof first. Only the first
+        MOST_PROOFS are used; their replies must all differ. Call this once, before the first exchange: from
+        then on the core reads the list.
         """
         self.proofs = tuple(proofs[:MOST_PROOFS])
         self._c_proofs = ffi.new("struct md_exchange *[]", [proof.c for proof in self.proofs])
@@ -212,9 +214,10 @@ class Peer:
         self.c.proofs, self.c.proof_count = self._c_proofs, len(self.proofs)
 
     def doubt_first_reply(self) -> None:
-        """After a proof, repeat the first read: the first reply may answer another process's request.
+        """Distrust the peer's first reply, which may answer another process's request.
 
-        If the peer has no proofs, its first reply is accepted.
+        The core then sends a proof (see `prove_by`) and repeats the read. If the peer has no proofs, its
+        first reply is accepted.
         """
         self.c.is_doubted = True
 
@@ -230,7 +233,10 @@ class Peer:
 
     @property
     def next_timeout_ns(self) -> int:
-        """The timeout of the next read in ns, which is sometimes longer while the drive is silent."""
+        """The timeout of the next read in ns.
+
+        While the drive is silent, this timeout is sometimes longer than `timeout`.
+        """
         return int(lib.md_next_timeout_ns(self.c))
 
     @property
@@ -246,13 +252,13 @@ class Peer:
 class Exchange:
     """A request with its drive, timing and settings; created once, carried out as often as needed.
 
-    Times are in seconds: `character` is the duration of one character, `silence` precedes the request and
-    follows its reply, `turnaround` follows a broadcast, `period` is the period of its slots (0: none). With
-    `insists` the request is sent even if a late reply could be mistaken for its own. `timeout` is the least
-    timeout; 0 means the learnt one. `answer` is the least and the greatest raw value of the only register in
-    the reply. `block` has the fields for rows, `values` those for the caller of `Port.carry_out`. The
-    `echo_probe` is sent first while it is unknown whether the adapter echoes; its reply is never a copy of
-    its request. The request is not sent once its `permit` has ended.
+    Times are in seconds. `character` is the duration of one character. `silence` precedes the request and
+    follows its reply, `turnaround` follows a broadcast. `period` is the period of the exchange's slots (0: it
+    has no slots). With `insists` the request is sent even if a late reply could be mistaken for its own.
+    `timeout` is the least timeout; 0 means the learnt one. `answer` is the least and the greatest raw value
+    of the only register in the reply. `block` has the fields for rows, `values` those for the caller of
+    `Port.carry_out`. The `echo_probe` is sent first while it is unknown whether the adapter echoes; its reply
+    is never a copy of its request. The request is not sent once its `permit` has ended.
     """
 
     __slots__ = (

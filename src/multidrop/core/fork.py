@@ -25,7 +25,7 @@ def register_at_fork(inherited: Inherited) -> None:
 
 
 def _call_all() -> None:
-    for inherited in list(_registered):  # a list keeps every object alive during the calls
+    for inherited in list(_registered):  # the list keeps every object alive during the calls
         inherited.forked()
 
 

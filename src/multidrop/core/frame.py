@@ -109,7 +109,7 @@ def parse_request(framing: Framing, received: bytes) -> tuple[int, Message | Non
 
 
 def parse_reply(framing: Framing, received: bytes, request: Message) -> tuple[int, Message | None]:
-    """Parse the reply to `request`; return the same as parse_request. The transaction id may differ."""
+    """Parse the reply to `request`, with any transaction id. Return a pair like that of `parse_request`."""
     found = ffi.new("struct md_message *")
     used = lib.md_parse_reply(framing, received, len(received), to_c(request), found)
     return used, from_c(found) if used > 0 else None

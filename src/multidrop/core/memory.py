@@ -1,7 +1,7 @@
-"""Allocate structs that the core uses at every exchange side by side, in whole cache lines.
+"""Allocate adjacent memory, in whole cache lines, for the structs that the core uses at every exchange.
 
-With many lines, this memory and its page translations are no longer cached when a line's next exchange
-starts. The structs of a drive are allocated together, so that they share a page or two.
+With many lines, a line's structs and their page translations are no longer cached when its next exchange
+starts. So the structs of a drive are placed side by side, and share a page or two.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ class Latch:
 
     def __init__(self) -> None:
         self.c: Any = ffi.new("uint32_t *")
-        self.why = ""  # why permits were last invalidated, or why all are invalid from now on
+        self.why = ""  # why permits were last invalidated, or after `shut`, why all permits are invalid
         self._is_shut = False
         self._holds: set[object] = set()  # stops in progress, during which new permits are invalid
 
@@ -38,7 +38,7 @@ class Latch:
         self.rise(why)
 
     def hold(self, stop: object, why: str) -> None:
-        """Invalidate all permits, and all new permits until `let_go` is called for this stop."""
+        """Invalidate all existing permits, and new ones until `let_go` is called for this stop."""
         self._holds.add(stop)
         self.rise(why)
 
@@ -47,13 +47,16 @@ class Latch:
         self._holds.discard(stop)
 
     def permit(self, seen: int | None = None) -> Permit:
-        """Return a permit that is valid until the next `rise`; never valid during a stop or after `shut`.
+        """Return a permit that is valid until the next `rise`.
 
-        `seen`: the value of `c[0]` at the start of the call that needs the permit.
+        A permit made during a stop or after `shut` is never valid.
+
+        `seen` is the value of the stop counter `c[0]` at the start of the call that needs the permit.
         """
         if seen is None:
             seen = int(self.c[0])
-        if self._is_shut or self._holds:  # after reading `seen`, to notice a rise in between
+        # checked after `seen` was read, so that a `rise` in between is noticed
+        if self._is_shut or self._holds:
             seen = (seen - 1) & 0xFFFF_FFFF
         return Permit(self, seen)
 
@@ -100,10 +103,10 @@ class Mastership:
         if c == ffi.NULL and ffi.errno == errno.ENOSYS:
             raise NotImplementedError("a mastership needs Linux, whose kernel can kill a suspended process")
         if c == ffi.NULL:
-            raise OSError(ffi.errno, "the kernel's timer cannot be made")
+            raise OSError(ffi.errno, "the kernel's timer cannot be created")
         self.c: Any = c
         self._free = finalize(self, lib.md_mastership_free, c)
-        self._free.atexit = False  # ports may still use the struct at exit
+        self._free.atexit = False  # the struct is not freed at exit, because ports may still use it
         self._is_inherited = False
         self._lock = threading.Lock()  # keeps the deadline and its timer consistent
         register_at_fork(self)
@@ -125,24 +128,25 @@ class Mastership:
 
     @property
     def holds(self) -> bool:
-        """True before the deadline."""
+        """True while the deadline has not passed."""
         return not self._is_inherited and bool(lib.md_mastership_holds(self.c))
 
     def extend(self, until_ns: int) -> None:
-        """Hold until this time, and set the kernel's timer to `guard_s / 2` seconds after it.
+        """Set the deadline to this time, and the kernel's timer to `guard_s / 2` seconds after it.
 
-        A time before the present deadline has no effect. After `end`, a call makes the mastership hold again.
+        A time before the present deadline has no effect. After `end`, a call starts the mastership again.
 
         Raises ValueError, without any change, if the time is past: such a timer would kill immediately.
         """
         if isinstance(until_ns, bool) or not isinstance(until_ns, int):
             raise TypeError(f"until_ns is a whole number of ns of CLOCK_BOOTTIME, not {until_ns!r}")
         if self._is_inherited:
-            raise ValueError("this mastership belongs to the parent of this forked process: make another one")
+            raise ValueError("this mastership belongs to the parent of this forked process: create a new one")
         late_ns = boottime_ns() - until_ns
         if late_ns >= 0:
             raise ValueError(
-                f"until_ns = {until_ns} is past by {late_ns / 1e9:.3f} s of CLOCK_BOOTTIME: give a later time"
+                f"until_ns = {until_ns} is {late_ns / 1e9:.3f} s in the past of CLOCK_BOOTTIME: give a "
+                f"later time"
             )
         if until_ns > MOST_NS:
             raise ValueError(f"until_ns = {until_ns} is beyond {MOST_NS}: give ns of CLOCK_BOOTTIME")
@@ -154,7 +158,8 @@ class Mastership:
     def end(self) -> None:
         """End the mastership and disarm the kernel's timer; after this call no byte is written.
 
-        Bytes in the system's output buffers are discarded when the ports close: remove the lines first.
+        Bytes that wait in the system's output buffers may still leave. Closing the ports discards these
+        bytes, so remove the lines first.
         """
         if self._is_inherited:
             return

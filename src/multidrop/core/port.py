@@ -22,7 +22,7 @@ from multidrop.core.permissions import Mastership
 from multidrop.core.result import Status
 
 CHUNK_ROWS = 1 << 12
-WAKE_PERIOD_S = 2e-3  # sleep between two measured wake-ups
+WAKE_PERIOD_S = 2e-3  # s; duration of each sleep whose end is measured
 MOST_CHUNKS = 256  # when all chunks are full, the queue drops new rows and counts them
 
 
@@ -68,7 +68,7 @@ class RowQueue:
         return int(lib.md_row_queue_dropped(self.c))
 
     def call(self, number: int) -> None:
-        """Wake the waiting client, as if the port of this number needed attention."""
+        """Wake the waiting client as if the port with this number needed attention."""
         lib.md_row_queue_call(self.c, number)
 
     def await_calls(self, seconds: float) -> list[int]:
@@ -82,7 +82,7 @@ utc_minus_monotonic_ns = lib.md_utc_minus_monotonic_ns
 
 
 class Echo(StrEnum):
-    """Whether an adapter returns the bytes that it sends; with `AUTO` the core finds out."""
+    """Whether an adapter echoes the bytes that it sends; with `AUTO` the core detects that."""
 
     AUTO = "auto"
     ON = "on"
@@ -136,7 +136,6 @@ class Transactions(IntEnum):
 
 _ECHOES = {Echo.AUTO: lib.MD_ECHO_UNKNOWN, Echo.ON: lib.MD_ECHO, Echo.OFF: lib.MD_NO_ECHO}
 
-
 _SWITCHES = {
     RS485.OFF: lib.MD_RS485_OFF,
     RS485.KERNEL: lib.MD_RS485_KERNEL,
@@ -154,7 +153,7 @@ class _Engine:
 
     def forked(self) -> None:
         """Forget the thread in a forked child: the next port starts another one."""
-        self._starting = threading.Lock()  # several threads may open the first port
+        self._starting = threading.Lock()  # several threads may open a first port at the same time
         self._c: Any = None
         self._changing = threading.Lock()
         self._realtime: set[Realtime] = set()
@@ -176,7 +175,7 @@ class _Engine:
             was_wanted = bool(self._realtime)
             (self._realtime.add if wanted else self._realtime.discard)(client)
             if was_wanted == bool(self._realtime):
-                return  # a thread that has ended realtime by itself does not start it again
+                return  # a thread that has ended realtime scheduling by itself does not return to it
             failure = lib.md_engine_realtime(self.c, bool(self._realtime))
             if failure:
                 self._realtime.discard(client)
@@ -202,12 +201,12 @@ class Realtime:
         """Request realtime scheduling, or withdraw the request. Raises OSError if the system refuses."""
         if wanted != self.is_wanted:
             self.is_wanted = wanted
-            self.is_held = False  # before the thread returns to normal scheduling: see `has_ended`
+            self.is_held = False  # set before the thread returns to normal scheduling: see `has_ended`
             _engine.set_realtime(self, wanted)
             self.is_held = wanted
 
     def has_ended(self) -> bool:
-        """Return True, once, if the thread has returned to normal scheduling by itself."""
+        """Return True if the thread has returned to normal scheduling by itself; True only once."""
         has_ended = self.is_held and not _engine.is_realtime
         self.is_held &= not has_ended
         return has_ended
@@ -217,7 +216,7 @@ REALTIME_ENDED = "realtime has ended: the lines took more than half of a process
 
 
 def why_not_realtime(failure: OSError) -> str:
-    """Return why the system refused realtime scheduling, with what would permit it."""
+    """Return why the system refused realtime scheduling, and what would permit it."""
     if failure.errno == errno.ENOSYS:
         return "this system is neither Linux nor Windows"
     if sys.platform == "win32":
@@ -229,7 +228,7 @@ def why_not_realtime(failure: OSError) -> str:
 
 
 def wake_lateness(seconds: float, *, realtime: bool) -> list[float]:
-    """Sleep again and again for `seconds` s in all, as the core does; return how late each sleep ended, in s.
+    """Sleep repeatedly, as the core does, for `seconds` s in total; return how late each sleep ended, in s.
 
     Raises OSError if `realtime` scheduling is refused.
     """
@@ -255,7 +254,7 @@ class _PortMemory:
 
     @contextmanager
     def replacing(self, kind: str, new: object) -> Iterator[None]:
-        """Keep alive the new object of this kind, and within the block also the object that it replaces."""
+        """Keep the new object of this kind alive; in the `with` block, also the object that it replaces."""
         self._newest[kind] = (*self._newest.get(kind, ()), new)
         yield
         self._newest[kind] = (new,)
@@ -268,9 +267,9 @@ def _owner_of(port: Any, memory: _PortMemory) -> Any:
     """Return the owner of a port and of its memory.
 
     When the last reference to the owner is gone, the core's thread first releases the port. Then the memory
-    is freed: cffi calls its destructor before it drops the handle, and the garbage collector calls all
-    destructors before it frees memory, also at interpreter exit. No Python code runs in between, so no signal
-    can interrupt this.
+    is freed. That order is certain, also at interpreter exit: cffi calls its destructor before it drops the
+    handle, and the garbage collector calls all destructors before it frees memory. No Python code runs in
+    between, so no signal can interrupt this.
     """
     return ffi.gc(ffi.new_handle(memory), partial(lib.md_port_free, port))
 
@@ -286,9 +285,9 @@ def _stop(port: Any, memory: _PortMemory) -> None:
 class Port:
     """A descriptor on which the core's thread carries out exchanges (struct md_port).
 
-    `must_take` is the mask of REFUSALS that are failures; -1 means a port without settings. `room` is the
-    length of the queue, a power of two. `transactions` is NONE unless all exchanges are Modbus TCP. With a
-    `mastership`, requests are sent only before its deadline.
+    `must_take` is the mask (of REFUSALS) of the settings that the port must not refuse; -1 means a port
+    without settings. `room` is the length of the queue, a power of two. `transactions` is NONE unless all
+    exchanges are Modbus TCP. With a `mastership`, requests are sent only before its deadline.
 
     Raises OSError if the descriptor cannot be polled.
     """
@@ -307,10 +306,10 @@ class Port:
         self._is_inherited = False
         self.c = lib.md_port_open(_engine.c, fd, must_take, transactions, room)
         if self.c == ffi.NULL:
-            raise OSError(ffi.errno, "the port cannot be waited for")
+            raise OSError(ffi.errno, "the core cannot watch the port")
         self._owner = _owner_of(self.c, self._memory)
         self._abandoned = finalize(self, _stop, self.c, self._memory)
-        self._abandoned.atexit = False  # other exit handlers may use the port
+        self._abandoned.atexit = False  # not stopped at exit: other exit handlers may use the port
         if mastership is not None:
             lib.md_port_fence(self.c, mastership.c)
         # Python reads this struct directly: a call into the core would release the GIL and wait for it again.
@@ -383,11 +382,12 @@ class Port:
     def repeat(self, exchanges: Sequence[Exchange]) -> int:
         """Carry out these exchanges in turn whenever no queued exchange is due, until the next call.
 
-        Return the index of the exchange that was next in the previous round; 0 on a closed port.
+        Return the index of the exchange that the replaced round would have sent next; 0 on a closed port.
         """
         if self.c is None:
             return 0
-        self._memory.lasting.update(exchanges)  # an exchange may be in flight when a new round replaces it
+        # keep all exchanges alive: one may still be in flight after a new round has replaced it
+        self._memory.lasting.update(exchanges)
         rounds = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
         with self._memory.replacing("round", rounds):
             return int(lib.md_port_repeat(self.c, rounds, len(exchanges)))
@@ -401,7 +401,7 @@ class Port:
         """Queue exchanges, each with its earliest start in ns; return how many fitted into the queue."""
         todo = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
         times = ffi.new("int64_t[]", not_before_ns)
-        self._memory.lasting.update(exchange.peer for exchange in exchanges)  # a late reply may still come
+        self._memory.lasting.update(exchange.peer for exchange in exchanges)  # its late reply may still come
         free = exchanges[: self.room - self.pending]
         for at, exchange in enumerate(free, int(self._progress.submitted)):
             self._memory.queued[at & (self.room - 1)] = exchange
@@ -433,8 +433,13 @@ class Port:
         return bool(self._progress.stalled)
 
     @property
+    def miscounts(self) -> bool:
+        """True if the driver's count of unsent bytes is ignored: it stayed above 0 although replies came."""
+        return bool(self._progress.miscounts)
+
+    @property
     def called_off(self) -> bool:
-        """True if a command has ended whose bytes the driver may still hold: discard them."""
+        """True if the driver may still hold bytes of a command that has ended: they must be discarded."""
         return bool(self._progress.called_off)
 
     @property
@@ -464,7 +469,7 @@ class Port:
         Reuse the completion `into` if it has room for the values. The request is not sent after
         `expires_ns` (CLOCK_BOOTTIME; 0: no limit), nor after a stop that ends its permit.
         """
-        self._memory.lasting.add(exchange.peer)  # a late reply may still come
+        self._memory.lasting.add(exchange.peer)  # its late reply may still come
         found = into if into is not None and into.room == exchange.room else Completion(room=exchange.room)
         found.count = lib.md_port_carry_out(
             self.c, exchange.c, not_before_ns, expires_ns, found.c, found.values

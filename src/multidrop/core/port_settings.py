@@ -12,7 +12,7 @@ REFUSALS = {
     lib.MD_REFUSED_PARITY: "parity",
     lib.MD_REFUSED_STOPBITS: "stop bits",
 }
-NO_DIVISOR = int(lib.MD_REFUSED_DIVISOR)  # only a failure on UARTs that divide their clock by a whole number
+NO_DIVISOR = int(lib.MD_REFUSED_DIVISOR)  # a failure only on UARTs with a whole-number divisor
 
 
 class CharacterFormat(NamedTuple):
@@ -34,7 +34,10 @@ def is_pseudo_terminal(device: str) -> bool:
 
 
 def must_take(device: str) -> int:
-    """Return the mask of REFUSALS that are failures; a pseudo-terminal may refuse all but the baud rate."""
+    """Return the mask (of REFUSALS) of the settings that a device must not refuse.
+
+    A pseudo-terminal may refuse all settings except the baud rate.
+    """
     return int(lib.MD_REFUSED_BAUDRATE) if is_pseudo_terminal(device) else sum(REFUSALS)
 
 
@@ -44,14 +47,14 @@ def refused_names(mask: int) -> str:
 
 
 def possible_rates(fd: int, baudrate: int) -> tuple[int, int, int]:
-    """Return the baud rate at which a UART would run instead of this one, and its nearest possible ones."""
+    """Return the rate at which a UART would run instead of `baudrate`, and its nearest possible rates."""
     base = int(lib.md_port_baud_base(fd))
     divisor = (base + baudrate // 2) // baudrate
     return base // divisor, base // -(-base // baudrate), base // (base // baudrate)
 
 
 def close_descriptor(fd: int, seconds: float) -> None:
-    """Close a port's descriptor; its driver's unsent bytes may leave for this time, then are discarded."""
+    """Close a port's descriptor. Its driver may still send for this time; then unsent bytes are discarded."""
     lib.md_port_close(fd, round(seconds * 1e9))
 
 
@@ -65,7 +68,7 @@ def get_settings(fd: int) -> tuple[int, str]:
 
 
 def set_settings(fd: int, baudrate: int, format: str) -> int:
-    """Put a port in raw mode with these settings; return the mask of REFUSALS, the settings it did not take.
+    """Put a port in raw mode with these settings; return the mask (of REFUSALS) of the refused settings.
 
     Raises OSError if the port has no settings.
     """

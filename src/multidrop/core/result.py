@@ -35,6 +35,7 @@ class Failure(IntEnum):
     NOT_MASTER = lib.MD_NOT_MASTER
     OTHER_MASTER = lib.MD_OTHER_MASTER
     POLLING_FAILED = lib.MD_POLLING_FAILED
+    STALLED = lib.MD_STALLED
 
 
 class Status(IntEnum):
@@ -62,6 +63,7 @@ class Status(IntEnum):
     NOT_MASTER = -Failure.NOT_MASTER
     OTHER_MASTER = -Failure.OTHER_MASTER
     POLLING_FAILED = -Failure.POLLING_FAILED
+    STALLED = -Failure.STALLED
 
     def __str__(self) -> str:
         return STATUSES[self]
@@ -90,9 +92,10 @@ _WORDS: dict[int, str] = {
     Status.NOT_MASTER: "not sent: not master",
     Status.OTHER_MASTER: "not sent: another master",
     Status.POLLING_FAILED: "not asked: polling failed",
+    Status.STALLED: "not sent: port stalled",
 }
 
-UNASKED = "not "  # the texts of statuses without a request start with this
+UNASKED = "not "  # start of the texts of statuses for values that were not requested
 EXCEPTION_STATUS: int = lib.MD_EXCEPTION  # status of an exception, to which its code is added
 
 STATUSES = (

@@ -1,4 +1,4 @@
-"""Run work so that no signal interrupts it: a handler's exception ends the main thread's wait, not the work.
+"""Run work that no signal interrupts: an exception from a signal handler ends only the wait for the work.
 
 Python raises KeyboardInterrupt and other exceptions of signal handlers between any two bytecodes of the main
 thread, even in `finally` and `__exit__`. Therefore separate threads open and close ports and lines.
@@ -14,7 +14,7 @@ from functools import partial, wraps
 from queue import Empty, SimpleQueue
 from typing import Any, ParamSpec, TypeVar
 
-HANDLING_S = 0.05  # longest delay in s of a signal that the kernel gave to another thread
+HANDLING_S = 0.05  # s; longest delay in handling a signal that the kernel gave to another thread
 
 P = ParamSpec("P")
 R = TypeVar("R")
