@@ -62,8 +62,8 @@ def test_a_suspended_master_sends_nothing_after_it_resumes() -> None:
 @pytest.mark.long
 @pytest.mark.slow
 def test_a_master_without_the_deadline_check_does_send() -> None:
-    """So the tests above can fail. This master's deadline is later than the other master assumes."""
+    """This shows that the tests above can fail. The master's deadline is later than its successor assumes."""
     with fence(beyond=1000) as made:
         found = rounds(made, 4)
-    assert any(each.stale > 0 for each in found)  # on a busy computer it may not resume in time
+    assert any(each.stale > 0 for each in found)  # on a busy computer, some masters resume too late to send
     assert not any(each.is_killed for each in found)

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 from lines import PATIENCE, line, plant, polled, rows_of, until
+from motors import LINES, of_one_variant
 from stories import PathWire, bus_over, constant, read_truly
 from tables import table
 from toy import Toy
-from variants import LINES, of_one_variant
 
 from multidrop import Bus, NoReply, Poller
 from multidrop.core import build_request
@@ -34,7 +34,7 @@ class Successor(Quick):
 
 
 class HoldingWire(Wire):
-    """A line that, once `holds` is set, keeps back the next reply until the reply after it."""
+    """A line that, once `holds` is set, sends the next reply only together with the reply after it."""
 
     holds = False
     _kept = b""
@@ -78,7 +78,7 @@ def test_a_late_reply_on_a_reopened_port_is_not_read_as_another_register(
     wire: HoldingWire, family: type[Toy], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     leave_a_reply_behind(wire, wire.path)
-    monkeypatch.setattr(Quick, "response_timeout", PATIENCE)  # else busy computers' replies are late
+    monkeypatch.setattr(Quick, "response_timeout", PATIENCE)  # otherwise replies are late on a busy computer
     with Bus(wire.path) as bus:
         pump = bus.attach(family, 1)
         assert bus.peer(pump).owes
@@ -115,7 +115,7 @@ def test_a_later_pseudo_terminal_of_the_same_number_has_another_identity() -> No
             os.close(ours)
 
     first = made()
-    until(lambda: made() != first)  # the creation times must differ by some ms
+    until(lambda: made() != first)  # until the creation times differ, by some ms
 
 
 def test_a_peer_without_late_replies_is_not_remembered(wire: HoldingWire) -> None:
@@ -125,7 +125,7 @@ def test_a_peer_without_late_replies_is_not_remembered(wire: HoldingWire) -> Non
     assert peers._former == before
 
 
-def test_a_remembered_peer_is_forgotten_after_the_same_time_as_in_the_core(
+def test_a_peer_is_remembered_exactly_as_long_as_the_core_expects_late_replies(
     wire: HoldingWire, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     leave_a_reply_behind(wire, wire.path)
@@ -142,7 +142,6 @@ def test_a_remembered_peer_is_forgotten_after_the_same_time_as_in_the_core(
 
 
 BEGIN = 1000.0  # s; time at which the clock of these lines starts
-
 
 DELAY = 0.1  # s; delay of the network between line and drive
 

@@ -6,14 +6,15 @@ import os
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 from kills import descriptors, threads
 from lines import PATIENCE, line, plant, polled, rows_of, until
+from ptys import SerialServer, pyserials_own, vanishing_pty
 from serial import Serial
-from serial_server import SerialServer, pyserials_own, vanishing_pty
 from tables import table
 from toy import PatientToy, Toy
 
@@ -51,17 +52,19 @@ def test_a_drive_is_read_and_written_through_a_socket_port() -> None:
     assert sim.wires[0].drives[0]["frequency"] == 25.0
 
 
-@pytest.mark.parametrize(
-    ("family", "baudrate"),
-    [(family, baudrate) for family in MODELS.values() for baudrate in family.baudrates],
-)
-def test_every_documented_baud_rate_can_be_read(family: type[Drive], baudrate: int) -> None:
-    """A drive may have a register with its baud rate's code, whose known value then serves as a proof."""
-    drive = simulated(family(1, baudrate=baudrate))
-    with Simulator([Wire([drive], unpaced=True)]) as sim, Bus(sim.wires[0].path) as bus:
-        attached = bus.attach(family, 1, baudrate=baudrate)
-        first = next(iter(attached.readings()))
-        assert attached.read(first) == drive[first.name]
+def read_at_every_baud_rate(family: type[Drive]) -> None:
+    drives = [simulated(family(at, baudrate=baudrate)) for at, baudrate in enumerate(family.baudrates, 1)]
+    with Simulator([Wire(drives, unpaced=True)]) as sim, Bus(sim.wires[0].path) as bus:
+        for drive, baudrate in zip(drives, family.baudrates, strict=True):
+            attached = bus.attach(family, drive.drive.address, baudrate=baudrate)
+            first = next(iter(attached.readings()))
+            assert attached.read(first) == drive[first.name]
+
+
+def test_every_documented_baud_rate_can_be_read() -> None:
+    """The baud rate's code is a known value, so no late reply is mistaken for the reply to its read."""
+    with ThreadPoolExecutor(len(MODELS)) as pool:
+        list(pool.map(read_at_every_baud_rate, MODELS.values()))
 
 
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
@@ -91,9 +94,7 @@ def test_the_echo_option_is_kept_when_the_port_is_reopened(
         assert told == [Echo(echo)] * 2
 
 
-def test_a_port_waits_and_discards_bytes_after_each_opening(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_port_waits_and_discards_bytes_after_each_opening(monkeypatch: pytest.MonkeyPatch) -> None:
     """Some gateways restart when their port is opened: they print text, and ignore requests for a while."""
     slept: list[float] = []
     with socket.create_server(("127.0.0.1", 0)) as listener:
@@ -114,8 +115,8 @@ def test_a_port_waits_and_discards_bytes_after_each_opening(
             connection.close()
 
 
-@pytest.mark.parametrize("settle", [-1, 10.1, float("nan"), "1.5 s", True])
-def test_a_settle_that_is_not_a_number_of_seconds_raises(settle: object) -> None:
+@table("settle", [-1, 10.1, float("nan"), "1.5 s", True])
+def test_a_settle_option_that_is_not_a_number_of_seconds_raises(settle: object) -> None:
     with pytest.raises(ValueError, match="is not a number of seconds from 0 to 10"):
         Bus("/dev/nowhere", settle=settle)  # type: ignore[arg-type]
 
@@ -152,7 +153,7 @@ def test_a_port_is_set_to_low_latency_mode(monkeypatch: pytest.MonkeyPatch) -> N
     assert told == [True, True]
 
 
-@pytest.mark.parametrize("refusal", [ValueError, OSError, NotImplementedError, AttributeError])
+@table("refusal", [ValueError, OSError, NotImplementedError, AttributeError])
 def test_a_port_without_low_latency_mode_is_opened(
     monkeypatch: pytest.MonkeyPatch, refusal: type[Exception]
 ) -> None:
@@ -195,7 +196,7 @@ def test_an_rfc2217_port_is_polled(server: SerialServer) -> None:
 @pyserials_own
 def test_drives_with_different_settings_on_an_rfc2217_port_raise(server: SerialServer) -> None:
     slow, fast = Toy(1, baudrate=9600), Toy(2, baudrate=19200)
-    with pytest.raises(LineError, match=r"cannot change its settings from drive to drive$"):
+    with pytest.raises(LineError, match=r"cannot switch its settings between two drives$"):
         Poller(plant(line(server.url, polled(slow, [Toy.status]), polled(fast, [Toy.status]))))
 
 
@@ -230,7 +231,7 @@ def os_words_of_an_unknown_zone() -> str:
         ("spy://{tmp}/absent", "there is no such port"),
     ],
 )
-def test_opening_an_invalid_port_raises_one_sentence(tmp_path: Path, port: str, reason: str) -> None:
+def test_opening_an_invalid_port_raises_a_one_sentence_error(tmp_path: Path, port: str, reason: str) -> None:
     (tmp_path / "file").write_text("no port")
     with socket.create_server(("127.0.0.1", 0)) as listener:
         closed = listener.getsockname()[1]
@@ -258,7 +259,7 @@ def test_a_port_that_is_open_cannot_be_opened_by_another_bus() -> None:
 
 def test_closed_and_unopened_ports_leave_no_descriptors_or_threads(tmp_path: Path) -> None:
     with Simulator([wire(), wire("socket://127.0.0.1:0")]) as sim:
-        Line(sim.wires[0].path).open().close()  # opens the descriptors that are opened only once
+        Line(sim.wires[0].path).open().close()  # opens the descriptors that the process keeps
         before = descriptors(), threads()
         for each in sim.wires:
             for _ in range(3):
@@ -286,7 +287,7 @@ def vanishing_socket() -> tuple[str, Callable[[], None]]:
 
 
 @pytest.mark.slow
-def test_on_a_flooded_port_a_read_raises_no_reply() -> None:
+def test_on_a_flooded_port_a_read_raises_the_error_no_reply() -> None:
     master, slave = os.openpty()
     with Bus(os.ttyname(slave)) as bus:
         toy = bus.attach(Toy(1))
@@ -308,7 +309,7 @@ def test_a_port_lost_during_a_read_raises_line_error(
     thread.start()
     with Bus(path) as bus:
         toy = bus.attach(PatientToy, 1)
-        for _ in range(2):  # the second time, the port is still lost
+        for _ in range(2):  # at the second read, the port is still lost
             with pytest.raises(LineError) as caught:
                 toy.read(toy.output_current)
             assert str(caught.value).startswith(f"{path}: the port was lost (")
@@ -336,12 +337,12 @@ def test_a_port_lost_during_a_write_raises_unconfirmed(
             toy.send_raw(6, 0x15, bytes(2))
 
 
-def test_a_port_is_reopened_by_the_device_link(tmp_path: Path) -> None:
+def test_a_port_is_reopened_through_its_device_link(tmp_path: Path) -> None:
     link = tmp_path / "by-id"
     with Simulator([wire(str(link))]), Bus(str(link)) as bus:
         read_and_write(bus)
         first = link.readlink()
-        held = os.open(link, os.O_RDONLY | os.O_NOCTTY)  # so that the system does not reuse its number
+        held = os.open(link, os.O_RDONLY | os.O_NOCTTY)  # keeps the pty's number in use
     with Simulator([wire(str(link))]):
         assert link.readlink() != first
         bus.line.reopen()
@@ -380,7 +381,7 @@ def test_a_bridged_port_keeps_its_settings_when_it_is_reopened() -> None:
             assert toy.read(toy.output_current) == 0
 
 
-def test_a_bridged_port_that_cannot_be_set_up_raises_one_sentence() -> None:
+def test_a_bridged_port_that_cannot_be_set_up_raises_a_one_sentence_error() -> None:
     master, slave = os.openpty()
     port = f"spy://{os.ttyname(slave)}"
     with Bus(port) as bus:
@@ -401,7 +402,7 @@ def test_a_port_is_not_freed_while_another_thread_ends_its_exchanges(monkeypatch
     def end_slowly(port: Port) -> bool:
         closing.append(threading.Thread(target=ours.close))
         closing[0].start()
-        closing[0].join(0.2)  # without the lock it would have ended by then
+        closing[0].join(0.2)  # without the lock, closing would have ended by then
         assert port.c is not None
         return end(port)
 

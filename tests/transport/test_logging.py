@@ -131,9 +131,7 @@ class Hanging(logging.Handler):
         self.released.wait(PATIENCE)
 
 
-def test_a_stop_is_repeated_although_a_log_handler_hangs(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_stop_is_repeated_although_a_log_handler_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1))
     handler, logger = Hanging(), logging.getLogger("multidrop.control")
     line.answers = lambda request: b"" if len(line.frames) < 6 else None

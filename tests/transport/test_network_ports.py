@@ -73,19 +73,14 @@ def test_escaped_telnet_data_are_restored(data: bytes, cuts: list[int]) -> None:
     st.lists(st.sampled_from([IAC, SB, SE, rfc2217.DO, rfc2217.WONT, b"\xf1", b"a", b"\x2c"]), max_size=40),
     st.lists(st.integers(0, 1000), max_size=20),
 )
-def test_a_telnet_stream_is_split_alike_in_any_pieces(stream: list[bytes], cuts: list[int]) -> None:
+def test_a_telnet_stream_is_split_the_same_whatever_its_pieces(stream: list[bytes], cuts: list[int]) -> None:
     whole = b"".join(stream)
     assert split(pieces(whole, cuts)) == split([whole])
 
 
 def test_a_telnet_stream_is_split_into_data_and_commands() -> None:
     stream = b"ab" + IAC + rfc2217.DO + b"\x2c" + IAC + SB + b"\x2c\x65" + IAC + IAC + IAC + SE + b"c"
-    assert split([stream]) == [
-        (b"", b"ab"),
-        (rfc2217.DO, b"\x2c"),
-        (SB, b"\x2c\x65\xff"),
-        (b"", b"c"),
-    ]
+    assert split([stream]) == [(b"", b"ab"), (rfc2217.DO, b"\x2c"), (SB, b"\x2c\x65\xff"), (b"", b"c")]
 
 
 def test_an_endless_telnet_suboption_does_not_fill_the_memory() -> None:
@@ -221,9 +216,7 @@ def test_a_bridge_forwards_requests_without_socket_timestamps(monkeypatch: pytes
     bridge.close()
 
 
-def test_a_bridge_without_threads_raises_os_error(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_bridge_without_threads_raises_os_error(monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[threading.Thread] = []
     start = threading.Thread.start
 
@@ -277,7 +270,7 @@ def test_a_write_to_a_full_network_fails_immediately() -> None:
         while True:
             port.write(bytes(1024))
 
-    with pytest.raises(SerialException, match=r"the connection failed|accepts no more bytes"):
+    with pytest.raises(SerialException, match=r"the connection failed|accepts only a part of the bytes"):
         fill()
     port.is_open = False
     near.close()
@@ -383,11 +376,11 @@ def far_network(request: pytest.FixtureRequest) -> Iterator[FarNetwork]:
         network.close()
 
 
-START = "010600140001"  # write 1, which starts it, to the control register of drive 1
+START = "010600140001"  # writes 1 to the control register of drive 1: its motor starts
 
 
 def start_into_the_cut(bus: Bus, toy: Toy, network: FarNetwork) -> None:
-    """Send a START that expires. It is sent at all because no reply to earlier requests is due."""
+    """Send a START that expires. The start is not held back, because no late reply is due."""
     toy.send_raw(6, 0x14, bytes([0, 2]))
     network.cut()
     with pytest.raises(Unconfirmed):
@@ -412,7 +405,7 @@ def test_a_start_into_a_cut_network_never_arrives_on_an_open_port(far_network: F
     with Bus(far_network.url, echo="off", expiry=PATIENCE) as bus:
         start_into_the_cut(bus, bus.attach(Toy, 1), far_network)
         far_network.join()
-        until(lambda: not waits_to_arrive(far_network.port))  # the data arrived, or the kernel gave it up
+        until(lambda: not waits_to_arrive(far_network.port))  # the data arrived, or the kernel dropped it
     taken = far_network.all_received()
     assert "010600140002" in taken
     assert START not in taken
@@ -424,7 +417,7 @@ def test_a_stalled_network_is_cut_before_a_write_times_out() -> None:
 
 
 def test_every_connection_limits_unacknowledged_data() -> None:
-    """This needs no network to cut: it reads the socket options."""
+    """The test only reads the socket options, so it needs no network that it can cut."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         near = socket.create_connection(listener.getsockname())
         far, _ = listener.accept()

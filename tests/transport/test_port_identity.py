@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pty
 import time
@@ -9,17 +10,23 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from lines import line, plant, polled, rows_of, until
+from serial import Serial
 from tables import table
+from toy import Toy
 
 from multidrop import Poller
-from multidrop.errors import LineError, PortLost
+from multidrop.bus import Bus
+from multidrop.core import NO_DIVISOR, RS485, Failure, Port, TransactionIds, port_settings
+from multidrop.errors import LineError, NoReply, PortLost
 from multidrop.families import InnovertIBD
-from multidrop.sim import EncodedDrive, Simulator, Wire
-from multidrop.transport import open_port, port_identity
+from multidrop.sim import EncodedDrive, Simulator, Wire, simulated
+from multidrop.transport import clock, open_port, port_identity
 from multidrop.transport.line import Line
+from multidrop.transport.open_port import CLOSING_S, STALLED, OpenPort, failing_refusals, why_lost
 from multidrop.transport.port_identity import USBAdapter, adapter_of, lasting_name
 
 USB = "devices/pci0000:00/0000:00:14.0/usb1"
@@ -124,13 +131,13 @@ def test_a_port_is_reopened_only_with_the_same_adapter(
 @table(
     ("before", "now", "others", "is_found"),
     [
-        (("1-1", "A1"), ("1-1", "A1"), [], True),  # same adapter, renamed ttyUSB1 after a sleep
+        (("1-1", "A1"), ("1-1", "A1"), [], True),  # the same adapter, renamed to ttyUSB1 after a sleep
         (("1-1", "A1"), ("1-1", "A1"), [("1-2", "A1")], True),  # its twin has the same serial number
         (("1-1", "A1"), ("1-2", "A1"), [], False),  # in another USB socket, it may be a twin
         (("1-1", "A1"), ("1-2", "A1"), [("1-1", "B2")], False),
         (("1-1", ""), ("1-1", ""), [("1-2", "")], True),
         (("1-1", ""), ("1-2", ""), [], False),
-        (("1-1", "A1"), ("1-2", "A1"), [("1-3", "A1")], False),  # copies with the same serial number
+        (("1-1", "A1"), ("1-2", "A1"), [("1-3", "A1")], False),  # one of two twins, in another socket
     ],
 )
 def test_an_adapter_is_followed_to_its_new_name(
@@ -238,7 +245,7 @@ def test_a_port_named_by_its_usb_socket_opens_with_any_adapter(
 
 
 @pytest.mark.slow
-def test_another_line_is_not_polled_and_a_stop_is_not_sent_to_its_drive(
+def test_a_port_that_leads_to_another_line_is_not_polled_and_gets_no_stop(
     tmp_path: Path, sysfs: Sysfs, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The other line's drive would report a standstill while the intended motor keeps running."""
@@ -264,3 +271,179 @@ def test_another_line_is_not_polled_and_a_stop_is_not_sent_to_its_drive(
         with sysfs.plugged_in(link, "1-3", "A1"):
             until(lambda: seen("ok"))
     assert caplog.text.count("not opened again: another adapter") == 1
+
+
+# ---- lost ports: the reported reason, a stalled adapter, baud rates that a UART cannot have ----
+
+
+@table(
+    ("port", "error", "why"),
+    [
+        ("/dev/null", 0, "hung up"),
+        ("/dev/null", errno.EIO, os.strerror(errno.EIO)),
+        ("/dev/ttyUSB999", 0, "unplugged"),
+        ("/dev/ttyUSB999", errno.EIO, "unplugged"),
+        ("/dev/ttyUSB999", errno.ETIMEDOUT, STALLED),
+        ("/dev/pts/99999", 0, "hung up"),
+        ("socket://10.0.0.7:4001", 0, "hung up"),
+        ("socket://10.0.0.7:4001", errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT)),
+    ],
+)
+def test_why_lost_distinguishes_unplugged_stalled_and_hung_up(port: str, error: int, why: str) -> None:
+    assert why_lost(port, error) == why
+
+
+@pytest.fixture
+def terminal() -> Iterator[str]:
+    ends = pty.openpty()
+    yield os.ttyname(ends[1])
+    for end in ends:
+        os.close(end)
+
+
+@pytest.mark.parametrize("must_discard", [False, True])
+def test_closing_a_stalled_port_takes_bounded_time_and_discards_a_command(
+    must_discard: bool, terminal: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    closed: list[float] = []
+
+    def close(fd: int, seconds: float) -> None:
+        closed.append(seconds)
+        os.close(fd)
+
+    monkeypatch.setattr(open_port, "close_descriptor", close)
+    monkeypatch.setattr(clock, "sleep", lambda seconds: None)
+    found = Line(terminal).open()
+    monkeypatch.setattr(Serial, "out_waiting", 8)
+    found._opened.must_discard = must_discard
+    found.close()
+    assert closed == [0.0 if must_discard else CLOSING_S]
+    assert ("waiting 0.75 s for its adapter" in caplog.text) != must_discard
+
+
+def test_a_lost_port_states_why_before_it_is_reopened(terminal: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = Line(terminal).open()
+    core = SimpleNamespace(lost=True, lost_error=0, called_off=True, is_stalled=False, stop=lambda: None)
+    found.queue = core  # type: ignore[assignment]
+    found.drop()
+    assert found.why_lost == f"{terminal}: the port was lost (hung up)"
+    assert found._opened.must_discard
+    found.close()
+
+
+def test_reads_reopen_a_port_that_was_closed_to_discard_a_command() -> None:
+    with Simulator([Wire([simulated(Toy(1))])]) as sim, Bus(sim.wires[0].path) as bus:
+        toy = bus.attach(Toy, 1)
+        assert bus.line.queue
+        bus.line._discard(bus.line.queue)
+        assert bus.line.queue is None
+        assert toy.read(toy.output_current) is not None
+
+
+@table(
+    ("sent_ns", "said"),
+    [
+        (0, f"nothing was sent: the port took no bytes until the time-out ({STALLED})"),
+        (1, f"the request was sent only in part: the port took no bytes until the time-out ({STALLED})"),
+    ],
+)
+def test_a_command_that_was_held_back_is_not_logged_as_a_lost_port(
+    sent_ns: int, said: str, terminal: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    found = Line(terminal).open()
+    held = SimpleNamespace(
+        count=-1, result=Failure.LINE_LOST, error=errno.ETIMEDOUT, sent_ns=sent_ns, raw=b""
+    )
+    monkeypatch.setattr(Port, "carry_out", lambda *given: held)
+    with pytest.raises(PortLost) as failure:
+        found.carry_out(SimpleNamespace())  # type: ignore[arg-type]
+    assert failure.value.reason == said
+    assert not found.is_lost
+    found.close()
+    assert "lost" not in caplog.text
+
+
+def test_ctrl_c_does_not_leave_a_called_off_command_in_the_driver(
+    terminal: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = Line(terminal).open()
+
+    def interrupted(*given: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Port, "called_off", True)
+    monkeypatch.setattr(Port, "carry_out", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        found.carry_out(SimpleNamespace())  # type: ignore[arg-type]
+    assert found.queue is None  # the port is closed
+    found.close()
+
+
+def test_a_driver_that_counts_its_bytes_wrong_is_logged_once(
+    terminal: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(Port, "miscounts", True)
+    found = Line(terminal).open()
+    found.note_news()
+    found.note_news()
+    found.close()
+    assert caplog.text.count("its driver counts unsent bytes although replies came") == 1
+
+
+def test_the_error_for_a_silent_drive_behind_a_stalled_adapter_names_the_stall(
+    terminal: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Line, "is_stalled", True)
+    with Bus(terminal) as bus:
+        toy = bus.attach(Toy, 1)
+        with pytest.raises(NoReply, match=f"but the port is {STALLED}"):
+            toy.read(toy.output_current)
+
+
+def test_a_read_that_is_not_sent_because_of_a_stall_does_not_lose_the_port(
+    terminal: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held = SimpleNamespace(count=-1, result=Failure.STALLED, error=errno.ETIMEDOUT, raw=b"", reply=None)
+    with Bus(terminal) as bus:
+        toy = bus.attach(Toy, 1)
+        monkeypatch.setattr(Port, "carry_out", lambda *given: held)
+        with pytest.raises(NoReply, match=f"but the port is {STALLED}"):
+            toy.read(toy.output_current)
+        assert not bus.line.is_lost
+
+
+# ---- baud rates ----
+
+
+@table(
+    ("baudrate", "sentence"),
+    [
+        (76800, "its UART would run at 57600; the nearest possible baud rates are 57600 and 115200"),
+        (12345, "its UART would run at 12800; the nearest possible baud rates are 11520 and 12800"),
+        (38400, "its driver replaces 38400 baud by a custom divisor: setserial /dev/ttyS1 spd_normal"),
+    ],
+)
+def test_an_impossible_baud_rate_is_refused_and_the_error_names_the_nearest_rates(
+    baudrate: int, sentence: str
+) -> None:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(port_settings, "lib", SimpleNamespace(md_port_baud_base=lambda fd: 115200))
+        found = OpenPort("/dev/ttyS1", TransactionIds.MATCH, RS485.OFF, None)
+        found._serial = SimpleNamespace(fileno=lambda: 0)  # type: ignore[assignment]
+        assert found.refusal(NO_DIVISOR, baudrate).endswith(sentence)
+
+
+@pytest.mark.parametrize(
+    ("driver", "is_checked"),
+    [("serial8250", True), ("serial", True), ("dw-apb-uart", False), ("ftdi_sio", False)],
+)
+def test_only_uarts_with_whole_divisors_are_checked(
+    driver: str, is_checked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for folder in ("tty/ttyS1", "drivers", "devices/card"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "drivers" / driver).mkdir()
+    (tmp_path / "devices" / "card" / "driver").symlink_to(tmp_path / "drivers" / driver)
+    (tmp_path / "tty/ttyS1/device").symlink_to(tmp_path / "devices/card")
+    monkeypatch.setattr(port_identity, "TTYS", tmp_path / "tty")
+    assert bool(failing_refusals("/dev/ttyS1") & NO_DIVISOR) == is_checked

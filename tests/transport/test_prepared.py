@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from enum import IntEnum
 from fractions import Fraction
 from itertools import permutations
+from pathlib import Path
 from threading import Barrier
 from typing import Any
 
+import checksums
 import pytest
-from completions import completed
+from batches import completed
 from hypothesis import example, given
 from hypothesis import strategies as st
-from toy import PatientToy, Toy
+from lines import line, plant, polled, proofs, rows_of, until
+from simulated_bus import SimulatedBus, one
+from toy import PatientToy, Picky, Toy, expected_values, family
 
 from multidrop.bus import Bus
-from multidrop.core import Completion, Exchange, Message, NumberFormat
+from multidrop.control.audit_log import read_audit
+from multidrop.core import Completion, Exchange, Failure, Message, NumberFormat
 from multidrop.drive import Drive
 from multidrop.drive.line_settings import Settings
 from multidrop.drive.register import HOLDING, reading
-from multidrop.errors import NoReply
+from multidrop.errors import BadReply, DriveException, Expired, NoReply, NotAttached
+from multidrop.families import DelixiModbus, DelixiNative, InnovertIBD
 from multidrop.planning.blocks import Block
 from multidrop.planning.bus_time import silence
-from multidrop.sim import SimulatedDrive, Simulator, Wire
+from multidrop.poller import Poller
+from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, proof
 from multidrop.transport import prepared as prepared_reads
 from multidrop.transport.prepared import BlockDecoder, decoder_of
 
@@ -33,7 +43,7 @@ WANTED = (Toy.output_frequency, Toy.mystery, Toy.acceleration_time)
 
 
 class Counted:
-    """Counts how often blocks are planned, and the exchanges."""
+    """Counts the plans of blocks, and the exchanges."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.plans = self.made = 0
@@ -238,7 +248,7 @@ def expected(data: bytes) -> dict[str, Any]:
         "flow_power": power_of_ten,
         "nibble": part >> 4 & 0xF,
         "decimal": int(f"{digits:x}") if f"{digits:x}".isdecimal() else None,
-        "fine": fine * 123456789 / 10,  # before the division, too many digits for a float
+        "fine": fine * 123456789 / 10,  # before the division, the number has too many digits for a float
     }
 
 
@@ -255,7 +265,7 @@ def decoder() -> BlockDecoder:
 def test_each_value_is_decoded_from_its_bytes(data: bytes) -> None:
     found = decoder().decode(reply(data))
     assert found == expected(data)
-    assert type(found["pulses"]) is int  # too many digits for a float
+    assert type(found["pulses"]) is int  # the number has too many digits for a float
 
 
 @example(bytes(2 * WORDS - 1))
@@ -274,3 +284,281 @@ def test_the_core_decodes_floats() -> None:
 def test_drives_of_a_model_share_a_decoder_and_other_blocks_do_not() -> None:
     assert decoder_of(Block.of(Mixed(2), REGISTERS)) is decoder()
     assert decoder_of(Block.of(Mixed(2), REGISTERS[1:])) is not decoder()
+
+
+# ---- if a drive refuses or ignores a read as a whole, `Bus` splits it, without losing a register ----
+
+
+WIDE = 24
+
+
+def picky(monkeypatch: pytest.MonkeyPatch, **faults: Any) -> tuple[Drive, Picky, SimulatedBus]:
+    """Return a drive on a bus with registers 0 to WIDE - 1, its simulation with these faults, and the bus."""
+    drive = family(WIDE)(1, name="pump-1")
+    sim = Picky(drive, **faults)
+    bus = SimulatedBus(monkeypatch, sim)
+    bus.attach(drive)
+    return drive, sim, bus
+
+
+def test_a_refused_block_is_read_in_parts_until_the_port_is_reopened(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive, sim, bus = picky(monkeypatch, most=8)
+    first = drive.read_many(drive.registers.values())
+    assert first == expected_values(range(WIDE))
+    assert [count for _, count in sim.asked] == [24, 12, 6, 6, 12, 6, 6]
+    sim.asked.clear()
+    assert drive.read_many(drive.registers.values()) == first
+    assert [count for _, count in sim.asked] == [6] * 4
+    bus.queue = object()  # a new queue, as after the port was reopened
+    sim.asked.clear()
+    assert drive.read_many(drive.registers.values()) == first
+    assert sim.asked[0] == (0, WIDE)
+
+
+def test_the_error_for_a_refused_block_names_the_refused_register(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive, sim, _ = picky(monkeypatch, refused={3})
+    with pytest.raises(DriveException, match=r"^pump-1 refuses r3: ") as caught:
+        drive.read_many(drive.registers.values())
+    assert caught.value.register == "r3"
+    assert sim.asked[-1] == (3, 1)
+    assert len(sim.asked) <= 11
+    sim.asked.clear()
+    with pytest.raises(DriveException, match=r"^pump-1 refuses r3: "):
+        drive.read_many(drive.registers.values())
+    assert sim.asked == [(3, 1)]  # only the refused register is requested again
+    sim.missing.clear()
+    assert drive.read_many(drive.registers.values()) == expected_values(range(WIDE))
+    others = [register for register in drive.registers.values() if register.address != 3]
+    assert drive.read_many(others) == expected_values(set(range(WIDE)) - {3})
+
+
+@given(st.sets(st.integers(0, 5), max_size=2), st.integers(1, 6), st.sets(st.integers(0, 5), min_size=1))
+def test_a_read_is_complete_or_names_the_refused_register(
+    refused: set[int], most: int, asked: set[int]
+) -> None:
+    drive = family(6)(1, name="pump-1")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        bus = SimulatedBus(monkeypatch, Picky(drive, refused, most)).bus
+        bus.attach(drive)
+        registers = [drive.register(f"r{at}") for at in sorted(asked)]
+        for _ in range(2):  # at the second read, the parts are already known
+            if not refused & asked:
+                assert drive.read_many(registers) == expected_values(asked)
+                continue
+            with pytest.raises(DriveException) as caught:
+                drive.read_many(registers)
+            assert caught.value.register in {f"r{at}" for at in refused & asked}
+
+
+@pytest.mark.parametrize("code", [1, 5, 6])
+def test_a_block_refused_as_busy_is_not_split(code: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    drive, sim, _ = picky(monkeypatch)
+    sim.limit = 0
+    monkeypatch.setattr(sim, "_code", lambda reason: code)
+    with pytest.raises(DriveException):
+        drive.read_many(drive.registers.values())
+    assert sim.asked == [(0, WIDE)]
+
+
+def test_the_error_for_several_refused_registers_names_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    scaled = {"flow": reading(2, scale_register="power"), "power": reading(3, number_format=NumberFormat.I16)}
+    drive = family(2, **scaled)(1, name="pump-1")
+    bus = SimulatedBus(monkeypatch, sim := Picky(drive))
+    bus.attach(drive)
+    sim.limit = 0
+    monkeypatch.setattr(sim, "_code", lambda reason: 6)
+    with pytest.raises(DriveException, match=r"^pump-1 refuses: ") as caught:
+        drive.read(drive.register("r1"), drive.register("flow"))
+    assert caught.value.register is None
+
+
+def test_a_long_request_without_a_reply_is_split(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive, sim, _ = picky(monkeypatch, silent_beyond=8)
+    assert drive.read_many(drive.registers.values()) == expected_values(range(WIDE))
+    sim.asked.clear()
+    assert drive.read_many(drive.registers.values()) == expected_values(range(WIDE))
+    assert [count for _, count in sim.asked] == [6] * 4
+
+
+def test_a_dead_drive_gets_only_one_additional_request(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive, sim, _ = picky(monkeypatch, silent_beyond=0)
+    with pytest.raises(NoReply):
+        drive.read_many(drive.registers.values())
+    assert sim.asked == [(0, WIDE)] * 3 + [(0, 1)]
+    sim.silent_beyond = 125
+    assert drive.read_many(drive.registers.values()) == expected_values(range(WIDE))
+    sim.asked.clear()
+    sim.silent_beyond = 1  # the silence may be noise, because the drive has answered the whole block
+    with pytest.raises(NoReply):
+        drive.read_many(drive.registers.values())
+    assert sim.asked == [(0, WIDE)] * 3
+
+
+@pytest.mark.parametrize("silent", [{1}, {1, 2}, {0, 2}])
+def test_bytes_received_for_one_attempt_are_reported(
+    monkeypatch: pytest.MonkeyPatch, silent: set[int]
+) -> None:
+    """The attempts in `silent` receive no bytes; the others receive a foreign reply, which is reported."""
+    drive = family(2)(1, name="pump-1")
+    bus = SimulatedBus(monkeypatch, Picky(drive))
+    bus.attach(drive)
+    attempts = itertools.count()
+    foreign = checksums.rtu(bytes.fromhex("63 03 02 00 07"))
+    bus.loses = lambda request: next(attempts) in silent
+    bus.answers = lambda request: foreign
+    with pytest.raises(BadReply, match="another address"):
+        drive.read_many(drive.registers.values())
+
+
+# ---- `Drive.read_raw`: raw reads of any address, which never write ----
+
+
+@pytest.fixture
+def simulated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[SimulatedBus]:
+    toy = SimulatedDrive(Toy(7))
+    toy["output_frequency"], toy["output_current"] = 12.3, 1.5
+    bus = SimulatedBus(monkeypatch, toy, audit=tmp_path / "audit.jsonl")
+    bus.attach(toy.drive)
+    with bus.bus:
+        yield bus
+
+
+@pytest.fixture
+def toy(simulated: SimulatedBus) -> Drive:
+    (toy,) = simulated.bus.drives
+    return toy
+
+
+def test_read_raw_sends_and_parses_the_standards_example(simulated: SimulatedBus, toy: Drive) -> None:
+    """The request is that of the application protocol V1.1b3, 6.3; its CRC was calculated separately."""
+    assert toy.read_raw(3, 1, 2) == bytes.fromhex("007B 0096")
+    assert [frame for _, frame in simulated.frames] == ["07 03 00 01 00 02 95 AD"]
+
+
+def test_read_raw_is_not_treated_as_a_write(simulated: SimulatedBus, toy: Drive, tmp_path: Path) -> None:
+    """The read is not audited, retried or reported as unconfirmed, and no identity check precedes it."""
+    simulated.loses = lambda request: True
+    with pytest.raises(NoReply):
+        toy.read_raw(3, 1, 2)
+    assert len(simulated.frames) == 1
+    assert list(read_audit(tmp_path / "audit.jsonl")) == []
+
+
+def test_read_raw_raises_drive_exception_for_an_exception(simulated: SimulatedBus, toy: Drive) -> None:
+    with pytest.raises(DriveException) as refusal:
+        toy.read_raw(3, 0x4000, 1)
+    assert refusal.value.code == 2
+
+
+def test_read_raw_raises_expired_if_it_cannot_start_in_time(simulated: SimulatedBus, toy: Drive) -> None:
+    simulated.queue_time = 0.3
+    with pytest.raises(Expired, match=r"a read of 2 from 1 by function 03H was not sent: .* within 0.2 s"):
+        toy.read_raw(3, 1, 2, expiry=0.2)
+    assert simulated.frames == []
+    assert toy.read_raw(3, 1, 2, expiry=0.4) == bytes.fromhex("007B 0096")
+
+
+def test_read_raw_waits_for_late_replies_only_until_it_expires(
+    monkeypatch: pytest.MonkeyPatch, simulated: SimulatedBus, toy: Drive
+) -> None:
+    found = completed(int(Failure.LATE_ANSWER_DUE), Message(0, 0), b"", at_ns=0)
+    found.c.late_until_ns = round((simulated.seconds + 60) * 1e9)
+    monkeypatch.setattr(simulated, "carry_out", lambda exchange, **times: found)
+    begun = simulated.seconds
+    with pytest.raises(Expired, match=r"was not sent: .* within 0.2 s"):
+        toy.read_raw(3, 1, 2, expiry=0.2)
+    assert simulated.seconds - begun < 0.21
+
+
+def test_a_copy_of_the_request_is_not_returned_as_a_raw_reply(simulated: SimulatedBus, toy: Drive) -> None:
+    """The reply to a read of 17 coils from 03xxH has its request's length and first three bytes."""
+    echo = checksums.rtu(bytes.fromhex("07 01 03 20 00 11"))
+    simulated.answers = lambda request: echo
+    with pytest.raises(BadReply, match="copy of the request"):
+        toy.read_raw(1, 0x320, 17)
+    assert simulated.frames[0][1] == echo.hex(" ").upper()
+    simulated.has_echo = True  # on a line known to echo, a copy and a reply are distinguishable
+    assert toy.read_raw(1, 0x320, 17) == bytes.fromhex("20 00 11")
+
+
+WRONG = {
+    (6, 1, 1): "function = 6 does not read; use 1, 2, 3, 4",
+    (0, 1, 1): "function = 0 does not read",
+    (3, -1, 1): "start = -1 is not an address from 0 to 65535",
+    (3, 65536, 1): "start = 65536 is not an address",
+    (3, 65535, 2): r"start \+ count = 65537: the last address is 65535",
+    (3, 1, 0): "count = 0 is outside 1 to 10, the limit of one request to toy@7",
+    (3, 1, 11): "count = 11 is outside 1 to 10",  # a limit of the family
+    (4, 1, 126): "count = 126 is outside 1 to 125",
+    (1, 1, 2001): "count = 2001 is outside 1 to 2000",
+}
+
+
+@pytest.mark.parametrize("asked", WRONG)
+def test_an_impossible_raw_read_raises_before_any_frame_is_sent(
+    simulated: SimulatedBus, toy: Drive, asked: tuple[int, int, int]
+) -> None:
+    with pytest.raises(ValueError, match=WRONG[asked]):
+        toy.read_raw(*asked)
+    assert simulated.frames == []
+
+
+@pytest.mark.parametrize("asked", [(True, 1, 1), (3, 1.0, 1), (3, 1, "2")])
+def test_a_raw_read_with_a_count_that_is_not_a_number_raises(
+    simulated: SimulatedBus, toy: Drive, asked: tuple[int, int, int]
+) -> None:
+    with pytest.raises(TypeError, match="is not a whole number"):
+        toy.read_raw(*asked)
+    for expiry in (0, -1, float("nan"), float("inf"), True):
+        with pytest.raises(ValueError, match="must be a number of seconds above 0"):
+            toy.read_raw(3, 1, 1, expiry=expiry)
+    assert simulated.frames == []
+
+
+@pytest.mark.parametrize("function", [1, 2, 3, 4])
+def test_send_raw_rejects_read_functions_before_sending(
+    simulated: SimulatedBus, toy: Drive, function: int
+) -> None:
+    """A read sent as a write would wait so long that a late reply to an earlier read could be accepted."""
+    with pytest.raises(
+        ValueError, match=rf"{function:02X}H is a read.*call drive.read_raw\({function}, 80, 2\)"
+    ):
+        toy.send_raw(function, 80, count=2)
+    assert simulated.frames == []
+
+
+def test_read_raw_is_limited_by_the_familys_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, native, _ = one(monkeypatch, DelixiNative(1))
+    with pytest.raises(ValueError, match="speaks Delixi's own protocol"):
+        native.read_raw(3, 1, 1)
+    bus, modbus, _ = one(monkeypatch, DelixiModbus(1))
+    with pytest.raises(ValueError, match="count = 2 is outside 1 to 1"):
+        modbus.read_raw(3, 1, 2)
+    with pytest.raises(NotAttached, match="fan is not attached to a bus: use bus"):
+        InnovertIBD(1, name="fan").read_raw(3, 1, 1)
+    assert bus.frames == []
+
+
+@pytest.mark.slow
+def test_read_raw_works_on_a_polled_line() -> None:
+    """Even on a busy computer, neither the poller nor the raw read accepts a reply to the other's request."""
+    drive = polled(Toy(1), [Toy.output_frequency, Toy.mystery])
+    expected = proofs(drive)
+    status = int(proof(drive.drive, Toy.status)).to_bytes(2)
+    answers = Counter[bytes]()
+    with Simulator([Wire([EncodedDrive(Toy(1))], unpaced=True)]) as sim:
+        with Poller(plant(line(sim.wires[0].path, drive))) as poller:
+
+            def asked() -> bool:
+                with suppress(NoReply, BadReply):
+                    answers[drive.drive.read_raw(3, Toy.status.address, 1, expiry=60.0)] += 1
+                return answers.total() >= 20
+
+            until(asked)
+            polls = poller.summary()["samples"]
+            until(lambda: poller.summary()["samples"] > polls + 20)
+        rows = rows_of(poller)
+    assert set(answers) == {status}
+    good = [row for row in rows if row.status == "ok"]
+    assert {row.register: row.value for row in good} == {name: value for (_, name), value in expected.items()}
+    assert all(row.value == expected[row.drive, row.register] for row in good)

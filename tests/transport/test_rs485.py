@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from c_programs import ROOT, preloaded
 from kills import descriptors, threads
 from lines import line, plant, polled
+from peers import ROOT, preloaded
 from toy import Toy
 
 from multidrop.bus import Bus
@@ -30,7 +30,7 @@ from multidrop.sim import Simulator, Wire, simulated
 from multidrop.transport import open_port
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the driver is Linux's")
-CHARACTER_NS = 1_041_667  # a toy's character at 9600 8N1
+CHARACTER_NS = 1_041_667  # duration of a character at 9600 baud, 8N1
 ENABLED, ON_SEND, AFTER_SEND = 1, 2, 4  # linux/serial.h
 
 
@@ -102,7 +102,7 @@ def test_rts_switches_to_sending_only_while_a_request_is_sent(
     assert len(read) == 20
     writes = [at for at, event in enumerate(events) if event.what == "write"]
     assert len(writes) >= 21
-    assert {event.what for event in events[: writes[0] - 1]} == {receiving}  # from the opening on
+    assert {event.what for event in events[: writes[0] - 1]} == {receiving}  # ever since the port was opened
     late = []
     for at in writes:
         before, write, after = events[at - 1 : at + 2]
@@ -110,7 +110,7 @@ def test_rts_switches_to_sending_only_while_a_request_is_sent(
         late.append(after.ns - write.ns - write.count * CHARACTER_NS)
     assert 0 <= min(late) < 3.5 * CHARACTER_NS  # at least once; a busy computer is sometimes late
     assert events[-1].what == receiving
-    assert events[-2].count == 49  # a broadcast: closing waited for its last bit
+    assert events[-2].count == 49  # closing waited for the last bit of the broadcast
 
 
 @pytest.mark.long
@@ -149,7 +149,7 @@ def test_a_failure_to_switch_rts_loses_the_port_and_ends_sending(driver: Path) -
 def test_a_poller_fails_immediately_without_rts_and_leaks_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(open_port, "is_pseudo_terminal", lambda device: False)
     with Simulator([Wire([simulated(Toy(1))])]) as sim:
-        Bus(sim.wires[0].path).close()  # starts the core's thread, which stays
+        Bus(sim.wires[0].path).close()  # starts the core's thread, which then continues to run
         before = descriptors(), threads()
         drive = polled(Toy(1), [Toy.output_current])
         declared = replace(line(sim.wires[0].path, drive), rs485=RS485.RTS_UP)

@@ -57,7 +57,7 @@ def test_delays_outside_of_the_buckets_are_counted_too(delay_ns: int) -> None:
     assert 0 <= found.p50 <= found.p99 <= found.longest
 
 
-def test_buckets_follow_each_other_closely() -> None:
+def test_between_two_buckets_there_is_no_gap() -> None:
     edges = [delay_edge(bucket) for bucket in range(129)]
     assert edges == sorted(set(edges))
     assert edges[0] == 0
@@ -208,7 +208,7 @@ def test_statistics_of_a_span_are_the_difference_of_two_readings() -> None:
 def test_the_longest_delay_of_a_span_is_derived_from_its_buckets() -> None:
     early, late = counters_of([50 * MS]), counters_of([50 * MS, 8 * MS])
     found = line_of(2, pump=late).since(line_of(1, pump=early)).delays
-    assert 8e-3 <= found.longest <= 8e-3 * 9 / 8  # not the exact longest delay, but its bucket's end
+    assert 8e-3 <= found.longest <= 8e-3 * 9 / 8  # the end of the longest delay's bucket, not the exact delay
     record = counters_of([50 * MS, 8 * MS, 70 * MS])
     assert line_of(2, pump=record).since(line_of(1, pump=early)).delays.longest == 0.070
 
@@ -293,7 +293,7 @@ STEPS = 400
 @pytest.mark.long
 @table("seconds", [0.001, 0.003, 0.01, 0.03, 0.1])
 def test_the_utilisation_of_a_polled_line_is_at_most_1(seconds: float) -> None:
-    """An exchange in flight when statistics are read counts only later, with its whole time."""
+    """An exchange that is in flight while statistics are read is counted only later, with its whole time."""
     pumps = [Toy(address, name=f"pump-{address}") for address in (1, 2)]
     wire = ClockedWire([EncodedDrive(pump) for pump in pumps], Faults())
     drives = [polled(pump, [Toy.output_frequency, Toy.acceleration_time]) for pump in pumps]

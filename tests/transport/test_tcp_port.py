@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +29,7 @@ from multidrop.transport.port_identity import of_name
 
 
 class Meter(Drive):
-    """A device with a separate connection, so that its unit id may be any."""
+    """A device with its own connection. Its unit id may be any number."""
 
     title = "Meter"
     framings = (Framing.TCP,)
@@ -38,29 +38,39 @@ class Meter(Drive):
 
 
 @contextmanager
-def responder(answer: bytes | None) -> Iterator[tuple[str, list[bytes]]]:
-    """Yield the address of a server that answers its first input with `answer`, and a list of its input."""
-    came: list[bytes] = []
+def serving(serve: Callable[[socket.socket], object]) -> Iterator[str]:
+    """Yield the address of a server that passes its connections to `serve`, one after another."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
-        def serve() -> None:
+        def run() -> None:
             while True:
                 try:
                     connection, _ = listener.accept()
                 except OSError:
                     return
-                with connection:
-                    came.append(connection.recv(1024))
-                    if answer is not None:
-                        connection.sendall(answer)
-                    while connection.recv(1024):
-                        pass
+                with connection, suppress(OSError):
+                    serve(connection)
 
-        thread = threading.Thread(target=serve, daemon=True)
+        thread = threading.Thread(target=run, daemon=True)
         thread.start()
-        yield f"127.0.0.1:{listener.getsockname()[1]}", came
+        yield f"127.0.0.1:{listener.getsockname()[1]}"
         listener.shutdown(socket.SHUT_RDWR)
     thread.join()
+
+
+@contextmanager
+def responder(answer: bytes) -> Iterator[tuple[str, list[bytes]]]:
+    """Yield the address of a server and a list of its inputs. It answers the first input with `answer`."""
+    came: list[bytes] = []
+
+    def serve(connection: socket.socket) -> None:
+        came.append(connection.recv(1024))
+        connection.sendall(answer)
+        while connection.recv(1024):
+            pass
+
+    with serving(serve) as place:
+        yield place, came
 
 
 # ---- names ----
@@ -80,7 +90,7 @@ def test_the_default_tcp_port_is_502(name: str, opened: str, identity: str) -> N
 
 
 @table("name", ["tcp://", "tcp://:502", "tcp://10.0.0.7:0", "tcp://10.0.0.7:99999"])
-def test_an_invalid_tcp_url_raises_one_sentence(name: str) -> None:
+def test_an_invalid_tcp_url_raises_a_one_sentence_error(name: str) -> None:
     with pytest.raises(NoSuchPort, match=r"it needs a host, such as tcp://10\.0\.0\.7|Port out of range"):
         Bus(name)
 
@@ -114,12 +124,12 @@ def test_a_drive_uses_the_ports_framing_while_it_is_attached(port: str) -> None:
 @pytest.mark.parametrize(
     ("drive", "sentence"),
     [
-        (InnovertIBD(1, framing="rtu"), "framing rtu is a serial line's, and tcp://.* speaks Modbus TCP"),
-        (InnovertIBD(1, framing="ascii"), "framing ascii is a serial line's"),
-        (DelixiNative(1), "does not speak Modbus, and tcp://.* carries nothing else"),
+        (InnovertIBD(1, framing="rtu"), "framing rtu is for serial lines, but tcp://.* speaks Modbus TCP"),
+        (InnovertIBD(1, framing="ascii"), "framing ascii is for serial lines"),
+        (DelixiNative(1), "does not speak Modbus, and a tcp:// port such as tcp://.* carries nothing else"),
     ],
 )
-def test_another_framing_on_tcp_raises_one_sentence(port: str, drive: Drive, sentence: str) -> None:
+def test_another_framing_on_tcp_raises_a_one_sentence_error(port: str, drive: Drive, sentence: str) -> None:
     with Bus(port) as bus, pytest.raises(ValueError, match=sentence):
         bus.attach(drive)
 
@@ -131,7 +141,7 @@ def test_another_framing_on_tcp_raises_one_sentence(port: str, drive: Drive, sen
         (Meter(0), "framing tcp is for tcp:// ports"),
     ],
 )
-def test_tcp_framing_on_a_serial_port_raises_one_sentence(drive: Drive, sentence: str) -> None:
+def test_tcp_framing_on_a_serial_port_raises_a_one_sentence_error(drive: Drive, sentence: str) -> None:
     wire = Wire([simulated(InnovertIBD(9))])
     with Simulator([wire]), Bus(wire.path) as bus, pytest.raises(ValueError, match=sentence):
         bus.attach(drive)
@@ -150,7 +160,7 @@ def test_unit_ids_of_modbus_tcp_raise_on_other_ports() -> None:
 
 
 @pytest.mark.parametrize("unit", [0, 1, 255])
-def test_every_unit_id_is_read(unit: int) -> None:
+def test_devices_with_every_unit_id_can_be_read(unit: int) -> None:
     sim = simulated(Meter(unit))
     sim["voltage"] = 230
     wire = Wire([sim], port="tcp://127.0.0.1:0", unpaced=True)
@@ -185,8 +195,8 @@ def test_every_mistake_of_a_plant_file_is_reported(tmp_path: Path) -> None:
         load_plant(path)
     said = "\n".join(mistakes.value.mistakes)
     assert """transaction 'skip' is none of "match" and "ignore\"""" in said
-    assert "framing rtu is a serial line's, and tcp://10.0.0.7 speaks Modbus TCP" in said
-    assert "transaction is a fact of tcp:// ports, and /dev/ttyUSB0 is none" in said
+    assert "framing rtu is for serial lines, but tcp://10.0.0.7 speaks Modbus TCP" in said
+    assert "transaction is only for tcp:// ports, and /dev/ttyUSB0 is not one" in said
     assert "framing tcp is for tcp:// ports" in said
 
 
@@ -271,7 +281,7 @@ def test_modbus_tcp_behind_a_socket_url_is_reported() -> None:
 
 @pytest.mark.slow
 def test_the_error_for_a_silent_port_names_the_other_protocol() -> None:
-    with responder(None) as (place, _):
+    with responder(b"") as (place, _):
         for kind, other in (("tcp", "socket"), ("socket", "tcp")):
             with Bus(f"{kind}://{place}") as bus:
                 drive = bus.attach(InnovertIBD, 1)
@@ -280,25 +290,17 @@ def test_the_error_for_a_silent_port_names_the_other_protocol() -> None:
 
 
 def test_a_gateway_s_unreachable_drive_gives_no_reply() -> None:
-    """The gateway answers each request with exception 0BH and the request's id."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
+    """The gateway answers each request with exception 0BH and the request's transaction id."""
 
-        def serve() -> None:
-            connection, _ = listener.accept()
-            with connection:
-                while request := connection.recv(260):
-                    connection.sendall(
-                        request[:4] + b"\0\3" + request[6:7] + bytes([request[7] | 0x80, 0x0B])
-                    )
+    def serve(connection: socket.socket) -> None:
+        while request := connection.recv(260):
+            connection.sendall(request[:4] + b"\0\3" + request[6:7] + bytes([request[7] | 0x80, 0x0B]))
 
-        thread = threading.Thread(target=serve, daemon=True)
-        thread.start()
-        with Bus(f"tcp://127.0.0.1:{listener.getsockname()[1]}") as bus:
-            drive = bus.attach(InnovertIBD, 1)
-            with pytest.raises(NoReply, match=r"behind the gateway, which says so \(exception 0BH\)"):
-                drive.read(drive.output_current)
-            assert bus.peer(drive).failures == 3
-    thread.join()
+    with serving(serve) as place, Bus(f"tcp://{place}") as bus:
+        drive = bus.attach(InnovertIBD, 1)
+        with pytest.raises(NoReply, match=r"behind the gateway, which says so \(exception 0BH\)"):
+            drive.read(drive.output_current)
+        assert bus.peer(drive).failures == 3
 
 
 @pytest.mark.parametrize("kind", ["socket", "tcp"])
@@ -328,33 +330,17 @@ class TwoBlocks(Drive):
 
 @contextmanager
 def closing_peer(replies: int) -> Iterator[tuple[str, list[Message]]]:
-    """Yield a Modbus TCP peer that closes a connection at the request after `replies` replies."""
+    """Yield a Modbus TCP peer that closes each connection after `replies` replies, or after a request."""
     asked: list[Message] = []
-    with socket.create_server(("127.0.0.1", 0)) as listener:
 
-        def serve() -> None:
-            while True:
-                try:
-                    connection, _ = listener.accept()
-                except OSError:
-                    return
-                with connection, suppress(OSError):
-                    for number in range(replies + 1):
-                        if not (frame := connection.recv(1024)):
-                            break
-                        request = parse_request(Framing.TCP, frame)[1]
-                        asked.append(request)
-                        if number == replies:
-                            break
-                        connection.sendall(answered(frame, request))
-                        if number + 1 == replies:
-                            break
+    def serve(connection: socket.socket) -> None:
+        for _ in range(max(replies, 1)):
+            if frame := connection.recv(1024):
+                asked.append(parse_request(Framing.TCP, frame)[1])
+                connection.sendall(answered(frame, asked[-1]) if replies else b"")
 
-        thread = threading.Thread(target=serve, daemon=True)
-        thread.start()
-        yield f"tcp://127.0.0.1:{listener.getsockname()[1]}", asked
-        listener.shutdown(socket.SHUT_RDWR)
-    thread.join()
+    with serving(serve) as place:
+        yield f"tcp://{place}", asked
 
 
 def answered(frame: bytes, request: Message) -> bytes:

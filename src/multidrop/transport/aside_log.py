@@ -1,4 +1,4 @@
-"""Do work that may hang, such as writing a log to a disk, on a thread for which stops never wait."""
+"""Do work that may hang, such as writing a log to a disk, on a separate thread. Stops never wait for it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from queue import Empty, SimpleQueue
 from multidrop.core.fork import register_at_fork
 
 MOST_FRAMES = 30  # number of innermost frames in a logged traceback
-MOST_WAITING = 10_000  # most queued pieces of work; further ones are dropped
+MOST_WAITING = 10_000  # limit of the queued pieces of work; further ones are dropped
 
 
 class AsideThread:
@@ -27,9 +27,9 @@ class AsideThread:
 
     def forked(self) -> None:
         self._work: SimpleQueue[Callable[[], object]] = SimpleQueue()
-        self._begun = threading.Lock()  # locked once the thread has started
-        # The last flush that timed out: a queue that gets an item when the flushed work is done, and the
-        # flush's timeout in s.
+        self._begun = threading.Lock()  # locked by the first `put`, which starts the thread
+        # The last call of `flush` that timed out: a queue that gets an item once the work queued before that
+        # call is done, and the timeout of that call in s.
         self._late: tuple[SimpleQueue[None], float] | None = None
 
     def put(self, work: Callable[[], object]) -> None:
@@ -38,14 +38,14 @@ class AsideThread:
             self._work.put(work)
         if self._begun.acquire(blocking=False):
             try:
-                _thread.start_new_thread(self._run, ())  # `threading` would wait until it runs
+                _thread.start_new_thread(self._run, ())  # `Thread.start` would wait until the thread runs
             except BaseException as failure:  # the system has no more threads, or the interpreter is ending
                 self._begun.release()
                 if not isinstance(failure, (RuntimeError, MemoryError)):
                     raise
 
     def flush(self, seconds: float) -> bool:
-        """Wait up to `seconds` s until all queued work is done; return True if it is."""
+        """Wait up to `seconds` s until all queued work is done; return True if it is done."""
         if not self._begun.locked():
             return self._work.empty()
         done: SimpleQueue[None] = SimpleQueue()
@@ -59,7 +59,7 @@ class AsideThread:
         return True
 
     def hangs(self, seconds: float) -> bool:
-        """Return True if a `flush` timed out after at least `seconds` s, and its work is still pending."""
+        """Return True if a `flush` timed out after at least `seconds` s, and the work is still not done."""
         late = self._late
         return late is not None and late[1] >= seconds and late[0].empty()
 

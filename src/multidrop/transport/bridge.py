@@ -28,14 +28,14 @@ _log = logging.getLogger("multidrop.line")
 # All exceptions that pyserial's ports may raise.
 PORT_FAILURES = (OSError, _terminal_error, serial.SerialException, ValueError, EOFError)
 
-# The next two limits are below WRITE_TIMEOUT, so that no write is sent after its caller got an outcome.
+# The next two limits are below WRITE_TIMEOUT, so that no write is sent after it was reported as unconfirmed.
 MOST_STALL_MS = 750  # ms; the kernel cuts a connection that stalls for longer
 MOST_AGE = 0.25  # s; an older request is not forwarded
-MOST_CHUNK = 1024  # most bytes that the core reads in one call
+MOST_CHUNK = 1024  # limit of the bytes that the core reads in one call
 LOOK_EVERY = 0.1  # s between checks of whether the bridge is closed
 CLOSING_TIME = 2.0  # s; limit of the wait for a thread that the port blocks
 
-# On Linux the socket pair keeps requests separate, and gives the time at which the core wrote each.
+# On Linux the socket pair keeps requests separate, and gives the time at which the core wrote each request.
 _STAMPED = sys.platform == "linux"
 _KIND = socket.SOCK_SEQPACKET if _STAMPED else socket.SOCK_STREAM
 _SO_TIMESTAMPNS = 35  # asm-generic/socket.h; the control message is a struct timespec
@@ -54,10 +54,10 @@ def set_up(port: serial.SerialBase, settings: tuple[int, str]) -> None:
 
 
 def discard_late_bytes(connection: socket.socket) -> None:
-    """Make the kernel cut a connection that stalls, and discard unsent bytes when it is closed.
+    """Make the kernel discard unsent bytes when the connection stalls for MOST_STALL_MS, or is closed.
 
-    Such bytes could start a motor, even after this process has died. Windows before 11 may not support the
-    timeout; it then cuts a connection when its retransmissions end.
+    Such bytes could start a motor, even after this process has died. A connection that stalls is cut. Windows
+    before 11 may not support this timeout, and then cuts the connection when its own retransmissions end.
     """
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack(_LINGER, 1, 0))
@@ -81,7 +81,7 @@ class Bridge:
     """A descriptor for a port that has none: a socket pair, and a thread for each direction.
 
     A request older than MOST_AGE is discarded, not forwarded: the core has already given it up. A request
-    gets that old if the process was suspended or the port blocked.
+    gets that old if the process was suspended, or if the port blocked its thread.
     """
 
     def __init__(self, port: serial.SerialBase) -> None:
@@ -166,6 +166,6 @@ class Bridge:
 
 
 def _is_fresh(stamps: list[tuple[int, int, bytes]]) -> bool:
-    """Return True if the request is at most MOST_AGE s old; False in doubt, if the clock was changed."""
+    """Return True if the request is at most MOST_AGE s old; False if the clock was changed since."""
     written = [_TIMESPEC.unpack(stamp) for _, kind, stamp in stamps if kind == _SO_TIMESTAMPNS]
     return any(abs(time.time() - seconds - ns / 1e9) <= MOST_AGE for seconds, ns in written)

@@ -7,12 +7,21 @@ through the module, as `clock.now_ns()`, so that tests can replace them in one p
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 from multidrop.core import boottime_ns as boottime_ns
 from multidrop.core import now_ns as core_now_ns
 from multidrop.core import utc_minus_monotonic_ns
 
-sleep = time.sleep
+_speed: ContextVar[float] = ContextVar("speed", default=1.0)
+
+
+def sleep(seconds: float) -> None:
+    """Wait for `seconds`, or for a shorter time in the context of `at_speed`."""
+    time.sleep(seconds / _speed.get())
+
 
 if hasattr(time, "clock_gettime_ns"):  # faster than calling the core's function
 
@@ -30,3 +39,16 @@ else:
 def utc_ns() -> int:
     """Return the present time as UTC in ns."""
     return int(now_ns() + utc_minus_monotonic_ns())
+
+
+@contextmanager
+def at_speed(speed: float) -> Iterator[None]:
+    """In this context and its copies, let `sleep` wait for a time that is shorter by the factor `speed`.
+
+    Other threads, which may command real drives, wait for the whole time.
+    """
+    token = _speed.set(speed)
+    try:
+        yield
+    finally:
+        _speed.reset(token)

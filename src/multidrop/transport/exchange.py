@@ -44,7 +44,7 @@ def good_reply(drive: Drive, completion: Completion) -> Message:
         return reply
     if result > 0:
         raise refusal_of(drive, reply.exception)
-    if result in (Failure.NO_REPLY, Failure.LATE_ANSWER_DUE):
+    if result in (Failure.NO_REPLY, Failure.LATE_ANSWER_DUE, Failure.STALLED):
         raise no_reply(drive, completion)
     advice = mixed_up(_port_of(drive), completion.raw)
     raise BadReply(drive.name, STATUSES[-result] + advice, completion.raw)
@@ -54,11 +54,13 @@ def no_reply(drive: Drive, completion: Completion) -> NoReply:
     """Return the error for a silent drive, or for a drive that its gateway reports as silent."""
     if drive.framing is Framing.TCP and completion.raw:
         code = completion.raw[-1]
-        return NoReply(drive.name, f" behind the gateway, which says so (exception {code:02X}H)")
+        where = f" behind the gateway, which says so (exception {code:02X}H)"
+        return NoReply(drive.name, where, code=code)
     if drive.bus is None:
         return NoReply(drive.name)
     line = drive.bus.line
-    hint = f"; but the port is {STALLED}" if line.is_stalled else silence_hint(line.port)
+    is_stalled = line.is_stalled or completion.result == Failure.STALLED
+    hint = f"; but the port is {STALLED}" if is_stalled else silence_hint(line.port)
     return NoReply(drive.name, hint=hint)
 
 
@@ -70,12 +72,12 @@ def check_master(drive: Drive, completion: Completion) -> None:
 
 
 def refusal_of(drive: Drive, code: int, register: str | None = None) -> DriveException:
-    """Return the error for an exception code; `register`: its name, if only one was requested."""
+    """Return the error for an exception code; `register` is the register's name if only one was requested."""
     return DriveException(drive.name, code, drive.exception(code), register)
 
 
 def no_value(drive: Drive, found: dict[str, Any]) -> NoValue:
-    """Return the error for the first register in `found` without a value; it carries the other values."""
+    """Return NoValue for the first register in `found` without a value; the error has the valid values."""
     known = {name: value for name, value in found.items() if value is not None}
     return NoValue(drive.name, next(name for name in found if name not in known), known)
 
@@ -88,7 +90,7 @@ T = TypeVar("T")
 
 READ_ATTEMPTS = 3
 WRITE_TIMEOUT = 1.0  # s; long, because a write wrongly reported as unconfirmed is worse than a wait
-ILLEGAL_FUNCTION = 1  # exception code after which shorter requests of the function fail too
+ILLEGAL_FUNCTION = 1  # exception code for an unsupported function: a shorter request would get it too
 
 
 class Exchanges:
@@ -142,9 +144,9 @@ class Exchanges:
     def read(self, drive: Drive, registers: Sequence[Register[Any] | Text | str]) -> dict[str, Any]:
         """Return the registers' values by name, as `values` does; reopen the port if it is lost.
 
-        This is for a gateway that closes the connection after each reply. If the port is lost after the drive
-        has answered on it, or is already closed, reopen it and read block by block. Raises PortLost if the
-        port is lost twice in a row at the same block, or before the drive has answered.
+        Some gateways close the connection after each reply. If the port was already closed, or is lost after
+        an answer of the drive, reopen it and read block by block. Raises PortLost if the port is lost before
+        the drive has answered, or twice in a row at the same block.
         """
         try:
             return self.values(drive, registers, READ_ATTEMPTS)
@@ -206,10 +208,10 @@ class Exchanges:
     ) -> dict[str, Any]:
         """Return the values of these registers (Register objects or names), by name.
 
-        Each block is tried up to `attempts` times. With `insists`, send immediately even if a late reply
-        could be mistaken for this one; on slow paths wait up to `timeout` seconds. If the drive does not
-        answer a block as a whole, the block is read in parts until the port is reopened. Raises NoValue if a
-        register holds no value, and TextWanted if one of `registers` is a text.
+        Each block is tried up to `attempts` times. With `insists`, each request is sent immediately, even if
+        a late reply could be mistaken for its reply; on a slow connection, wait up to `timeout` seconds. If
+        the drive does not answer a block as a whole, the block is read in parts until the port is reopened.
+        Raises NoValue if a register holds no value, and TextWanted if one of `registers` is a text.
         """
         prepared = self._prepare(drive)
         plan = prepared.newest
@@ -226,11 +228,11 @@ class Exchanges:
                     into = read.spare.pop()
                 except IndexError:
                     into = None
-                try:  # few calls if the read succeeds, for speed: see Completion
+                try:  # a successful read is fast because it makes few calls: see Completion
                     reply = self._peers.carry_out(drive, exchange, into=into)
                     if reply.count < 0:
                         reply = self._good(drive, exchange, attempts, self._settled(drive, exchange, reply))
-                    if reply.count == read.whole:  # the usual case is fast: no `strict`, no further call
+                    if reply.count == read.whole:  # fast path: zip without `strict`, no call of `decode`
                         values = dict(zip(read.names, reply.numbers.tolist()))  # noqa: B905
                     else:
                         values = read.decode(reply)
@@ -255,7 +257,10 @@ class Exchanges:
     def _parts(
         self, drive: Drive, prepared: PreparedReads, read: PreparedRead, failure: Exception
     ) -> tuple[Block, ...]:
-        """Return smaller blocks to read instead of a failed block; if they cannot help, raise the failure."""
+        """Return smaller blocks to read instead of a failed block.
+
+        If smaller blocks cannot help, raise the failure.
+        """
         block = read.block
         if isinstance(failure, DriveException):
             helps = failure.code != ILLEGAL_FUNCTION and not drive.is_temporary(failure.code)
@@ -314,7 +319,7 @@ class Exchanges:
     def value_as(self, other: Drive, drive: Drive, register: Register[Any] | Text) -> Any:
         """Read a register from this drive as if it were `other`, a drive of another family; return the value.
 
-        Each request is sent only once, and even if a late reply could be mistaken for its reply.
+        Each request is sent only once. It is sent even if a late reply could be mistaken for its reply.
         """
         if isinstance(register, Text):
             peer, blocks_of = self.peer(drive), text_blocks(other, register)
@@ -330,7 +335,7 @@ class Exchanges:
     def ask(
         self, drive: Drive, function: int, start: int, count: int, expiry: float, attempts: int = 1
     ) -> bytes:
-        """Read `count` items from address `start` by any read function; return the reply's data.
+        """Read `count` words or bits from address `start` by any read function; return the reply's data.
 
         The request is sent up to `attempts` times. Raises Expired if the first request cannot be sent within
         `expiry` seconds.
@@ -346,7 +351,9 @@ class Exchanges:
             completion = self._good(drive, asked, attempts, completion)
         self._note_answer(drive, completion)
         if completion.raw == build_request(drive.framing, request) and not self.line.has_echo:
-            raise BadReply(drive.name, "the reply is a copy of the request, as an echo is", completion.raw)
+            raise BadReply(
+                drive.name, "the reply is a copy of the request, so it may be an echo", completion.raw
+            )
         return good_reply(drive, completion).data
 
     def _note_answer(self, drive: Drive, completion: Completion) -> None:
@@ -369,7 +376,7 @@ class Exchanges:
             attempts -= 1
             self._note_answer(drive, completion)
             try:
-                good_reply(drive, completion)  # raises: the completion has no good reply
+                good_reply(drive, completion)  # always raises, because the completion has no good reply
             except (NoReply, BadReply, DriveException) as failure:
                 if isinstance(failure, BadReply):
                     came = failure
@@ -393,12 +400,12 @@ class Exchanges:
         timeout: float = WRITE_TIMEOUT,
         permit: Permit | None = None,
     ) -> Completion:
-        """Send a write a single time, before queued polling, after all late replies that may still come.
+        """Wait until no late reply can come, then send a write once, before queued polling.
 
         The write is not sent after `expires_ns` (CLOCK_BOOTTIME; 0: no limit), or if `permit` has ended. The
-        call waits for the reply at least `timeout` seconds. With `insists` it does not wait for late replies;
-        on a slow connection, it waits up to `timeout` seconds for its own reply. Raises NoReply without
-        sending if late replies are due and the drive is silent.
+        call waits for the reply at least `timeout` seconds. With `insists`, the call does not wait for late
+        replies; on a slow connection, it waits up to `timeout` seconds for the write's own reply. Raises
+        NoReply without sending if late replies are due and the drive is silent.
         """
         made = make_exchange(
             drive, request, self.peer(drive), NO_ROWS, insists=insists, timeout=timeout, permit=permit
@@ -428,10 +435,11 @@ class Exchanges:
     def _settled(
         self, drive: Drive, made: Exchange, completion: Completion, expires_ns: int = 0
     ) -> Completion:
-        """If late replies prevented the exchange, wait for them and carry it out again.
+        """If late replies prevented the exchange, wait for these replies, then carry out the exchange again.
 
-        The wait ends when the exchange expires. The core then first sends a proof, a read whose reply shows
-        that no earlier reply is still due. Raises NotMaster if another process may be the line's master.
+        The wait ends when the exchange expires. After the wait, the core first sends a proof: a read whose
+        reply shows that no earlier reply can still come. Raises NotMaster if another process may be the
+        line's master.
         """
         if completion.result == Failure.LATE_ANSWER_DUE:
             wait_ns = completion.late_until_ns - clock.now_ns()

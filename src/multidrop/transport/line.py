@@ -40,6 +40,10 @@ from multidrop.transport.open_port import (
 
 _log = logging.getLogger("multidrop.line")
 
+MISCOUNTS = (
+    "%s: its driver counts unsent bytes although replies came; the count is ignored, so a stall of the port "
+    "will not be noticed"
+)
 FOREIGN = "%s: another master: %d unexpected bytes came; only stops are sent until the line has been silent"
 
 
@@ -48,10 +52,10 @@ class LineLog:
 
     def __init__(self, port: str) -> None:
         self.foreign = 0  # number of another master's bytes, received while listening
-        self.shows = _log.isEnabledFor  # function that returns whether a log level is logged
+        self.shows = _log.isEnabledFor  # returns whether a log level is enabled
         self._port = port
         self._foreign_here = 0  # part of `foreign` since the port was last opened
-        self._is_lost = self._is_stalled = False
+        self._is_lost = self._is_stalled = self._miscounts = False
         self._why_unopened = ""
         self.forked()
 
@@ -72,11 +76,17 @@ class LineLog:
             log_aside(_log, logging.WARNING, "%s: lost (%s)", self._port, why)
 
     def note_stall(self, is_stalled: bool) -> None:
-        """Log that the adapter takes no bytes, or takes them again, unless this is already logged."""
+        """Log that the adapter accepts no bytes, or accepts them again, unless this is already logged."""
         if is_stalled != self._is_stalled:
             self._is_stalled = is_stalled
             said = STALLED if is_stalled else "its adapter takes bytes again"
             log_aside(_log, logging.WARNING, "%s: %s", self._port, said)
+
+    def note_miscount(self) -> None:
+        """Log that the driver's count of unsent bytes is wrong, unless this is already logged."""
+        if not self._miscounts:
+            self._miscounts = True
+            log_aside(_log, logging.WARNING, MISCOUNTS, self._port)
 
     def unopened(self, why: str) -> None:
         """Log why the port could not be opened or reopened, unless the last attempt had the same reason."""
@@ -164,7 +174,7 @@ class Line:
         register_at_fork(self)
 
     def _make_locks(self) -> None:
-        self._lock = threading.RLock()  # one thread opens or closes at a time
+        self._lock = threading.RLock()  # only one thread at a time opens or closes the port
 
     def forked(self) -> None:
         """Close the line in a forked child: a descriptor that stays open there would keep the port busy."""
@@ -238,7 +248,7 @@ class Line:
 
     def end(self) -> bool:
         """Start no more queued exchanges. Return True while a queued exchange is in flight."""
-        with self._lock:  # without it, another thread could free the port meanwhile
+        with self._lock:  # without the lock, another thread could free the port in the meantime
             return self.queue is not None and self.queue.end()
 
     def _let_go(self) -> None:
@@ -296,14 +306,14 @@ class Line:
     # ---- taps, settings and peers ----
 
     def tap(self, tap: Tap) -> None:
-        """Pass all bytes of the line to this tap, which replaces an earlier tap."""
+        """Copy all bytes of the line to this tap from now on, and none to an earlier tap."""
         with self._lock:
             self._tap = tap
             if self.queue:
                 self.queue.tap(tap)
 
     def require(self, settings: tuple[int, str]) -> None:
-        """Set a bridged port's settings. Raises LineError if it already has others or rejects these."""
+        """Set a bridged port's settings. Raises LineError if the port has other settings or rejects these."""
         with self._lock:
             self._opened.require(settings)
 
@@ -313,7 +323,7 @@ class Line:
         return self._opened.settings if self._opened.bridge else None
 
     def inherit(self, peer: Peer, before: Peer) -> None:
-        """Let `peer` also expect the late replies to `before`, an earlier peer at its address."""
+        """Let `peer` also expect the late replies due to `before`, the earlier peer at its address."""
         with self._lock:
             if self.queue:
                 self.queue.inherit(peer, before)
@@ -345,7 +355,7 @@ class Line:
         try:
             found = core.carry_out(exchange, not_before_ns, expires_ns, into)
             is_lost = found.count < 0 and is_lost_by(found.result, core)
-            self.note_foreign()
+            self.note_news()
             if self._log.shows(DEBUG):
                 self._log.frames(exchange, found)
             if is_lost:
@@ -388,7 +398,7 @@ class Line:
         return (LineError if is_over else PortLost)(self.port, self.why_closing or self._why_closed)
 
     def counted_ns(self, now_ns: int) -> int:
-        """Return the time up to which exchanges are counted: now, or the start of the one in flight."""
+        """Return the time up to which exchanges are counted: now, or the start of the exchange in flight."""
         return now_ns if (core := self.queue) is None else min(now_ns, core.counted_ns())
 
     def overruns(self) -> int | None:
@@ -404,10 +414,14 @@ class Line:
         """Log that the port is stalled, or no longer stalled, unless this is already logged."""
         self._log.note_stall(self.is_stalled)
 
-    def note_foreign(self) -> None:
-        """Log another master's bytes, on a line with a mastership."""
+    def note_news(self) -> None:
+        """Log a wrong count of unsent bytes, and on a line with a mastership another master's bytes."""
         core = self.queue
-        if self.mastership is not None and core is not None:
+        if core is None:
+            return
+        if core.miscounts:
+            self._log.note_miscount()
+        if self.mastership is not None:
             self._log.note_foreign(core)
 
     @property

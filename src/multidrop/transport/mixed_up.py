@@ -12,7 +12,7 @@ from multidrop.core import crc16
 from multidrop.drive.line_settings import MODBUS_PORT
 
 _HEAD = 6  # bytes of Modbus TCP's header before the unit id
-_LEAST, _MOST_RTU = 5, 256  # bytes of an RTU reply; the shortest one is an exception
+_LEAST, _MOST_RTU = 5, 256  # bytes of an RTU reply; the shortest reply is an exception
 _OTHER = {"socket": "tcp", "tcp": "socket"}
 _SPOKEN = {"socket": "RTU over TCP", "tcp": "Modbus TCP"}
 
@@ -27,7 +27,7 @@ def other_port(port: str) -> str:
 
 
 def spoken_on(port: str) -> str:
-    """Return the name of the protocol of a tcp:// or socket:// port."""
+    """Return the name of the protocol that multidrop speaks on a tcp:// or socket:// port."""
     return _SPOKEN[urlsplit(port).scheme]
 
 

@@ -1,7 +1,7 @@
 """RFC2217Port: pyserial's client for serial ports on a network (RFC 2217), with limits on memory and time.
 
 pyserial buffers received bytes without a limit, and waits for seconds until a stalled network takes a
-request. This class drops bytes that come too fast, as a serial line does, and sends a request immediately
+request. This class drops bytes that come too fast, as a serial line does. It sends a request immediately
 or never.
 """
 
@@ -30,7 +30,7 @@ class SocketPort(Serial):
         """End the connection, so that the far end can immediately accept a new connection."""
         connection, self._socket, self.is_open = self._socket, None, False
         if connection:
-            with suppress(OSError):  # the far end may have closed it already
+            with suppress(OSError):  # the far end may have closed the connection already
                 connection.shutdown(socket.SHUT_RDWR)
             connection.close()
 
@@ -41,10 +41,10 @@ class SocketPort(Serial):
                 pass
 
 
-MOST_RECEIVED = 4096  # bytes read from the network in one call
-MOST_CHUNKS = 64  # most received chunks that are buffered
+MOST_RECEIVED = 4096  # limit of the bytes read from the network in one call
+MOST_CHUNKS = 64  # limit of the received chunks that are buffered
 MOST_SUBOPTION = 256  # bytes; RFC 2217's suboptions are short, except the signature
-LOCK_TIME = 0.1  # s that a write waits while the reading thread answers a telnet option
+LOCK_TIME = 0.1  # s; how long a write waits for the reading thread to answer a telnet option
 
 _IAC, _SB, _SE = rfc2217.IAC, rfc2217.SB, rfc2217.SE
 _NEGOTIATIONS = (rfc2217.DO, rfc2217.DONT, rfc2217.WILL, rfc2217.WONT)
@@ -153,7 +153,7 @@ class RFC2217Port(rfc2217.Serial):
             raise serial.SerialException("the network accepts no bytes")
         try:
             if _send_at_once(self._socket, data) < len(data):
-                raise serial.SerialException("the network accepts no more bytes")
+                raise serial.SerialException("the network accepts only a part of the bytes")
         except OSError as failure:
             raise serial.SerialException(f"the connection failed: {failure}") from failure
         finally:

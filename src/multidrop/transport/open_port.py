@@ -45,9 +45,12 @@ _OVERRUN, _BUF_OVERRUN = 7, 10
 
 
 def overruns(fd: int) -> int:
-    """Return the number of overruns since the driver was loaded. Raises OSError if it counts none."""
+    """Return the number of overruns since the driver was loaded.
+
+    Raises OSError if the driver does not count overruns.
+    """
     if sys.platform != "linux":
-        raise OSError("only Linux counts them")
+        raise OSError("only Linux counts overruns")
     import fcntl  # Windows lacks this module
 
     counts = bytearray(_ICOUNTER.size)
@@ -67,7 +70,7 @@ _REASONS = {
     errno.ECONNREFUSED: "nothing listens there",
 }
 
-# pyserial keeps a Windows error only in its message: could not open port 'COM5': PermissionError(13, ...)
+# pyserial keeps only the text of a Windows error: could not open port 'COM5': PermissionError(13, ...)
 _WINDOWS_ERROR = re.compile(r"Error\((\d+), ")
 _WINDOWS_REASONS = {
     errno.EACCES: _REASONS[errno.EBUSY],  # a COM port is open in another program
@@ -112,7 +115,8 @@ def why_lost(port: str, error: int, received: bytes = b"") -> str:
     return f"the received bytes are not Modbus TCP: {shown}{mixed_up(port, received)}"
 
 
-_FOR_PROGRAMS = ("loop", "spy")  # pyserial's, allowed without options: spy://DEVICE?file=PATH empties a file
+# pyserial's URLs, allowed only without options: spy://DEVICE?file=PATH would empty a file
+_FOR_PROGRAMS = ("loop", "spy")
 
 
 def _socket_url(url: SplitResult) -> str:
@@ -149,10 +153,10 @@ def is_bridged(port: serial.SerialBase) -> bool:
 
 
 def check_port(port: str, mastership: Mastership | None) -> None:
-    """Raise NoSuchPort for an invalid port name, and TypeError unless this is a mastership or None.
+    """Raise NoSuchPort for an invalid port name, and TypeError unless `mastership` is a Mastership or None.
 
-    With a mastership, raise NoSuchPort for a bridged port too: a request that its thread has already taken
-    would be sent even after the mastership was lost.
+    With a mastership, raise NoSuchPort for a bridged port too. The bridge's thread could send a request after
+    the mastership was lost, because it takes requests from the core before it sends them.
     """
     if mastership is not None and not isinstance(mastership, Mastership):
         raise TypeError(f"mastership takes a multidrop.core.Mastership, not {mastership!r}")
@@ -160,8 +164,8 @@ def check_port(port: str, mastership: Mastership | None) -> None:
         raise NoSuchPort(
             port,
             "a line with a mastership needs a port that the core writes to itself, such as "
-            "socket://10.0.0.7:4001 or a device: what goes through a thread could leave after another "
-            "process has become master",
+            "socket://10.0.0.7:4001 or a device: bytes that another thread forwards could leave after "
+            "another process has become master",
         )
 
 
@@ -188,19 +192,19 @@ def identity_of(port: serial.SerialBase, name: str) -> str:
         return port_identity.of_connection(connection)
     try:
         return port_identity.of_device(device_of(port))
-    except (OSError, ValueError, AttributeError):  # a port without a device, such as loop://
+    except (OSError, ValueError, AttributeError):  # raised for a port without a device, such as loop://
         return port_identity.of_name(name)
 
 
 def failing_refusals(device: str) -> int:
-    """Return the mask of REFUSALS that are failures on this device."""
+    """Return the mask (of REFUSALS) of the settings that this device must not refuse."""
     return must_take(device) | (NO_DIVISOR if port_identity.has_divisor(device) else 0)
 
 
 TOLERANCE = 0.02  # relative deviation of a baud rate: the limit of the core and of the kernel
-CLOSING_S = 0.75  # how long the adapter may still take the driver's bytes when a port is closed
+CLOSING_S = 0.75  # time for which closing a port waits until the adapter has taken the driver's bytes
 _UNNOTICED_S = 0.05  # s; time in which a healthy adapter takes all bytes
-BY_PLACE = "/dev/serial/by-path/"  # names of USB sockets, into which any adapter may be plugged
+BY_PLACE = "/dev/serial/by-path/"  # links that name USB sockets, not adapters
 _NO_SETTINGS = -1
 _TRANSACTIONS = {
     TransactionIds.MATCH: Transactions.MATCHED,
@@ -237,9 +241,9 @@ class OpenPort:
         self._mastership = mastership
         self._settle = settle
         self._serial: serial.SerialBase | None = None
-        self._adapter: USBAdapter | None = None  # the adapter at the last opening
-        self._terminal: PseudoTerminal | None = None  # the pseudo-terminal at the last opening
-        self.must_discard = False  # the driver may hold bytes of a command that has ended
+        self._adapter: USBAdapter | None = None  # the adapter when the port was last opened
+        self._terminal: PseudoTerminal | None = None  # the pseudo-terminal when the port was last opened
+        self.must_discard = False  # True: the driver may hold bytes of a command that has ended
 
     def open(self) -> Port:
         """Open the port, wait for `settle` s, discard the input, and return the core's port.
@@ -251,7 +255,8 @@ class OpenPort:
         port.timeout = 0
         if isinstance(port, serial.Serial):
             port.exclusive = True
-            port.rts = self._rs485 is not RS485.RTS_UP  # opening with the other level would start sending
+            # opening with the other level would switch the transceiver to sending
+            port.rts = self._rs485 is not RS485.RTS_UP
         port.open()
         if isinstance(port, serial.Serial) and not self.name.startswith(BY_PLACE):
             self._require_same_adapter(device_of(port))
@@ -262,7 +267,7 @@ class OpenPort:
             port.reset_input_buffer()
         core = self._drive(port)
         with suppress(*PORT_FAILURES, AttributeError, NotImplementedError):
-            port.set_low_latency_mode(True)  # without it, a USB adapter delays bytes by up to 16 ms
+            port.set_low_latency_mode(True)  # without low latency, a USB adapter delays bytes by up to 16 ms
         return core
 
     def _name_now(self) -> str:
@@ -277,7 +282,7 @@ class OpenPort:
         return (None if is_same else port_identity.device_of(self._adapter)) or self.name
 
     def _terminal_now(self) -> PseudoTerminal | None:
-        """Return the pseudo-terminal to open. Raises LineError if a later one has its number now.
+        """Return the pseudo-terminal to open. Raises LineError if a later terminal now has its number.
 
         The later terminal may belong to any program, such as a shell, and opening it changes its settings.
         """
@@ -287,7 +292,7 @@ class OpenPort:
         return found
 
     def _require_same_adapter(self, device: str) -> None:
-        """Raise LineError if another adapter has this device name now: there are other motors on its line."""
+        """Raise LineError if another adapter has this device name now, because its line has other motors."""
         found = adapter_of(device)
         if self._adapter and (found is None or not self._adapter.is_same(found)):
             raise LineError(
@@ -338,7 +343,7 @@ class OpenPort:
         return False
 
     def holds_bytes(self) -> bool:
-        """Return True if the adapter takes longer for the driver's bytes than a healthy one."""
+        """Return True if the adapter has not taken the driver's bytes although a healthy one would have."""
         if not self._holds_bytes_now():
             return False
         clock.sleep(_UNNOTICED_S)
@@ -347,7 +352,8 @@ class OpenPort:
     def close(self) -> None:
         """Close the port, even if opening it failed halfway.
 
-        The adapter may take the driver's bytes for CLOSING_S; later, or with `must_discard`, they are lost.
+        The adapter has CLOSING_S seconds to take the driver's bytes; then the rest is discarded. With
+        `must_discard`, all are discarded now.
         """
         if self.bridge:
             self.bridge.close()
@@ -385,7 +391,7 @@ class OpenPort:
         if self.settings == settings:
             return
         if self.settings:
-            raise LineError(self.name, "this kind of port cannot change its settings from drive to drive")
+            raise LineError(self.name, "this kind of port cannot switch its settings between two drives")
         try:
             set_up(self._serial, settings)
         except PORT_FAILURES as failure:
@@ -393,7 +399,7 @@ class OpenPort:
         self.settings = settings
 
     def refusal(self, mask: int, baudrate: int) -> str:
-        """Return why the port did not take the settings of this mask of REFUSALS."""
+        """Return why the port refused settings; `mask` has a bit of REFUSALS for each of them."""
         if mask != NO_DIVISOR or self._serial is None:
             return f"the port does not take the {refused_names(mask)} that the drive needs"
         true, lower, higher = possible_rates(self._serial.fileno(), baudrate)

@@ -15,7 +15,8 @@ from multidrop.transport import clock, port_identity
 from multidrop.transport.line import Line
 from multidrop.transport.prepared import NO_ROWS, make_exchange
 
-KEPT_NS = 120_000_000_000  # late.c remembers outstanding requests for the same time
+# how long former peers are kept; late.c remembers outstanding requests for the same time
+KEPT_NS = 120_000_000_000
 
 
 class FormerPeers(NamedTuple):
@@ -67,7 +68,7 @@ LEAST_TIMEOUT = 0.02  # s; delay that computer and adapter may add to the drive'
 
 
 class Peers:
-    """The peers of the drives on one line. Threads may read them while one thread changes them."""
+    """The peers of the drives on one line. Threads may read the peers while one thread changes them."""
 
     def __init__(self, line: Line) -> None:
         self._line = line
@@ -79,8 +80,8 @@ class Peers:
     def add(self, drive: Drive) -> None:
         """Add a drive; a drive that was on the line before keeps its learnt timing and late replies.
 
-        First wait until no exchange with an earlier drive at this address is in flight: only then is it known
-        which replies of that drive are late.
+        First wait until no exchange with an earlier drive at this address is in flight. Until then, it is
+        unknown which replies of the earlier drive are late.
         """
         for other, known in self._known.items():
             while other[0] == drive.address and self._is_asked(known):
@@ -89,7 +90,8 @@ class Peers:
         least = min(drive.response_timeout, documented)
         asked_as = type(drive), drive.framing, drive.settings, silence(drive), least, drive.response_timeout
         key = drive.address, *asked_as
-        if key not in self._known:  # otherwise keep the known peer: the core may still use its proofs
+        # otherwise keep the known peer: the core may still use its proofs (see Peer.prove_by)
+        if key not in self._known:
             self._known[key] = self._new(drive, least)
         # A late reply of a removed drive could be mistaken for a reply of the next drive at its address.
         peer = self.present[drive] = self._known[key]
@@ -143,10 +145,10 @@ class Peers:
         Raises NotAttached if the drive was removed after the exchange was made.
         """
         asking = object()
-        try:  # a signal must never leave an entry in `_asked`: `add` would wait for it forever
-            self._asked[asking] = (
-                made.peer
-            )  # before the check, so that `add` of another drive at this address waits for this exchange
+        # a signal must never leave an entry in `_asked`, because `add` would wait for that entry forever
+        try:
+            # set before the check, so that `add` of another drive at this address waits for this exchange
+            self._asked[asking] = made.peer
             if self.present.get(drive) is not made.peer:
                 raise _not_attached(drive)
             return self._line.carry_out(made, expires_ns=expires_ns, into=into)

@@ -1,4 +1,4 @@
-"""Find the identity of a port, a text that is the same for all names of that port."""
+"""Find the identity of a port, a text that is the same for all its names, and mark simulated ports by it."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import os
 import re
 import socket
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 from multidrop.core import is_pseudo_terminal
 from multidrop.drive.line_settings import MODBUS_PORT, speaks_tcp
@@ -40,20 +41,20 @@ class USBAdapter:
 
 
 def adapter_of(device: str) -> USBAdapter | None:
-    """Return the USB adapter behind this device name; None if there is no adapter, or it is unknown."""
+    """Return the USB adapter behind this device name; None if no adapter is known there."""
     found = (TTYS / Path(device).name / "device").resolve()
     for part in (found, *found.parents):
         if interface := _INTERFACE.fullmatch(part.name):
-            number = f"{interface[1]}.{_text(found / 'port_number') or 0}"  # its port's number
+            number = f"{interface[1]}.{_text(found / 'port_number') or 0}"  # "1.0.0": interface and port
             serial = _text(part.parent / "serial")
             return USBAdapter(f"{part.parent.name}:{number}", serial and f"{serial}:{number}")
     return None
 
 
 def device_of(adapter: USBAdapter) -> str | None:
-    """Return the present device name of this adapter; None if it is not in its USB socket.
+    """Return this adapter's present device name; None if the adapter has left its USB socket.
 
-    In another socket it may be a twin: serial numbers are not unique.
+    An adapter in another socket may be a different one: serial numbers are not unique.
     """
     here = [name for name, one in _adapters().items() if one.place == adapter.place and adapter.is_same(one)]
     return str(DEVICES / here[0]) if len(here) == 1 else None
@@ -89,7 +90,10 @@ def _text(file: Path) -> str:
 
 @dataclass(frozen=True)
 class PseudoTerminal:
-    """A pseudo-terminal, and the links that lead to it. After its end, the system reuses its number."""
+    """A pseudo-terminal, and the links that lead to it.
+
+    After the end of a pseudo-terminal, the system reuses its number.
+    """
 
     device: str
     changed_ns: int  # ns; a later terminal with the same number has a later time
@@ -139,7 +143,7 @@ def of_device(path: str) -> str:
 
 
 def lasting_name(port: str) -> str:
-    """Return a device name that contains its adapter's serial number; without one, the given name."""
+    """Return the port's device name with the adapter's serial number; the given name if there is none."""
     if "://" in port or Path(port).is_symlink():
         return port
     adapter = adapter_of(port)
@@ -169,3 +173,56 @@ def of_name(name: str) -> str:
     if _PEER.fullmatch(name) and not Path(name).exists():
         return name
     return of_device(name)
+
+
+# ---- marks of simulated ports ----
+#
+# A client does not count writes to a marked port as EEPROM wear. On Linux, a simulator binds a name for each
+# of its ports (an abstract Unix address, see unix(7)). The kernel removes the name when the process ends,
+# even by SIGKILL. Other systems have no such names, so those writes are counted there.
+
+
+_HAS_NAMES = sys.platform == "linux"
+
+
+def _name(identity: str) -> bytes:
+    return b"\0multidrop/simulated/%d/%s" % (os.getuid(), identity.encode()[-60:])
+
+
+def ledger_of(identity: str, directory: Path) -> Path:
+    """Return the path of a simulated port's EEPROM ledger, kept while its simulator runs."""
+    return directory / "simulated" / f"{quote(identity, safe='')}.sqlite"
+
+
+class SimulatedPort:
+    """The mark of a simulated port. Creating or closing the mark deletes the port's EEPROM ledger."""
+
+    def __init__(self, identity: str, directory: Path) -> None:
+        self._ledger = ledger_of(identity, directory)
+        self._holder: socket.socket | None = None
+        self._forget_writes()
+        if _HAS_NAMES:
+            self._holder = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            with suppress(OSError):  # another simulator has marked a port of the same name
+                self._holder.bind(_name(identity))
+
+    def _forget_writes(self) -> None:
+        with suppress(OSError):
+            self._ledger.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        if self._holder is not None:
+            self._holder.close()
+        self._forget_writes()
+
+
+def is_simulated(identity: str) -> bool:
+    """Return True while a simulator of this user has marked this port."""
+    if not _HAS_NAMES:
+        return False
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as asking:
+        try:
+            asking.connect(_name(identity))
+        except OSError:
+            return False
+    return True

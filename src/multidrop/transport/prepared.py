@@ -1,4 +1,4 @@
-"""Create the exchanges for a drive's requests, and cache those of its reads."""
+"""Create the exchanges for a drive's requests, and cache the exchanges of its reads."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _is_exact(register: Register[Any]) -> bool:
 
 
 class BlockDecoder:
-    """Decoder for the reply to a read of a block: these registers, from address `start`."""
+    """Decoder for the reply to a read of a block, which has `registers` from address `start`."""
 
     def __init__(self, registers: tuple[Register[Any], ...], start: int) -> None:
         places = [(register, register.address - start) for register in registers]
@@ -67,8 +67,9 @@ def decoder_of(block: Block) -> BlockDecoder:
     return _shared(block.registers, block.start)
 
 
-MOST_PREPARED = 256  # most cached read plans of a drive, and most cached blocks
-NO_ROWS = core.RowLayout(0, [])  # for commands: the poll's summary does not count their values
+MOST_PREPARED = 256  # limit of a drive's cached read plans, and of its cached blocks
+# layout for reads of commands, whose values the poll's summary does not count
+NO_ROWS = core.RowLayout(0, [])
 
 
 def make_exchange(
@@ -117,7 +118,7 @@ class PreparedRead:
         self.spare: list[Completion] = []  # completions that later reads reuse
 
     def insisting(self, drive: Drive, timeout: float) -> Exchange:
-        """Return an exchange for the same block with `insists` and this timeout in s; see Exchange."""
+        """Return an exchange that reads the same block with `insists` and this timeout in s; see Exchange."""
         peer, values = self.exchange.peer, self.exchange.values
         return make_read(drive, self.block, peer, values=values, insists=True, timeout=timeout)
 
@@ -165,10 +166,10 @@ class PreparedReads:
             return ReadPlan(wanted, registers, tuple(map(prepare, reversed(blocks(drive, registers)))))
 
         self.of = of
-        self.newest = NOTHING  # the last plan used: to use it again, no registers are hashed
+        self.newest = NOTHING  # the last plan used; using it again needs no hashing of registers
         self.prepare = prepare
-        self.parts: dict[Block, tuple[Block, ...]] = {}  # parts of blocks not answered as a whole
-        self.answered: set[Block] = set()  # blocks that the drive answered, although maybe too long
+        self.parts: dict[Block, tuple[Block, ...]] = {}  # smaller blocks to read instead of a block
+        self.answered: set[Block] = set()  # answered blocks among those that may be too long for the drive
 
     def ask_first(self, block: Block) -> None:
         """From now on read a refused block before the other parts of its larger block.

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from multidrop.transport.exchange import Exchanges
 
 
-LOOKS = 3  # attempts to read all counters before another exchange ends
+LOOKS = 3  # attempts to read all counters without an exchange ending meanwhile
 _EPOCHS = count(1)
 
 
@@ -129,7 +129,7 @@ class Statistics:
     def timeout(self) -> float:
         """Present timeout in s; for a line, the longest timeout of its drives.
 
-        The timeout follows the drive's response delay, and grows if replies are late repeatedly.
+        The timeout follows the drive's measured response delay. It grows if replies are late repeatedly.
         """
         return self.counters.timeout_ns / 1e9
 
@@ -143,8 +143,8 @@ class Statistics:
         """Fraction of the line's time that the answered exchanges needed.
 
         An exchange needs silence, request, response delay and reply, at the line's settings. If the port is
-        faster than its settings (a network, a pseudo-terminal), at most the time that the exchange took
-        counts. An exchange counts when it ends: see `counted_s`.
+        faster than its settings (a network, a pseudo-terminal), the measured time of the exchange is the
+        limit. An exchange counts when it ends: see `counted_s`.
         """
         return self.used_s / (self.seconds if self.counted_s is None else self.counted_s)
 
@@ -222,7 +222,7 @@ def line_statistics(
 ) -> LineStatistics:
     """Return the statistics of a line and its drives from counters over `seconds` s, given by drive name.
 
-    `epochs`: the drives' epochs, by drive name.
+    `epochs`: each drive's epoch by name, a number that changes when its counts restart at zero.
     """
     drives = {
         name: Statistics(seconds, counters, counted_s=counted_s, epoch=epochs.get(name, 0))
@@ -239,7 +239,7 @@ def _sum(counters_by_drive: Iterable[Counters]) -> Counters:
 
 
 def _total(column: Sequence[Any]) -> Any:
-    """Return the sum of a column: of numbers, or key by key of Counter objects."""
+    """Return the sum of numbers, or of Counter objects key by key."""
     if not isinstance(column[0], Counter):
         return sum(column)
     found: Counter[Any] = Counter()
@@ -264,7 +264,7 @@ def _minus(now: Any, earlier: Any) -> Any:
 
 
 def _quantiles(counters: Counters, parts: Iterable[float]) -> list[float]:
-    """Return quantiles of the response delay: the middle of each one's bucket, in s; 0.0 without replies."""
+    """Return quantiles of the response delay in s, each as the middle of its bucket; 0.0 without replies."""
     buckets = sorted(counters.delays)
     seen = list(accumulate(counters.delays[bucket] for bucket in buckets))
     if not seen:
@@ -278,7 +278,7 @@ def _middle(counters: Counters, bucket: int) -> float:
 
 
 class Count(NamedTuple):
-    """Statistics since a line was opened, and the peers by the names that their drives had then."""
+    """A reading: the statistics since the line was opened, and the peer of each drive by the drive's name."""
 
     statistics: LineStatistics
     peers: Mapping[str, Peer]
@@ -287,7 +287,7 @@ class Count(NamedTuple):
 class LineMeter:
     """Statistics of a line since it was opened or last reset; frozen when the line is closed.
 
-    The counts at the last reset are matched by peer, because another drive may have the same name later.
+    A drive's counts at the last reset are found by its peer, because another drive may get its name later.
     """
 
     def __init__(self, exchanges: Exchanges) -> None:
