@@ -23,7 +23,9 @@ from multidrop.core.undisturbed import undisturbed
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.errors import LineError, PollingFailed
+from multidrop.plant.loader import check_channels
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
+from multidrop.polling.added_rows import AddedRows
 from multidrop.polling.adoption import GONE, Adoption
 from multidrop.polling.line_set import LineSet
 from multidrop.polling.row_source import RowSource
@@ -33,8 +35,9 @@ from multidrop.transport.aside_log import log_aside, traceback_of, words_of
 from multidrop.transport.statistics import LineStatistics
 
 LOOK_NS = 50_000_000  # interval between checks of the lines, if a line has a problem or `fileno` is in use
-BUSY_NS = 100_000_000  # the same interval if lines only need new exchanges: a third of AHEAD_NS
-REST_NS = 500_000_000  # the same interval if no line needs attention
+# interval between checks of the lines, if lines only need new exchanges: a third of AHEAD_NS
+BUSY_NS = 100_000_000
+REST_NS = 500_000_000  # interval between checks of the lines, if no line needs attention
 MOST_FAILURES = 8  # consecutive failures of the poller's thread before polling ends
 FAILED_NS = 50_000_000  # pause after a failure of the poller's thread
 
@@ -58,15 +61,15 @@ class Poller(RowSource):
     may take batches, and add or remove drives. Reads, writes and verbs of its drives are sent before queued
     polling. `ledger`, `audit`, `stop_on_exit` and `mastership` are as in Bus.
 
-    With `realtime`, or with that key in the plant file, the core's thread is scheduled before all normal
-    threads until the poller is closed. If the system refuses this, a warning is logged, and the poller works
-    without it.
+    With `realtime`, or with the key `realtime` in the plant file, the core's thread is scheduled before all
+    normal threads until the poller is closed. If the system refuses this, a warning is logged, and the poller
+    works without it.
 
     Raises LineError if a port cannot be opened. Later failures appear as rows with the reason why a value is
-    missing. If an exception occurs on one line, such as one in a user's own class, it is logged and the line
-    is tried again (see `line_failures`). If polling itself fails, `take`, `batches` and `close` raise
-    PollingFailed (see `failure`). Without its mastership the poller sends no request and opens no port; each
-    value that is due then has a row with that reason.
+    missing. An exception on one line, such as one in a user's own class, is logged, and the line is tried
+    again (see `line_failures`). If polling itself fails, `take`, `batches` and `close` raise PollingFailed
+    (see `failure`). Without its mastership the poller sends no request and opens no port; each value that is
+    due then has a row with that reason.
 
     The logger `multidrop.line` does not log polled frames. `multidrop poll --capture` writes them to a file
     for Wireshark.
@@ -83,14 +86,15 @@ class Poller(RowSource):
         realtime: bool = False,
     ) -> None:
         plant = _plant_of(plant)
+        check_channels(plant)
         row_queue = RowQueue()
         self._is_realtime_given = realtime
         self._realtime = Realtime()
         self._lines = LineSet(row_queue, ledger, audit, mastership)
         super().__init__(row_queue, self._lines.names)
-        self._path = plant.path
+        self._path, self._totals = plant.path, plant.totals
         self._thread = threading.Thread(target=self._run, name="multidrop poller", daemon=True)
-        self._look_ns = 0  # time of the next check of lines that the core has not called
+        self._look_ns = 0  # time of the next check of lines that the core has not reported
         self._is_failure_raised = False
         self._ending = threading.Lock()
         register_at_fork(self)
@@ -108,6 +112,7 @@ class Poller(RowSource):
         with self._changing:
             self._check_polling()  # an interruption may have closed the poller already
             self._lines.fill(plant.lines)
+            self._added.adopt(self.plant)
 
     def _want_realtime(self, plant: Plant) -> None:
         try:
@@ -120,6 +125,7 @@ class Poller(RowSource):
         self._closing = True
         self._over, self._caller = threading.Event(), None
         self._over.set()
+        self._added = AddedRows(self._names)
         self._changing = threading.Lock()
         self._ending = threading.Lock()
         self._wakeup.close()
@@ -140,7 +146,7 @@ class Poller(RowSource):
     def __enter__(self) -> Poller:
         try:
             self._start()
-        except BaseException:  # __exit__ is not called then
+        except BaseException:  # close here, because Python does not call __exit__ if __enter__ fails
             self._end()
             raise
         return self
@@ -157,17 +163,18 @@ class Poller(RowSource):
         self._end()
         if isinstance(error, KeyboardInterrupt):
             without_internals(error)
-        if error is not None:  # this error propagates; other failures were logged
+        if error is not None:  # the error of the `with` block propagates; other failures were logged
             self._caller, self._is_failure_raised = None, True
         self.close()
 
     def close(self) -> None:
         """Stop polling and close the ports. Rows that are not taken yet can still be taken.
 
-        Waits up to a second for exchanges in flight; every value due before the call has a row. If a signal
-        interrupts the wait, the closing still completes; a second call of `close` waits until the closing is
-        complete. The function given to `on_batch` gets its last batches first. Raises that function's
-        failure, and PollingFailed if polling had failed; neither is raised a second time.
+        Waits up to a second for exchanges in flight; every value due before the call has a row. Then waits up
+        to 2 s until the totals of channels are on the disk. If a signal interrupts the wait, the closing
+        still completes; a second call of `close` waits until the closing is complete. The function given to
+        `on_batch` gets its last batches first. Raises that function's failure, and PollingFailed if polling
+        had failed; neither is raised a second time.
         """
         self._end()
         give_signals_back()
@@ -184,12 +191,13 @@ class Poller(RowSource):
                 self._end_lines()
         if self._caller:
             self._caller.join()
+        self._added.save()
 
     def _end_lines(self) -> None:
         self._closing = True
         for line in self._lines:
             line.bus.leave()  # start the stops of all lines before waiting for any
-        with self._changing:  # waits for an adoption in progress
+        with self._changing:  # acquiring the lock waits for an adoption in progress
             if self._thread.is_alive():
                 self._call_thread()
                 self._thread.join()
@@ -226,7 +234,7 @@ class Poller(RowSource):
                 clock.sleep(FAILED_NS / 1e9)
 
     def _tend_lines(self) -> None:
-        """Wait until the core calls for lines or a check is due, and call `tend` of those lines."""
+        """Wait until the core reports lines, or a check is due; call `tend` of lines that need attention."""
         seconds = max(0, self._look_ns - clock.now_ns()) / 1e9
         called = self._lines.called(self._row_queue.await_calls(seconds))
         now = clock.now_ns()
@@ -248,11 +256,11 @@ class Poller(RowSource):
     def plant(self) -> Plant:
         """The plant as it is polled now, with the drive objects that are on the buses."""
         lines = tuple(replace(line.declared, drives=line.polled) for line in self._lines)
-        return Plant(lines, self._path, realtime=self._realtime.is_wanted)
+        return Plant(lines, self._path, realtime=self._realtime.is_wanted, totals=self._totals)
 
     @property
     def polled_since(self) -> dict[str, int]:
-        """By drive name, the `monotonic_ns` from which rows belong to the drive that `plant` describes."""
+        """For each drive name, the `monotonic_ns` since which rows belong to `plant`'s drive of that name."""
         return {name: since_ns for line in self._lines for name, since_ns in line.since_ns.items()}
 
     def adopt(self, plant: Plant | Path | str) -> dict[str, LineError]:
@@ -268,14 +276,15 @@ class Poller(RowSource):
 
         When lines and drives are removed, their requests in flight are completed and give rows. Other calls
         on a removed line raise LineError; calls of a removed drive raise NotAttached, or CancelledByStop if
-        they move its motor. Pending stops are waited for. Motors continue as they are, unless `stop_on_exit`
-        is set: then the drives are stopped before they are removed. A drive whose address becomes another
-        family's is not stopped, because its stop may mean something else there.
+        they move its motor. This call waits for pending stops. Motors continue as they are, unless
+        `stop_on_exit` is set: then the drives are stopped before they are removed. A drive whose address
+        becomes another family's is not stopped, because its stop may mean something else there.
 
-        Names in batches keep their codes. The call returns when the change is complete; other lines are
+        In batches, names keep their codes. The call returns when the change is complete; other lines are
         polled meanwhile. Any thread may call this; calls run one after another.
         """
         wanted = _plant_of(plant)
+        check_channels(wanted)
         self._take_signals()
         return self._adopt(wanted)
 
@@ -284,9 +293,11 @@ class Poller(RowSource):
         with self._changing:
             self._check_polling()
             adoption = Adoption(self._lines, plant)
-            self._path = plant.path
+            self._path, self._totals = plant.path, plant.totals
             self._want_realtime(plant)
-            return adoption.carry_out(start=self._thread.is_alive())
+            failures = adoption.carry_out(start=self._thread.is_alive())
+            self._added.adopt(self.plant)
+            return failures
 
     def add_line(self, line: PlantLine) -> None:
         """Open one more line and poll it from now on.
@@ -315,6 +326,7 @@ class Poller(RowSource):
             if failures:
                 self._lines.let_go([added], GONE)
                 raise failures[line.name]
+            self._added.adopt(self.plant)
             if self._thread.is_alive():
                 added.start()
 
@@ -327,10 +339,11 @@ class Poller(RowSource):
         with self._changing:
             self._check_polling()
             leaving = self._lines.find(name)
-        self._lines.wind_down([leaving])  # a stop may take half a minute
+        self._lines.wind_down([leaving])  # not under the lock, because a stop may take half a minute
         with self._changing:
             if not self._closing and leaving in self._lines:
                 self._lines.let_go([leaving], GONE)
+                self._added.adopt(self.plant)
 
     def _check_polling(self) -> None:
         if self._closing:
@@ -375,6 +388,7 @@ class Poller(RowSource):
             if polled.drive.name in names:
                 raise ValueError(f"another drive is called {polled.drive.name}; give each its own name")
             self._lines.find(line).add(polled)
+            self._added.adopt(self.plant)
 
     @undisturbed
     def remove(self, line: str, drive: str) -> None:
@@ -387,7 +401,8 @@ class Poller(RowSource):
             polled = self._lines.find(line)
             for attached in polled.bus.drives:
                 if attached.name == drive:
-                    return polled.remove(attached)
+                    polled.remove(attached)
+                    return self._added.adopt(self.plant)
         raise ValueError(f"there is no drive {drive!r} on line {line!r}")
 
     @undisturbed
@@ -406,6 +421,8 @@ class Poller(RowSource):
                 raise ValueError("polling has ended: no rate can be set")
             line, known = self._lines.find_drive(drive)
             line.set_rate(known, known.register(register) if isinstance(register, str) else register, every)
+            if self._added:
+                self._added.adopt(self.plant)  # the rate determines how long values of channels stay current
 
     def __getitem__(self, name: str) -> Drive:
         """Return the polled drive of this name. Raises KeyError if there is none."""
@@ -437,7 +454,7 @@ class Poller(RowSource):
 
     @property
     def line_failures(self) -> dict[str, str]:
-        """The exception of each line that polling failed on recently, by the line's name.
+        """The exceptions of lines on which polling failed recently, by the line's name.
 
         Such a line is tried again within 30 s, and is no longer listed after 10 s without another exception.
         """

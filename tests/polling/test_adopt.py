@@ -43,7 +43,7 @@ def wire(*drives: Drive) -> ClockedWire:
 
 
 def toys() -> ClockedWire:
-    """A wire with toys at the addresses 1 to 4."""
+    """A wire with a `Toy` drive at each of the addresses 1 to 4."""
     return wire(*(Toy(address) for address in range(1, 5)))
 
 
@@ -64,7 +64,7 @@ def fans(every: float | None = 0.1) -> tuple[PolledDrive, ...]:
 
 
 def clocked(*lines: PlantLine) -> ClockedLines:
-    """Return a polled plant with simulated wires for its lines, and for lines that may be added later."""
+    """Return a polled plant with simulated wires, for its lines and for lines that are added later."""
     names = {*(each.name for each in lines), "hall", "yard", "roof"}
     return ClockedLines.of_lines({f"port of {name}": toys() for name in names}, plant(*lines))
 
@@ -77,10 +77,18 @@ def statuses(rows: Sequence[Row], drive: str) -> set[str]:
     return {row.status for row in rows if row.drive == drive}
 
 
-def assert_rate(rows: Sequence[Row], drive: str, seconds: float, every: float) -> None:
-    counts = {values(rows)[drive, register.name] for register in ALL}
-    due = round(seconds / every)
-    assert counts <= {due - 1, due, due + 1}, (drive, counts)
+def check_rates(made: ClockedLines, wait: float = 1.0, **periods: float) -> list[Row]:
+    """Wait for `wait` s, then check for 5 s that each drive is polled with its period in s; return the rows.
+    `periods` has the drives' names, with an underscore in place of the hyphen.
+    """
+    if wait:
+        made.run(wait)
+    rows = made.run(5)
+    for name, period in periods.items():
+        drive, due = name.replace("_", "-"), round(5 / period)
+        counts = {values(rows)[drive, register.name] for register in ALL}
+        assert counts <= {due - 1, due, due + 1}, (drive, counts)
+    return rows
 
 
 # ---- lines that stay as they are ----
@@ -107,7 +115,7 @@ def test_adopting_other_lines_does_not_shift_an_unchanged_line_s_requests(every:
                     adopting = made.beside(lambda o=others: made.poller.adopt(plant(hall(*pumps(every)), *o)))
                 rows += made.run(1.7)
                 if adopts:
-                    made.finish(adopting)  # its thread may start late on a busy computer
+                    made.finish(adopting)  # on a busy computer, the adopting thread may start late
             rows += made.run(2)
         return [(row.monotonic_ns, row.register, row.status) for row in rows if row.drive.startswith("pump")]
 
@@ -139,21 +147,15 @@ def test_rates_and_registers_change_on_the_open_port() -> None:
         first, second = made.poller.bus("hall").drives
         slow = replace(hall(), drives=(toy("pump-1", 1, 0.5), toy("pump-2", 2)))
         assert made.poller.adopt(plant(slow)) == {}
-        made.run(1)
-        rows = made.run(10)
-        assert_rate(rows, "pump-1", 10, 0.5)
-        assert_rate(rows, "pump-2", 10, 0.1)
+        check_rates(made, pump_1=0.5, pump_2=0.1)
         few = hall(polled(Toy(1, name="pump-1"), [CURRENT], 0.1), polled(Toy(2, name="pump-2"), [], None))
         made.poller.adopt(plant(few))
         made.run(1)
-        assert {key: count in (99, 100, 101) for key, count in values(made.run(10)).items()} == {
+        assert {key: count in (49, 50, 51) for key, count in values(made.run(5)).items()} == {
             ("pump-1", "output_current"): True
         }
         made.poller.adopt(plant(hall(*pumps())))
-        made.run(1)
-        rows = made.run(10)
-        assert_rate(rows, "pump-1", 10, 0.1)
-        assert_rate(rows, "pump-2", 10, 0.1)
+        check_rates(made, pump_1=0.1, pump_2=0.1)
         assert made.poller.bus("hall").drives == [first, second]
         assert made.opened == ["port of hall"]
 
@@ -164,16 +166,11 @@ def test_adoption_adds_removes_and_readdresses_drives() -> None:
         made.run(2)
         stays = made.poller.bus("hall").drives[0]
         made.poller.adopt(plant(hall(toy("pump-1", 1), toy("pump-3", 3))))
-        made.run(1)
-        rows = made.run(10)
-        assert_rate(rows, "pump-1", 10, 0.1)
-        assert_rate(rows, "pump-3", 10, 0.1)
+        rows = check_rates(made, pump_1=0.1, pump_3=0.1)
         assert statuses(rows, "pump-2") == set()
         made.poller.adopt(plant(hall(toy("pump-1", 1), toy("pump-3", 4), toy("pump-2", 3))))
-        made.run(1)
-        rows = made.run(10)
+        rows = check_rates(made, pump_1=0.1, pump_2=0.1, pump_3=0.1)
         for name, address in (("pump-1", 1), ("pump-2", 3), ("pump-3", 4)):
-            assert_rate(rows, name, 10, 0.1)
             found = {row.value for row in rows if row.drive == name and row.register == "output_current"}
             assert found == {proof(Toy(address), CURRENT)}
         assert made.poller.bus("hall").drives[0] is stays
@@ -193,12 +190,10 @@ def test_a_drive_can_change_to_another_family() -> None:
         made.wires["port of hall"] = wire(drives[1], Toy(1))
         made.wires["port of hall"].open()
         made.poller.adopt(plant(hall(polled(drives[1], registers[1], 0.1), toy("fan", 1))))
-        made.run(2)
-        rows = made.run(5)
+        rows = check_rates(made, 2, fan=0.1)
     assert {
         row.value == proof(drives[1], drives[1].register(row.register)) for row in rows if row.drive == "pump"
     } == {True}
-    assert_rate(rows, "fan", 5, 0.1)
 
 
 @pytest.mark.slow
@@ -207,8 +202,7 @@ def test_a_line_with_a_new_name_keeps_its_port() -> None:
         made.run(2)
         names = replace(hall(*pumps()), name="yard"), replace(yard(*fans()), name="hall")
         assert made.poller.adopt(plant(*names)) == {}
-        rows = made.run(5)
-        assert_rate(rows, "pump-1", 5, 0.1)
+        check_rates(made, 0, pump_1=0.1)
         assert list(made.poller.statistics()) == ["yard", "hall"]
         assert [drive.name for drive in made.poller.bus("hall").drives] == ["fan-1", "fan-2"]
         assert sorted(made.opened) == ["port of hall", "port of yard"]
@@ -222,15 +216,12 @@ def test_adoption_adds_and_removes_lines() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(2)
         assert made.poller.adopt(plant(yard(*fans()))) == {}
-        rows = made.run(10)
+        rows = check_rates(made, 0, fan_1=0.1)
         assert statuses(rows, "pump-1") <= {"ok", "poll ended"}
-        assert_rate(rows, "fan-1", 10, 0.1)
         assert list(made.poller.buses) == ["yard"]
         assert made.ports["port of hall"] is None
         assert made.poller.adopt(plant(hall(*pumps()), yard(*fans()))) == {}
-        rows = made.run(10)
-        assert_rate(rows, "pump-1", 10, 0.1)
-        assert_rate(rows, "fan-1", 10, 0.1)
+        check_rates(made, 0, pump_1=0.1, fan_1=0.1)
         assert sorted(made.opened) == ["port of hall", "port of hall", "port of yard"]
 
 
@@ -250,8 +241,7 @@ def test_a_line_is_added_polled_and_removed() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         made.poller.add_line(yard(*fans()))
-        made.run(1)
-        assert_rate(made.run(5), "fan-1", 5, 0.1)
+        check_rates(made, fan_1=0.1)
         made.poller.remove_line("yard")
         rows_of(made.poller)
         assert statuses(made.run(2), "fan-1") == set()
@@ -281,15 +271,14 @@ def test_a_plant_can_be_adopted_before_polling_starts() -> None:
     made = clocked(hall(*pumps()))
     made.poller.adopt(plant(hall(toy("pump-1", 1, 0.2)), yard(*fans())))
     with made:
-        made.run(1)
-        rows = made.run(10)
-    assert_rate(rows, "pump-1", 10, 0.2)
-    assert_rate(rows, "fan-1", 10, 0.1)
+        rows = check_rates(made, pump_1=0.2, fan_1=0.1)
     assert statuses(rows, "pump-2") == set()
 
 
 def calls_to_add_one_to(count: int) -> int:
-    """Return the number of function calls in `adoption` when one line is added to `count` lines."""
+    """Return how many functions of the module `adoption` are called when one line is added to `count`
+    lines.
+    """
     lines = [hall(toy(f"pump-{number}", 1), name=f"hall-{number}") for number in range(count)]
     calls = 0
 
@@ -299,13 +288,13 @@ def calls_to_add_one_to(count: int) -> int:
 
     with clocked(*lines) as made:
         sys.setprofile(note)
-        threading.setprofile(note)  # for the thread that adopts
+        threading.setprofile(note)  # also counts calls in the thread that adopts
         try:
             made.poller.adopt(plant(*lines, yard(*fans())))
         finally:
             sys.setprofile(None)
             threading.setprofile(None)
-        assert_rate(made.run(10), "fan-1", 10, 0.1)
+        check_rates(made, 0, fan_1=0.1)
     return calls
 
 
@@ -326,12 +315,11 @@ def test_learnt_timing_survives_a_reopened_port() -> None:
         now = made.poller.bus("hall")
         assert now is not ours
         assert [now.peer(drive) for drive in now.drives] == peers
-        made.run(1)
-        assert_rate(made.run(5), "pump-1", 5, 0.1)
+        check_rates(made, pump_1=0.1)
 
 
 def test_a_drive_inherits_the_late_replies_due_at_its_address() -> None:
-    """The old drive's queued requests are sent before the new drive is added: it knows the replies due."""
+    """The old drive's queued requests are sent first. The new drive then knows which late replies are due."""
     wires = {"port of hall": wire(Toy(1))}
     with ClockedLines.of_lines(wires, plant(hall(toy("pump-1", 1), toy("deaf", 5, 0.05)))) as made:
         made.run(0.2)
@@ -353,7 +341,7 @@ def test_a_drive_inherits_the_late_replies_due_at_its_address() -> None:
 
 
 @pytest.mark.slow
-def test_an_absent_port_is_reported_and_awaited() -> None:
+def test_an_absent_port_is_reported_and_opened_once_it_exists() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         del made.wires["port of yard"]
@@ -363,14 +351,11 @@ def test_an_absent_port_is_reported_and_awaited() -> None:
         assert list(failures) == ["yard"]
         assert isinstance(failures["yard"], LineError)
         assert str(failures["yard"]) == "port of yard: it is not there"
-        rows = made.run(5)
+        rows = check_rates(made, 0, pump_1=0.1, v=0.1)
         assert statuses(rows, "fan-1") == {"port lost"}
-        assert_rate(rows, "pump-1", 5, 0.1)
-        assert_rate(rows, "v", 5, 0.1)
         made.wires["port of yard"] = toys()
         made.wires["port of yard"].open()
-        made.run(2)
-        assert_rate(made.run(5), "fan-1", 5, 0.1)
+        check_rates(made, 2, fan_1=0.1)
 
 
 def test_a_line_with_an_absent_port_is_not_added() -> None:
@@ -380,9 +365,8 @@ def test_a_line_with_an_absent_port_is_not_added() -> None:
         with pytest.raises(LineError, match="port of yard: it is not there"):
             made.poller.add_line(yard(*fans()))
         assert list(made.poller.buses) == ["hall"]
-        rows = made.run(5)
+        rows = check_rates(made, 0, pump_1=0.1)
         assert statuses(rows, "fan-1") == set()
-        assert_rate(rows, "pump-1", 5, 0.1)
 
 
 # ---- plants that cannot be adopted ----
@@ -402,7 +386,7 @@ def broken() -> dict[str, tuple[Plant, str]]:
         ),
         "drive twice": (
             plant(hall(pump), yard(toy("pump-1", 2))),
-            'line "yard", drive "pump-1": line "hall", drive "pump-1" already has this name',
+            'line "yard", drive "pump-1": another drive already has this name; each drive needs its own',
         ),
         "address twice": (
             plant(hall(pump, toy("pump-3", 1))),
@@ -430,10 +414,8 @@ def test_adopting_an_invalid_plant_changes_nothing(mistake: str) -> None:
             made.poller.adopt(wrong)
         assert any(told.startswith(sentence) for told in found.value.mistakes), found.value.mistakes
         assert made.poller.plant == before
-        rows = made.run(10)
-        for name in ("pump-1", "pump-2", "fan-1", "fan-2"):
-            assert_rate(rows, name, 10, 0.1)
-            assert statuses(rows, name) == {"ok"}
+        rows = check_rates(made, 0, pump_1=0.1, pump_2=0.1, fan_1=0.1, fan_2=0.1)
+        assert {row.status for row in rows} == {"ok"}
         assert sorted(made.opened) == ["port of hall", "port of yard"]
 
 
@@ -457,8 +439,7 @@ def test_an_unopenable_audit_log_raises_and_changes_nothing() -> None:
         made.poller._lines._audit = "/proc/none/audit"
         with pytest.raises(OSError, match="No such file"):
             made.poller.adopt(plant(yard(*fans())))
-        made.run(1)
-        assert_rate(made.run(5), "pump-1", 5, 0.1)
+        check_rates(made, pump_1=0.1)
 
 
 def test_adopting_drives_of_another_open_poller_raises() -> None:
@@ -469,15 +450,14 @@ def test_adopting_drives_of_another_open_poller_raises() -> None:
         assert list(made.poller.buses) == ["hall"]
 
 
-def test_adopting_more_names_than_a_batch_can_number_raises() -> None:
+def test_adopting_more_names_than_a_batch_has_codes_raises() -> None:
     with clocked(hall(*pumps())) as made:
         for number in range(65534):
             made.poller._lines.names.drives.number(f"gone-{number}")
         assert made.poller.adopt(plant(hall(*pumps()))) == {}
         with pytest.raises(ValueError, match="65537 names of drives since polling started are too many"):
             made.poller.adopt(plant(hall(toy("pump-1", 1), toy("one-more", 3))))
-        made.run(1)
-        assert_rate(made.run(5), "pump-2", 5, 0.1)
+        check_rates(made, pump_2=0.1)
 
 
 def test_adopt_raises_after_polling_has_ended() -> None:
@@ -503,7 +483,9 @@ def test_adopt_rejects_other_types() -> None:
 
 
 def test_polled_since_distinguishes_rows_of_a_reused_name() -> None:
-    """Drives at different addresses and on different lines exchange names; each has its own value."""
+    """Two drives on one line swap names, then two drives on different lines. Each drive has a different
+    value.
+    """
     wires = {"port of hall": toys(), "port of yard": wire(*(Toy(address) for address in (5, 6)))}
 
     def named(*names: str) -> Plant:
@@ -611,7 +593,7 @@ def test_memory_is_bounded_over_many_adoptions() -> None:
 
 
 def test_joining_drives_are_polled_with_the_fewest_changes_of_settings() -> None:
-    """The order is the same as if they had been polled from the start, with as few changes of baud rate."""
+    """The polling order has as few changes of baud rate as it has if all drives are polled from the start."""
 
     def drives() -> list[PolledDrive]:
         rates = {1: 9600, 2: 19200, 3: 9600, 4: 19200}

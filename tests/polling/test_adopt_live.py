@@ -5,9 +5,11 @@ from __future__ import annotations
 import gc
 import socket
 import threading
+import time
 import tracemalloc
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,9 +21,7 @@ from toy import Toy
 
 from multidrop.bus import Bus
 from multidrop.control.outcome import Seen, Stopped
-from multidrop.control.stops import StopAttempt
 from multidrop.drive import Drive
-from multidrop.drive.script import Step
 from multidrop.errors import CancelledByStop, LineError, NoReply, NotAttached
 from multidrop.plant.model import PlantLine, PolledDrive
 from multidrop.poller import Poller
@@ -90,6 +90,53 @@ def runs(drive: SimulatedDrive) -> bool:
     return drive["control"] == 1
 
 
+class Blocked:
+    """Blocks calls until the `with` block ends. Then waits for the threads that were started by `start`."""
+
+    def __init__(self) -> None:
+        self._reached, self._go_on = threading.Event(), threading.Event()
+        self._threads: list[threading.Thread] = []
+
+    def __enter__(self) -> Blocked:
+        return self
+
+    def __exit__(self, *failure: object) -> None:
+        self._go_on.set()
+        for thread in self._threads:
+            thread.join(PATIENCE)
+            assert not thread.is_alive()
+
+    def blocking(
+        self, act: Callable[..., Any], when: Callable[..., bool] = lambda *_: True
+    ) -> Callable[..., Any]:
+        """Return a version of `act` in which calls for which `when` is true wait for the end of the `with`
+        block.
+        """
+
+        def blocked(*arguments: Any, **details: Any) -> Any:
+            if when(*arguments):
+                self._reached.set()
+                assert self._go_on.wait(PATIENCE)
+            return act(*arguments, **details)
+
+        return blocked
+
+    def await_call(self) -> None:
+        """Wait until a call is blocked."""
+        assert self._reached.wait(PATIENCE)
+
+    @property
+    def is_blocking(self) -> bool:
+        """True if each thread is still alive."""
+        return all(thread.is_alive() for thread in self._threads)
+
+    def start(self, act: Callable[..., object], *arguments: object) -> threading.Thread:
+        """Call `act` on a new thread; return the thread."""
+        self._threads.append(threading.Thread(target=act, args=arguments))
+        self._threads[-1].start()
+        return self._threads[-1]
+
+
 # ---- motors ----
 
 
@@ -101,7 +148,7 @@ def test_motors_keep_running_when_their_line_is_removed(both: TwoLines) -> None:
     assert runs(both.fans[1])
 
 
-def test_with_stop_on_exit_drives_are_stopped_before_their_removal(both: TwoLines) -> None:
+def test_with_stop_on_exit_a_drive_is_stopped_before_it_is_removed(both: TwoLines) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         poller.stop_on_exit()
         for bus in poller.buses.values():
@@ -113,13 +160,13 @@ def test_with_stop_on_exit_drives_are_stopped_before_their_removal(both: TwoLine
         assert not runs(both.fans[1])
         assert not runs(both.fans[2])
         poller.adopt(plant(both.hall(1), both.yard()))
-        poller.bus("yard").drives[0].start()  # on the line that was just added
+        poller.bus("yard").drives[0].start()  # a drive on the line that was just added
     assert not runs(both.pumps[1])
     assert not runs(both.fans[1])
 
 
 def test_a_leaving_drive_cannot_be_started_after_its_stop(both: TwoLines) -> None:
-    """No later stop would be sent to the leaving drive."""
+    """Otherwise its motor would keep running, because no further stop is sent to a leaving drive."""
     with Poller(plant(both.hall())) as poller:
         poller.stop_on_exit()
         bus = poller.bus("hall")
@@ -140,29 +187,17 @@ def test_a_leaving_drive_cannot_be_started_after_its_stop(both: TwoLines) -> Non
 def test_drives_of_a_line_that_is_still_opening_are_stopped_at_exit(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    opening, go_on = threading.Event(), threading.Event()
-    open_bus = Bus.__init__
-
-    def slow(bus: Bus, *arguments: object, **details: object) -> None:
-        opening.set()
-        assert go_on.wait(PATIENCE)
-        open_bus(bus, *arguments, **details)  # type: ignore[arg-type]
-
     with Poller(plant(both.hall())) as poller:
-        monkeypatch.setattr(Bus, "__init__", slow)
-        adopting = threading.Thread(target=poller.adopt, args=[plant(both.hall(), both.yard())])
-        adopting.start()
-        try:
-            assert opening.wait(PATIENCE)
+        with Blocked() as opening:
+            monkeypatch.setattr(Bus, "__init__", opening.blocking(Bus.__init__))
+            opening.start(poller.adopt, plant(both.hall(), both.yard()))
+            opening.await_call()
             poller.stop_on_exit()
-        finally:
-            go_on.set()
-            adopting.join(PATIENCE)
         assert {name: bus.stops_on_exit for name, bus in poller.buses.items()} == {"hall": True, "yard": True}
 
 
 class Other(Quick):
-    """A drive of another family, for which the first family's stop would be a start."""
+    """A drive of another family, which may interpret the first family's stop as a different command."""
 
     model = "other"
 
@@ -184,7 +219,7 @@ def test_a_drive_of_a_changed_family_gets_no_stop_of_the_old_family(both: TwoLin
         assert writes == []
         assert runs(both.pumps[1])
         assert runs(both.fans[1])
-    assert not runs(both.pumps[1])  # stopped at exit by the stop of the new family
+    assert not runs(both.pumps[1])  # the new family's stop stopped this motor at exit
     assert not runs(both.fans[1])
 
 
@@ -201,44 +236,43 @@ def _note_writes(sim: SimulatedDrive, writes: list[int]) -> None:
 # ---- pending calls ----
 
 
-def _held_up(
-    bus: Bus, monkeypatch: pytest.MonkeyPatch, of: Drive | None = None
-) -> tuple[threading.Event, threading.Event]:
-    """Block all steps of stops: of all drives, or only of the drive `of`.
+def blocked_stop(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch, stop: Callable[[], object], of: Drive | None = None
+) -> Blocked:
+    """Call `stop` on a thread. Block the steps of every stop of the bus, or only those of the drive `of`."""
+    made, step = Blocked(), bus._stopper.do
+    monkeypatch.setattr(
+        bus._stopper, "do", made.blocking(step, lambda attempt, _: of in (None, attempt.drive))
+    )
+    made.start(stop)
+    made.await_call()
+    return made
 
-    Return an event that is set when the first step is blocked, and an event that ends the blocking.
-    """
-    begun, go_on = threading.Event(), threading.Event()
-    step = bus._stopper.do
 
-    def slow(stop: StopAttempt, next_step: Step) -> object:
-        if of in (None, stop.drive):
-            begun.set()
-            assert go_on.wait(PATIENCE)
-        return step(stop, next_step)
+def waited_for(bus: Bus, monkeypatch: pytest.MonkeyPatch, drive: Drive | None = None) -> threading.Event:
+    """Return an event that is set once a caller waits for the stops of the bus, or of this drive."""
+    found, await_stops = threading.Event(), bus._latches.await_stops
 
-    monkeypatch.setattr(bus._stopper, "do", slow)
-    return begun, go_on
+    def note_and_wait(drives: Collection[Drive] | None = None) -> None:
+        if drive is None or drive in (drives or ()):
+            found.set()
+        await_stops(drives)
+
+    monkeypatch.setattr(bus._latches, "await_stops", note_and_wait)
+    return found
 
 
 def test_removing_a_line_waits_for_its_stop(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         bus = poller.bus("yard")
         bus.drives[0].start()
-        begun, go_on = _held_up(bus, monkeypatch)
         found: dict[str, Stopped] = {}
-        stopping = threading.Thread(target=lambda: found.update(bus.stop_all()))
-        stopping.start()
-        assert begun.wait(PATIENCE)
-        adopting = threading.Thread(target=poller.adopt, args=[plant(both.hall())])
-        adopting.start()
-        before = samples(poller, "pump-1")
-        until(lambda: samples(poller, "pump-1") > before + 10)  # the other line is still polled
-        assert adopting.is_alive()
-        assert "yard" in poller.buses
-        go_on.set()
-        stopping.join(PATIENCE)
-        adopting.join(PATIENCE)
+        with blocked_stop(bus, monkeypatch, lambda: found.update(bus.stop_all())) as stopping:
+            adopting = stopping.start(poller.adopt, plant(both.hall()))
+            before = samples(poller, "pump-1")
+            until(lambda: samples(poller, "pump-1") > before + 10)  # the other line is still polled
+            assert adopting.is_alive()
+            assert "yard" in poller.buses
         assert {name: stopped.seen for name, stopped in found.items()} == {
             "fan-1": Seen.STOPPED,
             "fan-2": Seen.STOPPED,
@@ -252,53 +286,29 @@ def test_a_drive_can_be_removed_during_another_drive_s_stop(
 ) -> None:
     with Poller(plant(both.hall())) as poller:
         pump_1, _ = poller.bus("hall").drives
-        begun, go_on = _held_up(poller.bus("hall"), monkeypatch)
-        stopping = threading.Thread(target=pump_1.stop)
-        stopping.start()
-        assert begun.wait(PATIENCE)
-        adopting = threading.Thread(target=poller.adopt, args=[plant(both.hall(1))])
-        adopting.start()
-        try:
-            until(lambda: not adopting.is_alive())
-            assert stopping.is_alive()
-        finally:
-            go_on.set()
-            stopping.join(PATIENCE)
+        with blocked_stop(poller.bus("hall"), monkeypatch, pump_1.stop) as stopping:
+            poller.adopt(plant(both.hall(1)))
+            assert stopping.is_blocking
         assert poller.bus("hall").drives == [pump_1]
 
 
-def test_replaced_drives_stay_attached_until_all_stops_are_over(
+def test_replaced_drives_stay_attached_until_all_stops_have_ended(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both drives are replaced by others with the same names; until then the old drives can be stopped."""
-    exchanged = [polled(Quick(address, name=f"pump-{address}", silence=0.01), []) for address in (1, 2)]
+    """The new drives have the names of the old ones. Until all stops have ended, the old drives can still be
+    stopped.
+    """
+    replacements = [polled(Quick(address, name=f"pump-{address}", silence=0.01), []) for address in (1, 2)]
     with Poller(plant(both.hall())) as poller:
         bus = poller.bus("hall")
         pump_1, pump_2 = bus.drives
         pump_1.start()
-        begun, go_on = _held_up(bus, monkeypatch, pump_2)
-        stopping = threading.Thread(target=pump_2.stop)
-        stopping.start()
-        assert begun.wait(PATIENCE)
-        is_waited_for, await_stops = threading.Event(), bus._latches.await_stops
-
-        def tell_and_wait(drives: Collection[Drive] | None = None) -> None:
-            if pump_2 in (drives or ()):
-                is_waited_for.set()
-            await_stops(drives)
-
-        monkeypatch.setattr(bus._latches, "await_stops", tell_and_wait)
-        anew = plant(line(both.hall().port, *exchanged, name="hall"))
-        adopting = threading.Thread(target=poller.adopt, args=[anew])
-        adopting.start()
-        try:
+        with blocked_stop(bus, monkeypatch, pump_2.stop, pump_2) as stopping:
+            is_waited_for = waited_for(bus, monkeypatch, pump_2)
+            stopping.start(poller.adopt, plant(line(both.hall().port, *replacements, name="hall")))
             assert is_waited_for.wait(PATIENCE)
             pump_1.stop()
             assert not runs(both.pumps[1])
-        finally:
-            go_on.set()
-            stopping.join(PATIENCE)
-            adopting.join(PATIENCE)
         assert [drive.name for drive in bus.drives] == ["pump-1", "pump-2"]
         assert not {pump_1, pump_2} & {*bus.drives}
 
@@ -308,10 +318,10 @@ def test_replaced_drives_stay_attached_until_all_stops_are_over(
 def test_a_drive_stays_attached_until_another_line_releases_the_new_name(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch, is_circle: bool
 ) -> None:
-    """The drive's motor can be stopped while the adoption waits for a stop on the line that has the name."""
+    """While the adoption waits for a stop on the other line, the drive's motor can still be stopped."""
     hall, yard = both.hall(1), both.yard(1)
     names = ("fan-1", "pump-1" if is_circle else "fan-2")
-    anew = [
+    renamed = [
         line(each.port, quick(name, 1), name=each.name)
         for each, name in zip((hall, yard), names, strict=True)
     ]
@@ -319,32 +329,17 @@ def test_a_drive_stays_attached_until_another_line_releases_the_new_name(
         (pump,), (fan,) = (poller.bus(name).drives for name in ("hall", "yard"))
         pump.start()
         bus = poller.bus("yard")
-        begun, go_on = _held_up(bus, monkeypatch)
-        stopping = threading.Thread(target=fan.stop)
-        stopping.start()
-        assert begun.wait(PATIENCE)
-        is_waited_for, await_stops = threading.Event(), bus._latches.await_stops
-
-        def tell_and_wait(drives: Collection[Drive] | None = None) -> None:
-            is_waited_for.set()
-            await_stops(drives)
-
-        monkeypatch.setattr(bus._latches, "await_stops", tell_and_wait)
-        adopting = threading.Thread(target=poller.adopt, args=[plant(*anew)])
-        adopting.start()
-        try:
+        with blocked_stop(bus, monkeypatch, fan.stop) as stopping:
+            is_waited_for = waited_for(bus, monkeypatch)
+            stopping.start(poller.adopt, plant(*renamed))
             assert is_waited_for.wait(PATIENCE)
             assert poller.bus("hall").drives == [pump]
             pump.stop()
             assert not runs(both.pumps[1])
-        finally:
-            go_on.set()
-            stopping.join(PATIENCE)
-            adopting.join(PATIENCE)
         found = [drive.name for name in ("hall", "yard") for drive in poller.bus(name).drives]
         assert found == list(names)
         for name in names:
-            until(lambda name=name: samples(poller, name) > 3)  # type: ignore[misc]
+            until_sampled(poller, name)
 
 
 def test_a_stop_on_a_leaving_line_does_not_delay_changes_of_other_lines(
@@ -352,29 +347,18 @@ def test_a_stop_on_a_leaving_line_does_not_delay_changes_of_other_lines(
 ) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         bus = poller.bus("yard")
-        begun, go_on = _held_up(bus, monkeypatch)
-        stopping = threading.Thread(target=bus.stop_all)
-        stopping.start()
-        assert begun.wait(PATIENCE)
-        removing = threading.Thread(target=poller.remove_line, args=["yard"])
-        removing.start()
-        until(lambda: bus._latches.is_shut)
-        others = threading.Thread(target=lambda: (poller.remove_line("hall"), poller.add_line(both.hall(1))))
-        others.start()
-        try:
-            until(lambda: not others.is_alive())
-            assert stopping.is_alive()
-            assert removing.is_alive()
+        with blocked_stop(bus, monkeypatch, bus.stop_all) as stopping:
+            stopping.start(poller.remove_line, "yard")
+            until(lambda: bus._latches.is_shut)
+            poller.remove_line("hall")
+            poller.add_line(both.hall(1))
+            assert stopping.is_blocking
             assert sorted(poller.buses) == ["hall", "yard"]
-        finally:
-            go_on.set()
-        stopping.join(PATIENCE)
-        removing.join(PATIENCE)
         assert list(poller.buses) == ["hall"]
 
 
 def test_two_concurrent_removals_remove_a_line_once(both: TwoLines) -> None:
-    """Two callers wait for the line's stops; only one of them removes the line."""
+    """Two callers wait for the line's stops; only one caller then removes the line."""
     with Poller(plant(both.hall(), both.yard())) as poller:
         bus = poller.bus("yard")
         both_wait, part = threading.Barrier(2), bus.part
@@ -382,16 +366,13 @@ def test_two_concurrent_removals_remove_a_line_once(both: TwoLines) -> None:
         def wait_and_part() -> None:
             with suppress(threading.BrokenBarrierError):
                 both_wait.wait(PATIENCE)
-            both_wait.abort()  # the removal itself waits once more, alone
+            both_wait.abort()  # a later removal is alone, and must not block here
             part()
 
         vars(bus)["part"] = wait_and_part
-        removing = [threading.Thread(target=poller.remove_line, args=["yard"]) for _ in range(2)]
-        for one in removing:
-            one.start()
-        for one in removing:
-            one.join(PATIENCE)
-            assert not one.is_alive()
+        with Blocked() as removing:
+            for _ in range(2):
+                removing.start(poller.remove_line, "yard")
         assert list(poller.buses) == ["hall"]
 
 
@@ -443,27 +424,14 @@ def _is_asking(poller: Poller, of: PolledDrive) -> bool:
 
 
 def test_closing_waits_for_an_adoption(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
-    begun, go_on = threading.Event(), threading.Event()
-    open_bus = Bus.__init__
-
-    def slow(bus: Bus, *arguments: object, **details: object) -> None:
-        begun.set()
-        assert go_on.wait(PATIENCE)
-        open_bus(bus, *arguments, **details)  # type: ignore[arg-type]
-
     poller = Poller(plant(both.hall()))
     poller.__enter__()
-    monkeypatch.setattr(Bus, "__init__", slow)
-    adopting = threading.Thread(target=poller.adopt, args=[plant(both.hall(), both.yard())])
-    adopting.start()
-    assert begun.wait(PATIENCE)
-    closing_ = threading.Thread(target=poller.close)
-    closing_.start()
-    until(lambda: poller._closing)
-    go_on.set()
-    adopting.join(PATIENCE)
-    closing_.join(PATIENCE)
-    assert not any(thread.is_alive() for thread in (adopting, closing_))
+    with Blocked() as opening:
+        monkeypatch.setattr(Bus, "__init__", opening.blocking(Bus.__init__))
+        opening.start(poller.adopt, plant(both.hall(), both.yard()))
+        opening.await_call()
+        opening.start(poller.close)
+        until(lambda: poller._closing)
     assert not any(bus.is_open for bus in poller.buses.values())
 
 
@@ -471,7 +439,9 @@ def test_closing_waits_for_an_adoption(both: TwoLines, monkeypatch: pytest.Monke
 
 
 def test_connections_are_made_in_parallel(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All connections are requested before the first is made, and closing them takes no time."""
+    """Two calls of `create_connection` wait for each other, so connecting one after the other would fail.
+    Closing the connections never sleeps.
+    """
     with TwoLines("socket://127.0.0.1:0") as both:
         lines = both.hall(), both.yard()
         all_asked = threading.Barrier(2)
@@ -484,7 +454,7 @@ def test_connections_are_made_in_parallel(monkeypatch: pytest.MonkeyPatch) -> No
         def sleep(seconds: float) -> None:
             raise AssertionError(f"slept for {seconds} s")
 
-        monkeypatch.setattr(protocol_socket.time, "sleep", sleep)
+        monkeypatch.setattr(protocol_socket, "time", SimpleNamespace(**vars(time) | {"sleep": sleep}))
         monkeypatch.setattr(socket, "create_connection", connect_together)
         with Poller(plant(*lines)) as poller:
             until_sampled(poller, "fan-1")
@@ -494,27 +464,16 @@ def test_connections_are_made_in_parallel(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_slow_port_does_not_delay_other_ports(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
-    go_on = threading.Event()
-    open_bus = Bus.__init__
-
-    def slow(bus: Bus, port: str, **details: object) -> None:
-        if port.startswith("socket"):
-            assert go_on.wait(PATIENCE)
-        open_bus(bus, port, **details)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(Bus, "__init__", slow)
     nowhere = line("socket://127.0.0.1:1", quick("far", 1), name="far")
     found: dict[str, LineError] = {}
     with Poller(plant(both.hall())) as poller:
-        adopting = threading.Thread(
-            target=lambda: found.update(poller.adopt(plant(nowhere, both.hall(), both.yard())))
-        )
-        adopting.start()
-        until_sampled(poller, "fan-1")
-        until_sampled(poller, "pump-1")
-        assert adopting.is_alive()
-        go_on.set()
-        adopting.join(PATIENCE)
+        with Blocked() as opening:
+            is_slow = opening.blocking(Bus.__init__, lambda _, port: port.startswith("socket"))
+            monkeypatch.setattr(Bus, "__init__", is_slow)
+            opening.start(lambda: found.update(poller.adopt(plant(nowhere, both.hall(), both.yard()))))
+            until_sampled(poller, "fan-1")
+            until_sampled(poller, "pump-1")
+            assert opening.is_blocking
         assert list(poller.buses) == ["far", "hall", "yard"]
     assert {name: str(failure) for name, failure in found.items()} == {
         "far": "socket://127.0.0.1:1: nothing listens there"
@@ -524,38 +483,21 @@ def test_a_slow_port_does_not_delay_other_ports(both: TwoLines, monkeypatch: pyt
 def test_a_replaced_drive_can_be_stopped_while_a_port_opens_slowly(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    opening, go_on = threading.Event(), threading.Event()
-    open_bus = Bus.__init__
-
-    def slow(bus: Bus, port: str, **details: object) -> None:
-        opening.set()
-        assert go_on.wait(PATIENCE)
-        open_bus(bus, port, **details)  # type: ignore[arg-type]
-
-    exchanged = polled(Quick(1, name="pump-1", silence=0.01), [])
-    with Poller(plant(both.hall())) as poller:
+    replacement = polled(Quick(1, name="pump-1", silence=0.01), [])
+    with Poller(plant(both.hall())) as poller, Blocked() as opening:
         poller.bus("hall").drives[0].start()
-        monkeypatch.setattr(Bus, "__init__", slow)
-        anew = plant(line(both.hall().port, exchanged, name="hall"), both.yard())
-        adopting = threading.Thread(target=poller.adopt, args=[anew])
-        adopting.start()
-        try:
-            assert opening.wait(PATIENCE)
-            poller.bus("hall").drives[0].stop()
-            assert not runs(both.pumps[1])
-            assert adopting.is_alive()
-        finally:
-            go_on.set()
-            adopting.join(PATIENCE)
+        monkeypatch.setattr(Bus, "__init__", opening.blocking(Bus.__init__))
+        adopting = opening.start(
+            poller.adopt, plant(line(both.hall().port, replacement, name="hall"), both.yard())
+        )
+        opening.await_call()
+        poller.bus("hall").drives[0].stop()
+        assert not runs(both.pumps[1])
+        assert adopting.is_alive()
 
 
 def until_sampled(poller: Poller, drive: str) -> None:
-    waited = threading.Event()
-    for _ in range(int(PATIENCE / 0.01)):
-        if samples(poller, drive) > 5:
-            return
-        waited.wait(0.01)
-    raise AssertionError(f"no samples of {drive}")
+    until(lambda: samples(poller, drive) > 5)
 
 
 # ---- readers during an adoption ----
@@ -597,7 +539,7 @@ def test_a_summary_during_an_adoption_shows_the_old_or_the_new_plant(both: TwoLi
 @pytest.mark.long
 @pytest.mark.slow
 def test_a_hundred_adoptions_leave_no_leftovers(both: TwoLines) -> None:
-    """Other threads read drives, take statistics and batches; every value is of the right drive."""
+    """During the adoptions, threads read drives, statistics and batches. No value is misattributed."""
     held_by = {"pump-1": 1.0, "pump-2": 2.0, "fan-1": 3.0, "fan-2": 4.0}
     sims = [*both.pumps.values(), *both.fans.values()]
     for value, sim in zip(held_by.values(), sims, strict=True):

@@ -1,4 +1,4 @@
-"""Drives that are added to and removed from a running poller, and a bus."""
+"""Drives are added to, and removed from, a running poller and a bus."""
 
 from __future__ import annotations
 
@@ -138,8 +138,8 @@ def test_calls_of_a_detached_drive_raise_and_send_nothing(port: str) -> None:
             with pytest.raises(ValueError, match="pump-1 is not attached to this bus"):
                 do()
         again = bus.attach(Toy, address=1, name="pump-1")
-        assert bus.peer(again) is peer  # the peer knows of late replies
-        assert peer.proofs is proofs  # the core may be reading one of them
+        assert bus.peer(again) is peer  # the same peer, which knows the late replies that are due
+        assert peer.proofs is proofs  # kept, because the core may be reading a proof's register
 
 
 @pytest.mark.slow
@@ -200,7 +200,7 @@ def test_many_threads_can_read_poll_and_change_lines_concurrently() -> None:
 
 
 def test_statistics_can_be_read_while_drives_leave(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reading statistics does not fail if a drive is removed meanwhile."""
+    """Reading statistics does not fail if another thread removes a drive at the same time."""
     with Bus(port) as bus:
         ours = [bus.attach(Toy, address=address, name=f"pump-{address}") for address in (1, 2)]
         counters = bus.peer(ours[0]).counters

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import pytest
 import serial
 from examples import usually
-from lines import PATIENCE, line, patient, plant, polled, until
+from lines import PATIENCE, line, patient, plant, polled, rows_of, until
 from toy import Toy
 
 from multidrop import PollingFailed
@@ -20,9 +19,9 @@ from multidrop.core import Port, RowQueue
 from multidrop.drive import Drive
 from multidrop.poller import Poller
 from multidrop.polling import polled_line
-from multidrop.polling.batch import Row
+from multidrop.polling.batch import Batch, Row
 from multidrop.polling.port_queue import PortQueue
-from multidrop.sim import Simulator, Wire, simulated
+from multidrop.sim import EncodedDrive, Simulator, Wire, proof, simulated
 from multidrop.transport import clock
 from multidrop.transport.aside_log import flush
 from multidrop.transport.bridge import Bridge
@@ -36,7 +35,7 @@ class Ill(Exception):
 
 
 class Two:
-    """A poller of two lines, "ill" and "well", each with a drive of the same name."""
+    """A poller of the lines "ill" and "well". Each line has one drive, with the line's name."""
 
     def __init__(self, simulator: Simulator, every: float | None) -> None:
         drives = (Toy(1, name="ill"), Toy(1, name="well"))
@@ -51,20 +50,14 @@ class Two:
 
     def until(self, *wanted: tuple[str, str]) -> None:
         """Take new rows until each of these (drive, status) pairs has appeared."""
-        self.rows()
+        rows_of(self.poller)
         missing = set(wanted)
 
         def is_seen() -> bool:
-            missing.difference_update((row.drive, row.status) for row in self.rows())
+            missing.difference_update((row.drive, row.status) for row in rows_of(self.poller))
             return not missing
 
         until(is_seen)
-
-    def rows(self) -> list[Row]:
-        found: list[Row] = []
-        while batch := self.poller.take():
-            found += batch
-        return found
 
     def fails(self, *details: object) -> None:
         """Raise Ill, in place of a method of the line "ill"."""
@@ -89,12 +82,12 @@ def _retried_soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def of_line(name: str, method: Callable[..., Any], failure: BaseException) -> Callable[..., Any]:
-    """Return `method`, changed so that it raises `failure` for objects of this line."""
+    """Return a version of `method` that raises `failure` for objects of this line."""
 
     def act(self: Any, *details: Any, **more: Any) -> Any:
         drives = getattr(self, "_present", None) or {job.owner for job in self._schedule.jobs}
         if any(drive.name == name for drive in drives):
-            raise type(failure)(*failure.args)  # a new exception, because raising adds to its traceback
+            raise type(failure)(*failure.args)  # a new exception, with an empty traceback
         return method(self, *details, **more)
 
     return act
@@ -118,7 +111,7 @@ def test_a_failure_on_one_line_does_not_affect_other_lines(
     method: str,
     failure: BaseException,
 ) -> None:
-    for name in ("RETRY_NS", "LONGEST_RETRY_NS"):  # misses are only added until the retry
+    for name in ("RETRY_NS", "LONGEST_RETRY_NS"):  # pauses that allow a batch of misses before each retry
         monkeypatch.setattr(polled_line, name, 400_000_000)
     two.until(("ill", "ok"), ("well", "ok"))
     with monkeypatch.context() as broken:
@@ -161,7 +154,7 @@ def test_a_failing_line_is_retried_at_growing_intervals(
 def test_requests_queued_when_a_line_failed_are_carried_out(
     two: Two, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If the line fails right after queueing requests, the poller does not know how many are queued."""
+    """If a line fails right after queueing, the poller does not know how many requests are queued."""
     submit, repeat = Port.submit, Port.repeat
     left = 3
 
@@ -179,8 +172,7 @@ def test_requests_queued_when_a_line_failed_are_carried_out(
         two.poller.set_rate(name, CURRENT, 0.02)
     until(lambda: left == 0)
     two.until(("ill", "ok"), ("well", "ok"))
-    taken = Counter(row.drive for row in two.rows())
-    assert taken.keys() <= {"ill", "well"}
+    assert {row.drive for row in rows_of(two.poller)} <= {"ill", "well"}
 
 
 # ---- the poller's own thread ----
@@ -211,13 +203,13 @@ def failed(two: Two, monkeypatch: pytest.MonkeyPatch) -> Two:
     """A poller whose thread has ended with a failure, and that has rows queued."""
     two.until(("ill", "ok"), ("well", "ok"))
     taken = exchanges(two)
-    until(lambda: exchanges(two) >= taken + 2)  # so that rows are queued when polling ends
+    until(lambda: exchanges(two) >= taken + 2)  # waits until rows are queued for the end of polling
     monkeypatch.setattr(clock, "sleep", lambda seconds: None)
     monkeypatch.setattr(RowQueue, "await_calls", two.fails)
     two.poller._call_thread()
     until(lambda: two.poller.failure and not two.poller._thread.is_alive())
     flush(PATIENCE)
-    two.poller._is_failure_raised = True  # so that closing it in the fixture does not raise
+    two.poller._is_failure_raised = True  # then the fixture's call of `close` does not raise
     return two
 
 
@@ -227,7 +219,7 @@ def test_every_call_of_a_failed_poller_raises_polling_failed(
     poller = failed.poller
     assert repr(poller).startswith("<Poller polling has ended on all lines: Ill: of this line;")
     rows: list[Row] = []
-    with pytest.raises(PollingFailed) as raised:  # raised after the rows that are still queued
+    with pytest.raises(PollingFailed) as raised:  # raised once the queued rows have been taken
         rows.extend(row for batch in poller.batches() for row in batch)
     assert rows
     assert isinstance(raised.value.__cause__, Ill)
@@ -250,7 +242,7 @@ def test_a_failed_poller_stops_polling_but_sends_commands(failed: Two) -> None:
     before = exchanges(failed)
     bus = failed.poller.bus("ill")
     bus.drives[0].read(CURRENT)
-    assert exchanges(failed) - before <= 2  # one of them was in flight
+    assert exchanges(failed) - before <= 2  # the read, and an exchange that may have been in flight
 
 
 def test_waiting_callers_wake_when_polling_fails(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -271,7 +263,7 @@ def test_waiting_callers_wake_when_polling_fails(two: Two, monkeypatch: pytest.M
     two.poller._is_failure_raised = True
 
 
-# ---- the other threads ----
+# ---- threads that reopen ports, bridge bytes or log ----
 
 
 def test_a_failed_reopening_of_a_port_is_logged_and_retried(
@@ -347,7 +339,7 @@ def test_a_log_handler_that_raises_system_exit_does_not_end_logging(
 
 
 async def wait(batch: object) -> None:
-    """Do nothing: a call only creates a coroutine."""
+    """Do nothing. A call without `await` only creates a coroutine."""
 
 
 def give(batch: object) -> Iterator[object]:
@@ -386,7 +378,7 @@ def test_a_wrapped_async_callback_fails_with_its_first_batch(
 def test_a_user_s_class_that_fails_during_polling_only_affects_its_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A user's class may work when the poller is made, and fail during polling."""
+    """A class that a user wrote may work when the poller is made, and fail during polling."""
     failing = threading.Event()
 
     class Own(Toy):
@@ -412,3 +404,150 @@ def test_a_user_s_class_that_fails_during_polling_only_affects_its_line(
             failing.set()
             until(lambda: poller.line_failures == {"ill": "ZeroDivisionError: a bug of its author"})
             failing.clear()
+
+
+# ---- a poller's callback for batches: its thread, its failures, and its end ----
+
+
+@pytest.fixture
+def poller() -> Iterator[Poller]:
+    """Return a poller of a line with one drive; polling has not started."""
+    with Simulator([Wire([EncodedDrive(Toy(1))], unpaced=True)]) as simulator:
+        made = Poller(plant(line(simulator.wires[0].path, polled(Toy(1, name="pump-1"), [CURRENT], 0.01))))
+        try:
+            yield made
+        finally:
+            made.close()
+
+
+def counted(poller: Poller) -> int:
+    """Return the number of rows that the poller has counted."""
+    summary = poller.summary()
+    return int(summary["samples"]) + int(summary["misses"])
+
+
+def test_on_batch_gets_every_row_once_and_all_before_close_returns(poller: Poller) -> None:
+    rows: list[Row] = []
+    threads: set[str] = set()
+
+    def keep(batch: Batch) -> None:
+        threads.add(threading.current_thread().name)
+        rows.extend(batch)
+
+    with poller:
+        poller.on_batch(keep, every=0.01)
+        until(lambda: len(rows) > 20)
+    assert len(rows) == counted(poller)
+    assert {row.value for row in rows if row.value is not None} == {proof(Toy(1), CURRENT)}
+    sent = [row.monotonic_ns for row in rows if row.value is not None]
+    assert sent == sorted(sent)
+    assert threads == {"multidrop batches"}
+    assert "multidrop batches" not in {thread.name for thread in threading.enumerate()}
+    assert rows_of(poller) == []
+
+
+@pytest.mark.slow
+def test_a_slow_callback_does_not_delay_polling(poller: Poller) -> None:
+    go_on, entered = threading.Event(), threading.Event()
+    rows: list[Row] = []
+
+    def wait(batch: Batch) -> None:
+        entered.set()
+        go_on.wait()
+        rows.extend(batch)
+
+    with poller:
+        poller.on_batch(wait)
+        assert entered.wait(60)
+        before = poller.summary()["samples"]
+        until(lambda: poller.summary()["samples"] > before + 20)
+        go_on.set()
+    assert len(rows) == counted(poller)
+
+
+@pytest.mark.slow
+def test_an_exception_of_the_callback_is_logged_immediately_and_raised_by_close(
+    poller: Poller, caplog: pytest.LogCaptureFixture
+) -> None:
+    calls: list[int] = []
+
+    def fail(batch: Batch) -> None:
+        calls.append(len(batch))
+        raise OSError("the disk is full")
+
+    caplog.set_level(logging.ERROR, "multidrop.polling")
+    poller.__enter__()
+    poller.on_batch(fail, every=0.01)
+    until(lambda: bool(caplog.records))
+    before = poller.summary()["samples"]
+    until(lambda: poller.summary()["samples"] > before + 20)  # polling continues
+    with pytest.raises(OSError, match="the disk is full"):
+        poller.__exit__(None, None, None)
+    assert len(calls) == 1
+    (record,) = caplog.records
+    assert record.getMessage() == "on_batch: the function failed and is no longer called"
+    left = rows_of(poller)
+    assert calls[0] + len(left) == counted(poller)  # `left` has all later rows
+    poller.close()  # the failure is raised only once
+
+
+def test_an_exception_of_the_with_block_takes_precedence_over_the_callback_s(
+    poller: Poller, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(batch: Batch) -> None:
+        raise OSError("the disk is full")
+
+    def interrupted() -> None:
+        with poller:
+            poller.on_batch(fail)
+            until(lambda: bool(caplog.records))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    poller.close()
+
+
+def test_the_callback_may_close_the_poller(poller: Poller) -> None:
+    rows: list[Row] = []
+
+    def end(batch: Batch) -> None:
+        rows.extend(batch)
+        poller.close()
+
+    with poller:
+        poller.on_batch(end)
+        until(lambda: "closed" in repr(poller))
+
+    until(lambda: len(rows) == counted(poller))  # the function gets the last rows after the poller is closed
+
+
+def test_batches_end_when_the_poller_is_closed(poller: Poller) -> None:
+    rows: list[Row] = []
+
+    def take() -> None:
+        for batch in poller.batches(every=60.0):
+            rows.extend(batch)
+
+    with poller:
+        taker = threading.Thread(target=take)
+        taker.start()
+        until(lambda: poller.summary()["samples"] > 20)
+    taker.join(30.0)  # ends long before the 60 s of `every` are over
+    assert not taker.is_alive()
+    assert len(rows) == counted(poller)
+
+
+def test_on_batch_rejects_invalid_callbacks(poller: Poller) -> None:
+    with pytest.raises(TypeError, match="on_batch takes a function with one argument, the batch, not 3"):
+        poller.on_batch(3)  # type: ignore[arg-type]
+    with poller:
+        poller.on_batch(len)
+        with pytest.raises(ValueError, match="already has a function"):
+            poller.on_batch(len)
+    with pytest.raises(ValueError, match="already has a function"):
+        poller.on_batch(len)
+    other = Poller(plant())
+    other.close()
+    with pytest.raises(ValueError, match="polling has ended"):
+        other.on_batch(len)

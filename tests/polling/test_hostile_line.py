@@ -1,4 +1,5 @@
-"""Every fault on a line of every family: no misattribution, a reason for every miss, and recovery.
+"""Every fault on a line of every family: no value is misattributed, every miss has a reason, and polling
+recovers.
 
 The tests run on a simulated clock, so that a seed reproduces its run. To run for hours, with new seeds:
 `HOSTILE_HOURS=2 pytest -m '' tests/polling/test_hostile_line.py -k hours`.
@@ -8,25 +9,40 @@ from __future__ import annotations
 
 import gc
 import os
+import random
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from math import inf
 from pathlib import Path
+from typing import Any
 
 import pytest
 from clocked_lines import ClockedLines, ClockedWire
 from examples import usually
 from kills import descriptors, threads
-from lines import polled, rows_of
+from lines import LateWire, line, plant, polled, proofs, rows_of, served
+from motors import (
+    LATEST,
+    LINES,
+    REASONS,
+    fast_drives,
+    of_all_variants,
+    of_one_variant,
+    real_drives,
+    real_wires,
+)
 from stories import HEALTHY, Story
 from tables import table
-from variants import LINES, of_all_variants, of_one_variant
+from toy import Toy
 
 from multidrop.drive import Drive
+from multidrop.drive.register import HOLDING, Register
 from multidrop.families import DelixiNative
-from multidrop.sim import Faults, simulated
-
-pytestmark = pytest.mark.story
+from multidrop.plant.model import PolledDrive
+from multidrop.poller import Poller
+from multidrop.polling.batch import Row
+from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, Wire, simulated
 
 MOST_GROWTH_KB = 2048
 
@@ -56,7 +72,7 @@ def resident_kb() -> int:
     return pages * os.sysconf("SC_PAGESIZE") // 1024
 
 
-# The short run has one line for each fault, and one or two faults for each line.
+# The short run tests one line with each fault, and one or two faults on each line.
 EACH_ON_EACH = [
     pytest.param(name, kind, marks=pytest.mark.long if (number + nth) % 8 else ())
     for number, name in enumerate(LINES)
@@ -64,6 +80,7 @@ EACH_ON_EACH = [
 ]
 
 
+@pytest.mark.story
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "kind"), EACH_ON_EACH)
 def test_polling_recovers_from_each_fault_without_misattributed_values(name: str, kind: str) -> None:
@@ -75,24 +92,26 @@ def test_polling_recovers_from_each_fault_without_misattributed_values(name: str
     assert story.wire.struck.total()
 
 
+@pytest.mark.story
 @pytest.mark.long
 @table("name", LINES)
 def test_a_permanent_echo_is_detected_and_removed(name: str) -> None:
     story = Story(of_one_variant(LINES[name]))
     story.wire.faults = KINDS["echo"]
     with story.clocked:
-        begun = len(story.run(2))  # without the first two seconds, in which each first value is read twice
+        begun = len(story.run(2))  # skips the first 2 s, in which each first value is read twice
         story.run(HEALTHY)
     story.rows += rows_of(story.clocked.poller)
     story.judge()
     assert {row.status for row in story.rows[begun:]} <= {"ok", "poll ended"}
 
 
+@pytest.mark.story
 @pytest.mark.slow
 @table("echo", [0, 1], ids=["no echo", "an echo"])
 @table("register", ["dc_bus_voltage", "output_frequency"], ids=["a value", "a zero"])
 def test_a_delixi_reply_equal_to_its_request_is_not_taken_for_an_echo(register: str, echo: int) -> None:
-    """In Delixi's protocol, a reply with the value 0 equals its request; it must not count as an echo."""
+    """In Delixi's protocol, a reply with the value 0 equals its request. It must not be taken for an echo."""
     drive = DelixiNative(1, name="drive-1")
     asked = polled(drive, [drive.register(register)])
     with ClockedLines(ClockedWire([simulated(drive)], Faults(echo=echo)), [asked]) as clocked:
@@ -101,8 +120,11 @@ def test_a_delixi_reply_equal_to_its_request_is_not_taken_for_an_echo(register: 
     assert {(row.value == 0, row.status) for row in rows} == {(register == "output_frequency", "ok")}
 
 
+@pytest.mark.story
 def test_an_echo_of_a_silent_delixi_drive_is_not_read_as_0_for_long() -> None:
-    """A broken wire may silence a drive and cause an echo. After two values of 0, a probe shows the echo."""
+    """A broken wire may silence a drive and echo requests. An echo is read as the value 0; after two of them,
+    a probe detects the echo.
+    """
     drive = DelixiNative(1, name="drive-1")
     asked = polled(drive, [DelixiNative.output_frequency, DelixiNative.output_current])
     wire = ClockedWire([simulated(drive)], Faults())
@@ -118,6 +140,7 @@ def test_an_echo_of_a_silent_delixi_drive_is_not_read_as_0_for_long() -> None:
     assert rows[-1].status != "ok"
 
 
+@pytest.mark.story
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", usually(*KINDS))
 def test_polling_recovers_from_a_fault_while_the_core_repeats_the_cycle(kind: str) -> None:
@@ -128,16 +151,19 @@ def test_polling_recovers_from_a_fault_while_the_core_repeats_the_cycle(kind: st
 
 
 def all_lines() -> Iterator[list[Drive]]:
-    """Yield the drives of each variant alone, and then all variants on one line."""
+    """Yield the drives of each line: first one line for each family variant, then one line with all
+    variants.
+    """
     yield from map(of_one_variant, LINES.values())
     yield of_all_variants()
 
 
+@pytest.mark.story
 @pytest.mark.long
 def test_resources_do_not_grow_over_hours_of_faults() -> None:
     """Memory, descriptors and threads stay constant on a line with all families.
 
-    With HOSTILE_HOURS, each variant is also polled alone, with all kinds of faults in turn.
+    With HOSTILE_HOURS, each family variant is also polled alone, with each kind of fault in turn.
     """
     hours = float(os.environ.get("HOSTILE_HOURS", "0"))
     end = time.monotonic() + 3600 * hours
@@ -153,3 +179,161 @@ def test_resources_do_not_grow_over_hours_of_faults() -> None:
         print(f"pass {len(seen)}: %d kB, %d descriptors, %d threads" % seen[-1], flush=True)
     assert seen[-1][0] - seen[0][0] <= MOST_GROWTH_KB
     assert seen[-1][1:] == seen[0][1:]
+
+
+# ---- all families on one line: no value is taken for the value of another drive ----
+
+
+REAL_SECONDS = 4.0
+EVERY = 1.0  # period in s of the registers that have a rate
+
+FAST_SECONDS = 2.0
+
+
+class UnreliableWire(LateWire):
+    """A wire on which some replies are lost, late or doubled."""
+
+    def __init__(self, drives: list[EncodedDrive]) -> None:
+        super().__init__(drives, unpaced=True)
+        self._random = random.Random(8)
+
+    def distort(self, reply: bytes) -> bytes:
+        times = self._random.choices([1, 2, 0], [85, 10, 5])[0]
+        if times and self._random.random() < 0.1:
+            return self.hold_up(times * reply, self._random.uniform(0, LATEST))
+        return times * reply
+
+
+def fast_wires() -> list[Wire]:
+    return [UnreliableWire([EncodedDrive(drive) for drive in fast_drives()])]
+
+
+def poll(path: str, drives: list[PolledDrive], seconds: float) -> tuple[list[Row], dict[str, Any]]:
+    """Poll for `seconds` s; return all rows and the line's summary."""
+    with Poller(plant(line(path, *drives))) as poller:
+        rows = [row for batch in poller.batches(seconds) for row in batch]
+    return rows + rows_of(poller), poller.summary()["lines"]["line"]
+
+
+def check(rows: list[Row], drives: list[PolledDrive], summary: dict[str, Any]) -> None:
+    """Check that no value is misattributed, every miss has a valid reason, and the summary is complete."""
+    truth = proofs(*drives)
+    assert len(set(truth.values())) > len(drives)
+    samples = [row for row in rows if row.value is not None]
+    assert [row for row in samples if row.value != truth[row.drive, row.register]] == []
+    misses = Counter(row.status for row in rows if row.value is None)
+    assert misses.keys() <= REASONS
+    assert {row.status for row in samples} == {"ok"}
+    assert (len(samples), misses) == (summary["samples"], summary["misses"])
+
+
+def test_all_polled_registers_hold_different_values() -> None:
+    """The raw counts of any two drives differ, so that other tests can detect a misattributed value."""
+    for drives in (real_drives(), fast_drives()):
+        asked = [polled(drive, drive.readings()) for drive in drives]
+        truth = proofs(*asked)
+        steps = {
+            (each.drive.name, poll.register.name): poll.register.scale
+            for each in asked
+            for poll in each.polls
+        }
+        raws = Counter(round(value / steps[key]) for key, value in truth.items())
+        assert max(raws.values()) == 1
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_all_variants_on_one_line_are_polled_at_real_baud_rates() -> None:
+    drives = []
+    for drive in real_drives():
+        at_a_rate, *others = drive.readings()
+        polls = polled(drive, others[:5]).polls + polled(drive, [at_a_rate], EVERY).polls
+        drives.append(PolledDrive(drive, polls))
+    with served(real_wires) as (path,):
+        rows, summary = poll(path, drives, REAL_SECONDS)
+    check(rows, drives, summary)
+    assert {row.drive for row in rows if row.value is not None} == {each.drive.name for each in drives}
+    # Each slot of a register with a rate has a row or is counted as skipped, except the last slots.
+    on_a_grid = {(each.drive.name, each.polls[-1].register.name) for each in drives}
+    kept = sum(1 for row in rows if (row.drive, row.register) in on_a_grid)
+    assert kept + summary["overrun_slots"] >= len(drives) * (REAL_SECONDS // EVERY - 2)
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_late_lost_and_doubled_replies_are_never_misattributed() -> None:
+    drives = [polled(drive, drive.readings()) for drive in fast_drives()]
+    with served(fast_wires) as (path,):
+        rows, summary = poll(path, drives, FAST_SECONDS)
+    check(rows, drives, summary)
+    assert summary["samples"] > 0
+    assert summary["misses"]["no reply"] > 0
+    assert summary["stray_bytes"] > 0
+
+
+# ---- a lost request, if no later reply can show that no late reply is due ----
+
+
+POLLED = bytes((1, 3, 0, 1, 0, 1))  # output_frequency
+
+
+class LossyWire(ClockedWire):
+    """A wire that loses the next `loses` polled requests."""
+
+    loses = 0
+
+    def receive(self, request: bytes, now: float, baudrate: int) -> None:
+        if self.loses and request.startswith(POLLED):
+            self.loses -= 1
+        else:
+            super().receive(request, now, baudrate)
+
+
+class SilentWire(LossyWire):
+    """A wire whose device answers only polled reads. `unanswered` counts the other requests."""
+
+    unanswered = 0
+
+    def receive(self, request: bytes, now: float, baudrate: int) -> None:
+        if request.startswith(POLLED):
+            super().receive(request, now, baudrate)
+        else:
+            self.unanswered += 1
+
+
+class MisprintedToy(Toy):
+    """A drive whose `known_counts` are wrong for two registers."""
+
+    most_registers = {HOLDING: 1}
+
+    def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
+        return {Toy.mystery: (1, 1), Toy.acceleration_time: (2, 9)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", [1, 5])
+def test_a_lost_request_does_not_slow_a_drive_permanently(lost: int) -> None:
+    pump = Toy(1, name="pump")
+    wire = SilentWire([EncodedDrive(pump)], Faults())
+    with ClockedLines(wire, [polled(pump, [Toy.output_frequency], 0.1)]) as lines:
+        lines.run(4)
+        wire.loses = lost
+        lines.run(10)
+        assert wire.unanswered > 0
+        wire.unanswered = 0
+        rows = lines.run(4)
+    assert [row.status for row in rows] == ["ok"] * 40
+    assert wire.unanswered == 0
+
+
+def test_wrong_known_counts_do_not_end_polling_after_a_lost_request() -> None:
+    pump = MisprintedToy(1, name="pump")
+    sim = SimulatedDrive(pump)
+    sim["mystery"], sim["acceleration_time"] = 1234, 123.4
+    wire = LossyWire([sim], Faults())
+    with ClockedLines(wire, [polled(pump, [Toy.output_frequency], 0.1)]) as lines:
+        lines.run(4)
+        wire.loses = 1
+        lines.run(10)
+        rows = lines.run(4)
+    assert [row.status for row in rows] == ["ok"] * 40

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from time import sleep
@@ -19,12 +21,13 @@ from typing import Any
 
 import pytest
 from examples import usually
-from interruptions import every, interrupted
+from interruptions import Interruption, every, interrupted, interrupted_before
 from lines import ANY_PORT, PATIENCE, line, patient, plant, polled, until
+from motors import ReceivedRequests
 from toy import Toy
 
-from multidrop import Bus, Poller
-from multidrop.sim import EncodedDrive, Simulator, Wire, simulated
+from multidrop import Bus, InvtCHE, Poller
+from multidrop.sim import EncodedDrive, MotorDrive, Simulator, Wire, simulated
 
 # The warnings come from garbage collections, which may be interrupted too.
 pytestmark = [patient, pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")]
@@ -56,13 +59,13 @@ def hall() -> Iterator[Received]:
         yield Received(simulator.wires[0].path, drive)
 
 
-def falls_silent(hall: Received) -> None:
+def falls_silent(requests: Callable[[], int]) -> None:
     """Check that no further request is sent after the drive has received the last one."""
 
     def has_ended() -> bool:
-        before = hall.drive.requests
+        before = requests()
         sleep(0.02)
-        return hall.drive.requests == before
+        return requests() == before
 
     until(has_ended, 10.0)
 
@@ -75,7 +78,7 @@ def ended(poller: Poller, hall: Received) -> None:
     """Close the poller again; check that buses are closed, requests have ended, and the port is free."""
     poller.close()
     assert not any(bus.is_open for bus in poller.buses.values())
-    falls_silent(hall)
+    falls_silent(lambda: hall.drive.requests)
     with Bus(hall.path) as bus:  # the port is free
         bus.attach(Toy, 1).read(CURRENT)
 
@@ -83,8 +86,9 @@ def ended(poller: Poller, hall: Received) -> None:
 STEPS = usually(STRIDE, 1)
 
 
-@pytest.mark.parametrize("step", STEPS)
-@pytest.mark.parametrize("end", ["close", "__exit__"])
+@pytest.mark.parametrize(
+    ("end", "step"), [("close", STRIDE), *usually(("__exit__", STRIDE), ("__exit__", 1))]
+)  # `__exit__` calls `close`
 def test_an_interrupted_close_of_a_poller_can_be_completed(hall: Received, step: int, end: str) -> None:
     places: set[str] = set()
 
@@ -99,6 +103,45 @@ def test_an_interrupted_close_of_a_poller_can_be_completed(hall: Received, step:
 
     assert every(step, act) > 1
     assert any("Poller" in place for place in places)
+
+
+@pytest.mark.parametrize(
+    ("end", "step", "failure"),
+    [
+        ("close", STRIDE, Interruption),
+        *usually(("__exit__", STRIDE, Interruption), ("__exit__", 1, Interruption)),
+        *usually(("__exit__", 2 * STRIDE, ZeroDivisionError), ("__exit__", 7, ZeroDivisionError)),
+        pytest.param("__exit__", 1, ZeroDivisionError, marks=pytest.mark.long),
+    ],
+)
+def test_an_interrupted_end_with_stop_on_exit_stops_the_motors_and_a_second_close_ends_all_requests(
+    end: str, step: int, failure: type[BaseException]
+) -> None:
+    details = () if end == "close" else (None, None, None)
+    handler = signal.getsignal(signal.SIGINT)
+
+    def act(nth: int) -> bool:
+        sim = simulated(InvtCHE(1, baudrate=38400, maximum_frequency=50))
+        assert isinstance(sim, MotorDrive)
+        sim.motor.acceleration_time = sim.motor.deceleration_time = 0.01
+        received = ReceivedRequests(sim)
+        with Simulator([Wire([sim], unpaced=True)]) as simulator:
+            pump = InvtCHE(1, name="pump", baudrate=38400, maximum_frequency=50)
+            declared = plant(line(simulator.wires[0].path, polled(pump, [InvtCHE.output_frequency])))
+            poller = Poller(declared, stop_on_exit=True).__enter__()
+            pump.set_frequency(20)
+            pump.start()
+            with suppress(failure), interrupted_before(nth, failure) as place:
+                getattr(poller, end)(*details)
+            poller.close()
+            assert not any(bus.is_open for bus in poller.buses.values()), place
+            assert poller.bus("line").stopped["pump"].ok, place
+            assert not sim.motor.energised, place
+            assert signal.getsignal(signal.SIGINT) is handler, place
+            falls_silent(lambda: len(received.requests))
+        return bool(place)
+
+    assert every(step, act) > 1
 
 
 @pytest.mark.parametrize("step", STEPS)
@@ -211,7 +254,7 @@ def test_a_poller_left_open_at_exit_does_not_corrupt_memory(hall: Received, end:
     env = {**os.environ, "PYTHONMALLOC": "malloc", "MALLOC_PERTURB_": "165"}  # freed memory is overwritten
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, env=env)
     assert (ran.returncode, ran.stderr) == (0, "")
-    falls_silent(hall)
+    falls_silent(lambda: hall.drive.requests)
 
 
 # ---- openings ----

@@ -1,4 +1,4 @@
-"""A drive that needs a pause between requests: only this drive waits, not the line."""
+"""A drive that needs a pause between its requests: other drives on the line do not wait."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SLACK = 1e-6
 
 
 class Slow(Picky):
-    """A drive that records when requests come, and counts those that come too early after its last reply."""
+    """A drive that records the times of requests. It counts requests that come too soon after its reply."""
 
     def __init__(self, drive: Drive) -> None:
         super().__init__(drive)
@@ -90,7 +90,7 @@ def test_a_drive_with_a_least_interval_hardly_slows_the_other_drives() -> None:
             return sum(row.drive == other.name for row in clocked.run(10))
 
     alone, together = exchanges(other), exchanges(drive, other)
-    assert together >= 0.75 * alone  # the slow drive's exchanges take less than a quarter
+    assert together >= 0.75 * alone  # the slow drive's exchanges take less than a quarter of the bus time
     assert sim.early == 0
 
 
@@ -113,7 +113,7 @@ def test_a_stop_is_the_first_request_after_the_least_interval() -> None:
             while len(sim.times) == before:
                 clocked.run(0.001)
             assert len(its_sim.asked) - asked <= 1  # at most the request in flight
-            assert sim.times[-1] <= called + INTERVAL + 0.06  # plus two exchanges, one of them this drive's
+            assert sim.times[-1] <= called + INTERVAL + 0.06  # 0.06 s: one exchange with each drive
     assert sim.early == 0
 
 

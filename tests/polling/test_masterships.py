@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 from examples import usually
 from lines import HOST_LATE, PATIENCE, line, plant, polled, rows_of, until
+from tables import table
 from toy import Toy
 
 from multidrop import Bus, NotMaster
@@ -49,7 +50,7 @@ class Quick(Toy):
 
 
 class Slow(Toy):
-    """A drive with a timeout that is longer than a busy computer delays another master."""
+    """A drive with a timeout longer than any delay of the other master, even on a busy computer."""
 
     response_timeout = 1.5
 
@@ -100,7 +101,7 @@ class Rows:
         until(lambda: status in self.statuses(drive))
 
     def settle_unpolled(self, drive: str) -> None:
-        """Wait for several miss rows of this drive, so that earlier requests have ended."""
+        """Wait for several miss rows of this drive; by then, its earlier requests have ended."""
         for _ in range(3):
             rows_of(self._poller)
             self.until(drive, NOT_MASTER)
@@ -151,7 +152,7 @@ def test_without_mastership_a_line_has_few_miss_rows(mastership: Mastership, eve
         assert 0 < found <= most
 
 
-def test_the_summary_has_no_foreign_bytes_without_a_mastership() -> None:
+def test_without_a_mastership_the_summary_has_no_count_of_foreign_bytes() -> None:
     with lines(None) as (_, made), Poller(plant(*made)) as poller:
         Rows(poller).settle("pump")
         assert "foreign_bytes" not in poller.summary()["lines"]["hall"]
@@ -162,7 +163,7 @@ def test_the_summary_has_no_foreign_bytes_without_a_mastership() -> None:
 
 @contextmanager
 def seen_line(mastership: Mastership, every: float | None) -> Iterator[tuple[int, Poller]]:
-    """Yield the far end of a polled line without drives, and its poller."""
+    """Yield the far end of a polled line on which no drive answers, and the line's poller."""
     far, near = os.openpty()
     tty.setraw(near)
     os.set_blocking(far, False)
@@ -193,7 +194,9 @@ def test_a_poller_listens_before_its_first_request(mastership: Mastership, every
 @pytest.mark.slow
 @pytest.mark.parametrize("port", ["pty", "tcp://127.0.0.1:0"])
 def test_nothing_is_sent_during_the_guard_time_of_the_previous_master(port: str) -> None:
-    """Nothing is sent during the guard time, which is longer here than the listening time of serial lines."""
+    """The guard time is longer here than the time for which a serial line is listened to before the first
+    request.
+    """
     mastership = Mastership(guard_s=1.0)
     try:
         hold(mastership)
@@ -297,7 +300,7 @@ def test_a_removed_line_is_closed_and_receives_no_byte(mastership: Mastership, f
 
 @pytest.mark.slow
 def test_no_port_is_opened_without_mastership(mastership: Mastership, far: Listener) -> None:
-    """The port is not opened at first, nor reopened later, because that could cut the master's connection."""
+    """The port is neither opened nor reopened, because this could end the present master's connection."""
     yard = line(far.url, quick("fan", 1, None), name="yard")
     with lines(0.02) as (_, (hall, _)), Poller(plant(hall, yard), mastership=mastership) as poller:
         Rows(poller).until("fan", NOT_MASTER)
@@ -310,7 +313,7 @@ def test_no_port_is_opened_without_mastership(mastership: Mastership, far: Liste
         Rows(poller).settle_unpolled("fan")
         assert len(far.received) == 1
         hold(mastership)
-        until(lambda: any(far.received[1:]))  # the port may be opened more than once on a busy computer
+        until(lambda: any(far.received[1:]))  # on a busy computer, the port may be opened more than once
 
 
 def taken_of(poller: Poller, rows: list[Row]) -> list[Row]:
@@ -335,11 +338,11 @@ def test_other_lines_have_rows_while_lines_are_added_and_removed(
             until(lambda n=n: len(taken_of(poller, rows)) >= 10 * n)
         assert {row.status for row in rows} <= {"ok", *HOST_LATE}
         due = [row.monotonic_ns for row in rows]
-        assert max(later - at for at, later in pairwise(due)) < S  # a generous limit for a period of 0.02 s
+        assert max(later - at for at, later in pairwise(due)) < S  # generous: the period is 0.02 s
 
 
 @pytest.mark.slow
-def test_a_duplicate_or_unknown_line_name_raises_one_sentence(mastership: Mastership) -> None:
+def test_a_duplicate_or_unknown_line_name_raises_a_one_sentence_error(mastership: Mastership) -> None:
     hold(mastership)
     with lines(None) as (_, (hall, yard)), Poller(plant(hall), mastership=mastership) as poller:
         again = line(yard.port, quick("fan", 2, None), name="hall")
@@ -435,13 +438,12 @@ class Busy:
         return True
 
 
-@pytest.mark.parametrize(("left_ns", "waited_ns"), [(0, S), (S // 5, S // 5), (-S, 0), (5 * S, S)])
+@table(("left_ns", "waited_ns"), [(0, S), (S // 5, S // 5), (-S, 0), (5 * S, S)])
 def test_closing_waits_for_a_request_no_longer_than_the_mastership(
     monkeypatch: pytest.MonkeyPatch, left_ns: int, waited_ns: int
 ) -> None:
-    """The wait is limited, because the kernel kills the process soon after the mastership's end.
-
-    With `left_ns` 0 the process holds no mastership, so no timer runs.
+    """The mastership ends `left_ns` after the start, and soon afterwards the kernel kills the process. With
+    `left_ns` 0 the process holds no mastership, so no timer runs.
     """
     now = [1000 * S]
     until_ns = now[0] + left_ns if left_ns else 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,11 @@ from examples import examples, usually
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from lines import line, patient, plant, polled, rows_of, until
+from profile_families import shipped
+from tables import table
 from toy import Picky, Toy, expected_values, family
 
-from multidrop.core import NumberFormat
+from multidrop.core import Message, NumberFormat
 from multidrop.drive import Drive
 from multidrop.drive.register import HOLDING, HOLDING_MULTIPLE, INPUT, reading, setting
 from multidrop.planning.blocks import blocks, halves
@@ -23,7 +26,7 @@ from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling import refusals
 from multidrop.polling.batch import Row
-from multidrop.sim import Faults, SimulatedDrive, Simulator, Wire
+from multidrop.sim import Faults, SimulatedDrive, Simulator, Wire, simulated
 from multidrop.sim.protocol import Reason, Refusal
 
 WIDE = 24
@@ -40,7 +43,7 @@ def values(rows: list[Row]) -> dict[str, float]:
 # ---- halves ----
 
 
-def test_halves_keep_registers_of_one_address_or_group_together() -> None:
+def test_a_split_block_keeps_registers_of_one_address_or_group_together() -> None:
     class Kind(Drive):
         read_together = (("high", "low"),)
         a = reading(0)
@@ -79,7 +82,7 @@ def test_one_refused_register_hardly_delays_its_neighbours(every: float | None) 
     assert values(rows) == expected_values(set(range(WIDE)) - {7})
     assert told == ["pump-1.r7"]
     asked = {span for span in sim.asked if span != (7, 1)}
-    assert len(asked) <= 5  # blocks between the halvings of 24 registers
+    assert len(asked) <= 5  # 5 halvings of 24 registers isolate r7, and leave 5 blocks
     assert all(row.value is not None for row in rows if row.register != "r7")
 
 
@@ -151,13 +154,13 @@ def test_a_device_that_ignores_long_requests_is_read_with_shorter_ones(
 
 @pytest.mark.long
 def test_probes_of_a_device_that_ignores_long_requests_keep_the_rate() -> None:
-    """The probe, which reads a single register, has the same period as the block."""
+    """The probe reads a single register, with the same period as the block."""
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, silent_beyond=1)
     with clocked_line_of(drive, sim, every=5.0) as clocked:
         rows = clocked.run(600)
     assert len(values(rows)) == WIDE
-    assert max(Counter(sim.asked).values()) <= 2 * 600 / 5  # r0 is read by the probe, and later as a part
+    assert max(Counter(sim.asked).values()) <= 2 * 600 / 5  # r0 is read by the probe, later in a block
 
 
 @pytest.mark.long
@@ -199,7 +202,7 @@ def test_a_block_that_was_answered_once_is_not_split_by_silence() -> None:
         sim.silent_beyond = 1
         clocked.run(60)
         counts = {count for _, count in sim.asked}
-        assert counts <= {WIDE, 1}  # single registers are only read to prove that no late reply is due
+        assert counts <= {WIDE, 1}  # a single register is read only to prove that no late reply is due
         (line,) = clocked.poller._lines
         assert len(line._maker._made) == 1
 
@@ -209,9 +212,8 @@ def test_a_block_that_was_answered_once_is_not_split_by_silence() -> None:
 @example({2, 4}, 5, 1)
 @given(st.sets(st.integers(1, 5), max_size=3), st.integers(1, 6), st.integers(1, 6))
 def test_every_register_that_can_be_read_alone_is_polled(refused: set[int], most: int, silent: int) -> None:
-    """No example refuses register 0, because its reply proves that no late reply is due.
-
-    Without that proof, each missing reply would delay the next request by two minutes.
+    """No example refuses register 0. Its reply proves that no late reply is due, and without that proof, each
+    missing reply would delay the next request by two minutes.
     """
     drive = family(6)(1, name="pump-1")
     sim = Picky(drive, refused, most, silent)
@@ -277,10 +279,8 @@ class Moody(SimulatedDrive):
         return super().read(function, start, count)
 
 
-@pytest.mark.parametrize(
-    ("says", "is_set_aside"), [(Reason.BUSY, False), (Reason.READ_ADDRESS, True)], ids=["busy", "refused"]
-)
-@pytest.mark.parametrize("registers", [[Toy.output_current, Toy.fault], [Toy.fault]], ids=["two", "one"])
+@table(("says", "is_set_aside"), [(Reason.BUSY, False), (Reason.READ_ADDRESS, True)], ids=["busy", "refused"])
+@table("registers", [[Toy.output_current, Toy.fault], [Toy.fault]], ids=["two", "one"])
 def test_a_block_that_becomes_readable_again_is_polled_as_before(
     says: Reason, is_set_aside: bool, registers: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -409,3 +409,59 @@ def test_registers_written_by_function_16_are_read_together_with_others() -> Non
     sim = SimulatedDrive(Controller(1))
     sim["level"], sim["target"] = 3, 4
     assert sim.read(3, 0, 2) == [3, 4]
+
+
+# ---- reads that A1000 and CP2000 drives refuse: learnt without options, and other values are still read ----
+
+
+ILLEGAL_ADDRESS, ILLEGAL_VALUE = 2, 3
+
+
+class Choosy:
+    """A simulated drive that refuses some reads with an exception."""
+
+    def __init__(self, drive: Drive, refusal: Callable[[Message], int]) -> None:
+        self.sim: Any = simulated(drive)
+        self._answer = self.sim.answer
+        self._refusal = refusal
+        self.read: list[tuple[int, int]] = []
+        vars(self.sim)["answer"] = self.answer
+
+    def answer(self, request: Message, now: float) -> Message | None:
+        self.read.append((request.start, request.count))
+        if code := self._refusal(request):
+            return Message(request.address, request.function, request.start, exception=code)
+        reply: Message | None = self._answer(request, now)
+        return reply
+
+
+def more_than_four(request: Message) -> int:
+    return ILLEGAL_VALUE if request.count > 4 else 0
+
+
+def at_210b(request: Message) -> int:
+    return ILLEGAL_ADDRESS if request.start <= 0x210B < request.start + request.count else 0
+
+
+def registers_with_values(rows: list[Row]) -> set[str]:
+    return {row.register for row in rows if row.value is not None}
+
+
+@table(
+    "name, refusal, lost",
+    [("yaskawa-a1000", more_than_four, set()), ("delta-cp2000", at_210b, {"output_torque"})],
+)
+def test_a_refused_read_costs_no_other_value(
+    name: str, refusal: Callable[[Message], int], lost: set[str]
+) -> None:
+    drive = shipped(name, 1)
+    choosy = Choosy(drive, refusal)
+    readings = drive.readings()
+    with ClockedLines(ClockedWire([choosy.sim], Faults()), [polled(drive, readings, 0.5)]) as clocked:
+        clocked.run(8)
+        choosy.read.clear()
+        rows = clocked.run(4)
+    assert registers_with_values(rows) == {register.name for register in readings} - lost
+    refused = [each for each in choosy.read if refusal(Message(1, 3, *each))]
+    assert not refused, "the drive is asked again only after a minute"
+    assert len(set(choosy.read)) < len(readings), "registers are still read together"

@@ -1,4 +1,4 @@
-"""A stop reopens a lost port of a polled line if no thread or poller can."""
+"""A stop reopens a polled line's lost port if no thread of the poller can do so."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from examples import usually
 from lines import line, plant, polled, rows_of, until
+from tables import table
 
 from multidrop.core import Framing, Message, build_reply, parse_request
 from multidrop.drive import Drive
@@ -20,6 +21,7 @@ from multidrop.drive.register import HOLDING, reading
 from multidrop.errors import LineError, PollingFailed
 from multidrop.families import InvtCHE
 from multidrop.poller import Poller
+from multidrop.polling.batch import Row
 from multidrop.polling.polled_line import PolledLine
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
@@ -86,7 +88,7 @@ def test_a_stop_reopens_the_port_if_no_thread_can_and_polling_continues(
 def test_all_lines_are_opened_even_with_few_threads(
     hall: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int
 ) -> None:
-    """If a reload failed here, motors would keep running without any stop."""
+    """If a reload failed here, running motors would get no stop."""
     left = threads
 
     def start(thread: threading.Thread) -> None:
@@ -134,8 +136,9 @@ def test_a_stop_reopens_a_lost_port_after_the_poller_has_failed(
 
 
 @contextmanager
-def server(is_last: Callable[[int, int], bool]) -> Iterator[str]:
-    """Serve Modbus TCP to one client. After the nth request, close if `is_last(nth, address)` is True.
+def server(is_last: Callable[[int, int], bool], idle_s: float | None = None) -> Iterator[str]:
+    """Serve Modbus TCP to one client at a time. Close the connection after the nth request if `is_last(nth,
+    address)` is True, and if no request comes for `idle_s` s.
 
     The number n starts at 1 for each connection. Each register's value is its address. At a request for the
     address `DEADLY`, the server closes the connection without a reply.
@@ -156,6 +159,7 @@ def server(is_last: Callable[[int, int], bool]) -> Iterator[str]:
             with suppress(OSError):
                 while True:
                     connection, _ = listener.accept()
+                    connection.settimeout(idle_s)
                     with connection, suppress(OSError):
                         serve(connection)
 
@@ -178,10 +182,12 @@ class Scattered(Drive):
     deadly = reading(DEADLY, table=HOLDING)
 
 
-@pytest.mark.parametrize("every", [None, 0.1])
-@pytest.mark.parametrize("most", [1, 2, 3])
+@table("every", [None, 0.1])
+@table("most", [1, 2, 3])
 def test_every_register_is_read_although_connections_end_early(every: float | None, most: int) -> None:
-    """An interrupted request is sent first on the next connection, unless it was its connection's first."""
+    """An interrupted request is the first one on the next connection, unless it was also the first on the old
+    one.
+    """
     seen = Counter[tuple[str, float | None]]()
     with server(lambda nth, address: nth == most) as port:
         drive = polled(Scattered(1, name="pump"), list(Scattered.registers.values()), every)
@@ -193,3 +199,18 @@ def test_every_register_is_read_although_connections_end_early(every: float | No
 
             until(look)
     assert {name for name, _ in seen} == {"near", "far"}
+
+
+def test_a_connection_that_its_peer_closes_between_slow_polls_costs_no_value() -> None:
+    """Reported as home-assistant/core#101982 and zivillian/esp32-modbus-gateway#2."""
+    with server(lambda nth, address: False, idle_s=0.05) as port:
+        drive = polled(Scattered(1, name="pump"), [Scattered.registers["near"]], 0.3)
+        with Poller(plant(line(port, drive))) as poller:
+            rows: list[Row] = []
+
+            def look() -> bool:
+                rows.extend(rows_of(poller))
+                return len(rows) >= 4
+
+            until(look)
+    assert {row.status for row in rows} == {"ok"}

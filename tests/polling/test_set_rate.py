@@ -53,7 +53,7 @@ def only_line(made: ClockedLines) -> PolledLine:
 
 def test_set_rate_of_one_register_changes_no_other_rate(two: ClockedLines) -> None:
     two.poller.set_rate("pump-1", "output_current", 1.0)
-    two.run(1)  # queued requests are still sent
+    two.run(1)  # until the requests already queued have been sent
     counts = values(two.run(10))
     assert counts.pop(("pump-1", "output_current")) in (10, 11)
     assert len(counts) == 7
@@ -91,7 +91,7 @@ def test_the_first_value_at_a_new_rate_is_read_immediately(two: ClockedLines) ->
 
 
 def test_registers_with_an_unchanged_rate_keep_their_slots() -> None:
-    """The registers keep their slots in a new block, which lacks the register whose rate changed."""
+    """The registers keep their slots although their new block lacks the register whose rate changed."""
     with clocked(polled(toy(), ALL, 0.1)) as made:
         begun = made.run(3)[0].monotonic_ns
         made.poller.set_rate("pump-1", "output_frequency", 0.25)
@@ -181,7 +181,7 @@ def test_a_refused_register_remains_set_aside_at_a_new_rate() -> None:
         made.poller.set_rate(pump, None, 0.2)
         rows = made.run(3)
         missed = {row.register for row in rows if row.value is None}
-        assert missed <= {"fault", "status"}  # the refusal of the whole block is remembered at all rates
+        assert missed <= {"fault", "status"}  # the block's refusal is remembered at all rates
         assert only_line(made).summary()["set_aside"] == ["pump-1.fault"]
         counts = Counter(row.register for row in made.run(10) if row.value is not None)
     assert {counts[register.name] for register in (CURRENT, FREQUENCY, STATUS)} <= {49, 50, 51}
@@ -232,7 +232,12 @@ def test_an_invalid_rate_changes_nothing(two: ClockedLines) -> None:
         ("pump-3", None, 1.0, r"pump-3 is not polled here; did you mean pump-\d"),
         ("zzz", None, 1.0, "zzz is not polled here; there are pump-1, pump-2"),
         ("pump-1", "output_curent", 1.0, "has no register 'output_curent'; did you mean output_current"),
-        ("pump-1", "mystery", 1.0, "mystery of pump-1 is not polled: that is output_current, output_freq"),
+        (
+            "pump-1",
+            "mystery",
+            1.0,
+            "mystery of pump-1 is not polled; polled are: output_current, output_freq",
+        ),
         ("pump-1", None, 0, "every = 0 is not a number of seconds from 0.0001 to 86400, or None"),
         ("pump-1", None, -1.0, "every = -1.0 is not"),
         ("pump-1", None, float("nan"), "every = nan is not"),

@@ -1,19 +1,27 @@
-"""Drives that fall silent, on the test's clock: their cost to the others, and their return."""
+"""Drives that fall silent, on a clock that the test sets: the time they cost other drives, and their
+return.
+"""
 
 from __future__ import annotations
+
+from collections import Counter
 
 import pytest
 from clocked_lines import ClockedLines, ClockedWire, S
 from lines import polled, rows_of
+from tables import table
 from toy import Toy
 
+from multidrop.drive.register import HOLDING, reading
 from multidrop.families import InvtCHE
+from multidrop.polling.batch import Row
+from multidrop.polling.jobs import JobMaker
 from multidrop.polling.polled_line import PolledLine
-from multidrop.sim import Faults, simulated
+from multidrop.sim import Faults, SimulatedDrive, simulated
 
 DRIVES = 31
-FIRST, LATER = 8, 52  # durations in s over which the promised rates are measured
-BACK = 45  # s until drives that were dead from the start are polled again, after all have power
+FIRST, LATER = 8, 30  # consecutive durations in s, in each of which values are counted
+BACK = 45  # limit in s until drives that were dead from the start are polled again, once they have power
 
 
 def test_the_row_of_a_skipped_slot_does_not_appear_before_the_slot() -> None:
@@ -35,7 +43,7 @@ def test_the_row_of_a_skipped_slot_does_not_appear_before_the_slot() -> None:
 def test_a_line_is_checked_more_often_while_a_drive_is_silent(
     monkeypatch: pytest.MonkeyPatch, is_silent: bool, looks: int
 ) -> None:
-    """While all drives of a line with a period answer, its queue only needs to be refilled."""
+    """While all drives of a line with a period answer, the line is checked only to refill its queue."""
     looked: list[int] = []
     tend = PolledLine.tend
 
@@ -54,15 +62,12 @@ def test_a_line_is_checked_more_often_while_a_drive_is_silent(
         looked.clear()
         rows = clocked.run(2)
         assert len([row for row in rows if row.value is not None]) == (20 if is_silent else 40)
-        assert abs(len(looked) - looks) <= 3  # the core also calls when a drive falls silent or answers again
+        assert abs(len(looked) - looks) <= 3  # further checks: a drive falls silent or answers again
 
 
 @pytest.mark.long
 @pytest.mark.story
-@pytest.mark.parametrize(
-    ("dead", "back_s"),
-    [(1, 5), (5, 25), (10, 45)],
-)
+@pytest.mark.parametrize(("dead", "back_s"), [(1, 5), (5, 25), (10, 45)])
 def test_silent_drives_hardly_slow_the_others_and_return_soon(dead: int, back_s: int) -> None:
     drives = [InvtCHE(address, name=f"drive-{address}", baudrate=38_400) for address in range(1, DRIVES + 1)]
     sims = [simulated(drive) for drive in drives]
@@ -75,11 +80,11 @@ def test_silent_drives_hardly_slow_the_others_and_return_soon(dead: int, back_s:
         return sum(1 for row in clocked.run(seconds) if row.value is not None)
 
     with clocked:
-        clocked.run(5)  # until response delays are measured
+        clocked.run(5)  # the response delays are measured in this time
         healthy = answered(10)
         for sim in sims[:dead]:
             sim.deaf_until = float("inf")
-        clocked.run(10)  # until the poller knows that they are silent
+        clocked.run(10)  # in this time the poller notices that they are silent
         assert answered(50) >= 0.97 * 5 * healthy
         for sim in sims[:dead]:
             sim.deaf_until = 0.0
@@ -100,7 +105,7 @@ def test_drives_dead_from_the_start_hardly_slow_the_others(
     gone = {3 * number + 1 for number in range(dead)}
 
     def answered(addresses: list[int]) -> list[int]:
-        """Return the number of answers in the first seconds, and later."""
+        """Return the numbers of answers in the first FIRST s, and in the LATER s after that."""
         drives = [InvtCHE(address, name=f"drive-{address}", baudrate=38_400) for address in addresses]
         sims = [simulated(drive) for drive in drives]
         for sim in sims:
@@ -123,3 +128,98 @@ def test_drives_dead_from_the_start_hardly_slow_the_others(
     without_first, without_later = answered([address for address in every_drive if address not in gone])
     assert first >= 0.9 * without_first
     assert later >= 0.98 * without_later
+
+
+# ---- blocks of a drive that answers sooner or later than documented are planned again ----
+
+
+SOON, LATE = 0.005, 0.06  # short and long response delay in s
+
+
+class Wide(Toy):
+    """A drive with two registers far apart. One request for both is faster only if the response delay is
+    long.
+    """
+
+    most_registers = {HOLDING: 100}
+    readable_gaps = {HOLDING: range(100)}
+
+    near = reading(0x20)
+    far = reading(0x38)
+
+
+NAMES = (Wide.near.name, Wide.far.name)
+
+
+def asked_together(rows: list[Row]) -> set[bool]:
+    """Return, for each exchange, True if it read both registers."""
+    assert {row.status for row in rows} == {"ok"}
+    return {count == len(NAMES) for count in Counter(row.monotonic_ns for row in rows).values()}
+
+
+@pytest.mark.slow
+@table(("document", "truth"), [(SOON, LATE), (LATE, SOON)], ids=["later", "sooner"])
+@table("every", [None, 0.75], ids=["in turn", "at a rate"])
+def test_blocks_are_planned_again_for_the_measured_response_delay(
+    document: float, truth: float, every: float | None
+) -> None:
+    drive = Wide(1, name="pump-1")
+    drive.response_delay = document
+    sim = SimulatedDrive(Wide(1), response_delay=truth)
+    with ClockedLines(ClockedWire([sim], Faults()), [polled(drive, [Wide.near, Wide.far], every)]) as clocked:
+        first = clocked.run(0.7)
+        assert asked_together(first) == {document == LATE}
+        between = clocked.run(3.0)
+        after = clocked.run(9.0)
+        assert asked_together(after) == {truth == LATE}
+        summary = clocked.poller.summary()["lines"]["line"]
+    assert summary["misses"] == {}
+    if every:
+        assert summary["overrun_slots"] == 0
+        for name in NAMES:
+            slots = [row.monotonic_ns for row in first + between + after if row.register == name]
+            dues = {round((at - slots[0]) / (every * S)) for at in slots}
+            assert dues == set(range(len(dues)))  # each slot has exactly one row
+
+
+def test_replanning_one_drive_keeps_the_polling_order() -> None:
+    drives = [Wide(address, name=f"pump-{address}") for address in (1, 2, 3)]
+    drives[1].response_delay = LATE
+    sims = [SimulatedDrive(Wide(address), response_delay=SOON) for address in (1, 2, 3)]
+    with ClockedLines(
+        ClockedWire(sims, Faults()), [polled(each, [Wide.near, Wide.far]) for each in drives]
+    ) as clocked:
+        clocked.run(5.0)
+        rows = [(row.drive, row.register) for row in clocked.run(2.0)]
+    at = rows.index(("pump-1", "near"))
+    assert rows[at : at + 6] == [(drive.name, name) for drive in drives for name in NAMES]
+
+
+@pytest.mark.slow
+def test_memory_is_bounded_if_a_response_delay_keeps_changing() -> None:
+    drive = Wide(1, name="pump-1")
+    sim = SimulatedDrive(Wide(1), response_delay=SOON)
+    with ClockedLines(ClockedWire([sim], Faults()), [polled(drive, [Wide.near, Wide.far])]) as clocked:
+        (line,) = clocked.poller._lines
+        seen = set()
+        for _ in range(6):
+            for sim.response_delay in (SOON, LATE):
+                clocked.run(6.0)
+                seen.add(len(line._maker._made))
+    assert seen == {2, 3}
+
+
+@pytest.mark.slow
+def test_blocks_are_kept_unless_others_are_faster(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measured delays always vary a little. That alone must not change the blocks."""
+    drive = Wide(1, name="pump-1")
+    sim = SimulatedDrive(Wide(1), response_delay=SOON)
+    choose, chosen = JobMaker.plan, []
+    monkeypatch.setattr(JobMaker, "plan", lambda *given: chosen.append(given) or choose(*given))
+    with ClockedLines(ClockedWire([sim], Faults()), [polled(drive, [Wide.near, Wide.far])]) as clocked:
+        for sim.response_delay in (SOON / 20, 2 * SOON, SOON / 5, SOON):
+            assert asked_together(clocked.run(6.0)) == {False}
+        assert len(chosen) == 1
+        sim.response_delay = LATE
+        clocked.run(6.0)
+        assert len(chosen) == 2

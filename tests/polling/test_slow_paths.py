@@ -1,7 +1,7 @@
 """Network paths that delay replies, such as modems or stalled networks, on a clock that the test sets.
 
-No value is assigned to the wrong register, and polling continues. Over Modbus TCP a reply with its id needs
-no proof; a gateway that replies with its own ids is treated like RTU.
+No value is assigned to the wrong register, and polling continues. Over Modbus TCP, a reply is recognised by
+its request's id. A gateway that replies with its own ids is treated like an RTU line.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import ClassVar
 import pytest
 from examples import every_fourth, usually
 from lines import proof
-from motors import MAKE, ReceivedRequests
+from motors import LINES, MAKE, ReceivedRequests, of_all_variants, of_one_variant
 from stories import (
     TAIL,
     TURNS,
@@ -29,7 +29,6 @@ from stories import (
     stalling,
 )
 from tables import table
-from variants import LINES, of_all_variants, of_one_variant
 
 from multidrop.bus import Bus
 from multidrop.control.outcome import Effect
@@ -103,7 +102,7 @@ def check_stop(opened: Bus, line: PathLine, sim: SimulatedDrive, seconds: float)
         sim.motor.run(1)
         opened.drives[0].stop()
     assert not sim.motor.energised
-    assert sent_after[0] < 1  # s; after the identity check's reads, of which one may get no reply
+    assert sent_after[0] < 1  # s; the identity check's reads come first, and one of them may get no reply
     assert (line.now - begun) / S < 8 * seconds + 3
     return len(sent_after)
 
@@ -124,7 +123,7 @@ def test_no_value_is_misattributed_over_a_stalled_path(name: str, longest: float
 
 
 class OneByOne(Drive):
-    """A device that is read one register at a time, so that all its replies look alike."""
+    """A device whose registers are read one at a time, so that all its replies look alike."""
 
     title = "a user's device"
     framings = (Framing.RTU,)
@@ -152,11 +151,9 @@ def path_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Bus, PathLin
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "slow"), READS)
 def test_reads_over_a_slow_path_return_the_right_values(
-    name: str,
-    slow: tuple[Callable[[float], Delay], float],
-    path_of: Callable[..., tuple[Bus, PathLine]],
+    name: str, slow: tuple[Callable[[float], Delay], float], path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
-    """A client reads four registers of each of two drives in turn, and retries failed reads."""
+    """A client reads four registers of two drives alternately, and retries failed reads."""
     path, seconds = slow
     drives = of_one_variant(LINES[name])
     opened, line = path_of([EncodedDrive(drive) for drive in drives], path(seconds))
@@ -166,11 +163,11 @@ def test_reads_over_a_slow_path_return_the_right_values(
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "slow"), ASKED)
 def test_raw_reads_over_a_slow_path_return_the_right_values(
-    name: str,
-    slow: tuple[Callable[[float], Delay], float],
-    path_of: Callable[..., tuple[Bus, PathLine]],
+    name: str, slow: tuple[Callable[[float], Delay], float], path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
-    """Raw reads are sent once, between reads with the same function and length at other addresses."""
+    """Raw reads alternate with reads that have the same function and length and other addresses. No raw read
+    is retried.
+    """
     path, seconds = slow
     drives = [drive for drive in of_one_variant(LINES[name]) if drive.framing is not Framing.DELIXI]
     opened, line = path_of([EncodedDrive(drive) for drive in drives], path(seconds))
@@ -217,7 +214,7 @@ def test_outcomes_of_writes_over_a_slow_path_are_right(
 def test_a_write_may_be_answered_more_slowly_than_reads(
     name: str, path_of: Callable[..., tuple[Bus, PathLine]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Only the reply to the write is slow, and it is received, not replaced by a read back."""
+    """Only the reply to the write is slow. The bus waits for it, and does not read the value back."""
     drive = WRITTEN[name]
     sim = simulated(drive)
     opened, line = path_of([sim], constant(0.0))
@@ -238,9 +235,7 @@ def test_a_write_may_be_answered_more_slowly_than_reads(
         assert (opened.peer(drive).counters().late, opened.peer(drive).silences) == (0, 0)
 
 
-def test_timeouts_of_a_delixi_are_at_least_80_ms(
-    path_of: Callable[..., tuple[Bus, PathLine]],
-) -> None:
+def test_timeouts_of_a_delixi_are_at_least_80_ms(path_of: Callable[..., tuple[Bus, PathLine]]) -> None:
     for drive in (DelixiModbus(1), DelixiNative(1)):
         opened, _ = path_of([simulated(drive)], constant(0.0))
         with opened:
@@ -254,7 +249,9 @@ def test_timeouts_of_a_delixi_are_at_least_80_ms(
 def test_a_stop_over_a_slow_path_is_confirmed(
     model: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
-    """The stop's first frame is sent immediately; later reads wait as long as replies are known to take."""
+    """The stop's first frame is sent immediately. The reads after it wait as long as replies are known to
+    take.
+    """
     sim = simulated(MAKE[model](1))
     assert check_stop(*path_of([sim], constant(seconds)), sim, seconds) <= 6
 
@@ -278,11 +275,11 @@ TCP_PATHS = [
     for seconds in delays
 ]
 ON_TCP_PATHS = every_fourth(FAMILIES, TCP_PATHS, [("innovert-ibd", (constant, 0.6))])
-KINDS = ("delay", "twice", "merge")  # faults of a gateway that keep the stream in step
+KINDS = ("delay", "twice", "merge")  # faults of a gateway that leave the stream's frames intact
 
 
 class TrueIds(PathWire):
-    """A path behind a gateway that replies with the requests' ids, after arbitrary delays."""
+    """A path behind a gateway whose replies have the ids of their requests, after arbitrary delays."""
 
     most_late = 2.0
 
@@ -291,7 +288,7 @@ class OwnIds(PathWire):
     """A path behind a gateway that numbers its replies itself, regardless of the requests' ids."""
 
     ids = TransactionIds.IGNORE
-    most_late = 0.25  # s; without ids, a reply later than three timeouts cannot be recognised
+    most_late = 0.25  # s; without ids, a reply that comes after three timeouts cannot be recognised
     count = 0
 
     def distort(self, reply: bytes) -> bytes:
@@ -347,7 +344,7 @@ def test_no_value_is_misattributed_over_a_stalled_gateway(story_of: type[Path]) 
 
 @pytest.mark.long
 def test_a_late_reply_recognised_by_its_id_delays_no_request() -> None:
-    """No request waits for a late reply, and no request is sent only as a proof."""
+    """No request waits for a late reply, and no extra request is sent to prove that no late reply is due."""
     story = TrueIdsPath(two_of("innovert-ibd"), port=TCP)
     story.run_over(stalling(3.0))
     told = story.clocked.poller.summary()["lines"]["line"]

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import builtins
 import importlib
+import re
 import subprocess
 import sys
 from typing import Any
 
 import pyarrow as pa
 import pytest
-from batches import EXAMPLE, SECOND, UTC_0, block, completion, example
-from completions import add_miss, add_rows
+from batches import EXAMPLE, SECOND, UTC_0, add_miss, add_rows, block, completion, example
 from recordings import row
 
 from multidrop.core import Columns, Names, Status
+from multidrop.extras import install_command
 from multidrop.polling.batch import ROW_COLUMNS, Batch, Row
 from multidrop.recording.rows import from_rows
 
@@ -47,17 +48,9 @@ def test_to_polars_returns_times_as_datetime_in_utc() -> None:
 @pytest.mark.parametrize(
     ("method", "missing", "sentence"),
     [
-        (
-            "to_pandas",
-            "pandas",
-            r"to_pandas\(\) needs pandas, which is not installed: .*multidrop\[pandas\]",
-        ),
+        ("to_pandas", "pandas", r"to_pandas\(\) needs pandas, which is not installed: .*multidrop\[pandas\]"),
         ("to_pandas", "pyarrow", r"to_pandas\(\) needs pyarrow, which is not .*multidrop\[pandas\]"),
-        (
-            "to_polars",
-            "polars",
-            r"to_polars\(\) needs polars, which is not installed: .*multidrop\[polars\]",
-        ),
+        ("to_polars", "polars", r"to_polars\(\) needs polars, which is not installed: .*multidrop\[polars\]"),
     ],
 )
 def test_the_error_for_a_missing_library_has_the_install_command(
@@ -76,6 +69,13 @@ def test_the_error_for_a_missing_library_has_the_install_command(
             getattr(table, method)()
 
 
+def test_one_command_installs_the_libraries_of_several_extras() -> None:
+    """Everything after the `#` is a comment for the shell, so all libraries must come before the `#`."""
+    command, _, comment = install_command("serve", "plot").partition("#")
+    assert {"matplotlib", "starlette", "uvicorn"} <= {*re.findall(r"[a-z]{3,}", command)}
+    assert comment == " multidrop[serve,plot]"
+
+
 @pytest.mark.long
 def test_no_library_is_imported_before_it_is_needed() -> None:
     code = (
@@ -87,7 +87,7 @@ def test_no_library_is_imported_before_it_is_needed() -> None:
     late |= {
         "importlib.metadata",
         "multidrop.families.files.loader",
-    }  # most plants use no family file, and most commands write no capture
+    }  # modules that most programs do not need: few use family files or captures
     assert late.isdisjoint(told.stdout.split())
 
 
@@ -128,8 +128,8 @@ def test_pandas_and_polars_read_the_wide_form() -> None:
     assert frame[SPEED].to_list() == [0.3]
 
 
-def test_chosen_columns_are_in_their_order_even_if_empty() -> None:
-    """A chosen column is present even if a batch has no row for it: all batches have the same columns."""
+def test_chosen_columns_are_all_present_in_the_chosen_order() -> None:
+    """Then all batches have the same columns: a column is present even if the batch has no row for it."""
 
     never = "насос.output_frequency"
     wide = example().wide(never, SPEED, PUMP)
@@ -162,7 +162,7 @@ def test_only_rows_with_equal_times_are_joined() -> None:
         early,
         early._replace(register="b", time_ns=early.time_ns + 1, monotonic_ns=early.monotonic_ns + 1),
     ]
-    rows.append(rows[1]._replace(drive="fan"))  # on another line, at the same time to the nanosecond
+    rows.append(rows[1]._replace(drive="fan"))  # a row of another line, at the same time to the nanosecond
     table = pa.table(from_rows(rows).wide())
     assert table.column("pump.a").to_pylist() == [1.0, None]
     assert table.column("pump.b").to_pylist() == table.column("fan.b").to_pylist() == [None, 1.0]
@@ -194,7 +194,7 @@ def test_an_empty_batch_has_an_empty_wide_form() -> None:
 
 def test_equal_column_names_of_two_drives_raise_value_error() -> None:
     rows = from_rows([row(1.0, "a.b", "c", 1.0), row(1.0, "a", "b.c", 2.0)])
-    with pytest.raises(ValueError, match=r"'a\.b' and 'a' both have a register that is called 'a\.b\.c'"):
+    with pytest.raises(ValueError, match=r"'a\.b' and 'a' both have a column that is called 'a\.b\.c'"):
         rows.wide()
 
 

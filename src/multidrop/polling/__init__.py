@@ -1,4 +1,5 @@
-"""Polling: jobs of a line, their turn on its port, registers that are refused, and batches of rows."""
+"""Polling: the requests that are sent to a line, their order, refused registers, and batches of rows."""
 
 from multidrop.polling.batch import BatchColumns as BatchColumns
+from multidrop.polling.batch import slot_rows as slot_rows
 from multidrop.polling.tables import WideRows as WideRows

@@ -1,4 +1,4 @@
-"""Adoption: change the lines of a poller to those of another plant, while they are polled.
+"""Adoption: change the lines of a poller to those of another plant, while the lines are polled.
 
 All mistakes are found before anything changes. Then lines and drives are removed, kept lines are changed, and
 new ports are opened. Lines without changes are not touched.
@@ -33,9 +33,10 @@ class DriveChanges(NamedTuple):
 
 
 def check_plant(plant: Plant, *, is_free: Callable[[Drive], bool]) -> None:
-    """Raise PlantError with all mistakes of a plant, because a program may have built it.
+    """Raise PlantError with all mistakes of a plant. The plant may come from a program instead of a plant
+    file.
 
-    `is_free` returns False for a drive that is on another bus. Drives get the framing of their ports.
+    `is_free` returns False for a drive that is on another bus. Each free drive takes the framing of its port.
     """
     found: list[str] = []
     names: dict[tuple[str, object], str] = {}
@@ -55,7 +56,7 @@ def check_plant(plant: Plant, *, is_free: Callable[[Drive], bool]) -> None:
             )
         for polled in line.drives:
             drive, at = polled.drive, f'{where}, drive "{polled.drive.name}"'
-            once(at, "drive", drive.name, "{first} already has this name; each drive needs its own")
+            once(at, "drive", drive.name, "another drive already has this name; each drive needs its own")
             address = f"address {drive.address} is already used by {{first}}; give each drive its own"
             once(at, "address", (wire, drive.address), address)
             if not is_free(drive):
@@ -68,7 +69,7 @@ def check_plant(plant: Plant, *, is_free: Callable[[Drive], bool]) -> None:
             for poll in polled.polls:
                 found += _mistakes(at, partial(_check_polled, drive, poll.register))
     if found:
-        raise PlantError(tuple(dict.fromkeys(found)))  # without duplicates: registers may share a mistake
+        raise PlantError(tuple(dict.fromkeys(found)))  # several registers may cause the same mistake
 
 
 def _check_polled(drive: Drive, register: Register[Any]) -> None:
@@ -85,7 +86,7 @@ def _mistakes(place: str, check: Callable[[], object]) -> list[str]:
 
 
 def _description(drive: Drive) -> tuple[object, ...]:
-    """Return a drive's class and options as a key, which is equal for two objects of the same drive."""
+    """Return a key to compare drive objects: it is equal for the same class and options."""
     return (
         type(drive),
         drive.address,
@@ -111,8 +112,8 @@ def drive_changes(present: Iterable[PolledDrive], wanted: Iterable[PolledDrive])
             changes.joining.append(polled)
             continue
         left.remove(same)
-        if same.polls != polled.polls:
-            changes.repolled.append(PolledDrive(same.drive, polled.polls))
+        if (same.polls, same.channels) != (polled.polls, polled.channels):
+            changes.repolled.append(PolledDrive(same.drive, polled.polls, channels=polled.channels))
     return changes
 
 
@@ -130,17 +131,18 @@ class Staying:
     def await_stops(self) -> None:
         """Cancel the calls of the leaving drives, and wait for their stops.
 
-        With `stop_on_exit`, the leaving drives are stopped first, except those whose address a joining drive
-        takes: the leaving drive's stop could mean something else to the joining drive. All stops are over
-        before any drive is removed, because a removed drive could not be stopped while another motor still
-        ramps down.
+        With `stop_on_exit`, the leaving drives are stopped first. A drive whose address a joining drive takes
+        is not stopped, because its stop could be a different command to the joining drive. Drives are removed
+        only after all stops have ended: until then, every drive can be stopped again.
         """
         taken = {polled.drive.address for polled in self.drives.joining}
         leaving = [polled.drive for polled in self.drives.leaving]
         self.line.bus.part_with(leaving, [drive for drive in leaving if drive.address not in taken])
 
     def let_leave(self, names: Collection[str]) -> None:
-        """Remove the leaving drives; wait until the last exchange ends of each whose name is in `names`."""
+        """Remove the leaving drives. If a drive's name is in `names`, wait for the end of its last
+        exchange.
+        """
         leaving = [polled.drive for polled in self.drives.leaving]
         for drive in leaving:
             self.line.remove(drive)
@@ -160,13 +162,13 @@ class Staying:
         return bool(self.drives.leaving or self.drives.joining)
 
     def is_free(self, leaving: Mapping[str, Staying]) -> bool:
-        """Return False if a joining drive has the name of a drive that has yet to leave another line."""
+        """Return False if a joining drive has the name of a drive that has not left another line yet."""
         return all(leaving.get(polled.drive.name, self) is self for polled in self.drives.joining)
 
     def take_in(self) -> None:
         """Start polling the joining drives, and the changed registers and rates of kept drives.
 
-        Raises LineError if the port cannot have a drive's settings.
+        Raises LineError if the port does not support a drive's settings.
         """
         self.line.declared, self.line.switching = self.wanted, self.wanted.switching
         for polled in self.drives.repolled:
@@ -211,10 +213,10 @@ class Adoption:
                 ported.setdefault(line.declared.port, []).append(line)
         coming: list[Coming] = []
         for wanted in self._plant.lines:
-            others = ported.get(wanted.port, [])
-            same = next((line for line in others if _can_become(line, wanted)), None)
             if wanted.name in found:
                 continue
+            others = ported.get(wanted.port, [])
+            same = next((line for line in others if _can_become(line, wanted)), None)
             if same is not None:
                 others.remove(same)
                 found[wanted.name] = same
@@ -234,7 +236,7 @@ class Adoption:
             raise ValueError(
                 f"{len(self._plant.lines)} lines are too many for one poller: {MOST_LINES} at most"
             )
-        self._lines.names.check_room(polled for line in self._plant.lines for polled in line.drives)
+        self._lines.names.check_room(self._plant.drives)
         for coming in self._coming:
             self._lines.check_port(coming.wanted.port)
         if self._coming:
@@ -242,10 +244,12 @@ class Adoption:
         if self._coming and self._lines.stops_on_exit:
             exit_hook().take_signals()
 
-    # ---- carrying it out ----
+    # ---- carrying out the change ----
 
     def carry_out(self, *, start: bool) -> dict[str, LineError]:
-        """Change the lines; return the errors of ports that could not be opened or set up, by line name."""
+        """Change the lines; with `start`, start polling the new ones. Return the errors of ports, by line
+        name.
+        """
         self._let_go()
         failures = self._change() | self._open(start)
         self._lines.put_in_order([line.name for line in self._plant.lines])
@@ -262,12 +266,12 @@ class Adoption:
     def _change(self) -> dict[str, LineError]:
         """Change the kept lines one by one; return the errors of ports, by line name.
 
-        If a joining drive has the name of a drive that leaves another line, that other line is changed first.
-        Lines that wait for each other are changed together, once all their stops are over. This happens
-        before any port is opened, so that a slow port never delays the stop of a drive that is replaced.
+        A drive may join a line while a drive of the same name leaves another line. Then the other line is
+        changed first. Lines that wait for each other are changed together, once all their stops are over. New
+        ports are opened only later, so that a slow port never delays the stop of a drive that is replaced.
         """
         failures: dict[str, LineError] = {}
-        names = {polled.drive.name for line in self._plant.lines for polled in line.drives}
+        names = {polled.drive.name for polled in self._plant.drives}
         for staying in self._staying:
             if not staying.moves:
                 staying.take_in()
@@ -291,7 +295,7 @@ class Adoption:
     def _open(self, start: bool) -> dict[str, LineError]:
         """Open the new lines; return the errors of ports, by line name.
 
-        A line whose port is absent waits for the port, like a line with a lost port.
+        A line whose port cannot be opened is added too. The poller opens the port later, like a lost port.
         """
         failures: dict[str, LineError] = {}
         for place, bus in self._lines.open([coming.wanted for coming in self._coming]):
@@ -310,7 +314,7 @@ class Adoption:
     def _put(self, coming: Coming, bus: Bus, start: bool) -> None:
         """Add a line with this bus; if `start` is set, start to poll it.
 
-        Raises LineError if the port cannot have a drive's settings.
+        Raises LineError if the port does not support a drive's settings.
         """
         if coming.before:
             bus.remember(coming.before.bus)
@@ -328,7 +332,7 @@ def _is_free(drive: Drive, buses: set[Bus]) -> bool:
 
 
 def _can_become(line: PolledLine, wanted: PlantLine) -> bool:
-    """Return True if a line can change without reopening its port."""
+    """Return True if the line can become the line `wanted` without reopening its port."""
     facts, others = (
         (each.port, each.echo, each.ids, each.rs485, each.settle) for each in (line.declared, wanted)
     )
@@ -338,6 +342,6 @@ def _can_become(line: PolledLine, wanted: PlantLine) -> bool:
 
 
 def _is_another(drive: Drive, wanted: PlantLine) -> bool:
-    """Return True if another family is declared at the drive's address."""
+    """Return True if the new plant has a drive of another family at the drive's address."""
     others = [polled.drive for polled in wanted.drives if polled.drive.address == drive.address]
     return any(type(other) is not type(drive) for other in others)

@@ -1,4 +1,4 @@
-"""Rows of samples and misses: as columns for Arrow, and as single rows for people.
+"""Rows of samples and misses: as columns for Arrow, and as single `Row` objects.
 
 `batch.to_pandas()`, `batch.to_polars()` and `batch.wide()` make tables. Any library with the Arrow PyCapsule
 interface can read a batch directly: `pyarrow.record_batch(batch)`, `duckdb.sql("from batch")`. multidrop
@@ -11,16 +11,18 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from array import array
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from functools import cache
 from typing import Any, NamedTuple, NoReturn
 
+from multidrop.channels import SlotRow
 from multidrop.core import STATUSES, Columns, Names, spell
-from multidrop.core.columns import COLUMNS
+from multidrop.core.columns import COLUMNS, find_codes
 from multidrop.polling.tables import ArrowTable, WideRows, nanoarrow
 
-_STATUSES = Names(STATUSES)
+_STATUSES = Names(STATUSES)  # the core's status texts, followed by the texts of events
+MOST_STATUSES = 1 << 14  # limit of different status texts in a process
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -29,7 +31,7 @@ class Row(NamedTuple):
 
     time_ns: int  # UTC at which the request was sent
     monotonic_ns: int
-    uncertainty_ns: int | None  # the drive took the value between time_ns and time_ns + uncertainty_ns
+    uncertainty_ns: int | None  # the drive sampled the value between time_ns and time_ns + uncertainty_ns
     drive: str
     register: str
     value: float | None
@@ -41,7 +43,7 @@ class Row(NamedTuple):
         return EPOCH + timedelta(microseconds=self.time_ns // 1000)
 
 
-ROW_COLUMNS = ("time", *Row._fields[1:])  # names of the columns that hold rows
+ROW_COLUMNS = ("time", *Row._fields[1:])  # column names of a table of rows
 
 
 def shown_span(rows: Sequence[Row]) -> str:
@@ -80,6 +82,21 @@ class BatchColumns(NamedTuple):
     statuses: tuple[str, ...]
 
 
+def slot_rows(columns: BatchColumns, slots: Mapping[tuple[int, int], int]) -> Iterator[SlotRow]:
+    """Yield the rows of the series in `slots`, which maps each series' codes (drive, register) to its
+    slot.
+    """
+    for at in find_codes(columns.drive, columns.register, slots):
+        yield SlotRow(
+            slots[columns.drive[at], columns.register[at]],
+            columns.time[at],
+            columns.monotonic_ns[at],
+            columns.uncertainty_ns[at],
+            columns.value[at],
+            columns.status[at],
+        )
+
+
 class Rows(ArrowTable):
     """Rows as a sequence, as Arrow capsules, and as tables of other libraries."""
 
@@ -102,7 +119,7 @@ class Rows(ArrowTable):
         return WideRows(self, columns, self._may_have() if columns else ())
 
     def _may_have(self) -> Collection[str]:
-        """Return the names of valid columns of the wide form, even if they have no row."""
+        """Return the names of all columns that the wide form may have, even those without a row."""
         return ()
 
     def __array__(self, *how: object, **details: object) -> NoReturn:
@@ -123,7 +140,7 @@ class Rows(ArrowTable):
 
 
 class Batch(Rows):
-    """Rows from the core, with the names for the numbers in them."""
+    """Rows from the core, with the names that the codes in the rows stand for."""
 
     def __init__(self, columns: Columns, drives: Names, registers: Names) -> None:
         self._columns = columns
@@ -140,7 +157,7 @@ class Batch(Rows):
             *map(self._columns.array, names), strict=True
         ):
             sample = (uncertainty, value) if status == 0 else (None, None)
-            yield Row(time, sent, sample[0], drives[drive], registers[register], sample[1], STATUSES[status])
+            yield Row(time, sent, sample[0], drives[drive], registers[register], sample[1], _STATUSES[status])
 
     def columns(self) -> BatchColumns:
         """Return the columns, without a copy, and the names that their codes stand for.
@@ -206,6 +223,13 @@ def bitmap_of(statuses: memoryview[Any]) -> memoryview[Any]:
     return memoryview(int(bits or "0", 2).to_bytes((len(statuses) + 7) // 8, "little"))
 
 
+def status_code(text: str) -> int:
+    """Return the code of a row's status. Raises ValueError if there are too many different texts."""
+    if len(_STATUSES) >= MOST_STATUSES and text not in _STATUSES.listed:
+        raise ValueError(f"this process has more than {MOST_STATUSES} different event texts")
+    return _STATUSES.number(text)
+
+
 @cache
 def schema() -> Any:
     """Return the Arrow schema of every batch and every recording."""
@@ -240,7 +264,7 @@ def assemble(rows: int, *columns: tuple[Any, ...]) -> Any:
 
 
 class GatheredRows(Columns):
-    """Columns that grow by a copy of each batch, so that the core can immediately reuse its memory."""
+    """Columns that grow by a copy of each batch, so that the core can reuse the batch's memory."""
 
     def __init__(self, drives: Names, registers: Names) -> None:
         self._drives, self._registers = drives, registers
@@ -277,8 +301,15 @@ class GatheredRows(Columns):
 
 
 def gather(gathered: list[GatheredRows], batch: Batch) -> None:
-    """Append the rows to the last element of `gathered`, or to a new one if they are of another poller."""
+    """Append the rows to the last element of `gathered`. Rows of another poller go into a new element."""
     if not gathered or not gathered[-1].add(batch):
         _, drives, registers = batch.parts()
         gathered.append(GatheredRows(drives, registers))
         gathered[-1].add(batch)
+
+
+def copied(batch: Batch) -> Batch:
+    """Return a copy of the batch, so that the core can reuse the batch's memory."""
+    gathered: list[GatheredRows] = []
+    gather(gathered, batch)
+    return gathered[0].batch()

@@ -1,4 +1,4 @@
-"""Jobs: the blocks of registers in which a drive is polled, each with its exchange and its rows' layout."""
+"""Jobs: blocks of a drive's registers that are polled together, each with its exchange and row layout."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class RowNames:
         self.registers = Names()
 
     def check_room(self, drives: Iterable[PolledDrive]) -> None:
-        """Raise ValueError if there would be more than MOST_NAMES names with these drives."""
+        """Raise ValueError if these drives would bring the number of names above MOST_NAMES."""
         wanted = list(drives)
         of_drives = {*self.drives.listed, *(polled.drive.name for polled in wanted)}
-        of_registers = {*self.registers.listed, *(poll.register.name for d in wanted for poll in d.polls)}
+        of_registers = {*self.registers.listed, *(poll.register.name for d in wanted for poll in d.series)}
         for names, of in ((of_drives, "drives"), (of_registers, "registers")):
             if len(names) > MOST_NAMES:
                 raise ValueError(
@@ -38,7 +38,7 @@ class RowNames:
                 )
 
     def layout(self, drive: Drive, block: Block) -> RowLayout:
-        """Return the layout of the rows into which a reply with this block is decoded."""
+        """Return the layout of the rows that a reply with this block is decoded into."""
         return RowLayout(
             self.drives.number(drive.name),
             [
@@ -57,7 +57,7 @@ class PolledJob(Job):
     exchange: Exchange
     rows: RowLayout
     own_ns: int  # duration of the exchange's silence and characters, without the response delay
-    may_be_too_long: bool  # whether the request may be longer than the drive answers
+    may_be_too_long: bool  # True if the block may have more registers than the drive answers in one reply
 
     @property
     def name(self) -> str:
@@ -67,7 +67,7 @@ class PolledJob(Job):
 
 @dataclass
 class PlannedJobs:
-    """Jobs that read a drive in the least bus time, and their plan."""
+    """The jobs that read a drive's registers in the least bus time, and the plan that they follow."""
 
     jobs: list[PolledJob]
     plan: Plan
@@ -80,7 +80,8 @@ class JobMaker:
         self._bus = bus
         self._names = names
         self._made: dict[tuple[Drive, Block, int | None], PolledJob] = {}
-        self._rows: dict[tuple[Drive, Block], RowLayout] = {}  # shared by all rates; a layout counts refusals
+        # The layout counts a block's refusals, so a block has the same layout at all rates.
+        self._rows: dict[tuple[Drive, Block], RowLayout] = {}
         self._skipped = 0  # skipped slots of forgotten jobs
 
     def plan(self, polled: PolledDrive, delay: float) -> PlannedJobs:
@@ -107,7 +108,7 @@ class JobMaker:
         return self._made[key]
 
     def forget(self, jobs: Iterable[PolledJob]) -> None:
-        """Forget these jobs, except those without a period, to bound memory if rates change often.
+        """Forget these jobs, so that frequent changes of rates use limited memory.
 
         Jobs without a period are kept, because the core may repeat them until the port is closed.
         """
@@ -126,7 +127,7 @@ class JobMaker:
     def make(
         self, drive: Drive, block: Block, period_ns: int | None, *, rows: RowLayout | None = None
     ) -> PolledJob:
-        """Return a new job, which `job` does not return again."""
+        """Return a new job that is not cached."""
         rows = rows or self._names.layout(drive, block)
         own_ns = round((silence(drive) + sending(drive, block)) * 1e9)
         return PolledJob(

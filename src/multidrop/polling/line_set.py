@@ -1,8 +1,7 @@
-"""LineSet: the lines of a poller, which may be added and removed while it polls."""
+"""LineSet: the lines of a poller. Lines may be added and removed while the poller polls."""
 
 from __future__ import annotations
 
-import difflib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,17 +18,18 @@ from multidrop.drive.family import Drive
 from multidrop.plant.model import PlantLine
 from multidrop.polling.jobs import RowNames
 from multidrop.polling.polled_line import PolledLine
+from multidrop.printable import did_you_mean
 from multidrop.transport import clock
 from multidrop.transport.open_port import check_port
 
-OPENING = 32  # number of ports opened concurrently, so that a slow one delays no other
+OPENING = 32  # limit of ports that are opened concurrently
 ENDING_NS = 1_000_000_000  # how long to wait for in-flight exchanges
-NO_LINE = 0  # reserved: never a line's number
-MOST_LINES = (1 << 16) - 1  # limit of a row queue's line numbers
+NO_LINE = 0  # reserved; no line has this number
+MOST_LINES = (1 << 16) - 1  # the highest line number of a row queue
 
 
 class LineSet:
-    """A poller's lines, each with the number that the core knows it by. Changed by one thread at a time."""
+    """A poller's lines, each with its number for the core. Only one thread at a time may change the set."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class LineSet:
         self._ledger = ledger
         self._audit = audit
         self._mastership = mastership
-        self.stops_on_exit = False  # whether `stop_on_exit` applies, also to lines added later
+        self.stops_on_exit = False  # True if `stop_on_exit` applies, also to lines added later
         self._lines: tuple[PolledLine, ...] = ()  # replaced, never mutated: readers iterate without a lock
         self._numbered: dict[int, PolledLine] = {}
         self._free: list[int] = []  # numbers of removed lines
@@ -75,17 +75,13 @@ class LineSet:
         name = drive if isinstance(drive, str) else drive.name
         line, known = drives.get(name, (None, None))
         if line is None or known is None or drive not in (name, known):
-            near = difflib.get_close_matches(name, drives, n=2)
-            hint = (
-                f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(drives) or 'none'}"
-            )
-            raise ValueError(f"{name} is not polled here; {hint}")
+            raise ValueError(f"{name} is not polled here; {did_you_mean(name, drives)}")
         return line, known
 
     # ---- opening and adding lines ----
 
     def fill(self, declared: Sequence[PlantLine]) -> None:
-        """Open and add all these lines, or none.
+        """Open and add all these lines. If one cannot be opened, add none.
 
         Raises LineError if a port cannot be opened, ValueError for a drive that cannot be on its line. After
         any exception, no port is left open.
@@ -98,7 +94,7 @@ class LineSet:
                     failures[place] = bus
                 else:
                     buses[place] = bus
-                    stack.callback(bus.close)  # carried out unless `pop_all` is reached
+                    stack.callback(bus.close)  # closes the bus unless `pop_all` is reached
             if failures:
                 raise failures[min(failures)]
             for place, line in enumerate(declared):
@@ -108,8 +104,8 @@ class LineSet:
     def open(self, declared: Sequence[PlantLine]) -> Iterator[tuple[int, Bus | OSError]]:
         """Open these lines' ports concurrently.
 
-        Yields each line's index as soon as it is done, with its bus or its failure. Buses not yielded because
-        the caller stops early are closed.
+        Yields each line's index as soon as its port is open or has failed, with the line's bus or the
+        failure. If the caller stops early, the buses that were not yielded are closed.
         """
         if len(declared) < 2:
             yield from enumerate(map(self._opened, declared))
@@ -143,14 +139,14 @@ class LineSet:
 
     def _opened(self, line: PlantLine) -> Bus | OSError:
         try:
-            if self._mastership and not self._mastership.holds:  # opened once this process is master
+            if self._mastership and not self._mastership.holds:  # open the port only as master
                 return self.await_port(line)
             return self._bus(Bus, line)
-        except OSError as failure:  # a LineError of the port, or another OSError of the audit log
+        except OSError as failure:  # a LineError if the port failed, another OSError if the audit log did
             return failure
 
     def await_port(self, line: PlantLine) -> Bus:
-        """Return a bus whose port is opened later."""
+        """Return a bus whose port is not open yet."""
         return self._bus(Bus.awaiting, line)
 
     def _bus(self, make: Callable[..., Bus], line: PlantLine) -> Bus:
@@ -173,7 +169,8 @@ class LineSet:
             self._free.pop()
         self._numbered[number] = line
         self._lines = (*self._lines, line)
-        if self.stops_on_exit:  # checked after adding: a thread that sets it later finds this line
+        # checked after the line was added: if another thread sets the flag later, it finds the line
+        if self.stops_on_exit:
             bus.stop_on_exit()
         return line
 
@@ -195,7 +192,7 @@ class LineSet:
 
     @contextmanager
     def tended(self) -> Iterator[None]:
-        """After the block, let stops reopen lost ports themselves, because the poller no longer does."""
+        """In the `with` block, the poller reopens lost ports; after it, stops reopen them."""
         try:
             yield
         finally:
@@ -217,22 +214,22 @@ class LineSet:
             self._free.append(line.number)
 
     def end(self, lines: Iterable[PolledLine], why: str) -> None:
-        """End the exchanges of these lines and close their ports; waiting calls fail with `why`."""
+        """End the exchanges of these lines and close their ports; waiting calls fail with the text `why`."""
         going = list(lines)
         with ExitStack() as stack:
             for line in reversed(going):
-                stack.callback(line.close, why)  # carried out even if closing another line fails
+                stack.callback(line.close, why)  # called even if closing another line fails
             self.wind_down(going)
 
     def wind_down(self, lines: Sequence[PolledLine]) -> None:
         """Stop polling these lines, and wait for stops and exchanges in flight.
 
         Drives whose bus has `stop_on_exit` are stopped first. The wait for stops has no limit. The wait for
-        exchanges in flight ends after ENDING_NS, or earlier when the mastership expires: half of its guard
-        time later the kernel kills a process whose ports are still open.
+        exchanges in flight ends after ENDING_NS, or earlier when the mastership expires. If ports are still
+        open half a guard time after that, the kernel kills the process.
         """
         for line in lines:
-            line.bus.leave()  # starts the stops of all lines before waiting for any
+            line.bus.leave()  # starts the stops of all lines; the next loop waits for them
         for line in lines:
             line.leave()
         for line in lines:

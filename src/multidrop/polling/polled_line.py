@@ -1,6 +1,6 @@
 """PolledLine: polls the drives of one line by a schedule, and reopens the line's port if it is lost.
 
-A drive's blocks are planned again if its measured response delay differs too much from the planned one.
+If a drive's measured response delay makes another plan faster, its blocks are planned again.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _log = logging.getLogger("multidrop.polling")
 
 
 class Reopening:
-    """Attempts to reopen a lost port, one at a time, in a thread, so that a slow one delays no other line."""
+    """Attempts to reopen a lost port, one at a time, in a thread: a slow port must not delay other lines."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
@@ -43,7 +43,7 @@ class Reopening:
         return self._thread is not None and self._thread.is_alive()
 
     def begin(self) -> None:
-        """Start an attempt. If the system has no thread left, stops reopen the port themselves."""
+        """Start an attempt to reopen the port. If no thread can be started, let stops reopen it instead."""
         thread = threading.Thread(target=self._attempt, name="multidrop reopening", daemon=True)
         self._thread = None
         with suppress(RuntimeError, MemoryError):
@@ -98,13 +98,14 @@ def _drive_summary(drive: Statistics, response_delay: float) -> dict[str, Any]:
 
 
 LEARN_NS = 1_000_000_000  # interval between updates of exchange durations from measured response delays
-RELEARN_NS = 2_000_000_000  # the same interval while the core repeats the bus cycle
+# interval between updates of exchange durations while the core repeats the bus cycle
+RELEARN_NS = 2_000_000_000
 REOPEN_NS = 500_000_000  # interval between attempts to reopen a lost port
-STANDBY_NS = 500_000_000  # interval between miss rows while this process may not poll the line
-RETRY_NS = 500_000_000  # pause after polling failed; doubled by each further failure
+STANDBY_NS = 500_000_000  # interval between additions of miss rows while this process may not poll the line
+RETRY_NS = 500_000_000  # pause before polling is retried after a failure; each further failure doubles it
 LONGEST_RETRY_NS = 30_000_000_000
-SOUND_NS = 10_000_000_000  # time without a failure after which earlier failures are forgotten
-MARGIN = 0.05  # fraction by which a response delay may lie outside the range of its plan
+SOUND_NS = 10_000_000_000  # time without failures after which earlier ones are forgotten
+MARGIN = 0.05  # plan again if the delay is outside its plan's best range by this fraction
 
 
 class PolledLine:
@@ -117,35 +118,37 @@ class PolledLine:
     def __init__(
         self, declared: PlantLine, number: int, bus: Bus, row_queue: RowQueue, names: RowNames
     ) -> None:
-        self.declared = declared  # the line at the start; `polled` has the present drives
+        self.declared = declared  # the declared line; `polled` has its present drives
         self.bus = bus
-        self.switching = declared.switching  # s that a change of port settings takes; measured after `end`
+        self.switching = declared.switching  # s per settings change: declared, or measured at `end`
         self.started_ns = clock.now_ns()
         self.number = number
         self._is_left = False  # whether `leave` was called
-        self._ended_ns: int | None = None  # when polling ended
-        self._over_ns: int | None = None  # when the last exchange ended
+        self._ended_ns: int | None = None  # monotonic time at which polling ended
+        self._over_ns: int | None = None  # monotonic time at which the last exchange ended
         self._row_queue = row_queue
         self._schedule: Schedule[PolledJob] = Schedule()
         self._maker = JobMaker(bus, names)
         self._queue = PortQueue(self._schedule)
         self._refusals = Refusals(self._schedule, self._maker)
-        self._planned: dict[PolledDrive, PlannedJobs] = {}  # removed drives stay until `forget`
+        self._planned: dict[PolledDrive, PlannedJobs] = {}  # plans, also of removed drives until `forget`
         self._present: dict[Drive, PolledDrive] = {}  # the drives on the line
         self._since_ns: dict[Drive, int] = {}  # when each drive's polls were last changed
-        self._gone: dict[int, Peer] = {}  # by address, removed drives' peers, maybe still in an exchange
+        # Peers of removed drives, by address; a peer may still be in an exchange.
+        self._gone: dict[int, Peer] = {}
         self._polled: list[tuple[Drive, Peer]] = []  # the present drives that have jobs
-        self._observed: list[tuple[int, int, bool]] = []  # what `_observe` last saw, for each of `_polled`
+        self._observed: list[tuple[int, int, bool]] = []  # the last observation of each drive in `_polled`
         self._is_started = False
         self._learnt_ns = 0
         self._reopening = Reopening(bus)
         self._lost_ns = self._reopen_ns = 0
         self._standby_ns = 0
-        self.failure = ""  # the last failure of polling; "" after SOUND_NS without another
+        self.failure = ""  # the last failure of polling; "" after SOUND_NS without another failure
         self._failures = 0  # number of failures in a row
         self._retry_ns = 0  # when to poll again after the last failure
         self._is_broken = False  # whether a failure may have left the schedule incomplete
-        self._lock = threading.Lock()  # for everything above, because any thread may add and remove drives
+        # protects all attributes above, because any thread may add and remove drives
+        self._lock = threading.Lock()
         register_at_fork(self)
         try:
             for polled in declared.drives:
@@ -166,22 +169,22 @@ class PolledLine:
 
     @property
     def polled(self) -> tuple[PolledDrive, ...]:
-        """The present drives with their polled registers."""
+        """The drives that are on the line now, with their polled registers."""
         return tuple(self._present.values())
 
     @property
     def since_ns(self) -> dict[str, int]:
-        """By drive name, when the drive's polls were last changed (ns, CLOCK_MONOTONIC)."""
+        """The time at which each drive's polls last changed (ns, CLOCK_MONOTONIC), by drive name."""
         return {drive.name: since_ns for drive, since_ns in self._since_ns.copy().items()}
 
     def add(self, polled: PolledDrive) -> None:
-        """Start polling a drive. A drive that was polled before gets the same jobs again.
-
-        First waits for the last exchange of an earlier drive at its address, because only then the late
-        replies of the earlier drive are known.
+        """Start polling a drive. A drive that was polled before gets the same jobs again. Before that, wait
+        for the last exchange of an earlier drive at the same address. Until that exchange has ended, it is
+        unknown whether a late reply of the earlier drive is due.
         """
         self.await_gone(polled.drive.address)
-        settings = polled.drive.settings  # before locking: polling must not wait while a port is being opened
+        # called without the lock: `require` may wait until a port is open, but polling must not wait
+        settings = polled.drive.settings
         self.bus.line.require((settings.baudrate, settings.format))
         with self._lock:
             drive = self.bus.attach(polled.drive)
@@ -201,7 +204,7 @@ class PolledLine:
         self._row_queue.call(self.number)
 
     def _schedule_jobs(self, drive: Drive, due_ns: int) -> None:
-        """Schedule the jobs of a drive, first due at `due_ns`."""
+        """Schedule the jobs of a drive; each is first due at `due_ns`."""
         jobs = self._planned[self._present[drive]].jobs
         for job in jobs:
             self._schedule.add(job, due_ns)
@@ -212,7 +215,7 @@ class PolledLine:
         return [job for job in self._schedule.jobs if job.owner is drive]
 
     def put_in_order(self) -> None:
-        """Poll the drives in the order in which changes of the line's settings take the least time."""
+        """Sort the polled drives so that changes of the line's settings take the least time."""
         with self._lock:
             ordered = in_order(self.bus.drives, self.switching)
             self._schedule.put_in_order([drive.address for drive in ordered])
@@ -242,16 +245,18 @@ class PolledLine:
         self._row_queue.call(self.number)
 
     def forget(self, drive: Drive) -> None:
-        """Forget the jobs of a drive that was removed for good; its peer stays known."""
+        """Forget the jobs of a drive that was removed for good. Its peer, which knows of late replies, is
+        kept.
+        """
         with self._lock:
             self._planned = {each: jobs for each, jobs in self._planned.items() if each.drive is not drive}
             self._maker.forget_drive(drive)
 
     def set_rate(self, drive: Drive, register: Register[Any] | None, every: float | None) -> None:
-        """Set the period `every` in s of a polled register, or of all of them if `register` is None.
+        """Set the period `every` in s of a polled register, or of all polled registers if `register` is None.
 
-        `every` None means as fast as possible. Unchanged registers keep their slots. A new rate starts with a
-        slot now. Raises ValueError for a register that is not polled.
+        `every` None means as fast as possible. Registers whose rate is unchanged keep their slots. At a new
+        rate, the first slot is now. Raises ValueError for a register that is not polled.
         """
         with self._lock:
             after = self._present[drive].at_rate(register, every)
@@ -283,8 +288,8 @@ class PolledLine:
         """
         present = self._jobs(drive)
         old = [job for job in present if job not in wanted]
-        # A new job's first slot is the earliest slot of the old jobs with the same period, or else of any
-        # present job with the same period.
+        # A new job is first due at the earliest slot of the old jobs that have its period. If there are none,
+        # it takes the earliest slot of the present jobs that have its period.
         latest_first = [*sorted(present, key=_due, reverse=True), *sorted(old, key=_due, reverse=True)]
         dues = {job.period_ns: job.due_ns for job in latest_first}
         self._refusals.forget(drive)
@@ -315,7 +320,7 @@ class PolledLine:
         self._row_queue.call(self.number)
 
     def is_steady(self, now_ns: int) -> bool:
-        """Return True while the core repeats the bus cycle by itself, so that no check is needed."""
+        """Return True while the line needs no check, because the core repeats the bus cycle by itself."""
         return self._queue.is_repeating and now_ns - self._learnt_ns < RELEARN_NS
 
     def is_well(self, now_ns: int) -> bool:
@@ -328,14 +333,14 @@ class PolledLine:
     def tend(self, now_ns: int) -> None:
         """Process the results of queued exchanges, and queue the next ones.
 
-        Never raises. A failure, such as one in a user's own class, is logged; polling is retried later,
-        and until then the line's rows are misses with the status POLLING_FAILED.
+        Never raises. A failure, such as one in a user's own class, is logged, and polling is retried later.
+        Until then the line's rows are misses with the status POLLING_FAILED.
         """
-        if self._is_left:  # the lock may be held until the port is closed
+        if self._is_left:  # `close` may hold the lock until the port is closed
             return
         try:
             self._tend(now_ns)
-        except BaseException as failure:  # even SystemExit from a user's class must not end other lines
+        except BaseException as failure:  # even SystemExit of a user's class: other lines go on
             self._fail(failure, now_ns)
 
     def _fail(self, failure: BaseException, now_ns: int) -> None:
@@ -350,7 +355,7 @@ class PolledLine:
     def _is_sound(self, now_ns: int) -> bool:
         """Return True if polling may continue after a failure.
 
-        Before the next attempt, it returns False and records each due value as a miss.
+        While the next attempt is not due, return False and record each due value as a miss.
         """
         if self._is_broken:
             self._queue.abandon()
@@ -381,7 +386,7 @@ class PolledLine:
                 else:
                     self._stand_by(now_ns, Status.NOT_MASTER)
                 return
-            if port is not self._queue.port:  # the port was opened, or a stop has already reopened it
+            if port is not self._queue.port:  # the poller opened this port, or a stop reopened it
                 self._queue.give_back()
                 self._queue.move_to(port)
                 port.report_to(self._row_queue, self.number)
@@ -389,7 +394,7 @@ class PolledLine:
             if port.lost:
                 self._lose(port, now_ns)
                 return
-            self.bus.line.note_foreign()
+            self.bus.line.note_news()
             if not self.bus.line.may_send:
                 self._queue.pause(port)
                 self._stand_by(now_ns, Status.NOT_MASTER)
@@ -402,7 +407,9 @@ class PolledLine:
             self._miss_unasked(now_ns)
 
     def _observe(self, now_ns: int) -> None:
-        """Report the drives' failures and late replies to the schedule's back-off, if they have changed."""
+        """Report changes in the drives' failures and late replies to the schedule, which polls silent drives
+        less.
+        """
         seen = [(peer.failures, peer.late_until_ns, peer.has_answered) for _, peer in self._polled]
         if seen == self._observed:
             return
@@ -421,7 +428,7 @@ class PolledLine:
     def _learn(self, now_ns: int) -> None:
         """Update exchange durations and plans with the drives' measured response delays.
 
-        A plan is kept while refusals have split its blocks.
+        A plan is not changed while blocks of it are split because of refusals.
         """
         self._learnt_ns = now_ns
         delays = {drive: peer.response_delay for drive, peer in self._polled}
@@ -443,13 +450,13 @@ class PolledLine:
                 self._row_queue.add_miss(job.rows, why, due_ns)
 
     def _miss_unasked(self, now_ns: int) -> None:
-        """Add miss rows for the skipped slots that are due by now; slots may be skipped in advance."""
+        """Add miss rows for skipped slots that are now due. A slot may be skipped before it is due."""
         unasked = self._schedule.unasked
         if unasked:
             self._miss([slot for slot in unasked if slot[1] <= now_ns], Status.NOT_ASKED)
             self._schedule.unasked = [slot for slot in unasked if slot[1] > now_ns]
 
-    # ---- not the master, a port that is lost, and the end ----
+    # ---- lack of mastership, lost ports, and the end of polling ----
 
     def _stand_by(self, now_ns: int, why: Status) -> None:
         """Instead of polling, add a miss row for each value that is due, every STANDBY_NS."""
@@ -466,8 +473,7 @@ class PolledLine:
     def _regain(self, now_ns: int) -> None:
         """Reopen the port in a thread; until that succeeds, add a miss row for each value that is due.
 
-        The first attempt adds no miss rows: a port that can be reopened immediately continues in the same
-        slot.
+        The first attempt adds no miss rows: if it succeeds, polling continues in the same slot.
         """
         if now_ns < self._reopen_ns or self._reopening.is_under_way:
             return
@@ -477,7 +483,7 @@ class PolledLine:
         self._reopening.begin()
 
     def leave(self) -> None:
-        """Stop tending the line: from now on stops reopen a lost port themselves."""
+        """Stop tending the line. From now on, stops reopen a lost port themselves."""
         with self._lock:
             self._is_left = True
         self.bus.tended(False)
@@ -491,7 +497,9 @@ class PolledLine:
         return self.bus.line.end()
 
     def close(self, why: str) -> None:
-        """Add miss rows for all slots that are over, and close the bus; later calls fail with `why`."""
+        """Add miss rows for slots that ended without a request; close the bus. Later calls fail with text
+        `why`.
+        """
         self.bus.line.why_closing = why
         with self._lock:
             try:
@@ -531,7 +539,7 @@ class PolledLine:
 
 
 def _over(slots: list[Slot], ended_ns: int) -> list[Slot]:
-    """Return the slots that end by `ended_ns`; in a slot that ends later, no value is missed yet."""
+    """Return the slots that end by `ended_ns`. The value of a later slot does not count as missed."""
     return [(job, due_ns) for job, due_ns in slots if due_ns + (job.period_ns or 0) <= ended_ns]
 
 

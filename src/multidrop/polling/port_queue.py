@@ -1,4 +1,4 @@
-"""PortQueue: the exchanges that the core carries out on a port. Exchanges are queued ahead or repeated.
+"""PortQueue: the exchanges that the core carries out on a port, either queued ahead or repeated.
 
 If all drives of a line answer and are polled as fast as possible, the core repeats the bus cycle by itself.
 Otherwise the queue is refilled with many exchanges at a time.
@@ -14,7 +14,7 @@ from multidrop.polling.jobs import PolledJob
 
 AHEAD_NS = 300_000_000  # how far in advance exchanges are queued
 
-Slot = tuple[PolledJob, int]  # a job, and when it was due in ns
+Slot = tuple[PolledJob, int]  # a job, and the time in ns at which it was due
 
 
 class PortQueue:
@@ -27,14 +27,14 @@ class PortQueue:
         self._queued: deque[Turn[PolledJob]] = deque()  # turns that the core has not carried out yet
         self._ahead_ns = 0  # total duration of the queued turns
         self._newest: Turn[PolledJob] | None = None  # the last turn carried out
-        self._cycle: list[PolledJob] = []  # jobs that the core repeats
+        self._cycle: list[PolledJob] = []  # the jobs of the bus cycle that the core repeats
 
     @property
     def is_repeating(self) -> bool:
         return bool(self._cycle)
 
     def move_to(self, port: Port) -> None:
-        """Use another port, whose queue is empty."""
+        """Use this port, which was opened or reopened and has an empty queue."""
         self.port, self._done = port, port.done
 
     def conclude(self, port: Port) -> None:
@@ -86,7 +86,7 @@ class PortQueue:
             self._ahead_ns += sum(turn.job.duration_ns for turn in turns)
 
     def measure(self) -> None:
-        """Recompute the total duration of the queued turns, because durations of jobs have changed."""
+        """Recompute the total duration of the queued turns, after the durations of jobs have changed."""
         self._ahead_ns = sum(turn.job.duration_ns for turn in self._queued)
 
     def slots(self) -> list[Slot]:
@@ -96,8 +96,8 @@ class PortQueue:
     def give_back(self) -> None:
         """Return unsent exchanges to the schedule, because the port failed.
 
-        An exchange that the failure interrupted is retried first, unless it was the first one on its port: a
-        device may close the connection after each request that it rejects.
+        An exchange that the failure interrupted is retried first. This does not apply to the first exchange
+        on a newly opened port: it may be the reason why the device closes each connection.
         """
         if self.port is not None:
             self.conclude(self.port)

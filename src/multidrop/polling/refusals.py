@@ -1,10 +1,10 @@
 """Refusals: split blocks that a drive does not answer as a whole, and poll refused registers rarely.
 
-So a refused register does not prevent its neighbours from being read. Refused registers and split blocks are
-retried every SET_ASIDE_NS, and polled as before once the drive answers them. Rows are not made from the
-retries of a split block. A drive may also give no reply to a block that is too long. Such a block is split if
-the class states no limit, the block was never answered, and the drive answers other requests. A drive that
-has never answered is also sent requests for a single register.
+Then a refused register does not prevent its neighbours from being read. Refused registers and whole blocks
+are retried every SET_ASIDE_NS. Once the drive answers one, it is polled as before. The retries of a split
+block add no rows. A drive may also give no reply to a block that is too long. Such a block is split if it was
+never answered, the drive answers other requests, and its class states no limit. A drive that has never
+answered is also sent requests for a single register, because it may answer only short requests.
 """
 
 from __future__ import annotations
@@ -18,24 +18,25 @@ from multidrop.planning.schedule import Schedule
 from multidrop.polling.jobs import JobMaker, PolledJob
 from multidrop.transport.aside_log import log_aside
 
-REFUSALS = 3  # exceptions in a row before a block is split or a register is set aside
-FAILURES = 3  # unanswered requests in a row before a block is split, if the drive answers others
+REFUSALS = 3  # exceptions in a row after which a block is split or a register is set aside
+FAILURES = 3  # unanswered requests in a row after which a block is split
 SET_ASIDE_NS = 60_000_000_000  # interval between retries of refused blocks
 
 _log = logging.getLogger("multidrop.polling")
 
 
 class Refusals:
-    """Registers of one line that are set aside (polled rarely), and blocks that are split."""
+    """The registers of one line that are polled rarely ("set aside"), and its split blocks."""
 
     def __init__(self, schedule: Schedule[PolledJob], maker: JobMaker) -> None:
         self._schedule = schedule
         self._maker = maker
-        self._set_aside: dict[PolledJob, PolledJob] = {}  # from a rare job in use to the job that it replaces
-        self._rare: dict[PolledJob, PolledJob] = {}  # from a job to the rare job that can replace it
-        self._wholes: dict[PolledJob, PolledJob] = {}  # from a part of a split job to the planned job
-        self._trials: dict[PolledJob, PolledJob] = {}  # from a split block's retry job to its planned job
-        self._probes: dict[int, PolledJob] = {}  # by drive address, the job that reads a single register
+        # for each rare job in use, the job that it replaces
+        self._set_aside: dict[PolledJob, PolledJob] = {}
+        self._rare: dict[PolledJob, PolledJob] = {}  # for a job, the rare job made for it
+        self._wholes: dict[PolledJob, PolledJob] = {}  # for a part of a split job, the whole job as planned
+        self._trials: dict[PolledJob, PolledJob] = {}  # for a retry of a split job, the whole job as planned
+        self._probes: dict[int, PolledJob] = {}  # single-register jobs, by drive address
 
     @property
     def names(self) -> list[str]:
@@ -45,12 +46,13 @@ class Refusals:
         ]
 
     def update(self, now_ns: int) -> None:
-        """Split or set aside refused blocks, and restore those that are answered again."""
+        """Split or set aside refused blocks, and restore blocks that are answered again."""
         for trial in [trial for trial in self._trials if trial.rows.is_answered]:
             self._make_whole(trial, now_ns)
         for rare in [rare for rare in self._set_aside if not rare.rows.refusals]:
             job = self._set_aside.pop(rare)
-            job.rows.refusals = 0  # not earlier: a reply in flight when the job was set aside may add one
+            # the reply that was in flight when the job was set aside may have been a refusal
+            job.rows.refusals = 0
             self._schedule.replace([rare], [job], now_ns)
         for job in [job for job in self._schedule.jobs if self._is_refused(job)]:
             if parts := halves(job.owner, job.block):
@@ -64,9 +66,9 @@ class Refusals:
             self._end_probes()
 
     def _is_refused(self, job: PolledJob) -> bool:
-        """Return True if a job must be split or set aside.
+        """Return True if a job has had too many exceptions in a row, and must be split or set aside.
 
-        That is after REFUSALS exceptions in a row; a part of a split block needs only one.
+        The limit is REFUSALS, but only 1 for a part of a split block, if the part has several registers.
         """
         count = job.rows.refusals
         if not count or job in self._trials or job is self._probes.get(job.drive):
@@ -117,7 +119,7 @@ class Refusals:
     # ---- silence ----
 
     def _split_unanswered(self, job: PolledJob, now_ns: int) -> None:
-        """Split a block that may be too long and is not answered, once the drive answers other requests."""
+        """Split a block that may be too long and stays unanswered, if the drive answers other requests."""
         peer, drive = job.exchange.peer, job.owner
         if job.rows.is_answered or job in self._trials:
             return

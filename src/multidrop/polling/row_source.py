@@ -7,18 +7,20 @@ from __future__ import annotations
 
 import inspect
 import logging
+import socket
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Iterable, Iterator
+from contextlib import suppress
 from functools import partial
 
 from multidrop.core import RowQueue
 from multidrop.core.undisturbed import undisturbed
 from multidrop.errors import PollingFailed
+from multidrop.polling.added_rows import COMMENT, AddedRows
 from multidrop.polling.batch import Batch
 from multidrop.polling.jobs import RowNames
 from multidrop.polling.line_set import NO_LINE
 from multidrop.transport import clock
-from multidrop.transport.wakeup import WakeUp
 
 _log = logging.getLogger("multidrop.polling")
 
@@ -27,9 +29,9 @@ _DEFERRED = (inspect.iscoroutinefunction, inspect.isgeneratorfunction, inspect.i
 
 
 def check_function(function: object) -> None:
-    """Raise TypeError for an async or generator function: a call of it would run nothing."""
+    """Raise TypeError for an async or generator function, because a call would not run it."""
     if not callable(function):
-        raise TypeError(f"on_batch takes a function of one batch, not {function!r}")
+        raise TypeError(f"on_batch takes a function with one argument, the batch, not {function!r}")
     while isinstance(function, partial):
         function = function.func
     calls = (function, getattr(type(function), "__call__", None))  # noqa: B004 (the `__call__` of its class)
@@ -69,13 +71,15 @@ class BatchCaller:
             for batch in self._batches:
                 _check_returned(self._function, self._function(batch))
         except PollingFailed:
-            pass  # the poller has logged it, and raises it itself
+            pass  # the poller logs this error, and raises it when it is closed
         except BaseException as failure:  # any failure: close() raises it to its caller
             self._failure = failure
             _log.error("on_batch: the function failed and is no longer called", exc_info=failure)
 
     def join(self) -> None:
-        """Wait until the function has had the last batch. Does nothing if called by the function itself."""
+        """Wait until the call with the last batch has returned. Does nothing if called by the function
+        itself.
+        """
         if threading.current_thread() is not self._thread:
             self._thread.join()
 
@@ -86,19 +90,55 @@ class BatchCaller:
             raise failure
 
 
+class WakeUp:
+    """A descriptor that is readable from a call of `set` until `clear` is called, for select or an asyncio
+    loop.
+
+    It is a socket, because select on Windows takes only sockets.
+    """
+
+    def __init__(self) -> None:
+        self._reader, self._writer = socket.socketpair()
+        self._reader.setblocking(False)
+        self._writer.setblocking(False)
+        self._number = self._reader.fileno()
+        self._closed = False
+
+    def fileno(self) -> int:
+        return self._number
+
+    def set(self) -> None:
+        if not self._closed:
+            with suppress(BlockingIOError):
+                self._writer.send(b"\0")
+
+    def clear(self) -> None:
+        if not self._closed:
+            with suppress(BlockingIOError):
+                while self._reader.recv(64):
+                    pass
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            self._reader.close()
+            self._writer.close()
+
+
 FILLING_NS = 10_000_000  # minimum interval between batches taken from a chunk that is not full
-ASYNC_LOOK_S = 0.05  # interval at which `async for` checks for rows
+ASYNC_LOOK_S = 0.05  # interval between checks for rows in `async for`
 
 
 class RowSource:
-    """The rows in the core's queue, and the methods to take them."""
+    """The rows in the core's queue, and the methods by which consumers take rows."""
 
     def __init__(self, row_queue: RowQueue, names: RowNames) -> None:
         self._row_queue = row_queue
         self._names = names
+        self._added = AddedRows(names)  # rows of computed channels and events
         self._wakeup = WakeUp()
-        self._is_watched = False  # whether `fileno` was called
-        self._taken_ns = 0  # when rows of the newest chunk were last taken
+        self._is_watched = False  # True once `fileno` was called
+        self._taken_ns = 0  # when rows were last taken from a chunk that was not full
         self._closing = False
         self._over = threading.Event()  # set once all lines are closed, so that no further rows come
         self._caller: BatchCaller | None = None
@@ -113,8 +153,9 @@ class RowSource:
         return self._wakeup.fileno()
 
     def take(self) -> Batch | None:
-        """Return the oldest queued rows without waiting; None if there are no rows, or only a few new rows.
+        """Return the oldest queued rows without waiting; None if there are none.
 
+        A chunk that is not full is returned only if FILLING_NS have passed since the last such chunk.
         Raises PollingFailed if polling has failed and no rows are left.
         """
         now, chunks = clock.now_ns(), self._row_queue.chunks
@@ -127,7 +168,21 @@ class RowSource:
         columns = self._row_queue.take()
         if columns is None and self.failure and not self._closing:
             raise self.failure
-        return Batch(columns, self._names.drives, self._names.registers) if columns else None
+        batch = Batch(columns, self._names.drives, self._names.registers) if columns else None
+        if not self._added:
+            return batch
+        if batch is None and self._closing:
+            self._added.save()
+        return self._added.added_to(batch)
+
+    def mark(self, text: str, *, kind: str = COMMENT, ago: float = 0.0) -> None:
+        """Add an event to the rows, at the time `ago` s before now.
+
+        In its row, the drive is "event", the register is the kind of event, and the status is the text. Any
+        thread may call this. Raises ValueError for a text that is empty, longer than 500 characters or not
+        printable.
+        """
+        self._added.mark(kind, text, ago)
 
     def batches(self, seconds: float | None = None, *, every: float = 0.1) -> Iterator[Batch]:
         """Yield batches, about one every `every` s, for `seconds` s or until the poller is closed.
@@ -153,7 +208,7 @@ class RowSource:
         A batch is taken only when it is yielded. So if the task is cancelled, queued rows stay for the next
         consumer, even after the poller is closed.
         """
-        import asyncio  # imported here, because it uses 4 MB that other programs save
+        import asyncio  # imported here: only `async for` needs its 4 MB
 
         is_over = False
         while not is_over:
@@ -165,11 +220,11 @@ class RowSource:
 
     @undisturbed
     def on_batch(self, function: Callable[[Batch], object], *, every: float = 0.1) -> None:
-        """Call `function` with each of `batches()` on a thread of its own, until the poller is closed.
+        """On a separate thread, call `function` with each of `batches()`, until the poller is closed.
 
         A slow function delays no line: rows wait in the core's queue, and if it is full, further rows are
-        dropped and counted in `summary()`. Closing the poller waits until the function has had the last
-        batch. If the function raises, the failure is logged immediately, the calls end, and closing raises
+        dropped and counted in `summary()`. Closing the poller waits until the call with the last batch has
+        returned. If the function raises, the failure is logged immediately, the calls end, and closing raises
         the same failure. Each batch goes to one consumer only, so do not call `take` or `batches` too. Raises
         ValueError for a second function, and TypeError for an async or generator function, because a call
         would not run it.

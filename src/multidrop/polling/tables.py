@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from abc import ABC, abstractmethod
 from array import array
@@ -10,6 +9,7 @@ from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from multidrop.extras import install_command
+from multidrop.printable import did_you_mean
 
 
 class ArrowTable(ABC):
@@ -62,14 +62,17 @@ TIMES = ("time", "monotonic_ns")
 
 
 class _WideColumn:
-    """The values of one register of one drive, each with the number of its row."""
+    """One register's values on one drive, each with its row number."""
 
     def __init__(self) -> None:
         self.rows = array("q")
         self.values = array("d")
 
     def dense(self, places: Sequence[int]) -> tuple[bytearray, array[float]]:
-        """Return a bitmap (1 for each row with a value) and the values; `places`: each row's new number."""
+        """Return a bitmap (1 for each row with a value) and the values, in the table's final order.
+
+        `places[n]` is the position of row n in that order.
+        """
         valid = bytearray((len(places) + 7) // 8)
         values = array("d", bytes(8 * len(places)))
         for row, value in zip(self.rows, self.values, strict=True):
@@ -83,9 +86,9 @@ class WideRows(ArrowTable):
     """Rows by time: columns `time`, `monotonic_ns`, and `drive.register` for each register of each drive.
 
     Rows of the long form that have the same time to the nanosecond become one row. These are the rows of one
-    request, because its registers share the time at which it was sent. Other values are not joined, filled
-    or interpolated: a row has values for the registers of one request, and null for all others. A miss is
-    also null; only the long form has its reason. Rows are sorted by `monotonic_ns`.
+    request, because the registers of a request share the time at which it was sent. Other values are not
+    joined, filled or interpolated: a row has values for the registers of one request, and null for all
+    others. A miss is also null; only the long form has its reason. Rows are sorted by `monotonic_ns`.
     """
 
     def __init__(self, rows: Iterable[Row], chosen: Sequence[str] = (), known: Collection[str] = ()) -> None:
@@ -119,7 +122,7 @@ class WideRows(ArrowTable):
         if owners.setdefault(name, owner) != owner:
             drives = " and ".join(repr(drive) for drive, _ in (owners[name], owner))
             raise ValueError(
-                f"drives {drives} both have a register that is called {name!r}: rename one of them"
+                f"drives {drives} both have a column that is called {name!r}: rename one of them"
             )
         if are_chosen:
             return self._columns.get(name)
@@ -174,8 +177,7 @@ def _transposed(times: Sequence[tuple[int, int]]) -> Iterable[Iterable[int]]:
 def _check_chosen(chosen: Sequence[str], known: set[str]) -> None:
     for name in chosen:
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=2)
-            hint = f"did you mean {' or '.join(near)}?" if near else "a column is DRIVE.REGISTER"
+            hint = did_you_mean(name, known, "a column is DRIVE.REGISTER")
             raise ValueError(f"there is no column {name!r}; {hint}")
         if chosen.count(name) > 1:
             raise ValueError(f"column {name!r} is chosen twice")
