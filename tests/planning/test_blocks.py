@@ -58,7 +58,7 @@ def spans(drive: Drive, *names: str) -> list[tuple[int, int]]:
     return [(block.start, block.count) for block in blocks(drive, [drive.register(name) for name in names])]
 
 
-def test_neighbours_are_read_together_up_to_the_limit() -> None:
+def test_neighbouring_registers_are_read_together_up_to_the_limit() -> None:
     drive = Example(1)
     assert spans(drive, "a", "b") == [(1, 2)]
     assert spans(drive, "a", "b", "c") == [(1, 4)]
@@ -90,7 +90,7 @@ def test_blocks_have_the_standards_read_requests() -> None:
         write_request(Example(7), Example.a, 1)
 
 
-def test_the_duration_of_a_block_is_characters_silence_and_delay() -> None:
+def test_the_duration_of_a_block_includes_characters_silence_and_response_delay() -> None:
     drive = Example(1, baudrate=9600, format="8N1")
     (block,) = blocks(drive, [Example.a])
     characters = 8 + 7
@@ -132,7 +132,7 @@ def partitions(registers: list[Register[float]]) -> Iterator[list[list[Register[
 
 
 def cheapest_of_all(drive: Drive, registers: list[Register[float]], delay: float | None = None) -> float:
-    """Return the least seconds of all ways to cut the sorted registers of one table into requests."""
+    """Return the shortest time, in s, of all divisions of one table's sorted registers into requests."""
     table = registers[0].table
     limit, gaps = drive.most_registers.get(table, 1), drive.readable_gaps.get(table, range(0))
     readable = {
@@ -284,7 +284,7 @@ def test_no_other_plan_for_a_built_in_family_takes_less_time(data: st.DataObject
             tables.setdefault(register.table, []).append(register)
     registers = data.draw(st.sampled_from([*tables.values()]))
     first = data.draw(st.integers(0, len(registers) - 1))
-    near = registers[first : first + 12]  # neighbours, so that some can share a request
+    near = registers[first : first + 12]  # neighbouring registers, so that some can share a request
     wanted = data.draw(st.lists(st.sampled_from(near), unique=True, min_size=1, max_size=8))
     drive = family(
         1,
@@ -326,7 +326,7 @@ def companies(draw: st.DrawFn) -> list[Drive]:
 
 @settings(max_examples=examples(100))
 @given(companies())
-def test_no_other_order_has_less_silence(drives: list[Drive]) -> None:
+def test_no_other_order_of_the_drives_has_less_silence(drives: list[Drive]) -> None:
     order = in_order(drives)
     assert sorted(each.address for each in order) == [drive.address for drive in drives]
     least = min(silences([drives[0], *rest]) for rest in permutations(drives[1:]))
@@ -347,7 +347,7 @@ def test_if_switching_takes_time_drives_with_equal_settings_are_side_by_side() -
     assert silences(order, 0.05) < silences(drives, 0.05)
 
 
-def test_a_gap_is_the_longer_silence_plus_the_switching_time() -> None:
+def test_the_gap_between_two_exchanges_is_the_longer_silence_plus_the_switching_time() -> None:
     slow, fast = MODELS["yd1000"](1), MODELS["erman-er-g-220"](2)
     longer = 24 * 11 / 9600 + 1 / 9600
     assert gap(slow, fast) == gap(fast, slow) == pytest.approx(longer)

@@ -1,27 +1,33 @@
-"""Predictions: compared with manually counted frame lengths and with the core, and invariants of any line."""
+"""Predictions, compared with manually counted frame lengths and with the core; and properties of any line."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 
 import pytest
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from line_driver import LineDriver
+from own_drives import ADDRESSES, Meter, StatedMeter
 
+from multidrop.cli import main
 from multidrop.core import Peer, build_reply
 from multidrop.drive import Drive, Framing
-from multidrop.drive.register import HOLDING, reading
+from multidrop.drive.register import HOLDING, INPUT, reading
 from multidrop.families import MODELS, YD1000, ErmanERG220, InnovertIBD, InvtCHE
+from multidrop.families.files.loader import load_family
+from multidrop.families.registry import SHIPPED
 from multidrop.planning import prediction
 from multidrop.planning.blocks import Planned, planned
 from multidrop.planning.bus_time import in_order
 from multidrop.planning.prediction import LATENESS
 from multidrop.planning.prediction import predict as predict_with_host
 from multidrop.planning.schedule import TURN_SHARE
-from multidrop.planning.suggestions import Suggestions, duration_text, suggest
+from multidrop.planning.suggestions import Suggestions, duration_text, reading_gain, suggest
 from multidrop.sim import EncodedDrive
 from multidrop.transport.prepared import make_exchange
 
@@ -51,7 +57,7 @@ def asked(drive: Drive, every: float | None = None, *names: str) -> list[Planned
     return planned(drive, [(register, every) for register in registers])
 
 
-def test_a_cycle_is_characters_delays_and_silences() -> None:
+def test_the_predicted_cycle_includes_characters_response_delays_and_silences() -> None:
     drives = [Simple(1, name="one", format="8N1"), Simple(2, name="two", format="8N1")]
     found = predict([each for drive in drives for each in asked(drive)])
     assert found.cycle == pytest.approx(4 * (OWN + SILENCE))
@@ -88,7 +94,7 @@ def test_a_prediction_includes_a_shorter_silence() -> None:
 
 
 def test_a_prediction_includes_10_ms_of_silence_before_and_after_an_ibd() -> None:
-    """Two of three gaps have the IBD's silence, although the other drives' silence is shorter."""
+    """Two of a cycle's three silences are as long as the IBD needs. The other drives need a shorter one."""
     che, other, ibd = InvtCHE(1, format="8N1"), InvtCHE(2, format="8N1"), InnovertIBD(3)
     exchanges = [asked(one, None, "output_current") for one in (che, other, ibd)]
     found = predict([one for each in exchanges for one in each])
@@ -165,7 +171,7 @@ def test_a_prediction_adds_the_hosts_lateness_to_each_exchange() -> None:
 
 
 def carried_out(exchanges: Sequence[Planned]) -> float:
-    """Return the seconds of a bus cycle of the core in which every drive has its documented delay."""
+    """Return the seconds that a bus cycle takes in the core if every drive has its documented delay."""
     drives = in_order(dict.fromkeys(exchange.drive for exchange in exchanges))
     order = [exchange for drive in drives for exchange in exchanges if exchange.drive is drive]
     peers = {each: Peer(least_timeout=0.02, most_timeout=each.response_timeout) for each in drives}
@@ -216,7 +222,7 @@ PERIODS = st.sampled_from([None, 0.02, 0.1, 0.5, 2.0])
 @settings(max_examples=examples(40), deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(sorted(MODELS)), PERIODS), min_size=1, max_size=8))
 def test_predicted_rates_never_need_more_than_the_lines_time(wanted: list[tuple[str, float | None]]) -> None:
-    """The exchanges per second of all rates, even counted without silence, fit into a second."""
+    """The exchanges predicted for one second, each timed as if its drive were alone, fit into a second."""
     exchanges: list[Planned] = []
     for address, (model, every) in enumerate(wanted, 1):
         drive = MODELS[model](address)
@@ -291,10 +297,134 @@ def test_a_prediction_depends_on_the_framing() -> None:
     assert predict(asked(rtu, None, "output_current")).cycle > 10e-3
 
 
-def test_suggestions_as_text_are_one_sentence() -> None:
+def test_suggestions_as_text_form_one_sentence() -> None:
     every = 'every = "100 ms" instead of 50 ms'
     found = Suggestions(((0.05, 0.1),), (19200, (YD1000(1, name="fan-1"), YD1000(2, name="fan-2"))), 3)
     assert str(found) == (
         f"it would fit with {every}, or baudrate = 19200 for fan-1, fan-2, "
         "or at most 3 of these registers for each drive"
     )
+
+
+# ---- suggested readable gaps ----
+
+
+SUPPORT = Path(__file__).parents[1] / "support" / "drives"
+PLANT = f"""
+[[line]]
+name = "hall"
+port = "/dev/ttyUSB0"
+
+[[line.drive]]
+name = "meter-1"
+model = '{SUPPORT / "own_drives.py"}:Meter'
+address = 1
+baudrate = 9600
+format = "8N1"
+
+[[line.drive]]
+name = "pump-1"
+model = "innovert-ibd"
+address = 2
+baudrate = 9600
+format = "8N1"
+"""
+SENTENCE = (
+    "4 requests with readable_gaps = {INPUT: range(0x36, 0x46)} instead of 8: 0.268 s instead of 0.341 s; "
+    "state them if the document allows reading there"
+)
+
+
+def test_readable_gaps_would_save_a_fifth_of_the_meters_reading_time() -> None:
+    drive = Meter(1, baudrate=9600, format="8N1")
+    gain = reading_gain(drive, [(drive.register(name), None) for name in ADDRESSES])
+    assert gain is not None
+    assert str(gain) == SENTENCE
+    assert drive.readable_gaps == Meter.readable_gaps == {}
+    stated = type("Told", (Meter,), {"__doc__": "As advised.", "readable_gaps": dict(gain.gaps)})
+    told = stated(1, baudrate=9600, format="8N1")
+    assert reading_gain(told, [(told.register(name), None) for name in ADDRESSES]) is None
+
+
+def test_the_suggestion_for_a_family_file_uses_its_notation(tmp_path: Path) -> None:
+    source = (
+        "[family]\ntitle = 'Meter'\nmanual = 'of this test'\ncounts_from = 0\n[reading]\n"
+        "low = { at = 1, unit = 'V' }\nhigh = { at = 3, unit = 'V' }\n"
+    )
+    path = tmp_path / "meter.toml"
+    path.write_text(source, "utf-8")
+    gains = []
+    for line in ("counts_from = 0", "counts_from = 0\ngaps = { holding = [0x2, 0x2] }"):
+        path.write_text(source.replace("counts_from = 0", line), "utf-8")
+        drive = load_family(path)(1)
+        gains.append(reading_gain(drive, [(register, None) for register in drive.readings()]))
+    assert str(gains[0]).startswith("1 request with gaps = { holding = [0x2, 0x2] } instead of 2: ")
+    assert gains[1] is None
+
+
+def test_readable_gaps_are_not_suggested_if_declared_or_useless() -> None:
+    class Compact(Drive):
+        a = reading(1)
+        b = reading(2)
+        far = reading(2000)
+
+    for drive in (StatedMeter(1), Compact(1)):
+        assert reading_gain(drive, [(register, None) for register in drive.readings()]) is None
+
+
+def test_a_stated_limit_bounds_the_gain_of_readable_gaps() -> None:
+    class Limited(Drive):
+        most_registers = {HOLDING: 3}
+        a = reading(1)
+        b = reading(3)
+        c = reading(5)
+
+    gain = reading_gain(Limited(1), [(register, None) for register in Limited.registers.values()])
+    assert gain is not None
+    assert (gain.requests, gain.requests_now) == (2, 3)
+    assert [len(gap) for _, gap in gain.gaps] == [1]
+
+
+def test_plan_and_models_suggest_readable_gaps_only_for_a_users_own_class(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plant = tmp_path / "hall.toml"
+    plant.write_text(PLANT, "utf-8")
+    main(["plan", str(plant), "--json"])
+    warnings = json.loads(capsys.readouterr().out)["lines"]["hall"]["warnings"]
+    assert len(warnings) == 1
+    assert warnings[0].startswith(
+        "meter-1: 5 requests with readable_gaps = {INPUT: range(0x36, 0x46)} instead of 9"
+    )
+    main(["models", f"{SUPPORT / 'own_drives.py'}:Meter"])
+    told = " ".join(capsys.readouterr().out.split())
+    assert "reading all readings in 5 requests with readable_gaps" in told
+    assert "read 04H, at most 125, the standard's limit: the family states none" in told
+    for model in (*MODELS, *SHIPPED):
+        main(["models", model])
+        told = " ".join(capsys.readouterr().out.split())
+        assert "readable_gaps" not in told
+        assert "the family states none" not in told or model in SHIPPED  # some document no limit
+
+
+def test_plan_and_models_show_a_familys_groups_and_interval(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = (
+        "from multidrop import Drive, reading\n"
+        "class Own(Drive):\n"
+        "    least_interval = 0.1\n"
+        "    read_together = (('high', 'low'),)\n"
+        "    high = reading(1)\n"
+        "    low = reading(2)\n"
+    )
+    (tmp_path / "own.py").write_text(source, "utf-8")
+    main(["models", f"{tmp_path / 'own.py'}:Own"])
+    told = capsys.readouterr().out
+    assert "interval        100 ms from the end of an exchange to the next request" in told
+    assert "read together   high, low" in told
+    main(["models", f"{tmp_path / 'own.py'}:Own", "--json"])
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["least_interval_s"], facts["read_together"]) == (0.1, [["high", "low"]])
+    assert facts["read_limits"] == {"holding register": 125}
+    assert INPUT.name not in facts["read_limits"]

@@ -1,4 +1,4 @@
-"""Block sizes without a stated limit, tables with one read function, and groups that share a request."""
+"""Block sizes if no limit is stated, tables with the same read function, groups that share a request."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from meter import ADDRESSES, Meter, StatedMeter
+from own_drives import ADDRESSES, Meter, StatedMeter
 from tables import table
 
 from multidrop.core import Message, NumberFormat
@@ -84,8 +84,8 @@ def test_a_delixi_request_reads_one_register() -> None:
     assert spans(drive) == [(500, 1), (501, 1)]
 
 
-# The requests for all readings at the families' own settings, before the standard's limits were a default:
-# (function, start, count).
+# Requests (function, start, count) that read all readings of a family at its own settings. They were recorded
+# before families without a stated limit got the standard's limits.
 REQUESTS = {
     "erman-er-g-220": [(4, 1, 12), (4, 1024, 4)],
     "invt-che": [(3, 0x1001, 1), (3, 0x3000, 14), (3, 0x3010, 7), (3, 0x5000, 2)],

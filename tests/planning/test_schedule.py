@@ -30,7 +30,7 @@ def schedule(*jobs: Job) -> Schedule[Job]:
 
 
 def take(made: Schedule[Job], now_ms: int, ahead_ms: int, most: int = 1000) -> list[tuple[Job, int]]:
-    """Take turns for an idle line; return each job with its earliest time in ms."""
+    """Take the turns of an idle line until `ahead_ms` from now; return pairs (job, earliest time in ms)."""
     now = now_ms * MS
     return [
         (each, not_before // MS) for each, not_before, _ in made.take(now, now, now + ahead_ms * MS, most)
@@ -74,7 +74,7 @@ def test_a_slot_that_ends_before_the_line_is_free_is_not_queued() -> None:
     assert poll.skipped == 5
 
 
-def test_the_slot_that_ends_first_goes_first_and_jobs_without_a_period_fill_the_rest() -> None:
+def test_the_slot_that_ends_first_is_first_and_jobs_without_a_period_fill_the_rest() -> None:
     timed, late = job(1, 40), job(2, 60)
     first, second, third = job(3), job(4), job(5)
     made = schedule(first, late, second, timed, third)
@@ -89,7 +89,7 @@ def test_slow_jobs_that_are_due_together_do_not_delay_a_fast_job() -> None:
     done = carry_out(made, 10)
     waited = [sent - due for each, due, sent in done if each is fast]
     assert len(waited) == pytest.approx(200, abs=1)
-    assert max(waited) <= 20 * MS  # until the job in flight has ended
+    assert max(waited) <= 20 * MS  # the longest wait: until the job in flight has ended
     assert [each.skipped for each in made.jobs] == [0] * 31
 
 
@@ -111,7 +111,7 @@ def test_on_an_overloaded_line_every_job_gets_a_share() -> None:
 
 def test_jobs_without_a_period_get_their_share_from_the_start_of_an_overload() -> None:
     made = schedule(turn := job(1, duration_ms=10))
-    take(made, 0, 10_000)  # before the overload
+    take(made, 0, 10_000)  # turns before the overload
     for drive in (2, 3):
         made.add(job(drive, 10, duration_ms=10), 10_000 * MS)
     taken = [each for each, _ in take(made, 10_000, 3_000)]
@@ -149,7 +149,7 @@ def test_no_job_of_the_round_gets_a_second_turn_while_others_wait() -> None:
 
 
 def test_an_interrupted_round_continues_at_the_same_job() -> None:
-    """Otherwise the jobs at its end would never be carried out."""
+    """If it restarted, frequent interruptions would keep the last jobs of the round from their turns."""
     jobs = [job(drive) for drive in range(5)]
     made = schedule(*jobs)
     assert made.cycle(0) == jobs
@@ -265,7 +265,7 @@ def test_a_silent_drive_gets_its_shortest_request_at_any_rate() -> None:
     made = schedule(job(1, 100, 20), short := job(1, 60_000, 7), job(1, None, 9))
     fail(made, 1, 2, now_ms=0)
     take(made, 1, 400)
-    assert take(made, 501, 50) == [(short, 0)]  # outside its slots, which stay the same
+    assert take(made, 501, 50) == [(short, 0)]  # this request uses no slot of the job
     fail(made, 1, 0, now_ms=502)
     assert (short, 60_000) in take(made, 502, 60_000, most=10_000)
 
@@ -354,15 +354,10 @@ def test_observing_the_same_failures_again_does_not_end_a_rest() -> None:
     assert poll not in [each for each, _ in take(made, 100, 300)]
 
 
-def test_after_one_failure_no_slot_is_reported_as_not_asked() -> None:
-    made = schedule(job(1))
-    fail(made, 1, 1, now_ms=7)
-    assert made.unasked == []
-
-
 def test_a_drive_does_not_rest_after_one_failure() -> None:
     made = schedule(poll := job(1))
     fail(made, 1, 1, now_ms=0)
+    assert made.unasked == []
     assert take(made, 0, 5) == [(poll, 0)]
 
 
@@ -471,7 +466,7 @@ def test_stalls_cause_neither_drift_nor_bursts(
         now += stall * MS
     for each, taken in slots.items():
         if each.period_ns:
-            assert all(due % each.period_ns == 0 for due in taken)  # slots start at multiples of the period
+            assert all(due % each.period_ns == 0 for due in taken)  # slots start at each multiple
             assert taken == sorted(set(taken))  # each slot once
             assert each.due_ns // each.period_ns == len(taken) + each.skipped  # none uncounted
 
@@ -481,7 +476,8 @@ def test_stalls_cause_neither_drift_nor_bursts(
 def test_every_job_gets_turns_on_any_overloaded_line(kinds: list[tuple[int, int | None, int, int]]) -> None:
     made = schedule(*(job(*kind) for kind in kinds))
     done = carry_out(made, 3)
-    # Each other job once, a few rounds of jobs of this kind, and the share of jobs without a period.
+    # A job waits at most for one turn of each other job, the share of jobs without a period, and a few
+    # rounds of its kind.
     longest = 80 * MS + 8 * 10 * MS / TURN_SHARE + 1000 * MS
     for each in made.jobs:
         sent = [0, *(at for other, _, at in done if other is each), 3000 * MS]
@@ -504,7 +500,7 @@ def test_no_slot_is_skipped_if_all_jobs_fit(kinds: list[tuple[int, int | None, i
 
 
 def test_a_drive_that_answers_again_gets_no_request_while_an_earlier_reply_may_come() -> None:
-    """The first of two requests between observations got no reply; otherwise that could repeat forever."""
+    """The first of two requests got no reply, so `late_until_ns` is set; the second one was answered."""
     made = schedule(quick := job(1), timed := job(2, period_ms=10))
     fail(made, 1, 0, now_ms=0, late_until_ms=100)
     fail(made, 2, 0, now_ms=0, late_until_ms=60)
@@ -524,7 +520,7 @@ class Operation(RuleBasedStateMachine):
         self.now = self.busy_until = 1000 * MS
         self.added: dict[Job, int] = {}
         self.slots: dict[Job, list[int]] = {}  # start times of the slots that were carried out
-        self.passed: Counter[Job] = Counter()  # number of slots reported as not asked
+        self.passed: Counter[Job] = Counter()  # number of slots reported because no request was sent
         self.failures = dict.fromkeys(range(4), 0)
         self.silent_until = dict.fromkeys(range(4), 0)  # until when a late reply may come
 
@@ -571,14 +567,14 @@ class Operation(RuleBasedStateMachine):
         for each, not_before, due in taken:
             at = max(at, not_before)
             assert each in self.made.jobs
-            # No request leaves while a late reply may come, even if the line is ready too soon.
+            # No request is sent while a late reply may come, even if the line is ready earlier.
             assert max(self.now, not_before) >= self.silent_until[each.drive]
             if each.period_ns and due is None:  # a request to a silent drive, outside the slots
                 assert self.failures[each.drive] >= 2
             elif each.period_ns:
-                assert (due - self.added[each]) % each.period_ns == 0  # at multiples of the period
+                assert (due - self.added[each]) % each.period_ns == 0  # slots start at each multiple
                 assert due > max(self.slots[each], default=-1)  # each slot once, in their order
-                assert due > at - each.period_ns  # missed slots are not made up for
+                assert due > at - each.period_ns  # the slot is not over: missed slots are not repeated
                 self.slots[each].append(due)
             else:
                 self.slots[each].append(at)
@@ -670,7 +666,7 @@ def test_a_new_drive_gets_one_request_until_the_outcome_is_known() -> None:
     assert [asked.drive for asked, _ in take(made, 0, 1000)] == [2, 1]
     assert take(made, 10, 1000) == []
     assert made.cycle(10 * MS) == []
-    made.back_off.conclude(one.drive)  # perhaps after a damaged reply, which does not count as an answer
+    made.back_off.conclude(one.drive)  # concluded without an answer, for example after a damaged reply
     assert [asked for asked, _ in take(made, 20, 1000)] == [two]
     answer(made, two, 30)
     assert [asked for asked, _ in take(made, 30, 20)] == [one, two, one, two]
@@ -692,7 +688,7 @@ def test_a_silent_new_drive_rests_immediately() -> None:
     answer(made, living, 1)
     made.back_off.conclude(dead.drive)
     made.back_off.observe(1, 1, 60 * MS, late_until_ns=0, cost_ns=450 * MS, has_answered=False)
-    rest_ms = 30_000  # after it, the cost is within the share of silent drives
+    rest_ms = 30_000  # 450 ms are 1.5 % of this rest, which is the share of silent drives
     assert {asked for asked, _ in take(made, 60, rest_ms)} == {living}
     assert made.unasked == [(dead, 60 * MS)]
     assert take(made, 60 + rest_ms, 1) == [(dead, 0)]

@@ -1,11 +1,11 @@
 """Back off from silent drives, so that other drives lose little time. Callers pass the time, in ns.
 
 A silent drive rests (gets no request) for longer each time. After each rest it gets its shortest request, in
-spare time or in the share of jobs without a period. All silent drives together take only a small share of the
-line. When a silent drive replies, its rests end, and the next silent drive is tried immediately, because both
-may have been without power. A new drive, which has never answered, gets one request and no other until the
-outcome is known; without a reply it rests immediately. Once all new drives have had this request, and if only
-few were silent, the silent ones get a second request.
+spare time or in the line time of jobs without a period. All silent drives together take only a small share of
+the line. When a silent drive replies, its rests end. The next silent drive is then tried immediately, because
+both may have been without power. A new drive, which has never answered, gets one request and no other until
+the outcome is known; without a reply it rests immediately. Once all new drives have had their first request,
+the silent ones get a second request if they are few.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ SILENT_AFTER = 2  # number of consecutive failures after which a drive rests
 FIRST_REST_NS = 500_000_000
 LONGEST_REST_NS = 2_000_000_000
 SILENT_SHARE = 0.015  # share of the line's time for requests to silent drives
-SECOND_COST_NS = 400_000_000  # limit of the total time for second requests to silent new drives
+SECOND_COST_NS = 400_000_000  # limit of the line time for second requests to all silent new drives
 
 
 @dataclass
@@ -39,7 +39,7 @@ class BackOff:
 
     begin_rest: Callable[[int, int], None]  # its arguments: the drive's address, and the time
     health: dict[int, Health] = field(default_factory=dict)
-    has_silent: bool = False  # whether any drive is new, or did not answer its last request
+    has_silent: bool = False  # True if any drive is new, or did not answer its last request
     _late_until_ns: int = 0  # the latest `late_until_ns` of all drives
 
     def meet(self, drive: int) -> None:
@@ -56,7 +56,7 @@ class BackOff:
             self.health[drive].is_pending = False
 
     def may_sleep(self, at_ns: int) -> bool:
-        """Return True if any drive may be asleep, which means that it gets no request now."""
+        """Return True if any drive may be asleep (gets no request now)."""
         return self.has_silent or at_ns < self._late_until_ns
 
     def is_asleep(self, drive: int, at_ns: int) -> bool:
@@ -81,10 +81,11 @@ class BackOff:
         cost_ns: int,
         has_answered: bool = True,
     ) -> None:
-        """Record a drive's consecutive failures, and the line time of its next request if that gets no reply.
+        """Record a drive's number of consecutive failures.
 
-        Until `late_until_ns` a reply to an earlier request may come, so the drive gets no request, even if it
-        has answered since. Once that late reply has come, the drive can be tried immediately.
+        `cost_ns` is the line time of its next request if no reply comes. Until `late_until_ns` a reply to an
+        earlier request may come. Until then the drive gets no request, even if it has answered another one.
+        Once the late reply has come, the drive can be tried immediately.
         """
         health = self.health[drive]
         has_answered_late = late_until_ns < health.late_until_ns
@@ -114,18 +115,18 @@ class BackOff:
             self.begin_rest(drive, now_ns)
 
     def _fair_rest_ns(self) -> int:
-        """Return the rest in ns with which requests to all silent drives stay within SILENT_SHARE."""
+        """Return the pause, in ns, that keeps requests to all silent drives within SILENT_SHARE."""
         return round(sum(health.cost_ns for health in self.health.values() if health.rest_ns) / SILENT_SHARE)
 
     def _wake_next(self, drive: int, now_ns: int) -> None:
-        """End the rest of the silent drive that is due next, because this drive answers again."""
+        """Retry now the silent drive that would be due next, because this drive answers again."""
         resting = [health for number, health in self.health.items() if health.rest_ns and number != drive]
         if resting:
             first = min(resting, key=lambda health: health.asleep_until_ns)
             first.asleep_until_ns = min(first.asleep_until_ns, max(now_ns, first.late_until_ns))
 
     def _try_new_again(self, now_ns: int) -> None:
-        """End the rest of silent new drives once all new drives have had a request, if few were silent."""
+        """If all new drives have had a request and few of them were silent, retry the silent ones now."""
         new = [health for health in self.health.values() if health.is_new]
         silent = [health for health in new if health.failures == 1]
         if all(health.failures for health in new) and sum(each.cost_ns for each in silent) <= SECOND_COST_NS:

@@ -54,8 +54,8 @@ class Plan:
     """The blocks that read a drive's registers fastest, for response delays from `least` to `most` s."""
 
     planned: tuple[Planned, ...]
-    least: float  # with shorter response delays, more but shorter requests would be quicker
-    most: float  # with longer response delays, fewer but longer requests would be quicker
+    least: float  # below this response delay, more but shorter requests would be quicker
+    most: float  # above this response delay, fewer but longer requests would be quicker
 
     def suits(self, delay: float, margin: float = 0.0) -> bool:
         """Return True if no other plan is quicker at this response delay, within a relative `margin`."""
@@ -67,17 +67,19 @@ def plan(
 ) -> Plan:
     """Return the quickest plan that reads these registers, each with its period in seconds.
 
-    `delay` is the drive's measured response delay in s; with None the documented one is used. Registers of
-    one function share a request if that is quicker. A request may include other readable registers, and
-    reserved addresses if the family's document allows that, up to the family's limit or else the standard's.
-    Registers of different rates never share a request, because some would be read too often. Registers of a
-    group in `read_together` with the same rate always share a request, and the blocks are in the order of the
-    groups. Raises ValueError for a register that cannot be read.
+    `delay` is the drive's measured response delay in s; with None the documented one is used. Registers
+    that are read by the same function code share a request if that is quicker. The request then also reads
+    the addresses between them. These may be readable registers, or reserved addresses if the family's
+    document allows reading them. The family limits the length of a request; without such a limit, the Modbus
+    standard does. Registers of different rates never share a request, because some would be read too often.
+    Registers of one `read_together` group always share a request if they have the same rate. Blocks are in
+    the order of these groups. Raises ValueError for a register that cannot be read.
     """
     rates: dict[float | None, list[Register[Any]]] = {}
     for register, every in wanted:
         rates.setdefault(every, []).append(register)
-    overhead = silence(drive) + (drive.response_delay if delay is None else delay)  # s that each request adds
+    # time in s that each request adds to its characters
+    overhead = silence(drive) + (drive.response_delay if delay is None else delay)
     character = drive.settings.character
     found: list[Planned] = []
     least, most = 0.0, math.inf
@@ -110,14 +112,14 @@ def planned(
     return list(plan(drive, wanted, delay).planned)
 
 
-def blocks(drive: Drive, registers: Iterable[Register[Any]], delay: float | None = None) -> tuple[Block, ...]:
+def blocks(drive: Drive, registers: Iterable[Register[Any]]) -> tuple[Block, ...]:
     """Return the blocks that read these registers once in the least time; see `plan`."""
-    found = plan(drive, ((register, None) for register in registers), delay)
-    return tuple(each.block for each in found.planned)
+    found = planned(drive, ((register, None) for register in registers))
+    return tuple(each.block for each in found)
 
 
 def first_block(drive: Drive) -> Block | None:
-    """Return a block with the drive's first reading or else first readable register; None if it has none."""
+    """Return a block with the drive's first reading, or else its first readable register, or else None."""
     readable = [*drive.readings(), *(each for each in drive.registers.values() if each.readable)]
     return blocks(drive, readable[:1])[0] if readable else None
 
@@ -127,8 +129,8 @@ def all_requests(
 ) -> Iterator[tuple[int, tuple[Register[Any], ...], int, int]]:
     """Yield every request that may read some of these registers.
 
-    Each is a tuple: the number of addresses, all registers of the read space by rising address, and begin and
-    end of the slice of them that the request reads.
+    Each request is a tuple (count, registers, begin, end): `count` is its number of addresses, `registers`
+    are all registers of the read space in order of address, and the request reads `registers[begin:end]`.
     """
     for neighbours in _neighbours(drive, registers):
         for end in range(1, len(neighbours.registers) + 1):
@@ -156,7 +158,7 @@ def sending(drive: Drive, block: Block) -> float:
 
 @dataclass(frozen=True)
 class _Neighbours:
-    """Registers of one read space by rising address, with the limits of a request.
+    """Registers of one read space in order of address, with the rules for requests that read them.
 
     Registers may overlap: several may be parts of one 16-bit word.
     """
@@ -164,9 +166,9 @@ class _Neighbours:
     carrier: Carrier
     registers: tuple[Register[Any], ...]
     spans: tuple[tuple[int, int], ...]  # for each register: its first address, and the address after its last
-    joined: tuple[bool, ...]  # for each register: whether addresses up to the next register may be read
+    joined: tuple[bool, ...]  # for each register: whether a request may read on to the next register
     tied: tuple[bool, ...]  # for each register: whether it must be read together with the next register
-    limit: int  # most addresses in a request; a longer register is still read whole
+    limit: int  # most addresses in a request; a register with more addresses is still read whole
 
     def ending_at(self, end: int) -> Iterator[tuple[int, int]]:
         """Yield (begin, count) of each allowed request for registers[begin:end]; `count` is in addresses."""
@@ -217,15 +219,15 @@ def _side_by_side(drive: Drive, wanted: list[tuple[range, Register[Any]]]) -> _N
     )
 
 
-# ---- ways to cut neighbours into requests ----
+# ---- dividing neighbours into requests ----
 
 
 @dataclass(frozen=True)
 class _Way:
-    """A division of neighbours into requests, with the fewest characters for this number of requests."""
+    """A division of registers into requests. No division into as many requests has fewer characters."""
 
     characters: int  # total characters of the requests and their replies
-    spans: tuple[tuple[int, int], ...]  # (begin, end) of each request's registers
+    spans: tuple[tuple[int, int], ...]  # (begin, end) of each request: it reads registers[begin:end]
 
     @property
     def requests(self) -> int:
@@ -234,13 +236,13 @@ class _Way:
 
 @lru_cache(maxsize=256)
 def _ways(framing: Framing, neighbours: _Neighbours) -> tuple[_Way, ...]:
-    """Return all ways that are quickest at some response delay, and maybe more; fewest requests first.
+    """Return divisions, sorted by number of requests, that include the quickest for every response delay.
 
-    Dynamic programming over the first register of the last request.
+    The algorithm is dynamic programming over the first register of the last request.
     """
-    fronts: list[list[_Way]] = [[_Way(0, ())]]  # ways for the first n registers, by n
+    fronts: list[list[_Way]] = [[_Way(0, ())]]  # index n: divisions of the first n registers
     for end in range(1, len(neighbours.registers) + 1):
-        fewest: dict[int, _Way] = {}  # the way with the fewest characters, by number of requests
+        fewest: dict[int, _Way] = {}  # number of requests: division with the fewest characters
         for begin, count in neighbours.ending_at(end):
             own = characters(framing, neighbours.carrier, count)
             for before in fronts[begin]:
@@ -253,7 +255,7 @@ def _ways(framing: Framing, neighbours: _Neighbours) -> tuple[_Way, ...]:
 
 
 def _worthwhile(ways: dict[int, _Way]) -> list[_Way]:
-    """Return the ways, but without each that needs more requests than another and no fewer characters."""
+    """Drop each division that has more requests than another one but not fewer characters."""
     kept: list[_Way] = []
     for requests in sorted(ways):
         if not kept or ways[requests].characters < kept[-1].characters:
@@ -262,7 +264,7 @@ def _worthwhile(ways: dict[int, _Way]) -> list[_Way]:
 
 
 def _even(drive: Drive, few: _Way, many: _Way) -> float:
-    """Return the response delay in s at which both ways take equally long."""
+    """Return the response delay in s at which both divisions take equally long."""
     saved = (few.characters - many.characters) * drive.settings.character
     return saved / (many.requests - few.requests) - silence(drive)
 
@@ -270,7 +272,7 @@ def _even(drive: Drive, few: _Way, many: _Way) -> float:
 def halves(drive: Drive, block: Block) -> tuple[Block, ...]:
     """Return two blocks that together read the block's registers, or () if it cannot be split.
 
-    Registers at the same addresses stay together, and so do those of a group in `read_together`. Splitting
+    Registers at the same address stay in one block, and so do those of a group in `read_together`. Splitting
     a block of n registers repeatedly gives at most 2 n - 1 blocks, including the block itself.
     """
     units = _units(drive, block)
@@ -282,7 +284,7 @@ def halves(drive: Drive, block: Block) -> tuple[Block, ...]:
 
 
 def _units(drive: Drive, block: Block) -> list[list[Register[Any]]]:
-    """Return the block's groups of registers that are always read together, by rising address."""
+    """Return the block's groups of registers that are always read together, in order of address."""
     groups = {name: place for place, group in enumerate(drive.read_together) for name in group}
     found: dict[object, list[Register[Any]]] = {}
     for register in block.registers:

@@ -9,20 +9,20 @@ from multidrop.core import Framing
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Carrier
 
-# Characters of a read without its data (request plus reply), and characters of each data byte.
+# By framing: characters of a read (request plus reply) without its data; characters per data byte.
 _FRAMES = {
     Framing.RTU: (8 + 5, 1),
     Framing.ASCII: (17 + 11, 2),
     Framing.DELIXI: (21 + 21, 0),
-    Framing.TCP: (8 + 5, 1),  # RTU on the wire behind the gateway
+    Framing.TCP: (8 + 5, 1),  # the gateway sends RTU on the wire
 }
 
 
 def silence(drive: Drive) -> float:
-    """Return the seconds of silence around a drive's exchanges: those that the drive needs, plus one bit.
+    """Return the silence around a drive's exchanges, in s: the silence that the drive needs, plus one bit.
 
-    ASCII frames need no silence, but get 1.5 characters. That is enough to notice further bytes, such as a
-    second copy of the reply, which could otherwise be mistaken for the next reply. Modbus TCP has no silence.
+    Text frames need no silence, but get 1.5 characters, so that bytes that follow a reply are noticed.
+    Otherwise a second copy of the reply could be mistaken for the next reply. Modbus TCP has no silence.
     """
     settings = drive.settings
     if drive.framing is Framing.TCP:
@@ -52,16 +52,17 @@ def switches(before: Drive, after: Drive) -> bool:
 
 
 def kind(drive: Drive) -> tuple[float, str]:
-    """Return the drive's silence and line settings; drives of one kind take the least time in succession."""
+    """Return the drive's silence and line settings. Drives that agree in both are polled in a row."""
     return silence(drive), str(drive.settings)
 
 
 def in_order(drives: Iterable[Drive], switching: float = 0.0) -> list[Drive]:
-    """Return the drives in an order with the least silence in a bus cycle, and then the fewest switches.
+    """Sort the drives so that a bus cycle has the least silence, and then the fewest switches.
 
-    Between two drives the line keeps the longer of their silences. Therefore drives of the same kind (silence
-    and settings) are put side by side. Kinds are inserted by rising silence, each at its cheapest place. If
-    switching takes no time, no other order is shorter.
+    A switch is a change of the line's settings. Between two drives the line keeps the longer of their
+    silences. Therefore drives of the same kind (silence and settings) are polled one after another. Kinds are
+    inserted in order of their silence, each at its cheapest place. If switching takes no time, no other order
+    has a shorter bus cycle.
     """
     kinds: dict[tuple[float, str], list[Drive]] = {}
     for drive in drives:

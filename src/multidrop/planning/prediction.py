@@ -18,8 +18,8 @@ from multidrop.planning.blocks import Planned, sending
 from multidrop.planning.bus_time import gap, in_order, kind, silence, switches
 from multidrop.planning.schedule import TURN_SHARE, Job, Schedule
 
-LATENESS = 100e-6  # s that a usual computer adds to each exchange, to wake up and to write
-ENOUGH = 0.97  # fraction of a wanted rate from which the rate counts as reached
+LATENESS = 100e-6  # s that a typical computer adds to each exchange to wake up and write
+ENOUGH = 0.97  # a rate counts as reached if it is at least this fraction of the wanted rate
 LEAST_EXCHANGES = 1000  # minimum number of simulated exchanges
 LEAST_ROUNDS = 3  # minimum number of simulated exchanges per job
 FAR_NS = 1 << 62
@@ -46,7 +46,7 @@ class Prediction:
 
     cycle: float  # s for one exchange of each block
     switches: int  # number of changes of baud rate or format in a cycle
-    utilisation: float  # fraction of the line's time; above 1, the factor by which the line is too slow
+    utilisation: float  # share of the line's time that the rates need; above 1, they do not fit
     rates: tuple[Rate, ...]
 
     @property
@@ -102,7 +102,8 @@ def predict(
     turn = [job for job in jobs if job.planned.every is None]
     load = sum(job.cost / job.planned.every for job in jobs if job.planned.every)
     turns = max(TURN_SHARE, 1 - load) / sum(job.cost for job in turn) if turn else 0.0
-    has_rests = any(job.interval_ns for job in jobs)  # with intervals, the line may be idle between exchanges
+    # if a drive needs intervals between its requests, the line may be idle in these intervals
+    has_rests = any(job.interval_ns for job in jobs)
     if has_rests:
         load += sum(job.cost * job.reached for job in turn)
     groups: dict[tuple[Drive, float | None], list[_PredictedJob]] = {}
@@ -130,7 +131,7 @@ def predict(
 
 
 def _rests(jobs: Iterable[_PredictedJob]) -> dict[Drive, float]:
-    """Return the seconds that each drive needs for all of its jobs once, including its intervals."""
+    """Return, by drive, the time in s of one exchange of each of its jobs, with silences and intervals."""
     found: dict[Drive, float] = {}
     for job in jobs:
         drive = job.planned.drive
@@ -164,7 +165,8 @@ def _jobs(
 
 def _run(jobs: Sequence[_PredictedJob], switching: float) -> None:
     """Run the jobs on a simulated clock, and store the results in them."""
-    ends = {job.kind: job.planned.drive for job in jobs}  # any drive of each kind: gaps depend on the kind
+    # one drive represents each kind: the pause between two drives depends only on their kinds
+    ends = {job.kind: job.planned.drive for job in jobs}
     numbers = {kind: number for number, kind in enumerate(ends)}
     gaps = tuple(tuple(gap(before, after, switching) for after in ends.values()) for before in ends.values())
     slots = tuple(
@@ -202,7 +204,7 @@ class _Done(NamedTuple):
 def _carried_out(slots: tuple[_Slots, ...], gaps: tuple[tuple[float, ...], ...]) -> tuple[_Done, ...]:
     """Simulate the jobs in the schedule's order; return the results of each job.
 
-    `gaps[a][b]` is the time in s between a drive of kind a and a following drive of kind b.
+    `gaps[a][b]` is the pause in s from a drive of kind a to a following drive of kind b.
     """
     schedule: Schedule[Job] = Schedule()
     jobs = [
@@ -242,8 +244,8 @@ def _carried_out(slots: tuple[_Slots, ...], gaps: tuple[tuple[float, ...], ...])
 def prediction_metadata(exchanges: Sequence[Planned], switching: float = 0.0) -> dict[str, Any]:
     """Return the prediction for a line and its drives' blocks as plain numbers, for a recording.
 
-    A reader of the recording can compare it with the measurement. Numbers of characters are those on the
-    wire, with a good reply.
+    A reader of the recording can compare the prediction with the measurement. The character counts are those
+    on the wire if the reply is valid.
     """
     prediction = predict(exchanges, switching=switching)
     drives = dict.fromkeys(planned.drive for planned in exchanges)

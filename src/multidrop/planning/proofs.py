@@ -1,9 +1,11 @@
-"""Choose proofs: requests to a drive whose replies cannot be mistaken for one another.
+"""Choose proofs: reads whose replies show that no earlier reply of the drive can still come.
 
-After a timeout a reply may still come, at any time and to any outstanding request. A late reply can never be
-mistaken for the reply to a proof. Once the reply to a proof has come, no earlier reply can still come,
-because a line and the path to it keep the order. Replies differ by function, by length, in Delixi's own
-protocol by parameter, and otherwise by the values that two registers are known to hold.
+After a timeout a reply may still come, at any time and to any outstanding request. But a late reply can never
+be mistaken for the reply to a proof. Once the reply to a proof has come, no earlier reply can still come,
+because a line, and the path to it, deliver replies in order.
+
+The replies to a drive's proofs differ in function, in length, or (in Delixi's own protocol) in parameter. If
+a family allows no such difference, the proofs read two registers that are known to hold different values.
 """
 
 from __future__ import annotations
@@ -18,11 +20,14 @@ from multidrop.drive.register import COIL, DISCRETE, HOLDING, INPUT, Access, Car
 from multidrop.drive.request import read_request
 from multidrop.planning.blocks import Block, all_requests
 
-MOST_PROOFS = 4  # limit per drive, because each proof uses memory
+MOST_PROOFS = 4  # limit of proofs per drive, because each proof uses memory
 
-# Tables to read if all replies of a device look alike: replies, even exceptions, name their function.
+# Tables to read as proofs if a device's replies all look alike: each reply, even an exception, has the
+# function code of its table.
 OTHER_TABLES = (INPUT, COIL, HOLDING, DISCRETE)
-ENOUGH = 3  # one proof may be outstanding itself, the last is kept for a drive that answers again
+# Number of proofs that a drive needs. A late reply to the first may still come, so another one is needed. The
+# last is sent only once a silent drive answers again.
+ENOUGH = 3
 
 RawRange = tuple[int, int]  # lowest and highest raw value of the only register in a reply
 
@@ -30,8 +35,9 @@ RawRange = tuple[int, int]  # lowest and highest raw value of the only register 
 def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
     """Return the blocks to read from this drive as proofs.
 
-    Each has the range of raw values that its reply is known to hold, or None. The last block is the least
-    likely to be polled. If a Modbus device has fewer than ENOUGH such blocks, its other tables are read too.
+    Each block comes with the range of raw values that its reply is known to hold, or with None. The last
+    block is the least likely to be polled. If a Modbus device has fewer than ENOUGH blocks, blocks of its
+    other tables are added.
     """
     known = [(Block.of(drive, [register]), counts) for register, counts in drive.known_counts().items()]
     family: Any = type(drive)
@@ -51,9 +57,10 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
 
 @lru_cache(maxsize=256)
 def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
-    """Return groups of registers whose replies differ in shape: the first MOST_PROOFS groups, and the last.
+    """Return groups of registers. The replies to reads of any two groups differ in shape; see `_shape`.
 
-    Readings come first, because they are polled anyway, and shorter requests before longer ones.
+    If there are many groups, only the first MOST_PROOFS and the last one are returned. Groups of readings
+    come first, because readings are polled anyway, and shorter requests come before longer ones.
     """
     readable: list[Register[Any]] = [register for register in family.registers.values() if register.readable]
     readings = [register for register in readable if register.access is Access.READING]
@@ -68,7 +75,7 @@ def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
 
 
 def _of_other_tables(drive: Drive, found: Sequence[Block]) -> list[Block]:
-    """Return blocks of one register whose replies differ by function from those of the blocks `found`."""
+    """Return blocks of one register, each with a function code that no block in `found` has."""
     start = found[0].start if found else 0
     functions = {block.table.read for block in found}
     return [

@@ -1,11 +1,12 @@
 """Decide which exchange of a line is carried out next. Callers pass the time, in ns.
 
 The exchanges are planned in advance, up to a horizon, so that the line never waits for Python. A job with a
-period has slots at multiples of the period, which never drift. Of the started slots, the one that ends first
-goes first. If there is time for all of them, jobs of one kind go together. If a slot is over before its turn,
-it is counted and skipped, and not made up for later. From then on, until the line has caught up, the job that
-has waited longest goes first, so that each job gets a share. Jobs without a period take turns in the
-remaining time (the round), and have a minimum share of the line. `BackOff` handles silent drives.
+period has one slot in each period; slots start at multiples of the period and never drift. Among the started
+slots, the slot that ends first goes first. If there is time for all of them, jobs of one kind are sent one
+after another. A slot that ends before its turn is counted and skipped for good. Then, until the line has
+caught up, the job that has waited longest goes first, so that each job gets a share. Jobs without a period
+form the round: they take turns in the remaining time, and have a minimum share of the line. `BackOff` handles
+silent drives.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Generic, NamedTuple, TypeVar
 from multidrop.planning.back_off import BackOff, Health
 
 TURN_SHARE = 0.05  # minimum share of the line for jobs without a period
-CREDIT_NS = 50_000_000  # line time of that share that may be used in advance
+CREDIT_NS = 50_000_000  # most line time by which these jobs can be ahead of their share
 NEVER_NS = 1 << 63
 
 
@@ -26,13 +27,14 @@ NEVER_NS = 1 << 63
 class Job:
     """One exchange that is carried out repeatedly with the drive at this address.
 
-    Jobs of one `kind` have the same line settings and silence, so they take the least time one after another.
+    Jobs of one `kind` have the same line settings and silence. They take the least time if they follow each
+    other.
     """
 
     drive: int
     period_ns: int | None
     duration_ns: int
-    silence_ns: int = 0  # part of the duration that may pass before the job, while the line is idle
+    silence_ns: int = 0  # silence before the request, included in `duration_ns`; may pass on an idle line
     interval_ns: int = 0  # minimum time from the end of an exchange to the drive's next request
     kind: Hashable = None
     due_ns: int = 0
@@ -71,12 +73,12 @@ class Schedule(Generic[J]):
         self._health: dict[int, Health] = self.back_off.health
         self._waiting: list[tuple[int, int, J]] = []  # a heap of (due, number, job)
         self._begun: list[J] = []  # jobs whose slot has started
-        self._ready: dict[int, int] = {}  # earliest time of the next request, by drive with an interval
+        self._ready: dict[int, int] = {}  # drive that needs intervals: its next request's earliest time
         self._held: list[J] = []  # jobs without a period whose turn came before their drive was ready
         self._round: list[J] = []  # jobs without a period
         self._next = 0  # index of the next job in the round
-        self._owed_ns = -CREDIT_NS  # line time owed to the jobs of the round
-        self._is_late = False  # whether a slot was skipped since the line last had no due job
+        self._owed_ns = -CREDIT_NS  # line time that the round lacks of its share; negative: it is ahead
+        self._is_late = False  # True after a skipped slot, until the line has no due job
         self._kind: Hashable = None  # kind of the job that was taken last
         self._number = 0
 
@@ -107,7 +109,7 @@ class Schedule(Generic[J]):
             self._round.pop(at)
 
     def replace(self, jobs: Sequence[J], others: Sequence[J], due_ns: int) -> None:
-        """Replace `jobs` by `others` at their place in the round. The first slots start at `due_ns`."""
+        """Put `others` in the place of `jobs` in the round. The first slots of `others` start at `due_ns`."""
         rest = self._round[self._next :] + self._round[: self._next]
         at = next((at for at, job in enumerate(rest) if job in jobs), len(rest))
         for job in others:
@@ -129,7 +131,7 @@ class Schedule(Generic[J]):
     # ---- the next jobs ----
 
     def cycle(self, now_ns: int) -> list[J]:
-        """Return the jobs of the round, the next one first.
+        """Return the jobs of the round, starting with the next job.
 
         Return [] if any job has slots or an interval, or if any drive is silent.
         """
@@ -138,7 +140,7 @@ class Schedule(Generic[J]):
         return self._round[self._next :] + self._round[: self._next]
 
     def go_on(self, job: J) -> None:
-        """Make this job the next one of the round."""
+        """Make this job the next job of the round."""
         if job in self._round:
             self._next = self._round.index(job)
 
@@ -167,7 +169,7 @@ class Schedule(Generic[J]):
         return not self._ready or at_ns >= self._ready.get(job.drive, 0)
 
     def _next_ns(self, at_ns: int) -> int:
-        """Return the next time at which a slot starts or a drive's interval ends."""
+        """Return the earliest future time at which a slot starts or a drive's interval ends."""
         times = [max(at_ns, self._waiting[0][0])] if self._waiting else []
         times += [ready_ns for ready_ns in self._ready.values() if ready_ns > at_ns]
         return min(times, default=NEVER_NS)
@@ -187,8 +189,9 @@ class Schedule(Generic[J]):
         self._await(job)
 
     def _due(self, at_ns: int) -> J | None:
-        """Return the started job whose slot ends first, or one of the last job's kind if that misses no slot.
+        """Return the started job whose slot ends first.
 
+        But if all started jobs can be carried out before that slot ends, prefer a job of the last job's kind.
         If slots were skipped, return the job that has waited longest. Return None if no job can be sent.
         """
         if self.back_off.may_sleep(at_ns):
@@ -261,7 +264,7 @@ class Schedule(Generic[J]):
         return max(job.duration_ns, health.cost_ns) if health.rest_ns else job.duration_ns
 
     def _put_off(self) -> None:
-        """Let started slots of a new drive wait again while the outcome of its first request is pending."""
+        """While a new drive's first request is pending, treat its started slots as not started."""
         for job in [job for job in self._begun if self._health[job.drive].is_pending]:
             self._begun.remove(job)
             self._await(job)
@@ -285,7 +288,7 @@ class Schedule(Generic[J]):
     # ---- slots without a request ----
 
     def _begin_rest(self, drive: int, now_ns: int) -> None:
-        """Add the drive's jobs without slots to `unasked`: each gets a row without a value."""
+        """Add the drive's jobs without slots to `unasked`, so that each gets a row without a value."""
         self.unasked += [(job, now_ns) for job in self._round if job.drive == drive]
 
     def pass_slots(self, now_ns: int) -> list[tuple[J, int]]:
@@ -301,5 +304,5 @@ class Schedule(Generic[J]):
         return passed
 
     def pass_all(self, now_ns: int) -> list[tuple[J, int]]:
-        """Skip all due slots, and one turn of each job without a period; return them as `pass_slots` does."""
+        """Skip all due slots and one turn of each job without a period; return pairs like `pass_slots`."""
         return [*((job, now_ns) for job in self._round), *self.pass_slots(now_ns)]

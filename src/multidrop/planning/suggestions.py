@@ -17,7 +17,7 @@ from multidrop.planning.blocks import Planned, planned, sending
 from multidrop.planning.bus_time import silence
 from multidrop.planning.prediction import Prediction, Rate, predict
 
-WORTH_SAYING = 0.02  # fraction of the reading time that a suggestion must save at least
+WORTH_SAYING = 0.02  # minimum fraction of the reading time that a suggestion must save
 _NAMES = {
     HOLDING: "HOLDING",
     HOLDING_MULTIPLE: "HOLDING",
@@ -26,17 +26,17 @@ _NAMES = {
     DISCRETE: "DISCRETE",
 }
 
-
 SLOWER = 1.05  # factor from one attempted period to the next
 
 
 @dataclass(frozen=True)
 class Suggestions:
-    """Three changes, each of which alone makes the line reach its rates; None if that change cannot."""
+    """Three changes, each of which lets the line reach its rates. A change that cannot do so is None."""
 
     every: tuple[tuple[float, float], ...]  # pairs: wanted period, reachable period (s)
-    baudrate: tuple[int, tuple[Drive, ...]] | None  # lowest sufficient rate, and the drives with a lower one
-    registers: int | None  # most registers of each drive whose rates do not fit
+    # lowest sufficient baud rate, and the drives that now use a lower one
+    baudrate: tuple[int, tuple[Drive, ...]] | None
+    registers: int | None  # most registers per drive, for drives whose rates do not fit
 
     def __str__(self) -> str:
         pairs = (f'every = "{duration_text(new)}" instead of {duration_text(old)}' for old, new in self.every)
@@ -56,9 +56,10 @@ def duration_text(seconds: float) -> str:
 
 
 def suggest(exchanges: Sequence[Planned], prediction: Prediction, switching: float = 0.0) -> Suggestions:
-    """Return changes that would make these exchanges reach their rates; `prediction` shows which do not.
+    """Return changes that would make these exchanges reach their rates.
 
-    `switching` is the time in s of a change of settings, as for `predict`.
+    `prediction` shows which rates they do not reach. `switching` is the time in s that the port takes to
+    change baud rate or format.
     """
     tight = [rate for rate in prediction.rates if not rate.fits]
     return Suggestions(
@@ -71,10 +72,10 @@ def suggest(exchanges: Sequence[Planned], prediction: Prediction, switching: flo
 def _every(
     exchanges: Sequence[Planned], tight: Sequence[Rate], least: float, switching: float
 ) -> tuple[tuple[float, float], ...]:
-    """Multiply the periods that are not reached by one factor, at least `least`, so that all are reached.
+    """Return pairs (wanted period, longer period) in s; with the longer periods, all rates are reached.
 
-    Return pairs of a wanted and a longer period. The search ends, because the other exchanges reach
-    their rates already, the more so the longer these periods are.
+    The wanted periods of `tight` are multiplied by one factor, at least `least`. The search always ends: the
+    other exchanges reach their rates already, and longer periods leave them more time.
     """
     hasty = {(rate.drive, rate.every) for rate in tight}
     wanted = sorted({rate.every for rate in tight if rate.every})
@@ -98,7 +99,7 @@ def _rounded_up(seconds: float) -> float:
 
 
 def _baudrate(exchanges: Sequence[Planned], switching: float) -> tuple[int, tuple[Drive, ...]] | None:
-    """Return the lowest baud rate with which all rates are reached, and the drives that are slower now."""
+    """Return the lowest baud rate at which all rates are reached, and the drives that now use a lower one."""
     wanted: dict[Drive, list[tuple[Register[Any], float | None]]] = {}
     for each in exchanges:
         wanted.setdefault(each.drive, []).extend((register, each.every) for register in each.block.registers)
@@ -126,7 +127,7 @@ def _at(drive: Drive, baudrate: int) -> Drive:
 
 
 def _registers(exchanges: Sequence[Planned], tight: Sequence[Rate], switching: float) -> int | None:
-    """Return the largest number of registers with which each rate is reached; None if one is too many."""
+    """Return the most registers per drive with which each rate is reached; None if even one is too many."""
     crowded = {(rate.drive, rate.every) for rate in tight}
     others = [each for each in exchanges if (each.drive, each.every) not in crowded]
 
@@ -144,7 +145,10 @@ def _registers(exchanges: Sequence[Planned], tight: Sequence[Rate], switching: f
 
 @dataclass(frozen=True)
 class ReadingGain:
-    """Readable gaps that a class could declare, and the cost of its reads with these gaps and now."""
+    """The cost of a drive's reads if its class declared these readable gaps, and their cost now.
+
+    A readable gap is a range of addresses without declared registers that a request may read across.
+    """
 
     drive: Drive
     gaps: tuple[tuple[Table, range], ...]
@@ -172,7 +176,10 @@ class ReadingGain:
 
 
 def reading_gain(drive: Drive, wanted: Iterable[tuple[Register[Any], float | None]]) -> ReadingGain | None:
-    """Return the gain if the class declared readable gaps; None if it already does, or gains too little."""
+    """Return the bus time that these reads would save if the class declared readable gaps.
+
+    Return None if the class already declares some, or if the gain is too small.
+    """
     wanted = list(wanted)
     before = planned(drive, wanted)
     unstated = {
@@ -192,7 +199,7 @@ def reading_gain(drive: Drive, wanted: Iterable[tuple[Register[Any], float | Non
 
 
 def _crossed(drive: Drive, table: Table, found: Sequence[Planned]) -> range:
-    """Return the range of addresses that these blocks read although no register is declared there."""
+    """Return the range from the first to the last undeclared address in these blocks of `table`."""
     family: Any = type(drive)
     readable = readable_addresses(family, table)
     blocks = [one.block for one in found if one.block.table.read_space == table.read_space]
