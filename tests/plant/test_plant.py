@@ -11,11 +11,14 @@ from typing import Any
 import pytest
 from tables import table
 
+from multidrop.channels import Channel
 from multidrop.core import Echo
 from multidrop.drive import Framing
 from multidrop.drive.line_settings import Settings
+from multidrop.families.files.sections import NOT_OPTIONS
 from multidrop.families.yd1000 import YD1000
-from multidrop.plant.loader import PlantError, load_plant
+from multidrop.plant import RESERVED_NAMES, check_drive_name, drive_meant
+from multidrop.plant.loader import DRIVE_KEYS, PlantError, load_plant
 from multidrop.plant.model import Plant, Polled
 from multidrop.toml_check import parse_duration
 
@@ -86,6 +89,7 @@ rated_frequency = 60
 
 HEAD = '[[line]]\nname = "L"\nport = "/dev/a"\n'
 TOY = '[[line.drive]]\nname = "D"\nmodel = "family.py:Toy"\naddress = 1\n'
+POLL = 'poll = ["output_current"]\n'
 FIXED = '[[line.drive]]\nname = "F"\nmodel = "family.py:Fixed"\naddress = 2\n'
 
 Load = Callable[[str], Plant]
@@ -177,7 +181,7 @@ address = 3
 """
 
 
-def test_a_line_s_silence_replaces_the_standard_s_but_not_a_family_s(load: Load) -> None:
+def test_the_silence_of_a_line_replaces_the_standards_silence_but_not_a_familys(load: Load) -> None:
     (line,) = load(SILENT).lines
     assert [polled.drive.needed_silence() for polled in line.drives] == pytest.approx([500e-6, 10e-3, 0])
     assert line.switching == 0
@@ -254,7 +258,7 @@ def test_five_mistakes_in_one_file_are_all_reported_together(mistakes: Mistakes)
         .replace("rated_frequency = 60", "rated_frequency = 600")
     )
     assert mistakes(text) == [
-        "line \"hall-1\": unknown key 'prot'; did you mean 'port'?",
+        "line \"hall-1\": unknown key 'prot'; did you mean port?",
         'line "hall-1", drive "pump-1": every = \'50\' is not a duration from 100 us to 24 h, '
         'such as "50 ms", "2 s" or "1 min"',
         'line "hall-1", drive "pump-1", poll number 1: '
@@ -291,8 +295,8 @@ def test_five_mistakes_in_one_file_are_all_reported_together(mistakes: Mistakes)
         ),
         (
             HEAD + 'silence = "500 us"\n' + TOY,
-            'line "L", drive "D": silence 500 us is shorter than 1.5 characters at 9600 8N1, which may pass '
-            "within a frame: it must be 1563 us or more",
+            'line "L", drive "D": silence 500 us is shorter than 1.5 characters at 9600 8N1, and a frame may '
+            "contain pauses as long: it must be 1563 us or more",
         ),
         (HEAD + 'silence = "2 s"\n' + TOY, 'line "L", drive "D": silence 2.0 is not a time from 0 to 1 s'),
         (HEAD + 'echo = "loud"\n' + TOY, 'line "L": echo \'loud\' is none of "auto", "on" and "off"'),
@@ -315,17 +319,23 @@ def test_five_mistakes_in_one_file_are_all_reported_together(mistakes: Mistakes)
         ),
         (
             (HEAD + TOY).replace("= 1", "= 32"),
-            'line "L", drive "D": address 32 is not one of TOY T1: 1 to 31',
+            'line "L", drive "D": address 32 is not supported by TOY T1; choose 1 to 31',
         ),
         (
             HEAD + TOY + "baudrate = 38400",
-            'line "L", drive "D": baud rate 38400 is not one of TOY T1: 9600, 19200',
+            'line "L", drive "D": baud rate 38400 is not supported by TOY T1; choose 9600, 19200',
         ),
-        (HEAD + TOY + "baudrate = 0", 'line "L", drive "D": baud rate 0 is not one of TOY T1: 9600, 19200'),
-        (HEAD + TOY + 'format = "8O1"', 'line "L", drive "D": format \'8O1\' is not one of TOY T1: 8N1, 8E1'),
+        (
+            HEAD + TOY + "baudrate = 0",
+            'line "L", drive "D": baud rate 0 is not supported by TOY T1; choose 9600, 19200',
+        ),
+        (
+            HEAD + TOY + 'format = "8O1"',
+            'line "L", drive "D": format \'8O1\' is not supported by TOY T1; choose 8N1, 8E1',
+        ),
         (
             HEAD + TOY + 'framing = "udp"',
-            'line "L", drive "D": framing \'udp\' is not one of TOY T1: rtu, ascii',
+            'line "L", drive "D": framing \'udp\' is not supported by TOY T1, which has rtu, ascii',
         ),
         (
             HEAD + TOY + 'framing = "tcp"',
@@ -334,12 +344,12 @@ def test_five_mistakes_in_one_file_are_all_reported_together(mistakes: Mistakes)
         ),
         (
             HEAD + "baudrate = 9600\n" + FIXED,
-            'line "L", drive "F": baud rate 9600 is not one of FIXED F1: 38400 '
+            'line "L", drive "F": baud rate 9600 is not supported by FIXED F1; choose 38400 '
             "(the line's); add baudrate = 38400 to this drive",
         ),
         (
             HEAD + 'format = "8N1"\n' + TOY + 'framing = "ascii"',
-            'line "L", drive "D": format \'8N1\' is not one of TOY T1: 7E1 '
+            'line "L", drive "D": format \'8N1\' is not supported by TOY T1; choose 7E1 '
             '(the line\'s); add format = "7E1" to this drive',
         ),
         (
@@ -368,21 +378,15 @@ def test_five_mistakes_in_one_file_are_all_reported_together(mistakes: Mistakes)
         ),
         (
             HEAD + TOY + 'poll = [{ register = "output_current", evry = "1 s" }]',
-            "line \"L\", drive \"D\", poll number 1: unknown key 'evry'; did you mean 'every'?",
+            'line "L", drive "D", poll number 1: unknown key \'evry\'; did you mean every?',
         ),
-        (
-            HEAD + TOY + "every = 5",
-            'line "L", drive "D": every = 5 is not right; write every = "50 ms"',
-        ),
+        (HEAD + TOY + "every = 5", 'line "L", drive "D": every = 5 is not right; write every = "50 ms"'),
         (
             HEAD + TOY + 'every = "0 ms"',
             'line "L", drive "D": every = \'0 ms\' is not a duration from 100 us to 24 h, '
             'such as "50 ms", "2 s" or "1 min"',
         ),
-        (
-            HEAD + 'settle = "11 s"\n' + TOY,
-            'line "L": settle = 11.0 is not a number of seconds from 0 to 10',
-        ),
+        (HEAD + 'settle = "11 s"\n' + TOY, 'line "L": settle = 11.0 is not a number of seconds from 0 to 10'),
         (
             HEAD + 'switching = "now"\n' + TOY,
             "line \"L\": switching = 'now' is not a duration from 100 us to 24 h, "
@@ -404,7 +408,7 @@ def test_five_mistakes_in_one_file_are_all_reported_together(mistakes: Mistakes)
         (
             HEAD + FIXED + "rated_frequency = 50",
             'line "L", drive "F": unknown key \'rated_frequency\'; '
-            "the keys here are name, model, address, framing, baudrate, format, ram, every, poll",
+            "the keys here are name, model, address, framing, baudrate, format, ram, every, poll, channel",
         ),
         (
             HEAD + '[[line.drive]]\nname = "M"\nmodel = "family.py:Mute"\naddress = 1',
@@ -420,12 +424,17 @@ def test_five_mistakes_in_one_file_are_all_reported_together(mistakes: Mistakes)
         ),
         (
             HEAD + TOY + '[[line]]\nname = "M"\nport = "/dev/b"\n' + TOY,
-            'line "M", drive "D": line "L", drive "D" already has this name; each drive needs its own',
+            'line "M", drive "D": another drive already has this name; each drive needs its own',
         ),
         (
-            '[[line]]\nname = "L"\n' + TOY,
-            'line "L": \'port\' is missing; add port = "/dev/ttyUSB0"',
+            HEAD + TOY + POLL + TOY.replace("= 1", "= 2") + POLL,
+            'line "L", drive "D": another drive already has this name; each drive needs its own',
         ),
+        (
+            HEAD + TOY + HEAD.replace("/dev/a", "/dev/b") + TOY.replace('"D"', '"E"'),
+            'line "L": another line already has this name; each line needs its own',
+        ),
+        ('[[line]]\nname = "L"\n' + TOY, 'line "L": \'port\' is missing; add port = "/dev/ttyUSB0"'),
         (
             HEAD.replace("/dev/a", "socket://10.0.0.9:40O1") + TOY,
             "line \"L\": socket://10.0.0.9:40O1: Port could not be cast to integer value as '40O1'",
@@ -436,7 +445,7 @@ def test_five_mistakes_in_one_file_are_all_reported_together(mistakes: Mistakes)
         ),
     ],
 )
-def test_each_mistake_is_one_sentence_with_its_place_and_remedy(
+def test_each_mistake_is_reported_in_one_sentence_with_place_and_remedy(
     mistakes: Mistakes, text: str, sentence: str
 ) -> None:
     assert mistakes(text) == [sentence]
@@ -471,10 +480,10 @@ def test_an_unreadable_plant_file_is_reported_as_a_sentence(tmp_path: Path) -> N
         load_plant(tmp_path / "latin.toml")
 
 
-SCANNED = "is a port, and no plant file; `multidrop scan {} --out plant.toml` writes one"
+SCANNED = "is a port, not a plant file; `multidrop scan {} --out plant.toml` writes one"
 
 
-@pytest.mark.parametrize(
+@table(
     ("name", "told"),
     [
         ("http://10.0.0.7:8750", "a gateway's page is for a browser"),
@@ -494,14 +503,14 @@ def test_a_url_or_port_given_as_a_plant_file_is_reported_as_such(name: str, told
 
 def test_a_device_given_as_a_plant_file_is_not_read() -> None:
     """Reading a serial port would block, and take bytes from its line."""
-    with pytest.raises(PlantError, match=r": is a device, and no plant file$"):
+    with pytest.raises(PlantError, match=r": is a device, not a plant file$"):
         load_plant(os.devnull)
 
 
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("a = " + "[" * 5000 + "]" * 5000, "is not TOML of ours: it is nested too deeply"),
+        ("a = " + "[" * 5000 + "]" * 5000, "is nested too deeply"),
         ("address = " + "9" * 5000, "is not TOML: Exceeds the limit"),
         ("address = 0x" + "f" * 5000, "is not TOML: a number does not fit into 64 bits"),
     ],
@@ -523,9 +532,10 @@ def test_control_characters_in_names_are_escaped_in_errors(mistakes: Mistakes) -
     assert address.startswith(r'line "L", drive "D\n\x1b[2J": address 99')
 
 
-@pytest.mark.parametrize(
-    "port", ["spy:///dev/null?file={}", "SPY://x?file={}", "alt://x?class={}", "loop://"]
-)
+UNDOCUMENTED = ("spy:///dev/null?file={}", "SPY://x?file={}", "alt://x?class={}", "loop://")
+
+
+@pytest.mark.parametrize("port", UNDOCUMENTED)
 def test_urls_with_undocumented_schemes_are_refused(mistakes: Mistakes, port: str) -> None:
     """For example, pyserial's spy:// would overwrite the file that the URL names."""
     (sentence,) = mistakes((HEAD + TOY).replace('port = "/dev/a"', f'port = "{port}"'))
@@ -554,8 +564,7 @@ def test_a_model_file_name_that_is_too_long_is_reported_as_a_sentence(mistakes: 
 
 
 @table(
-    ("text", "expected"),
-    [("500 us", 500e-6), ("50ms", 0.05), ("2 s", 2), ("1.5 min", 90), (" 1 h ", 3600)],
+    ("text", "expected"), [("500 us", 500e-6), ("50ms", 0.05), ("2 s", 2), ("1.5 min", 90), (" 1 h ", 3600)]
 )
 def test_parse_duration_returns_seconds(text: str, expected: float) -> None:
     assert parse_duration(text) == pytest.approx(expected)
@@ -635,7 +644,7 @@ def test_with_ports_refuses_unknown_lines_and_duplicate_ports(tmp_path: Path) ->
     plant = load_plant(two_lines(tmp_path))
     with pytest.raises(ValueError, match=r"plant\.toml has no line 'rof'; did you mean roof\?"):
         plant.with_ports({"rof": "x"})
-    with pytest.raises(ValueError, match="lines hall and roof would both be at /dev/hall"):
+    with pytest.raises(ValueError, match="lines hall and roof would both use /dev/hall"):
         plant.with_ports({"roof": "/dev/hall"})
 
 
@@ -687,3 +696,129 @@ def test_polling_a_text_is_reported_as_such(mistakes: Mistakes, tmp_path: Path) 
 def test_a_second_star_in_a_poll_list_is_reported(mistakes: Mistakes) -> None:
     (sentence,) = mistakes(HEAD + TOY + 'poll = ["*", "*"]')
     assert sentence.endswith('poll number 2: "*" is there twice; keep it once')
+
+
+# ---- names of drives: Unicode normal forms, which differ between keyboards; reserved names ----
+
+
+# Letters with two encodings, from the code charts: U+00FC = U+0075 U+0308; U+0439 = U+0438 U+0306.
+COMPOSED, APART = "L\u00fcfter", "Lu\u0308fter"
+SHORT, LONG = "\u0439", "\u0438\u0306"
+
+
+@table(
+    ("given", "names", "meant"),
+    [
+        (APART, [COMPOSED, "pump"], COMPOSED),
+        (COMPOSED, ["pump", APART], APART),
+        (LONG, [SHORT], SHORT),
+        (APART, [COMPOSED, APART], APART),  # an exact match takes precedence
+        ("pump", ["pump", "pump-1"], "pump"),
+        ("Pump", ["pump"], "Pump"),  # case is significant
+        ("\u212b", ["A\u030a", "\u00c5"], "\u212b"),  # ambiguous: both names have this normal form
+        ("Lufter", [COMPOSED], "Lufter"),
+        ("\ufb01", ["fi"], "\ufb01"),  # a ligature is not its two letters
+        ("\ud800", [COMPOSED], "\ud800"),
+        ("", [], ""),
+    ],
+)
+def test_a_name_is_found_by_its_unicode_normal_form(given: str, names: list[str], meant: str) -> None:
+    assert drive_meant(given, names) == meant
+
+
+@table("name", [*RESERVED_NAMES, "--all", "-"])
+def test_reserved_names_are_refused(name: str) -> None:
+    with pytest.raises(ValueError, match="give it another name"):
+        check_drive_name(name)
+
+
+@table("name", ["stop-1", "Stop", "gateways", "...", "a-", "__proto"])
+def test_names_similar_to_reserved_ones_are_allowed(name: str) -> None:
+    assert check_drive_name(name)
+
+
+def test_no_option_of_a_family_file_has_the_name_of_a_plant_files_key() -> None:
+    assert set(DRIVE_KEYS) <= NOT_OPTIONS
+
+
+# ---- computed channels of a plant file: the loaded channels, and the place of each mistake ----
+
+
+FILE = """\
+totals = "kept.json"
+[[line]]
+name = "hall"
+port = "/dev/ttyUSB0"
+[[line.drive]]
+name = "pump-1"
+model = "yaskawa-v1000"
+address = 1
+poll = ["output_power", "output_frequency"]
+[[line.drive.channel]]
+name = "energy"
+value = "integral(output_power)"
+unit = "kWh"
+[[line.drive]]
+name = "pump-2"
+model = "yaskawa-v1000"
+address = 2
+poll = ["output_power"]
+[[line.drive.channel]]
+name = "both"
+value = "pump-1.output_power + output_power"
+unit = "W"
+"""
+
+
+def loaded(folder: Path, text: str = FILE) -> tuple[tuple[Channel, ...], ...]:
+    path = folder / "plant.toml"
+    path.write_text(text)
+    plant = load_plant(path)
+    assert plant.totals == folder / "kept.json"
+    return tuple(polled.channels for polled in plant.lines[0].drives)
+
+
+def test_channels_belong_to_their_drive(tmp_path: Path) -> None:
+    first, second = loaded(tmp_path)
+    assert first == (Channel("energy", "integral(output_power)", "kWh"),)
+    assert second == (Channel("both", "pump-1.output_power + output_power", "W"),)
+
+
+WRONG_CHANNELS = (
+    (
+        "pump-1.output_power +",
+        "pump-1.output_frequency +",
+        21,
+        "column 25: kW cannot be combined with Hz; both",
+    ),
+    ('"kWh"', '"kW"', 12, "column 1: the value is in kW*s, which cannot be converted to kW"),
+    ("integral(", "integrall(", 12, "column 1: there is no function 'integrall'; did you mean integral?"),
+    (
+        '"energy"',
+        '"output_power"',
+        12,
+        "pump-1 already has a register or channel 'output_power'; give the channel another name",
+    ),
+    ("+ output_power", "+ output_current", 21, "column 23: pump-2.output_current is not polled; add"),
+    ('\nunit = "kWh"', "\nunits = 3", 13, "unknown key 'units'; did you mean unit?"),
+    ('"both"', '"energy"\n[[line.drive.channel]]', 19, "'value' is missing; add"),
+)
+
+
+@pytest.mark.parametrize(("right", "wrong", "line", "sentence"), WRONG_CHANNELS)
+def test_mistake_in_a_channel_is_reported_with_its_place(
+    tmp_path: Path, right: str, wrong: str, line: int, sentence: str
+) -> None:
+    assert right in FILE
+    with pytest.raises(PlantError) as mistake:
+        loaded(tmp_path, FILE.replace(right, wrong))
+    first = mistake.value.mistakes[0]
+    assert first.startswith(f"{tmp_path}/plant.toml:{line}: ")
+    assert sentence in first
+
+
+def test_drive_with_a_wrong_channel_can_still_be_stopped(tmp_path: Path) -> None:
+    with pytest.raises(PlantError) as mistake:
+        loaded(tmp_path, FILE.replace("integral(", "integrall("))
+    assert mistake.value.right is not None
+    assert [polled.drive.name for polled in mistake.value.right.lines[0].drives] == ["pump-1", "pump-2"]

@@ -1,27 +1,39 @@
-"""Load a plant file, and find all errors in it. Opens no port."""
+"""Load a plant file, and find all errors in the file. Opens no port."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+from multidrop.channels import MOST_CHARACTERS, MOST_NAME, Channel, ChannelSet
+from multidrop.channels.functions import NAMES as FUNCTION_NAMES
 from multidrop.core import RS485, Echo, TransactionIds
 from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import BAUDRATES, FORMAT, Settings, check_port, check_settle, speaks_tcp
 from multidrop.families import MODELS
 from multidrop.families.files import FamilyError
-from multidrop.families.registry import SHIPPED, find_model, installed_models, shipped_family
-from multidrop.plant.drive_names import RESERVED_NAMES, check_drive_name
-from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
+from multidrop.families.registry import find_model
+from multidrop.plant.model import (
+    FLEET_KEYS,
+    RESERVED_NAMES,
+    Plant,
+    PlantLine,
+    Polled,
+    PolledDrive,
+    check_drive_name,
+    series_of,
+)
 from multidrop.toml_check import (
     DURATION,
+    PORT_NUMBER,
     Key,
     TomlPlace,
     duration_of,
+    duration_up_to,
     grouped,
     json_schema,
     line_numbers,
@@ -32,34 +44,53 @@ from multidrop.toml_check import (
 class PlantError(ValueError):
     """All errors of a plant file; `mistakes` has a sentence for each, with its place and what would be right.
 
-    `rest` is the plant without its lines if the file is valid TOML, else None. `right` has the lines and
-    drives without a mistake, so that these drives can be stopped.
+    `right` is the plant with those drives that can be stopped: their own entries have no mistakes, except in
+    `every`, `poll` and channels. It is None if the file is not valid TOML.
     """
 
-    def __init__(
-        self, mistakes: tuple[str, ...], rest: Plant | None = None, right: Plant | None = None
-    ) -> None:
+    def __init__(self, mistakes: tuple[str, ...], right: Plant | None = None) -> None:
         super().__init__("\n".join(mistakes))
         self.mistakes = mistakes
-        self.rest = rest
         self.right = right
 
 
 def load_plant(path: Path | str) -> Plant:
     """Return the plant that the file describes. Raises PlantError if there is any error in the file."""
+    return _load(path, lambda document: PLANT_KEYS)
+
+
+def load_served_plant(path: Path | str) -> Plant:
+    """Load a plant file as `load_plant` does; a file with only [serve.fleet] gives a plant without lines."""
+    return _load(path, _served_keys)
+
+
+def _served_keys(document: Mapping[str, Any]) -> Mapping[str, Key]:
+    serve = document.get("serve")
+    return _FOLLOWING_KEYS if isinstance(serve, dict) and "fleet" in serve else PLANT_KEYS
+
+
+def _load(path: Path | str, keys_of: Callable[[Mapping[str, Any]], Mapping[str, Key]]) -> Plant:
     if why := port_or_address(path):
         raise PlantError((why,))
     path = Path(path)
     place = TomlPlace(path, lines=cache(partial(line_numbers, path)))
     document = place.attempt(read_document, path, "plant file")
-    given = {} if document is None else place.check(document, _PLANT)
+    given = {} if document is None else place.check(document, keys_of(document))
     lines = [_line(table, at) for table, at in place.inside("line", given.get("line", []))]
     right = tuple(line for line in lines if line is not None)
-    plant = Plant(right, path, given.get("serve", {}), given.get("realtime", False))
+    totals = path.parent / given["totals"] if "totals" in given else None
+    plant = Plant(right, path, given.get("serve", {}), given.get("realtime", False), totals)
+    if not place.config_errors:
+        _check_channels(plant, given, place)
     if place.config_errors:
-        rest = None if document is None else replace(plant, lines=())
-        raise PlantError(grouped(place.config_errors), rest, plant)
+        raise PlantError(grouped(place.config_errors), None if document is None else plant)
     return plant
+
+
+def check_channels(plant: Plant) -> None:
+    """Raise PlantError with all mistakes of the channels of a plant, which a program may have built."""
+    if mistakes := ChannelSet(series_of(plant)).mistakes:
+        raise PlantError(tuple(map(str, mistakes)))
 
 
 def port_or_address(name: Path | str) -> str:
@@ -69,44 +100,57 @@ def port_or_address(name: Path | str) -> str:
         return ""
     shown = f"{url[1]}://{url[2]}" if url else str(name)
     if url and url[1].lower() in ("http", "https"):
-        return f"{shown} is an address, and no plant file; a gateway's page is for a browser: open it there"
+        return f"{shown} is an address, not a plant file; a gateway's page is for a browser: open it there"
     if url and url[1].lower() not in _PORTS:
-        return f"{shown} is an address, and no plant file; name a file such as plant.toml"
-    return f"{shown} is a port, and no plant file; `multidrop scan {shown} --out plant.toml` writes one"
+        return f"{shown} is an address, not a plant file; name a file such as plant.toml"
+    return f"{shown} is a port, not a plant file; `multidrop scan {shown} --out plant.toml` writes one"
 
 
-_URL = re.compile(r"([a-z][a-z0-9+.-]+):/{1,2}(.*)", re.IGNORECASE)  # Path reduces two slashes to one
+_URL = re.compile(r"([a-z][a-z0-9+.-]+):/{1,2}(.*)", re.IGNORECASE)  # Path leaves only one slash of two
 _PORTS = ("tcp", "socket", "rfc2217")
 
-NAME = {"not": {"enum": [*RESERVED_NAMES]}, "pattern": "^[^-]"}
+# Keywords of JSON Schema.
+NAME = {"not": {"enum": [*RESERVED_NAMES]}, "pattern": r"^[^-\x00-\x1f\x7f][^\x00-\x1f\x7f]*$"}
+_HOST = r"(\[[0-9A-Fa-f:.%]+\]|[^@:/?#\[\]]+)"
+_NUMBER = rf":(?!0+([/?#]|$)){PORT_NUMBER}"
+_BY_TCP = rf"[Tt][Cc][Pp]://{_HOST}({_NUMBER})?"
+_BY_SOCKET = rf"([Ss][Oo][Cc][Kk][Ee][Tt]|[Rr][Ff][Cc]2217)://{_HOST}{_NUMBER}"
+PORT = {"pattern": rf"^((?!.*://).*|({_BY_TCP}|{_BY_SOCKET})([/?#].*)?)$"}
 FORMATS = {"pattern": f"^{FORMAT}$"}
 BAUDRATE = {"minimum": BAUDRATES[0], "maximum": BAUDRATES[1]}
 TEXTS = {"items": {"type": "string", "minLength": 1}}
+_KNOWN = "|".join((*FUNCTION_NAMES, "and", "or", "not"))  # words that may precede a parenthesis
+_UNKNOWN_FUNCTION = rf"^[^\"']*(?<![\w.-])(?!({_KNOWN})\s*\()[^\W\d]\w*\s*\("
 
-_PLANT = {
+PLANT_KEYS = {
     "realtime": Key(bool, "realtime = true"),
+    "totals": Key(str, 'totals = "totals.json"'),
     "line": Key(list, "[[line]], in two brackets, with its name, port and drives", needed=True),
     "serve": Key(dict, "[serve], a table that `multidrop serve` reads"),
-    "fleet": Key(dict, "[fleet], a table that `multidrop fleet init` reads"),
+    "fleet": Key(
+        dict, "[fleet], a table that `multidrop fleet init` reads", keywords=json_schema(FLEET_KEYS)
+    ),
 }
 
-_LINE = {
+_FOLLOWING_KEYS = {**PLANT_KEYS, "line": replace(PLANT_KEYS["line"], needed=False)}
+
+LINE_KEYS = {
     "name": Key(str, 'name = "hall-1"', needed=True, keywords=NAME),
-    "port": Key(str, 'port = "/dev/ttyUSB0"', needed=True),
+    "port": Key(str, 'port = "/dev/ttyUSB0"', needed=True, keywords=PORT),
     "baudrate": Key(int, "baudrate = 9600", keywords=BAUDRATE),
     "format": Key(str, 'format = "8N1"', keywords=FORMATS),
-    "silence": Key(str, 'silence = "500 us"', keywords=DURATION),
+    "silence": Key(str, 'silence = "500 us"', keywords=duration_up_to(0)),
     "switching": Key(str, 'switching = "2 ms"', keywords=DURATION),
     "echo": Key(str, 'echo = "auto"', keywords={"enum": [one.value for one in Echo]}),
     "rs485": Key(str, 'rs485 = "kernel"', keywords={"enum": [one.value for one in RS485]}),
-    "settle": Key(str, 'settle = "1.5 s"', keywords=DURATION),
+    "settle": Key(str, 'settle = "1.5 s"', keywords=duration_up_to(1)),
     "transaction": Key(
         str, 'transaction = "match"', keywords={"enum": [one.value for one in TransactionIds]}
     ),
     "drive": Key(list, "[[line.drive]], in two brackets, with its name, model and address", needed=True),
 }
 
-_DRIVE = {
+DRIVE_KEYS = {
     "name": Key(str, 'name = "pump-1"', needed=True, keywords=NAME),
     "model": Key(str, 'model = "innovert-ibd"', needed=True),
     "address": Key(int, "address = 1", needed=True, keywords={"minimum": 0, "maximum": 255}),
@@ -118,76 +162,44 @@ _DRIVE = {
     ),
     "every": Key(str, 'every = "50 ms"', keywords=DURATION),
     "poll": Key(list, 'poll = ["output_current"], or leave it out to poll all readings'),
+    "channel": Key(list, "[[line.drive.channel]], in two brackets, with its name and value"),
 }
 
-_POLL = {
+POLL_KEYS = {
     "register": Key(str, 'register = "output_current"', needed=True),
     "every": Key(str, 'every = "50 ms"', keywords=DURATION),
 }
 
-_NOT_ARGUMENTS = ("name", "model", "every", "poll")  # keys that are not arguments of a drive's class
+CHANNEL_KEYS = {
+    "name": Key(
+        str,
+        'name = "energy"',
+        needed=True,
+        keywords={"pattern": r"^[^\W\d]\w*$", "maxLength": MOST_NAME},
+    ),
+    "value": Key(
+        str,
+        'value = "integral(output_power)"',
+        needed=True,
+        keywords={"maxLength": MOST_CHARACTERS, "not": {"pattern": _UNKNOWN_FUNCTION}},
+    ),
+    "unit": Key(str, 'unit = "kWh"', keywords={"maxLength": MOST_NAME}),
+}
 
-
-def plant_schema() -> dict[str, Any]:
-    """Return the JSON Schema of a plant file, from the keys that `load_plant` checks.
-
-    The schema also has the registers, addresses and options of the built-in and shipped families. It accepts
-    any tables [serve] and [fleet].
-    """
-    families = [*MODELS.values(), *map(shipped_family, SHIPPED)]
-    drive = json_schema(_DRIVE) | {
-        "additionalProperties": {"type": "number"},  # options of families in files
-        "allOf": [_of_family(name, family) for name, family in zip(_names(), families, strict=True)],
-    }
-    drive["properties"]["model"] |= {
-        "anyOf": [
-            {"enum": [*_names(), *installed_models()]},
-            {"pattern": r"\.toml$"},
-            {"pattern": r"\.py:\w+$"},
-        ]
-    }
-    drive["properties"]["poll"]["items"] = _polls_of({"type": "string", "minLength": 1})
-    line = json_schema(_LINE)
-    line["properties"]["drive"]["items"] = drive
-    plant = json_schema(_PLANT)
-    plant["properties"]["line"]["items"] = line
-    return {"$schema": "http://json-schema.org/draft-07/schema#", "title": "multidrop plant file", **plant}
-
-
-def _names() -> list[str]:
-    return [*MODELS, *SHIPPED]
-
-
-def _polls_of(register: Mapping[str, Any]) -> dict[str, Any]:
-    table = json_schema(_POLL)
-    table["properties"]["register"] = register
-    return {"anyOf": [register, table]}
-
-
-def _of_family(name: str, family: type[Drive]) -> dict[str, Any]:
-    """Return what the schema requires of a drive with this model."""
-    readable = [register.name for register in family.registers.values() if register.readable]
-    return {
-        "if": {"properties": {"model": {"const": name}}, "required": ["model"]},
-        "then": {
-            "propertyNames": {"enum": [*_DRIVE, *family.options]},
-            "properties": {
-                "address": {"minimum": family.addresses[0], "maximum": family.addresses[-1]},
-                "poll": {"items": _polls_of({"enum": ["*", *readable]})},
-            },
-        },
-    }
+# keys that are not arguments of a drive's class
+_NOT_ARGUMENTS = ("name", "model", "every", "poll", "channel")
 
 
 def _line(table: Any, place: TomlPlace) -> PlantLine | None:
-    """Return the line with its drives that have no mistake; None if the line itself has one."""
+    """Return the line with the drives that can be stopped; None if the line itself has a mistake."""
     before = len(place.config_errors)
-    given = place.check(table, _LINE)
+    given = place.check(table, LINE_KEYS)
     name, port = given.get("name", ""), given.get("port", "")
     if name:
         place.attempt(check_drive_name, name)
         place.once("line", name, sentence="another line already has this name; each line needs its own")
-    if port and not speaks_tcp(port):  # several lines may have one tcp:// port, each its own connection
+    # several lines may have the same tcp:// port, because each has its own connection
+    if port and not speaks_tcp(port):
         place.once("port", port, sentence=f"port {port} is already used by {{first}}; make them one line")
     if port:
         place.attempt(check_port, port)
@@ -204,7 +216,7 @@ def _line(table: Any, place: TomlPlace) -> PlantLine | None:
     place.attempt(rs485.check_port, port)
     ids = place.attempt(TransactionIds, given.get("transaction", "match"))
     if "transaction" in given and not speaks_tcp(port):
-        place.wrong(f"transaction is a fact of tcp:// ports, and {port} is none; leave it out")
+        place.wrong(f"transaction is only for tcp:// ports, and {port} is not one; remove it")
     is_right = len(place.config_errors) == before
     inherited = {**settings, "silence": silence, "port": port}
     drives = [_drive(drive, inherited, at) for drive, at in place.inside("drive", given.get("drive", []))]
@@ -225,16 +237,20 @@ def _line(table: Any, place: TomlPlace) -> PlantLine | None:
 
 
 def _drive(table: Any, line: Mapping[str, Any], place: TomlPlace) -> PolledDrive | None:
+    """Return the drive; None if a key that its stop needs has a mistake."""
     before = len(place.config_errors)
     model = _model(table, place)
-    given = place.check(table, _DRIVE | _option_keys(model))
+    given = place.check(table, DRIVE_KEYS | _option_keys(model))
     if "name" in given:
         place.attempt(check_drive_name, given["name"])
-        place.once("drive", given["name"], sentence="{first} already has this name; each drive needs its own")
+        place.once(
+            "drive", given["name"], sentence="another drive already has this name; each drive needs its own"
+        )
     if "address" in given:
         sentence = f"address {given['address']} is already used by {{first}}; give each drive its own"
-        wire = line["port"] if speaks_tcp(line["port"]) else place.labels[0]
+        wire = line["port"] if speaks_tcp(line["port"]) else place.steps[0]
         place.once("address", wire, given["address"], sentence=sentence)
+    is_right = len(place.config_errors) == before
     every = duration_of(given, "every", place)
     if model is None:
         return None
@@ -242,14 +258,38 @@ def _drive(table: Any, line: Mapping[str, Any], place: TomlPlace) -> PolledDrive
     inherited = {
         key: value for key, value in line.items() if value is not None and key not in given and key != "port"
     }
+    before = len(place.config_errors)
     _try_each(model, arguments, inherited, place)
+    is_right &= len(place.config_errors) == before
     polls = _polls(given.get("poll"), model, every, place)
-    if len(place.config_errors) > before:
+    channels = [_channel(table, at) for table, at in place.inside("channel", given.get("channel", []))]
+    if not is_right:  # a drive with mistakes only in `every`, `poll` and channels can still be stopped
         return None
     drive = place.attempt(partial(model, name=given["name"], **inherited, **arguments))
     if drive and place.attempt(partial(_on_port, drive, line["port"])) is None:
         return None
-    return PolledDrive(drive, polls) if drive else None
+    return PolledDrive(drive, polls, channels=filter(None, channels)) if drive else None
+
+
+def _channel(table: Any, place: TomlPlace) -> Channel | None:
+    given = place.check(table, CHANNEL_KEYS)
+    return (
+        Channel(given["name"], given["value"], given.get("unit", ""))
+        if {"name", "value"} <= given.keys()
+        else None
+    )
+
+
+def _check_channels(plant: Plant, given: Mapping[str, Any], place: TomlPlace) -> None:
+    """Add the mistakes of channels, which may name registers of any drive."""
+    places = {
+        (drive["name"], channel["name"]): at
+        for line, at_line in place.inside("line", given.get("line", []))
+        for drive, at_drive in at_line.inside("drive", line["drive"])
+        for channel, at in at_drive.inside("channel", drive.get("channel", []))
+    }
+    for mistake in ChannelSet(series_of(plant)).mistakes:
+        places[mistake.drive, mistake.channel].wrong(mistake.sentence, "value")
 
 
 def _on_port(drive: Drive, port: str) -> Drive:
@@ -265,7 +305,7 @@ def _model(table: Any, place: TomlPlace) -> type[Drive] | None:
         return find_model(text, place.path.parent)
     except FamilyError as wrong:
         once = ("family", text)
-        if once not in place.seen:  # report the file's mistakes only once
+        if once not in place.seen:  # report the family file's mistakes only once
             for mistake in wrong.mistakes:
                 place.wrong(mistake)
         place.seen.setdefault(once, "")
@@ -275,7 +315,7 @@ def _model(table: Any, place: TomlPlace) -> type[Drive] | None:
 
 
 def _option_keys(model: type[Drive] | None) -> dict[str, Key]:
-    """Return the keys of the family's options; for an unknown family, those of all families' options."""
+    """Return the keys of the family's options; for an unknown family, the keys of all families' options."""
     families = [model] if model else list(MODELS.values())
     return {
         name: Key((int, float), f"{name} = {option.span[1]:g}")
@@ -287,7 +327,7 @@ def _option_keys(model: type[Drive] | None) -> dict[str, Key]:
 def _try_each(
     model: type[Drive], arguments: Mapping[str, Any], inherited: Mapping[str, Any], place: TomlPlace
 ) -> None:
-    """Try one argument at a time, so that each argument that the family refuses gets its own error."""
+    """Try each argument alone, so that each argument that the family refuses gets its own error."""
     least: dict[str, Any] = {"address": model.addresses[0]}
     if "framing" in arguments:
         framing = {"framing": arguments["framing"]}
@@ -329,15 +369,15 @@ def _polled(
     if not isinstance(entry, (str, dict)):
         place.wrong(f'{entry!r} is not right; write "output_current" or {{ register = "output_current" }}')
         return None
-    given = place.check({"register": entry} if isinstance(entry, str) else entry, _POLL)
+    given = place.check({"register": entry} if isinstance(entry, str) else entry, POLL_KEYS)
     own = duration_of(given, "every", place) if "every" in given else every
     if given.get("register") == "*":
-        place.once(place.labels[:-1], "*", sentence='"*" is there twice; keep it once')
+        place.once(place.steps[:-1], "*", sentence='"*" is there twice; keep it once')
         return tuple(Polled(register, own) for register in model.readings())
     register = place.attempt(model.register, given["register"]) if "register" in given else None
     if register is None:
         return None
-    place.once(place.labels[:-1], register.name, sentence=f"{register} is polled twice; keep it once")
+    place.once(place.steps[:-1], register.name, sentence=f"{register} is polled twice; keep it once")
     if not register.readable:
         place.wrong(f"{register} can only be written, not polled; see `multidrop models {model.model}`")
         return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,21 +10,44 @@ from importlib import import_module
 from itertools import product
 from pathlib import Path
 from typing import Any, Final, NoReturn
+from unicodedata import normalize
 
+import multidrop
+from multidrop.channels import Channel, DriveSeries
 from multidrop.core import RS485, Echo, TransactionIds
 from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import check_port
-from multidrop.drive.named_verbs import verbs_of
+from multidrop.drive.named_verbs import LISTED_VERBS, verbs_of
 from multidrop.drive.register import Register
 from multidrop.planning.blocks import Planned, planned
-from multidrop.planning.prediction import prediction_metadata
-from multidrop.toml_check import Key, TomlPlace, check_period
+from multidrop.planning.prediction import predict, prediction_metadata
+from multidrop.printable import did_you_mean
+from multidrop.toml_check import Key, TomlPlace, check_period, json_schema
+
+_VERB = f"({'|'.join(LISTED_VERBS)})"
+
+
+def _entries(pattern: str) -> dict[str, Any]:
+    return {"items": {"type": "string", "pattern": f"^{pattern}$"}}
+
 
 MAY_LISTS: Final = {
-    "write": Key(list, 'write = ["pump-1.frequency_setpoint"]'),
-    "verbs": Key(list, 'verbs = ["pump-1.start"]'),
+    "write": Key(list, 'write = ["pump-1.frequency_setpoint"]', keywords=_entries(r".+\.[A-Za-z]\w*")),
+    "verbs": Key(list, 'verbs = ["pump-1.start"]', keywords=_entries(rf".+\.{_VERB}")),
 }
-MAY_KEYS: Final = {**MAY_LISTS, "family": Key(dict, 'family.invt-che = { write = ["setpoint"] }')}
+_OF_A_FAMILY = {
+    "write": Key(list, 'write = ["setpoint"]', keywords=_entries(r"[A-Za-z]\w*")),
+    "verbs": Key(list, 'verbs = ["start"]', keywords=_entries(_VERB)),
+}
+MAY_KEYS: Final = {
+    **MAY_LISTS,
+    "family": Key(
+        dict,
+        'family.invt-che = { write = ["setpoint"] }',
+        keywords={"additionalProperties": json_schema(_OF_A_FAMILY)},
+    ),
+}
+FLEET_KEYS: Final = {"may": Key(dict, "[fleet.may], a table", keywords=json_schema(MAY_KEYS))}
 
 
 @dataclass(frozen=True)
@@ -48,12 +70,14 @@ class PolledDrive:
     """A drive and its polled registers, each with its rate.
 
     `polls` lists registers of the drive or their names, or Polled for a register with a period of its own.
-    Without `polls`, all readings of the drive are polled. `every` is the period of the others in s; None
-    means as fast as the line allows.
+    Without `polls`, all readings of the drive are polled. `every` is the period in s of registers without
+    their own; None means as fast as the line allows. `channels` are computed from registers of this drive and
+    of others.
     """
 
     drive: Drive
     polls: tuple[Polled, ...]
+    channels: tuple[Channel, ...]
 
     def __init__(
         self,
@@ -61,12 +85,14 @@ class PolledDrive:
         polls: Iterable[Polled | Register[Any] | str] | None = None,
         *,
         every: float | None = None,
+        channels: Iterable[Channel] = (),
     ) -> None:
         wanted = drive.readings() if polls is None else polls
         object.__setattr__(self, "drive", drive)
         object.__setattr__(self, "polls", tuple(_polled(drive, one, every) for one in wanted))
+        object.__setattr__(self, "channels", tuple(channels))
 
-    def __hash__(self) -> int:  # without the polls, because it is computed often
+    def __hash__(self) -> int:  # leaves out the polls, because the hash is computed often
         return hash(self.drive)
 
     @property
@@ -75,17 +101,28 @@ class PolledDrive:
         return [(poll.register, poll.every) for poll in self.polls]
 
     def at_rate(self, register: Register[Any] | None, every: float | None) -> PolledDrive:
-        """Return a copy with another period in s for one register, or for all if `register` is None.
+        """Return a copy in which `register` (None: every register) is polled with another period in s.
 
         Raises ValueError for a register that is not polled.
         """
         if register is not None and register not in [poll.register for poll in self.polls]:
             names = ", ".join(poll.register.name for poll in self.polls) or "nothing"
-            raise ValueError(f"{register.name} of {self.drive.name} is not polled: that is {names}")
+            raise ValueError(f"{register.name} of {self.drive.name} is not polled; polled are: {names}")
         polls = [
             Polled(poll.register, every) if register in (None, poll.register) else poll for poll in self.polls
         ]
-        return PolledDrive(self.drive, tuple(polls))
+        return PolledDrive(self.drive, tuple(polls), channels=self.channels)
+
+    @property
+    def series(self) -> tuple[Polled, ...]:
+        """The polled registers, followed by a register for each channel, which is never read."""
+        slowest = max((poll.every or 0.0 for poll in self.polls), default=0.0) or None
+        return (*self.polls, *(Polled(channel.register, slowest) for channel in self.channels))
+
+    def find_register(self, name: str) -> Register[Any]:
+        """Return the register or the channel of this name. Raises ValueError if there is none."""
+        found = (channel.register for channel in self.channels if channel.name == name)
+        return next(found, None) or self.drive.register(name)
 
 
 def _polled(drive: Drive, wanted: Polled | Register[Any] | str, every: float | None) -> Polled:
@@ -96,7 +133,7 @@ def _polled(drive: Drive, wanted: Polled | Register[Any] | str, every: float | N
 
 @dataclass(frozen=True)
 class PlantLine:
-    """A port with its drives; its baud rate and format are already in the drives' settings."""
+    """A port with its drives, whose settings already contain the line's baud rate and format."""
 
     name: str
     port: str
@@ -113,13 +150,13 @@ class PlantLine:
         object.__setattr__(self, "drives", tuple(self.drives))
 
     def at(self, port: str) -> PlantLine:
-        """Return the same line at another port; without `rs485` if that is a network port."""
+        """Return a copy of the line at another port; without `rs485` if the new port is a network port."""
         return replace(self, port=port, rs485=RS485.OFF if "://" in port else self.rs485)
 
 
 @dataclass(frozen=True)
 class Plant:
-    """All lines of a plant file, and its table `serve`, unchecked, which only the gateway reads.
+    """All lines of a plant file, and its unchecked table `serve`, which only the gateway reads.
 
     With `realtime`, the core's thread is scheduled before all normal threads; see Poller.
     """
@@ -128,6 +165,7 @@ class Plant:
     path: Path = Path("plant")  # the plant file
     serve: Mapping[str, Any] = field(default_factory=dict, hash=False)
     realtime: bool = False
+    totals: Path | None = None  # file of the channels' totals; None: the default, see `totals_path`
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lines", tuple(self.lines))
@@ -137,6 +175,11 @@ class Plant:
         """Return the plant that a file describes; no port is opened. Raises PlantError with all mistakes."""
         plant: Plant = import_module("multidrop.plant.loader").load_plant(path)  # avoids an import cycle
         return plant
+
+    @property
+    def drives(self) -> tuple[PolledDrive, ...]:
+        """The drives of all lines, with their polled registers."""
+        return tuple(polled for line in self.lines for polled in line.drives)
 
     def find_line(self, name: str) -> PlantLine:
         """Return the line of this name. Raises ValueError with the nearest names if there is none."""
@@ -149,10 +192,7 @@ class Plant:
         return drives.get(name) or self._unknown("drive", name, drives)
 
     def _unknown(self, kind: str, name: str, names: Iterable[str]) -> NoReturn:
-        names = list(names)
-        near = difflib.get_close_matches(name, names, n=2)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(names) or 'none'}"
-        raise ValueError(f"{self.path} has no {kind} {name!r}; {hint}")
+        raise ValueError(f"{self.path} has no {kind} {name!r}; {did_you_mean(name, names)}")
 
     def with_ports(self, ports: Mapping[str, str]) -> Plant:
         """Return the same plant with other ports, given by line name, such as those of a simulator.
@@ -166,7 +206,7 @@ class Plant:
         owners: dict[str, str] = {}
         for line in lines:
             if line.port in owners:
-                raise ValueError(f"lines {owners[line.port]} and {line.name} would both be at {line.port}")
+                raise ValueError(f"lines {owners[line.port]} and {line.name} would both use {line.port}")
             owners[line.port] = line.name
         return replace(self, lines=lines)
 
@@ -193,11 +233,36 @@ def planned_on(line: PlantLine, delays: Mapping[Drive, float] | None = None) -> 
     ]
 
 
-def _metadata(plant: Plant) -> dict[str, Any]:
-    from importlib.metadata import version  # imported here: a fifth of the import time of a poller
+def series_of(plant: Plant, planned: Mapping[str, Any] | None = None) -> list[DriveSeries]:
+    """Return the series from which channels are computed; [] if the plant has no channels.
 
+    How long a value stays current: see `current_for`. Pass `plant.metadata()["planned"]` as `planned`
+    if it is known.
+    """
+    if not any(polled.channels for polled in plant.drives):
+        return []
+    found = []
+    for line in plant.lines:
+        if planned is None:
+            cycle = predict(planned_on(line), switching=line.switching).cycle
+        else:
+            cycle = planned[line.name]["cycle_ms"] / 1e3
+        for polled in line.drives:
+            units = {
+                poll.register.name: (
+                    "" if poll.register.values else poll.register.value_unit,
+                    current_for(max(cycle, poll.every or 0.0)),
+                )
+                for poll in polled.polls
+            }
+            drive = polled.drive
+            found.append(DriveSeries(drive.name, units, drive.registers.keys(), polled.channels))
+    return found
+
+
+def _metadata(plant: Plant) -> dict[str, Any]:
     return {
-        "multidrop": version("multidrop"),
+        "multidrop": multidrop.__version__,
         "plant": str(plant.path),
         "planned": {line.name: prediction_metadata(planned_on(line), line.switching) for line in plant.lines},
         "drives": {
@@ -214,7 +279,10 @@ def _of_drive(line: PlantLine, polled: PolledDrive) -> dict[str, Any]:
         "address": drive.address,
         "settings": str(drive.settings),
         "framing": str(drive.framing),
-        "registers": {poll.register.name: _of_register(poll.register) for poll in polled.polls},
+        "registers": {
+            **{poll.register.name: _of_register(poll.register) for poll in polled.polls},
+            **{one.name: {"unit": one.unit, "computed": one.value} for one in polled.channels},
+        },
     }
 
 
@@ -243,25 +311,19 @@ def allowed(plant: Plant, table: Mapping[str, Any], place: TomlPlace) -> dict[st
             names.update(place.attempt(_listed, plant, key, entry) or ())
     for model, lists in table.get("family", {}).items():
         inside = place.within(f"family {model}")
-        drives = [drive for drive in _drives(plant) if drive.model == model]
+        drives = [polled.drive for polled in plant.drives if polled.drive.model == model]
         if not drives:
-            inside.wrong(f"no drive has this model; the plant has {', '.join(sorted(_models(plant)))}")
-        for key, entries in inside.check(lists, MAY_LISTS).items():
+            models = {polled.drive.model for polled in plant.drives}
+            inside.wrong(f"no drive has this model; the plant has {', '.join(sorted(models))}")
+        for key, entries in inside.check(lists, _OF_A_FAMILY).items():
             for drive, entry in product(drives, entries):
                 found[key].update(filter(None, [inside.attempt(_entry, key, drive, entry)]))
     return {key: frozenset(names) for key, names in found.items()}
 
 
-def _drives(plant: Plant) -> list[Drive]:
-    return [polled.drive for line in plant.lines for polled in line.drives]
-
-
-def _models(plant: Plant) -> set[str]:
-    return {drive.model for drive in _drives(plant)}
-
-
 def _listed(plant: Plant, key: str, entry: object) -> list[str]:
-    """Return what an entry such as "pump-1.start" or "pump-*.start" allows. Raises ValueError if it is wrong.
+    """Return what an entry such as "pump-1.start" or "pump-*.start" allows. Raises ValueError for a wrong
+    entry.
 
     `*` stands for any characters of a drive's name. Drives without the register or verb are left out, unless
     no drive has it.
@@ -269,7 +331,8 @@ def _listed(plant: Plant, key: str, entry: object) -> list[str]:
     name, dot, rest = entry.rpartition(".") if isinstance(entry, str) else ("", "", "")
     if not dot:
         raise ValueError(f"{key}: {entry!r} is not right; write {MAY_LISTS[key].example}")
-    if "*" not in name or any(drive.name == name for drive in _drives(plant)):
+    drives = [polled.drive for polled in plant.drives]
+    if "*" not in name or any(drive.name == name for drive in drives):
         try:
             _, drive = plant.find_drive(name)
         except ValueError as unknown:
@@ -277,14 +340,14 @@ def _listed(plant: Plant, key: str, entry: object) -> list[str]:
         return [_entry(key, drive, rest)]
     pattern = re.compile(".*".join(map(re.escape, name.split("*"))))
     found, refusals = [], [f"there is no drive {name!r}"]
-    for drive in _drives(plant):
+    for drive in drives:
         if pattern.fullmatch(drive.name):
             try:
                 found.append(_entry(key, drive, rest))
             except ValueError as refusal:
                 refusals.append(str(refusal).removeprefix(f"{key}: "))
     if not found:
-        raise ValueError(f"{key}: {entry} allows nothing: {refusals[-1]}")
+        raise ValueError(f"{key}: {entry} matches no register or verb: {refusals[-1]}")
     return found
 
 
@@ -299,8 +362,49 @@ def _entry(key: str, drive: Drive, name: object) -> str:
         if not register.writable:
             raise ValueError(f"{key}: {entry} is never written: {register.never or 'it can only be read'}")
         return entry
-    verbs = [verb for verb in verbs_of(drive) if verb != "stop"]
+    verbs = [verb for verb in verbs_of(drive) if verb in LISTED_VERBS]
     if name not in verbs:
         known = ", ".join(verbs) or "none"
-        raise ValueError(f"{key}: {drive.name} has no verb {name!r} that a list allows; it has {known}")
+        raise ValueError(f"{key}: {drive.name} has no verb {name!r} for this list; choose from {known}")
     return entry
+
+
+# ---- names of drives and lines ----
+
+
+# Reserved names, each with its use: a topic, path, file or key has this name already.
+RESERVED_NAMES: Final[Mapping[str, str]] = {
+    "gateway": "the MQTT topic PREFIX/gateway",
+    "stop": "the MQTT topic PREFIX/stop, which stops all drives",
+    "alarms": "the MQTT topic PREFIX/alarms",
+    "act": "the MQTT topic PREFIX/DRIVE/act, which takes verbs",
+    "set": "the MQTT topics PREFIX/DRIVE/set/REGISTER, which take writes",
+    "available": "the MQTT topic PREFIX/DRIVE/available",
+    "told": "the MQTT topic PREFIX/DRIVE/told",
+    "event": "rows of events, such as comments",
+    ".": "this folder, in paths of files and URLs",
+    "..": "the folder above, in paths of files and URLs",
+    "__proto__": "a key of JavaScript's own, on the gateway's page",
+}
+
+
+def check_drive_name(name: str) -> bool:
+    """Return True for a valid name of a drive or a line. Raises ValueError for a reserved or invalid one."""
+    if name in RESERVED_NAMES:
+        raise ValueError(f'name "{name}" is reserved for {RESERVED_NAMES[name]}; give it another name')
+    if name.startswith("-"):
+        raise ValueError(f'name "{name}" begins with -, like the options of commands; give it another name')
+    return True
+
+
+def drive_meant(name: str, names: Iterable[str]) -> str:
+    """Return the listed name that `name` means.
+
+    That is `name` itself if it is listed, else the only listed name with the same Unicode normal form; else
+    return `name`. Use this only for stops and reads: a command that moves a motor must name it exactly.
+    """
+    names = [*names]
+    if name in names:
+        return name
+    alike = [one for one in names if normalize("NFC", one) == normalize("NFC", name)]
+    return alike[0] if len(alike) == 1 else name
