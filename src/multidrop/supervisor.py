@@ -70,7 +70,7 @@ class Supervisor:
         return [*self._watched]
 
     def keep(self, name: str, work: Coroutine[Any, Any, R]) -> asyncio.Task[R]:
-        """Start a permanent task, which must run until `release`; if it ends before, `dead` says why."""
+        """Start a permanent task, which must run until `release`. If it ends earlier, `dead` says why."""
         task = asyncio.get_running_loop().create_task(work, name=name)
         self.dead.pop(name, None)
         self._kept[name] = task
@@ -85,7 +85,7 @@ class Supervisor:
         self.note_dead(name, "it was cancelled" if task.cancelled() else reason_of(failure), failure)
 
     def let_go(self, name: str) -> asyncio.Task[Any] | None:
-        """Let a permanent task end from now on. Return the task; None if it has ended already."""
+        """Let a permanent task end without being reported. Return the task; None if it has already ended."""
         return self._kept.pop(name, None)
 
     async def release(self, *names: str) -> None:
@@ -98,7 +98,7 @@ class Supervisor:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     def start(self, name: str, work: Coroutine[Any, Any, R]) -> asyncio.Task[R]:
-        """Start a task that ends by itself. The failure is logged unless the task is awaited."""
+        """Start a task that ends by itself. Its failure is logged unless the task is awaited."""
         task = asyncio.get_running_loop().create_task(work, name=name)
         self._short.add(task)  # the event loop itself keeps only weak references to tasks
         task.add_done_callback(self._short.discard)
@@ -167,12 +167,21 @@ class Supervisor:
             raise
         return future
 
+    def keep_thread(self, name: str, work: Callable[[], object]) -> None:
+        """Start a permanent thread. If the thread ends before `let_go`, `dead` says why."""
+        thread = self.thread(name, inf, work)
+
+        async def wait() -> None:
+            await asyncio.shield(thread)
+
+        self.keep(name, wait())
+
     async def within(self, name: str, limit_s: float, work: Callable[[], R], *, most: int = 4) -> R:
         """Return the result of work, which is done in its own thread.
 
         At most `most` calls with this name work concurrently; further calls wait. Raises Hung if the work
-        cannot start within `limit_s` seconds, or is not done `limit_s` seconds after its start. Once it is
-        done, earlier work with this name no longer counts as hanging, because the disk answers again.
+        cannot start within `limit_s` seconds, or is not done `limit_s` seconds after its start. When work is
+        done, earlier work with the same name no longer counts as hanging, because the disk answers again.
         """
         begin_by = monotonic() + limit_s
         while len(going := [future for future, one in self._works.items() if one.name == name]) >= most:
@@ -180,7 +189,7 @@ class Supervisor:
                 going, timeout=max(0.0, begin_by - monotonic()), return_when=asyncio.FIRST_COMPLETED
             )
             if monotonic() >= begin_by:
-                raise Hung(f"{name}: {most} others are not done; does the disk answer?")
+                raise Hung(f"{name}: {most} earlier tasks of this name are not done; does the disk answer?")
         before = [future for future, one in self._works.items() if one.name == name]
         future = self.thread(name, limit_s, work)
         await asyncio.wait([future], timeout=limit_s)
@@ -230,7 +239,7 @@ async def end_tasks(*tasks: asyncio.Task[Any]) -> list[Any]:
 
 
 def in_time(name: str, seconds: float, work: Callable[[], R]) -> R:
-    """Return the result of work done in a thread, without a loop. Raises Hung if it exceeds `seconds`."""
+    """Return the result of work done in a thread, without a loop. Raises Hung if that exceeds `seconds`."""
     ended: Future[R] = Future()
 
     def run() -> None:
@@ -243,18 +252,21 @@ def in_time(name: str, seconds: float, work: Callable[[], R]) -> R:
     try:
         return ended.result(seconds)
     except TimeoutError as late:
-        if ended.done():  # the work itself raised TimeoutError
+        if ended.done():  # not a timeout of the wait: the work itself raised TimeoutError
             raise
         raise Hung(f"{name}: not done within {seconds:g} s; does the disk answer?") from late
 
 
 def for_a_future(failure: BaseException) -> Exception:
-    """Return a failure that a future accepts: SystemExit would end the loop, StopIteration is refused."""
+    """Return `failure`, or a RuntimeError in its place if a future would not accept it.
+
+    SystemExit would end the loop, and a future refuses StopIteration.
+    """
     if isinstance(failure, Exception) and not isinstance(failure, StopIteration):
         return failure
     return RuntimeError(reason_of(failure))
 
 
 def reason_of(failure: BaseException | None) -> str:
-    """Return why a task or thread ended: the exception it raised, or None if it returned."""
+    """Return why a task or thread ended; `failure` is the exception it raised, or None if it returned."""
     return "it returned" if failure is None else f"{type(failure).__name__}: {failure}"

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from command_desks import Desks
+    from fleets import Desks
     from nats_clusters import Cluster
 
 HERE = Path(__file__).parent
 if not os.environ.get("CI") and not all(map(find_spec, ("nats", "nkeys", "pyarrow", "starlette"))):
-    collect_ignore_glob = ["*"]  # a library of the extra `fleet` is missing; in CI that is an error
+    collect_ignore_glob = ["*"]  # the extra `fleet` is not installed; in CI this is an error
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -83,7 +83,7 @@ async def _init(servers: Cluster) -> None:
 @pytest.fixture
 def desk(tmp_path: Path) -> Iterator[Desks]:
     """Return the desks of a gateway with a simulated drive."""
-    from command_desks import desks
+    from fleets import desks
 
     with desks(tmp_path) as made:
         yield made

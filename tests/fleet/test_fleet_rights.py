@@ -117,7 +117,7 @@ async def refused(servers: SecuredCluster) -> set[Attempt]:
                 await client.publish(subject, b"{}")
             else:
                 await client.subscribe(subject)
-        for _ in range(2):  # the first flush's ping may overtake pending data; the second's cannot
+        for _ in range(2):  # the first flush may end before pending data is sent; the second cannot
             await client.flush()
         await client.close()
         for attempt, subject in mine.items():
@@ -219,7 +219,7 @@ def test_adding_a_gateway_keeps_all_existing_keys(tmp_path: Path) -> None:
     assert public_key(text("keys/gw-1.key").strip()) not in text("rights.conf")
     (tmp_path / "keys/hub.key").write_text("SUNKEN")
     before = {str(path): path.read_text() for path in tmp_path.rglob("*") if path.is_file()}
-    with pytest.raises(ValueError, match=r"hub\.key is damaged: remove it, and its user gets another key"):
+    with pytest.raises(ValueError, match=r"hub\.key is damaged: remove it, then its user gets a new key"):
         write_files(tmp_path, ["gw-3"], urls, None)
     assert {str(path): path.read_text() for path in tmp_path.rglob("*") if path.is_file()} == before
 
@@ -280,8 +280,8 @@ def test_an_invalid_rights_command_writes_no_file(
     assert not (tmp_path / "nats").exists()
 
 
-def test_only_a_denial_of_this_request_means_not_sent() -> None:
-    """Rights may be granted on an open connection, so an older denial says nothing about this request."""
+def test_a_request_counts_as_unsent_only_if_this_request_was_denied() -> None:
+    """Rights may change while a connection is open, so an earlier denial does not apply to this request."""
     denials = Denials()
     denied = Exception('nats: permissions violation for publish to "stop.line-1"')
     asyncio.run(denials.note(denied))

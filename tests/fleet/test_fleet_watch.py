@@ -21,10 +21,9 @@ from nats_clusters import Cluster
 from tables import table
 from terminals import on_terminal
 
-from multidrop.cli.fleet import look
-from multidrop.cli.fleet import watch as fleet_watch
-from multidrop.cli.fleet.screen import picture
+from multidrop.cli.fleet import views
 from multidrop.cli.fleet.tables import moment, move_table, size
+from multidrop.cli.fleet.views import picture
 from multidrop.fleet.overview import FleetWatch
 from multidrop.supervisor import Ended, supervisor
 
@@ -66,10 +65,10 @@ def test_the_screen_shows_gateways_lines_and_moves() -> None:
 
 
 @pytest.mark.long
-@table("height", range(1, 60))
+@table("height", [*range(1, 30), 59])
 def test_the_picture_fits_each_screen_height(height: int) -> None:
     for width in (20, 80, 200):
-        drawn(told(trouble="no server", lines=500), width, height)
+        drawn(told(trouble="no server", lines=100), width, height)
 
 
 def test_hidden_lines_are_counted_and_masterless_lines_come_first() -> None:
@@ -136,7 +135,7 @@ def test_no_table_head_is_shown_without_rows(height: int) -> None:
 
 
 def test_lines_of_a_silent_master_are_shown() -> None:
-    """While no gateway is alive, no session of a dead gateway is ended, so the records still name masters."""
+    """If all gateways are dead, none of them ends the others' sessions, so the records still name masters."""
     found = told(lines=12)
     assert "1 without a master\n" in drawn(found)
     found["lines"]["line-7"]["master"] = "gw-2"
@@ -156,8 +155,8 @@ def test_the_exit_status_is_1_if_a_line_has_no_living_master(
     async def seen(paths: object) -> dict[str, Any]:
         return told() | {"lines": {"line-1": line(master)}}
 
-    monkeypatch.setattr(look, "_seen", seen)
-    assert asyncio.run(look._status(Namespace(json=False), [])) == status
+    monkeypatch.setattr(views, "_seen", seen)
+    assert asyncio.run(views._print_status(Namespace(json=False), [])) == status
 
 
 def test_a_missing_gateway_and_a_lost_port_are_shown(
@@ -174,8 +173,8 @@ def test_a_missing_gateway_and_a_lost_port_are_shown(
         (gone, "gw-9 on pc-9 is missing: last seen 2025-11-24 16:00:00"),
         (lost, f"gw-1: line line-1: {why}"),
     ):
-        monkeypatch.setattr(look, "_seen", AsyncMock(return_value=found))
-        assert asyncio.run(look._status(Namespace(json=False), [])) == 1
+        monkeypatch.setattr(views, "_seen", AsyncMock(return_value=found))
+        assert asyncio.run(views._print_status(Namespace(json=False), [])) == 1
         assert sentence in capsys.readouterr().out.splitlines()
     assert "1 with a lost port" in drawn(lost)
     assert "gw-1: line line-2 cannot be opened from here; another gateway polls it" in drawn(lost)
@@ -234,7 +233,7 @@ class FailingView:
 async def test_after_a_failed_read_the_last_view_is_shown_with_its_age(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(fleet_watch, "EVERY_S", 0.02)
+    monkeypatch.setattr(views, "EVERY_S", 0.02)
     shown: list[dict[str, Any]] = []
     over = asyncio.Event()
 
@@ -243,7 +242,7 @@ async def test_after_a_failed_read_the_last_view_is_shown_with_its_age(
         if len(shown) == 3:
             over.set()
 
-    await fleet_watch.follow(FleetWatch(FailingView()), show, over)  # type: ignore[arg-type]
+    await views.follow(FleetWatch(FailingView()), show, over)  # type: ignore[arg-type]
     assert [one["trouble"] for one in shown] == [None, "no server", "no server"]
     assert shown[0]["age_s"] < shown[1]["age_s"] < shown[2]["age_s"]
 
@@ -253,7 +252,7 @@ async def test_watch_ends_when_the_task_of_its_connection_ends() -> None:
     supervisor().keep("path", asyncio.sleep(0)).cancel()
     watch: Any = FleetWatch(FailingView())  # type: ignore[arg-type]
     with pytest.raises(Ended, match="path has ended: it was cancelled"):
-        await fleet_watch.follow(watch, lambda told: None, asyncio.Event())
+        await views.follow(watch, lambda told: None, asyncio.Event())
 
 
 def test_without_a_terminal_watch_suggests_json(run: Run) -> None:

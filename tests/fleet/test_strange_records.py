@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,18 +15,21 @@ from nats.aio.msg import Msg
 from nats_clusters import Cluster, connected_path
 from tables import table
 
-from multidrop.fleet.errors import FleetError
-from multidrop.fleet.gateway import ask_gateway
+from multidrop.fleet.errors import FleetError, Unsure
+from multidrop.fleet.gateway import FleetGateway, ask_gateway
 from multidrop.fleet.leases import member as member_module
 from multidrop.fleet.leases.lease import boottime_ns
 from multidrop.fleet.leases.member import Member
 from multidrop.fleet.leases.rules import SECOND, USUAL
-from multidrop.fleet.servers import names
-from multidrop.fleet.servers.buckets import Bucket, LeaseBucket, ServerError
+from multidrop.fleet.samples import samples_stream
+from multidrop.fleet.servers import names, setup
+from multidrop.fleet.servers.buckets import Bucket, LeaseBucket, Record, ServerError
 from multidrop.fleet.servers.connections import ServerPath, paths_of
+from multidrop.fleet.servers.leaders import Cluster as Leaders
+from multidrop.fleet.servers.leaders import known_cluster, led_clusters
 from multidrop.fleet.servers.plant_store import store
 from multidrop.fleet.servers.record_shapes import LARGE, SMALL, parsed
-from multidrop.fleet.servers.setup import open_all
+from multidrop.fleet.servers.setup import check_buckets, open_all
 
 LEASE = {
     **dict.fromkeys(("session", "began", "pid"), 1),
@@ -67,7 +72,7 @@ def test_invalid_records_are_rejected(name: str) -> None:
     assert found.endswith(mistake)
 
 
-@pytest.mark.parametrize(
+@table(
     ("bucket", "key", "value"), [("lease_2", "gw-1", LEASE), ("own_0", "l", OWNER), ("plant", "line-1", LINE)]
 )
 def test_a_valid_record_may_have_further_fields(bucket: str, key: str, value: dict[str, Any]) -> None:
@@ -104,11 +109,11 @@ async def test_servers_reject_huge_records_and_rollup_headers(one: Cluster) -> N
         assert (await bucket.get("stays")).value == OWNER
 
 
-async def test_a_record_written_by_another_gateway_is_an_end(one: Cluster) -> None:
+async def test_a_lease_record_written_by_another_gateway_counts_as_an_end(one: Cluster) -> None:
     async with connected_path(one) as path:
         own, rogue = (LeaseBucket("lease_0", lambda: path, name) for name in ("gw-1", "gw-2"))
         revision = await own.put("gw-1", {**LEASE, "by": "me"}, 0)
-        assert (await rogue.get("gw-1")).value == LEASE  # no other user has written a record
+        assert (await rogue.get("gw-1")).value == LEASE  # without "by": gw-1 itself has written it
         await rogue.put("gw-1", {**LEASE, "session": 8, "ended": False}, revision)
         ended = {**LEASE, "session": 8, "ended": True, "by": "gw-2"}
         assert (await own.get("gw-1")).value == ended
@@ -116,7 +121,7 @@ async def test_a_record_written_by_another_gateway_is_an_end(one: Cluster) -> No
 
 
 @pytest.mark.long
-async def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_gateway_survives_invalid_records(one: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each bucket has an invalid record of each kind before the gateway starts, and gets more later."""
     monkeypatch.setattr(member_module, "SETTLE_S", 1.0)
 
@@ -145,7 +150,7 @@ async def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pyt
         await strew(path, "-again")
         await asyncio.wait([task], timeout=1.0)
         await until_polled(is_first=True)
-        for bucket in names.LEASES[:2]:  # our own records: losing them costs only a session
+        for bucket in names.LEASES[:2]:  # the gateway's own records: losing them ends only its session
             await path.request(f"$KV.{bucket}.gw-a.rogue", b"{")
         await until_polled(is_first=False)
         task.cancel()
@@ -155,8 +160,10 @@ async def test_no_gateway_ends_by_strange_records(one: Cluster, monkeypatch: pyt
 
 
 @pytest.mark.long
-async def test_an_early_end_by_another_counts_once_the_lease_has_expired(one: Cluster) -> None:
-    """The gateway may hang while its engine polls on: it cannot know that its session was ended."""
+async def test_an_early_end_written_by_another_gateway_counts_once_the_lease_has_expired(
+    one: Cluster,
+) -> None:
+    """The gateway may hang, and not notice the end of its session, while its engine continues to poll."""
     async with connected_path(one) as path:
         await store(Bucket(names.PLANT, lambda: path), {"line-1": LINE})
         hall, members, tasks = Hall(), {}, {}
@@ -222,7 +229,126 @@ async def test_an_invalid_gateway_state_is_reported(one: Cluster, answer: bytes,
 
 
 @pytest.mark.slow
-async def test_a_refusal_by_the_servers_is_one_sentence(one: Cluster, tmp_path: Path) -> None:
+async def test_a_refusal_by_the_servers_is_reported_in_one_sentence(one: Cluster, tmp_path: Path) -> None:
     async with connected_path(one) as path:
         with pytest.raises(ServerError, match="NATS refuses: "):
             await Bucket("nothing", lambda: path).get("gw-1")
+
+
+# ---- invalid answers instead of JetStream's: each is reported in one sentence, and ends no task ----
+
+
+STRANGE_ANSWERS = {
+    "nothing": b"",
+    "truncated": b'{"stream": "KV_own_0", "se',
+    "no text": b"\xff\xfe\x00",
+    "deep": b"[" * 500_000,
+    "a number of 10,000 digits": b'{"seq": ' + b"9" * 10_000 + b"}",
+    "a list": b"[1]",
+    "null": b"null",
+    "an error that is none": b'{"error": "no"}',
+    "an error that is a list": b'{"error": [1]}',
+}
+PARTS = {
+    "without a sequence": b"{}",
+    "a text for a sequence": b'{"seq": "one"}',
+    "a list for a sequence": b'{"seq": [1]}',
+    "a message that is none": b'{"message": 5, "seq": null}',
+    "a message of nothing": b'{"message": {}, "seq": null}',
+    "no base 64": b'{"message": {"subject": "$KV.own_0.a", "seq": 1, "data": "QUI", "hdrs": "QUI"}}',
+    "data of another kind": b'{"message": {"subject": "$KV.own_0.a", "seq": 1, "data": 5, "hdrs": 5}}',
+    "a sequence that is none": b'{"message": {"subject": "$KV.own_0.a", "seq": "x"}, "config": 5}',
+}
+CLUSTERS = {
+    "a text": b'{"cluster": "n1"}',
+    "a list": b'{"cluster": [1]}',
+    "null": b'{"cluster": null}',
+    "replicas that are a table": b'{"cluster": {"leader": "n1", "replicas": {"name": "n2"}}}',
+    "replicas that are texts": b'{"cluster": {"leader": "n1", "replicas": ["n2", "n3"]}}',
+    "a replica without a name": b'{"cluster": {"leader": "n1", "replicas": [{"current": true}]}}',
+    "a list for a time": b'{"cluster": {"leader": "n1", "replicas": [{"name": "n2", "active": [1]}]}}',
+}
+TIMES = {
+    "none": b"{}",
+    "a number": b'{"ts": 5}',
+    "a text that is none": b'{"ts": "now"}',
+    "the year one": b'{"ts": "0001-01-01T00:00:00"}',
+}
+
+
+class Liar:
+    """A path or connection that gives this answer to every request."""
+
+    url = "nats://liar"
+    server_name = "liar"
+
+    def __init__(self, answer: bytes) -> None:
+        self.answer = answer
+        self.asked: list[str] = []
+
+    async def request(self, subject: str, *_: Any, **__: Any) -> Any:
+        self.asked.append(subject)
+        return SimpleNamespace(data=self.answer)
+
+    async def request_all(self, requests: Sequence[Any]) -> list[bytes]:
+        return [self.answer for _ in requests]
+
+
+@pytest.mark.parametrize("name", [*STRANGE_ANSWERS, *PARTS])
+async def test_invalid_answers_leave_the_outcome_unknown_and_are_reported(name: str) -> None:
+    """Gateway, forwarder and hub retry after a FleetError. Any other exception would end them."""
+    path: Any = Liar({**STRANGE_ANSWERS, **PARTS}[name])
+    bucket = Bucket("own_0", lambda: path)
+    for request in (bucket.put("a", {}, 1), bucket.get("a")):
+        with pytest.raises(Unsure, match="the answer of NATS "):
+            await request
+    assert await bucket.put_all([Record("a", 1, {})]) == ([], set())
+    for request in (
+        samples_stream.about(path),
+        samples_stream.last_of(path, "samples.gw.log"),
+        samples_stream.publish(path, "samples.gw.log", b"", {}),
+    ):
+        with pytest.raises(FleetError, match="the answer of NATS "):
+            await request
+
+
+@pytest.mark.parametrize("name", CLUSTERS)
+async def test_invalid_cluster_states_are_reported_and_move_no_leader(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The gateway's tasks that read cluster states must not end."""
+    monkeypatch.setattr(setup, "WAIT_S", 0.0)  # do not wait for an election
+    path: Any = Liar(CLUSTERS[name])
+    with pytest.raises(FleetError, match="the answer of NATS about a bucket's servers is invalid"):
+        await check_buckets(path)
+    assert await known_cluster(path, names.OWNERS[0]) == Leaders()
+    assert await led_clusters(path) == {}
+    assert {subject.split(".KV_")[0] for subject in path.asked} == {"$JS.API.STREAM.INFO"}
+
+
+@pytest.mark.parametrize("name", TIMES)
+async def test_an_invalid_server_time_is_reported(name: str) -> None:
+    path: Any = Liar(TIMES[name])
+    with pytest.raises(Unsure, match="the answer of nats://liar about a bucket has no valid time stamp"):
+        await check_buckets(path)
+
+
+LONG = {**STATE, "trouble": "x" * 10**6, "troubles": {"hall": "y" * 10**6}}
+
+
+async def test_long_texts_of_a_gateway_s_state_are_cut_by_sender_and_receiver() -> None:
+    """NATS does not send an answer beyond its size limit, and the page shows the whole text of an answer."""
+    answers: list[bytes] = []
+
+    async def respond(data: bytes) -> None:
+        answers.append(data)
+
+    member = SimpleNamespace(lease=SimpleNamespace(session=1))
+    gateway: Any = SimpleNamespace(name="gw-1", member=member, state=lambda: LONG)
+    message: Any = SimpleNamespace(reply="_INBOX.a.b", subject="gateway.gw-1.state", respond=respond)
+    await FleetGateway._answer(gateway, message)
+    assert len(answers[0]) < 2000
+    path: Any = Liar(json.dumps(LONG).encode())
+    found = await ask_gateway(path, "gw-1", "state")
+    assert found["troubles"] == {"hall": "y" * 300}
+    assert len(json.dumps(found)) < 2000

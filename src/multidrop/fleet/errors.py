@@ -13,7 +13,7 @@ from multidrop.printable import masked
 
 
 class FleetError(OSError):
-    """The fleet's servers cannot be used. The message says why, in one sentence."""
+    """The fleet's servers cannot be used. The error's message says why, in one sentence."""
 
 
 class TooOld(FleetError):
@@ -49,15 +49,9 @@ class Conflict(Exception):
 
 
 MOST_DENIALS = 1000
-REFUSALS = (  # part of a client's error message, and the sentence that users see
-    (
-        "authorization violation",
-        "{} refuses these credentials, or the lack of any: see --credentials",
-    ),
-    (
-        "certificate_verify_failed",
-        "the certificate of {} is not trusted ({why}); name its issuer with --ca",
-    ),
+REFUSALS = (  # a part of nats-py's error message, and the sentence that users see instead of it
+    ("authorization violation", "{} refuses these credentials, or the lack of any: see --credentials"),
+    ("certificate_verify_failed", "the certificate of {} is not trusted ({why}); name its issuer with --ca"),
     (
         "[ssl",
         "{} does not start with TLS, which these options require: set `handshake_first: true` in its tls "
@@ -83,7 +77,7 @@ def failure_to_connect(url: str, failure: BaseException) -> FleetError:
 
 
 def _words(text: str) -> str:
-    """Return an error's text without its numbers; for asyncio's connection errors, the system's texts."""
+    """Return an error's text without "[Errno ...]"; for failed connects, only the system's own texts."""
     numbers = dict.fromkeys(re.findall(r"\[Errno (\d+)\] Connect call failed", text))
     if numbers:
         return ", ".join(os.strerror(int(number)) for number in numbers)
@@ -94,7 +88,8 @@ class Denials:
     """Counts the server's denials on one connection, by subject, and logs each denied subject once."""
 
     def __init__(self) -> None:
-        self._said: Counter[tuple[str, str]] = Counter()  # number of denials by kind and subject
+        # number of denials by kind ("publish" or "subscription") and subject
+        self._said: Counter[tuple[str, str]] = Counter()
         self._raised = ""  # the subject whose denied subscription is raised instead of logged
 
     async def note(self, failure: Exception) -> None:

@@ -18,27 +18,26 @@ from multidrop.fleet.commands.held_lines import HeldLines
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects
 from multidrop.fleet.errors import FleetError, NoRight
-from multidrop.fleet.leases.life_lock import LifeLock
+from multidrop.fleet.leases.lease import LifeLock
 from multidrop.fleet.leases.member import Member
 from multidrop.fleet.leases.rules import SECOND, USUAL
 from multidrop.fleet.lines.fleet_lines import FleetLines
 from multidrop.fleet.lines.line_keeper import SILENT_S
 from multidrop.fleet.lines.moves import MOST_REPORTED
 from multidrop.fleet.samples.forwarder import Forwarder
-from multidrop.fleet.samples.polled_units import PolledUnits
 from multidrop.fleet.samples.samples_stream import samples_path
-from multidrop.fleet.samples.spool import Spool
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.connections import ServerPath, paths_of
-from multidrop.fleet.servers.record_shapes import misshapen
+from multidrop.fleet.servers.record_shapes import misshapen, with_short_texts
 from multidrop.fleet.servers.setup import check_buckets, open_all
+from multidrop.samples import PolledUnits, Spool
 from multidrop.supervisor import Ended, end_tasks, supervisor
 
 SPOOL_BYTES = 10_000_000_000
 STATE = {"state": str, "lines": int, "margin_s": float, "trouble": str, "troubles": dict, "spool": dict}
 SPOOL = {"bytes": int, "lost": int, "behind": int | None, "lag_s": float | None, "trouble": str | None}
 FORWARD_S = 10.0  # time limit at shutdown for forwarding samples; the rest is forwarded after the next start
-IN_TROUBLE_S = 3.0  # the same time limit if the samples' stream has a problem
+IN_TROUBLE_S = 3.0  # time limit for forwarding samples at shutdown, if the samples' stream has a problem
 SYNC_S = 3.0  # time limit at shutdown for writing the last rows to the disk
 ENDING_S = 0.05
 LOOK_S = 0.2  # pause between checks of the threads
@@ -73,7 +72,7 @@ class FleetGateway:
         self.spool = Spool(folder / "spool", name, most=spool_bytes, units=units)
         self.lines = FleetLines(self.mastership, folder, units)
         held = HeldLines(
-            self.lines.poller,
+            self.lines.poller.bus,
             may_command=lambda line: self.member.keeper.may_command(line),  # `self.member` is created below
             may_stop=lambda line: self.member.keeper.may_stop(line),
         )
@@ -81,10 +80,7 @@ class FleetGateway:
         self.log.open()
         self.commands = CommandSubjects(name, self.paths, held, self.log)
         commanded = CommandedLines(self.lines, self.commands, lambda: self.member.lease.left_s > SILENT_S)
-        self.member = Member(
-            *(name, self.paths, commanded, self.mastership),
-            lock=self.lock,
-        )
+        self.member = Member(*(name, self.paths, commanded, self.mastership), lock=self.lock)
         self.forwarder: Forwarder | None = None
         self._end = asyncio.Event()
 
@@ -92,8 +88,8 @@ class FleetGateway:
         """Poll and forward until `end` is called; then close all lines, and forward the remaining samples.
 
         Raises FleetError if no server answers, or if the fleet was not set up. Raises Ended if polling has
-        failed, or if a task or thread ended that must run as long as the gateway. Ended is raised after an
-        orderly shutdown, so other gateways take over the lines.
+        failed, or if a task or thread that the gateway needs has ended. Ended is raised after an orderly
+        shutdown, so other gateways take over the lines.
         """
         try:
             await open_all(self.paths)
@@ -122,7 +118,8 @@ class FleetGateway:
                 self.member.end()  # no effect if `end` was called already
                 await asyncio.wait([member])
                 await end_tasks(looking)
-                with suppress(Ended, PollingFailed, asyncio.CancelledError):  # the supervisor reports them
+                # the supervisor reports these exceptions
+                with suppress(Ended, PollingFailed, asyncio.CancelledError):
                     member.result()
                 with suppress(PollingFailed):
                     await self.lines.close()
@@ -133,13 +130,16 @@ class FleetGateway:
             await end_tasks(forwarding)
 
     async def _until_the_end(self) -> None:
-        """Wait until `end` is called; return early if a task or thread has ended that must not."""
+        """Wait until `end` is called; return early if a task or thread that the gateway needs has ended."""
         waits = [asyncio.ensure_future(one.wait()) for one in (self._end, supervisor().has_dead)]
         await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
         await end_tasks(*waits)
 
     async def _look(self) -> None:
-        """Check repeatedly for ended threads; report failed polling to the supervisor, and return."""
+        """Check repeatedly for ended threads.
+
+        If polling has failed, report that to the supervisor, and return.
+        """
         while True:
             supervisor().look()
             if failure := self.lines.poller.failure:
@@ -173,14 +173,17 @@ class FleetGateway:
     # ---- requests ----
 
     async def _answer(self, message: Msg) -> None:
-        """Answer a request about this gateway, unless it has no session: a namesake may have one."""
+        """Answer a request about this gateway.
+
+        Without a session, ignore the request: another gateway of this name may have one.
+        """
         if not self.member.lease.session or not names.is_inbox(message.reply):
             return
         if message.subject == names.gateway_subject(self.name, "drain"):
             self.member.drain()
             _log.warning("%s: draining: all lines go to other gateways", self.name)
         with suppress(Exception):  # the requester may have disconnected
-            await message.respond(json.dumps(self.state()).encode())
+            await message.respond(json.dumps(with_short_texts(self.state())).encode())
 
     def state(self) -> dict[str, Any]:
         """Return the state that `multidrop fleet status` shows."""
@@ -227,7 +230,7 @@ async def ask_gateway(path: ServerPath, gateway: str, wanted: str) -> dict[str, 
             f"no gateway called {gateway} answers; `multidrop fleet status` lists them"
         ) from None
     try:
-        found: dict[str, Any] = json.loads(message.data)
+        found: dict[str, Any] = with_short_texts(json.loads(message.data))
     except (ValueError, RecursionError):
         found = {}
     if mistake := misshapen(found, STATE) or misshapen(found["spool"], SPOOL):

@@ -1,8 +1,8 @@
 """Metrics of a fleet's gateway: its state as OpenMetrics, and the HTTP port that serves it on this computer.
 
 A figure that is unknown, such as the lease's remaining time when there is no lease, has no sample. Every
-client that can connect can read the metrics, so the port listens only on loopback addresses. It also checks
-the `Host` header, so that a web page whose name resolves to this computer cannot read the metrics.
+client that can connect can read the metrics, so the port listens only on loopback addresses. The port also
+checks the `Host` header, so that a web page whose name resolves to this computer cannot read the metrics.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 from multidrop.exposition import MetricFamily, expose_metrics
 from multidrop.fleet.leases.member import MemberState
+from multidrop.toml_check import parse_address
 
 
 class _Figure(NamedTuple):
@@ -36,16 +37,21 @@ _FIGURES = (
     _Figure("spool_waiting_rows", "gauge", "Rows in memory, not yet on the disk.", ("spool", "waiting")),
     _Figure("spool_rows", "counter", "Rows that reached the disk.", ("spool", "rows")),
     _Figure(
-        "spool_lost_rows", "counter", "Rows that never reached it, or were removed unsent.", ("spool", "lost")
+        "spool_lost_rows",
+        "counter",
+        "Rows that never reached the disk, or were removed unsent.",
+        ("spool", "lost"),
     ),
     _Figure("sent_messages", "counter", "Messages that the servers stored.", ("spool", "sent")),
     _Figure("behind_messages", "gauge", "Messages that the servers lack.", ("spool", "behind")),
-    _Figure("behind_seconds", "gauge", "Age of the oldest message that they lack.", ("spool", "lag_s")),
+    _Figure(
+        "behind_seconds", "gauge", "Age of the oldest message that the servers lack.", ("spool", "lag_s")
+    ),
 )
 _LINES = {
-    "lost": "Lines of its own that are not polled because their port is lost.",
+    "lost": "The gateway's lines that are not polled because their port is lost.",
     "failing": "Lines on which polling raised an exception and is retried.",
-    "unopened": "Lines that others should take because it cannot open their ports.",
+    "unopened": "Lines that other gateways should take, because this one cannot open their ports.",
 }
 _SUFFIXES = {"gauge": "", "counter": "_total"}
 _PREFIX = "multidrop_fleet_"
@@ -66,8 +72,7 @@ def families_of(state: Mapping[str, Any], version: str) -> Iterator[MetricFamily
     yield _family("servers", "gauge", "Servers that its three connections use.", servers)
     yield _family("troubled_lines", "gauge", "Lines that cannot be opened, or fail.", len(state["troubles"]))
     for key, text in _LINES.items():
-        if key in state:  # gateways of earlier versions do not report every figure
-            yield _family(f"{key}_lines", "gauge", text, len(state[key]))
+        yield _family(f"{key}_lines", "gauge", text, len(state[key]))
     for figure in _FIGURES:
         value: Any = state
         for key in figure.keys:
@@ -92,18 +97,15 @@ _log = logging.getLogger("multidrop.fleet")
 Metrics = Callable[[], Iterable[MetricFamily]]
 
 
-def parse_address(text: str) -> tuple[str, int]:
+def local_address(text: str) -> tuple[str, int]:
     """Return host and port. Raises ValueError if they are invalid, or if other computers can reach them."""
-    host, _, port = text.rpartition(":")
-    host = host.removeprefix("[").removesuffix("]")
-    if not host or not re.fullmatch(r"[0-9]{1,5}", port) or int(port) > 65535:
-        raise ValueError(f"--metrics {text!r} is not an address and port; write --metrics {EXAMPLE}")
+    host, port = parse_address(text, f"--metrics {EXAMPLE}")
     if not _is_loopback(host):
         raise ValueError(
             f"--metrics {text} is open to other machines, without tokens or TLS: listen "
             f"on {EXAMPLE}, and put a proxy with TLS in front"
         )
-    return host, int(port)
+    return host, port
 
 
 def _is_loopback(host: str) -> bool:
@@ -118,7 +120,7 @@ def listen(text: str) -> socket.socket:
 
     Raises ValueError for an invalid address, OSError if the port is in use.
     """
-    address = parse_address(text)
+    address = local_address(text)
     try:
         family, *_, where = socket.getaddrinfo(*address, type=socket.SOCK_STREAM)[0]
         return socket.create_server(where[:2], family=family)

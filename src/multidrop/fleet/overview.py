@@ -15,6 +15,7 @@ from multidrop.fleet.leases.observer import BELIEVING
 from multidrop.fleet.lines.moves import move_of
 from multidrop.fleet.lines.ownership import owner_of
 from multidrop.fleet.lines.records import FleetRecords
+from multidrop.fleet.servers.buckets import Record
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.setup import check_buckets
 from multidrop.printable import masked
@@ -43,7 +44,7 @@ class FleetView:
     async def look(self) -> None:
         """Read the records and ask the gateways. Raises FleetError if no server returns the records."""
         if not self._path.is_open:
-            raise FleetError(f"no NATS server is reached at {', '.join(self._path.urls)}")
+            raise FleetError(f"no NATS server can be reached at {', '.join(self._path.urls)}")
         if not self._is_checked:
             await self.check()
         await self._records.look()
@@ -59,13 +60,17 @@ class FleetView:
             return await ask_gateway(self._path, gateway, "state")
         return None
 
+    def line_records(self) -> dict[str, Record]:
+        """Return the record of each line of the plant."""
+        return {name: self._records.plant.records[name] for name in self._records.lines()}
+
     def fleet(self) -> dict[str, Any]:
         """Return living and missing gateways, lines with their masters, and the last moves.
 
         A dead gateway is listed as living until another one has ended its session. If a gateway does not
-        answer, its `says` is None. Its `unseen_s` is the time since its last renewal was seen, in s. Once its
-        session is ended, a gateway is listed as missing until it runs again. `seen_ms` is then the time of
-        its last renewal (UTC).
+        answer, its `says` is None. `unseen_s` is the time in s since a renewal of its lease was last
+        seen. Once its session is ended, a gateway is listed as missing until it runs again. Its `seen_ms`
+        is then the time of its last renewal (UTC).
         """
         sessions = self._records.observer.sessions()
         lines = self._lines(sessions)
@@ -93,7 +98,7 @@ class FleetView:
 
     def _lines(self, sessions: Container[str]) -> dict[str, Any]:
         observer, plant = self._records.observer, self._records.plant.records
-        held: dict[tuple[str, int], bool] = {}  # whether an owner's session lasts (cached)
+        held: dict[tuple[str, int], bool] = {}  # by owner: is its session still alive (cached)
         found: dict[str, Any] = {}
         for name in self._records.lines():
             record = self._records.owner(name)
@@ -147,6 +152,10 @@ class FleetWatch:
     def age_s(self) -> float | None:
         """Return how old the newest view is; None if there is none yet."""
         return None if self._looked is None else round(self._clock() - self._looked, 3)
+
+    def lines(self) -> dict[str, Record]:
+        """Return the record of each line of the plant."""
+        return self._view.line_records()
 
     def state(self) -> dict[str, Any]:
         """Return the view of the fleet that `fleet watch --json` prints and the gateway's page shows."""

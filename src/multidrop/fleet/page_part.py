@@ -1,21 +1,26 @@
 """The part `fleet` of `multidrop serve`: shows a fleet on the page, and can stop it with a commander's key.
 
+If the plant file has no lines, the part also has a `source`: the gateway gets the fleet's lines and rows
+from it.
+
 `multidrop.gateway` imports this module by its name, as it imports its other parts.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from multidrop.printable import masked
 from multidrop.supervisor import end_tasks
 
 if TYPE_CHECKING:
+    from multidrop import Plant
     from multidrop.fleet.commands.fleet_commands import FleetCommands
+    from multidrop.fleet.followed import FollowedFleet
     from multidrop.fleet.overview import FleetWatch
     from multidrop.fleet.servers.connections import ServerPath
 
@@ -23,19 +28,28 @@ EXAMPLE = "nats://127.0.0.1:4222"
 OLD_S = 5.0  # an older view of the fleet makes the part unhealthy
 AGAIN_S = 1.0  # pause between attempts to connect as a commander
 LOG = "fleet-commands.jsonl"
+WHOLE = "the fleet"  # name for all drives in the answer to a stop
+NO_COMMANDER = (
+    "the stop was NOT sent: [serve.fleet] has no commander; use `multidrop fleet stop` or the hard-wired stop"
+)
 
 
 @dataclass(frozen=True)
 class FleetSettings:
     """The table `[serve.fleet]`: the URLs of the fleet's servers, and the same files as for `fleet watch`.
 
-    `commander` is the file with a commander's key. With it, the page can stop the whole fleet.
+    `commander` is the file with a commander's key. With it, the page can stop the whole fleet. `samples` is
+    the file with a hub's key, for a plant file without lines.
     """
 
-    nats: tuple[str, ...] = (EXAMPLE,)
+    nats: tuple[str, ...] = field(
+        default=(EXAMPLE,), metadata={"items": {"type": "string", "pattern": "^(nats|tls)://"}}
+    )
     credentials: str = ""
     commander: str = ""
+    samples: str = ""
     ca: str = ""
+    libraries: ClassVar[tuple[str, ...]] = ("nats",)  # imported when the part is built
 
     def __post_init__(self) -> None:
         wrong = [
@@ -58,8 +72,13 @@ class FleetPart:
     """
 
     def __init__(
-        self, path: ServerPath, watch: FleetWatch, command: Callable[[], FleetCommands] | None = None
+        self,
+        path: ServerPath,
+        watch: FleetWatch,
+        command: Callable[[], FleetCommands] | None = None,
+        source: FollowedFleet | None = None,
     ) -> None:
+        self.source = source
         self._path = path
         self._watch = watch
         self._command = command
@@ -72,13 +91,16 @@ class FleetPart:
         return self._command is not None
 
     def take(self, batch: object) -> None:
-        """Ignore the batch: its rows are from the gateway's own lines, not from the fleet."""
+        """Ignore the batch: its rows are from the gateway's own lines, or from `source`."""
 
     async def run(self) -> None:
         works = [self._path.keep(), self._watch.run()]
         if self._command is not None:
             works.append(self._keep_commander(self._command))
-        tasks = [asyncio.create_task(work) for work in works]
+        if self.source is not None:
+            works += self.source.works()
+        names = [f"fleet: {getattr(work, '__qualname__', '')}" for work in works]
+        tasks = [asyncio.create_task(work, name=name) for work, name in zip(works, names, strict=True)]
         try:
             ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in ended:
@@ -98,27 +120,35 @@ class FleetPart:
                 self._commands = None
             await asyncio.sleep(AGAIN_S)
 
-    async def stop(self, by: str) -> Mapping[str, tuple[bool, str]]:
-        """Stop all drives of the fleet; return for each drive whether it is stopped, and a sentence."""
+    async def stop(self, by: str, drives: Sequence[str] | None = None) -> Mapping[str, tuple[bool, str]]:
+        """Stop these drives, or all drives of the fleet if None.
+
+        Return for each drive whether it is stopped, and a sentence. A failure that concerns all drives
+        has the key "the fleet".
+        """
+        if not self.can_stop:
+            return {WHOLE: (False, NO_COMMANDER)}
         try:
             if self._commands is None:
                 raise ConnectionError(f"the stop was NOT sent: {self._why}; use the hard-wired stop")
-            answer = await self._commands.stop(by=by)
+            answer = await self._commands.stop(drives, by=by)
         except (OSError, ValueError) as failure:
-            return {"the fleet": (False, masked(str(failure)))}
+            return {WHOLE: (False, masked(str(failure)))}
         found = {name: (one.ok, one.text) for name, one in answer.drives.items()}
-        if not found or not answer.ok:  # the answer for a line without a master lists no drives
-            found["the fleet"] = answer.ok, answer.text
+        if not found or not answer.ok:  # if the line has no master, the answer lists no drives
+            found[WHOLE] = answer.ok, answer.text
         return found
 
     async def close(self) -> None:
         await self._path.close()
+        if self.source is not None:
+            await self.source.path.close()
 
     def health(self) -> str:
         """Return why the fleet's state is unknown; "" if it is known."""
         age = self._watch.age_s
         if age is not None and age <= OLD_S:
-            return ""
+            return self.source.health() if self.source is not None else ""
         seen = "it was never read" if age is None else f"it was read {age:.0f} s ago"
         return f"{seen}: {self._watch.trouble or 'the first read is in progress'}"
 
@@ -131,6 +161,7 @@ class HasFolder(Protocol):
     """The attributes of the gateway's PartContext that this part uses."""
 
     folder: Path  # base of relative file names
+    plant: Plant
 
 
 def build(settings: FleetSettings, inside: HasFolder) -> FleetPart:
@@ -149,7 +180,15 @@ def build(settings: FleetSettings, inside: HasFolder) -> FleetPart:
 
     path = ServerPath(settings.nats, options(settings.credentials))
     watch = FleetWatch(FleetView(path))
+    source = None
+    if not inside.plant.lines:
+        from multidrop.fleet.followed import FollowedFleet  # needs pyarrow
+
+        key_of_samples = options(settings.samples or settings.credentials)
+        source = FollowedFleet(ServerPath(settings.nats, key_of_samples), watch)
     if not settings.commander:
-        return FleetPart(path, watch)
+        return FleetPart(path, watch, source=source)
     key, log = options(settings.commander), inside.folder / LOG
-    return FleetPart(path, watch, lambda: FleetCommands(settings.nats, by="page", log=log, options=key))
+    return FleetPart(
+        path, watch, lambda: FleetCommands(settings.nats, by="page", log=log, options=key), source
+    )

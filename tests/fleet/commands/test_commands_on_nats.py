@@ -1,4 +1,4 @@
-"""Commands on real servers: delivered on three paths, and carried out once, only by the present master."""
+"""Commands on real servers: they arrive on three paths, and only the master carries them out, once."""
 
 from __future__ import annotations
 
@@ -10,19 +10,24 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from command_desks import LINE, MAY, Desks, desks
 from command_drills import CommandDrill, command_drill
+from fleets import LINE, MAY, Desks, desks
+from nats.aio.client import Client
+from nats.errors import NoRespondersError
+from nats.errors import TimeoutError as NatsTimeout
 from nats_clusters import Cluster
+from secured_clusters import GATEWAYS, SecuredCluster, secured_cluster
 
+from multidrop.fleet.commands import fleet_commands
 from multidrop.fleet.commands.fleet_commands import FleetCommands
 from multidrop.fleet.commands.messages import CommandOutcome, Offered
 from multidrop.fleet.commands.subjects import CommandSubjects
 from multidrop.fleet.errors import NobodyThere, Unsure
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Bucket
-from multidrop.fleet.servers.connections import ServerPath, paths_of
+from multidrop.fleet.servers.connections import ServerPath, connect, paths_of
 from multidrop.fleet.servers.plant_store import store
-from multidrop.fleet.servers.setup import open_all
+from multidrop.fleet.servers.setup import open_all, set_up
 from multidrop.supervisor import supervisor
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
@@ -131,7 +136,11 @@ def test_a_command_received_on_three_paths_is_sent_once(tell: Callable[[Story], 
     tell(story)
 
 
-def test_without_a_master_a_command_is_reported_as_not_sent(tell: Callable[[Story], None]) -> None:
+def test_without_a_master_a_command_is_reported_as_not_sent(
+    tell: Callable[[Story], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fleet_commands, "NO_MASTER_S", 0.5)
+
     async def story(fleet: Fleet) -> None:
         await fleet.one.open()
         await fleet.one.shut()
@@ -166,7 +175,7 @@ async def _is_unheard(path: ServerPath, subject: str) -> bool:
 
 
 async def _died(fleet: Fleet) -> None:
-    """Kill the first gateway, wait until all servers know that, and open the line on the other gateway."""
+    """Kill the first gateway, wait until all servers have noticed, and open the line on the other gateway."""
     await fleet.one.die()
     async with asyncio.timeout(PATIENCE_S):
         for path in fleet.asker._paths:
@@ -306,7 +315,90 @@ def test_the_fleet_command_line_writes_and_stops(drill: CommandDrill) -> None:
 def test_commands_are_carried_out_once_and_answers_are_true(drill: CommandDrill) -> None:
     """`python -m bench.questions.fleet_commands --commands 6000` is the long version."""
     before = {drive: drill.setpoints(drive) for drive in drill.sims}
-    found = asyncio.run(drill.ask(120, 15.0))
+    found = asyncio.run(drill.ask(80, 10.0))
     assert (found.twice, found.wrongly, found.unnoted) == (0, 0, 0)
     assert found.deeds
     assert sum((drill.setpoints(drive) - before[drive]).total() for drive in drill.sims) > 0
+
+
+# ---- commands under the rights that `fleet rights` writes: a commander may send them, a viewer may not ----
+
+
+PLANT = {LINE: {"line": {"name": LINE, "drive": [{"name": "pump"}]}, "files": {}, "may": MAY}}
+
+
+@pytest.fixture(scope="module")
+def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecuredCluster]:
+    with secured_cluster(tmp_path_factory.mktemp("secured")) as running:
+        yield running
+
+
+@asynccontextmanager
+async def commanded(servers: SecuredCluster, made: Desks) -> AsyncIterator[CommandSubjects]:
+    """Subscribe to commands with the rights of a gateway."""
+    operator = paths_of(servers.urls, servers.options("operator"))
+    await set_up(operator)
+    await store(Bucket(names.PLANT, lambda: operator[0]), PLANT)
+    gateway = GATEWAYS[0]
+    paths = paths_of(servers.urls, servers.options(gateway))
+    subjects = CommandSubjects(gateway, paths, made.lines, made.log)
+    try:
+        await open_all(paths)
+        await subjects.begin()
+        subjects.open(LINE, PLANT[LINE])
+        await asyncio.gather(*supervisor().started)
+        yield subjects
+    finally:
+        for path in (*operator, *paths):
+            await path.close()
+
+
+def test_a_commander_may_command_and_a_viewer_may_not(servers: SecuredCluster, tmp_path: Path) -> None:
+    async def main(made: Desks) -> None:
+        async with commanded(servers, made):
+            for user, outcome in (("viewer", CommandOutcome.NOT_SENT), ("commander", CommandOutcome.DONE)):
+                log = tmp_path / f"{user}.jsonl"
+                async with FleetCommands(
+                    servers.urls, by=user, log=log, options=servers.options(user)
+                ) as asker:
+                    told = await asker.write("pump", "frequency", 20.0)
+                    assert told.outcome is outcome, told.text
+                    if outcome is CommandOutcome.NOT_SENT:
+                        assert f"do not allow to publish to cmd.{LINE}" in told.text
+                        assert made.writes == []
+                    stopped = await asker.stop()
+                    assert stopped.ok == told.ok, stopped.text
+            assert [name for name, _ in made.writes] == ["frequency", "control"]
+
+    with desks(tmp_path) as made:
+        asyncio.run(main(made))
+
+
+async def nobody_is_asked(asker: Client) -> bool:
+    """Return True if a server reports that no gateway subscribes to the line's commands."""
+    while True:
+        try:
+            await asker.request(names.command_subject(LINE), b"{}", 1.0)
+        except NoRespondersError:
+            return True
+        except NatsTimeout:
+            continue
+        return False
+
+
+def test_servers_report_a_line_without_gateway(servers: SecuredCluster, tmp_path: Path) -> None:
+    """Servers report this although commander and gateway are in different accounts."""
+
+    async def main(made: Desks) -> None:
+        async with commanded(servers, made) as subjects:
+            askers = [await connect(url, servers.options("commander")) for url in servers.urls]
+            assert not any([await nobody_is_asked(asker) for asker in askers])
+            subjects.shut(LINE)
+            await asyncio.gather(*supervisor().started)
+            assert all([await nobody_is_asked(asker) for asker in askers])
+            for asker in askers:
+                await asker.close()
+        assert made.writes == []
+
+    with desks(tmp_path) as made:
+        asyncio.run(asyncio.wait_for(main(made), PATIENCE_S))

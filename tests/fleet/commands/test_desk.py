@@ -5,21 +5,30 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Callable
+from functools import partial
+from math import inf
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
-from command_desks import LINE, PATIENCE_S, Desks, desks
 from examples import every_third
-from lines import patient
+from fleets import LINE, PATIENCE_S, Desks, desks
+from kills import BoundProcess
+from lines import PATIENCE, patient
 from tables import table
 
 from multidrop import InvtCHE, Stopped
 from multidrop.control import Seen, audit_log, read_audit
+from multidrop.control.commands import RepeatedStops, Results, begin_stops, stop_drive, stop_line
 from multidrop.fleet.commands import desk as desk_module
 from multidrop.fleet.commands.desk import MOST_WRITES
+from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.messages import (
     CommandAnswer,
     CommandOutcome,
@@ -38,14 +47,13 @@ DONE, REFUSED, NOT_SENT, UNKNOWN = (
 )
 SETPOINT = "frequency"
 
-pytestmark = patient  # writes are counted here, and a stop is repeated if its reply is late
-
 
 def setpoints(desk: Desks) -> list[int]:
     return [raw for name, raw in desk.writes if name == SETPOINT]
 
 
-def test_a_command_is_offered_then_done_and_logged_before_and_after(desk: Desks, tmp_path: Path) -> None:
+@patient
+def test_a_command_is_offered_carried_out_and_logged_before_and_after(desk: Desks, tmp_path: Path) -> None:
     token = desk.offered(20.0)
     assert desk.writes == []
     answer = asyncio.run(desk.do(token))
@@ -59,6 +67,7 @@ def test_a_command_is_offered_then_done_and_logged_before_and_after(desk: Desks,
     assert (frame["by"], frame["way"]) == ("anna", "fleet")
 
 
+@patient
 def test_a_duplicated_confirmation_is_carried_out_once_with_one_answer(desk: Desks) -> None:
     token = desk.offered()
 
@@ -72,12 +81,14 @@ def test_a_duplicated_confirmation_is_carried_out_once_with_one_answer(desk: Des
     assert setpoints(desk) == [2000]
 
 
+@patient
 def test_copies_of_a_request_get_the_same_offer(desk: Desks) -> None:
     same = {"id": "one", "register": SETPOINT, "value": 20.0}
     assert desk.offered(**same) == desk.offered(**same)
     assert desk.offered(**same) != desk.offered(**(same | {"id": "two"}))
 
 
+@patient
 @pytest.mark.parametrize(("seconds", "outcome"), [(0.5, DONE), (1.0, NOT_SENT), (60.0, NOT_SENT)])
 def test_a_late_confirmation_sends_nothing(desk: Desks, seconds: float, outcome: CommandOutcome) -> None:
     token = desk.offered()
@@ -88,50 +99,44 @@ def test_a_late_confirmation_sends_nothing(desk: Desks, seconds: float, outcome:
     assert ("s have passed since the offer" in answer.text) == (outcome is NOT_SENT)
 
 
-def test_a_command_delayed_in_its_thread_is_not_sent(tmp_path: Path) -> None:
-    """The bus waits only for the rest of the second until it must send."""
-    with desks(tmp_path, patience_s=0) as desk:
-        _is_held_up(desk)
-
-
-def _is_held_up(desk: Desks) -> None:
+def do_after(desk: Desks, deed: Callable[[], object], waited_s: float = 0.0) -> CommandAnswer:
+    """Let `waited_s` pass, then carry out an offer; its thread calls `deed` before it sends the command."""
     token = desk.offered()
     offer = desk.desk.offers.find(token)
     assert offer is not None
     work = offer.prepared.work
 
-    def held_up() -> CommandAnswer:
-        time.sleep(0.2)
+    def late() -> CommandAnswer:
+        deed()
         return work()
 
-    offer.prepared = offer.prepared._replace(work=held_up)
-    desk.clock.pass_s(0.95)
-    answer = asyncio.run(desk.do(token))
-    assert answer.outcome is NOT_SENT
-    assert "did not come within" in answer.text
-    assert desk.writes == []
+    offer.prepared = offer.prepared._replace(work=late)
+    desk.clock.pass_s(waited_s)
+    return asyncio.run(desk.do(token))
 
 
-def test_a_command_voided_by_a_stop_in_its_thread_is_not_sent(tmp_path: Path) -> None:
-    """The bus checks again right before it sends."""
-    with desks(tmp_path) as desk:
-        token = desk.offered()
-        offer = desk.desk.offers.find(token)
-        assert offer is not None
-        work = offer.prepared.work
-
-        def made_void() -> CommandAnswer:
-            desk.desk.offers.void(LINE, ["pump"], "a stop was called")
-            return work()
-
-        offer.prepared = offer.prepared._replace(work=made_void)
-        assert asyncio.run(desk.do(token)).outcome is NOT_SENT
+@patient
+def test_a_command_delayed_in_its_thread_is_not_sent(tmp_path: Path) -> None:
+    """The bus waits only for the rest of the second within which the command may be sent."""
+    with desks(tmp_path, patience_s=0) as desk:
+        answer = do_after(desk, lambda: time.sleep(0.2), waited_s=0.95)
+        assert answer.outcome is NOT_SENT
+        assert "did not come within" in answer.text
         assert desk.writes == []
 
 
+@patient
+def test_a_command_voided_by_a_stop_in_its_thread_is_not_sent(desk: Desks) -> None:
+    """The bus checks again, right before it sends, whether the command is void."""
+    answer = do_after(desk, lambda: desk.desk.offers.void(LINE, ["pump"], "a stop was called"))
+    assert answer.outcome is NOT_SENT
+    assert desk.writes == []
+
+
+@patient
 def test_a_command_is_on_the_disk_before_it_is_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with desks(tmp_path) as desk:
-        synced: list[tuple[int, int]] = []  # lines in the log, and writes received by the drive by then
+        synced: list[tuple[int, int]] = []  # per sync: lines in the log, writes to the drive
 
         def sync(file: int) -> None:
             os.fsync(file)
@@ -143,7 +148,7 @@ def test_a_command_is_on_the_disk_before_it_is_sent(tmp_path: Path, monkeypatch:
 
 
 def while_noted(desk: Desks, deed: Callable[[], object]) -> CommandAnswer:
-    """Call `deed` while a command's first record is being logged: the last moment before it is sent."""
+    """Call `deed` while a command's first record is logged, the last moment before the command is sent."""
 
     def before(record: dict[str, Any]) -> None:
         if record["step"] == "begun":
@@ -168,10 +173,11 @@ MEANWHILE: dict[str, Callable[[Desks], object]] = {
 }
 
 
+@patient
 @pytest.mark.parametrize("deed", MEANWHILE)
 @pytest.mark.parametrize("is_late", [False, True])
 def test_a_command_is_not_sent_after_a_change_since_its_offer(desk: Desks, deed: str, is_late: bool) -> None:
-    """The change comes before the confirmation, or between the confirmation and the sending."""
+    """The change comes before the confirmation, or between the confirmation and the write."""
     if is_late:
         answer = while_noted(desk, lambda: MEANWHILE[deed](desk))
     else:
@@ -182,6 +188,7 @@ def test_a_command_is_not_sent_after_a_change_since_its_offer(desk: Desks, deed:
     assert desk.writes == []
 
 
+@patient
 def test_a_stop_of_another_drive_does_not_void_the_offer(desk: Desks) -> None:
     token = desk.offered()
     desk.desk.offers.void(LINE, ["fan"], "a stop was called")
@@ -189,6 +196,7 @@ def test_a_stop_of_another_drive_does_not_void_the_offer(desk: Desks) -> None:
     assert asyncio.run(desk.do(token)).outcome is DONE
 
 
+@patient
 def test_a_restarted_master_rejects_earlier_tokens(desk: Desks, tmp_path: Path) -> None:
     token = desk.offered()
     with desks(tmp_path) as after:
@@ -198,8 +206,9 @@ def test_a_restarted_master_rejects_earlier_tokens(desk: Desks, tmp_path: Path) 
     assert desk.writes == []
 
 
+@patient
 def test_only_the_master_answers_commands_and_stops(desk: Desks) -> None:
-    """Another gateway may be the master, and the sender uses the first answer."""
+    """A gateway that is not the master stays silent, because the sender uses the first answer."""
     desk.is_master = False
     assert desk.ask(register=SETPOINT, value=20.0) is None
     assert asyncio.run(desk.stop()) is None
@@ -207,8 +216,9 @@ def test_only_the_master_answers_commands_and_stops(desk: Desks) -> None:
     assert isinstance(desk.ask(register=SETPOINT, value=20.0), Offered)
 
 
+@patient
 def test_a_command_waits_for_the_guard_and_a_stop_does_not(desk: Desks) -> None:
-    """A new master accepts only stops in its first second."""
+    """A new master accepts only stops until the guard time has passed."""
     desk.is_guarded = True
     assert desk.ask(register=SETPOINT, value=20.0) is None
     stopped = asyncio.run(desk.stop())
@@ -217,6 +227,7 @@ def test_a_command_waits_for_the_guard_and_a_stop_does_not(desk: Desks) -> None:
     assert desk.written == {"control"}
 
 
+@patient
 def test_asking_for_the_result_withdraws_the_offer(desk: Desks) -> None:
     token = desk.offered()
 
@@ -228,6 +239,7 @@ def test_asking_for_the_result_withdraws_the_offer(desk: Desks) -> None:
     assert desk.writes == []
 
 
+@patient
 def test_without_a_permission_list_only_stops_are_carried_out(tmp_path: Path) -> None:
     with desks(tmp_path, {}) as desk:
         for what in ({"register": SETPOINT, "value": 20.0}, {"verb": "start"}, {"verb": "emergency_stop"}):
@@ -242,7 +254,8 @@ def test_without_a_permission_list_only_stops_are_carried_out(tmp_path: Path) ->
         assert desk.written == {"control"}
 
 
-@pytest.mark.parametrize("may", ["all", [], {"write": "pump.frequency"}, {"write": [["pump.frequency"]]}])
+@patient
+@table("may", ["all", [], {"write": "pump.frequency"}, {"write": [["pump.frequency"]]}])
 def test_a_damaged_permission_list_allows_nothing(tmp_path: Path, may: Any) -> None:
     with desks(tmp_path, may) as desk:
         answer = desk.ask(register=SETPOINT, value=20.0)
@@ -250,6 +263,7 @@ def test_a_damaged_permission_list_allows_nothing(tmp_path: Path, may: Any) -> N
         assert answer.outcome is REFUSED
 
 
+@patient
 @pytest.mark.slow
 def test_a_start_runs_the_motor_and_a_stop_stops_it(desk: Desks) -> None:
     async def main() -> list[CommandOutcome]:
@@ -263,6 +277,7 @@ def test_a_start_runs_the_motor_and_a_stop_stops_it(desk: Desks) -> None:
     assert {"begun", "over"} == {note["step"] for note in desk.notes if note["what"] == "stop"}
 
 
+@patient
 @pytest.mark.slow
 def test_a_long_stop_reports_its_progress(desk: Desks) -> None:
     """The sender learns that the stop was sent long before the motor has stopped."""
@@ -290,11 +305,12 @@ LOSSES: dict[str, Callable[[Desks], object]] = {
 }
 
 
+@patient
 @pytest.mark.parametrize("loss", LOSSES)
 def test_a_gateway_that_loses_the_line_does_not_answer_its_stop(
     desk: Desks, monkeypatch: pytest.MonkeyPatch, loss: str
 ) -> None:
-    """The next master may have got a copy of the stop. If we are master again, we answer the next copy."""
+    """The next master may have a copy of the stop. A gateway that is master again answers the next copy."""
 
     def lost(seconds: float | None) -> dict[str, Stopped]:
         LOSSES[loss](desk)
@@ -302,7 +318,7 @@ def test_a_gateway_that_loses_the_line_does_not_answer_its_stop(
 
     same = {"id": "one", "drives": None}
     with monkeypatch.context() as patched:
-        patched.setattr(desk.bus(LINE), "stop_all", lost)
+        patched.setattr(desk.bus, "stop_all", lost)
         assert asyncio.run(desk.stop(**same)) is None
     desk.is_master = True
     desk.take()
@@ -312,6 +328,7 @@ def test_a_gateway_that_loses_the_line_does_not_answer_its_stop(
     assert desk.written == {"control"}
 
 
+@patient
 def test_copies_of_a_stop_are_sent_once_and_void_offers(desk: Desks) -> None:
     token = desk.offered()
 
@@ -331,6 +348,7 @@ def full_disk(record: Any) -> None:
     raise OSError(28, "No space left on device")
 
 
+@patient
 def test_a_full_disk_blocks_commands_but_not_stops(desk: Desks) -> None:
     token = desk.offered()
     desk.log.before = full_disk
@@ -343,6 +361,7 @@ def test_a_full_disk_blocks_commands_but_not_stops(desk: Desks) -> None:
     assert stopped.outcome is DONE
 
 
+@patient
 @pytest.mark.slow
 def test_concurrent_writes_on_a_line_are_limited(desk: Desks) -> None:
     async def main() -> list[CommandAnswer]:
@@ -402,8 +421,9 @@ HOSTILE = [
 ]
 
 
+@patient
 @table("data", HOSTILE, ids=range(len(HOSTILE)))
-def test_hostile_commands_are_refused_in_one_sentence(desk: Desks, data: bytes) -> None:
+def test_invalid_commands_are_each_refused_in_one_sentence(desk: Desks, data: bytes) -> None:
     answer = desk.desk.offer(LINE, data)
     assert isinstance(answer, CommandAnswer)
     assert answer.outcome is REFUSED
@@ -449,6 +469,7 @@ ODD_STOPS = [  # messages that any client may send, or that a network may damage
 ]
 
 
+@patient
 @pytest.mark.parametrize("data", every_third(ODD_STOPS))
 def test_a_malformed_stop_is_carried_out(
     desk: Desks,
@@ -472,6 +493,7 @@ def test_a_malformed_stop_is_carried_out(
     assert {frame["by"] for frame in read_audit(tmp_path / "audit.jsonl")} == {begun["by"]}
 
 
+@patient
 @pytest.mark.slow
 @table(
     ("first", "then"),
@@ -482,7 +504,7 @@ def test_a_malformed_stop_is_carried_out(
         ({"id": "one", "drives": ["fan"]}, {"id": "one", "drives": ["pump"]}),
     ],
 )
-def test_a_stop_with_another_id_is_another_stop(
+def test_a_request_with_another_id_is_a_new_stop(
     desk: Desks, first: dict[str, Any], then: dict[str, Any]
 ) -> None:
     asyncio.run(desk.stop_by(json.dumps(first).encode()))
@@ -491,6 +513,7 @@ def test_a_stop_with_another_id_is_another_stop(
     assert len(desk.writes) == before + 1
 
 
+@patient
 def test_a_stop_with_an_unknown_drive_stops_the_others(desk: Desks) -> None:
     answer = asyncio.run(desk.stop(drives=["pump", "fan"]))
     assert answer is not None
@@ -498,6 +521,7 @@ def test_a_stop_with_an_unknown_drive_stops_the_others(desk: Desks) -> None:
     assert {name: one.outcome for name, one in answer.drives.items()} == {"pump": DONE, "fan": REFUSED}
 
 
+@patient
 def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_path: Path) -> None:
     """Depending on the keyboard, a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
     fan, spelt = "L\u00fcfter", "Lu\u0308fter"
@@ -511,12 +535,14 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_p
         assert desk.writes == [("control", 0xC000)]
 
 
+@patient
 @table("data", [b"", b"[]", b'{"outcome": "maybe", "text": ""}', b'{"outcome": "done"}'])
 def test_a_sender_rejects_invalid_answers(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"is not|must be"):
         read_answer(data) if data.startswith((b"{", b"[")) else read_offer(data)
 
 
+@patient
 def test_a_command_to_a_drive_that_has_left_its_line_is_not_sent() -> None:
     drive = InvtCHE(1, name="mill", maximum_frequency=50)
     for request in (
@@ -528,9 +554,120 @@ def test_a_command_to_a_drive_that_has_left_its_line_is_not_sent() -> None:
         assert answer.text.startswith("mill is ")
 
 
-def test_an_offer_keeps_the_known_setpoint() -> None:
+@patient
+def test_an_offer_does_not_change_the_known_setpoint() -> None:
     """The offered command may never be sent. A changed setpoint would affect the next start."""
     drive = InvtCHE(1, name="mill", maximum_frequency=50)
     drive.commanded = 40.0
     prepare(drive, CommandRequest("1", "anna", "mill", verb="set_frequency", options={"hz": 10.0}))
     assert drive.commanded == 40.0
+
+
+# ---- the log of commands on disks that hang or fail, and after its thread was killed ----
+
+
+HANGING_LOG = """
+import asyncio, sys, threading
+from pathlib import Path
+from multidrop.fleet.commands import log as logs
+
+async def main():
+    log = logs.CommandLog(Path(sys.argv[1]))
+    log._add = lambda record, now_ns: threading.Event().wait()
+    asyncio.create_task(log.note({}))
+    await asyncio.sleep(0.05)
+    log.close()
+
+asyncio.run(main())
+"""
+HANGING_LINE = """
+import asyncio, sys, threading
+from pathlib import Path
+from multidrop.core import Mastership
+from multidrop.fleet.lines.fleet_lines import FleetLines
+from multidrop.samples.polled_units import PolledUnits
+
+async def main():
+    lines = FleetLines(Mastership(), Path(sys.argv[1]).parent, PolledUnits())
+    lines._take = lambda record: threading.Event().wait()
+    asyncio.create_task(lines.take("hall", {}))
+    await asyncio.sleep(0.05)
+    await lines.close()
+
+asyncio.run(main())
+"""
+
+
+async def test_a_killed_log_thread_blocks_commands_but_not_stops(tmp_path: Path) -> None:
+    with desks(tmp_path) as desk, patch.object(CommandLog, "_add", side_effect=SystemExit("killed")):
+        answer = await desk.do(desk.offered())
+        assert answer.outcome is NOT_SENT
+        assert answer.text.endswith("commands.jsonl: RuntimeError: SystemExit: killed")
+        assert desk.writes == []
+        stopped = await desk.stop()
+        assert stopped is not None
+        assert stopped.ok
+        assert desk.written == {"control"}
+
+
+async def test_log_records_keep_the_order_of_calls_and_none_follows_the_close(tmp_path: Path) -> None:
+    log = CommandLog(tmp_path / "commands.jsonl")
+    await asyncio.gather(*(log.note({"step": number}) for number in range(5)))
+    log.close()
+    with pytest.raises(OSError, match=r"commands\.jsonl is closed"):
+        await log.note({})
+    lines = (tmp_path / "commands.jsonl").read_text().splitlines()
+    assert [line.partition('"step": ')[2] for line in lines] == ["0}", "1}", "2}", "3}", "4}"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", [HANGING_LOG, HANGING_LINE], ids=["log", "line"])
+def test_a_hanging_disk_or_port_does_not_block_the_exit(tmp_path: Path, script: str) -> None:
+    words = [sys.executable, "-c", script, str(tmp_path / "commands.jsonl")]
+    with BoundProcess(words, stderr=subprocess.PIPE, text=True) as process:
+        _, errors = process.communicate(timeout=PATIENCE)
+        assert process.returncode == 0, errors
+
+
+# ---- stops of one silent drive: the gateway repeats one of the stops, and sends each of the others once ----
+
+
+@pytest.mark.slow
+def test_only_one_of_many_stops_of_a_silent_drive_is_repeated(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """For each call, a stop is sent after the call. All calls get the answer of the stop that is repeated."""
+    repeated: list[float | None] = []
+
+    are_all_called = threading.Event()
+
+    def noted(*details: Any, stop: Callable[..., Results]) -> Results:
+        repeated.append(details[-1])
+        if repeated[1:]:
+            are_all_called.wait(PATIENCE)
+        return stop(*details)
+
+    monkeypatch.setattr(desk_module, "stop_line", partial(noted, stop=stop_line))
+    monkeypatch.setattr(
+        RepeatedStops.__init__, "__defaults__", (partial(noted, stop=stop_drive), begin_stops)
+    )
+
+    async def stopped(desk: Desks) -> list[CommandAnswer | None]:
+        desk.sim.deaf_until = inf
+        called = [asyncio.create_task(desk.stop())]
+        async with asyncio.timeout(PATIENCE):
+            while not desk.lines.for_stop(LINE).bus.stops_under_way():  # type: ignore[union-attr]
+                await asyncio.sleep(0.002)
+            called += [asyncio.create_task(desk.stop()) for _ in range(8)]
+            while len(desk.stops._repeated._tasks) < 8:
+                await asyncio.sleep(0.002)
+            are_all_called.set()
+            while len(repeated) < 3 or desk.stops._repeated._sent:
+                await asyncio.sleep(0.002)
+        desk.sim.deaf_until = 0.0
+        return await asyncio.gather(*called)
+
+    with desks(tmp_path) as desk:
+        answers = asyncio.run(stopped(desk))
+    assert [answer.outcome for answer in answers if answer] == [CommandOutcome.DONE] * 9
+    assert repeated == [None, 0.0, 0.0]  # seven calls got the answer of the last of these three stops

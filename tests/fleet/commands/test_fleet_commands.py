@@ -1,4 +1,4 @@
-"""The sender of commands: each command is sent once, and its reported outcome is true."""
+"""The sender of commands sends each command only once, and reports its real outcome."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 from unittest.mock import patch
 
 import pytest
+from tables import table
 
 from multidrop.control import read_audit
 from multidrop.fleet.commands import fleet_commands as asker_module
@@ -60,11 +61,11 @@ class ScriptedPath:
         return Said(found if isinstance(found, bytes) else json.dumps(found).encode())
 
     async def close(self) -> None:
-        """Do nothing: the answers stay."""
+        """Do nothing, so that the same answers are given after the next connection."""
 
 
 class Plant:
-    """The plant's bucket, of which a test may make reads fail."""
+    """The plant's bucket. A test may let its reads fail."""
 
     def __init__(self, failure: FleetError | None = None) -> None:
         self._failure = failure
@@ -109,7 +110,7 @@ def write(asker: FleetCommands) -> Awaitable[CommandAnswer]:
 
 NOBODY, LOST, CUT = NobodyThere("nobody"), Unsure("no answer"), NotDelivered("no connection")
 NO_RIGHT = MayNotSend("no right")
-ANY = FleetError("no right")  # the gateway may have received the request
+ANY = FleetError("no right")  # after this error, the gateway may or may not have received the request
 UNDER_WAY, TAKEN_BACK, IT_IS_DONE = answer("under way"), answer("not sent"), answer("done")
 
 WRITES: dict[
@@ -194,7 +195,7 @@ STOPS: dict[str, tuple[ScriptedPath, CommandOutcome, str]] = {
 }
 
 
-@pytest.mark.parametrize("case", STOPS)
+@table("case", STOPS)
 def test_a_stop_is_sent_until_a_gateway_answers(tmp_path: Path, case: str) -> None:
     path, outcome, text = STOPS[case]
     told = asked(tmp_path, path, stop)
@@ -348,7 +349,7 @@ def test_a_stop_is_sent_whatever_the_senders_name(tmp_path: Path, by: Any, noted
 
     async def stopped(asker: FleetCommands) -> CommandAnswer:
         asker.by = by
-        return await asker.stop("pump-1")  # means ["pump-1"], although a text is a sequence too
+        return await asker.stop("pump-1")  # a single name, which must not be read as a sequence of letters
 
     assert asked(tmp_path, path, stopped).outcome is DONE
     assert path.asked == ["stop"]

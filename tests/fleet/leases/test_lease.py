@@ -13,15 +13,14 @@ from fleets import GatedBucket, HandClock, MemoryBucket, RecordingMastership
 from tables import table
 
 from multidrop.fleet.errors import FleetError, Unsure
-from multidrop.fleet.leases import life_lock
-from multidrop.fleet.leases.lease import Lease
-from multidrop.fleet.leases.life_lock import LifeLock
+from multidrop.fleet.leases import lease as leases
+from multidrop.fleet.leases.lease import Lease, LifeLock
 from multidrop.fleet.leases.observer import Observer
 from multidrop.fleet.leases.rules import SECOND, USUAL
 
 
 class Trial:
-    """Three buckets and a clock. Gateways are created by `lease` and `observer`."""
+    """Three buckets and a clock. `lease` and `observer` create gateways."""
 
     def __init__(self) -> None:
         self.clock = HandClock()
@@ -39,6 +38,15 @@ class Trial:
 
     def values(self, name: str = "a") -> list[Any]:
         return [bucket.records[name].value for bucket in self.buckets]
+
+    def store_ends(self, **more: int) -> None:
+        """Let another gateway end the session of gateway a on all paths."""
+        for bucket in self.buckets:
+            bucket.store("a", {**bucket.records["a"].value, **more, "ended": True, "by": "rogue"})
+
+    def pass_lease(self) -> None:
+        """Let the time of a lease pass."""
+        self.clock.pass_s(USUAL.lease / SECOND)
 
 
 async def renew(lease: Lease) -> None:
@@ -67,7 +75,7 @@ async def watched() -> tuple[Trial, Lease, Observer]:
     return trial, lease, observer
 
 
-async def test_a_session_starts_on_all_paths_and_counts_from_its_request() -> None:
+async def test_a_session_starts_on_all_paths_and_its_lease_counts_from_the_request() -> None:
     trial = Trial()
     for bucket in trial.buckets:
         bucket.before_put = lambda key: trial.clock.pass_s(0.25)  # the request takes 0.25 s
@@ -78,7 +86,7 @@ async def test_a_session_starts_on_all_paths_and_counts_from_its_request() -> No
     assert trial.masterships[0].until == lease.until
 
 
-async def test_a_renewal_counts_from_its_request() -> None:
+async def test_a_renewed_lease_counts_from_the_renewals_request() -> None:
     trial, lease = await begun()
     trial.clock.pass_s(1)
     sent = trial.clock.now
@@ -90,14 +98,14 @@ async def test_a_renewal_counts_from_its_request() -> None:
 
 
 async def test_an_unanswered_start_counts_only_after_its_renewal() -> None:
-    """It is unknown when the stored record was sent."""
+    """The answer was lost, so the lease does not know which of its requests stored the record."""
     trial = Trial()
     trial.buckets[2].loses_answers = True
     lease, began = trial.lease(), trial.clock.now
     assert await lease.try_to_begin()
     trial.buckets[2].loses_answers = False
     trial.clock.pass_s(1)
-    await lease.renew_once(2)  # finds the record that the unanswered start has stored
+    await lease.renew_once(2)  # reads the record that was stored at the unanswered start
     assert lease.held[2] is not None
     trial.clock.pass_s(0.5)
     await lease.renew_once(1)
@@ -106,7 +114,7 @@ async def test_an_unanswered_start_counts_only_after_its_renewal() -> None:
     assert lease.until == began + 1.5 * SECOND + USUAL.lease
 
 
-async def test_the_deadline_is_that_of_the_second_newest_renewal() -> None:
+async def test_the_lease_counts_from_the_second_newest_renewal_of_its_paths() -> None:
     trial, lease = await begun()
     began = trial.clock.now
     trial.clock.pass_s(1)
@@ -129,14 +137,14 @@ async def test_the_lease_survives_one_lost_path_but_not_two() -> None:
         trial.clock.pass_s(0.5)
         await renew(lease)
     assert not lease.is_valid
-    trial.buckets[1].is_down = False  # no other gateway has ended its record, so the session continues
+    trial.buckets[1].is_down = False  # no gateway has ended this path's record, so the session continues
     await renew(lease)
     assert lease.is_valid
     assert lease.session == 1
 
 
 def test_a_failed_renewal_is_retried_soon() -> None:
-    """The path is renewed as soon as its bucket has a leader."""
+    """The path is renewed as soon as its bucket has a leader again."""
 
     async def main() -> None:
         loop = asyncio.get_running_loop()
@@ -167,7 +175,7 @@ async def test_an_unanswered_renewal_does_not_extend_the_lease() -> None:
     trial.clock.pass_s(1)
     for _ in range(2):
         await renew(lease)
-        lease._extend()  # as after an answer on another path
+        lease._extend()  # called after the renewal of each path
         assert lease.until == until
     for bucket in trial.buckets:
         bucket.loses_answers = False
@@ -202,7 +210,9 @@ async def test_a_session_ends_despite_renewals_stored_meanwhile() -> None:
 
 
 @pytest.mark.parametrize("later", [{"nonce": "another's"}, {"ended": True, "by": "b"}])
-async def test_an_end_replaces_only_renewals_of_the_same_session(later: dict[str, Any]) -> None:
+async def test_the_record_of_a_sessions_end_replaces_only_renewals_of_this_session(
+    later: dict[str, Any],
+) -> None:
     trial, lease = await begun()
     trial.buckets[0].store("a", {**trial.values()[0], **later})
     await lease.end()
@@ -230,7 +240,7 @@ async def test_an_unanswered_renewal_does_not_extend_an_ended_session() -> None:
     assert trial.masterships[0].events == ["extend", "end"]
 
 
-async def test_a_late_answer_of_an_ended_session_gives_the_next_no_path() -> None:
+async def test_a_late_answer_to_an_ended_session_gives_the_next_session_no_path() -> None:
     trial = Trial()
     late = GatedBucket("lease_2", answers=True)
     trial.buckets[2] = late
@@ -251,7 +261,7 @@ async def test_a_late_answer_of_an_ended_session_gives_the_next_no_path() -> Non
     assert lease.held[2] is None
 
 
-async def test_a_suspension_between_clock_and_timer_is_survived() -> None:
+async def test_a_suspension_between_reading_the_clock_and_setting_the_timer_is_survived() -> None:
     """A timer that is set to the past would kill the process, so the engine refuses it."""
 
     class StandingStill(RecordingMastership):
@@ -280,7 +290,7 @@ async def test_session_numbers_come_from_the_record_not_from_a_clock() -> None:
 
 
 async def test_no_session_number_is_reused_whatever_the_records_say() -> None:
-    """Otherwise lines that other gateways consider free could belong to a session that polls them."""
+    """If a number were reused, other gateways could claim lines that the new session polls."""
     trial = Trial()
     lease = trial.lease()
     for number in (1, 2, 3):
@@ -294,18 +304,17 @@ async def test_no_session_number_is_reused_whatever_the_records_say() -> None:
     assert lease.session == 4
     await lease.end()
     for bucket in trial.buckets:
-        bucket.store("a", None)  # as an invalid record is read
+        bucket.store("a", None)  # an invalid record is read as None
     after, newest = trial.lease(), trial.buckets[0].last  # a lease of another process
     assert not await after.try_to_begin()
-    trial.clock.pass_s(USUAL.lease / SECOND)
+    trial.pass_lease()
     assert await after.try_to_begin()
     assert after.session == newest + 1 > 4
 
 
 async def test_a_gateway_with_a_taken_name_waits_until_the_lease_expires() -> None:
-    trial = Trial()
-    first, second = trial.lease(), trial.lease()
-    assert await first.try_to_begin()
+    trial, first = await begun()
+    second = trial.lease()
     for _ in range(10):
         trial.clock.pass_s(0.5)
         await renew(first)
@@ -323,11 +332,10 @@ async def test_a_gateway_with_a_taken_name_waits_until_the_lease_expires() -> No
     assert not first.is_valid
 
 
-async def test_a_single_free_path_is_not_taken() -> None:
-    """Otherwise a waiting namesake would take one path after another."""
-    trial = Trial()
-    first, second = trial.lease(), trial.lease()
-    assert await first.try_to_begin()
+async def test_no_session_starts_if_only_one_path_is_free() -> None:
+    """Otherwise a waiting gateway of the same name would take one path after another."""
+    trial, first = await begun()
+    second = trial.lease()
     for _ in range(8):
         assert not await second.try_to_begin()
         trial.clock.pass_s(0.5)
@@ -337,7 +345,7 @@ async def test_a_single_free_path_is_not_taken() -> None:
     assert first.is_valid
 
 
-async def test_of_two_simultaneous_starts_at_most_one_is_valid() -> None:
+async def test_of_two_simultaneous_session_starts_at_most_one_is_valid() -> None:
     trial = Trial()
     first, second = trial.lease(), trial.lease()
     begun = await asyncio.gather(first.try_to_begin(), second.try_to_begin())
@@ -346,7 +354,7 @@ async def test_of_two_simultaneous_starts_at_most_one_is_valid() -> None:
 
 
 async def test_a_starting_session_takes_no_path_of_a_living_one() -> None:
-    """The first session renews path 0 right before the second session takes it, and keeps renewing path 2."""
+    """The first session renews path 0 right before the second session would take it. It renews path 2 too."""
     trial = Trial()
     gate = trial.buckets[0] = GatedBucket("lease_0")
     first, second = trial.lease(), trial.lease()
@@ -372,7 +380,7 @@ async def test_a_starting_session_takes_no_path_of_a_living_one() -> None:
 async def test_the_lock_file_proves_that_the_predecessor_is_dead(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(life_lock, "machine_id", lambda: "this machine")
+    monkeypatch.setattr(leases, "machine_id", lambda: "this machine")
     trial = Trial()
     lock = LifeLock(tmp_path / "a.lock")
     assert await trial.lease(lock=lock).try_to_begin()
@@ -394,29 +402,29 @@ async def test_the_lock_file_proves_that_the_predecessor_is_dead(
         ("this machine", "this machine", False),  # another file at the same path, as in two containers
     ],
 )
-async def test_a_lock_of_another_machine_or_file_proves_no_death(
+async def test_a_lock_of_another_machine_or_file_does_not_prove_that_the_predecessor_is_dead(
     before: str, after: str, is_copied: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trial = Trial()
-    monkeypatch.setattr(life_lock, "machine_id", lambda: before)
+    monkeypatch.setattr(leases, "machine_id", lambda: before)
     with closing(LifeLock(tmp_path / "a.lock")) as lock:
         assert await trial.lease(lock=lock).try_to_begin()
-    monkeypatch.setattr(life_lock, "machine_id", lambda: after)
+    monkeypatch.setattr(leases, "machine_id", lambda: after)
     if not is_copied:
         (tmp_path / "a.lock").unlink()
     with closing(LifeLock(tmp_path / "a.lock")) as lock:
         assert not await trial.lease(lock=lock).try_to_begin()
 
 
-async def test_a_copied_disk_or_a_reboot_proves_no_death(
+async def test_a_copied_disk_or_a_reboot_does_not_prove_that_the_predecessor_is_dead(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The machine id, the path and the lock's id are copied; the id of the kernel's boot is not."""
+    """A copy has the same machine id, path and lock id, but not the id of the kernel's boot."""
     trial = Trial()
     machine, boot = tmp_path / "machine-id", tmp_path / "boot_id"
     machine.write_text("copied\n", "utf-8")
     boot.write_text("first\n", "utf-8")
-    monkeypatch.setattr(life_lock, "IDS", (machine, boot))
+    monkeypatch.setattr(leases, "IDS", (machine, boot))
     lock = LifeLock(tmp_path / "a.lock")
     assert await trial.lease(lock=lock).try_to_begin()
     lock.close()
@@ -434,25 +442,24 @@ def test_a_machine_without_one_of_its_ids_counts_as_unknown(
     ids = (tmp_path / "machine-id", tmp_path / "boot_id")
     for path in ids:
         path.write_text("something\n", "utf-8")
-    monkeypatch.setattr(life_lock, "IDS", ids)
-    assert life_lock.machine_id() == "something.something"
+    monkeypatch.setattr(leases, "IDS", ids)
+    assert leases.machine_id() == "something.something"
     ids[empty].write_text("\n", "utf-8")
-    assert life_lock.machine_id() == ""
+    assert leases.machine_id() == ""
     ids[empty].unlink()
-    assert life_lock.machine_id() == ""
+    assert leases.machine_id() == ""
 
 
 # ---- observers ----
 
 
 async def test_a_dead_gateway_is_ended_after_a_lease_on_the_observers_clock() -> None:
-    trial = Trial()
-    lease, observer = trial.lease(), trial.observer()
-    assert await lease.try_to_begin()
+    trial, _ = await begun()
+    observer = trial.observer()
     trial.clock.pass_s(100)  # an observer that starts late cannot know when the record was written
     await look(observer)
     assert observer.dead() == {}
-    trial.clock.pass_s(USUAL.lease / SECOND)
+    trial.pass_lease()
     await look(observer)
     await observer.end_the_dead()
     assert observer.is_over("a", 1)
@@ -461,10 +468,10 @@ async def test_a_dead_gateway_is_ended_after_a_lease_on_the_observers_clock() ->
 
 
 @pytest.mark.parametrize("has_rival", [False, True])
-async def test_ending_the_dead_does_not_wait_for_a_leaderless_path(has_rival: bool) -> None:
-    """The path's server may have died with the gateway; a rival observer may have ended another record."""
+async def test_ending_a_dead_session_does_not_wait_for_a_path_without_a_leader(has_rival: bool) -> None:
+    """The path's server may have died with the gateway. Another observer may have ended a second path."""
     trial, _lease, observer = await watched()
-    trial.clock.pass_s(USUAL.lease / SECOND)
+    trial.pass_lease()
     await look(observer)
     asked: list[str] = []
 
@@ -482,10 +489,10 @@ async def test_ending_the_dead_does_not_wait_for_a_leaderless_path(has_rival: bo
     assert observer.is_over("a", 1)
 
 
-async def test_only_the_stale_revision_is_ended() -> None:
-    """A record that is renewed between the decision to end it and the write is kept, even if read again."""
+async def test_a_record_renewed_after_the_decision_to_end_it_is_kept() -> None:
+    """The record is renewed between the decision and the write. A read in between makes no difference."""
     trial, lease, observer = await watched()
-    trial.clock.pass_s(USUAL.lease / SECOND)
+    trial.pass_lease()
     await look(observer)
     judged = observer.dead()["a"]
     await renew(lease)  # the network recovers at this moment
@@ -499,10 +506,10 @@ async def test_only_the_stale_revision_is_ended() -> None:
     assert not lease.is_over
 
 
-async def test_a_record_that_was_just_read_is_not_stale() -> None:
-    """A gateway may be judged between the reads of two of its paths."""
+async def test_a_gateway_with_a_record_that_was_just_renewed_does_not_count_as_dead() -> None:
+    """The observer may decide before it has read the gateway's new records on all paths."""
     trial, lease, observer = await watched()
-    trial.clock.pass_s(USUAL.lease / SECOND)
+    trial.pass_lease()
     await look(observer)
     assert [*observer.dead()] == ["a"]
     await renew(lease)
@@ -512,8 +519,8 @@ async def test_a_record_that_was_just_read_is_not_stale() -> None:
     assert not await observer.end_the_dead()
 
 
-async def test_no_gateway_ends_itself() -> None:
-    """An end by the gateway itself would count immediately for all others."""
+async def test_no_gateway_writes_the_end_of_its_own_dead_session() -> None:
+    """If it did, all other gateways would treat the session as over immediately."""
     trial = Trial()
     lease, observer = trial.lease("b"), trial.observer("b")
     assert await lease.try_to_begin()
@@ -532,16 +539,16 @@ async def test_a_gateway_that_was_cut_off_ends_no_other_session() -> None:
     await look(observer)
     await observer.end_the_dead()
     assert not observer.is_over("a", 1)
-    trial.clock.pass_s(USUAL.lease / SECOND)
+    trial.pass_lease()
     await look(observer)
     await observer.end_the_dead()
     assert observer.is_over("a", 1)
 
 
-async def test_an_ended_session_stays_over_after_an_outage() -> None:
+async def test_an_ended_session_stays_ended_after_an_outage() -> None:
     """Otherwise lines would be assigned to a dead gateway for a while."""
     trial, _lease, observer = await watched()
-    trial.clock.pass_s(USUAL.lease / SECOND)
+    trial.pass_lease()
     await look(observer)
     assert await observer.end_the_dead()
     await observer.end_the_dead()
@@ -551,8 +558,8 @@ async def test_an_ended_session_stays_over_after_an_outage() -> None:
     assert observer.is_over("a", 1)
     assert observer.sessions() == {}
     second = trial.lease()
-    assert not await second.try_to_begin()  # another gateway wrote the end, of unknown age
-    trial.clock.pass_s(USUAL.lease / SECOND)
+    assert not await second.try_to_begin()  # another gateway ended the session, at an unknown time
+    trial.pass_lease()
     assert await second.try_to_begin()
     await look(observer)
     assert not observer.is_over("a", second.session)
@@ -560,28 +567,26 @@ async def test_an_ended_session_stays_over_after_an_outage() -> None:
 
 
 async def test_an_end_written_during_an_outage_does_not_count_yet() -> None:
-    """The session's last renewal may have come right before that end."""
+    """The session may have been renewed unseen, right before another gateway recorded the session's end."""
     trial, _lease, observer = await watched()
     await observer.end_the_dead()
     trial.clock.pass_s(60)
-    for bucket in trial.buckets:
-        bucket.store("a", {**bucket.records["a"].value, "ended": True, "by": "rogue"})
-    await look(observer)  # the last renewal that this observer saw is old
+    trial.store_ends()
+    await look(observer)  # the observer has seen no renewal for 60 s
     observer.restart_waits()
     await observer.end_the_dead()
     assert not observer.is_over("a", 1)
-    trial.clock.pass_s(USUAL.lease / SECOND)
+    trial.pass_lease()
     assert observer.is_over("a", 1)
 
 
 async def test_a_read_reports_whether_a_session_ended_or_may_be_ended() -> None:
-    trial = Trial()
-    lease, observer = trial.lease(), trial.observer()
-    assert await lease.try_to_begin()
+    trial, lease = await begun()
+    observer = trial.observer()
     assert [await observer.look(path) for path in range(3)] == [False, False, False]
     await renew(lease)
     assert [await observer.look(path) for path in range(3)] == [False, False, False]
-    trial.clock.pass_s(USUAL.lease / SECOND)
+    trial.pass_lease()
     assert [await observer.look(path) for path in range(3)] == [False, True, True]  # two ended paths suffice
     await observer.end_the_dead()
     assert [await observer.look(path) for path in range(3)] == [False, False, False]
@@ -607,7 +612,7 @@ def test_a_possibly_dead_gateway_is_read_without_delay(since_s: float, rests_s: 
 
 
 async def test_without_answers_no_gateway_counts_as_dead() -> None:
-    """The server that the observer reads may be suspended while gateways renew their leases on others."""
+    """The observer's server may be suspended while gateways renew their leases on other servers."""
     trial, _lease, observer = await watched()
     for bucket in trial.buckets:
         bucket.is_down = True
@@ -625,21 +630,20 @@ async def test_without_answers_no_gateway_counts_as_dead() -> None:
     assert observer.dead().keys() == {"a"}
 
 
-async def test_an_end_by_another_counts_once_the_lease_has_expired() -> None:
-    """The end's writer may be wrong. Until the lease has expired, the ended gateway may still send."""
+async def test_an_end_written_by_another_gateway_counts_once_the_lease_has_expired() -> None:
+    """The gateway that recorded the end may be wrong: until the lease expires, its owner may still send."""
     trial = Trial()
     lease, observer, late = trial.lease(), trial.observer(), trial.observer("c")
     assert await lease.try_to_begin()
     await look(observer)
-    for bucket in trial.buckets:
-        bucket.store("a", {**bucket.records["a"].value, "session": 9, "ended": True, "by": "rogue"})
+    trial.store_ends(session=9)
     trial.clock.pass_s(1.0)
     await look(observer)
     await look(late)
     assert lease.is_valid
     assert not observer.is_over("a", 1)
     assert not observer.is_over("a", 9)
-    trial.clock.pass_s(USUAL.lease / SECOND - 1.0)  # since the observer saw the last renewal
+    trial.clock.pass_s(USUAL.lease / SECOND - 1.0)  # time since the observer saw the last renewal
     assert observer.is_over("a", 1)
     assert observer.sessions() == {}
     assert not late.is_over("a", 1)
@@ -647,7 +651,7 @@ async def test_an_end_by_another_counts_once_the_lease_has_expired() -> None:
     assert late.is_over("a", 1)
 
 
-async def test_an_end_by_the_gateway_itself_counts_immediately() -> None:
+async def test_a_session_that_its_own_gateway_has_ended_is_over_immediately() -> None:
     trial, lease, observer = await watched()
     await lease.end()
     await look(observer)
@@ -655,23 +659,20 @@ async def test_an_end_by_the_gateway_itself_counts_immediately() -> None:
     assert await trial.lease().try_to_begin()
 
 
-async def test_a_namesake_waits_although_another_gateway_wrote_the_end() -> None:
-    trial = Trial()
-    lease, second = trial.lease(), trial.lease()
-    assert await lease.try_to_begin()
-    for bucket in trial.buckets:
-        bucket.store("a", {**bucket.records["a"].value, "ended": True, "by": "rogue"})
+async def test_a_gateway_of_the_same_name_waits_although_another_gateway_wrote_the_end() -> None:
+    trial, lease = await begun()
+    second = trial.lease()
+    trial.store_ends()
     assert not await second.try_to_begin()
     assert lease.is_valid
-    trial.clock.pass_s(USUAL.lease / SECOND)
+    trial.pass_lease()
     assert await second.try_to_begin()
 
 
 async def test_a_gateway_with_only_one_stale_path_is_not_ended() -> None:
-    """An ended path would stay ended for the rest of the session."""
-    trial = Trial()
-    lease, observer = trial.lease(), trial.observer()
-    assert await lease.try_to_begin()
+    """If that path were ended, it would stay ended for the rest of the session."""
+    trial, lease = await begun()
+    observer = trial.observer()
     for _ in range(20):
         await look(observer)
         trial.clock.pass_s(0.5)
@@ -692,7 +693,7 @@ async def test_an_ended_path_stays_ended_for_this_session() -> None:
     assert lease.is_valid
 
 
-async def test_a_session_without_one_path_is_weak_until_the_next_starts() -> None:
+async def test_a_session_without_one_path_is_weak_until_the_next_session_starts() -> None:
     trial, lease, observer = await watched()
     assert (lease.is_weak, observer.weak()) == (False, [])
     trial.buckets[1].store("a", {**trial.values()[1], "ended": True, "by": "b"})
@@ -725,7 +726,7 @@ async def test_a_path_that_was_down_at_the_start_is_taken_later() -> None:
 
 
 async def test_a_path_with_a_rival_session_of_the_same_number_is_taken_later() -> None:
-    """A namesake that died while it started left this record. It held no other path, so it is over."""
+    """Another process of this gateway, which died when its session had only one path, left the record."""
     trial = Trial()
     trial.buckets[2].is_down = True
     lease = trial.lease()

@@ -1,21 +1,35 @@
-"""A line that is being closed: commands end immediately, and stops are answered until it is closed."""
+"""A line that is being closed accepts no further commands, and answers stops until it is closed."""
 
 from __future__ import annotations
 
 import asyncio
 import json
+import sys
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
-from command_desks import LINE, MAY, PATIENCE_S, Desks
+from fleets import LINE, MAY, PATIENCE_S, Desks
+from lines import until
+from tables import table
 
+from multidrop.core import UNASKED, Mastership
+from multidrop.families import InnovertIBD
 from multidrop.fleet.commands import desk as command_desk
 from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome
 from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects
 from multidrop.fleet.servers import names
+from multidrop.plant.loader import load_plant
+from multidrop.plant.model import Plant, PlantLine
+from multidrop.poller import Poller
+from multidrop.polling.batch import Row
+from multidrop.sim import SimulatedDrive, Simulator, Wire
+from multidrop.sim.memory import MemoryCell
 from multidrop.supervisor import supervisor
 
 
@@ -91,7 +105,7 @@ async def test_a_closing_line_answers_its_stops_until_it_is_closed(desk: Desks) 
 
 
 async def test_a_stop_is_answered_only_on_an_inbox(desk: Desks) -> None:
-    """An answer that is stored as a record of the plant would take the line from all gateways."""
+    """A requester may name a record of the plant as reply subject: the answer would overwrite the record."""
     answered: list[str] = []
 
     path = HeardPath()
@@ -152,7 +166,7 @@ async def test_closing_a_line_waits_for_its_command_if_the_lease_leaves_time(
 
 
 class ClosedLines(SlowLines):
-    """Lines whose buses close before their gateway notes that."""
+    """Lines whose buses are closed, although their gateway does not know it yet."""
 
     def __init__(self, close: Callable[[], None]) -> None:
         super().__init__()
@@ -169,9 +183,9 @@ class ClosedLines(SlowLines):
 async def test_a_stop_on_a_closed_line_is_left_to_the_next_master(
     desk: Desks, drives: list[str] | None
 ) -> None:
-    """The sender would accept a refusal, and ask no other gateway."""
+    """If this gateway refused the stop, the sender would ask no other gateway."""
 
-    lines = ClosedLines(desk.bus(LINE).close)
+    lines = ClosedLines(desk.bus.close)
     subjects = CommandSubjects("gw-1", [HeardPath()], desk.lines, desk.log)  # type: ignore[list-item]
     commanded = CommandedLines(lines, subjects)  # type: ignore[arg-type]
     await commanded.take(LINE, {"may": MAY})
@@ -181,3 +195,172 @@ async def test_a_stop_on_a_closed_line_is_left_to_the_next_master(
     lines.closes.set()
     await going
     await settled(subjects)
+
+
+# ---- requests in flight while a line is handed over: each of them gets its row ----
+
+
+NUMBERED = "motor_speed"  # a register without a scale: its value is the raw count
+
+
+class NumberedDrive(SimulatedDrive):
+    """A drive whose motor speed register counts its own reads."""
+
+    answers = 0
+
+    def refresh(self, cell: MemoryCell) -> None:
+        super().refresh(cell)
+        if cell.name == NUMBERED:
+            self.answers += 1
+            cell.raw = self.answers
+
+
+class Verdict(NamedTuple):
+    """How many of a drive's replies have no row, have two rows, or came after their request got a row."""
+
+    lost: int = 0
+    doubled: int = 0
+    late: int = 0
+
+
+def judge_drive(numbers: Sequence[int | None], answered: int) -> Verdict:
+    """Judge the numbers in a drive's rows, in the order of their requests; None is a miss."""
+    late = lost = doubled = misses = last = 0
+    for number in (*numbers, answered + 1):  # the appended number shows if rows are missing at the end
+        if number is None:
+            misses += 1
+        elif number <= last:
+            doubled += 1
+        else:
+            explained = min(number - last - 1, misses)
+            late += explained
+            lost += number - last - 1 - explained
+            last, misses = number, 0
+    return Verdict(lost, doubled, late)
+
+
+if sys.platform != "linux":
+    pytest.skip("masterships are Linux's", allow_module_level=True)
+
+SECOND = 1_000_000_000
+HOUR_NS = 3600 * SECOND
+
+
+@contextmanager
+def simulated_line(folder: Path, delay: float) -> Iterator[tuple[list[NumberedDrive], PlantLine]]:
+    """Yield two drives that answer after `delay` seconds, and their line."""
+    drives = [
+        NumberedDrive(InnovertIBD(address=at, name=f"drive-{at}"), response_delay=delay) for at in (1, 2)
+    ]
+    with Simulator([Wire(drives, name="line", port="tcp://127.0.0.1:0")]) as simulator:
+        path = folder / "plant.toml"
+        path.write_text(
+            f'[[line]]\nname = "line"\nport = "{simulator.wires[0].path}"\n'
+            + "".join(
+                f'[[line.drive]]\nname = "drive-{at}"\nmodel = "{InnovertIBD.model}"\naddress = {at}\n'
+                f'poll = ["{NUMBERED}"]\nevery = "100 ms"\n'
+                for at in (1, 2)
+            )
+        )
+        yield drives, load_plant(path).lines[0]
+
+
+class Gateway:
+    """A poller with a valid mastership, and its rows for requests that were sent."""
+
+    def __init__(self, folder: Path) -> None:
+        self.mastership = Mastership(guard_s=0.01)
+        self.mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + HOUR_NS)
+        self.rows: list[Row] = []
+        self.poller = Poller(Plant((), folder), mastership=self.mastership)
+        self.poller.on_batch(lambda batch: self.rows.extend(row for row in batch if is_asked(row)))
+
+    def close(self) -> None:
+        self.poller.close()
+        self.mastership.end()
+
+
+def is_asked(row: Row) -> bool:
+    return not row.status.startswith(UNASKED)
+
+
+@pytest.fixture
+def gateways(tmp_path: Path) -> Iterator[list[Gateway]]:
+    made = [Gateway(tmp_path) for _ in range(2)]
+    for gateway in made:
+        gateway.poller.__enter__()
+    yield made
+    for gateway in made:
+        gateway.close()
+
+
+def hand_over(gateway: Gateway, drives: list[NumberedDrive], line: PlantLine) -> None:
+    """Poll until a drive has received a request, and close the line before the drive answers."""
+    gateway.poller.add_line(line)
+    begun = sum(drive.answers for drive in drives)
+    until(lambda: sum(drive.answers for drive in drives) > begun)
+    gateway.poller.remove_line("line")
+
+
+def judge(drives: list[NumberedDrive], gateways: list[Gateway]) -> list[Verdict]:
+    for gateway in gateways:
+        gateway.close()
+    rows = sorted((row for gateway in gateways for row in gateway.rows), key=lambda row: row.time_ns)
+    numbers: dict[str, list[int | None]] = {drive.drive.name: [] for drive in drives}
+    for row in rows:
+        numbers[row.drive].append(None if row.value is None else round(row.value))
+    return [judge_drive(numbers[drive.drive.name], drive.answers) for drive in drives]
+
+
+@pytest.mark.slow
+def test_no_row_is_lost_when_a_line_moves_between_gateways(tmp_path: Path, gateways: list[Gateway]) -> None:
+    with simulated_line(tmp_path, delay=0.1) as (drives, line):
+        for turn in range(8):
+            hand_over(gateways[turn % 2], drives, line)
+        judged = judge(drives, gateways)
+    assert sum(drive.answers for drive in drives) >= 8
+    assert [(one.lost, one.doubled) for one in judged] == [(0, 0), (0, 0)]
+
+
+def test_an_abandoned_request_has_a_row_with_its_status(
+    tmp_path: Path, gateways: list[Gateway], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("multidrop.polling.line_set.ENDING_NS", 0)
+    with simulated_line(tmp_path, delay=1.0) as (drives, line):
+        hand_over(gateways[0], drives, line)
+        hand_over(gateways[1], drives, line)
+        judged = judge(drives, gateways)
+    assert [(one.lost, one.doubled) for one in judged] == [(0, 0), (0, 0)]
+    assert {row.status for gateway in gateways for row in gateway.rows} == {"poll ended"}
+
+
+@table(
+    ("numbers", "answered", "expected"),
+    [
+        ((1, 2, 3), 3, Verdict()),
+        ((), 0, Verdict()),
+        ((1, None, 3), 3, Verdict(late=1)),
+        ((1, None, 2), 2, Verdict()),
+        ((1, 3), 3, Verdict(lost=1)),
+        ((1, None, 4), 4, Verdict(late=1, lost=1)),
+        ((1, 2), 3, Verdict(lost=1)),
+        ((1, 2, 2, 3), 3, Verdict(doubled=1)),
+    ],
+)
+def test_the_judge_finds_lost_and_doubled_answers(
+    numbers: Sequence[int | None], answered: int, expected: Verdict
+) -> None:
+    assert judge_drive(numbers, answered) == expected
+
+
+@pytest.mark.long
+def test_late_answers_have_a_row_marked_as_late(tmp_path: Path, gateways: list[Gateway]) -> None:
+    with simulated_line(tmp_path, delay=0.02) as (drives, line):
+        gateways[0].poller.add_line(line)
+        for delay in (0.02, 0.45, 0.02, 0.9, 0.02):
+            drives[0].response_delay = delay
+            begun = drives[0].answers
+            until(lambda begun=begun: drives[0].answers >= begun + 3)  # type: ignore[misc]
+        judged = judge(drives, gateways)
+    assert [(one.lost, one.doubled) for one in judged] == [(0, 0), (0, 0)]
+    assert judged[0].late > 0

@@ -66,12 +66,12 @@ class Trial:
         await until(lambda: "hall" in self.keeper.polled and not self.keeper._tasks)
 
     async def is_polled(self) -> None:
-        """Wait until the line is polled, while time passes."""
+        """Let time pass until the line is polled."""
         while "hall" not in self.keeper.polled or self.keeper._at_work:
             await asyncio.sleep(0.001)
 
     async def is_at_rest(self) -> None:
-        """Wait, while time passes, until no task is in progress on the line."""
+        """Let time pass until no task is in progress on the line."""
         while self.keeper._at_work:
             await asyncio.sleep(0.001)
 
@@ -100,12 +100,12 @@ class Trial:
         self.keeper.claim({"hall": claim})
 
     def owner(self) -> tuple[str, int] | None:
-        """Return the line's owner by its votes, as far as the gateway has read them."""
+        """Return the line's owner according to the records that the gateway has read."""
         record = self.records.owner("hall")
         return owner_of(record) if record else None
 
     def is_taken_by_another(self, *places: int) -> None:
-        """Let the gateway read that the records at these places name another gateway."""
+        """Let the gateway read records of these buckets that name another gateway."""
         for place in places:
             bucket = names.owner_buckets("hall")[place]
             known = self.records.of("hall")[bucket]
@@ -236,9 +236,9 @@ async def test_a_line_is_not_polled_while_its_release_may_be_stored() -> None:
     trial.keeper.releasing = {"hall"}
     await trial.reconcile()
     trial.are_down()
-    trial.keeper.reconcile()  # its release is sent, but not answered
+    trial.keeper.reconcile()  # the line's release is sent, but not answered
     await until(lambda: trial.keeper.is_silent)
-    trial.keeper.releasing = set()  # the line shall stay with this gateway after all
+    trial.keeper.releasing = set()  # the line is assigned to this gateway again
     for _ in range(3):
         await trial.reconcile()
         assert trial.lines.taken == set()
@@ -293,7 +293,7 @@ async def test_a_slow_bucket_does_not_delay_a_claim(monkeypatch: pytest.MonkeyPa
 
 
 async def test_a_refused_claim_does_not_wait_for_a_late_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The claim is repeated immediately, with newer records. A server that is cut off is silent for long."""
+    """The claim is repeated immediately, with newer records. A server that is cut off may answer late."""
     monkeypatch.setattr(owner_records, "SPARE_S", 100.0)
     trial = DeadTrial()
     await trial.read_and_begin()
@@ -333,7 +333,7 @@ async def test_if_all_leases_lag_no_bucket_is_written_last() -> None:
 async def test_a_bucket_that_lost_its_home_server_does_not_delay_claims(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Until the gateway has read a second bucket, it can write a claim only in this bucket."""
+    """A new line is first written in this bucket, so the gateway cannot use another bucket instead."""
     monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
     trial = Trial()
     await trial.read_and_begin()
@@ -365,7 +365,7 @@ async def test_a_late_answer_does_not_reclaim_a_line_being_released(monkeypatch:
     trial.keeper.reconcile()
     await until(lambda: not trial.keeper.polled and not trial.keeper._at_work)
     writers = trial.keeper._owners._writing[trial.buckets[1].name]
-    async with writers, writers:  # all writers of that bucket are busy
+    async with writers, writers:  # all writers of this bucket are busy
         trial.keeper.reconcile()
         await until(lambda: owners(trial) == [NOBODY, ME, NOBODY])
         trial.buckets[0].open()
@@ -382,7 +382,7 @@ async def test_a_late_answer_does_not_reclaim_a_line_being_released(monkeypatch:
 
 
 async def test_a_late_answer_does_not_undo_a_release() -> None:
-    """The claim's record was read before its answer came, and the line was released immediately."""
+    """The gateway reads its stored claim, releases the line, and only then gets the answer to the claim."""
     trial = Trial()
     await trial.read_and_begin()
     bucket = trial.buckets[0] = GatedBucket(trial.buckets[0].name, answers=True)
@@ -405,7 +405,7 @@ async def test_a_line_with_an_uncertain_release_is_claimed_like_any_other() -> N
     trial = await claimed()
     trial.are_down()
     trial.keeper.releasing = {"hall"}
-    for _ in range(2):  # the first call closes the line
+    for _ in range(2):  # the first call closes the line, the second call releases it
         trial.keeper.reconcile()
         await until(lambda: not trial.keeper._tasks)
     assert not trial.keeper.is_mine("hall")
@@ -420,7 +420,7 @@ async def test_a_line_with_an_uncertain_release_is_claimed_like_any_other() -> N
 
 
 async def test_a_line_that_cannot_be_closed_ends_the_gateway() -> None:
-    """The gateway's session is not ended, so others wait as long as after its death."""
+    """The gateway does not end its session, so other gateways wait as long as after its death."""
     trial = await claimed()
 
     async def fail(line: str) -> None:

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import random
 from collections import Counter
+from typing import Any
 
 import pytest
+from fleet_scale import groups, large_fleet, plant_of_fake_lines, until
+from fleets import Hall, HandClock, RecordingMastership
+from nats_clusters import Cluster as Servers
 from tables import table
 
+from multidrop.fleet.leases.member import SETTLE_S, Member
+from multidrop.fleet.leases.rules import RULES, SECOND
+from multidrop.fleet.lines import releases
 from multidrop.fleet.lines.ownership import NEEDED, Claim, Step, claim_of, decide, owner_by, owner_value
-from multidrop.fleet.lines.shares import assign
+from multidrop.fleet.lines.releases import WAIT_S, Releases
+from multidrop.fleet.lines.shares import QUIET_NS, assign
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Record
+from multidrop.fleet.servers.leaders import Cluster, Replica
 
 LINES = [f"hall-{hall}-line-{line}" for hall in range(20) for line in range(50)]
 GATEWAYS = [f"gw{at:02}" for at in range(20)]
@@ -44,7 +54,7 @@ def test_the_assignment_does_not_depend_on_the_order_of_names() -> None:
 
 
 def weight(line: str, gateway: str, number: int) -> int:
-    """Return the weight of a line and a gateway as the first version computed it, with Python's integers."""
+    """Return the weight of a line and a gateway by the first version's formula, with Python's integers."""
     own, other = (
         int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
         for name in (line, gateway)
@@ -54,8 +64,10 @@ def weight(line: str, gateway: str, number: int) -> int:
 
 @table("number", [1, 2, 3, 5, 20])
 @table("lines", [1, 7, 40, 333])
-def test_each_line_is_with_the_heaviest_gateway_that_has_room(lines: int, number: int) -> None:
-    """Versions with other weights would assign lines differently, and so move them back and forth."""
+def test_each_line_is_assigned_to_the_gateway_of_greatest_weight_that_has_room(
+    lines: int, number: int
+) -> None:
+    """Gateways of versions with different weights would move lines back and forth."""
     room = dict.fromkeys(GATEWAYS[:number], -(-lines * 110 // (100 * number)))
     wanted = {}
     for line in sorted(LINES[:lines]):
@@ -150,7 +162,7 @@ CASES = {
 
 
 @table("case", CASES)
-def test_claims_and_releases_in_each_case(case: str) -> None:
+def test_claims_and_releases_are_as_expected_in_each_case(case: str) -> None:
     found, wanted = CASES[case]
     assert found == wanted
 
@@ -201,7 +213,7 @@ def test_the_owner_of_a_line_needs_two_votes() -> None:
 
 
 def test_the_newer_of_two_owners_is_shown() -> None:
-    """The first record has two votes for a dead session, because its bucket has no leader."""
+    """The first record still has two votes for a dead session: without a leader it was not replaced."""
     records = records_of(DEAD, ME, ME, alone=True)
     for bucket in ("second", "third"):
         records[bucket] = Record("x", 20, owner_value(ME, 6, 0))
@@ -216,7 +228,7 @@ def test_names_that_are_invalid_in_a_subject_are_rejected(name: str) -> None:
         names.checked_name("line", name)
 
 
-@pytest.mark.parametrize(
+@table(
     ("name", "better"),
     [("hall 1", "hall-1"), ("hall.1", "hall-1"), ("зал 1", "1"), ("", "line-1"), ("*", "line-1")],
 )
@@ -231,3 +243,185 @@ def test_first_records_are_spread_over_all_three_buckets() -> None:
     assert all(sorted(place) == sorted(names.OWNERS) for place in places)
     shares = Counter(place[0] for place in places)
     assert min(shares[bucket] for bucket in names.OWNERS) > len(LINES) / 4
+
+
+# ---- shares of lines: assigned immediately, or in a cold start once no further gateway joins ----
+
+
+VALUE: dict[str, Any] = {"session": 1, "draining": False, "rules": RULES}
+FEW_LINES = tuple(f"line-{at}" for at in range(40))
+
+
+class Trial:
+    """Gateway a at the start of its session, with its own clock and without a server."""
+
+    def __init__(self) -> None:
+        self.clock = HandClock()
+        mastership = RecordingMastership(self.clock)
+        self.member = Member("a", [], Hall().add("a", mastership), mastership)
+        self.member.lease.clock = self.clock
+        self.member.lease.session = 1
+        self.member._settled_at = self.clock() + int(SETTLE_S * SECOND)
+        self.member.records._lines = FEW_LINES
+
+    def sees(self, *others: str) -> None:
+        """Note these other gateways, as gateway a does before its session starts."""
+        self.member._see(dict.fromkeys(others, VALUE))
+
+    def shared_among(self, *others: str) -> set[str]:
+        """Take a step while these other gateways are present; return the gateways that have lines now."""
+        asyncio.run(self.member._share_out(dict.fromkeys(others, VALUE)))
+        return set(Counter(self.member.wanted.values()))
+
+    def is_shared_with_those_who_come(self, *others: str) -> bool:
+        return self.shared_among(*others) == {"a", *others}
+
+
+def test_a_returning_gateway_gets_its_share_immediately() -> None:
+    trial = Trial()
+    trial.sees("b", "c")
+    trial.clock.pass_s(QUIET_NS / SECOND)
+    assert trial.is_shared_with_those_who_come("b", "c")
+
+
+def test_a_cold_start_assigns_lines_once_no_gateway_joins() -> None:
+    """Otherwise the first gateway would read the records of all lines, and the second those of half."""
+    trial = Trial()
+    assert trial.shared_among("b") == set()
+    trial.clock.pass_s(QUIET_NS / SECOND - 0.01)
+    assert trial.shared_among("b") == set()
+    assert trial.shared_among("b", "c") == set()
+    trial.clock.pass_s(QUIET_NS / SECOND - 0.01)
+    assert trial.shared_among("b", "c") == set()
+    trial.clock.pass_s(0.02)
+    assert trial.is_shared_with_those_who_come("b", "c")
+
+
+def test_a_settled_gateway_reassigns_lines_immediately() -> None:
+    trial = Trial()
+    trial.clock.pass_s(SETTLE_S)
+    assert trial.is_shared_with_those_who_come("b", "c")
+    assert trial.is_shared_with_those_who_come("b")
+    assert trial.is_shared_with_those_who_come("b", "d")
+
+
+# ---- a line is released only while other gateways can claim it, now and immediately afterwards ----
+
+
+FIRST = {names.owner_buckets(line)[0]: line for line in (f"line-{at}" for at in range(30))}  # by first bucket
+FIRST_LINES = set(FIRST.values())
+
+
+class Releasing:
+    """The releases of a gateway, the buckets with a leader, and the buckets with a silent server."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.led = set(names.OWNERS)
+        self.maimed: set[str] = set()
+        self.asked: list[str] = []
+        self.changes = 0
+        self.now_s = 0.0
+        nowhere: Any = None
+        self.releases = Releases(lambda: nowhere, self.note, lambda: self.now_s)
+        monkeypatch.setattr(releases, "known_cluster", self.known_cluster)
+
+    def note(self) -> None:
+        self.changes += 1
+
+    async def known_cluster(self, path: Any, bucket: str) -> Cluster:
+        self.asked.append(bucket)
+        silent = Replica("n3", is_current=bucket not in self.maimed, is_offline=False, active_ns=0)
+        return Cluster("n1" if bucket in self.led else "", (silent,))
+
+    def look(self) -> None:
+        asyncio.run(self.releases.look())
+
+
+def test_lines_are_not_released_until_two_buckets_have_a_leader(monkeypatch: pytest.MonkeyPatch) -> None:
+    trial = Releasing(monkeypatch)
+    trial.led = {"own_1"}
+    assert trial.releases.due(FIRST_LINES) == set()
+    trial.look()
+    assert trial.changes == 1
+    assert trial.releases.due(FIRST_LINES) == set()
+    trial.led.add("own_2")
+    trial.look()
+    assert trial.changes == 2
+    assert trial.releases.due(FIRST_LINES) == {FIRST["own_1"], FIRST["own_2"]}
+
+
+def test_servers_are_checked_only_while_lines_wait_for_release(monkeypatch: pytest.MonkeyPatch) -> None:
+    trial = Releasing(monkeypatch)
+    trial.look()
+    assert trial.asked == []
+    trial.releases.due(FIRST_LINES)
+    trial.look()
+    assert trial.asked == [*names.OWNERS]
+    assert trial.releases.due(set()) == set()
+    trial.look()
+    trial.led.clear()
+    assert trial.releases.due(FIRST_LINES) == set()
+
+
+def test_lines_are_not_released_while_two_ownership_buckets_do_not_answer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    trial = Releasing(monkeypatch)
+    trial.maimed = {"own_0", "own_1"}
+    trial.releases.due(FIRST_LINES)
+    trial.look()
+    assert trial.releases.due(FIRST_LINES) == set()
+    trial.maimed.remove("own_0")
+    trial.look()
+    assert trial.changes == 2
+    assert trial.releases.due(FIRST_LINES) == FIRST_LINES - {FIRST["own_1"]}
+
+
+def test_releases_ignore_a_long_silent_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    trial = Releasing(monkeypatch)
+    trial.maimed = {"own_0", "own_1"}
+    trial.releases.due(FIRST_LINES)
+    trial.look()
+    trial.now_s = WAIT_S - 1
+    trial.look()
+    assert trial.releases.due(FIRST_LINES) == set()
+    trial.now_s = WAIT_S
+    trial.look()
+    assert trial.releases.due(FIRST_LINES) == FIRST_LINES
+    trial.maimed.clear()  # the server answered once and is silent again, so the wait restarts
+    trial.look()
+    trial.maimed = {"own_0", "own_1"}
+    trial.look()
+    assert trial.releases.due(FIRST_LINES) == set()
+
+
+def test_a_drained_gateway_releases_lines_as_soon_as_buckets_have_leaders(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    trial = Releasing(monkeypatch)
+    trial.maimed = set(names.OWNERS)
+    trial.led.remove("own_2")
+    trial.releases.due(FIRST_LINES, 0)
+    trial.look()
+    assert trial.releases.due(FIRST_LINES, 0) == FIRST_LINES - {FIRST["own_2"]}
+    assert trial.releases.due(FIRST_LINES) == set()
+    trial.led.remove("own_1")
+    trial.look()
+    assert trial.releases.due(FIRST_LINES, 0) == set()
+
+
+# ---- the state machines of 20 gateways with a thousand lines, in four processes ----
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_each_of_1000_lines_has_one_gateway_after_5_of_20_die_and_return(nats: Servers) -> None:
+    with large_fleet(nats, plant_of_fake_lines(1000)) as fleet:
+        fleet.settled(fleet.start(*groups(20, 4)))
+        until(lambda: 30 <= fleet.loads()[0] <= fleet.loads()[-1] <= 55, "each has its share")
+        dead = fleet.processes[1]
+        fleet.kill(dead)
+        fleet.check()
+        fleet.start(dead.gateways)
+        until(lambda: fleet.loads()[0] >= 30, "those that come back have their share")
+        fleet.check()

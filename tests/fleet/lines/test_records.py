@@ -6,14 +6,27 @@ import asyncio
 from typing import Any
 
 import pytest
-from fleets import MemoryBucket
+from fleets import HandClock, MemoryBucket
 from nats_clusters import Cluster, connected_path
+from tables import table
 
 from multidrop.fleet.errors import Unsure
-from multidrop.fleet.leases.rules import USUAL
+from multidrop.fleet.leases.rules import SECOND, USUAL
 from multidrop.fleet.lines import records as line_records
+from multidrop.fleet.lines.moves import Move, Moves, move_of
 from multidrop.fleet.lines.ownership import NEEDED, owner_of, owner_value
 from multidrop.fleet.lines.records import ShareFollower, ShareRecords
+from multidrop.fleet.lines.shares import assign, hand_over
+from multidrop.fleet.lines.unopened_lines import (
+    FIRST_WAIT_NS,
+    LAST_WAIT_NS,
+    LOST_NS,
+    MOST_BYTES,
+    OPENINGS,
+    REPLY_NS,
+    TRIAL_NS,
+    UnopenedLines,
+)
 from multidrop.fleet.servers import buckets, names
 from multidrop.fleet.servers.buckets import Bucket, Record
 
@@ -48,7 +61,7 @@ class Trial:
         return self.bucket.asked > before
 
 
-def test_free_and_own_lines_are_read_once() -> None:
+def test_records_of_free_and_own_lines_are_read_once() -> None:
     trial = Trial()
     trial.bucket.store("mine", ME)
     trial.bucket.store("free", NOBODY)
@@ -73,7 +86,7 @@ def test_a_line_of_another_session_is_read_until_it_is_free(value: Any) -> None:
     assert not trial.asks()
 
 
-def test_lines_that_are_ours_by_other_records_are_not_read() -> None:
+def test_lines_that_two_other_records_show_as_ours_are_not_read() -> None:
     trial = Trial()
     trial.bucket.store("line", OTHER)
     trial.follower.want(["line"])
@@ -121,12 +134,12 @@ async def test_an_added_line_is_read_without_delay() -> None:
     await trial.follower.look()
     resting = asyncio.create_task(trial.follower.rest())
     trial.follower.want(["line", "another"])
-    for _ in range(5):  # turns of the event loop, during which no time passes
+    for _ in range(5):  # lets the event loop run; no time passes
         await asyncio.sleep(0)
     assert resting.done()
 
 
-FIRST, SECOND, _ = names.owner_buckets("line")
+FIRST_BUCKET, SECOND_BUCKET, _ = names.owner_buckets("line")
 
 
 def followed() -> ShareRecords:
@@ -143,58 +156,58 @@ def moves_of(records: ShareRecords) -> list[tuple[str | None, str]]:
     return [(move.before, move.after) for move in records.moves.newest(9)]
 
 
-def test_moves_name_the_former_master_when_two_records_agree() -> None:
+def test_a_move_names_the_former_master_if_two_records_agree_on_it() -> None:
     records = followed()
-    take(records, 1, owner_value(("b", 1), 1, 0, NEEDED), FIRST)
+    take(records, 1, owner_value(("b", 1), 1, 0, NEEDED), FIRST_BUCKET)
     assert moves_of(records) == [("", "b")]
-    take(records, 2, owner_value(("a", 2), 2, 0), FIRST)
+    take(records, 2, owner_value(("a", 2), 2, 0), FIRST_BUCKET)
     assert moves_of(records) == [("", "b")]
-    take(records, 3, owner_value(("a", 2), 2, 0), SECOND)
+    take(records, 3, owner_value(("a", 2), 2, 0), SECOND_BUCKET)
     assert moves_of(records) == [("b", "a"), ("", "b")]
 
 
 def test_a_single_first_record_is_enough_to_own_a_line() -> None:
     records = followed()
-    take(records, 1, OTHER, FIRST, SECOND)
-    take(records, 2, ME, FIRST)
+    take(records, 1, OTHER, FIRST_BUCKET, SECOND_BUCKET)
+    take(records, 2, ME, FIRST_BUCKET)
     assert records.owned_by("a", 2) == records.owned_by("b", 1) == {"line"}
-    take(records, 2, ME, SECOND)
+    take(records, 2, ME, SECOND_BUCKET)
     assert records.owned_by("a", 2) == {"line"}
     assert records.owned_by("b", 1) == set()
 
 
 def test_a_line_read_long_ago_has_no_known_former_master() -> None:
-    """The line was read in a cold start or an hour ago, and has had other masters since."""
+    """The line was last read in a cold start or an hour ago, and has had other masters since then."""
     records = followed()
-    take(records, 8, owner_value(("b", 1), 8, 0), FIRST, SECOND)
+    take(records, 8, owner_value(("b", 1), 8, 0), FIRST_BUCKET, SECOND_BUCKET)
     assert moves_of(records) == [(None, "b")]
-    take(records, 11, owner_value(("a", 2), 11, 0), FIRST, SECOND)
+    take(records, 11, owner_value(("a", 2), 11, 0), FIRST_BUCKET, SECOND_BUCKET)
     assert moves_of(records)[0] == (None, "a")
-    take(records, 12, owner_value(("", 0), 12, 0), FIRST, SECOND)  # we have released the line
+    take(records, 12, owner_value(("", 0), 12, 0), FIRST_BUCKET, SECOND_BUCKET)  # we have released the line
     assert moves_of(records)[0] == ("a", "")
 
 
-def test_a_line_claimed_again_by_its_master_is_no_move() -> None:
-    """The outcome of the line's release was unknown."""
+def test_a_line_claimed_again_by_its_master_is_not_reported_as_moved() -> None:
+    """The master claims the line again because the outcome of its own release was unknown."""
     records = followed()
-    take(records, 1, owner_value(("a", 2), 1, 0), FIRST, SECOND)
-    take(records, 2, owner_value(("a", 2), 2, 0), FIRST, SECOND)
+    take(records, 1, owner_value(("a", 2), 1, 0), FIRST_BUCKET, SECOND_BUCKET)
+    take(records, 2, owner_value(("a", 2), 2, 0), FIRST_BUCKET, SECOND_BUCKET)
     assert moves_of(records) == [("", "a")]
-    take(records, 3, owner_value(("b", 1), 3, 0), FIRST, SECOND)
+    take(records, 3, owner_value(("b", 1), 3, 0), FIRST_BUCKET, SECOND_BUCKET)
     assert moves_of(records) == [("a", "b"), ("", "a")]
 
 
 def test_sessions_without_lines_are_forgotten() -> None:
     records = followed()
     for session in range(1, 1000):
-        take(records, session, owner_value(("b", session), session, 0), FIRST, SECOND)
-    take(records, 1000, owner_value(("b", 999), 1000, 0), FIRST, SECOND)
+        take(records, session, owner_value(("b", session), session, 0), FIRST_BUCKET, SECOND_BUCKET)
+    take(records, 1000, owner_value(("b", 999), 1000, 0), FIRST_BUCKET, SECOND_BUCKET)
     assert records.owned_by("b", 999) == {"line"}
     assert len(records._owned) == 1
 
 
 def test_lines_read_before_a_failure_stay_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The lines fill whole batches, and the read that would show their end fails."""
+    """The lines fill whole batches exactly. The next read, which would return no more lines, fails."""
     monkeypatch.setattr(buckets, "BATCH", 2)
     path: Any = None
     records = ShareRecords("a", lambda: path, USUAL, lambda: None, is_mine)
@@ -231,3 +244,225 @@ async def test_servers_give_the_newest_records_of_many_lines(one: Cluster) -> No
         assert follower.records == {**newest, "never had": Record("never had", 0, None)}
         assert len(changed) == 1101
         assert len(await follower.look()) == 0
+
+
+# ---- moves of lines: a former master is reported only if its record was read ----
+
+
+def told(*moves: Move) -> list[tuple[str | None, str]]:
+    """Return the moves that are shown after these reports, each as former and new master."""
+    found = Moves()
+    found.add(moves)
+    return [(move.before, move.after) for move in found.newest(100)]
+
+
+def move(turn: int, before: str | None, after: str, line: str = "hall-1") -> Move:
+    return Move(line, turn, 1000 * turn, before, after)
+
+
+OWNER_1 = move(1, "", "gw-1")
+
+
+def test_the_newest_move_is_listed_first() -> None:
+    assert told(OWNER_1, move(2, "gw-1", "gw-2")) == [("gw-1", "gw-2"), ("", "gw-1")]
+
+
+def test_a_line_that_was_released_and_claimed_has_moved_once() -> None:
+    moves = [OWNER_1, move(2, "gw-1", ""), move(3, "", "gw-2")]
+    assert told(*moves) == told(*reversed(moves)) == [("gw-1", "gw-2"), ("", "gw-1")]
+
+
+def test_a_released_line_has_no_master() -> None:
+    assert told(OWNER_1, move(2, "gw-1", "")) == [("gw-1", ""), ("", "gw-1")]
+
+
+def test_a_more_complete_report_of_a_move_replaces_another() -> None:
+    assert told(move(2, None, "gw-2"), move(2, "gw-1", "gw-2")) == [("gw-1", "gw-2")]
+    assert told(move(2, "gw-1", "gw-2"), move(2, None, "gw-2")) == [("gw-1", "gw-2")]
+
+
+def test_a_release_and_a_claim_by_two_gateways_are_one_move() -> None:
+    """Each gateway reports half of the move: one has seen only the release, the other only the claim."""
+    giver, taker = [OWNER_1, move(2, "gw-1", "")], [move(2, None, ""), move(3, "", "gw-2")]
+    back = [move_of(one.as_json()) for one in (*giver, *taker, *giver)]
+    assert told(*back) == [("gw-1", "gw-2"), ("", "gw-1")]
+
+
+def test_moves_of_different_lines_are_separate() -> None:
+    moves = told(move(2, "gw-1", ""), move(3, "", "gw-2", "hall-2"))
+    assert moves == [("", "gw-2"), ("gw-1", "")]
+
+
+def test_a_move_is_read_back_unchanged_from_json() -> None:
+    one = move(7, None, "gw-1")
+    assert move_of(one.as_json()) == one
+
+
+def test_only_the_newest_moves_are_kept() -> None:
+    moves = Moves(most=10)
+    for turn in range(1000, 0, -1):  # buckets are read independently, so moves may be added in any order
+        moves.add([move(turn, None, "gw-1", f"line-{turn}")])
+    assert [one.turn for one in moves.newest(10)] == list(range(1000, 990, -1))
+    assert len(moves.newest(1000)) <= 40
+
+
+# ---- lines that a gateway cannot open: when it reports them to others, and when it tries them again ----
+
+
+def failed(unopened: UnopenedLines, line: str) -> None:
+    for _ in range(OPENINGS):
+        unopened.failed(line)
+
+
+def test_a_line_is_reported_after_three_failed_openings() -> None:
+    unopened = UnopenedLines(HandClock())
+    for _ in range(OPENINGS - 1):
+        unopened.failed("a")
+    unopened.opened("a")
+    for _ in range(OPENINGS - 1):
+        unopened.failed("a")
+    assert unopened.named() == frozenset()
+    unopened.failed("a")
+    assert unopened.named() == {"a"}
+    unopened.opened("a")
+    assert unopened.named() == frozenset()
+
+
+def test_a_polled_line_is_reported_when_its_port_is_lost_for_6_s() -> None:
+    clock = HandClock()
+    unopened = UnopenedLines(clock)
+    unopened.lost("a")
+    clock.pass_s(LOST_NS / SECOND - 1)
+    unopened.lost("a")
+    unopened.opened("a")
+    unopened.lost("a")
+    clock.pass_s(LOST_NS / SECOND - 1)
+    unopened.lost("a")
+    assert unopened.named() == frozenset()
+    clock.pass_s(1)
+    unopened.lost("a")
+    assert unopened.named() == {"a"}
+
+
+@table(
+    ("silent_s", "named_after_s"),
+    [(2.0, 4.0), (REPLY_NS / SECOND, 3.0), (60.0, 6.0), (None, 6.0)],  # None: no reply at all
+)
+def test_a_loss_counts_from_the_last_reply(silent_s: float | None, named_after_s: float) -> None:
+    """The port's loss and the failure of reopening are noticed only some seconds after the line was cut."""
+    clock = HandClock()
+    unopened = UnopenedLines(clock)
+
+    def lost_after(seconds: float) -> bool:
+        clock.pass_s(seconds)
+        silent_ns = None if silent_s is None else round((silent_s + seconds) * SECOND)
+        unopened.lost("a", silent_ns)
+        return "a" in unopened.named()
+
+    assert not lost_after(0.0)
+    assert not lost_after(named_after_s - 0.1)
+    assert lost_after(0.1)
+
+
+def test_one_line_is_tried_at_a_time_with_increasing_pauses() -> None:
+    clock = HandClock()
+    unopened = UnopenedLines(clock)
+    for line in "abc":
+        failed(unopened, line)
+    wait_s = FIRST_WAIT_NS / SECOND
+    for line in "abcab":
+        clock.pass_s(wait_s - 1)
+        assert unopened.named() == set("abc")
+        clock.pass_s(1)
+        assert unopened.named() == set("abc") - {line}
+        failed(unopened, line)
+        assert unopened.named() == set("abc")
+        wait_s = min(2 * wait_s, LAST_WAIT_NS / SECOND)
+
+
+def test_lines_reported_by_all_gateways_are_tried_first_and_regularly() -> None:
+    clock = HandClock()
+    unopened = UnopenedLines(clock)
+    for line in "abc":
+        failed(unopened, line)
+    unopened.hopeless = frozenset("b")
+    for _ in range(5):
+        clock.pass_s(FIRST_WAIT_NS / SECOND)
+        assert unopened.named() == {"a", "c"}
+        failed(unopened, "b")
+    unopened.hopeless = frozenset()
+    clock.pass_s(FIRST_WAIT_NS / SECOND)
+    assert unopened.named() == {"a", "b", "c"}
+
+
+def test_after_a_successful_trial_the_other_lines_are_tried_at_once() -> None:
+    clock = HandClock()
+    unopened = UnopenedLines(clock)
+    for line in "abc":
+        failed(unopened, line)
+    clock.pass_s(FIRST_WAIT_NS / SECOND)
+    for line, left in (("a", {"b", "c"}), ("b", {"c"}), ("c", set[str]())):
+        assert unopened.named() == left
+        unopened.opened(line)
+
+
+def test_a_trial_prefers_assigned_lines_and_its_success_clears_the_rest() -> None:
+    """A line that is assigned to another gateway would not come back after a trial."""
+    clock = HandClock()
+    unopened = UnopenedLines(clock)
+    for line in "abcd":
+        failed(unopened, line)
+    unopened.home = frozenset("bd")
+    clock.pass_s(FIRST_WAIT_NS / SECOND)
+    assert unopened.named() == {"a", "c", "d"}
+    unopened.opened("b")
+    assert unopened.named() == frozenset()  # the trial of d starts immediately
+    unopened.opened("d")
+    assert unopened.named() == frozenset()
+
+
+def test_a_trial_ends_after_a_minute_if_the_line_does_not_come_back() -> None:
+    clock = HandClock()
+    unopened = UnopenedLines(clock)
+    failed(unopened, "a")
+    failed(unopened, "b")
+    clock.pass_s(FIRST_WAIT_NS / SECOND)
+    assert unopened.named() == {"b"}
+    clock.pass_s(max(TRIAL_NS, FIRST_WAIT_NS) / SECOND)
+    assert unopened.named() == frozenset()
+
+
+def test_only_lines_that_fit_into_a_lease_record_are_reported() -> None:
+    unopened = UnopenedLines(HandClock())
+    for number in range(MOST_BYTES // 8):
+        failed(unopened, f"line-{number}")
+    assert 0 < sum(len(line) + 4 for line in unopened.named()) <= MOST_BYTES
+
+
+# ---- which gateway gets reported lines ----
+
+LINES = [f"line-{number}" for number in range(60)]
+SHARED = assign(LINES, ["a", "b", "c"])
+OF_A = {line for line, name in SHARED.items() if name == "a"}
+
+
+def test_only_reported_lines_move_and_all_gateways_agree_where() -> None:
+    found = hand_over(SHARED, {"a": OF_A, "b": [], "c": []})
+    assert set(found.values()) == {"b", "c"}
+    assert {line for line in LINES if found[line] != SHARED[line]} == OF_A
+    assert found == hand_over(dict(reversed(SHARED.items())), {"c": [], "b": [], "a": sorted(OF_A)})
+
+
+def test_a_line_that_no_gateway_can_open_is_not_moved() -> None:
+    assert hand_over(SHARED, {"a": LINES, "b": LINES, "c": LINES}) == SHARED
+
+
+def test_a_reported_line_moves_to_a_gateway_that_has_not_tried_it() -> None:
+    found = hand_over(SHARED, {"a": OF_A, "b": OF_A, "c": []})
+    assert {found[line] for line in OF_A} == {"c"}
+
+
+def test_a_gateway_without_a_list_of_unopened_lines_gets_no_lines_of_others() -> None:
+    """A gateway without a list has another version, which would not take lines that are handed over."""
+    assert hand_over(SHARED, {"a": OF_A}) == SHARED
+    assert set(hand_over(SHARED, {"a": OF_A, "c": []}).values()) == {"b", "c"}

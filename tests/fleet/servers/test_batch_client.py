@@ -1,4 +1,4 @@
-"""Many answers at a time: which are accepted, and what a missing answer causes."""
+"""Many answers at a time: which of them are accepted, and what happens if one is missing."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SERVERS = (
 
 @pytest.fixture(params=["taken at once", "nats-py's own way", "another nats-py"])
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Use the fast path, nats-py's own path, or a changed nats-py; return a unique name."""
+    """Receive answers directly, by nats-py's queue, or with a changed nats-py; return a prefix of keys."""
     if request.param == "nats-py's own way":
         monkeypatch.delattr(BatchClient, "_process_msg")
     elif request.param == "another nats-py":
@@ -108,7 +108,7 @@ async def test_a_record_like_an_end_marker_does_not_hide_later_ones(one: Cluster
         await client.flush()
         await client.close()
         while f"{way}-b" not in [record.key for record in await bucket.changes(0)]:
-            await asyncio.sleep(0.05)  # the write has no answer to wait for
+            await asyncio.sleep(0.05)  # waits until the unanswered write is stored
         await bucket.put(f"{way}-c", OWNER, 0)
         found = await bucket.changes(0)
         keys = [record.key for record in found if record.key.startswith(way)]
@@ -145,9 +145,9 @@ async def test_unanswered_requests_are_distinguished_from_answered_ones(one: Clu
     assert found[1] == b""  # the server reports that the request has no receiver
     assert found[2] is not None
     assert found[2].startswith(b"{")
-    with pytest.raises(TimeoutError, match=r"nothing came for 0.2 s"):
+    with pytest.raises(TimeoutError, match=r"no message came for 0.2 s"):
         await client.batch(mute, DirectGet(), 0.2)
-    with pytest.raises(OSError, match="it ended with 503"):
+    with pytest.raises(OSError, match="it ended with status 503"):
         await client.batch(nobody, DirectGet(), 5.0)
     assert client._takers == {}
     await deaf.unsubscribe()
@@ -174,7 +174,7 @@ async def test_reads_lost_on_a_cut_off_server_are_repeated(
                 await other.flush()
 
         await other.subscribe("moody", cb=answer)
-        await other.flush()  # this flush's ping may precede the subscription; the second one's does not
+        await other.flush()  # may return before the server has the subscription; the second cannot
         await other.flush()
         if is_told:
             assert await path.collect("moody", b"") == []
@@ -213,7 +213,7 @@ async def test_a_late_answer_is_not_taken_for_another_request(one: Cluster) -> N
         asked.put_nowait(message.reply)  # type: ignore[attr-defined]
 
     await other.subscribe("slow", cb=keep)
-    await other.flush()  # this flush's ping may precede the subscription; the second one's does not
+    await other.flush()  # may return before the server has the subscription; the second cannot
     await other.flush()
     assert await client.replies([Request("slow", b"first")], 0.2) == [None]
     second = asyncio.create_task(client.replies([Request("slow", b"second")], 30.0))

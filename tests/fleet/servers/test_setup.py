@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import re
+import json
 import subprocess
 import time
 from pathlib import Path
@@ -11,16 +11,19 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fleets import MemoryBucket
 from nats_clusters import Cluster, cluster, connected_path, free_ports, old_server_program, server_program
 from tables import table
 
+from multidrop import Plant
 from multidrop.fleet.errors import FleetError, Unsure
 from multidrop.fleet.servers import connections as servers
 from multidrop.fleet.servers import names, setup
 from multidrop.fleet.servers.batch_client import DirectMessage
-from multidrop.fleet.servers.buckets import LeaseBucket, ask
+from multidrop.fleet.servers.buckets import LeaseBucket, Record, ask
 from multidrop.fleet.servers.connections import ServerPath, paths_of
 from multidrop.fleet.servers.leaders import have_leaders
+from multidrop.fleet.servers.plant_store import line_of, read_plant, store
 
 
 async def _init(urls: list[str]) -> dict[str, object]:
@@ -91,10 +94,10 @@ def test_lines_can_be_claimed_while_two_of_three_buckets_have_a_leader(said: byt
 def test_a_cluster_that_grants_a_key_twice_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In a trial its servers grant a key to two writers; this is found even if versions are ignored."""
+    """These old servers accept two concurrent writes to one revision. The test disables the version check."""
     monkeypatch.setattr(servers, "OLDEST", (0, 0))
     with cluster(tmp_path, 3, old_server_program()) as old:
-        sentence = re.escape("claimants at once: no lease is safe there")
+        sentence = "same revision of a record: they could give one lease to two gateways"
         with pytest.raises(FleetError, match=sentence):
             asyncio.run(_init(old.urls))
 
@@ -104,16 +107,16 @@ def test_servers_that_ignore_other_writers_records_are_refused(
 ) -> None:
     """Such servers would grant a lease to two gateways. Some of their answers may come too late."""
     monkeypatch.setattr(LeaseBucket, "_all_of", LeaseBucket._subject)
-    with pytest.raises(FleetError, match=r"gave one revision of a key to [2-6] of 6 claimants at once"):
+    with pytest.raises(FleetError, match=r"accepted [2-6] of 6 concurrent writes to the same revision"):
         asyncio.run(_init(nats.urls))
 
 
 @pytest.mark.slow
 @table(("is_carried_out",), [(True,), (False,)])
-def test_an_unanswered_removal_is_checked_and_repeated(
+def test_an_unanswered_removal_of_a_bucket_is_checked_and_repeated(
     is_carried_out: bool, nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A busy leader may answer late when the bucket of the trial of writers is removed."""
+    """A busy leader may answer late when `init` removes the bucket in which it tested concurrent writes."""
     removals = []
 
     async def ask_in_vain(path: ServerPath, subject: str, data: Any = None) -> dict[str, Any]:
@@ -148,12 +151,12 @@ def test_init_needs_all_servers_only_the_first_time(tmp_path: Path) -> None:
         while not {f"KV_{name}" for name in names.BUCKETS} <= set().union(*(one.leads() for one in others)):
             assert time.monotonic() < ends
             time.sleep(0.1)
-        assert asyncio.run(_init(three.urls))["replicas"] == 3  # a plant can be stored in the meantime
+        assert asyncio.run(_init(three.urls))["replicas"] == 3  # a plant can still be stored
 
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_no_quorum_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_quorum_is_reported_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(setup, "WAIT_S", 1.0)
     with cluster(tmp_path, 3) as three:
         for node in three.nodes[1:]:
@@ -182,10 +185,8 @@ def test_servers_that_cannot_decide_are_reported_as_no_quorum(
 
 
 @pytest.mark.slow
-def test_a_plant_that_cannot_be_read_yet_is_waited_for(
-    nats: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """For a new bucket, a direct get may find no server."""
+def test_init_waits_until_a_new_plant_can_be_read(nats: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A direct get from a new bucket may at first find no server."""
     collect, failures = ServerPath.collect, [Unsure("it ended with 503")] * 2
 
     async def fail_at_first(self: ServerPath, subject: str, data: bytes) -> list[DirectMessage]:
@@ -199,7 +200,9 @@ def test_a_plant_that_cannot_be_read_yet_is_waited_for(
 
 
 @pytest.mark.slow
-def test_a_server_without_jetstream_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_without_jetstream_is_reported_in_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(setup, "WAIT_S", 0.5)
     [port] = free_ports(1)
     command = [server_program(), "-a", "127.0.0.1", "-p", str(port)]
@@ -219,7 +222,7 @@ def test_a_server_without_jetstream_is_one_sentence(tmp_path: Path, monkeypatch:
 def test_a_bucket_without_a_leader_is_reported_as_no_quorum(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A server that is left alone answers some seconds after the others' death, and names no leader."""
+    """The last running server of a cluster answers for some seconds, but its answers name no leader."""
     told = setup.ask
 
     async def without_leader(path: ServerPath, subject: str) -> dict[str, Any]:
@@ -234,7 +237,7 @@ def test_a_bucket_without_a_leader_is_reported_as_no_quorum(
 
 
 @pytest.mark.slow
-def test_an_election_in_progress_is_waited_for(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_init_waits_for_an_election_in_progress(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     """After its leader died, a bucket has no leader for a moment, although most servers run."""
     told, silent = setup.ask, ["STREAM.INFO.KV_lease_1"] * 3
 
@@ -298,9 +301,142 @@ def test_a_path_moves_to_another_server_and_returns_home(tmp_path: Path) -> None
 
 
 @pytest.mark.long
-async def test_a_silent_home_server_delays_releases_for_at_most_a_minute(tmp_path: Path) -> None:
+async def test_a_path_whose_home_server_is_silent_uses_another_server(tmp_path: Path) -> None:
     with cluster(tmp_path, 2) as two:
         two.nodes[0].pause()
 
         async with connected_path(two) as path:
             assert path.server_name == "n2"
+
+
+# ---- a plant in the bucket: each line read from its record equals that line of the plant file ----
+
+
+PLANT = r"""
+[[line]]
+name = "hall-1"
+port = "socket://10.0.0.7:4001"
+baudrate = 19200
+format = "8E1"
+switching = "2 ms"
+[[line.drive]]
+name = "pump \"1\" \\ Größe æ"
+model = "innovert-ibd"
+address = 1
+every = "50 ms"
+poll = ["output_current", {register = "motor_speed", every = "1 s"}]
+[[line.drive]]
+name = "fan"
+model = "innovert-ibd"
+address = 2
+maximum_frequency = 87.5
+[[line]]
+name = "hall-2"
+port = "tcp://10.0.0.8:502"
+[[line.drive]]
+name = "other"
+model = "invt-che"
+address = 3
+"""
+
+
+def lines_again(path: Path, folder: Path) -> list[Any]:
+    """Return the lines of a plant file as another computer reads them from their records in JSON."""
+    _, records = read_plant(path)
+    shipped: dict[str, Any] = json.loads(json.dumps(records))
+    return [line_of(Record(name, 7, value), folder) for name, value in shipped.items()]
+
+
+def as_text(line: Any) -> str:
+    return repr(
+        [line.name, line.port, line.baudrate, line.format, line.switching, line.echo, line.ids]
+    ) + repr(
+        [
+            (
+                polled.drive.name,
+                polled.drive.address,
+                type(polled.drive).__name__,
+                vars(polled.drive.settings)
+                if hasattr(polled.drive.settings, "__dict__")
+                else polled.drive.settings,
+                [(poll.register.name, poll.every) for poll in polled.polls],
+            )
+            for polled in line.drives
+        ]
+    )
+
+
+def test_lines_read_from_their_records_equal_the_plant_files(tmp_path: Path) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(PLANT, "utf-8")
+    again = lines_again(path, tmp_path / "gateway")
+    assert [as_text(line) for line in again] == [as_text(line) for line in Plant.load(path).lines]
+
+
+def test_a_family_file_is_stored_with_its_line(tmp_path: Path) -> None:
+    (tmp_path / "families").mkdir()
+    head = '[family]\ntitle = "Meter"\nmanual = "M"\ncounts_from = 0\n'
+    (tmp_path / "families" / "own.toml").write_text(f'{head}[reading]\nvoltage = {{ at = 3, unit = "V" }}\n')
+    path = tmp_path / "plant.toml"
+    path.write_text(
+        '[[line]]\nname = "hall"\nport = "socket://h:1"\n[[line.drive]]\nname = "meter"\n'
+        'model = "families/own.toml"\naddress = 1\n'
+    )
+    [again] = lines_again(path, tmp_path / "gateway")
+    assert as_text(again) == as_text(Plant.load(path).lines[0])
+    assert (tmp_path / "gateway" / "hall" / "families" / "own.toml").exists()
+
+
+@pytest.mark.parametrize("name", ["../escape.toml", "/escape.toml", "a/../../b.toml"])
+def test_a_record_writes_no_file_outside_its_folder(tmp_path: Path, name: str) -> None:
+    value = {"line": {"name": "hall"}, "files": {name: "text"}}
+    with pytest.raises(ValueError, match="outside of its folder"):
+        line_of(Record("hall", 1, value), tmp_path / "gateway")
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+async def test_unchanged_lines_keep_their_records_revision() -> None:
+    memory = MemoryBucket("plant")
+    bucket: Any = memory
+    first = {name: {"line": {"name": name}, "files": {}} for name in ("a", "b", "c")}
+    assert await store(bucket, first) == {"new": 3, "changed": 0, "removed": 0, "kept": 0}
+    before = {name: memory.revision(name) for name in first}
+    second = {**first, "b": {"line": {"name": "b", "port": "x"}, "files": {}}}
+    del second["c"]
+    assert await store(bucket, second) == {"new": 0, "changed": 1, "removed": 1, "kept": 1}
+    assert memory.revision("a") == before["a"]
+    assert memory.records["c"].value is None
+    assert await store(bucket, first) == {"new": 1, "changed": 1, "removed": 0, "kept": 1}
+
+
+def test_a_lines_record_has_only_its_own_permissions(tmp_path: Path) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(PLANT)
+    _, before = read_plant(path)
+    lists = 'write = ["fan.frequency"]\nverbs = ["other.start", "fan.start", "other.reset_fault"]'
+    path.write_text(f"{PLANT}\n[fleet.may]\n{lists}\n")
+    plant, records = read_plant(path)
+    assert len(plant.lines) == 2
+    assert records["hall-1"]["may"] == {"write": ["fan.frequency"], "verbs": ["fan.start"]}
+    assert records["hall-2"]["may"] == {"verbs": ["other.reset_fault", "other.start"]}
+    assert all("may" not in record for record in before.values())
+    path.write_text(f'{PLANT}\n[fleet.may]\nverbs = ["other.start"]\n')
+    assert read_plant(path)[1]["hall-1"] == before["hall-1"]  # the record is unchanged, so polling continues
+
+
+CHANNEL = '[[line.drive.channel]]\nname = "half"\nvalue = "{} / 2"\nunit = "{}"\n'
+
+
+def test_channels_of_a_line_are_in_its_record(tmp_path: Path) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(PLANT + CHANNEL.format("output_frequency", "Hz"))
+    *_, last = lines_again(path, tmp_path / "copy")
+    assert last.drives[0].channels == Plant.load(path).lines[1].drives[0].channels != ()
+
+
+def test_channel_of_several_lines_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(PLANT + CHANNEL.format("fan.output_current", "A"))
+    assert Plant.load(path)
+    with pytest.raises(ValueError, match="in a fleet, a channel may only use drives of its own line"):
+        read_plant(path)

@@ -1,12 +1,12 @@
 """The two desks of a gateway: CommandDesk carries out each command once, StopDesk carries out stops.
 
 Both act only on lines whose master is this gateway. The command desk checks a command and sends the
-sender an offer with a token. If the sender returns the token within a second of this computer's
-CLOCK_BOOTTIME, the desk carries out the command. The command is recorded on the disk before it is sent, and
-again when it has ended.
+sender an offer with a token. If the sender returns the token within a second, measured by this computer's
+CLOCK_BOOTTIME, the desk carries out the command. The command is recorded on the disk before it is sent,
+and again when it has ended.
 
-A stop needs no offer and no permission in the plant's list, because a repeated stop is harmless, but a late
-one may do harm. It is sent first and recorded afterwards.
+A stop needs no offer and no entry in `[fleet.may]`: sending a stop twice is harmless, but a late stop may do
+harm. The stop is sent first and recorded afterwards.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ from multidrop.plant import drive_meant
 from multidrop.supervisor import supervisor
 
 HOLD_S = 0.5  # how long to wait for a command's end before answering "under way"
-AWAITED_S = 3.0  # time limit for commands when a line is released; most writes and read-backs are faster
+AWAITED_S = 3.0  # how long a release of a line waits for commands; most writes and read-backs are faster
 POLL_S = 0.01  # pause between checks whether the commands have ended
 MOST_WRITES = 8  # limit of concurrent commands on one line; stops are not counted
-WAY = "fleet"  # how commands that came through the fleet are marked in the audit log
+WAY = "fleet"  # how the audit log marks commands that came through the fleet
 STOPS_REMEMBERED = 1000  # limit of stops in memory; the oldest are removed
 CALLED = "a stop was called"
 
@@ -54,7 +54,10 @@ _log = logging.getLogger("multidrop.fleet")
 
 
 class CommandDesk:
-    """Offers commands on this gateway's lines and carries them out; senders return tokens on `subject`."""
+    """Offers commands on this gateway's lines, and carries out the accepted offers.
+
+    To accept an offer, its sender publishes the offer's token on the NATS subject `subject`.
+    """
 
     def __init__(
         self,
@@ -74,7 +77,9 @@ class CommandDesk:
     # ---- offering a command ----
 
     def offer(self, line: str, data: bytes) -> Offered | CommandAnswer | None:
-        """Return an offer or a refusal; None unless this gateway is the line's master.
+        """Check the command in a message; return an offer or a refusal.
+
+        Return None unless this gateway is the line's master.
 
         The sender uses the first answer that it gets, so only the master may give one.
         """
@@ -91,10 +96,12 @@ class CommandDesk:
     # ---- carrying out an offered command ----
 
     async def do(self, data: bytes) -> CommandAnswer:
-        """Carry out an offered command once, and return its result, also for a copy of the message.
+        """Carry out an offered command once, and return its result.
 
-        A message with `ask` instead of `do` only asks for the result. If it comes before any `do`, the offer
-        is withdrawn, so that the answer "not sent" stays true.
+        A copy of the message gets the same result.
+
+        A message with `ask` instead of `do` only asks for the result. If `ask` comes before any `do`,
+        answer "not sent", and withdraw the offer so that this answer stays true.
         """
         try:
             message = read_json(data)
@@ -103,10 +110,10 @@ class CommandDesk:
         token = message.get("do", message.get("ask"))
         offer = self.offers.find(token) if isinstance(token, str) else None
         if offer is None:
-            sentence = "no offer with this token is known here, and nothing is sent for it now"
+            sentence = "no offer with this token is known here, so nothing is sent now"
             return CommandAnswer(CommandOutcome.UNKNOWN, sentence, self.gateway)
         if "do" not in message:
-            self.offers.withdraw(offer, "its asker asked for the result before confirming it")
+            self.offers.withdraw(offer, "the client asked for the result before it confirmed the offer")
         elif self.offers.take(offer):
             supervisor().start("command", self._carry_out(offer))
         with suppress(TimeoutError):
@@ -159,7 +166,8 @@ class CommandDesk:
 
     def _limit_ns(self, offer: Offer) -> float:
         """Return the deadline for sending the command (CLOCK_MONOTONIC, ns); 0 if its offer is void."""
-        now_ns = time.monotonic_ns()  # read first: a pause between the two clocks' reads shortens the limit
+        # CLOCK_MONOTONIC is read before CLOCK_BOOTTIME: a pause between the two reads only shortens the limit
+        now_ns = time.monotonic_ns()
         return 0 if offer.why_void else now_ns + self.offers.left_ns(offer)
 
     def _refusal(self, offer: Offer) -> CommandResult | None:
@@ -186,13 +194,13 @@ class CommandDesk:
 
 
 def _prepared(held: HeldLine, request: CommandRequest) -> Prepared:
-    """Return the checked command for a request.
+    """Return the checked command for a request, ready to be carried out.
 
     Raises ValueError if the plant's list does not allow the command, and the errors of `prepare`.
     """
     drive = held.drive(request.drive)
     if request.verb == "stop":
-        raise ValueError("a stop needs no offer: it goes to the line's own subject of stops")
+        raise ValueError("a stop needs no offer: send it to the line's own subject for stops")
     kind = "write" if request.register else "verbs"
     if request.entry not in held.may[kind]:
         raise ValueError(
@@ -210,16 +218,17 @@ class StopDesk:
         self._lines = lines
         self._offers = offers
         self._log = log
-        self._stops: dict[tuple[int, object], asyncio.Task[CommandAnswer]] = {}  # stops by line and message
+        # tasks that carry out stops; the keys are a `HeldLine.number` and the stop's message
+        self._stops: dict[tuple[int, object], asyncio.Task[CommandAnswer]] = {}
         self._repeated = RepeatedStops()
 
     async def stop(self, line: str, data: bytes) -> CommandAnswer | None:
         """Stop drives of a line now; return None unless this gateway is the line's master.
 
-        A damaged message stops all drives of the line. A copy of a message gets the answer of the same stop;
+        A damaged message stops all drives of the line. A copy of a message gets the answer to the first copy;
         a message without an id is always a new stop. A stop that takes longer than HOLD_S is answered with
         "under way" and its progress; the sender then asks again. If this gateway has released or lost the
-        line since, and the motors have not stopped, return None: the next master answers.
+        line in the meantime, and the motors still run, return None, because the line's next master answers.
         """
         held = self._lines.for_stop(line)
         if held is None:
@@ -253,7 +262,10 @@ class StopDesk:
         return CommandAnswer(CommandOutcome.UNDER_WAY, text, self.gateway, drives=drives)
 
     async def _stop_or_report(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
-        """Carry out a stop and return its answer, also if it fails with an unexpected exception."""
+        """Carry out a stop and return its answer.
+
+        If an unexpected exception is raised, the answer reports it.
+        """
         try:
             return await self._stop(held, request)
         except Exception as failure:

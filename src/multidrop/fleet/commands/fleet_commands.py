@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import difflib
 import json
 import logging
 import uuid
@@ -31,11 +30,13 @@ from multidrop.fleet.servers.buckets import Bucket, Follower
 from multidrop.fleet.servers.connections import ServerPath, paths_of
 from multidrop.fleet.servers.setup import open_all
 from multidrop.plant import drive_meant
+from multidrop.printable import did_you_mean
 from multidrop.supervisor import Ended, end_tasks, reason_of
 
-LOST_S = 6.0  # after this long without any answer, a command's result is reported as unknown
+LOST_S = 6.0  # after this many seconds without any answer, a command's result is reported as unknown
 AGAIN_S = 0.2
-NO_MASTER_S = 6.0  # how long a stop waits for a new master, which takes 1 s, or 4 s after a gateway's death
+# how long a stop waits for a new master: a change of masters takes 1 s, or 4 s if a gateway died
+NO_MASTER_S = 6.0
 HARD_WIRED = "use the hard-wired stop"
 
 News = Callable[[CommandAnswer], object]
@@ -51,8 +52,8 @@ class FleetCommands:
     """A client that commands the drives of a fleet.
 
     `by` is the client's name in its own log and in the gateways' logs; `log` is the path of its own log. A
-    command is sent once, and only if it could be noted in `log`. A stop is sent until a gateway answers, even
-    if it cannot be noted. Raises FleetError if no server can be reached.
+    command is sent once, and only after it was written to `log`. A stop is repeated until a gateway answers,
+    even if `log` cannot be written. Raises FleetError if no server can be reached.
     """
 
     def __init__(
@@ -114,8 +115,8 @@ class FleetCommands:
     async def carry_out(self, request: CommandRequest, agreed: str = "") -> CommandAnswer:
         """Send a command once, and return its result. Raises the errors of `write`.
 
-        `agreed` is the text of the preview that a person has confirmed. If the command's text has changed
-        since, the command is not sent.
+        `agreed` is the text of the preview that a person has confirmed. If the text of the offer differs
+        from `agreed`, the command is not sent.
         """
         line = await self._line_of(request.drive)
         record = {"id": request.id, "line": line, "what": request.words, "by": request.by}
@@ -136,7 +137,10 @@ class FleetCommands:
         return answer
 
     async def _offer(self, line: str, request: CommandRequest) -> Offered | CommandAnswer:
-        """Ask for an offer on one path after another: an offer has no effect, so two are harmless."""
+        """Ask for an offer on one path after another until one answers.
+
+        An unused offer has no effect, so two offers do no harm.
+        """
         why = ""
         for path in self._paths:
             try:
@@ -170,7 +174,7 @@ class FleetCommands:
     async def _end_of(
         self, answer: CommandAnswer, subject: str, asked: bytes, lost: str, on_news: News = _ignore
     ) -> CommandAnswer:
-        """Ask for the result on all paths in turn until it is final; UNKNOWN after LOST_S without answers."""
+        """Ask on all paths in turn until the result is final. Return UNKNOWN after LOST_S without answers."""
         loop = asyncio.get_running_loop()
         ends, at = loop.time() + LOST_S, 0
         reported = {""}
@@ -193,26 +197,21 @@ class FleetCommands:
     # ---- stops ----
 
     async def stop(
-        self,
-        drives: Sequence[str] | None = None,
-        *,
-        line: str = "",
-        on_news: News = _ignore,
-        by: str = "",
+        self, drives: Sequence[str] | None = None, *, line: str = "", on_news: News = _ignore, by: str = ""
     ) -> CommandAnswer:
         """Stop these drives, or all drives of the plant if None; the lines are stopped in parallel.
 
         With `line` the plant is not read, and the drives are those of the line. `by` replaces this object's
-        `by` in the logs. If a stop takes longer than half a second, `on_news` is called in the loop with its
-        progress, and again at each change. A drive that is not in the plant gets the answer "refused"; the
-        other drives are stopped.
+        `by` in the logs. If a stop takes longer than half a second, `on_news` is called in the event loop
+        with the stop's progress, and again whenever it changes. A drive that is not in the plant gets the
+        answer "refused"; the other drives are stopped.
 
         Raises ValueError if none of the drives is in the plant, FleetError if the plant cannot be read. In
         both cases no stop was sent.
         """
         drives = [drives] if isinstance(drives, str) else drives
         wanted, unknown = await self._lines_of(drives, line)
-        asked = spelt(by or self.by) or UNNAMED  # a stop is sent even without a valid name
+        asked = spelt(by or self.by) or UNNAMED  # a stop is sent even if its sender's name is invalid
         answers = await asyncio.gather(*(self._stop(one, wanted[one], on_news, asked) for one in wanted))
         answers += unknown
         if len(answers) == 1:
@@ -279,7 +278,10 @@ class FleetCommands:
         return self._find(drive)
 
     async def _read_plant(self, otherwise: str) -> None:
-        """Read changes of the plant. If that fails, use an older copy: masters check each command."""
+        """Read changes of the plant.
+
+        If that fails, use an older copy, because masters check each command anyway.
+        """
         try:
             await self._plant.look()
         except FleetError as failure:
@@ -291,8 +293,8 @@ class FleetCommands:
         for line, drives in lines.items():
             if drive in drives:
                 return line
-        near = difflib.get_close_matches(drive, [name for names in lines.values() for name in names], n=2)
-        hint = f"did you mean {' or '.join(near)}?" if near else "`multidrop fleet lines` lists its lines"
+        names = [name for drives in lines.values() for name in drives]
+        hint = did_you_mean(drive, names, "`multidrop fleet lines` lists its lines")
         raise ValueError(f"the fleet's plant has no drive {drive!r}; {hint}")
 
     async def _note_end(self, record: Mapping[str, Any], answer: CommandAnswer | None) -> None:
@@ -312,7 +314,7 @@ async def _first_answer(
     """Send a stop until a gateway answers or may have received it; return that answer or UNDER_WAY.
 
     Return NOT_SENT if no gateway can have received the stop within NO_MASTER_S, or if this client may not
-    send stops. Until then, `on_news` reports that the stop was not sent yet.
+    send stops. During the wait, `on_news` reports that the stop was not sent yet.
     """
     loop = asyncio.get_running_loop()
     ends, reported = loop.time() + NO_MASTER_S, ""

@@ -4,21 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from itertools import count
-from typing import Any, Protocol
+from typing import Any
 
 from multidrop import Bus, Drive
 
 LISTS = ("write", "verbs")  # keys of [fleet.may]
 
 
-class PolledBuses(Protocol):
-    """The methods of a Poller that commands need."""
-
-    def bus(self, line: str) -> Bus: ...
-
-
 class HeldLine:
-    """A line that this gateway polls. It gets a new number each time this gateway becomes its master."""
+    """A line that this gateway polls. It has a new `number` each time this gateway becomes its master."""
 
     _numbers = count(1)
 
@@ -42,24 +36,28 @@ class HeldLine:
 
 
 class HeldLines:
-    """The lines for which this gateway accepts commands and stops.
+    """The lines for which this gateway accepts commands and stops. `bus` returns the bus of a polled line.
 
-    `may_stop` returns True while this gateway is the line's master. `may_command` returns True once no frame
-    of the previous master can still be on the line. A stop that collides with such a frame is repeated; a
-    command would be lost.
+    `may_stop` returns True while this gateway is the line's master. `may_command` returns True once no
+    frame of the previous master can still be on the line. A stop that collides with such a frame is
+    repeated, but a command would be lost.
     """
 
     def __init__(
-        self, buses: PolledBuses, *, may_command: Callable[[str], bool], may_stop: Callable[[str], bool]
+        self,
+        bus: Callable[[str], Bus],
+        *,
+        may_command: Callable[[str], bool],
+        may_stop: Callable[[str], bool],
     ) -> None:
-        self._buses = buses
+        self._bus = bus
         self._may_command = may_command
         self._may_stop = may_stop
         self._held: dict[str, HeldLine] = {}
 
     def open(self, line: str, description: Mapping[str, Any]) -> None:
         """Accept commands and stops for a line from now on, because it is polled."""
-        self._held[line] = HeldLine(line, self._buses.bus(line), lists_of(description))
+        self._held[line] = HeldLine(line, self._bus(line), lists_of(description))
 
     def leave(self, line: str) -> None:
         """Accept only stops for the line from now on."""

@@ -1,4 +1,7 @@
-"""CommandLog: a file with one line of JSON for each step of a command. A step waits until it is logged."""
+"""CommandLog: a file with one line of JSON for each step of a command.
+
+`note` returns once its line is on the disk, so that a caller can log a step before taking it.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from multidrop.control import AuditLog
 from multidrop.supervisor import supervisor
 
 WRITING_S = 10.0  # if writing a record takes longer, the disk is reported as hanging
-CLOSING_S = 1.0  # closing waits this long for the record that is being written
+CLOSING_S = 1.0  # how long, in s, closing waits for the record that is being written
 
 
 class CommandLog:
@@ -60,7 +63,7 @@ class CommandLog:
             log.sync()
 
     def close(self) -> None:
-        """Close the file when the record that is being written is done; later records are refused."""
+        """Wait until the present record is written, then close the file; later records are refused."""
         self._is_closed = True
         if self._writing.acquire(timeout=CLOSING_S):
             if self._log:

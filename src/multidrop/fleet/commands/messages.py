@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from math import isfinite
+from sys import float_info
 from typing import Any, NamedTuple
 
 from multidrop.control import CommandOutcome as CommandOutcome
 from multidrop.control import CommandResult, with_name
+from multidrop.printable import is_number
 
-MOST_BYTES = 64 * 1024  # limit of a message's size
+MOST_BYTES = 64 * 1024  # limit of a message's size in bytes
 MOST_CHARACTERS = 200  # limit of a name's, an id's or a value's length
 UNNAMED = "somebody"  # name of a stop's sender if the message has no name
 
@@ -18,7 +19,7 @@ UNNAMED = "somebody"  # name of a stop's sender if the message has no name
 class CommandAnswer(NamedTuple):
     """The outcome of a command or a stop.
 
-    `held` is the value that the drive holds after a write, as text with its unit.
+    `held` is the register's value in the drive after a write, as text with its unit.
     `drives` has an answer for each drive of a stop.
     """
 
@@ -87,7 +88,7 @@ class Offered(NamedTuple):
 
     token: str
     subject: str  # the subject to which the sender returns the token
-    text: str  # description of the command
+    text: str  # what the gateway will do, as a sentence
     gateway: str
 
 
@@ -115,7 +116,7 @@ def read_command(data: bytes) -> CommandRequest:
     id, by, drive = (_text(found, key) for key in ("id", "by", "drive"))
     verb, register = (_text(found, key, is_needed=False) for key in ("verb", "register"))
     if bool(verb) == bool(register):
-        raise ValueError("a command has either a verb or a register")
+        raise ValueError("a command must have either a verb or a register")
     options = found.get("options", {})
     if not isinstance(options, dict):
         raise ValueError("options must be a JSON object")
@@ -162,16 +163,9 @@ def _value(found: Mapping[str, Any]) -> float | str:
     value = found.get("value")
     if isinstance(value, str):
         return _text(found, "value")
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not _is_finite(value):
+    if not is_number(value) or not abs(value) <= float_info.max:
         raise ValueError("value is missing, or is neither a number nor a text")
     return value
-
-
-def _is_finite(value: float) -> bool:
-    try:
-        return isfinite(value)
-    except OverflowError:  # raised for an int that is too large for a float
-        return False
 
 
 def read_offer(data: bytes) -> Offered | CommandAnswer:

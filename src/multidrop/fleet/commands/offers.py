@@ -81,10 +81,10 @@ def _prepare_write(drive: Drive, request: CommandRequest) -> Prepared:
 
 @dataclass(eq=False)
 class Offer:
-    """An offer to carry out one command on a held line.
+    """An offer to carry out one command on a line that this gateway polls.
 
-    `is_taken` is set when the sender returns the token. `answer` and `over` are set when the command has
-    ended.
+    `is_taken` becomes True when the sender returns the token. When the command has ended, `answer` and
+    the event `over` are set.
     """
 
     token: str
@@ -114,7 +114,10 @@ class Offers:
         return len(self._by_token)
 
     def make(self, request: CommandRequest, prepared: Prepared, held: HeldLine) -> Offer:
-        """Return a new offer; for a copy of an earlier request, return the earlier offer."""
+        """Return a new offer for a checked request.
+
+        For a copy of an earlier request, return the earlier offer.
+        """
         known = self._by_request.get((held.name, request.id))
         if known is not None and known.request == request:
             return known
@@ -129,7 +132,10 @@ class Offers:
         return self._by_token.get(token)
 
     def take(self, offer: Offer) -> bool:
-        """Return True at the first call for an offer: only then may its command be carried out."""
+        """Mark the offer as taken.
+
+        Return True only at the first call: only then may the command be carried out.
+        """
         is_first = not offer.is_taken
         offer.is_taken = True
         return is_first

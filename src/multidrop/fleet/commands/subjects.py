@@ -2,8 +2,8 @@
 
 A gateway subscribes to a line's subjects only while it polls the line. For a line without a master, the
 server therefore reports to a sender that there is no receiver. Each message arrives once on each path;
-CommandDesk and StopDesk recognise copies by the id that the sender chose. Messages are not stored in a
-stream.
+CommandDesk and StopDesk recognise copies by the id that the sender chose. No stream stores these
+messages.
 """
 
 from __future__ import annotations
@@ -67,7 +67,8 @@ class CommandSubjects:
 
     async def _subscribe(self, subject: str, heard: Heard) -> None:
         async def take(message: Msg) -> None:
-            supervisor().start("answer", _answer(message, heard))  # so messages do not wait for each other
+            # in a task, so that messages do not wait for each other
+            supervisor().start("answer", _answer(message, heard))
 
         await asyncio.gather(*(path.subscribe(subject, take) for path in self._paths))
 
@@ -102,7 +103,7 @@ async def _answer(message: Msg, heard: Heard) -> None:
 class CommandedLines:
     """Polls lines, and accepts commands for a line while it is polled.
 
-    `may_wait` returns True while the lease leaves time before the lines must be closed.
+    `may_wait` returns True until the lines must be closed because the lease is about to expire.
     """
 
     def __init__(

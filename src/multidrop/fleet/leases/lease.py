@@ -1,4 +1,7 @@
-"""Lease: a gateway's own session, which is renewed on three paths, and the deadline for sending."""
+"""Lease: a gateway's own session, which is renewed on three paths, and the deadline for sending.
+
+LifeLock lets a gateway prove that the earlier process which used its folder is dead.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,14 @@ import time
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from multidrop.fleet.errors import Conflict, FleetError, Unsure
-from multidrop.fleet.leases import life_lock
 from multidrop.fleet.leases import rules as lease_rules
-from multidrop.fleet.leases.life_lock import LifeLock
 from multidrop.fleet.leases.rules import RENEW_S, SECOND, SeenRevision, Terms
 from multidrop.fleet.servers.buckets import NONE_YET, Bucket, Record
+from multidrop.recording import FileLock
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -25,7 +28,7 @@ AGAIN_S = 0.1  # pause before a failed renewal is repeated
 
 
 def boottime_ns() -> int:
-    """Return CLOCK_BOOTTIME in ns: it also runs while the computer sleeps, and cannot be set."""
+    """Return CLOCK_BOOTTIME in ns: this clock also runs while the computer sleeps, and cannot be set."""
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
@@ -82,7 +85,7 @@ class Lease:
         self._nonce = uuid.uuid4().hex
         self._watched: list[SeenRevision | None] = [None] * len(buckets)
         self._newest = 0  # newest session number of this process; later sessions get higher numbers
-        self._ended: set[int] = set()  # paths on which others have ended this session's record
+        self._ended: set[int] = set()  # paths on which other gateways have ended this session's record
 
     # ---- state ----
 
@@ -97,17 +100,20 @@ class Lease:
 
     @property
     def best(self) -> int:
-        """Return the number of the path that was renewed last: that path's server has the newest records."""
+        """Return the path of the newest renewal, because that path's server has the newest records."""
         return max(range(len(self.held)), key=lambda path: held.sent if (held := self.held[path]) else 0)
 
     @property
     def is_over(self) -> bool:
-        """Return True if we hold too few of the session's records to renew the session."""
+        """Return True if the session cannot be renewed, because we hold too few of its records."""
         return sum(path is not None for path in self.held) < self.terms.needed
 
     @property
     def is_weak(self) -> bool:
-        """Return True if others have ended one of our three records: losing one more ends the session."""
+        """Return True if other gateways have ended one of our three records.
+
+        Losing one more record ends the session.
+        """
         return bool(self.session and self._ended)
 
     async def could_be_whole(self) -> bool:
@@ -160,7 +166,10 @@ class Lease:
             return None
 
     def _is_free(self, path: int, record: Record) -> bool:
-        """Return True if the record may be taken: its session was ended, its process died, or it is stale."""
+        """Return True if the record may be taken.
+
+        That is so if its session was ended, its process died, or the record is stale.
+        """
         value = record.value
         if record.revision == NONE_YET or (value and value["ended"] and "by" not in value):
             return True
@@ -181,7 +190,7 @@ class Lease:
             revision = await self._buckets[path].put(self.name, self._value(), record.revision)
         except (Conflict, FleetError):
             return
-        if nonce == self._nonce:  # otherwise the answer is for an earlier session
+        if nonce == self._nonce:  # otherwise the answer belongs to an earlier session
             self.held[path] = Held(revision, sent)
 
     def _value(self, *, ended: bool = False) -> dict[str, Any]:
@@ -193,7 +202,7 @@ class Lease:
             "ended": ended,
             "began": self.began_ms,
             "host": os.uname().nodename,
-            "machine": life_lock.machine_id(),
+            "machine": machine_id(),
             "lock": str(self._lock.path) if self._lock else "",
             "lock_id": self._lock.id if self._lock else "",
             "pid": os.getpid(),
@@ -202,9 +211,9 @@ class Lease:
     # ---- renewal ----
 
     async def renew(self, path: int) -> None:
-        """Renew one path forever. Each path has its own task, so no path waits for another.
+        """Renew the record on one path forever. Each path has its own task, so no path waits for another.
 
-        A failed renewal is repeated soon, because the bucket may get a leader at any moment. Two renewed
+        A failed renewal is repeated soon, because the bucket may get a leader at any moment. Renewals on two
         paths are enough to poll.
         """
         while True:
@@ -216,7 +225,7 @@ class Lease:
             await asyncio.sleep(max(rest, AGAIN_S))
 
     async def renew_once(self, path: int) -> None:
-        """Renew one path's record. The lease's time counts from the moment before the request is sent."""
+        """Renew the record on one path. The time of the lease starts right before the request is sent."""
         held, nonce, sent = self.held[path], self._nonce, self.clock()
         if held is None:
             if path not in self._ended:
@@ -230,7 +239,7 @@ class Lease:
             if isinstance(failure, Unsure):
                 await self._look_again(path, nonce, held)
         else:
-            if nonce == self._nonce:  # otherwise the answer is for an earlier session
+            if nonce == self._nonce:  # otherwise the answer belongs to an earlier session
                 self.held[path] = Held(revision, sent)
                 self._extend()
 
@@ -241,7 +250,8 @@ class Lease:
             return
         value = record.value
         if value and value["nonce"] == nonce and not value["ended"]:
-            self.held[path] = Held(record.revision, held.sent)  # the earlier of two possible times is safe
+            # This renewal or an earlier one stored the record. The earlier one's time is safe in both cases.
+            self.held[path] = Held(record.revision, held.sent)
         elif record.revision > held.revision:
             self._lose(path)
 
@@ -255,8 +265,8 @@ class Lease:
     async def _take_late(self, path: int) -> None:
         """Take the record on a path that was not available when the session started.
 
-        The session in that record ended when we took the records on the other paths. While we hold too few of
-        those, do nothing: another gateway of this name may still need this record.
+        That record's session ended when we took its records on the other paths. While we hold too few of the
+        other paths' records, do nothing: another gateway of this name may still need this record.
         """
         nonce = self._nonce
         record = await self._read(path)
@@ -274,14 +284,14 @@ class Lease:
     def _extend(self) -> None:
         until = lease_rules.deadline([held.sent if held else None for held in self.held], self.terms)
         if until > self.until and lease_rules.may_send(self.clock(), until):
-            with suppress(ValueError):  # this process was suspended after the clock was read
+            with suppress(ValueError):  # raised if this process was suspended after the clock was read
                 self._mastership.extend(until)
                 self.until = until
 
     # ---- end ----
 
     async def end(self) -> None:
-        """Stop sending, and record the end of this session, so that other gateways need not wait."""
+        """Stop sending, and mark this session's records as ended, so that other gateways need not wait."""
         self._mastership.end()
         self.until = 0
         held, value = self.held, self._value(ended=True)
@@ -297,12 +307,15 @@ class Lease:
 
 
 def _least_session(record: Record) -> int:
-    """Return a number that no earlier session exceeds: the record's session, or its revision if invalid."""
+    """Return the highest session number that was used so far, as far as this record shows.
+
+    If the record is invalid, return its revision, which is never below that number.
+    """
     return int(record.value["session"]) if record.value else record.revision
 
 
 async def put_end(bucket: Bucket, end: Record) -> None:
-    """Replace our own record by a record that ends its session. Raises the errors of `Bucket.put`.
+    """Replace our own record by `end`, which marks our session as ended. Raises the errors of `Bucket.put`.
 
     If a cancelled renewal was stored in the meantime, replace that record too.
     """
@@ -313,3 +326,55 @@ async def put_end(bucket: Bucket, end: Record) -> None:
         if not newest.value or newest.value["ended"] or newest.value["nonce"] != end.value["nonce"]:
             raise
         await bucket.put(end.key, end.value, newest.revision)
+
+
+# ---- the lock of a gateway's process ----
+
+
+IDS = (Path("/etc/machine-id"), Path("/proc/sys/kernel/random/boot_id"))
+
+
+class LifeLock:
+    """A lock on a local file, held until the process ends.
+
+    A process that gets the lock later knows that this process is dead.
+
+    The file holds a random id, because containers may share the machine id and the path. Raises
+    FleetError if another process of this computer holds the lock.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path.resolve()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            self._lock = FileLock(path)
+        except BlockingIOError:
+            sentence = f"another gateway of this machine uses {path}; stop that one first"
+            raise FleetError(sentence) from None
+        self.id = path.read_text("ascii", "replace").strip()
+        if not self.id:
+            self.id = uuid.uuid4().hex
+            with path.open("w", encoding="ascii") as file:
+                file.write(self.id)
+                file.flush()
+                os.fsync(file.fileno())
+
+    def proves_death(self, value: Mapping[str, Any]) -> bool:
+        """Return True if the process that wrote this record is dead: it held the lock that we hold now."""
+        mine = (str(self.path), self.id, machine_id())
+        return "" not in mine and (value.get("lock"), value.get("lock_id"), value.get("machine")) == mine
+
+    def close(self) -> None:
+        self._lock.close()
+
+
+def machine_id() -> str:
+    """Return an id of this computer's present boot; "" if unknown: then no process can be proved to be dead.
+
+    Computers with copies of one disk have the same machine id and the same lock file, but different
+    boot ids. After a reboot, a gateway waits until the lease in its earlier record has expired.
+    """
+    with suppress(OSError):
+        ids = [path.read_text("utf-8", "replace").strip() for path in IDS]
+        return ".".join(ids) if all(ids) else ""
+    return ""

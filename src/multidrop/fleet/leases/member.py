@@ -23,8 +23,7 @@ from enum import StrEnum
 from functools import partial
 from typing import Any
 
-from multidrop.fleet.leases.lease import Lease, MayPoll
-from multidrop.fleet.leases.life_lock import LifeLock
+from multidrop.fleet.leases.lease import Lease, LifeLock, MayPoll
 from multidrop.fleet.leases.observer import Observer
 from multidrop.fleet.leases.rules import RULES, SECOND, USUAL, Terms
 from multidrop.fleet.lines.line_keeper import LineKeeper, Lines, TakenLine
@@ -41,7 +40,8 @@ from multidrop.supervisor import Ended, end_tasks, supervisor
 _log = logging.getLogger("multidrop.fleet")
 
 WEAK_LOOK_S = 1.0
-WEAK_NS = 10 * SECOND  # keep a weak session at least this long after the gateway has settled
+# After the STARTING state, a session that has lost one of its three records is kept for at least this long.
+WEAK_NS = 10 * SECOND
 
 
 class IncompatibleGateways:
@@ -59,7 +59,7 @@ class IncompatibleGateways:
     def look(self, present: Mapping[str, Mapping[str, Any]]) -> None:
         """Update the set of incompatible gateways from the sessions in `present`.
 
-        A gateway that no longer renews its lease does not count, even if its session was not ended yet.
+        A gateway that no longer renews its lease is left out, even if its session was not ended yet.
         """
         others = {name for name, value in present.items() if value.get("rules") != RULES}
         found = frozenset(others - {self._me} - self._observer.dead(others).keys())
@@ -77,12 +77,12 @@ class IncompatibleGateways:
 
 
 GUARD_LOOK_S = 0.02
-STEP_S = 0.05  # time between steps if no record changes
+STEP_S = 0.05  # time between steps while no record changes
 LEAST_STEP_S = 0.01  # least time between steps
-TIDY_NS = SECOND // 2  # time between checks of the share's lines, if no change was reported
+TIDY_NS = SECOND // 2  # time between checks of this gateway's lines, if no change was reported
 SETTLE_S = 3.0
-# End other gateways' sessions only with this much left of our own lease. If less is left, the servers may be
-# failing for all gateways.
+# End other gateways' sessions only while this much of our own lease (in s) is left. If less is left, the
+# servers may be failing for all gateways.
 SOUND_S = 1.0
 
 
@@ -162,7 +162,7 @@ class Member:
         return self.lease.clock() >= self._settled_at
 
     def best(self) -> ServerPath:
-        """Return the path whose lease was renewed last; without a lease, any open path."""
+        """Return the path over which the lease was renewed last; without a lease, return any open path."""
         path = self.paths[self.lease.best]
         return path if path.is_open else next((one for one in self.paths if one.is_open), path)
 
@@ -258,7 +258,7 @@ class Member:
                 await asyncio.wait_for(self._woken.wait(), STEP_S - LEAST_STEP_S)
 
     async def _prepare(self) -> None:
-        """Wait until all records were read, which takes longer than a lease lasts in a large plant.
+        """Wait until all records were read. In a large plant, this takes longer than a lease lasts.
 
         Also wait until no incompatible gateway is alive.
         """
@@ -269,7 +269,7 @@ class Member:
             await asyncio.sleep(STEP_S)
 
     async def _guard(self) -> None:
-        """Close the lines before the lease expires; only then cancel the kernel's timer."""
+        """Close the lines before the lease expires, and cancel the kernel's timer when they are closed."""
         is_armed = was_late = False
         while True:
             if self.keeper.may_poll:
@@ -285,11 +285,11 @@ class Member:
             await asyncio.sleep(GUARD_LOOK_S)
 
     async def _watch_weakness(self) -> None:
-        """Decide when to give up this session after others have ended one of its three records.
+        """Decide when to give up this session after other gateways have ended one of its three records.
 
-        If the session were kept, it would end as soon as one more server fails. Giving it up leaves the lines
-        without a master for a moment. So only one gateway at a time does so, when all paths answer and lines
-        can be claimed.
+        If the session were kept, it would end as soon as one more server fails. Giving it up leaves the
+        lines without a master for a moment. So only one gateway at a time gives up its session, when all
+        paths answer and lines can be claimed.
         """
         while True:
             await asyncio.sleep(WEAK_LOOK_S)
@@ -306,7 +306,7 @@ class Member:
     # ---- one step ----
 
     async def step(self) -> None:
-        """Do the work that is due. The only wait for a server is for ending the sessions of dead gateways."""
+        """Do the work that is due. Only ending the sessions of dead gateways waits for servers."""
         observer = self.records.observer
         present = observer.sessions()
         if not self.lease.is_valid:
@@ -326,7 +326,7 @@ class Member:
             self.keeper.reconcile()
 
     def _see(self, present: Mapping[str, Mapping[str, Any]]) -> set[str]:
-        """Return the other gateways that take lines, and record when this set changes."""
+        """Return the other gateways that take lines, and note the time if this set has changed."""
         self._incompatible.look(present)
         self.keeper.may_claim = not self._incompatible.gateways
         others = {name for name, value in present.items() if not value["draining"]}
@@ -335,7 +335,7 @@ class Member:
         return others
 
     async def _share_out(self, present: Mapping[str, Mapping[str, Any]]) -> None:
-        """Assign the lines to gateways again if gateways or lines came or went."""
+        """Assign the lines to gateways again if gateways or lines were added or removed."""
         sharing = self._see(present)
         if not self.is_draining and self.lease.session:
             sharing.add(self.name)
@@ -354,7 +354,7 @@ class Member:
     ) -> tuple[tuple[str, frozenset[str]], ...]:
         """Return the lines that each gateway could not open.
 
-        Gateways whose record lacks that list are left out.
+        Gateways whose lease record lacks the list of such lines are left out.
         """
         unopened = {name: value.get("unopened") for name, value in present.items()}
         unopened[self.name] = list(self.keeper.unopened.named())

@@ -1,9 +1,10 @@
-"""Observer: watches the sessions of all gateways, and ends those that are no longer renewed.
+"""Observer: watches the sessions of all gateways, and ends the sessions that are no longer renewed.
 
-If a gateway itself ends its session, the end counts immediately. If another gateway ended it, the end counts
-only when the last renewal that this process has read is older than a lease, by its own clock. So neither a
-hasty gateway nor a wrong clock can create a second master. A malicious gateway could, if a session is renewed
-after a long silence and the malicious end is stored before this process has read that renewal.
+If a gateway has ended its own session, this process treats the session as over immediately. If another
+gateway has ended it, this process first waits until, by its own clock, the last renewal that it has read is
+older than a lease. So neither a hasty gateway nor a wrong clock can create a second master. A malicious
+gateway could create one in one case: a session is renewed after a long silence, and the malicious end is
+stored before this process has read that renewal.
 """
 
 from __future__ import annotations
@@ -21,10 +22,11 @@ from multidrop.fleet.leases.rules import SeenRevision, Terms
 from multidrop.fleet.servers.buckets import Bucket, Follower, Record
 from multidrop.supervisor import end_tasks
 
-BELIEVING = lease_rules.USUAL._replace(lease=0, guard=0)  # for viewers: every end counts immediately
+# lease terms for viewers: a session is over as soon as any gateway has ended it
+BELIEVING = lease_rules.USUAL._replace(lease=0, guard=0)
 
-LOOK_S = 0.1  # pause between reads of a path; a takeover takes up to this much longer
-ENDING_S = 0.1  # time limit for answers when ending sessions; the next read shows the other outcomes
+LOOK_S = 0.1  # pause between reads of a path; a takeover may take this much longer
+ENDING_S = 0.1  # how long to wait for answers when ending sessions; later ones show in the next read
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -41,13 +43,13 @@ class Observer:
         self.ended = 0  # number of sessions that this process ended
         self._watched: list[dict[str, SeenRevision]] = [{} for _ in buckets]
         self._looked = [0] * len(self.paths)  # start of the newest read that was answered, by path (ns)
-        self._over: dict[str, int] = {}  # newest session number that is certainly over, by gateway
+        self._over: dict[str, int] = {}  # highest number of a session that is certainly over, by gateway
         self._clock = clock
 
     def restart_waits(self) -> None:
         """Restart all waiting times, because this gateway was cut off and may have missed renewals.
 
-        A session that was over stays over, because it cannot be renewed.
+        A session that is already over stays over, because it cannot be renewed.
         """
         now = self._clock()
         for seen in self._watched:
@@ -74,7 +76,8 @@ class Observer:
     def _note(self, path: int, record: Record) -> None:
         watched = self._watched[path]
         before = watched.get(record.key)
-        if before is not None and is_ended_by_another(record):  # the waiting time of this record continues
+        # The waiting time starts at the last renewal. An end that another gateway wrote does not restart it.
+        if before is not None and is_ended_by_another(record):
             watched[record.key] = before._replace(revision=record.revision)
         else:
             watched[record.key] = lease_rules.watch(before, record.revision, self._clock())
@@ -107,9 +110,9 @@ class Observer:
         return found
 
     def missing(self) -> dict[str, dict[str, Any]]:
-        """Return each gateway whose session others had to end, with its record.
+        """Return each gateway whose session was ended by other gateways, with its record.
 
-        A gateway that ended its session on any path itself is not missing.
+        A gateway is not missing if it has ended the session itself on at least one path.
         """
         present = self.sessions()
         found = {}
@@ -123,7 +126,7 @@ class Observer:
         return found
 
     def weak(self) -> list[str]:
-        """Return the gateways whose session continues although others have ended one of its records."""
+        """Return the gateways whose session continues with two records: other gateways ended the third."""
         return [
             name
             for name, value in self.sessions().items()
@@ -145,7 +148,7 @@ class Observer:
         return not is_ended_by_another(record) or self._is_stale(path, record, now)
 
     def unseen_s(self, gateway: str) -> float:
-        """Return how long (s) no renewal was seen on the two paths that a lease needs."""
+        """Return how many seconds ago renewals were last seen on two paths, as a lease needs them."""
         seen = [watched[gateway].since for watched in self._watched if gateway in watched]
         latest = sorted(seen, reverse=True)[: self.terms.needed]
         return (self._clock() - latest[-1]) / lease_rules.SECOND if latest else 0.0
@@ -155,9 +158,9 @@ class Observer:
     def dead(self, present: Iterable[str] | None = None) -> dict[str, dict[int, Record]]:
         """Return the gateways whose sessions may be ended, each with its stale records by path.
 
-        A record counts as stale only if it was stale at the last read that was answered. While a server
-        answers no reads, the record may be renewed unseen. `present` are the names in `sessions`, if the
-        caller already has them.
+        A record counts as stale only if it was already stale at the start of the last answered read of its
+        path. While no reads are answered, this process does not see renewals of the record. `present` are the
+        names in `sessions`, if the caller already has them.
         """
         found = {}
         for name in self.sessions() if present is None else present:
@@ -198,17 +201,17 @@ class Observer:
         return self.ended > before
 
     def _keep_what_is_over(self) -> None:
-        """Remember which sessions are over, so that they stay over after `restart_waits`."""
+        """Remember the sessions that are over, so that `restart_waits` does not revive them."""
         for name in {name for follower in self.paths for name in follower.records}:
             session = max((record.value["session"] for _, record in self._of(name)), default=0)
             if self.is_over(name, session):
                 self._over[name] = max(session, self._over.get(name, 0))
 
     async def _end_enough(self, records: Mapping[int, Record]) -> bool:
-        """End these records concurrently, and wait for as many answers as needed: a path may have no leader.
+        """End these records concurrently; wait for as many answers as a session's end needs.
 
-        Return True if this call has ended a record. Another gateway may have ended the others; the next read
-        shows that.
+        A path without a leader gives no answer. Return True if this call has ended a record. Another gateway
+        may have ended the other records; the next read shows that.
         """
         ends = [asyncio.create_task(self._end(path, record)) for path, record in records.items()]
         answers: list[bool] = []
@@ -221,7 +224,8 @@ class Observer:
         except TimeoutError:
             pass  # the next step decides again, with newer records
         finally:
-            await end_tasks(*ends)  # a cancelled request may still be stored; the next read shows it
+            # a cancelled request may still be stored; the next read shows whether it was
+            await end_tasks(*ends)
         return any(answers)
 
     async def _end(self, path: int, record: Record) -> bool:
@@ -238,5 +242,5 @@ class Observer:
 
 
 def is_ended_by_another(record: Record) -> bool:
-    """Return True if another gateway wrote the end of this session."""
+    """Return True if this record ends a session, and another gateway has written it."""
     return bool(record.value and record.value["ended"] and record.value.get("by", record.key) != record.key)

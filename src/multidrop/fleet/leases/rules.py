@@ -1,16 +1,17 @@
 """Lease rules: until when a gateway may send, and when another may end its session. No I/O.
 
 A session has one record on each of three paths. Its holder renews all three records; a gateway that takes
-over ends them. `needed` and `ended` are each more than half of the paths. So at least one of the paths that
-the holder must renew is also one that the other gateway must end. The server of that path decides. The holder
-counts the lease from the moment before it sent a renewal. An observer counts from the moment at which it
-first saw a revision, by its own clock. After the time of a lease it ends exactly that revision. So clocks of
-different computers are never compared. An ended path stays ended for its session.
+over ends them. The holder must renew more than half of the paths (`needed`), and the other gateway must end
+more than half (`ended`). So both must write on at least one common path. That path's server accepts only one
+of the two writes. The holder's lease starts right before it sends a renewal. An observer starts to wait when
+it first sees a revision, by its own clock. After the time of a lease it ends the record only if the record
+still has that revision. So clocks of different computers are never compared. An ended path stays ended for
+its session.
 
-Once a session is over, its lines are claimed and opened immediately. The guard starts then: the engine
-listens for at least that long before the first request on a line (csrc/listen.c).
+Once a session is over, its lines are claimed and opened immediately. The guard time starts then: before its
+first request on a line, the engine only listens for at least this time (csrc/line.c).
 
-tests/fleet/test_lease_model.py checks all interleavings with these functions.
+tests/fleet/test_ownership_model.py checks all interleavings with these functions.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import NamedTuple
 SECOND = 1_000_000_000  # one second in ns
 PATHS = 3
 RENEW_S = 0.5  # time between renewals of a path
-RULES = 2  # version of the ownership rules (ownership.py): increment it with each change
+RULES = 2  # version of the ownership rules (ownership.py); increment it if these rules change
 
 
 class Terms(NamedTuple):
@@ -30,7 +31,7 @@ class Terms(NamedTuple):
     lease: int = 2_300_000_000
     guard: int = 700_000_000  # from the end of a session to the first request of the next master
     needed: int = 2  # number of paths that the holder must renew
-    ended: int = 2  # number of paths that a gateway must end to take over
+    ended: int = 2  # number of paths that another gateway must end to take over
 
 
 USUAL = Terms()
@@ -58,7 +59,7 @@ def may_send(now: int, until: int) -> bool:
 
 
 def watch(before: SeenRevision | None, revision: int, now: int) -> SeenRevision:
-    """Return the updated observation of a record after reading it."""
+    """Return the observation of a record after a read: `before`, or a new one if the revision is new."""
     return before if before is not None and before.revision == revision else SeenRevision(revision, now)
 
 

@@ -10,22 +10,26 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from multidrop import Bus, Plant, Poller, PollingFailed
+from multidrop import Plant, Poller, PollingFailed
 from multidrop.core import Mastership
 from multidrop.fleet.lines.line_keeper import PortLoss
-from multidrop.fleet.samples.polled_units import PolledUnits
 from multidrop.fleet.servers.buckets import Record
 from multidrop.fleet.servers.plant_store import line_of
+from multidrop.samples import PolledUnits
 from multidrop.supervisor import supervisor
 
 THREADS = 32  # limit of lines that are opened or closed at the same time
 
 
 class FleetLines:
-    """Adds lines to a poller and removes them. Both wait for ports, so they run in threads."""
+    """Adds lines to a poller and removes them, in threads, because both wait for ports."""
 
     def __init__(self, mastership: Mastership, folder: Path, units: PolledUnits) -> None:
-        self.poller = Poller(Plant((), folder), mastership=mastership, audit=folder / "audit.jsonl")
+        self.poller = Poller(
+            Plant((), folder, totals=folder / "totals.json"),
+            mastership=mastership,
+            audit=folder / "audit.jsonl",
+        )
         self._folder = folder / "lines"
         self._units = units
         self._free = asyncio.Semaphore(THREADS)
@@ -33,8 +37,8 @@ class FleetLines:
     async def take(self, line: str, description: Any) -> None:
         """Open the line and poll it. If that raises, the line is not polled and its port is closed.
 
-        Raises LineError if its port does not exist, ValueError for a mistake in its description, and anything
-        that a user's own class raises.
+        Raises LineError if its port does not exist, and ValueError for a mistake in its description. A user's
+        own class may raise other errors.
         """
         await self._in_thread(self._take, Record(line, 0, description))
 
@@ -46,7 +50,8 @@ class FleetLines:
     def _take(self, record: Record) -> None:
         line = line_of(record, self._folder)
         polled = {drive.name for bus in self.poller.buses.values() for drive in bus.drives}
-        if not any(one.drive.name in polled for one in line.drives):  # otherwise `add_line` refuses the line
+        # a line without polled drives would be refused by `add_line`
+        if not any(one.drive.name in polled for one in line.drives):
             self._units.note(line, time.monotonic_ns())  # must precede the line's first row
         before = self.poller.buses.get(line.name)
         try:
@@ -65,9 +70,6 @@ class FleetLines:
             self.poller.remove_line(line)
         except PollingFailed:  # polling of all lines has ended; closing the port is enough
             self.poller.bus(line).close()
-
-    def bus(self, line: str) -> Bus:
-        return self.poller.bus(line)
 
     def port_loss(self, line: str) -> PortLoss | None:
         """Return how the port of a polled line was lost; None if it is open."""

@@ -21,10 +21,12 @@ from multidrop.fleet.lines.unopened_lines import UnopenedLines
 
 _log = logging.getLogger("multidrop.fleet")
 
-REPORTED_NS = 2_000_000_000  # report a lost port immediately if the newest reply is older
-SILENT_S = 0.5  # close lines this long before the lease expires; the kernel's timer fires guard / 2 after
+REPORTED_NS = 2_000_000_000  # report a lost port immediately if the newest reply is older than this
+# Lines are closed this many seconds before the lease expires. The kernel's timer fires half of the guard time
+# after the expiry.
+SILENT_S = 0.5
 TAKE_AGAIN_S = 2.0  # pause between attempts to open a line
-WRITTEN_AT_ONCE = 64  # limit of records written together: more would delay renewals of the lease
+WRITTEN_AT_ONCE = 64  # limit of records written together: larger batches would delay renewals of the lease
 LINES_AT_ONCE = 32
 
 
@@ -34,7 +36,7 @@ class Lines(Protocol):
     async def take(self, line: str, description: Any) -> None:
         """Open the line and poll it.
 
-        If this raises, the line must be closed again; the keeper repeats the call later.
+        If this raises, it must leave the line closed; the keeper calls it again later.
         """
 
     async def let_go(self, line: str) -> None:
@@ -65,20 +67,17 @@ class TakenLine(NamedTuple):
 class LineKeeper:
     """The lines that one gateway polls, and the task in progress on each.
 
-    `on_change` is called when the member's next step should be taken.
+    `on_change` is called when the member should take its next step.
     """
 
     def __init__(
-        self,
-        lines: Lines,
-        lease: Lease,
-        records: ShareRecords,
-        on_change: Callable[[], object],
+        self, lines: Lines, lease: Lease, records: ShareRecords, on_change: Callable[[], object]
     ) -> None:
         self.lines = lines
         self.polled: dict[str, TakenLine] = {}
         self.troubles: dict[str, str] = {}  # why lines could not be opened, by line
-        self.lost: dict[str, str] = {}  # by line: how its port was lost, so the line is not polled
+        # how the port was lost, by line; only lines that are not polled because their port is lost
+        self.lost: dict[str, str] = {}
         self.unopened = UnopenedLines(lambda: lease.clock())
         self.releasing: set[str] = set()  # our lines that must be released to other gateways
         self.may_claim = True  # False while a gateway of an incompatible version is alive
@@ -118,17 +117,17 @@ class LineKeeper:
         return None if line in self._at_work else self._owners.claim_of(line)
 
     def may_stop(self, line: str) -> bool:
-        """Return True if this gateway is the line's master now, even if `may_command` must still wait."""
+        """Return True if this gateway is the line's master now, even if `may_command` is still False."""
         return self._lease.is_valid and self.is_mine(line) and line in self.polled
 
     def may_command(self, line: str) -> bool:
-        """Return True if this gateway is the line's master, and has been for the time of the guard."""
+        """Return True if this gateway is the line's master, and has been so for the guard time."""
         if not self.may_stop(line):
             return False
         return self._lease.clock() - self.polled[line].since >= self._lease.terms.guard
 
     async def fail(self) -> None:
-        """Wait until a line cannot be closed, and raise its error, so that the process ends."""
+        """Wait until an attempt to close a line fails; then raise the error, so that the process ends."""
         await self._has_failed.wait()
         assert self._failure is not None
         raise self._failure
@@ -194,7 +193,7 @@ class LineKeeper:
         self.unopened.gone(line)
 
     async def let_all_go(self) -> None:
-        """Close all lines, whatever is in progress on them. Raises the error of a failed closing."""
+        """Close all lines, whatever is in progress on them. If that fails for a line, raise its error."""
         self._is_leaving = True
         try:
             while not self.is_silent:

@@ -13,7 +13,7 @@ MOST_REPORTED = 20  # limit of the moves that a gateway reports with its state
 
 
 class Move(NamedTuple):
-    """A line's move from one gateway to another. A gateway's name is "" for none, None if unknown."""
+    """A line's move from one gateway to another. A name is "" if there is none, None if it is unknown."""
 
     line: str
     turn: int  # number of the move: all observers of a move see the same number
@@ -45,14 +45,14 @@ def move_of(sent: Any) -> Move:
 
 
 class Moves:
-    """The latest moves. A line that was released and then claimed has moved once."""
+    """The latest moves. A release of a line and the claim that follows it are one move."""
 
     def __init__(self, most: int = MOST) -> None:
         self._most = most
         self._moves: dict[tuple[str, int], Move] = {}
 
     def add(self, moves: Iterable[Move]) -> None:
-        """Add moves. Of two reports of the same move, keep the more complete one."""
+        """Add moves. If a move was reported before, keep the more complete report."""
         for move in moves:
             key = (move.line, move.turn)
             known = self._moves.get(key)
@@ -63,10 +63,10 @@ class Moves:
             self._moves = {(move.line, move.turn): move for move in kept}
 
     def newest(self, number: int) -> list[Move]:
-        """Return at most this many moves, newest first.
+        """Return at most this many moves of lines, newest first.
 
-        A gateway that releases a line does not see which gateway claims it, and that gateway may not know the
-        previous master. The two gateways' reports are joined into one move.
+        A gateway that releases a line does not see which gateway claims it, and that gateway may not know
+        the previous master. The two gateways' reports are joined into one move.
         """
         moves = dict(self._moves)
         for (line, turn), move in self._moves.items():

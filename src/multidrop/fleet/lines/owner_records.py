@@ -29,8 +29,10 @@ from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Record, WriteAnswers
 from multidrop.supervisor import end_tasks
 
-WRITERS = 2  # concurrent batches of writes in each bucket
-LAG_NS = SECOND  # two renewal periods; if our lease on a path lags by more, its bucket may have no leader
+WRITERS = 2  # limit of concurrent batches of writes in each bucket
+# Two renewal periods. If the last renewal of our lease on one path is this much older than those on the other
+# paths, that path's bucket may have no leader.
+LAG_NS = SECOND
 SPARE_S = 0.15  # how long to wait after the first bucket's answer before the spare bucket is used
 
 
@@ -69,7 +71,7 @@ class OwnerRecords:
         return votes >= NEEDED
 
     def doubted(self, line: str) -> set[str]:
-        """Return the buckets in which this line's release was sent, but its outcome is unknown."""
+        """Return the buckets to which this line's release was sent, with an unknown outcome."""
         return {
             bucket
             for bucket, record in self._records.of(line).items()
@@ -98,7 +100,7 @@ class OwnerRecords:
         return {bucket for bucket, moment in zip(names.OWNERS, sent, strict=True) if moment < since}
 
     async def claim(self, claims: Mapping[str, Claim]) -> None:
-        """Write the first records of these claims; write the spare ones if a bucket's answer comes late.
+        """Write the first records of these claims; also write the spare records if a bucket answers late.
 
         A refused claim is repeated soon with newer records. So after a refusal, do not wait for further
         answers, such as those of a bucket that may have no leader.
@@ -127,7 +129,7 @@ class OwnerRecords:
         late = await self._decide(claims, (late - vain).union(spare.values()), refused)
         if refused:
             late, vain = set(), late | vain
-        await end_tasks(*vain)  # a cancelled request may still be stored; the next read shows it
+        await end_tasks(*vain)  # a cancelled request may still be stored; the next read shows whether it was
         await asyncio.gather(*late)
 
     async def _decide(
@@ -137,7 +139,10 @@ class OwnerRecords:
         refused: set[str],
         within_s: float | None = None,
     ) -> set[asyncio.Task[set[str]]]:
-        """Wait until each line is ours or refused; fill `refused`, and return the unanswered writes."""
+        """Wait until each line is ours or refused, for at most `within_s`; return the unanswered writes.
+
+        Add the lines of refused writes to `refused`.
+        """
         late = set(writes)
         with suppress(TimeoutError):
             async with asyncio.timeout(within_s):
@@ -173,7 +178,10 @@ class OwnerRecords:
         }
 
     async def _write_in(self, bucket: str, records: Sequence[Record]) -> set[str]:
-        """Replace records of unchanged revision; return refused lines, and report lines that became ours."""
+        """Replace the records whose revision has not changed, and return the lines of the refused records.
+
+        Report each line that becomes ours.
+        """
         follower = self._records.owners[bucket]
         async with self._writing[bucket]:
             if not self._may_write():

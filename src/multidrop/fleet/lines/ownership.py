@@ -1,9 +1,9 @@
-"""Ownership: the records that name a line's master, and which gateway may write them when. No I/O.
+"""Ownership: the records that name a line's master, and rules for writing these records. No I/O.
 
 A line has one record in each of three buckets, with one vote each. Its master is the session that at least
 two votes name, so no line waits for a bucket without a leader. A record that names a living session is
-replaced only by that session, and only at the revision that it has read. So two sessions never have two votes
-each.
+replaced only by that session, and only at the revision that its gateway has read. So two sessions never have
+two votes each.
 
 The very first record of a line has two votes, which shortens the cold start of a large fleet by a second. It
 is written in the line's first bucket, where the server accepts only one first record. A gateway that has not
@@ -29,7 +29,8 @@ LineRecords = Mapping[str, Record | None]  # a line's records by bucket, in writ
 class Claim(NamedTuple):
     """The records to write to become master of a line: their present revisions, by bucket.
 
-    The `spare` records are written if a `first` one gets no answer. Each record will have this many `votes`.
+    The `spare` records are written if a write of a `first` record gets no answer. Each written record has
+    this many `votes`.
     """
 
     first: dict[str, int]
@@ -92,7 +93,7 @@ def claim_of(
     doubted: Collection[str] = (),
     leaderless: Collection[str] = (),
 ) -> Claim | None:
-    """Return the records to write to get enough votes; None if we have enough, or cannot get enough.
+    """Return the records to write to get enough votes; None if we have enough already, or cannot get enough.
 
     In the `doubted` buckets our release of the line was sent, but its outcome is unknown. Buckets that may be
     `leaderless` are written last.
@@ -111,7 +112,7 @@ def claim_of(
         elif record and (owner == me or owner[0] == NOBODY or is_over(*owner)):
             free[bucket] = record.revision
         elif record and record.value["votes"] >= NEEDED:
-            return None  # the record's living master has both votes
+            return None  # another session, which is alive, already has both votes
     if not 0 < needed <= len(free):
         return None
     wanted = {bucket: free[bucket] for bucket in sorted(free, key=leaderless.__contains__)[:needed]}
@@ -132,7 +133,8 @@ def decide(
     """Return which lines to claim and which to release.
 
     `me` is our name and session, `wanted` the gateway assigned to each line. A line that never had a master
-    is claimed only once we are settled. Otherwise the first gateway of a cold start would take all of them.
+    is claimed only if `is_settled`, which is False in the first seconds of a session. Otherwise the first
+    gateway of a cold start would take all of these lines.
     """
     step = Step({}, set())
     for line in lines:

@@ -1,8 +1,8 @@
 """The records that a gateway or viewer reads about its fleet: sessions, masters of lines, the plant.
 
-A large fleet has thousands of lines. A gateway reads master records only for those lines of its share of
-which it is not the master yet. It need not read those of its own lines: no other gateway takes them while its
-session lasts. So a gateway whose lines do not change reads no master records.
+A large fleet has thousands of lines. In its share, a gateway reads master records only for lines that
+it is not yet the master of. It need not read the records of its own lines: no other gateway takes these
+lines while its session lasts. So a gateway whose lines do not change reads no master records.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class FleetRecords:
             for bucket in names.OWNERS
         }
         self._of: dict[str, dict[str, Record | None]] = {}  # records that name masters, by line and bucket
-        self._owned: dict[Owner, set[str]] = {}  # lines with a record that names the session, by session
+        self._owned: dict[Owner, set[str]] = {}  # by session: lines with a record that names it
         self._masters: dict[str, tuple[str, int]] = {}  # the line's master and turn, by line
         self.plant = Follower(Bucket(names.PLANT, path), self._note_plant)
         self._has_plant_changed = False
@@ -66,7 +66,7 @@ class FleetRecords:
         return self._of.get(line, _UNREAD)
 
     def owner(self, line: str) -> Record | None:
-        """Return the record that names the line's master or NOBODY with enough votes; None without one."""
+        """Return a record of the line's owner, a master or NOBODY; None if no owner has enough votes."""
         return owner_by(self.of(line))
 
     def lines(self) -> tuple[str, ...]:
@@ -109,7 +109,7 @@ class FleetRecords:
     async def _look_at_plant(self) -> bool:
         try:
             return bool(await self.plant.look())
-        finally:  # also after a failure: records that were read before it are not read again
+        finally:  # also after a failure, because records that were read before the failure are not read again
             if self._has_plant_changed:
                 self._has_plant_changed = False
                 self._lines = tuple(sorted(filter(self.is_in_plant, self.plant.records)))
@@ -126,12 +126,13 @@ class FleetRecords:
             if former in self._owned and former not in map(owner_of, records.values()):
                 self._owned[former].discard(line)
                 if not self._owned[former]:
-                    del self._owned[former]  # otherwise sessions would accumulate over years
+                    # delete the empty set, because former sessions would accumulate over years
+                    del self._owned[former]
         if record.value:
             self._note_move(line)
 
     def _note_move(self, line: str) -> None:
-        """Note a move of the line. The former master is known only if the turn has increased by one."""
+        """Note a move of the line. The former master is unknown if an earlier record was not read."""
         record = self.owner(line)
         if not record:
             return
@@ -140,12 +141,15 @@ class FleetRecords:
         if turn != seen:
             self._masters[line] = master, turn
             known = before if turn == seen + 1 else None
-            if known != master:  # equal if a gateway claimed its line again after an uncertain release
+            # the two are equal if a gateway has claimed its own line again after an uncertain release
+            if known != master:
                 self.moves.add([Move(line, turn, record.value["since"], known, master)])
 
 
 ASKED_AT_ONCE = 500  # limit of lines in one request; servers allow 1024
-DOUBT_S = 30.0  # longer than an election, after which an unanswered write may still be stored
+# how long a line with an unanswered write is read again: longer than an election takes, because the write may
+# still be stored after an election
+DOUBT_S = 30.0
 
 
 class ShareFollower(Follower):
@@ -163,7 +167,7 @@ class ShareFollower(Follower):
         self._has = has
         self._share: frozenset[str] = frozenset()
         self._asked: frozenset[str] | None = frozenset()  # lines whose record may change; None: recompute
-        self._doubted: dict[str, float] = {}  # lines with an unanswered write, and when it was sent
+        self._doubted: dict[str, float] = {}  # by line with an unanswered write: when that write was sent
         self._is_urgent = asyncio.Event()
 
     def want(self, lines: Iterable[str]) -> None:
@@ -182,7 +186,7 @@ class ShareFollower(Follower):
         self._asked = None
 
     async def look(self) -> list[Record]:
-        """Read the records that are unknown or may change, and return those that have changed."""
+        """Read the records that were not read yet or may have changed; return those that have changed."""
         self._is_urgent.clear()
         asked = self._to_ask()
         changed: list[Record] = []

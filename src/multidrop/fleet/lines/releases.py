@@ -3,7 +3,8 @@
 A line is closed before it is released. It has no master until the release is stored and the other gateway has
 claimed it. If too few buckets have a leader, a release cannot be stored, so this gateway continues to poll
 the line. It also continues while a server is silent. When a server that was cut off returns, buckets may lose
-their leaders for seconds, and so between release and claim.
+their leaders for seconds. If that happened between release and claim, the line would have no master
+for these seconds.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.leaders import known_cluster
 
 LOOK_S = 0.05  # pause between checks of the servers
-WAIT_S = 60.0  # a server that is silent for longer is ignored
+WAIT_S = 60.0  # a server that is silent for longer than this (in s) is ignored
 
 
 class Releases:
@@ -37,8 +38,8 @@ class Releases:
         self._on_change = on_change
         self._clock = clock
         self._has_lines = False
-        # By bucket that has a leader: the time in s since which one of its servers is silent; None if all
-        # answer.
+        # by bucket with a leader: since when (in s) one of the bucket's servers is silent; None if all of
+        # them answer
         self._led: dict[str, float | None] = {}
 
     def due(self, lines: Set[str], wait_s: float = WAIT_S) -> set[str]:

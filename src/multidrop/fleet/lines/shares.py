@@ -1,8 +1,8 @@
 """Shares: assigns each line to a gateway, by rendezvous hashing with bounded loads.
 
-Each pair of line and gateway has a weight. A gateway is full when it has 110 % of the mean number of lines. A
-line goes to the gateway with the highest weight among those that are not full. So when a gateway comes or
-goes, its own share moves, and few other lines.
+Each pair of line and gateway has a weight. A gateway is full when it has 110 % of the mean number of
+lines. A line goes to the gateway with the highest weight among those that are not full. So when a
+gateway is added or removed, few lines move besides those of its own share.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def assign(lines: Sequence[str], gateways: Sequence[str]) -> dict[str, str]:
 def hand_over(wanted: Mapping[str, str], unopened: Mapping[str, Collection[str]]) -> dict[str, str]:
     """Return each line's gateway after moving lines away from gateways that cannot open them.
 
-    `unopened` maps a gateway to the lines that it cannot open. A line that no gateway can open stays where it
-    is. Gateways that are not keys of `unopened` get no further lines.
+    `unopened` maps a gateway to the lines that it cannot open. A line that no gateway can open stays with
+    its gateway. Gateways that are not keys of `unopened` get no lines.
     """
     found = dict(wanted)
     for line in {line for lines in unopened.values() for line in lines} & wanted.keys():
@@ -93,7 +93,8 @@ class Sharers(NamedTuple):
 
     gateways: tuple[str, ...]
     lines: tuple[str, ...]
-    unopened: tuple[tuple[str, frozenset[str]], ...] = ()  # gateway, and the lines that it could not open
+    # each gateway with the lines that it could not open
+    unopened: tuple[tuple[str, frozenset[str]], ...] = ()
 
 
 class Shares:
@@ -101,7 +102,7 @@ class Shares:
 
     def __init__(self) -> None:
         self.wanted: dict[str, str] = {}  # each line's gateway
-        self.home: dict[str, str] = {}  # the assignment if every gateway could open every line
+        self.home: dict[str, str] = {}  # how lines would be assigned if every gateway could open every line
         self._made: Sharers | None = None
         self._others: frozenset[str] = frozenset()
         self._seen_at = 0

@@ -1,10 +1,10 @@
 """UnopenedLines: lines whose port this gateway cannot open, so that other gateways may try. No I/O.
 
 A gateway that is cut off from a line, but not from the servers, reports the line in its lease record after
-some failures. The line is then assigned to a gateway that has not reported it. From time to time, the first
-gateway withdraws the report of one line, as a trial. The line comes back, but is not polled if its port still
-cannot be opened. So after each failed trial, the wait for the next one is longer. If all gateways have
-reported a line, its trials cost nothing, because no gateway polls it, and they stay frequent.
+some failures. The line is then assigned to a gateway that has not reported it. From time to time, a gateway
+withdraws its report of one line, as a trial. The gateway then gets the line back, but cannot poll it if the
+port still cannot be opened. So after each failed trial, the wait for the next trial is longer. If all
+gateways have reported a line, no gateway polls it. Its trials then cost nothing, so they stay frequent.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from multidrop.fleet.leases.rules import SECOND
 
 OPENINGS = 3  # number of failed attempts to open a line before the line is reported
 LOST_NS = 6 * SECOND  # a lost port is reported this long after the last reply
-REPLY_NS = 3 * SECOND  # an older reply does not show when the port was lost
+REPLY_NS = 3 * SECOND  # a newest reply that is older than this does not show when the port was lost
 FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND  # first and longest wait before a trial
-TRIAL_NS = 60 * SECOND  # if the line does not come back, its trial ends after this time
-MOST_BYTES = 8_000  # limit of all line names in a lease record
+TRIAL_NS = 60 * SECOND  # if the line does not come back within this time, its trial ends
+MOST_BYTES = 8_000  # limit, in bytes, of all line names in a lease record
 
 
 class UnopenedLines:
@@ -29,7 +29,7 @@ class UnopenedLines:
 
     def __init__(self, clock: Callable[[], int]) -> None:
         self.hopeless: frozenset[str] = frozenset()  # lines that all gateways have reported
-        self.home: frozenset[str] | None = None  # our lines if all ports could be opened; None: unknown
+        self.home: frozenset[str] | None = None  # our share if all ports could be opened; None: unknown
         self._clock = clock
         self._failures: dict[str, int] = {}
         self._lost_since: dict[str, int] = {}
@@ -48,9 +48,9 @@ class UnopenedLines:
     def lost(self, line: str, silent_ns: int | None = None) -> None:
         """Note that the port of a polled line is lost; report the line when LOST_NS have passed.
 
-        `silent_ns` is the age of the newest reply on the line. The time counts from that reply, because a
-        network that drops everything delays the failures of writes and connection attempts by seconds. If
-        `silent_ns` is None or large, the time counts from the first call.
+        `silent_ns` is the age of the newest reply on the line. LOST_NS starts at that reply, because in a
+        network that drops everything, writes and connection attempts fail only after seconds. If `silent_ns`
+        is None or large, LOST_NS starts at the first call.
         """
         now = self._clock()
         since = now - silent_ns if silent_ns is not None and silent_ns <= REPLY_NS else now
@@ -65,7 +65,8 @@ class UnopenedLines:
         if line == self._tried:  # the network is back: try the other reported lines immediately
             self._tried, self._wait_ns, self._trial_at = "", FIRST_WAIT_NS, self._clock()
             for other in self._named.keys() - (self._named.keys() if self.home is None else self.home):
-                del self._named[other]  # not one of our lines: a trial would not bring it back
+                # the other line is not assigned to us, so a trial would not return it to us
+                del self._named[other]
 
     def gone(self, line: str) -> None:
         """Forget the line's failures, because it is no longer ours."""
@@ -73,7 +74,10 @@ class UnopenedLines:
         self._lost_since.pop(line, None)
 
     def named(self) -> frozenset[str]:
-        """Return the lines that other gateways should take. Call this often: it also starts trials."""
+        """Return the lines that other gateways should take.
+
+        Call this often, because each call may start a trial.
+        """
         now = self._clock()
         if self._tried and now - self._tried_since >= TRIAL_NS:
             self._tried = ""

@@ -2,9 +2,9 @@
 
 nats-py parses the headers of each message with Python's e-mail parser, passes the message through a queue,
 and has a timer for each request. A gateway of a large fleet reads tens of thousands of records and claims
-hundreds of lines at a time. Here such answers are taken directly from the connection, and only the needed
-headers are parsed. nats-py has no public hook for this. If its internals change, the answers arrive as
-ordinary messages, which costs more.
+hundreds of lines at a time. This client takes the answers directly from the connection, and parses only the
+needed headers. nats-py has no public hook for this. If its internals change, the answers arrive as ordinary
+messages, which costs more.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 STATUS = slice(9, 12)  # position of the status in headers such as "NATS/1.0 404 No Messages"
-PROCESSED = 4  # number of arguments of Client._process_msg after the subscription id
-WHOLE = ("204", "404")  # statuses that end an answer: after the last message; without any message
+PROCESSED = 4  # number of the arguments of Client._process_msg that follow the subscription id
+# statuses that end an answer: 204 comes after the last message, 404 if there is no message
+WHOLE = ("204", "404")
 
 
 class DirectMessage(NamedTuple):
@@ -39,7 +40,7 @@ class Request(NamedTuple):
 
 
 class Gathered:
-    """Collects answers that arrive one by one; `last` is called with the status of the final answer."""
+    """Collects answers that arrive one by one; the future `last` gets the status of the final answer."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -75,7 +76,7 @@ class DirectGet(Gathered):
 
 
 class Replies(Gathered):
-    """The answers to several requests, in the order of the requests; None for a missing answer."""
+    """Collects the answers to several requests, in the order of the requests; None for a missing answer."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -104,9 +105,9 @@ class BatchClient(Client):
         """Collect the answer to a direct get. Raises OSError if it is incomplete, and nats-py's errors."""
         await self._ask([request], [get.take], get, silence_s)
         if not get.last.done():
-            raise TimeoutError(f"nothing came for {silence_s:g} s")
+            raise TimeoutError(f"no message came for {silence_s:g} s")
         if get.last.result() not in WHOLE:
-            raise OSError(f"it ended with {get.last.result() or 'no status'}")
+            raise OSError(f"it ended with status {get.last.result() or 'none'}")
 
     async def replies(self, requests: Sequence[Request], silence_s: float) -> list[bytes | None]:
         """Send all requests together and return their answers; None for each answer that is late."""

@@ -18,7 +18,7 @@ from multidrop.fleet.servers.record_shapes import largest, parsed
 NONE_YET = 0  # revision of a key that has no record
 BATCH = 1000  # limit of records in one read
 FOLLOW_S = 0.2  # time between reads of a bucket
-MOST_STRANGE = 1000  # limit of the invalid records of a bucket that are logged
+MOST_STRANGE = 1000  # how many of a bucket's invalid records are logged
 _WRONG_REVISION = (10071, 10164)
 _NO_MESSAGE = 10037
 _NO_STREAM = 10059
@@ -96,7 +96,7 @@ def parsed_answer(data: bytes) -> dict[str, Any]:
         found = json.loads(data)
         if isinstance(found, dict) and isinstance(found.get("error") or {}, dict):
             return found
-    raise Unsure("the answer of NATS is not one of JetStream")
+    raise Unsure("the answer of NATS is not a JetStream answer")
 
 
 def _revision(said: Mapping[str, Any]) -> int:
@@ -138,7 +138,7 @@ class Bucket:
         if not error:
             return _revision(said)
         if error.get("err_code") in _WRONG_REVISION:
-            raise Conflict(f"{self.name}.{key} has another revision than {revision}")
+            raise Conflict(f"{self.name}.{key} is no longer at revision {revision}")
         raise Unsure(f"NATS did not store {self.name}.{key}: {error.get('description')}")
 
     async def put_all(self, records: Sequence[Record]) -> WriteAnswers:
@@ -169,7 +169,7 @@ class Bucket:
         )
 
     async def get(self, key: str) -> Record:
-        """Return the record from the bucket's leader; a missing record has revision 0."""
+        """Return a key's record, read from the bucket's leader; a missing record has revision 0."""
         wanted = {"last_by_subj": self._all_of(key)}
         try:
             said = await ask(self.path(), f"STREAM.MSG.GET.KV_{self.name}", wanted)
@@ -189,14 +189,13 @@ class Bucket:
 
         Any server may answer, so some records may be out of date. The server keeps no state between calls.
         """
-        wanted = {"seq": after + 1, "batch": BATCH, "next_by_subj": ">"}
-        subject = f"$JS.API.DIRECT.GET.KV_{self.name}"
-        messages = await self.path().collect(subject, json.dumps(wanted).encode())
-        return [self._record(*message) for message in messages]
+        return await self._direct_get({"seq": after + 1, "batch": BATCH, "next_by_subj": ">"})
 
     async def newest(self, keys: Sequence[str]) -> list[Record]:
         """Return the records of at most 1000 keys. Any server may answer, so some may be out of date."""
-        wanted = {"multi_last": [self._all_of(key) for key in keys]}
+        return await self._direct_get({"multi_last": [self._all_of(key) for key in keys]})
+
+    async def _direct_get(self, wanted: Mapping[str, Any]) -> list[Record]:
         subject = f"$JS.API.DIRECT.GET.KV_{self.name}"
         messages = await self.path().collect(subject, json.dumps(wanted).encode())
         return [self._record(*message) for message in messages]
@@ -255,7 +254,7 @@ class Follower:
         await asyncio.sleep(FOLLOW_S)
 
     def take(self, record: Record) -> bool:
-        """Keep a record unless a newer one is known; return True if it was kept."""
+        """Keep a record unless a newer record of its key was read before. Return True if it was kept."""
         before = self.records.get(record.key)
         if before is not None and before.revision >= record.revision:
             return False
@@ -267,9 +266,10 @@ class Follower:
 class LeaseBucket(Bucket):
     """A bucket of leases, to which records are written in the name of `writer`.
 
-    A record's subject is `<gateway>.<writer>`, so servers can check which user writes. The newest record of
-    all writers counts, and is replaced only at its revision. A gateway may write only in its own name. So a
-    record that another gateway has written is the end of a session, whatever it contains.
+    A record's subject is `<gateway>.<writer>`, so servers can check which user writes. A gateway's valid
+    record is the newest one of all writers, and is replaced only at its revision. A gateway may write only in
+    its own name. If another gateway has written the newest record, that record ends the session, whatever it
+    contains.
     """
 
     def __init__(self, name: str, path: Callable[[], ServerPath], writer: str) -> None:

@@ -28,12 +28,12 @@ from multidrop.fleet.servers.batch_client import BatchClient, DirectGet, DirectM
 from multidrop.fleet.servers.direct_gets import Spare, first_answer
 from multidrop.printable import masked
 
-OLDEST = (2, 12)  # minimum version; 2.9.10 grants one revision to several claimants (nats-server issue 4320)
+OLDEST = (2, 12)  # minimum version; 2.9.10 accepts several writes to one revision (nats-server issue 4320)
 CONNECT_S = 1.0
 ANSWER_S = 1.0  # time limit of an answer; leases are renewed twice a second
-PONG_S = 0.7  # time limit of a ping; the path leaves a slower server
+PONG_S = 0.7  # time limit of a ping; if a server is slower, the path moves to another server
 KEEP_S = 1.0  # pause between checks of a connection
-# With a limit of 0 attempts, nats-py would retry a closed port until our own timeout.
+# If the limit of attempts were 0, nats-py would retry a closed port until `connect` times out.
 ONE_TRY = {"allow_reconnect": False, "max_reconnect_attempts": 1, "reconnect_time_wait": 0.05}
 
 _log = logging.getLogger("multidrop.fleet")
@@ -54,7 +54,7 @@ class ServerPath:
         self._pong_s = pong_s
         self._client: BatchClient | None = None
         self._denials = Denials()
-        self._trouble = ""  # the failure that was logged last; "" after a success
+        self._trouble = ""  # the failure that was logged last; "" since the last success
         self._leaving: set[asyncio.Task[None]] = set()
         self._wanted: dict[str, Callable[[Msg], Any]] = {}  # the function to call with messages, by subject
         self._standing: dict[str, Subscription] = {}  # subscriptions at the present server, by subject
@@ -106,7 +106,7 @@ class ServerPath:
             await asyncio.sleep(KEEP_S)
 
     async def look_after(self) -> None:
-        """Do one check of `keep`."""
+        """Check the connection once; `keep` repeats this."""
         if not self.is_open or not await self._answers():
             self._leave()
             await self.open()
@@ -142,7 +142,7 @@ class ServerPath:
             self._client, self.url = None, ""
 
     async def subscribe(self, subject: str, called: Callable[[Msg], Any]) -> None:
-        """Call a coroutine function with each message of a subject, also after a move to another server."""
+        """Call a coroutine function with each message of a subject, also after a change of server."""
         self._wanted[subject] = called
         await self._follow_wanted()
 
@@ -154,12 +154,12 @@ class ServerPath:
     async def _follow_wanted(self) -> None:
         async with self._changing:
             if self._client is not None:
-                # If this fails, the path soon moves to another server, where it subscribes again.
+                # If this fails, `keep` soon connects again, and subscribes to all of `_wanted`.
                 with suppress(NatsError, OSError):
                     await self._bring(self._client, self._standing)
 
     async def _bring(self, client: BatchClient, standing: dict[str, Subscription]) -> None:
-        """Subscribe a client to the wanted subjects, and end its subscriptions to other subjects.
+        """Subscribe a client to all subjects in `_wanted`, and end its subscriptions to other subjects.
 
         `standing` has the client's subscriptions by subject, and is updated.
         """
@@ -218,7 +218,7 @@ class ServerPath:
             await client.batch(request, get, silence_s)
         except (NatsError, OSError) as failure:
             denials.check_request(request.subject, self._options.get("inbox_prefix", "_INBOX"), before)
-            raise Unsure(f"{self.url} gave no whole answer to {request.subject}: {failure}") from None
+            raise Unsure(f"{self.url} gave no complete answer to {request.subject}: {failure}") from None
 
     async def request_all(self, requests: Sequence[Request]) -> list[bytes | None]:
         """Send all requests together and return the answer to each; None for a request without an answer."""
@@ -279,7 +279,8 @@ async def _close(client: BatchClient) -> None:
 def _cut(client: BatchClient) -> None:
     """Close the socket, and end the tasks that nats-py may leave behind.
 
-    nats-py leaves tasks if it is cancelled or the server is gone. The error of its reading task is ignored.
+    nats-py leaves tasks behind if it is cancelled or the server is gone. Ignore the error of its reading
+    task.
     """
     for subscription in client._subs.values():
         subscription._stop_processing()

@@ -67,7 +67,7 @@ def _user(credentials: Path) -> dict[str, Any]:
     try:
         public = public_key(text)
     except ValueError:
-        raise ValueError(f"{credentials} is damaged: not a key of `fleet rights`") from None
+        raise ValueError(f"{credentials} is not a valid key of `fleet rights`") from None
     return {"nkeys_seed_str": text, "inbox_prefix": inbox_of(public)}
 
 

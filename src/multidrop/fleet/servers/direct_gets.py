@@ -1,17 +1,17 @@
 """Direct gets: reads that any server can answer, and that continue to work while one server is cut off.
 
-A server forwards such a read to a random server that has the records: to itself, or to another one. A server
-that is cut off still gets its share of the reads for seconds, until the others notice. So a read without an
-early answer is repeated on all paths together. Each answer may be out of date. A write that depends on such
-an answer therefore names the revision that was read.
+A server forwards such a read to a random server that has the records: to itself, or to another one. A
+server that is cut off still gets its share of the reads for seconds, until the others notice. So a read
+without an early answer is repeated on all paths together. Each answer may be out of date. A write that
+depends on such an answer therefore names the revision that was read.
 
 If all servers are slow, repeated reads make them even slower. So repeats have a budget, which is empty at
-first. Each timely answer earns half a repeat. If the first request of a read is answered after all, it was
-not lost, and the budget is halved.
+first. Each timely answer earns half a repeat. If a read was repeated, and its first request is answered after
+all, the repeat was needless, and the budget is halved.
 
 A client that has seen slow answers also waits proportionally longer before a repeat. Otherwise, when many
-gateways start together and read whole buckets, the repeats that small reads have earned would be spent on
-large reads.
+gateways start and read whole buckets, these large reads would use up the repeats that small reads have
+earned.
 """
 
 from __future__ import annotations
@@ -24,16 +24,17 @@ from multidrop.fleet.errors import NoRight, Unsure
 from multidrop.fleet.servers.batch_client import DirectGet, DirectMessage, Request
 from multidrop.supervisor import end_tasks
 
-AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)  # silence before each repeat; the read fails after the last silence
-SLOW = 3.0  # silence before a repeat, as a multiple of an answer's usual time
-MOST_SILENCE_S = 1.0  # limit of the silence before a repeat, because a path gives up then
-FORGET = 0.97  # decay of the usual time, per answer
-MOST_SPARE = 300.0  # limit of the budget: twice the need of the 3 s until servers notice a dead route
+# silence before each repeat of a read; after the last silence the read fails
+AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)
+SLOW = 3.0  # silence before a repeat, as a multiple of the usual time of an answer
+MOST_SILENCE_S = 1.0  # limit of the silence before a repeat, because requests time out then
+FORGET = 0.97  # factor by which the usual time of an answer decays with each answer
+MOST_SPARE = 300.0  # limit of the budget: twice the repeats needed until servers notice a dead route (3 s)
 EARNED = 0.5  # repeats that one timely answer earns
 
 
 class Way(Protocol):
-    """A path to the servers."""
+    """A network connection to the servers, such as ServerPath."""
 
     async def gather(self, request: Request, get: DirectGet) -> None:
         """Collect the answer to a direct get. Raises FleetError."""
@@ -71,7 +72,7 @@ class Spare:
 async def first_answer(ways: Sequence[Way], request: Request, spare: Spare) -> list[DirectMessage]:
     """Return the messages of the first complete answer. Raises FleetError if no complete answer comes.
 
-    Only the first path is asked at first, because it usually answers immediately.
+    The request is first sent on the first path only, because that path usually answers immediately.
     """
     loop = asyncio.get_running_loop()
     gets: dict[asyncio.Task[None], DirectGet] = {}
@@ -104,7 +105,7 @@ async def first_answer(ways: Sequence[Way], request: Request, spare: Spare) -> l
 
 
 async def _is_one_over(gets: Mapping[asyncio.Task[None], DirectGet], silence_s: float) -> bool:
-    """Wait until one request has ended, and return True.
+    """Wait until one of the requests has ended, and return True.
 
     Return False after `silence_s` seconds without data, or if no request is left.
     """

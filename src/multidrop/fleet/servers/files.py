@@ -2,7 +2,7 @@
 
     n1.conf, n2.conf …   one server each, with its routes to the others; only for that server
     rights.conf          users by their public keys, their rights and accounts; for all servers
-    keys/NAME.key        the secret key of a user; only for its computer
+    keys/NAME.key        the secret key of a user; only for that user's computer
     keys/routes          the password between servers, as in the servers' files
 
 Existing keys are kept, so adding a gateway changes no other key. A user whose name is no longer given loses
@@ -12,7 +12,6 @@ all rights.
 from __future__ import annotations
 
 import json
-import os
 import secrets
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,6 +21,7 @@ from urllib.parse import urlsplit
 from multidrop.fleet.servers.credentials import new_seed, public_key
 from multidrop.fleet.servers.rights import accounts, rights_of
 from multidrop.printable import masked
+from multidrop.whole_file import whole_file
 
 CLUSTER = "multidrop"
 ROUTE_PORTS = 2000  # a server's port for routes is its client port plus this, such as 6222 for 4222
@@ -97,17 +97,14 @@ def _public(path: Path, seed: str) -> str:
     try:
         return public_key(seed)
     except ValueError:
-        raise ValueError(f"{path} is damaged: remove it, and its user gets another key") from None
+        raise ValueError(f"{path} is damaged: remove it, then its user gets a new key") from None
 
 
 def _write_secret(path: Path, text: str) -> None:
     """Write a file that other users cannot read, not even while it is written."""
-    beside = path.with_name(path.name + ".new")
-    beside.unlink(missing_ok=True)
-    descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-        file.write(text)
-    beside.replace(path)
+    with whole_file(path) as part:
+        part.touch(0o600, exist_ok=False)
+        part.write_text(text, "utf-8")
 
 
 def _server(

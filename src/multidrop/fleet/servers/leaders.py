@@ -1,11 +1,11 @@
-"""Leaders of buckets: each bucket has a different server as leader, so one failed server stops only one path.
+"""Leaders of buckets: each bucket has its own server as leader, so one failed server stops only one path.
 
-A server that is cut off starts an election every 4 to 9 s, each in a newer term of Raft, although the others
-do not hear it. When it returns, a leader with an older term steps down, and its bucket has no leader for 4 to
-9 s. If that happens to two lease buckets, no line is polled. A hand-over of the leadership also starts a
-newer term, but takes only an instant. So while a server is silent, the lease buckets are handed over more
-often than that server starts elections. Its terms then stay older. Which server leads has no influence on
-which gateway may poll: only revisions decide that.
+A server that is cut off starts an election every 4 to 9 s, each in a newer term of Raft, although no other
+server receives its messages. When it returns, a leader with an older term steps down, and its bucket has no
+leader for 4 to 9 s. If that happens to two lease buckets, no line is polled. A hand-over of the leadership
+also starts a newer term, but takes only an instant. So while a server is silent, the lease buckets are handed
+over more often than that server starts elections. The terms of the silent server then stay older. Which
+server leads a bucket has no effect on which gateway may poll: only the records' revisions decide that.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from multidrop.fleet.servers.buckets import ask
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.supervisor import end_tasks
 
-SILENT_NS = 2_000_000_000  # a server is silent after this time; followers contact their leader once a second
+# a server counts as silent after this time (in ns); followers contact their leader once a second
+SILENT_NS = 2_000_000_000
 
 
 class Replica(NamedTuple):
@@ -32,7 +33,7 @@ class Replica(NamedTuple):
     name: str
     is_current: bool
     is_offline: bool
-    active_ns: int  # ns since the leader last heard from this server; 0 for never
+    active_ns: int  # ns since the leader last heard from this server; 0: never
 
     @property
     def is_ready(self) -> bool:
@@ -41,9 +42,9 @@ class Replica(NamedTuple):
 
     @property
     def is_silent(self) -> bool:
-        """Return True if the leader never heard from this server, or not for 2 s.
+        """Return True if the leader never heard from this server, or has not heard from it for 2 s.
 
-        A server that lags, but was heard, is not silent.
+        A server whose copy lags behind is not silent if the leader heard from it.
         """
         return not self.is_current and not 0 < self.active_ns < SILENT_NS
 
@@ -55,7 +56,7 @@ class Cluster(NamedTuple):
     followers: tuple[Replica, ...] = ()
 
     def home_of(self, place: int) -> str:
-        """Return the server that should lead bucket number `place`: servers take turns, sorted by name."""
+        """Return the server that should lead bucket number `place`. Servers take turns, sorted by name."""
         servers = sorted([self.leader, *(follower.name for follower in self.followers)])
         return servers[place % len(servers)]
 
@@ -125,7 +126,10 @@ async def led_clusters(path: ServerPath) -> dict[str, Cluster]:
 
 
 async def bring_leaders_home(path: ServerPath, clusters: Mapping[str, Cluster]) -> int:
-    """Hand each bucket over to its home server if that is a ready follower; return how many."""
+    """Hand each bucket over to its home server if that server is a ready follower.
+
+    Return the number of hand-overs.
+    """
     moved = 0
     for group in (names.LEASES, names.OWNERS):
         for place, bucket in enumerate(group):
@@ -144,8 +148,8 @@ async def hand_over(path: ServerPath, bucket: str, server: str) -> None:
         await ask(path, f"STREAM.LEADER.STEPDOWN.KV_{bucket}", wanted)
 
 
-HAND_OVER_S = 3.0  # time between hand-overs of a bucket: shorter than between two elections
-SILENT_FOR_S = 60.0  # a server that is silent for longer is ignored
+HAND_OVER_S = 3.0  # time between hand-overs of a bucket: shorter than the time between two elections
+SILENT_FOR_S = 60.0  # a server that is silent for longer than this is ignored
 HANDED_S = 1.0  # time limit of a hand-over; it takes 0.03 to 0.3 s
 LEADER_LOOK_S = 0.02
 
@@ -161,7 +165,7 @@ class LeaseTerms:
     async def keep_ahead(self, path: ServerPath, clusters: Mapping[str, Cluster]) -> bool:
         """Hand over the lease buckets that are due, and return True if any was due.
 
-        Stop after a hand-over that fails, so that at most one bucket waits for an election because of this.
+        Stop after a failed hand-over, so that at most one bucket must wait for an election.
         """
         led = {bucket: clusters[bucket] for bucket in names.LEASES if bucket in clusters}
         silent = {bucket: cluster for bucket, cluster in led.items() if cluster.has_silent}
@@ -199,7 +203,8 @@ async def _leads_now(path: ServerPath, bucket: str, server: str) -> bool:
     return False
 
 
-KEEP_S = 0.4  # leaders notice a silent server after 2 s; it starts elections after 4 s
+# interval of `keep_leaders`: leaders notice a silent server after 2 s, and it starts elections after 4 s
+KEEP_S = 0.4
 
 
 async def keep_leaders(

@@ -1,4 +1,4 @@
-"""Names in NATS: of buckets and subjects, and of the gateways and lines in them."""
+"""Names in NATS: the names of buckets and subjects, and valid names for the gateways and lines in them."""
 
 from __future__ import annotations
 
@@ -38,8 +38,9 @@ def owner_buckets(line: str) -> tuple[str, ...]:
 def is_inbox(subject: str) -> bool:
     """Return True if this is an inbox, on which a requester may wait for an answer.
 
-    Servers let a responder answer on any subject that the requester names. That may be a subject to which the
-    requester itself may not publish, such as that of a plant's record. So answer only on inboxes.
+    Servers let a responder answer on any subject that the requester names. The requester may name a
+    subject to which it may not publish itself, such as that of a plant's record. So answer only on
+    inboxes.
     """
     return subject.startswith(("_INBOX.", "_INBOX_"))
 

@@ -10,26 +10,26 @@ import asyncio
 import json
 import tomllib
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from multidrop import Plant, PlantError, PlantLine
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Bucket, Follower, Record
-from multidrop.plant import MAY_KEYS, allowed
-from multidrop.toml_check import Key, TomlPlace
+from multidrop.plant import FLEET_KEYS, MAY_KEYS, allowed, check_channels
+from multidrop.toml_check import TomlPlace
 
 AT_ONCE = 64  # limit of concurrent writes of records
 SOCKETS = ("socket://", "tcp://")
-
-_FLEET = {"may": Key(dict, "[fleet.may], a table")}
 
 
 def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
     """Return the plant in a file, and the record of each line by name.
 
-    Raises PlantError for mistakes in the file, and ValueError for a plant that a fleet cannot poll. A port
-    must be a network address, a line's name must be valid in a subject, and no family may be a Python file.
+    Raises PlantError for mistakes in the file, and ValueError for a plant that a fleet cannot poll. Each
+    port must be a network address. Each line's name must be allowed in a NATS subject. No family may be a
+    Python file.
     """
     plant = Plant.load(path)
     document = tomllib.loads(path.read_text("utf-8"))
@@ -43,6 +43,12 @@ def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
                 f"{path}: line {line.name} is at {line.port}: a fleet polls socket:// and tcp:// ports, "
                 "which every gateway can reach and close at once"
             )
+        try:
+            check_channels(replace(plant, lines=(line,)))
+        except PlantError as mistake:
+            raise ValueError(
+                f"{path}: {mistake}; in a fleet, a channel may only use drives of its own line"
+            ) from None
     may = _lists(document.get("fleet", {}), plant)
     return plant, {table["name"]: _description(table, path.parent, may) for table in document["line"]}
 
@@ -50,7 +56,7 @@ def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
 def _lists(table: Any, plant: Plant) -> dict[str, frozenset[str]]:
     """Return the entries of [fleet.may]: registers and verbs that may be commanded through the fleet."""
     place = TomlPlace(plant.path, ("[fleet]",))
-    may = place.check(table, _FLEET).get("may", {})
+    may = place.check(table, FLEET_KEYS).get("may", {})
     inner = place.of_file(plant.path, "[fleet.may]")
     found = allowed(plant, inner.check(may, MAY_KEYS), inner)
     if place.config_errors:
@@ -80,7 +86,7 @@ def _description(
 
 
 def _family_files(folder: Path, model: str) -> dict[str, str]:
-    """Return the text of a family's file, and of the CSV tables beside it that it names, by file name."""
+    """Return the text of a family's file and of the CSV tables that this file names, by file name."""
     family = (folder / model).resolve()
     text = family.read_text("utf-8")
     found = {model: text}
@@ -125,7 +131,7 @@ def line_of(record: Record, folder: Path) -> PlantLine:
     for name, text in value["files"].items():
         path = Path(name)
         if path.is_absolute() or ".." in path.parts:
-            raise ValueError(f"line {record.key}: a file {name!r} outside of its folder")
+            raise ValueError(f"line {record.key}: the file {name!r} is outside of its folder")
         (home / path).parent.mkdir(parents=True, exist_ok=True)
         (home / path).write_text(text, "utf-8")
     plant = home / "line.plant"  # no family file has this suffix

@@ -24,6 +24,7 @@ SHAPES: Mapping[str, Mapping[str, Any]] = {
     **dict.fromkeys(names.OWNERS, OWNER),
     names.PLANT: LINE,
 }
+MOST_TEXT = 300  # limit of characters of a text in a gateway's state
 SMALL, LARGE = 1 << 14, 1 << 20  # limits of a record's bytes; a line's record contains its family files
 _KINDS: Mapping[Any, str] = {
     **{int: "a whole number", float: "a number", str: "a text", bool: "true or false", dict: "a table"},
@@ -62,6 +63,15 @@ def misshapen(value: Any, shape: Mapping[str, Any]) -> str:
         if type(value[name]) not in (get_args(kind) or (kind,)):
             return f"its {name!r} is not {_KINDS[kind]}"
     return ""
+
+
+def with_short_texts(value: Any) -> Any:
+    """Return a JSON value with all texts cut to MOST_TEXT characters."""
+    if isinstance(value, dict):
+        return {key[:MOST_TEXT]: with_short_texts(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [*map(with_short_texts, value)]
+    return value[:MOST_TEXT] if isinstance(value, str) else value
 
 
 def _nothing(key: str, value: Any) -> str:

@@ -45,7 +45,7 @@ class UserRights(NamedTuple):
 
     publish: Sequence[str]
     subscribe: Sequence[str] = ()
-    answers: bool = False  # True if it may answer requests on the requester's inbox
+    answers: bool = False  # True if the user may answer requests on the requester's inbox
 
 
 def _api(request: str, *buckets: str) -> list[str]:
@@ -133,10 +133,10 @@ def rights_of(gateways: Sequence[str]) -> dict[str, UserRights]:
 
 
 STORE = "multidrop"
-LAST_ANSWER = "10s"  # the server forwards further answers to a request for this long
+LAST_ANSWER = "10s"  # how long the server forwards further answers to one request
 ANSWER = '{ max: 1, expires: "1m" }'  # limits of an answer; a stop of many drives may take long
 _STORED = ("$JS.", "$KV.", f"{STREAM}.")
-_MANY = "$JS.API.DIRECT.GET."  # requests that get several answers
+_MANY = "$JS.API.DIRECT.GET."  # prefix of the requests that get several answers
 # Without this import, a server answers every JetStream request in a user's account with "not enabled".
 # No user has the right to send this request.
 _INFO = "$JS.API.INFO"

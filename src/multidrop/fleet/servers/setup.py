@@ -17,7 +17,7 @@ from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.leaders import bring_leaders_home, cluster_of, led_clusters
 
 CONTEST = "contest"
-ROUNDS = 40  # tests in `_contest`; nats-server 2.9.10 fails one of the first few
+ROUNDS = 40  # number of tests in `_contest`; nats-server 2.9.10 fails one of the first few
 CLAIMANTS = 6
 MOST_REPLICAS = 3
 WAIT_S = 10.0  # time limit of retries; an election takes 4 to 9 s
@@ -39,14 +39,14 @@ async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
     away = [path.urls[0] for path in paths if path.url != path.urls[0]]
     if away and not replicas:
         raise FleetError(
-            f"{away[0]} does not answer, and new buckets would stay on the other servers for good: start it "
-            "first, or leave its address out"
+            f"{away[0]} does not answer, and new buckets would always stay on the other servers: start this "
+            f"server first, or leave its address out"
         )
     replicas = replicas or reached
     await _contest(paths, reached)
     for bucket in names.BUCKETS:
         await _retried(paths[0], partial(_create, paths[0], bucket_settings(bucket, replicas)))
-    # Right after a bucket's creation no server returns its records.
+    # Wait until a server returns the bucket's records; right after the bucket's creation none does.
     await _retried(paths[0], partial(Bucket(names.PLANT, lambda: paths[0]).changes, 0))
     await bring_leaders_home(paths[0], await led_clusters(paths[0]))
     servers = {path.server_name: path.version for path in paths}
@@ -80,7 +80,7 @@ def check_clock(path: ServerPath, server_time: Any) -> None:
     try:
         apart = time.time() - datetime.fromisoformat(server_time).timestamp()
     except (TypeError, ValueError, OverflowError):
-        raise Unsure(f"the answer of {path.url} about a bucket has no time") from None
+        raise Unsure(f"the answer of {path.url} about a bucket has no valid time stamp") from None
     if abs(apart) > CLOCKS_APART_S:
         _log.warning(
             "this machine's clock is %.0f s %s that of %s: set it, because samples have its time",
@@ -102,7 +102,7 @@ def no_quorum(path: ServerPath, failure: Exception) -> FleetError:
 
 
 async def _kept_on(path: ServerPath) -> int:
-    """Return the number of servers that store the least replicated bucket; 0 if a bucket is missing."""
+    """Return on how many servers the least replicated bucket is stored; 0 if a bucket is missing."""
     infos = [await _retried(path, partial(_info, path, f"KV_{bucket}")) for bucket in names.BUCKETS]
     return min(1 + len(cluster_of(info, path).followers) if info else 0 for info in infos)
 
@@ -165,15 +165,16 @@ async def _contest(paths: Sequence[ServerPath], replicas: int) -> None:
             granted = [found for found in await asyncio.gather(*claims) if found is not None]
             if len(granted) > 1:
                 raise FleetError(
-                    f"the NATS servers around {paths[0].url} gave one revision of a key to {len(granted)} of "
-                    f"{CLAIMANTS} claimants at once: no lease is safe there"
+                    f"{paths[0].url} and the other NATS servers accepted {len(granted)} of {CLAIMANTS} "
+                    "concurrent writes to the same revision of a record: they could give one lease to two "
+                    "gateways"
                 )
             if granted:
                 revision = granted[0]
             else:
                 revision = (await _retried(paths[0], partial(claimants[0].get, CONTEST))).revision
             if unsure > 2 * ROUNDS:
-                raise no_quorum(paths[0], Unsure("a key was never granted"))
+                raise no_quorum(paths[0], Unsure("no attempt to claim a key succeeded"))
     finally:
         await _retried(paths[0], partial(_remove, paths[0], settings["name"]))
 

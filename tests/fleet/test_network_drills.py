@@ -1,0 +1,84 @@
+"""Drills in network namespaces: cables are cut and whole machines die, but no line ever has two masters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from fleet_drills import SOON_S, FleetDrill, MachineDrill, cut, drilled_in_network, drilled_on_machines
+
+pytestmark = [pytest.mark.slow, pytest.mark.long]
+
+CUT = ("gateway cut off", "gateway does not hear the nodes", "node hears nobody")
+
+
+@pytest.fixture(scope="module")
+def cut_drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetDrill]:
+    with drilled_in_network(tmp_path_factory.mktemp("cuts")) as found:
+        yield found
+        found.settle()  # waits for elections that the last drill has caused
+        assert found.hall.overlaps() == 0
+
+
+@pytest.mark.parametrize("name", CUT)
+def test_no_network_cut_gives_a_line_two_masters(cut_drill: FleetDrill, name: str) -> None:
+    cut_drill.settle()
+    cut_drill.judge(lambda: cut(cut_drill, name), SOON_S)
+    assert cut_drill.hall.overlaps() == 0
+
+
+def test_a_gateway_cut_off_from_its_lines_hands_them_over(cut_drill: FleetDrill) -> None:
+    cut_drill.settle()
+    place, host = cut_drill.places["gw-a"], cut_drill.hall.host
+
+    def gateway() -> dict[str, Any]:
+        found: dict[str, Any] = cut_drill.status()["gateways"]["gw-a"]
+        return found
+
+    session = gateway()["session"]
+    cut_drill.hall.reset()
+    place.cut_to_here(host)
+    try:
+        # `cut_drill.status` also checks that `fleet status` exits with 1 while a port is lost
+        cut_drill.wait(lambda: gateway()["says"]["lost"] != [], "status tells of lost ports")
+        cut_drill.wait(lambda: cut_drill.hall.are_polled(1.0) and not gateway()["lines"], "handed over")
+        found = cut_drill.run("status")
+        assert "cannot be opened from here; another gateway polls it" in found.stdout
+        assert found.returncode == 0
+        assert gateway()["session"] == session
+    finally:
+        place.heal_to_here(host)
+        cut_drill.gateways["gw-a"].kill()  # a restarted gateway tries to open all lines immediately
+        cut_drill.gateways["gw-a"].wait()
+    assert cut_drill.hall.overlaps() == 0
+
+
+# ---- machines with one gateway and one server each ----
+
+
+@pytest.fixture(scope="module")
+def machine_drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MachineDrill]:
+    with drilled_on_machines(tmp_path_factory.mktemp("machines")) as found:
+        yield found
+        found.settle()  # waits for elections that the last drill has caused
+        assert found.hall.overlaps() == 0
+
+
+def test_takeover_from_a_dead_machine_waits_for_no_election(machine_drill: MachineDrill) -> None:
+    """The buckets with the dead gateway's lines have leaders on other machines: `settle` waits for that."""
+    machine_drill.settle()
+    before = machine_drill.status()["lines"]
+    machine_drill.judge(machine_drill.kill_machine, SOON_S)
+    assert machine_drill.hall.overlaps() == 0
+
+    def has_moved() -> bool:
+        return any(one != before[line] for line, one in machine_drill.status()["lines"].items())
+
+    machine_drill.wait(has_moved, "lines of the dead machine have moved")
+
+
+def test_no_network_cut_of_a_whole_machine_gives_a_line_two_masters(machine_drill: MachineDrill) -> None:
+    machine_drill.settle()
+    machine_drill.judge(machine_drill.cut_machine, SOON_S)
+    assert machine_drill.hall.overlaps() == 0
