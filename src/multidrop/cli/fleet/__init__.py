@@ -1,17 +1,17 @@
 """`multidrop fleet`: several gateways share the lines of one plant through NATS JetStream.
 
-Each action is a command, with the name of the similar command for a plant without a fleet.
+An action has the name of the similar command for a plant without a fleet, if there is one.
 """
 
-ACTIONS = {  # by action: its module in this package, and its help
+ACTIONS = {  # action: (its module in this package, its help text)
     "demo": ("demo", "kill a gateway of a simulated fleet and show the takeover"),
-    "rights": ("rights", "write the servers' configuration, and a key for each user"),
-    "init": ("init", "set the NATS servers up, and store the plant"),
-    "serve": ("serve", "run the gateway with this name"),
-    "drain": ("drain", "move all lines of a gateway to the others"),
-    "status": ("look", "show all gateways; exit status 1 if a line is not polled"),
-    "lines": ("look", "list the lines with their masters"),
-    "watch": ("watch", "show the fleet live on a terminal"),
+    "rights": ("setup", "write the servers' configuration, and a key for each user"),
+    "init": ("setup", "set the NATS servers up, and store the plant"),
+    "serve": ("gateway", "run the gateway with this name"),
+    "drain": ("gateway", "move all lines of a gateway to the others"),
+    "status": ("views", "show all gateways; exit status 1 if a line is not polled"),
+    "lines": ("views", "list the lines with their masters"),
+    "watch": ("views", "show the fleet live on a terminal"),
     "stop": ("commands", "stop drives, or all of them, without confirmation"),
     "coast": ("commands", "let a motor coast to a stop, without confirmation"),
     "emergency-stop": ("commands", "use a drive's emergency stop, without confirmation"),

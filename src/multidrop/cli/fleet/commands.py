@@ -20,9 +20,9 @@ from multidrop.cli.fleet.connection import (
     STATE,
     add_server_arguments,
     nats_options,
+    nats_urls,
     run_action,
     state_folder,
-    urls_of,
 )
 from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.writing import confirm
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 _DIRECTIONS = ("forward", "reverse")
 _DIRECTED = ("start", "jog")
-_FURTHER = {"write": ("REGISTER", "VALUE"), "set-frequency": ("HZ",)}  # further arguments after the drive
+_FURTHER = {"write": ("REGISTER", "VALUE"), "set-frequency": ("HZ",)}  # command: arguments after the drive
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,13 +75,16 @@ def _asker(arguments: argparse.Namespace) -> FleetCommands:
         by = printable(by)[:MOST_CHARACTERS]  # a name that is too long must not prevent a stop
     elif not by.isprintable() or len(by) > MOST_CHARACTERS:
         raise ValueError(f"--by {by!r} is not 1 to {MOST_CHARACTERS} printable characters")
-    log, urls = arguments.audit or state_folder() / "commands.jsonl", urls_of(arguments)
+    log, urls = arguments.audit or state_folder() / "commands.jsonl", nats_urls(arguments.nats)
     return FleetCommands(urls, by=by, log=log, options=nats_options(arguments, urls))
 
 
 @asynccontextmanager
 async def _asking(arguments: argparse.Namespace) -> AsyncIterator[FleetCommands]:
-    """Yield a connected client for commands. If that fails, a stop's error says that it was not sent."""
+    """Yield a connected client for commands.
+
+    If a stop cannot connect, the error says that the stop was not sent.
+    """
     from multidrop.fleet.commands.fleet_commands import HARD_WIRED
     from multidrop.fleet.errors import FleetError
 
@@ -112,16 +115,16 @@ def _what(arguments: argparse.Namespace) -> dict[str, Any]:
         try:
             options["hz"] = plain_number(arguments.hz)
         except ValueError:
-            raise ValueError(f"HZ = {arguments.hz} is not a number; write 25") from None
+            raise ValueError(f"HZ = {arguments.hz} is not a number; write a number such as 25") from None
     elif getattr(arguments, "direction", None):
         options["direction"] = arguments.direction
     return {"verb": action.replace("-", "_"), "options": options}
 
 
 async def _command(arguments: argparse.Namespace) -> int:
-    """Show the command, let the user confirm it, and then send it as a new request.
+    """Show the command as the gateway would carry it out, let the user confirm it, and then send it.
 
-    The gateway's offer is valid for only a second, and a user takes longer to confirm.
+    The gateway's preview is valid for only a second. So the confirmed command is sent as a new request.
     """
     from multidrop.fleet.commands.messages import CommandAnswer
 

@@ -33,7 +33,7 @@ def add_nats_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def nats_urls(given: str | None) -> list[str]:
-    """Return the servers' URLs from a list separated by commas, or from MULTIDROP_NATS.
+    """Return the servers' URLs from a list separated by commas, or from the variable MULTIDROP_NATS.
 
     Raises ValueError for an empty list, and for a URL that does not start with nats:// or tls://.
     """
@@ -48,7 +48,7 @@ def nats_urls(given: str | None) -> list[str]:
 
 
 def nats_options(arguments: argparse.Namespace, urls: Sequence[str]) -> dict[str, Any]:
-    """Return nats-py's options for a connection. Raises ValueError for a file without a key."""
+    """Return nats-py's options for a connection. Raises ValueError if the credentials file has no key."""
     from multidrop.fleet.servers.credentials import connect_options
 
     logging.getLogger("asyncio").addFilter(_is_news)
@@ -59,7 +59,7 @@ def nats_options(arguments: argparse.Namespace, urls: Sequence[str]) -> dict[str
 
 
 def _is_news(record: logging.LogRecord) -> bool:
-    """Return False for a log record of Python 3.11's asyncio about a TLS connection closed by the server."""
+    """Return False for the record that Python 3.11's asyncio logs when a server closes a TLS connection."""
     return "eof_received" not in record.getMessage()
 
 
@@ -88,11 +88,6 @@ def add_address_arguments(parser: argparse.ArgumentParser) -> None:
     add_nats_arguments(parser)
 
 
-def urls_of(arguments: argparse.Namespace) -> list[str]:
-    """Return the servers' URLs. Raises ValueError for an invalid or empty list."""
-    return nats_urls(arguments.nats)
-
-
 def state_folder() -> Path:
     """Return the folder for the state of this user's gateways and the log of commands.
 
@@ -116,7 +111,7 @@ def run_action(work: Callable[[], Coroutine[Any, Any, int]]) -> int:
 
 
 async def open_path(paths: Sequence[ServerPath]) -> ServerPath:
-    """Open all connections; return one that is open. Raises FleetError if no server answers."""
+    """Open all connections; return one that succeeded. Raises FleetError if no server answers."""
     from multidrop.fleet.servers.setup import open_all
 
     await open_all(paths)
@@ -124,12 +119,12 @@ async def open_path(paths: Sequence[ServerPath]) -> ServerPath:
 
 
 def run_with_paths(arguments: argparse.Namespace, work: Callable[[list[ServerPath]], Awaitable[int]]) -> int:
-    """Run an action with three connections to the servers, and close these afterwards."""
+    """Run an action with three connections to the servers; close the connections afterwards."""
 
     async def with_paths() -> int:
         from multidrop.fleet.servers.connections import paths_of
 
-        urls = urls_of(arguments)
+        urls = nats_urls(arguments.nats)
         paths = paths_of(urls, nats_options(arguments, urls))
         try:
             return await work(paths)

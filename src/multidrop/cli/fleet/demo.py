@@ -19,7 +19,7 @@ from multidrop.cli.fleet.demo_processes import (
     start_nodes,
     temporary_folder,
 )
-from multidrop.cli.fleet.watch import drawing, follow
+from multidrop.cli.fleet.views import drawing, follow
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import end_signals_cancel
 from multidrop.cli.support.values import counted
@@ -28,7 +28,7 @@ GATEWAYS = ("gw-1", "gw-2", "gw-3")
 KILLED = "gw-2"
 LINES = 12
 DRIVES = 2  # drives per line
-WAIT_S = 60.0  # time limit of steps that take only seconds on an idle computer
+WAIT_S = 60.0  # time limit of a step, in s; on an idle computer, a step takes a few seconds
 RUN_S = 2.0  # pause before the kill, and after each step
 KEEP = "100 MB"  # limit of stored samples; each server may store 256 MB in all
 
@@ -36,7 +36,7 @@ Fleet = dict[str, Any]
 
 
 class Stage:
-    """What the demo shows: its notes so far, and the newest view of the fleet."""
+    """The demo's output: its notes so far, and the newest view of the fleet."""
 
     def __init__(self) -> None:
         self.notes: list[str] = []
@@ -76,10 +76,10 @@ class Stage:
                     self.updated.clear()
                     await self.updated.wait()
         except TimeoutError:
-            raise OSError(f"{what} not within {WAIT_S:.0f} s: the demo has failed") from None
+            raise OSError(f"the demo has failed: {what} not within {WAIT_S:.0f} s") from None
 
     async def calm(self, seconds: float) -> None:
-        """Wait until no line has changed its master for this time, because a view may be late."""
+        """Wait until no line has changed its master for `seconds` s, because views may be out of date."""
         before: dict[str, str | None] | None = None
         while (found := self.masters()) != before:
             before = found
@@ -93,14 +93,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Show a takeover. Raises OSError if a step takes longer than a minute."""
+    """Run a fleet, kill a gateway, and show the takeover. Raises OSError if a step exceeds a minute."""
     require_fleet()
     from multidrop.fleet.servers.connections import OLDEST
 
     program = server_program(OLDEST)
     stage = Stage()
     with temporary_folder() as folder, ExitStack() as stack:
-        none = dict.fromkeys((CREDENTIALS, CA), "")  # ignore variables for the user's own fleet
+        # so that the demo does not use the credentials of the user's own fleet
+        none = dict.fromkeys((CREDENTIALS, CA), "")
         children = Children(folder, {"XDG_STATE_HOME": str(folder / "state"), **none})
         stack.callback(children.close)
         demo = Demo(folder, children, stage)
@@ -116,7 +117,7 @@ def drives_of(line: str) -> list[str]:
 
 
 def plant_file(ports: Mapping[str, int]) -> str:
-    """Return a plant file with these lines, which are on TCP ports of this computer."""
+    """Return the text of a plant file whose lines are on these TCP ports of this computer."""
     return "\n".join(
         f'[[line]]\nname = "{line}"\nport = "tcp://127.0.0.1:{port}"\n'
         + "".join(
@@ -144,7 +145,7 @@ class Demo:
         plant.write_text(plant_file(dict(zip(lines, free_ports(LINES), strict=True))), "utf-8")
         simulator = children.start_multidrop("lines", "simulate", str(plant))
         assert simulator.stdout is not None
-        simulator.stdout.readline()  # printed when the ports are open
+        simulator.stdout.readline()  # waits for the line that is printed when the ports are open
         self._urls = ",".join(start_nodes(children, self._folder, program))
         note(f"three NATS servers are ready, in {self._folder}")
         children.run_multidrop("init", "fleet", "init", str(plant), "--keep", KEEP, "--nats", self._urls)
@@ -162,7 +163,7 @@ class Demo:
     async def play(self) -> float:
         """Kill a gateway and start it again; return how many seconds its lines took to get other masters.
 
-        Raises KeyboardInterrupt if a signal comes.
+        Raises KeyboardInterrupt if the process receives a signal.
         """
         over = asyncio.Event()
         with end_signals_cancel(), _drawn(self._stage):

@@ -22,9 +22,9 @@ PR_SET_PDEATHSIG = 1  # option of prctl(2): the signal that a process gets when 
 # This shell command removes the folder when stdin is closed. It retries, because processes that are being
 # killed may still write into the folder.
 REMOVE = 'cat; for n in 1 2 3 4 5 6 7 8 9 10; do rm -rf "$0" && exit; sleep 1; done'
-ENDING_S = 10.0  # time limit for a process that was asked to exit
+ENDING_S = 10.0  # time limit, in s, for a process that was asked to exit
 NODES = ("n1", "n2", "n3")
-ATTEMPTS = 3  # a port that was just free may be taken by another program
+ATTEMPTS = 3  # tries to start the servers: another program may take a free port before a server does
 STARTING_S = 20.0
 
 CONFIGURATION = """
@@ -51,7 +51,7 @@ def temporary_folder() -> Iterator[Path]:
 
 
 class Children:
-    """Child processes by name. Each has its own log in this folder, and its own session without Ctrl-C."""
+    """Child processes by name. Each has a log in `folder`, and its own session, so that it gets no Ctrl-C."""
 
     def __init__(self, folder: Path, environment: Mapping[str, str]) -> None:
         self._folder = folder
@@ -86,7 +86,7 @@ class Children:
         return self.start(name, sys.executable, "-m", "multidrop", *words)
 
     def run_multidrop(self, name: str, *words: str) -> str:
-        """Run a multidrop command and return its output. Raises OSError with its last line if it fails."""
+        """Run a multidrop command; return its output. Raises OSError with the log's last line if it fails."""
         out, _ = self.start_multidrop(name, *words).communicate()
         if self._running[name].returncode:
             raise OSError(f"`multidrop {words[0]}` of the demo failed: {self._last_line(name)}")
@@ -133,7 +133,7 @@ def _reap(process: subprocess.Popen[str]) -> None:
 
 
 def server_program(oldest: tuple[int, int]) -> str:
-    """Return the path of a nats-server of at least this version: the Python package's, or one in PATH.
+    """Return the path of a nats-server of this version or newer, from its Python package or from PATH.
 
     Raises ValueError if there is none.
     """

@@ -25,7 +25,7 @@ GATEWAYS = (
     "LOST",
 )
 LINES = ("LINE", "PORT", "MASTER", "SINCE")
-# Columns that are left out if the terminal is too narrow, in this order.
+# Columns to leave out, in this order, until the table fits the terminal.
 LEFT_OUT = ("SINCE", "HOST", "SESSION", "SPOOL", "LAG", "LEASE")
 LINES_LEFT_OUT = ("PORT", "SINCE")
 UNITS = ("B", "kB", "MB", "GB", "TB")
@@ -115,7 +115,7 @@ def line_columns(fleet: FleetState, names: Iterable[str], width: int) -> list[st
 
 
 def silent_gateways(fleet: FleetState) -> set[str]:
-    """Return the gateways that do not answer, and so may not poll their lines."""
+    """Return the gateways that do not answer. Their lines may not be polled."""
     return {name for name, gateway in fleet["gateways"].items() if gateway["says"] is None}
 
 
@@ -131,12 +131,12 @@ def unsure_lines(fleet: FleetState) -> list[str]:
 
 
 def lost_lines(fleet: FleetState) -> list[str]:
-    """Return the lines whose master has lost the port, so that they are not polled."""
+    """Return the lines that are not polled because their master has lost the line's port."""
     return [line for gateway in fleet["gateways"].values() for line in _lines_in(gateway["says"], "lost")]
 
 
 def failing_lines(fleet: FleetState) -> list[str]:
-    """Return the lines on which polling raises exceptions, so that their values are missing."""
+    """Return the lines whose values are missing because polling raises exceptions."""
     return [line for gateway in fleet["gateways"].values() for line in _lines_in(gateway["says"], "failing")]
 
 

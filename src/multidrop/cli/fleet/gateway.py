@@ -1,27 +1,45 @@
-"""`multidrop fleet serve`: runs one gateway of a fleet."""
+"""`multidrop fleet serve` and `drain`: run a gateway of a fleet, or move its lines to other gateways."""
 
 from __future__ import annotations
 
 import argparse
+import asyncio
+import json
 import logging
+import time
 from contextlib import AsyncExitStack
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from multidrop.cli.fleet.connection import (
     STATE,
     add_address_arguments,
+    add_server_arguments,
     nats_options,
+    nats_urls,
+    open_path,
     require_fleet,
+    run_with_paths,
     state_folder,
-    urls_of,
 )
 from multidrop.cli.support.log_thread import LogThread, add_log_argument, logging_to_stderr
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import on_end_signals, run_loop
+from multidrop.cli.support.values import counted
 from multidrop.supervisor import supervisor
+
+if TYPE_CHECKING:
+    from multidrop.fleet.servers.connections import ServerPath
+
+DRAIN_S = 30.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    if parser.get_default("command") == "drain":
+        parser.add_argument("gateway", metavar="NAME", help="the gateway's name, such as gw-1")
+        add_server_arguments(parser)
+        return
     parser.add_argument("gateway", metavar="NAME", help="its name, such as gw-1, unique in the fleet")
     parser.add_argument(
         "--folder",
@@ -39,6 +57,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     require_fleet()
+    if arguments.command == "drain":
+        from multidrop.fleet.servers.names import checked_name
+
+        checked_name("gateway", arguments.gateway)
+        return run_with_paths(arguments, partial(_drain, arguments))
     with logging_to_stderr(arguments.log, {"multidrop": logging.INFO, "asyncio": logging.WARNING}) as log:
         return run_loop(_serve(arguments, log))
 
@@ -53,7 +76,7 @@ async def _serve(arguments: argparse.Namespace, log: LogThread) -> int:
     name = arguments.gateway
     listener = listen(arguments.metrics) if arguments.metrics else None
     folder = arguments.folder or state_folder() / name
-    urls = urls_of(arguments)
+    urls = nats_urls(arguments.nats)
     options = nats_options(arguments, urls)
     gateway = FleetGateway(name, urls, folder, options=options, spool_bytes=parse_size(arguments.keep))
     on_end_signals(gateway.end)
@@ -66,3 +89,24 @@ async def _serve(arguments: argparse.Namespace, log: LogThread) -> int:
             print_text(f"metrics http://{host}:{port}/metrics", flush=True)
         await gateway.run(lambda: print_text(f"ready {name}", flush=True))
     return 0
+
+
+async def _drain(arguments: argparse.Namespace, paths: list[ServerPath]) -> int:
+    from multidrop.fleet.gateway import ask_gateway
+    from multidrop.fleet.servers.setup import check_buckets
+
+    name = arguments.gateway
+    path = await open_path(paths)
+    await check_buckets(path)
+    said = await ask_gateway(path, name, "drain")
+    ends = time.monotonic() + DRAIN_S
+    while said["lines"] and time.monotonic() < ends:
+        await asyncio.sleep(0.1)
+        said = await ask_gateway(path, name, "state")
+    if arguments.json:
+        print_text(json.dumps(said, indent=2))
+    else:
+        print_text(
+            f"{name} has {counted(said['lines'], 'line')} left; it takes none until it is started again"
+        )
+    return 1 if said["lines"] else 0
