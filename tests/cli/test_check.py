@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 from commands import Run
-from families import write_meter
+from profile_families import write_meter
 
-DATA = Path(__file__).parents[1] / "data" / "families"
 FAN = """\
 [family]
 title = "Fan FC-2"
@@ -43,7 +42,7 @@ def test_check_lists_contents_gaps_and_refusals(run: Run, fan: Path) -> None:
     status, out, err = run("check", fan)
     shown = words(out)
     assert (status, err) == (0, "")
-    assert "000FH speed reading 1 rpm" in shown  # 000FH is the address that is sent; the manual counts from 1
+    assert "000FH speed reading 1 rpm" in shown  # 000FH is the address on the wire; the manual counts from 1
     assert "declared by its file, untested" in shown
     unknown, refused = shown.partition(" not known ")[2].split(" will be refused ")
     for told in (
@@ -68,7 +67,7 @@ def test_check_lists_contents_gaps_and_refusals(run: Run, fan: Path) -> None:
 
 
 def test_check_refuses_an_address_in_place_of_a_file(run: Run) -> None:
-    told = "http://10.0.0.7:8750 is an address, and no plant file; a gateway's page is for a browser: "
+    told = "http://10.0.0.7:8750 is an address, not a plant file; a gateway's page is for a browser: "
     for command in ("check", "plan", "poll", "simulate"):
         assert run(command, "http://10.0.0.7:8750") == (2, "", f"multidrop: {told}open it there\n")
 
@@ -91,8 +90,8 @@ def test_check_hints_at_the_right_name_or_command(run: Run, tmp_path: Path) -> N
     ]
 
 
-def test_a_sheet_writes_facts_as_the_manuals_do(run: Run, tmp_path: Path) -> None:
-    """Bits have numbers, registers have hex addresses; only a family with verbs has a watchdog."""
+def test_a_familys_sheet_has_the_notation_of_manuals(run: Run, tmp_path: Path) -> None:
+    """Bits have numbers, and registers have hex addresses. Only a family with verbs has a watchdog."""
     _, out, _ = run("check", "abb-acs355")
     assert "bit 0 READY_TO_SWITCH_ON, bit 1 READY_TO_OPERATE" in words(out)
     assert "only verbs write it, except 047EH, 047CH, 0476H" in words(out)
@@ -182,7 +181,7 @@ def test_mistakes_of_a_family_file_are_reported_once_for_all_drives(run: Run, tm
     assert all('plant.toml:4: line "L", drive "f1": ' in line for line in reported)
 
 
-def test_a_coil_without_a_span_is_no_gap(run: Run, tmp_path: Path) -> None:
+def test_check_reports_no_missing_span_for_a_coil(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "io.toml"
     path.write_text(
         '[family]\ntitle = "IO"\nmanual = "v1"\n[setting]\nlamp = { at = "00001", place = "1" }\n'

@@ -12,6 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from batches import METADATA, counting
 from commands import TOY, Run
 from kills import BoundProcess
 from tables import table
@@ -21,6 +22,7 @@ from multidrop.cli.fleet import ACTIONS as FLEET
 from multidrop.drive import Advice, WriteForbidden, carry_out
 from multidrop.families import MODELS, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.families.registry import SHIPPED, find_model
+from multidrop.recording import open_writer
 
 
 def test_the_help_lists_every_command(run: Run) -> None:
@@ -28,10 +30,7 @@ def test_the_help_lists_every_command(run: Run) -> None:
     assert (status, err) == (0, "")
     assert all(f"\n  {name} " in out for name in COMMANDS)
     assert max(map(len, out.splitlines())) <= 80
-
-
-def test_without_a_command_the_help_is_printed(run: Run) -> None:
-    assert run()[0] == 2
+    assert run() == (2, out, "")
 
 
 @table("name", [*COMMANDS, *(f"fleet {action}" for action in FLEET)])
@@ -45,7 +44,7 @@ def test_every_command_has_help_within_80_columns(
     assert max(map(len, out.splitlines())) <= 80
 
 
-@pytest.mark.parametrize("name", ["read", "write", "state", "start"])
+@table("name", ["read", "write", "state", "start"])
 def test_each_commands_help_describes_each_argument(run: Run, name: str) -> None:
     words = " ".join(run(name, "--help")[1].split())
     for word in ("PORT: a device", "MODEL: one of", "ADDRESS: the drive's", "PLANT.toml DRIVE: a plant file"):
@@ -104,7 +103,7 @@ def test_the_help_imports_no_command_and_no_large_library() -> None:
             ["read", "/dev/ttyX", TOY, "one"],
             "argument ADDRESS: 'one' is not a number such as 1; see `multidrop read --help`",
         ),
-        (["read", "/dev/ttyX", TOY, "99"], "address 99 is not one of TOY T1: 1 to 31"),
+        (["read", "/dev/ttyX", TOY, "99"], "address 99 is not supported by TOY T1; choose 1 to 31"),
         (
             ["read", "/dev/ttyX", TOY, "1", "output_curent"],
             "TOY T1 has no register 'output_curent'; did you mean output_current or output_frequency?",
@@ -115,7 +114,7 @@ def test_the_help_imports_no_command_and_no_large_library() -> None:
         ),
         (
             ["read", "/dev/ttyX", TOY, "1", "--baudrate", "38400"],
-            "baud rate 38400 is not one of TOY T1: 9600, 19200",
+            "baud rate 38400 is not supported by TOY T1; choose 9600, 19200",
         ),
         (
             ["read", "/dev/ttyX", TOY, "1", "--option", "rated"],
@@ -126,10 +125,7 @@ def test_the_help_imports_no_command_and_no_large_library() -> None:
             ["read", "/dev/ttyX", TOY, "1", "--option", "rated-frequency=5"],
             "rated_frequency = 5.0 is outside 10 to 400 Hz",
         ),
-        (
-            ["write", "/dev/ttyX", TOY, "1", "frequency", "fast"],
-            "frequency takes a number in Hz, not 'fast'",
-        ),
+        (["write", "/dev/ttyX", TOY, "1", "frequency", "fast"], "frequency takes a number in Hz, not 'fast'"),
         (["write", "/dev/ttyX", TOY, "1", "frequency", "60"], "frequency = 60 is outside 0 to 50 Hz"),
         (["write", "/dev/ttyX", TOY, "1", "frequency", "-5"], "frequency = -5 is outside 0 to 50 Hz"),
         (["start", "/dev/ttyX", TOY, "1", "--frequency", "60"], "frequency = 60 is outside 0 to 50 Hz"),
@@ -152,16 +148,48 @@ def test_the_help_imports_no_command_and_no_large_library() -> None:
         ),
     ],
 )
-def test_a_mistaken_command_is_one_sentence_with_status_2(run: Run, words: list[str], sentence: str) -> None:
+def test_a_mistaken_command_is_reported_in_one_sentence_with_status_2(
+    run: Run, words: list[str], sentence: str
+) -> None:
     assert run(*words) == (2, "", f"multidrop: {sentence}\n")
 
 
-def test_the_printed_version_is_the_packages(run: Run) -> None:
+def test_version_prints_the_version_of_the_package(run: Run) -> None:
     assert run("--version") == (0, f"multidrop {version('multidrop')}\n", "")
 
 
-@pytest.mark.parametrize("seconds", ["ten", "0", "-1", "nan", "inf"])
-def test_an_invalid_polling_time_is_one_sentence(run: Run, seconds: str) -> None:
+@pytest.mark.parametrize(
+    ("library", "words"),
+    [
+        ("asammdf", ["convert", "a.csv", "b.mf4"]),
+        ("h5py", ["convert", "a.csv", "b.h5"]),
+        ("pyarrow", ["convert", "a.csv", "b.parquet"]),
+        ("matplotlib", ["report", "a.csv"]),
+        ("shtab", ["completion", "bash"]),
+        ("starlette", ["schema", "plant"]),
+        ("uvicorn", ["serve", "--demo"]),
+        ("yaml", ["import", "device.yaml"]),
+        ("nats", ["hub", "nats://127.0.0.1:1", "--parquet", "rows", "--once"]),
+        ("nats", ["fleet", "status", "--nats", "nats://127.0.0.1:1"]),
+    ],
+)
+def test_a_missing_library_is_reported_with_its_pip_command_and_status_2(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str, words: list[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with open_writer(tmp_path / "a.csv", METADATA) as writer:
+        writer.write(counting(1, 0))
+    Path("device.yaml").write_text("a: 1")
+    for module in ("mdf4", "hdf5"):
+        monkeypatch.delitem(sys.modules, f"multidrop.recording.{module}", raising=False)
+    monkeypatch.setitem(sys.modules, library, None)
+    status, out, err = run(*words)
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert ": pip install " in err
+
+
+@table("seconds", ["ten", "0", "-1", "nan", "inf"])
+def test_an_invalid_polling_time_is_reported_in_one_sentence(run: Run, seconds: str) -> None:
     status, out, err = run("poll", "plant.toml", f"--seconds={seconds}")
     assert (status, out) == (2, "")
     assert f"argument --seconds: '{seconds}' is not a number of seconds above 0" in err
@@ -179,10 +207,7 @@ def test_a_line_with_a_slash_in_its_name_is_not_simulated(run: Run, tmp_path: Pa
         '[[line]]\nname = "hall/1"\nport = "x"\n[[line.drive]]\nname = "a"\naddress = 1\nmodel = "yd1000"\n'
     )
     status, _, err = run("simulate", plant, "--ports", tmp_path / "ports")
-    assert (status, err) == (
-        2,
-        "multidrop: line 'hall/1' has a / in its name: rename it to link its port\n",
-    )
+    assert (status, err) == (2, "multidrop: line 'hall/1' has a / in its name: rename it to link its port\n")
 
 
 def test_a_file_in_place_of_the_directory_of_ports_is_refused(run: Run, tmp_path: Path) -> None:
@@ -235,7 +260,7 @@ def test_a_sheet_shows_which_writes_may_move_the_motor(run: Run, tmp_path: Path)
     assert told == {"speed": False, "jog_bit": True, "unsaid": None}
 
 
-@pytest.mark.parametrize(
+@table(
     ("words", "sentence"),
     [
         (
@@ -267,7 +292,9 @@ def test_a_sheet_shows_which_writes_may_move_the_motor(run: Run, tmp_path: Path)
         ),
     ],
 )
-def test_a_forbidden_write_is_one_sentence_with_status_1(run: Run, words: list[str], sentence: str) -> None:
+def test_a_forbidden_write_is_reported_in_one_sentence_with_status_1(
+    run: Run, words: list[str], sentence: str
+) -> None:
     assert run(*words) == (1, "", f"multidrop: {sentence}\n")
 
 
@@ -315,8 +342,8 @@ def test_advice_for_programs_is_converted_for_the_command_line() -> None:
     assert WriteForbidden("use emergency_stop()").for_command_line() == "use emergency_stop()"
 
 
-def test_each_advice_is_found_in_the_error_that_contains_it() -> None:
-    """Otherwise the command line could not replace the advice by a command."""
+def test_each_kind_of_advice_in_errors_has_a_command_that_replaces_it() -> None:
+    """The command line replaces advice for programs, such as reset_fault(), by a command or an option."""
     erman, che, ibd = ErmanERG220(1), InvtCHE(1), InnovertIBD(1)
     answers = {"last_fault": 64, "status": 4, "setpoint": 0.0, "frequency_setpoint": 0.0}
     for script, command in (
@@ -336,7 +363,7 @@ def test_each_advice_is_found_in_the_error_that_contains_it() -> None:
         ("/dev/null", "/dev/null: it is not a serial port"),
     ],
 )
-def test_a_port_that_cannot_be_opened_is_one_sentence_with_status_1(
+def test_a_port_that_cannot_be_opened_is_reported_in_one_sentence_with_status_1(
     run: Run, port: str, sentence: str
 ) -> None:
     assert run("read", port, TOY, 1) == (1, "", f"multidrop: {sentence}\n")
@@ -350,6 +377,9 @@ def test_models_lists_the_families(run: Run) -> None:
     assert status == 0
     lines = [line for line in out.splitlines()[1:-2] if line[0] != " "]  # indented lines continue a title
     assert [line.split()[0] for line in lines] == [*MODELS, *SHIPPED]
+    assert max(map(len, out.splitlines())) <= 80
+    titles = " ".join(out.split())
+    assert [family.title for family in MODELS.values() if family.title not in titles] == []
     _, out, _ = run("models", "--json")
     assert [family["model"] for family in json.loads(out)] == [*MODELS, *SHIPPED]
 
@@ -387,7 +417,7 @@ def test_a_familys_json_has_every_register(run: Run) -> None:
     assert by_name["mystery"]["step"] is None
 
 
-@pytest.mark.parametrize(
+@table(
     ("name", "facts"),
     [
         (
@@ -444,7 +474,7 @@ def test_a_familys_json_has_every_register(run: Run) -> None:
     ],
 )
 def test_a_sheet_has_drive_settings_and_limits_of_values(run: Run, name: str, facts: list[str]) -> None:
-    """Settings and limits are printed in the family's own words (ERMAN, section 3; YD1000, 4.3 and 6.1)."""
+    """Settings and limits are printed in the words of the manual (ERMAN, section 3; YD1000, 4.3 and 6.1)."""
     _, out, _ = run("models", name)
     shown = " ".join(out.split())
     assert [fact for fact in facts if fact not in shown] == []
@@ -455,9 +485,9 @@ def test_a_familys_json_has_the_limits_of_values(run: Run) -> None:
     _, out, _ = run("models", "yd1000", "--json")
     sheet = json.loads(out)
     by_name = {register["name"]: register for register in sheet["registers"]}
-    upper = by_name["upper_limit_frequency"]  # from 0.5 Hz to the highest frequency FH
+    upper = by_name["upper_limit_frequency"]  # values from 0.5 Hz to the highest frequency FH
     assert (upper["span"][0], upper["at_most"]) == (0.5, "maximum_frequency")
-    speeds = [by_name[f"preset_speed_{number}"] for number in range(1, 8)]  # from lower to upper limit
+    speeds = [by_name[f"preset_speed_{number}"] for number in range(1, 8)]  # between both limits
     limits = {("minimum_frequency", "upper_limit_frequency")}
     assert {(speed["at_least"], speed["at_most"]) for speed in speeds} == limits
     assert by_name["control"]["harmless"] == [0xC000, 0x8000, 0xC800]
@@ -474,14 +504,6 @@ def test_a_familys_json_has_the_limits_of_values(run: Run) -> None:
     assert "address 0" in json.loads(out)["no_broadcasts"]
 
 
-def test_the_list_of_families_is_at_most_80_columns_wide(run: Run) -> None:
-    _, out, _ = run("models")
-    assert max(map(len, out.splitlines())) <= 80
-    assert [name for name in MODELS if f"\n{name} " not in out] == []
-    titles = " ".join(out.split())
-    assert [family.title for family in MODELS.values() if family.title not in titles] == []
-
-
 @table("name", [*MODELS, *SHIPPED])
 def test_every_sheet_is_at_most_80_columns_wide(run: Run, name: str) -> None:
     _, out, _ = run("models", name)
@@ -491,11 +513,11 @@ def test_every_sheet_is_at_most_80_columns_wide(run: Run, name: str) -> None:
 
 
 NOTES = """
-Where the document errs or is silent, the safest reading is taken:
+Where the document errs or is silent, the safest interpretation applies:
 
-- The example of function 04 has the checksum of function 03's, and its reply a
-  byte count of 10H for 5 registers: a reply must have the byte count of the
-  request.
+- The example of function 04 has the checksum of function 03's example. Its
+  reply has a byte count of 10H for 5 registers: the library requires the byte
+  count that fits the request.
 - The example of function 06"""
 
 
@@ -562,11 +584,7 @@ def test_output_into_a_closed_pipe_returns_0(words: list[str]) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("closed", "words", "status"),
-    [
-        (0, ["start", "/dev/ttyX", "yd1000", "1"], 1),
-        (1, ["models", "yd1000"], 0),
-        (2, ["models", "zzz"], 2),
-    ],
+    [(0, ["start", "/dev/ttyX", "yd1000", "1"], 1), (1, ["models", "yd1000"], 0), (2, ["models", "zzz"], 2)],
 )
 def test_a_closed_standard_stream_causes_no_traceback(closed: int, words: list[str], status: int) -> None:
     done = subprocess.run(

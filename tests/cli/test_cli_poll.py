@@ -15,16 +15,16 @@ from typing import Any
 
 import pytest
 from batches import METADATA, counting
-from commands import TOY_IS_RUN, Run, multidrop, plant_file, running
+from commands import Run, multidrop, plant_file, running
 from examples import usually
 from kills import BoundProcess
 from lines import until
 from recordings import recorded
-from terminals import on_terminal
 from toy import Toy
 
 from multidrop.bus import Bus
 from multidrop.capture import Capture, Decoding
+from multidrop.cli.support import demo_plant
 from multidrop.cli.support.demo_plant import DRIVES, Operator
 from multidrop.core import Status
 from multidrop.errors import NoReply
@@ -42,17 +42,17 @@ with simulator(Path(sys.argv[1]), Path(sys.argv[2])):
 """
 
 
-def test_poll_asks_for_realtime_by_option_or_by_plant_file(
+def test_poll_requests_realtime_scheduling_by_option_or_by_plant_file(
     run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[bool] = []
     monkeypatch.setattr("multidrop.core.port._Engine.set_realtime", lambda *words: asked.append(words[-1]))
-    run("poll", plant, "--seconds", 0.1, "--json")
+    run("poll", plant, "--seconds", 0.01, "--json")
     assert asked == []
-    run("poll", plant, "--seconds", 0.1, "--json", "--realtime")
+    run("poll", plant, "--seconds", 0.01, "--json", "--realtime")
     assert asked == [True, False]
     plant.write_text("realtime = true\n" + plant.read_text())
-    run("poll", plant, "--seconds", 0.1, "--json")
+    run("poll", plant, "--seconds", 0.01, "--json")
     assert asked == [True, False, True, False]
 
 
@@ -104,23 +104,24 @@ def test_simulate_applies_the_faults_of_its_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_poll_records_in_segments_and_continues_after_a_restart(plant: Path, tmp_path: Path) -> None:
+def test_poll_records_in_segments_and_continues_after_a_restart(
+    run: Run, plant: Path, tmp_path: Path
+) -> None:
     counted = 0
-    words = ["--seconds", 1.6, "--out", tmp_path / "run.arrows", "--rotate", "1 s", "--json"]
+    words = ["--out", tmp_path / "run.arrows", "--rotate", "1 s"]
     for _ in range(2):  # the second run continues the recording
-        done = multidrop("poll", plant, *words)
-        assert (done.returncode, done.stderr) == (0, "")
-        summary = json.loads(done.stdout)
+        status, out, err = run("poll", plant, "--seconds", 1.3, *words, "--json")
+        assert (status, err) == (0, "")
+        summary = json.loads(out)
         counted += summary["samples"] + summary["misses"]
     names = sorted(path.name for path in tmp_path.glob("*.arrows"))
     assert names == [f"run.{number:08d}.arrows" for number in range(1, len(names) + 1)]
     assert len(names) >= 3
     assert sum(len(recorded(tmp_path / name)) for name in names) == counted
-    done = multidrop("poll", plant, "--seconds", 0.5, "--out", tmp_path / "run.arrows", "--rotate", "1 h")
-    assert done.stdout.endswith(f" in segments of {tmp_path}/run.arrows\n")
+    _, out, _ = run("poll", plant, "--seconds", 0.1, *words)
+    assert out.endswith(f" in segments of {tmp_path}/run.arrows\n")
 
 
-@pytest.mark.usefixtures("_unpainted")
 def test_a_recording_in_segments_must_be_named_by_a_segment(run: Run, tmp_path: Path) -> None:
     for number in (1, 2):
         with open_writer(tmp_path / f"run.0000000{number}.arrows", METADATA) as writer:
@@ -141,7 +142,7 @@ def test_a_recording_in_segments_must_be_named_by_a_segment(run: Run, tmp_path: 
         (["--most", "big"], "invalid size 'big': write 1 kB or more"),
     ],
 )
-def test_invalid_options_for_segments_are_one_sentence(
+def test_invalid_options_for_segments_are_reported_in_one_sentence(
     run: Run, plant: Path, words: list[str], sentence: str
 ) -> None:
     status, out, told = run("poll", plant, *words)
@@ -155,7 +156,7 @@ LATE_OR_SILENT = {str(each) for each in (Status.NO_REPLY, Status.LATE_ANSWER_DUE
 @pytest.mark.slow
 def test_poll_records_as_many_rows_as_its_summary_counts(run: Run, plant: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.arrows"
-    status, told, err = run("poll", plant, "--seconds", 1.5, "--out", out, "--json")
+    status, told, err = run("poll", plant, "--seconds", 0.6, "--out", out, "--json")
     assert (status, err) == (0, "")
     summary = json.loads(told)
     rows = recorded(out)
@@ -215,15 +216,46 @@ def test_poll_ended_by_a_signal_keeps_its_recording(plant: Path, tmp_path: Path,
 
 
 @pytest.mark.slow
-def test_poll_prints_its_summary_as_text(run: Run, plant: Path) -> None:
-    lines = run("poll", plant, "--seconds", 1)[1].splitlines()
+def test_poll_prints_its_summary_and_the_comparison_as_text(run: Run, plant: Path) -> None:
+    plant.write_text(plant.read_text().replace("address = 9\n", "address = 9\nbaudrate = 19200\n"))
+    lines = run("poll", plant, "--seconds", 0.6)[1].splitlines()
     assert lines[0].startswith("hall-1: ")
     assert lines[1].split() == ["DRIVE", "EXCHANGES/S", "SAMPLES/S", "MISSES"]
     living, dead = (next(line for line in lines if line.split()[0] == name) for name in ("pump-1", "pump-9"))
     assert any(reason in living for reason in {"none", *LATE_OR_SILENT})
     assert dead.split()[:3] == ["pump-9", "0.0", "0.0"]
     assert any(reason in dead for reason in LATE_OR_SILENT)
+    words = [line.split() for line in lines]
+    told = lines[words.index(["PREDICTED", "WITH", "DELAYS", "MEASURED"]) + 1 :]
+    assert [line.split()[0] for line in told[:4]] == ["bus", "utilisation", "pump-1,", "pump-9,"]
+    assert told[3].split()[-1] == "0.0"
+    assert re.search(r"\n  and the measured \d+\.\d\d ms to change the port's settings\n", "\n".join(lines))
     assert max(map(len, lines)) <= 80
+
+
+@pytest.mark.slow
+def test_poll_puts_prediction_and_measurement_side_by_side(run: Run, plant: Path) -> None:
+    summary = json.loads(run("poll", plant, "--seconds", 0.5, "--json")[1])["lines"]["hall-1"]
+    found = summary["comparison"]
+    planned = json.loads(run("plan", plant, "--json")[1])["lines"]["hall-1"]
+    assert list(found) == ["predicted", "predicted_with_measured_delays", "measured"]
+    assert found["predicted"]["cycle_ms"] == planned["cycle_ms"]
+    assert found["predicted"]["utilisation"] == planned["utilisation"]
+    delay = summary["drives"]["pump-1"]["response_delay_ms"]  # pump-9 never answers: 5 ms are assumed
+    known = found["predicted_with_measured_delays"]["cycle_ms"]
+    assert known == pytest.approx(planned["cycle_ms"] + delay - 5, abs=0.01)
+    assert found["measured"]["utilisation"] == summary["utilisation"]
+    assert found["measured"]["exchanges_per_second"]["pump-9"] == 0
+    assert found["measured"]["cycle_ms"] > 0
+    assert found["measured"]["switching_ms"] == summary["switching_ms"] > 0
+
+
+@pytest.mark.slow
+def test_no_bus_cycle_is_measured_if_registers_are_polled_at_rates(run: Run, plant: Path) -> None:
+    plant.write_text(plant.read_text().replace("address = 1\n", 'address = 1\nevery = "200 ms"\n'))
+    found = json.loads(run("poll", plant, "--seconds", 0.5, "--json")[1])["lines"]["hall-1"]["comparison"]
+    assert found["measured"]["cycle_ms"] is None
+    assert found["predicted"]["exchanges_per_second"]["pump-1"] == 5
 
 
 @pytest.mark.slow
@@ -243,9 +275,9 @@ def test_all_mistakes_of_a_plant_file_are_printed(run: Run, tmp_path: Path) -> N
     status, out, err = run("poll", path)
     assert (status, out) == (2, "")
     assert [re.sub(rf'multidrop: {path}:\d+: line "hall-1"', "", line) for line in err.splitlines()] == [
-        ": unknown key 'prot'; did you mean 'port'?",
+        ": unknown key 'prot'; did you mean port?",
         ', drive "pump-1": every = 5 is not right; write every = "50 ms"',
-        ', drive "pump-1": address 99 is not one of TOY T1: 1 to 31',
+        ', drive "pump-1": address 99 is not supported by TOY T1; choose 1 to 31',
         ', drive "pump-1", poll number 1: '
         "control can only be written, not polled; see `multidrop models toy`",
         ', drive "pump-1", poll number 2: '
@@ -269,7 +301,7 @@ def test_poll_and_convert_never_overwrite_a_recording(run: Run, tmp_path: Path) 
         ("none/out.arrows", 1, "cannot be written: No such file or directory"),
     ],
 )
-def test_a_recording_that_cannot_be_written_is_one_sentence(
+def test_a_recording_that_cannot_be_written_is_reported_in_one_sentence(
     run: Run, plant: Path, tmp_path: Path, out: str, status: int, sentence: str
 ) -> None:
     done, _, err = run("poll", plant, "--seconds", 1, "--out", tmp_path / out)
@@ -278,7 +310,7 @@ def test_a_recording_that_cannot_be_written_is_one_sentence(
 
 @pytest.mark.long
 @pytest.mark.uncounted
-def test_a_full_disk_ends_polling_and_keeps_the_rows_before(plant: Path, tmp_path: Path) -> None:
+def test_a_full_disk_ends_polling_and_keeps_the_earlier_rows(plant: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.arrows"
     done = multidrop("poll", plant, "--seconds", 30, "--out", out, most_bytes=12_000)
     rows = len(recorded(out))
@@ -299,7 +331,7 @@ def test_poll_reports_a_missing_port_in_one_sentence(run: Run, tmp_path: Path) -
 
 @pytest.mark.slow
 def test_convert_keeps_every_row(run: Run, plant: Path, tmp_path: Path) -> None:
-    run("poll", plant, "--seconds", 1, "--out", tmp_path / "a.arrows")
+    run("poll", plant, "--seconds", 0.3, "--out", tmp_path / "a.arrows")
     rows = recorded(tmp_path / "a.arrows")
     status, out, _ = run("convert", tmp_path / "a.arrows", tmp_path / "b.csv")
     assert (status, out) == (0, f"{len(rows)} rows in {tmp_path}/b.csv\n")
@@ -328,7 +360,7 @@ def test_convert_warns_of_a_recording_with_a_missing_end(run: Run, tmp_path: Pat
     assert run("report", path) == (0, f"{tmp_path}/a.html\n", sentence)
 
 
-def test_convert_refuses_a_file_that_is_no_recording(run: Run, tmp_path: Path) -> None:
+def test_convert_refuses_a_file_that_is_not_a_recording(run: Run, tmp_path: Path) -> None:
     (tmp_path / "a.arrows").write_text("hello")
     status, out, err = run("convert", tmp_path / "a.arrows", tmp_path / "b.csv")
     assert (status, out) == (2, "")
@@ -343,7 +375,7 @@ def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
     out, capture = tmp_path / "demo.arrows", tmp_path / "demo.pcapng"
     with open_writer(out, {"drives": dict.fromkeys(DRIVES)}):
         pass
-    done = multidrop("demo", "--seconds", 4, "--out", out, "--capture", capture, "--json")
+    done = multidrop("demo", "--seconds", 3, "--out", out, "--capture", capture, "--json")
     assert (done.returncode, done.stderr) == (0, "")
     summary = json.loads(done.stdout)
     drives = open_recording(out).metadata["drives"]
@@ -368,8 +400,9 @@ def framings_of(model: str) -> list[str]:
 
 
 @pytest.mark.slow
-def test_the_operator_of_a_demo_never_undoes_a_stop() -> None:
+def test_the_operator_of_a_demo_never_undoes_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     """The operator skips a silent drive, and restarts a motor after a trip."""
+    monkeypatch.setattr(demo_plant, "STEP_S", 0.05)
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
     sims[0].deaf_until = math.inf
     stopped, tripped = sims[1].motor, sims[2].motor
@@ -405,39 +438,51 @@ def test_a_killed_demo_leaves_no_simulator(tmp_path: Path) -> None:
     until(lambda: not (ports / "hall-1").is_symlink())
 
 
-# ---- on a terminal ----
+# ---- triggers ----
 
 
 @pytest.mark.slow
-@pytest.mark.long
-def test_on_a_terminal_a_demo_shows_the_monitor_until_its_time_is_over(tmp_path: Path) -> None:
-    out = tmp_path / "demo.arrows"
-    with on_terminal("demo", "--out", out, "--seconds", 2, size=(120, 24)) as terminal:
-        terminal.wait_for(">pump-1")
-        terminal.wait_for_match(r"belts +7 ")
-        terminal.wait_for("multidrop demo --web")
-        terminal.wait_for(f"report {out}")
-        terminal.wait_for("scan /dev/ttyUSB0")
-        assert terminal.process.wait(timeout=60) == 0
-    assert "belt-3" in {row.drive for row in recorded(out)}
+def test_poll_records_triggers(run: Run, plant: Path, tmp_path: Path) -> None:
+    condition = "integral(pump-1.output_current >= 0) > 0.3"
+    options = ("--trigger", condition, "--trigger", "fault", "--pre", "100 ms", "--post", "200 ms")
+    for number in (1, 2):  # the integral starts at 0 each time
+        _, out, _ = run("poll", plant, "--seconds", 1, *options, "--out", tmp_path / "trip.arrows")
+        path = tmp_path / f"trip.{number:08d}.arrows"
+        assert f"1 trigger recorded\ntrigger: see {path}\n" in out
+    assert not list(tmp_path.glob("*.totals.json"))
+    recording = open_recording(path)
+    trigger = recording.metadata["trigger"]
+    assert (trigger["condition"], trigger["pre_s"], trigger["post_s"]) == (condition, 0.1, 0.2)
+    values = [(row.time_ns, row.value) for row in recorded(path) if row.register == "trigger_1"]
+    assert next(time for time, value in values if value) == trigger["time_ns"]
+    assert values[0][0] >= trigger["time_ns"] - 100_000_000
+    assert values[-1][0] <= trigger["time_ns"] + 200_000_000
 
 
-@pytest.mark.long
-def test_on_a_terminal_poll_shows_the_newest_values_in_a_table(plant: Path) -> None:
-    with on_terminal("poll", plant, "--seconds", "1", size=(120, 24)) as terminal:
-        terminal.wait_for("DRIVE   SAMPLES  MISSES  NEWEST VALUES")
-        terminal.wait_for("output_current 0.00 A, mystery 0 raw, fault NONE, status none")
-        terminal.wait_for("output_frequency: no")  # for the other drive: "no reply" or "not asked"
-        terminal.wait_for("utilisation")
-        assert terminal.process.wait(timeout=60) == 0
-        assert b"\x1b[3F\x1b[J" in terminal.written  # table and head are drawn over the previous ones
-
-
-@pytest.mark.long
-def test_the_live_table_is_cut_to_the_size_of_its_terminal(plant: Path) -> None:
-    with on_terminal("poll", plant, "--seconds", "1", size=(40, 2)) as terminal:
-        terminal.wait_for("... and 3 more drives")
-        terminal.wait_for("utilisation")
-        assert terminal.process.wait(timeout=60) == 0
-        table = terminal.text.replace("\r\n", "\n").removeprefix(TOY_IS_RUN).partition("hall-1: ")[0]
-        assert max(map(len, table.splitlines())) < 40
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (
+            ["--trigger", "pump-1.output_current", "--out", "a.arrows"],
+            "--trigger pump-1.output_current: column 1: ",
+        ),
+        (
+            ["--trigger", "output_current > 30", "--out", "a.arrows"],
+            "output_current has no drive; write it as pump-1.output_current",
+        ),
+        (["--trigger", "key"], "--trigger needs --out"),
+        (
+            ["--trigger", "key", "--out", "a.arrows", "--rotate", "1 h"],
+            "--trigger and --rotate exclude each other",
+        ),
+        (
+            ["--trigger", "key", "--out", "a.txt"],
+            "a.txt: a recording's name must end in .arrows, .csv, .parquet",
+        ),
+        (["--pre", "1 s"], "--pre and --post belong to a trigger"),
+    ],
+)
+def test_wrong_trigger_is_refused(run: Run, plant: Path, options: list[str], sentence: str) -> None:
+    status, _, err = run("poll", plant, *options)
+    assert status == 2
+    assert sentence in err

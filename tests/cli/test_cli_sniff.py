@@ -17,8 +17,8 @@ import pytest
 from commands import Run, multidrop
 from frames import PRINTED
 from lines import PATIENCE, until
+from ptys import SerialServer, pyserials_own
 from recordings import recorded
-from serial_server import SerialServer, pyserials_own
 from sniffing import sniffing, tapped
 
 from multidrop.capture import CaptureWriter, Side
@@ -98,7 +98,7 @@ def test_polled_values_are_sniffed_captured_and_decoded(
     assert set(polled) <= set(decoded)
     for name, column in polled.items():
         assert decoded[name][: len(column)] == column  # the poll may have missed the last reply
-        assert len(decoded[name]) <= len(column) + 3  # at most three replies are no rows of the poll
+        assert len(decoded[name]) <= len(column) + 3  # at most three replies have no polled row
     assert {exchange["line"] for exchange in sniffer.exchanges} == {"hall-1"}
 
 
@@ -127,7 +127,7 @@ def test_an_unanswered_request_is_printed_while_the_line_is_silent() -> None:
 def test_bytes_received_late_do_not_count_as_silence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The listener waited for a processor before it read the request. The reply comes next."""
+    """A busy computer reads the request late, and soon after it the reply. The line was never silent."""
     now = 0.0
 
     class Listening:
@@ -194,7 +194,7 @@ def test_a_network_line_is_sniffed_without_sending(run: Run, kind: str) -> None:
     told = [json.loads(line) for line in out.splitlines()]
     assert {record["line"] for record in told[:-1]} == {url}
     assert told[-1]["summary"]["exchanges"] > 10
-    sniffed = [record.get("frames", [])[1:] for record in told[2:-2]]  # first and last may be incomplete
+    sniffed = [record.get("frames", [])[1:] for record in told[2:-2]]  # the others may be incomplete
     pair = [[each.frame.hex(" ").upper()] for each in (READ, WRITE)]
     assert sniffed in ((len(sniffed) * pair)[: len(sniffed)], (len(sniffed) * pair)[1 : len(sniffed) + 1])
     if server:
@@ -320,7 +320,7 @@ def test_requests_other_than_reads_are_printed_too(run: Run, tmp_path: Path) -> 
     ]
 
 
-def test_noise_without_end_is_printed_while_it_comes() -> None:
+def test_endless_noise_is_printed_as_it_arrives() -> None:
     stream, splitter, pairing, told = Stream(), Splitter(), Pairing(), []
     for time in range(4):
         stream.put(b"\xff" * 1500, time)
@@ -342,7 +342,7 @@ class Meter(Drive):
 """
 
 
-def test_a_not_a_number_reply_is_printed_as_no_valid_value(run: Run, tmp_path: Path) -> None:
+def test_a_reply_that_is_nan_is_printed_as_no_valid_value(run: Run, tmp_path: Path) -> None:
     """A meter without a sensor replies with the NaN of the floating-point format."""
     (tmp_path / "meter.py").write_text(METER)
     drive = 'name = "meter"\nmodel = "meter.py:Meter"\naddress = 1\n'
@@ -371,11 +371,7 @@ def test_a_capture_can_be_replayed_into_an_equal_capture(run: Run, capture: Path
 
 def test_decode_prints_the_number_of_columns_and_rows(run: Run, capture: Path) -> None:
     out = capture.parent / "a.csv"
-    assert run("decode", capture, "--out", out) == (
-        0,
-        f"2 rows in {out}: 2 exchanges, 2 unknown bytes\n",
-        "",
-    )
+    assert run("decode", capture, "--out", out) == (0, f"2 rows in {out}: 2 exchanges, 2 unknown bytes\n", "")
     assert [row.value for row in recorded(out)] == [5000, 5000]
 
 
@@ -419,7 +415,7 @@ def test_sniff_reports_a_missing_permission(run: Run, monkeypatch: pytest.Monkey
     )
 
 
-def test_invalid_sniff_arguments_are_one_sentence(
+def test_invalid_sniff_arguments_are_reported_in_one_sentence(
     run: Run, tmp_path: Path, capture: Path, request: pytest.FixtureRequest
 ) -> None:
     none, text = tmp_path / "none.pcapng", tmp_path / "text"
@@ -433,9 +429,9 @@ def test_invalid_sniff_arguments_are_one_sentence(
         (["sniff"], 2, "name either a PORT to listen to, or a capture with --replay FILE"),
         (["sniff", "--replay", capture, "--out", "a.csv"], 2, "a.csv: a capture's name must end in .pcapng"),
         (["decode", none], 2, f"{none}: No such file or directory"),
-        (["decode", text], 2, f"{text} is not a capture: it does not begin like pcap or pcapng"),
-        (["decode", pipe], 2, f"{pipe} is not a capture: it is no file"),
-        (["sniff", "--replay", pipe], 2, f"{pipe} is not a capture: it is no file"),
+        (["decode", text], 2, f"{text} is not a capture: it does not start like a pcap or pcapng file"),
+        (["decode", pipe], 2, f"{pipe} is not a capture: it is not a regular file"),
+        (["sniff", "--replay", pipe], 2, f"{pipe} is not a capture: it is not a regular file"),
         (
             ["decode", capture, "--out", capture],
             2,

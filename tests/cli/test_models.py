@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from commands import Run
+from tables import table
 
 from multidrop.drive import Drive
 from multidrop.families import MODELS
@@ -42,7 +45,7 @@ def refused(text: str, relative_to: Path | None = None) -> str:
     return pytest.fail(f"{text} is taken for a model")
 
 
-def test_a_built_in_model_is_found_by_its_name() -> None:
+def test_a_built_in_family_is_found_by_its_name() -> None:
     for name, model in MODELS.items():
         assert find_model(name) is model
         assert model.model == name
@@ -84,7 +87,7 @@ def test_a_model_file_that_is_a_link_to_another_type_is_reported(tmp_path: Path)
     assert refused("fan.py:Fan", tmp_path) == f"{tmp_path}/fan.txt cannot be loaded as Python"
 
 
-@pytest.mark.parametrize(
+@table(
     ("source", "ending"),
     [
         ("class Fan(:\n", "SyntaxError: invalid syntax (broken.py, line 1)"),
@@ -97,7 +100,9 @@ def test_a_model_file_that_is_a_link_to_another_type_is_reported(tmp_path: Path)
         ),
     ],
 )
-def test_a_failing_model_file_is_one_sentence_with_its_line(tmp_path: Path, source: str, ending: str) -> None:
+def test_error_in_a_model_file_is_one_sentence_that_names_the_line(
+    tmp_path: Path, source: str, ending: str
+) -> None:
     (tmp_path / "broken.py").write_text(source)
     sentence = refused("broken.py:Fan", tmp_path)
     assert sentence.startswith(str(tmp_path / "broken.py"))
@@ -188,7 +193,7 @@ def test_modules_that_the_program_imported_are_reused(
     }
 
 
-def test_a_failing_neighbour_module_is_reported_with_its_line(tmp_path: Path) -> None:
+def test_an_error_in_a_module_beside_a_model_file_is_reported_with_its_line(tmp_path: Path) -> None:
     directory = with_scales(tmp_path / "plant", 0.1)
     (directory / "scales.py").write_text("\n1 / 0\n")
     sentence = f"{directory}/scales.py, line 2: ZeroDivisionError: division by zero"
@@ -202,3 +207,30 @@ def test_a_module_missing_beside_a_model_file_is_reported(tmp_path: Path) -> Non
     (directory / "scales.py").unlink()
     ending = "fan.py, line 2: ModuleNotFoundError: No module named 'scales'"
     assert refused("fan.py:Fan", directory).endswith(ending)
+
+
+# ---- multidrop completion ----
+
+
+TYPED = {
+    "multidrop po": {"ports", "poll"},
+    "multidrop fleet wa": {"watch"},
+    "multidrop params di": {"diff"},
+    "multidrop poll --capt": {"--capture"},
+    "multidrop poll pla": {"plant.toml"},
+}
+COMPLETE = """COMP_WORDS=({}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1)); COMPREPLY=(); _shtab_multidrop
+echo "${{COMPREPLY[@]}}"
+"""
+
+
+@pytest.mark.slow
+def test_bash_completes_words_with_the_generated_script(run: Run, tmp_path: Path) -> None:
+    pytest.importorskip("shtab")
+    status, script, _ = run("completion", "bash")
+    assert status == 0
+    (tmp_path / "plant.toml").touch()
+    script += "".join(COMPLETE.format(words) for words in TYPED)
+    done = subprocess.run(["bash"], input=script, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    found = [set(line.split()) for line in done.stdout.splitlines()]
+    assert dict(zip(TYPED, found, strict=True)) == TYPED

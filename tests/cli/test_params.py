@@ -12,11 +12,13 @@ from pathlib import Path
 
 import patient
 import pytest
-from commands import Run
-from parameter_drives import with_parameters
+from commands import Run, multidrop
+from simulated_pumps import CHE, STEPS, with_parameters, write_test
 
 from multidrop import YD1000, ErmanERG220, cli
+from multidrop.recording import open_recording
 from multidrop.sim import MotorDrive, Simulator, Wire
+from multidrop.transport import clock
 
 pytestmark = pytest.mark.usefixtures("_patient")
 PATIENT_MULTIDROP = [sys.executable, patient.__file__, str(Path(cli.__file__).parents[1] / "__main__.py")]
@@ -73,8 +75,9 @@ def test_a_refused_second_write_names_the_option_that_permits_it(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setattr(YD1000, "silence_characters", 3.5)  # the manual's silences would take 2 s
     sim = with_parameters(YD1000(1))
-    with Simulator([Wire([sim], unpaced=True)]) as simulator:
+    with Simulator([Wire([sim], unpaced=True)], speed=50) as simulator, clock.at_speed(50):
         drive = simulator.wires[0].path, "yd1000", 1
         Path("fan.toml").write_text('format = 1\nmodel = "yd1000"\n\n[parameters]\n"0009" = 100\n')
         for seconds in (25.0, 30.0):
@@ -155,7 +158,7 @@ def test_two_files_and_two_drives_are_compared(run: Run, drive: tuple[object, ..
         (("apply", "gone.toml", "DRIVE"), "gone.toml: the parameter file cannot be read"),
         (("apply", "plant.toml", "DRIVE"), "give a parameter file, and then the drive"),
         (("apply", "other.toml", "DRIVE"), "of yd1000"),
-        (("apply", "newer.toml", "DRIVE"), "has format 9, and this version of multidrop reads format 1"),
+        (("apply", "newer.toml", "DRIVE"), "has format 9, but this version of multidrop reads format 1"),
         (("apply", "unknown.toml", "DRIVE"), "has no parameter b.999"),
         (("apply", "wide.toml", "DRIVE"), "does not fit"),
         (("diff", "other.toml", "newest.toml"), "other.toml has parameters of yd1000, and newest.toml of"),
@@ -166,7 +169,7 @@ def test_two_files_and_two_drives_are_compared(run: Run, drive: tuple[object, ..
         (("list", "invt-che"), "no reliable rule"),
     ],
 )
-def test_mistaken_params_arguments_are_one_sentence(
+def test_mistaken_params_arguments_are_reported_in_one_sentence(
     run: Run, drive: tuple[object, ...], words: tuple[str, ...], sentence: str
 ) -> None:
     Path("plant.toml").write_text("[[line]]\nname = 'hall'\n")
@@ -180,3 +183,72 @@ def test_mistaken_params_arguments_are_one_sentence(
     assert status in (1, 2)
     assert sentence in err
     assert (out, err.count("\n")) == ("", 1)
+
+
+# ---- `multidrop run`: the dry run, refusals, and a simulated run ----
+
+
+HIDDEN = CHE | {"poll": ["output_current"]}
+
+
+def test_a_dry_run_shows_the_planned_times_and_the_limits(run: Run, tmp_path: Path) -> None:
+    path = write_test(tmp_path, '[abort]\nlimits = ["fan.output_current > 30"]\n' + STEPS, fan=HIDDEN)
+    assert run("run", path, "--dry-run") == (
+        0,
+        """\
+ AT  LASTS  PHASE    COMMANDS
+0 s    0 s  start    fan to 10 Hz, start fan
+0 s    2 s  steps 1  fan to 20 Hz
+2 s    2 s  steps 2  fan to 30 Hz
+3 steps in 4 s, then all drives stop
+! no polled register of fan shows a fault, so a fault does not abort the run
+aborts: fan.output_current > 30; no value for 5 s; a failed command
+""",
+        "",
+    )
+    status, out, _ = run("run", path, "--dry-run", "--json")
+    assert (status, [step["at_s"] for step in json.loads(out)["steps"]]) == (0, [0.0, 0.0, 2.0])
+
+
+def test_a_test_that_does_not_fit_is_refused_before_a_port_is_opened(run: Run, tmp_path: Path) -> None:
+    path = write_test(tmp_path, STEPS.replace('"2 s"', '"50 ms"'))
+    status, out, _ = run("run", path, "--dry-run")
+    assert status == 1
+    assert "! steps 1 lasts 50 ms, less than 2 bus cycles of line hall: it would fit with " in out
+    status, _, errors = run("run", path, "--yes")
+    assert status == 2
+    assert "it would fit with" in errors
+
+
+def test_wrong_options_are_refused(run: Run, tmp_path: Path) -> None:
+    path = write_test(tmp_path)
+    assert run("run", path, "--speed", 3)[::2] == (
+        2,
+        "multidrop: --speed is for simulated drives: add --simulate\n",
+    )
+    assert "--simulate has ports of its own" in run("run", path, "--simulate", "--port", "hall=x")[2]
+    status, _, errors = run("run", path)
+    assert status == 1
+    assert "There is no terminal to ask on: add --yes to confirm" in errors
+    assert "fan, if this computer or its power fails: " in errors
+    assert "which commands fan at up to 30 Hz, and then stops all drives of the plant?" in errors
+
+
+def test_the_question_names_missing_setpoints_and_fault_registers(run: Run, tmp_path: Path) -> None:
+    text = '[[phase]]\nname = "a"\n[[phase.step]]\nstart = ["fan"]\ndwell = "9 s"'
+    status, _, errors = run("run", write_test(tmp_path, text, fan=HIDDEN))
+    assert status == 1
+    assert "no polled register of fan shows a fault" in errors
+    assert "fan is started at the setpoint that it has, because no earlier step sets one" in errors
+    assert "which commands fan, and then stops" in errors
+
+
+@pytest.mark.slow
+def test_a_simulated_run_needs_no_drive_and_is_recorded(tmp_path: Path) -> None:
+    out = tmp_path / "run.arrows"
+    done = multidrop("run", write_test(tmp_path), "--simulate", "--speed", 20, "--out", out)
+    assert (done.returncode, done.stderr) == (0, "")
+    stopped, next_command = done.stdout.splitlines()
+    assert stopped.startswith("fan: stopped after ")
+    assert next_command == f"recorded in {out}; next: multidrop report {out}"
+    assert {"steps 1", "stop"} <= {*open_recording(out).to_pandas()["phase"]}

@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from commands import plant_file
+from batches import METADATA, counting
+from commands import Run, plant_file
 from peers import require_module
 from recordings import recorded
 from terminals import closing_terminal
@@ -20,6 +21,7 @@ from terminals import closing_terminal
 from multidrop import cli
 from multidrop.cli.support import signals
 from multidrop.cli.support.signals import end_signals_interrupt, noting_signals, on_end_signals, run_loop
+from multidrop.recording import open_writer
 
 PATIENCE = 60.0
 
@@ -73,7 +75,7 @@ def test_a_signal_while_the_event_loop_is_made_leaves_no_traceback(
     monkeypatch.setattr(asyncio.SelectorEventLoop, "_make_self_pipe", interrupted)
     with end_signals_interrupt(), pytest.raises(KeyboardInterrupt):
         run_loop(work())
-    gc.collect()  # pytest turns what Python would print into errors
+    gc.collect()  # pytest raises an error for each warning that Python would print
 
 
 def test_under_nohup_sighup_is_ignored() -> None:
@@ -140,7 +142,7 @@ def test_simulate_removes_its_links_when_its_terminal_is_closed(tmp_path: Path) 
         terminal.wait_for("ready hall-1")
         assert link.is_symlink()
         terminal.close()
-        assert terminal.process.wait(PATIENCE) >= 0  # it was not ended by a signal
+        assert terminal.process.wait(PATIENCE) >= 0  # the process was not ended by a signal
     assert not link.is_symlink()
 
 
@@ -152,7 +154,7 @@ def test_the_demo_of_serve_ends_when_its_terminal_is_closed() -> None:
     with closing_terminal("serve", "--demo", "--no-browser") as terminal:
         terminal.wait_for("Ctrl-C ends it")
         terminal.close()
-        assert terminal.process.wait(PATIENCE) >= 0  # it was not ended by a signal
+        assert terminal.process.wait(PATIENCE) >= 0  # the process was not ended by a signal
 
 
 @pytest.mark.slow
@@ -200,7 +202,7 @@ def test_a_closed_terminal_ends_its_foreground_command(
 
 
 def interrupted_class(words: list[str]) -> int:
-    """Create a class during which Ctrl-C comes, as in an import. Python 3.11 raises RuntimeError then."""
+    """Press Ctrl-C while a class is created, as during an import. Python 3.11 then raises RuntimeError."""
 
     class Interrupted:
         def __set_name__(self, owner: type, name: str) -> None:
@@ -218,7 +220,30 @@ def interrupted_parser(words: list[str]) -> int:
         raise AttributeError("'_StoreAction' object has no attribute 'save_nargs'")
 
 
-def test_ctrl_c_during_the_first_imports_is_one_sentence() -> None:
+CARELESS = """\
+import signal
+try:
+    signal.raise_signal(signal.SIGINT)
+except:
+    pass
+"""
+
+
+def test_ctrl_c_ends_a_conversion_although_its_library_catches_it(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "asammdf.py").write_text(CARELESS)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(sys.modules, "asammdf", None)
+    del sys.modules["asammdf"]
+    with open_writer(tmp_path / "a.csv", METADATA) as writer:
+        writer.write(counting(1, 0))
+    words = ("convert", tmp_path / "a.csv", tmp_path / "a.mf4")
+    assert run(*words) == (130, "", "multidrop: interrupted\n")
+    assert not (tmp_path / "a.mf4").exists()
+
+
+def test_ctrl_c_during_the_first_imports_prints_one_sentence() -> None:
     code = (
         "import sys, types; from multidrop.__main__ import main\n"
         "class Interrupting:\n"
@@ -231,7 +256,7 @@ def test_ctrl_c_during_the_first_imports_is_one_sentence() -> None:
 
 
 @pytest.mark.parametrize("run", [interrupted_class, interrupted_parser])
-def test_an_interruption_wrapped_by_python_is_one_sentence(
+def test_an_interruption_wrapped_in_another_exception_prints_one_sentence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], run: Callable[[list[str]], int]
 ) -> None:
     monkeypatch.setattr(cli, "_run_interruptible", run)

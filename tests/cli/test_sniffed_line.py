@@ -1,7 +1,7 @@
 """A line with several framings, on which pymodbus is the master and `sniff` listens.
 
-The listener first receives all bytes undamaged, then with damage. SNIFFED_EXCHANGES is the number of
-exchanges: 3,000 in .ci/run, 10,000 for the complete proof.
+In the first test, the listener receives all bytes undamaged. In the second test, some bytes are damaged.
+SNIFFED_EXCHANGES is the number of exchanges: 3,000 in .ci/run, 10,000 in a thorough run.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def drives() -> list[Drive]:
 # ---- other programs' masters ----
 
 Said = tuple[int, int, list[int] | int]  # address, function, and values or minus the exception code
-NUMBERS = itertools.count(1)  # each number is written once, so that each exchange is unique
+NUMBERS = itertools.count(1)  # each number is written only once, so that each exchange is unique
 
 
 def pymodbus(framer: str, address: int, starts: list[int], written: int) -> Callable[..., Iterator[Said]]:

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import ast
 import logging
+import math
 import struct
 import subprocess
+import sys
+from io import BytesIO, TextIOWrapper
 from pathlib import Path
+from typing import Any
 
 import pytest
 from captures import write
@@ -19,14 +23,20 @@ from tables import table
 from terminals import MULTIDROP
 
 import multidrop.cli
-from multidrop.cli.serve import _logging
+from multidrop.cli import main
+from multidrop.cli.support.log_thread import logging_to_stderr
 from multidrop.core import Framing, Message
+from multidrop.families import InvtCHE
+from multidrop.families.files import notation
+from multidrop.gateway.http.messages import Denied, number_in
 from multidrop.gateway.settings import read_plant
+from multidrop.importers.numbers import count, number
 from multidrop.plant.loader import PlantError, load_plant
-from multidrop.printable import masked, printable
+from multidrop.printable import masked, plain_number, plain_whole, printable
+from multidrop.recording.csv import _parse
 
-# They clear the screen, set the title, write the clipboard, reverse the text direction, start an escape with
-# one byte, or break the line.
+# In this order: clear the screen, set the title, write the clipboard, reverse the text direction, start an
+# escape with one byte, break the line, end a C string.
 TRAPS = ("\x1b[2J", "\x1b]0;title\x07", "\x1b]52;c;cm0gLXJm\x07", "\u202egpj.exe", "\x9b2J", "a\r\nb", "\0")
 TRAP = "".join(TRAPS)
 
@@ -44,7 +54,7 @@ def test_printable_text_stays_unchanged() -> None:
 @pytest.mark.parametrize("form", ["text", "json"])
 def test_a_gateways_log_escapes_the_names_of_callers(capfd: pytest.CaptureFixture[str], form: str) -> None:
     """A caller's address may come from a proxy, and a drive's name may come from an MQTT topic."""
-    with _logging(form, logging.INFO):
+    with logging_to_stderr(form, {"multidrop": logging.INFO}):
         logging.getLogger("multidrop.gateway").warning("stop of %s, asked for by %s", TRAP, "anna")
     (line,) = capfd.readouterr().err.removesuffix("\n").split("\n")
     assert "asked for by anna" in line
@@ -114,7 +124,7 @@ def test_a_plant_files_mistakes_are_reported_without_a_urls_password(tmp_path: P
 
 @pytest.mark.parametrize("form", ["text", "json"])
 def test_a_gateways_log_contains_no_urls_password(capfd: pytest.CaptureFixture[str], form: str) -> None:
-    with _logging(form, logging.INFO):
+    with logging_to_stderr(form, {"multidrop": logging.INFO}):
         failure = OSError(f"nats://bob:{SECRET}@host is lost")
         logging.getLogger("multidrop.gateway").error("at %s", f"nats://{SECRET}@host", exc_info=failure)
     said = capfd.readouterr().err
@@ -122,7 +132,7 @@ def test_a_gateways_log_contains_no_urls_password(capfd: pytest.CaptureFixture[s
     assert "S3C" not in said
 
 
-@pytest.mark.parametrize("trap", TRAPS)
+@table("trap", TRAPS)
 def test_names_and_ports_that_cannot_be_printed_are_refused(tmp_path: Path, trap: str) -> None:
     text = "".join(f"\\u{ord(character):04x}" for character in trap)
     path = tmp_path / "plant.toml"
@@ -201,7 +211,7 @@ def test_names_with_markup_are_plain_text_in_pictures_and_legends(tmp_path: Path
     require_module("matplotlib")
     from multidrop.report import load, plot, plot_page, report_page
 
-    # a hidden label, mathematics, a format string and a command for the terminal
+    # matplotlib hides a label that starts with _, and reads mathematics between two $
     name = rf"_$x^{{$\frac%s{{0}}{TRAP}"
     rows = [
         row(at, name, register, at) for at in range(3) for register in (name, "output_frequency", "fault")
@@ -244,8 +254,9 @@ def section_length(path: Path) -> int:
 
 @pytest.mark.slow
 def test_commands_print_through_the_escaping_function() -> None:
-    """Commands call `print` only for help, drawings and questions. All other text is escaped."""
-    ours = {"__init__.py", "support/output.py", "support/writing.py", "params.py", "poll.py", "scan.py"}
+    """Commands call `print` only for help, drawings, schemas and questions. All other text is escaped."""
+    printing = ("__init__", "support/output", "support/writing", "params", "poll", "scan", "schema")
+    ours = {f"{name}.py" for name in printing}
     root = Path(multidrop.cli.__file__).parent
     found = {
         str(path.relative_to(root))
@@ -276,3 +287,96 @@ def test_running_a_users_model_file_is_reported_once(tmp_path: Path, command: st
     assert told == f"multidrop: {tmp_path}/fan.py is run as Python: a user's model is a program"
     assert not any("is run as Python" in line for line in rest)
     assert done.returncode == (0 if command == "plan" else 1)
+
+
+# ---- output in an encoding that lacks some letters, such as that of a pipe on Windows ----
+
+
+PLANT = """
+[[line]]
+name = "зал"
+port = "/dev/ttyUSB0"
+[[line.drive]]
+name = "насос"
+model = "innovert-ibd"
+address = 1
+"""
+
+
+@pytest.mark.parametrize("words", [["plan"], ["plan", "--json"]])
+def test_letters_that_the_encoding_lacks_are_printed_as_escapes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str]
+) -> None:
+    plant, out = tmp_path / "plant.toml", BytesIO()
+    plant.write_text(PLANT, "utf-8")
+    monkeypatch.setattr(sys, "stdout", TextIOWrapper(out, "cp1252"))
+    assert main([*words, str(plant)]) == 0
+    said = out.getvalue().decode("cp1252")
+    assert r"\u0437\u0430\u043b" in said
+    assert "зал" not in said
+
+
+# ---- numbers in command arguments, requests and files: only ASCII decimal digits are accepted ----
+
+
+# Fullwidth, Arabic-Indic, Devanagari and mathematical digits, and underscores as in Python.
+ODD = ["1_0", "\uff11\uff12", "\u0663", "\u0967\u0968", "\U0001d7cf", "\u00bd", "12\u00a0", "1\u066b5"]
+
+
+@table("text", [*ODD, "", "-", "0x10", "0b1", "1 2", "1,5"])
+def test_texts_with_other_digits_are_not_parsed_as_numbers(text: str) -> None:
+    for parse in (plain_number, plain_whole):
+        with pytest.raises(ValueError, match="in decimal digits"):
+            parse(text)
+
+
+def test_a_number_of_thousands_of_digits_is_refused_in_one_sentence() -> None:
+    with pytest.raises(ValueError, match="100 digits at most, and this one has 5000"):
+        plain_whole("9" * 5000)
+
+
+def test_numbers_in_ascii_digits_are_parsed() -> None:
+    given = ("12", " 12 ", "+12", "-0", "12.", ".5", "1e1", "0012")
+    assert [plain_number(text) for text in given] == [12, 12, 12, 0, 12, 0.5, 10, 12]
+    assert [plain_whole(text) for text in ("12", " 12", "+12", "-3", "0012")] == [12, 12, 12, -3, 12]
+    assert math.isnan(plain_number("nan"))
+
+
+@table("text", [text for text in ODD if text.strip() == text])
+def test_other_digits_are_refused_in_requests_and_files(text: str) -> None:
+    row = ["2026-11-21T09:30:00.000000000Z", "1", "", "pump", "speed", text, "ok"]
+    attempts: list[tuple[Any, Any]] = [
+        (InvtCHE(1).setpoint.parse, text),
+        (notation.number, text),
+        (notation.whole, text),
+        (count, text),
+        (number, (text, 0)),
+        (_parse, row),
+        (number_in, (text, "count")),
+    ]
+    for parse, given in attempts:
+        with pytest.raises((ValueError, Denied)):
+            parse(*given) if isinstance(given, tuple) else parse(given)
+
+
+@table("text", ODD[:2])
+@table(
+    "words",
+    [
+        ["set-frequency", "/dev/none", "invt-che", "3", "--yes", "{}"],
+        ["set-frequency", "/dev/none", "invt-che", "{}", "--yes", "21"],
+        ["simulate", "none.toml", "--speed", "{}"],
+        ["start", "/dev/none", "invt-che", "3", "--yes", "--frequency", "{}"],
+        ["write", "/dev/none", "invt-che", "3", "setpoint", "{}", "--yes"],
+        ["state", "/dev/none", "invt-che", "3", "--option", "maximum_frequency={}"],
+        ["state", "/dev/none", "invt-che", "3", "--baudrate", "{}"],
+        ["scan", "/dev/none", "--addresses", "{}"],
+        ["scan", "/dev/none", "--baudrates", "{}"],
+        ["doctor", "/dev/none", "--address", "{}"],
+    ],
+)
+def test_a_command_whose_arguments_have_other_digits_returns_2(
+    words: list[str], text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([word.format(text) for word in words]) == 2
+    assert "no such" not in capsys.readouterr().err.lower()  # neither a port nor a file was opened

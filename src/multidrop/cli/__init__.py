@@ -1,4 +1,4 @@
-"""The command line: runs one command. A failure is printed as a sentence on stderr, with an exit status.
+"""The command line: runs one command. A failure becomes a sentence on stderr and an exit status.
 
 Each command's module is imported only when the command runs, so `multidrop --help` imports none of them.
 """
@@ -6,7 +6,6 @@ Each command's module is imported only when the command runs, so `multidrop --he
 from __future__ import annotations
 
 import argparse
-import difflib
 import importlib
 import logging
 import os
@@ -17,24 +16,22 @@ from functools import partial
 from typing import Any, NoReturn
 
 from multidrop.errors import BusError, Unsupported, WriteForbidden
+from multidrop.printable import did_you_mean
 
 DONE, FAILED, MISTAKE, INTERRUPTED = 0, 1, 2, 130
-STOPS = (
-    "stop",
-    "coast",
-    "emergency-stop",
-)  # commands that are sent despite SIGHUP, and despite mistakes in arguments other than the drive's name
+# Commands that continue after SIGHUP. Invalid arguments after the drive's name do not prevent them.
+STOPS = ("stop", "coast", "emergency-stop")
 HARD_WIRED = "use the hard-wired stop"  # advice to the user when a stop could not be sent
 _MISNAMED = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 
-COMMANDS = {  # by command: its module in this package, and its help
-    "demo": ("demo", "poll simulated drives of every family on one line"),
+COMMANDS = {  # command name: (its module in this package, its help text)
+    "demo": ("demo", "poll simulated drives on three lines, and run their motors"),
     "schema": ("schema", "print the JSON Schema of a plant file, for editors"),
     "models": ("models", "list the families, or one family's registers"),
     "check": ("check", "check a family file or a plant file; opens no port"),
     "import": ("import_family", "convert another program's register table into a family file"),
-    "read": ("read", "read values from a drive"),
-    "write": ("write", "write one register of a drive"),
+    "read": ("registers", "read values from a drive"),
+    "write": ("registers", "write one register of a drive"),
     "state": ("verbs", "show whether a drive runs, its direction and its fault"),
     "start": ("verbs", "start a drive's motor"),
     "stop": ("verbs", "stop a drive's motor along its deceleration ramp"),
@@ -50,6 +47,7 @@ COMMANDS = {  # by command: its module in this package, and its help
     "plan": ("plan", "predict the load of a plant file's lines; opens no port"),
     "wear": ("wear", "list the writes to EEPROMs, and how many are left"),
     "poll": ("poll", "poll the drives of a plant file, and record them"),
+    "run": ("run", "run the steps of a test file, and record them"),
     "doctor": ("doctor", "examine a port and its adapter, and advise"),
     "serve": ("serve", "poll a plant for browsers and other programs"),
     "fleet": ("fleet", "share a plant's lines among several gateways, by NATS"),
@@ -57,11 +55,11 @@ COMMANDS = {  # by command: its module in this package, and its help
     "monitor": ("monitor", "show the drives of a plant file live on a terminal"),
     "simulate": ("simulate", "simulate the drives of a plant file on pseudo-terminals"),
     "sniff": ("sniff", "listen to a line that another master polls"),
-    "decode": ("decode", "convert a capture into a recording or text"),
-    "plot": ("plot", "plot a recording's values"),
-    "report": ("report", "summarise a recording on one HTML page"),
+    "decode": ("sniff", "convert a capture into a recording or text"),
+    "plot": ("recordings", "plot a recording's values"),
+    "report": ("recordings", "summarise a recording on one HTML page"),
     "completion": ("completion", "print a script by which a shell completes commands"),
-    "convert": ("convert", "convert a recording to another format"),
+    "convert": ("recordings", "convert a recording to another format"),
 }
 
 
@@ -124,7 +122,7 @@ def _replace_closed_streams() -> None:
 
 
 def _describe_itself(words: list[str]) -> int:
-    """Print the version; or print the help, if there are no words or it was requested."""
+    """Print the version; or print the help, if there are no words or help was requested."""
     if words[:1] == ["--version"]:
         from importlib.metadata import version
 
@@ -136,9 +134,10 @@ def _describe_itself(words: list[str]) -> int:
 
 @contextmanager
 def _without_wrappers() -> Iterator[None]:
-    """Raise the KeyboardInterrupt that Python or argparse has turned into another exception.
+    """If another exception has replaced a KeyboardInterrupt, raise the KeyboardInterrupt itself.
 
-    Python does so in `__set_name__`, which runs when a class is created, for example during an import.
+    Python replaces it in `__set_name__`, which runs when a class is created, for example during an import.
+    argparse replaces it too.
     """
     try:
         yield
@@ -166,14 +165,15 @@ def _guarded(run: Callable[[], int]) -> int:
         return _fail(str(mistake), MISTAKE)
     except OSError as failure:
         if failure.strerror is None:  # raised by multidrop, not by the operating system
-            return _fail(str(failure), FAILED)
+            lacks_library = isinstance(failure.__cause__, ImportError)
+            return _fail(str(failure), MISTAKE if lacks_library else FAILED)
         _abandon_output()
         where = f"{failure.filename}: " if failure.filename else ""
         return _fail(f"{where}{failure.strerror}", MISTAKE if isinstance(failure, _MISNAMED) else FAILED)
     except BusError as failure:
         return _fail(str(failure), FAILED)
     except ImportError as missing:
-        if missing.name != "nanoarrow":  # this library does not exist for some machines
+        if missing.name != "nanoarrow":  # some machines have no build of this library
             raise
         return _fail(str(missing), MISTAKE)
     return status
@@ -181,8 +181,7 @@ def _guarded(run: Callable[[], int]) -> int:
 
 def _found(kind: str, name: str, table: Mapping[str, tuple[str, str]], prog: str) -> tuple[str, str]:
     if name not in table:
-        near = difflib.get_close_matches(name, table, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"see `{prog} --help`"
+        hint = did_you_mean(name, table, f"see `{prog} --help`", 1)
         raise ValueError(f"there is no {kind} {name!r}; {hint}")
     return table[name]
 
@@ -231,7 +230,7 @@ class _Parser(argparse.ArgumentParser):
 def _parsed(
     parser: argparse.ArgumentParser, words: list[str], command: str
 ) -> tuple[argparse.Namespace, list[str]]:
-    """Return the parsed arguments, and the words that a stop ignores. Raises ValueError for a mistake.
+    """Return the parsed arguments, and the words that a stop ignores. Raises ValueError for an invalid word.
 
     A stop ignores unknown options. It also ignores the word after such an option, because that may be the
     option's value instead of a drive.

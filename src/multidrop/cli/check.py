@@ -1,4 +1,4 @@
-"""`multidrop check`: prints a family file's contents, its unknown facts, and the requests that are refused.
+"""`multidrop check`: prints a family file's contents, unknown facts, and requests that are never sent.
 
 It also checks a plant file, except its table `[serve]`, which `multidrop serve --check` checks.
 """
@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _is_plant(file: Path) -> bool:
     """Return True for a plant file.
 
-    Return False for an unreadable file too: loading it as a family reports the reason.
+    Return False for an unreadable file too: loading it as a family then reports why it cannot be read.
     """
     try:
         return "line" in read_document(file, "file")
@@ -93,8 +93,7 @@ def _check_plant(arguments: argparse.Namespace) -> int:
     elif mistakes:
         warn("\n".join(mistakes))
     else:
-        drives = sum(len(line.drives) for line in plant.lines)
-        holds = f"{counted(len(plant.lines), 'line')}, {counted(drives, 'drive')}"
+        holds = f"{counted(len(plant.lines), 'line')}, {counted(len(plant.drives), 'drive')}"
         served = "; `multidrop serve --check` checks its [serve]" if plant.serve else ""
         for name, sentence in remarks:
             warn(f"{plant.path}: {name}: {sentence}")
@@ -103,7 +102,7 @@ def _check_plant(arguments: argparse.Namespace) -> int:
 
 
 def _family(file: Path) -> type[Drive]:
-    """Return the family in a file, or the built-in family of this name. Raises ValueError for neither."""
+    """Return the family in a file, or the built-in family of this name. Raises ValueError for others."""
     name = str(file)
     if name in MODELS:
         raise ValueError(f"{name} is built in and has no file; see `multidrop models {name}`")
@@ -140,7 +139,7 @@ _OF_A_MOTOR = {
 
 
 def unknown(family: type[Drive]) -> Iterator[Remark]:
-    """Yield each key that the family file leaves out, with a sentence about the fact that is unknown."""
+    """Yield each key that is missing in the family file, and a sentence that names the unknown fact."""
     drive = family(family.addresses[0])
     registers = family.registers.values()
     for register in registers:
@@ -174,7 +173,7 @@ def _unknown_of(drive: Drive, register: Register[Any]) -> Iterator[str]:
 
 
 def crowded(plant: Plant) -> Iterator[Remark]:
-    """Yield each line that has more drives than one of the drives' manuals allows, with a sentence."""
+    """Yield each line with more drives than the manual of one of them allows, and a sentence about it."""
     for line in plant.lines:
         stated = [polled.drive for polled in line.drives if polled.drive.most_devices]
         strictest = min(stated, key=lambda drive: drive.most_devices, default=None)

@@ -1,4 +1,4 @@
-"""`multidrop completion`: prints a script by which a shell completes commands, options and file names."""
+"""`multidrop completion`: prints a script that lets a shell complete commands, options and file names."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _add(
     parser: argparse.ArgumentParser, table: Mapping[str, tuple[str, str]], package: str, file: Any
 ) -> None:
-    """Add the commands of a table, with their arguments; without choices, values are file names."""
+    """Add the commands in `table` to the parser. Arguments without choices are completed as file names."""
     subparsers = parser.add_subparsers()
     for word, (name, text) in table.items():
         module: Any = import_module(f"{package}.{name}" if name else package)

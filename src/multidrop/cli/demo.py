@@ -60,7 +60,7 @@ def _operator(poller: Poller) -> Operator:
 
 
 def _text(summary: Mapping[str, Any], out: Path) -> Iterator[str]:
-    """Yield the summary as text: a row per simulated line, the numbers of samples, the next commands."""
+    """Yield the summary as text: a row for each line, the number of samples, and commands to try next."""
     rows = [("LINE", "DRIVES", "EXCHANGES/S", "WIRE USED", "MISSES")]
     for name, line in summary["lines"].items():
         rate = line["exchanges"] / line["seconds"] if line["seconds"] else 0.0
@@ -84,7 +84,7 @@ class NextCommand(NamedTuple):
 
     @property
     def lacks(self) -> bool:
-        """Return True if a library of the command's extra is missing."""
+        """Return True if the command needs an optional extra, and one of the extra's libraries is missing."""
         return not all(map(find_spec, LIBRARIES[self.extra]))
 
 
@@ -99,18 +99,18 @@ WEB_NEXT = (
 
 
 def _next(commands: Sequence[NextCommand]) -> Iterator[str]:
-    """Yield the next commands as text, with the program's name as the user typed it."""
+    """Yield the commands to try next as text, with the program's name as the user typed it."""
     typed = sys.argv[0]
     program = typed if Path(typed).name == "multidrop" and which("multidrop") != typed else "multidrop"
     rows = [(f"  {command_line([program, *one.words])}", one.effect) for one in commands]
     yield from ("", "Next:", *aligned(rows, "<<"))
     if lacking := [one for one in commands if one.lacks]:
-        wanted = " ".join(install_command(one.extra).removeprefix("pip install ") for one in lacking)
-        yield f"first: {Path(program).with_name('pip')} install {wanted}"
+        install = install_command(*dict.fromkeys(one.extra for one in lacking))
+        yield f"first: {Path(program).with_name('pip')}{install.removeprefix('pip')}"
 
 
 def _check_web(arguments: argparse.Namespace) -> None:
-    """Raise ValueError for options that have no effect with --web, which serves without recording."""
+    """Raise ValueError for options that have no effect with --web, such as those of a recording."""
     given = {
         "--seconds": arguments.seconds != SECONDS,
         "--out": str(arguments.out) != OUT,
@@ -131,7 +131,7 @@ def _make_room(out: Path) -> None:
 
 
 def _can_be_watched(arguments: argparse.Namespace) -> bool:
-    """Return True if the monitor can show the demo: it has a terminal, and no capture or JSON is wanted."""
+    """Return True if the monitor can show the demo: on a terminal, and without capture or JSON output."""
     if arguments.capture or arguments.flight_recorder:
         return False
     return not arguments.json and is_possible()

@@ -69,7 +69,7 @@ from multidrop.transport.peers import LEAST_TIMEOUT
 from multidrop.transport.port_identity import lasting_name
 from multidrop.transport.prepared import make_exchange
 
-WAKE_S = 5.0  # how long the wake-ups of this computer are measured
+WAKE_S = 5.0  # how long to measure this computer's wake-ups, in s
 NOBODY = 247  # an address without a drive: only an echo of the request may come back
 SETTING_UP_COM = "while the port is open, multidrop makes it raw and sets each drive's baud rate and format"
 SETTING_UP = (
@@ -155,7 +155,7 @@ def _by_hand(arguments: argparse.Namespace) -> _Target:
 
 
 def _examined(target: _Target, *, is_alone: bool) -> Iterator[Finding]:
-    """Yield the findings about a port. If there are several ports, failing to open one is a finding too."""
+    """Yield the findings about a port. Raises LineError if it is the only port and cannot be opened."""
     try:
         yield from _findings(target)
     except LineError as failure:
@@ -165,10 +165,11 @@ def _examined(target: _Target, *, is_alone: bool) -> Iterator[Finding]:
 
 
 def _add_wake_findings(found: list[tuple[_Target, list[Finding]]]) -> None:
-    """Measure how late this computer wakes the core; add the finding for each line with a silence."""
+    """Measure how late this computer wakes a thread; add a finding to each open port except Modbus TCP."""
     if all(speaks_tcp(target.port) for target, _ in found):
         return
-    with ThreadPoolExecutor(2) as threads:  # measured at the same time, under the same load
+    # both kinds of scheduling are measured at the same time, under the same load
+    with ThreadPoolExecutor(2) as threads:
         normal = threads.submit(wake_lateness, WAKE_S, realtime=False)
         realtime = threads.submit(wake_lateness, WAKE_S, realtime=True)
     usual = WakeLateness.of(normal.result())
@@ -214,7 +215,7 @@ def _findings(target: _Target) -> Iterator[Finding]:
     block = first_block(target.drives[0]) if target.drives else None
     if block:
         yield other_way_finding(port, block.request, settings)
-    elif not speaks_tcp(port):  # without drives, silence in the other framing proves nothing
+    elif not speaks_tcp(port):  # without a drive to ask, silence in the other framing proves nothing
         yield other_way_finding(port, nobody, settings)
 
 
@@ -238,7 +239,7 @@ def _remote(port: str) -> Iterator[Finding]:
 
 
 def _local(port: str, rs485: RS485) -> Iterator[Finding]:
-    line = Line(port, rs485=rs485).open()  # raises LineError with the reason if it fails
+    line = Line(port, rs485=rs485).open()  # raises LineError with the reason if the port cannot be opened
     try:
         yield from _opened_com(port) if sys.platform == "win32" else _opened(port, rs485)
     finally:
@@ -246,7 +247,7 @@ def _local(port: str, rs485: RS485) -> Iterator[Finding]:
 
 
 def _opened_com(port: str) -> Iterator[Finding]:
-    """Yield the facts about an open COM port that Windows reports."""
+    """Yield the facts that Windows reports about an open COM port."""
     yield Finding("port", f"{port} is a serial port")
     yield Finding("set here", SETTING_UP_COM)
     yield Finding("adapter", com_description(port) or "the system lists none")
@@ -258,7 +259,7 @@ def _opened_com(port: str) -> Iterator[Finding]:
 
 
 def _opened(port: str, rs485: RS485) -> Iterator[Finding]:
-    """Yield findings about a device, which multidrop has open in the meantime."""
+    """Yield findings about a device; open the device if it is not a pseudo-terminal."""
     device = str(Path(port).resolve())
     link = f", which is {device}" if device != port else ""
     if is_pseudo_terminal(device):
@@ -285,7 +286,7 @@ def _opened(port: str, rs485: RS485) -> Iterator[Finding]:
 
 
 def _echo(port: str, rs485: RS485, settings: Settings) -> Finding:
-    """Read from an unused address, and return a finding: only an echo of the request may come back."""
+    """Read from an unused address, where only an echo of the request may come back. Return a finding."""
     request = Message(NOBODY, 0x03, 0, 1)
     try:
         found = ask_once(port, request, settings, rs485, 4 * LEAST_TIMEOUT)
@@ -306,16 +307,16 @@ def _text(findings: list[Finding]) -> Iterator[str]:
 # ---- the round trip ----
 
 
-UNANSWERED = 5  # number of requests to a drive that never answers
-MOST_S = 5.0  # time limit of all requests, for slow and silent drives
-RETRY_S = 0.05  # pause before a delayed request is tried again
-OF_GATEWAYS = (0x0A, 0x0B)  # exception codes: no path; no response of the device (application protocol, 7)
+UNANSWERED = 5  # a drive gets no further requests after this many without a single reply
+MOST_S = 5.0  # time limit, in s, for all requests to a slow or silent drive
+RETRY_S = 0.05  # pause, in s, before the retry of a request that the line held back
+OF_GATEWAYS = (0x0A, 0x0B)  # exception codes: no path; device does not respond (Modbus protocol, section 7)
 
 
 def measure(port: str, rs485: RS485, settle: float, drive: Drive | None) -> tuple[Finding, bool]:
     """Measure a drive's response delay.
 
-    Return the finding, and whether anything answered in the port's framing.
+    Return the finding, and True if a drive or a gateway answered in the port's framing.
     """
     if drive is None:
         return Finding(
@@ -330,8 +331,8 @@ def measure(port: str, rs485: RS485, settle: float, drive: Drive | None) -> tupl
         bus.attach(drive)
         poll = make_exchange(drive, block.request, bus.peer(drive))
         completions = list(_repeat(bus.line, poll))
-    # `wire` is the time in s of the request and the reply's first character. On a network and on a
-    # pseudo-terminal, the actual time on the wire is unknown.
+    # `wire` is the time in s that the request and the reply's first character take on the wire. It is unknown
+    # on a network and on a pseudo-terminal.
     sent = characters_on_wire(drive.framing, len(build_request(drive.framing, poll.request)))
     wire = (sent + 1) * drive.settings.character
     shows_bits = "://" not in port and not is_pseudo_terminal(str(Path(port).resolve()))
@@ -355,25 +356,26 @@ def _bad_bytes(completions: Sequence[Completion]) -> str:
 
 
 def _exception(framing: Framing, request: Message, done: Completion) -> int:
-    """Return the exception code of a reply, from the drive or from a gateway; 0 for any other reply."""
+    """Return the code of an exception reply, from the drive or from a gateway; 0 for any other reply."""
     if done.result > 0:
         return done.reply.exception
     if framing is not Framing.TCP:
         return 0
-    _, reply = parse_reply(framing, done.raw, request)  # the core reports a gateway's exception as no reply
+    # parsed here, because the core reports a gateway's exception as no reply
+    _, reply = parse_reply(framing, done.raw, request)
     return reply.exception if reply else 0
 
 
 def _is_from_gateway(drive: Drive, done: Completion) -> bool:
-    """Return True if the reply is the exception of a gateway that does not reach its device."""
+    """Return True if the reply is a gateway's exception: the gateway does not reach the device."""
     return done.reply.exception in OF_GATEWAYS and done.reply.exception not in drive.exceptions
 
 
 def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
     """Send up to ROUNDS requests within MOST_S; yield their outcomes.
 
-    A request that was held back, because the reply to an earlier one may still come, does not count. A drive
-    that never answers gets only UNANSWERED requests.
+    While the reply to an earlier request may still come, the line holds a request back. Such a request does
+    not count. A drive that never answers gets only UNANSWERED requests.
     """
     end = time.monotonic() + MOST_S
     count, is_silent = 0, True
@@ -390,7 +392,7 @@ def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
 # ---- the other framing: Modbus TCP instead of RTU, or the reverse ----
 
 
-TIMEOUT = 2.0  # in s; a gateway waits for its drives in the meantime
+TIMEOUT = 2.0  # in s: long enough for a gateway that waits for its drives
 
 
 def ask_once(
@@ -415,14 +417,14 @@ def ask_once(
 
 
 def other_way_finding(port: str, request: Message, settings: Settings) -> Finding:
-    """Return a finding: whether the far end answers in the other framing."""
+    """Send the request in the other framing (TCP or RTU); return a finding about the far end's answer."""
     other = other_port(port)
     way = spoken_on(other)
     try:
         found = ask_once(other, request, settings)
     except LineError as failure:
         return Finding("other framing", f"{way} was not tested: {failure.reason}")
-    if found.result > 0 or mixed_up(port, found.raw):  # any other received bytes prove nothing
+    if found.result > 0 or mixed_up(port, found.raw):  # other received bytes do not prove the framing
         return Finding(
             "other framing",
             f"the far end speaks {way}, not {spoken_on(port)}",
@@ -433,7 +435,7 @@ def other_way_finding(port: str, request: Message, settings: Settings) -> Findin
 
 
 def unit_finding(port: str, request: Message, settings: Settings) -> Finding:
-    """Return a finding: how a Modbus TCP port answers a request to an unused unit id."""
+    """Send a request to an unused unit id of a Modbus TCP port; return a finding about the answer."""
     try:
         found = ask_once(port, request, settings)
     except LineError as failure:

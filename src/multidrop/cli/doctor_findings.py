@@ -18,9 +18,9 @@ from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import Settings
 from multidrop.transport.port_identity import of_name
 
-LATENCY_MS = 1  # advise to change a larger latency timer
+LATENCY_MS = 1  # ms; if the adapter's latency timer is longer, advise to lower it
 ROUNDS = 20
-SLOW_S = 0.005  # a delay that exceeds the family's usual delay by more gets advice
+SLOW_S = 0.005  # advise if a measured delay exceeds the family's usual delay by more than this many s
 
 
 _LEVELS = {RS485.RTS_UP: "on", RS485.RTS_DOWN: "off"}
@@ -31,13 +31,13 @@ class Finding:
     topic: str
     what: str
     advice: str = ""
-    is_failure: bool = False  # True if a drive does not answer, or not to every request
+    is_failure: bool = False  # True: the exit status of `doctor` is 1
 
 
 def adapter_finding(adapter: Adapter, port: str, lasting: str) -> Finding:
-    """Describe the adapter.
+    """Return a finding that describes the adapter.
 
-    `lasting` is the device name that contains the adapter's serial number, or else the port.
+    `lasting` is the device name with the adapter's serial number; if there is none, it is the port.
     """
     advice = f"name it {lasting} in plant files: {port} is assigned in the order of plugging in"
     return Finding("adapter", str(adapter), advice if lasting != port else "")
@@ -57,12 +57,12 @@ def latency_finding(adapter: Adapter) -> Finding:
     )
 
 
-# Drivers that delay received bytes unless the low-latency flag is set; others store the flag and ignore it.
+# Drivers that delay received bytes unless the low-latency flag is set. Other drivers ignore the flag.
 HEEDING_LOW_LATENCY = ("", "ftdi_sio", "serial8250")  # "": the driver is unknown
 
 
 def low_latency_finding(low: bool | None, driver: str = "") -> Finding:
-    """Describe the flag of a sysfs driver."""
+    """Return a finding about a driver's low-latency flag; `low` is None if the driver has no such flag."""
     if driver not in HEEDING_LOW_LATENCY:
         return Finding("low latency", f"the driver {driver} does not delay received bytes: nothing to set")
     if low is None:
@@ -150,10 +150,12 @@ def round_trip_finding(
 ) -> Finding:
     """Return a finding about the delays of the replies to `asked` requests.
 
-    `delays` are sorted, in s, from the request's last bit to the reply's first. If the port does not show
-    bits, as on a network, they count from handing over the request. `wire` is then the time in s that the
-    request and one character take on a wire. `refusals` are the codes of exception replies; those of a
-    gateway have no delay. `came` describes the bytes that were received instead of valid replies.
+    `delays` are sorted, in s. On a serial device, a delay is the time from the request's last bit to the
+    reply's first bit, and `wire` is 0. On a network or pseudo-terminal, the times of bits are unknown. There,
+    a delay is the time from the handover of the request to the reply's first byte. `wire` is the part of
+    that time, in s, that the request and one character take on a wire. `refusals` are the codes of exception
+    replies. A gateway's exception reply has a code but no delay. `came` describes the bytes that were
+    received instead of valid replies.
     """
     codes = ", ".join(f"{code:02X}" for code in sorted(set(refusals)))
     if not delays:
@@ -219,12 +221,12 @@ def wake_finding(
     *,
     is_realtime: bool = False,
 ) -> Finding:
-    """Return a finding: whether this computer wakes the core in time for a line with these settings.
+    """Return a finding: whether this computer wakes a thread in time for a line with these settings.
 
     `realtime` is the lateness under realtime scheduling, or the reason why the system refuses it.
-    `is_realtime` is the plant file's key `realtime`. A p99 below t3.5, the silence that precedes each request
-    anyway, is in time. If multidrop switches RTS, even the greatest lateness must be below t3.5: a drive may
-    answer after t3.5, and a later switch would cut off the first bytes of its reply.
+    `is_realtime` is the plant file's key `realtime`. The 99th percentile must be below t3.5, the silence that
+    precedes each request anyway. If multidrop switches RTS, even the greatest lateness must be below t3.5: a
+    drive may answer after t3.5, and a later switch would cut off the first bytes of its reply.
     """
     limit, kind = settings.t3_5, "max" if switch in _LEVELS else "p99"
 
@@ -263,7 +265,7 @@ _LACKING = {errno.ENOTTY, errno.EINVAL, errno.EOPNOTSUPP, errno.ENOSYS, errno.EI
 
 @dataclass(frozen=True)
 class Adapter:
-    """Facts about an adapter from sysfs. A fact that is unknown is empty or None."""
+    """Facts about an adapter, read from sysfs. An unknown fact is empty or None."""
 
     name: str  # the terminal's name, such as ttyUSB0
     driver: str = ""
@@ -284,7 +286,7 @@ class RS485Mode:
 
 
 def find_adapter(device: str, sysfs: Path = SYSFS) -> Adapter:
-    """Find the adapter behind a device such as /dev/ttyUSB0, or a link to it."""
+    """Find the adapter behind a device such as /dev/ttyUSB0, or behind a link to a device."""
     name = Path(device).resolve().name
     tty = sysfs / "class/tty" / name / "device"
     driver = tty / "driver"
@@ -310,7 +312,7 @@ def com_description(port: str) -> str:
 
 
 def _usb_device(tty: Path) -> Path | None:
-    """Return the nearest parent directory that belongs to a USB device: it names a product."""
+    """Return the USB device's directory: the nearest parent directory that names a product."""
     if not tty.exists():
         return None
     above = tty.resolve()
@@ -327,7 +329,7 @@ def _text(path: Path) -> str:
 def rs485_mode(fd: int) -> RS485Mode | None:
     """Return the RS-485 mode that the driver reports; None if the driver has none.
 
-    A plain 8250 states a mode but refuses to set one, so the mode is written back as read.
+    The mode is also written back as it was read, because a plain 8250 reports a mode but refuses to set one.
     """
     answer = _ask(fd, TIOCGRS485, bytes(RS485_STRUCT.size))
     if answer is None or _ask(fd, TIOCSRS485, answer) is None:
@@ -348,7 +350,7 @@ def low_latency(fd: int) -> bool | None:
 
 
 def _ask(fd: int, request: int, data: bytes) -> bytes | None:
-    """Return the driver's answer to an ioctl with this data; None if it does not know the request."""
+    """Return the driver's answer to an ioctl with this data; None if the driver does not know the request."""
     if sys.platform != "linux":
         return None
     import fcntl  # Windows has no fcntl

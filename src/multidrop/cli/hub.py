@@ -30,8 +30,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "servers", metavar="URL", nargs="*", help=f"servers of NATS; else MULTIDROP_NATS, or {URLS}"
     )
     sinks = parser.add_mutually_exclusive_group(required=True)
-    sinks.add_argument("--parquet", metavar="FOLDER", type=Path, help="keep samples in Parquet files there")
-    sinks.add_argument("--postgres", metavar="WHERE", help="keep them in PostgreSQL: 'host=db dbname=plant'")
+    sinks.add_argument(
+        "--parquet", metavar="FOLDER", type=Path, help="store samples as Parquet files in this folder"
+    )
+    sinks.add_argument(
+        "--postgres", metavar="WHERE", help="store samples in PostgreSQL: 'host=db dbname=plant'"
+    )
     parser.add_argument(
         "--every",
         metavar="S",
@@ -39,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=EVERY_S,
         help="seconds of samples in a commit; 10 if not given",
     )
-    parser.add_argument("--once", action="store_true", help="end when all is kept that is there now")
+    parser.add_argument("--once", action="store_true", help="end once all present samples are stored")
     add_log_argument(parser)
     add_nats_arguments(parser)
     add_json_argument(parser)

@@ -21,7 +21,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--address", metavar="N", type=whole, help="the device, if the file has several")
     parser.add_argument("--title", metavar="NAME", help="the device's hub, if several have that address")
-    parser.add_argument("--out", metavar="FAMILY.toml", type=Path, help="a new file; else it is printed")
+    parser.add_argument(
+        "--out",
+        metavar="FAMILY.toml",
+        type=Path,
+        help="the new family file; without it the family is printed",
+    )
     parser.add_argument("--plant", metavar="PLANT.toml", type=Path, help="a new plant file with this device")
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.output import print_text, warn
-from multidrop.cli.support.values import LONGEST_NAME, aligned, wrapped
+from multidrop.cli.support.values import LONGEST_NAME, aligned, user_title, wrapped
 from multidrop.core import Framing, NumberFormat
 from multidrop.drive.family import Drive
 from multidrop.drive.options import Option
@@ -182,7 +182,8 @@ def sheet(family: type[Drive]) -> str:
     notes = inspect.cleandoc(family.__doc__ or "")
     for block in notes.split("\n\n") if notes else ():
         lines.append("")
-        for paragraph in re.split(r"\n(?=[-*] |    )", block):  # list items and indented lines
+        # list items and indented lines start a paragraph of their own
+        for paragraph in re.split(r"\n(?=[-*] |    )", block):
             item = "  " if paragraph[:2] in ("- ", "* ") else ""
             first = " " * (len(paragraph) - len(paragraph.lstrip()))
             lines += wrapped(" ".join(paragraph.split()), first, first + item)
@@ -223,9 +224,9 @@ def _lines_of(family: type[Drive]) -> Iterator[tuple[str, str]]:
 
 
 def gain_of(family: type[Drive]) -> ReadingGain | None:
-    """Return the gaps between registers that reads may span if declared, and the bus time that this saves.
+    """Return the bus time that `readable_gaps` would save for a user's class at default settings.
 
-    Assumes default settings. None for a built-in family: only users' own classes can declare such gaps.
+    Return None if it would save little, and for a built-in family.
     """
     drive = family(family.addresses[0])
     if not is_users_own(family):
@@ -315,6 +316,8 @@ def _text_row(text: Text) -> tuple[str, ...]:
 
 
 def _remarks(register: Register[Any]) -> Iterator[str]:
+    if title := user_title(register):
+        yield title
     if register.access is Access.SETTING or register.kept is not Kept.UNKNOWN:
         yield f"kept: {register.kept.value}"
     if register.ram_address is not None:
@@ -345,7 +348,7 @@ def _remarks(register: Register[Any]) -> Iterator[str]:
 
 
 def _word(register: Register[Any], raw: int) -> str:
-    """Return the name of a raw count, or the raw count if the names of its bits are too long."""
+    """Return the name of a raw count, or the number itself if the names of its bits are too long."""
     name = register.format(register.decode(raw))
     return name if len(name) <= 2 * LONGEST_NAME else f"{raw:04X}H"
 

@@ -20,10 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from multidrop.cli.monitor_screen import (
-    BLOCKS,
     LEAST_HEIGHT,
     LEAST_WIDTH,
-    PLAIN_BLOCKS,
     Position,
     overview,
     page,
@@ -37,16 +35,20 @@ from multidrop.cli.support.polling import (
     LivePlant,
     PollingSession,
     SideReader,
+    Triggering,
     polling_session,
 )
 from multidrop.cli.support.screen import Screen, TextLine
+from multidrop.cli.support.triggers import add_trigger_arguments, trigger_picture, triggering_of
 from multidrop.cli.support.values import counted
 from multidrop.plant.model import Plant
 from multidrop.poller import Poller
+from multidrop.polling.added_rows import TRIGGER
+from multidrop.recording.triggered import TriggeredWriter
 
 DRAW_S = 0.25
-SCROLL_S = 2.0  # time between two pictures on a terminal that scrolls
-PAGE = 10  # lines per press of a page key
+SCROLL_S = 2.0  # s between two pictures on a terminal that scrolls
+PAGE = 10  # number of lines that a page key scrolls
 _STOP_KEYS = ("s", "S")
 STILL_STOPPING = "waiting for a stop in progress; press Ctrl-C repeatedly to leave, and watch the motors"
 
@@ -55,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_plant_argument(parser)
     add_port_option(parser)
     parser.add_argument("--out", metavar="FILE", type=Path, help="record too, into this new file")
+    add_trigger_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -62,9 +65,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise ValueError(
             "`multidrop monitor` needs a terminal on Linux or macOS; `multidrop poll` works without one"
         )
-    if arguments.out:
+    if arguments.out and not arguments.trigger:
         refuse_overwriting(arguments.out)
-    summary = watch(plant_of(arguments.plant, arguments), out=arguments.out)
+    plant, triggering = triggering_of(plant_of(arguments.plant, arguments), arguments)
+    summary = watch(plant, out=arguments.out, how=triggering)
     return 0 if summary["samples"] else 1
 
 
@@ -77,24 +81,27 @@ def watch(
     plant: Plant,
     *,
     out: Path | None = None,
+    how: Triggering | None = None,
     seconds: float | None = None,
     beside: Callable[[Poller], AbstractContextManager[object]] = nullcontext,
 ) -> dict[str, Any]:
     """Poll the plant and show it until the user quits or `seconds` have passed; return the poller's summary.
 
-    `beside` is a context that is entered while the plant is polled. Closing the terminal ends the monitor
-    too. Stops in progress are always finished before it ends.
+    `how` says which triggers are recorded and shown; None: all rows are recorded. `beside` returns a context
+    that lasts while the plant is polled. The monitor also ends when the terminal is closed. Stops in progress
+    are always finished before it ends.
     """
     screen = Screen()
     _check_size(screen)
     live = LivePlant(plant, plant.metadata()["planned"])
-    with polling_session(plant, out, live.add) as session:
-        monitor = Monitor(live, session, screen)
+    with polling_session(plant, out, live.add, how=how) as session:
+        monitor = Monitor(live, session, screen, how)
         with session.poller, beside(session.poller):
             try:
                 monitor.show(seconds)
             finally:
-                failures = monitor.await_stops()  # before ports are closed: a stop may not have been sent yet
+                # wait before the ports are closed, because a stop may not have been sent yet
+                failures = monitor.await_stops()
         for sentence in failures:
             warn(sentence)
     return session.poller.summary()
@@ -103,22 +110,25 @@ def watch(
 class Monitor:
     """Draws the newest values of a polled plant on the screen, and carries out the user's keys."""
 
-    def __init__(self, plant: LivePlant, session: PollingSession, screen: Screen) -> None:
+    def __init__(
+        self, plant: LivePlant, session: PollingSession, screen: Screen, how: Triggering | None = None
+    ) -> None:
         self._screen = screen
         self._session = session
         self._plant = plant
         self._at = Position()
         self._on_yes: Callable[[], None] | None = None  # called if the user answers the question with y
         self._stops: list[threading.Thread] = []  # threads that carry out stops
-        self._stop_results: dict[str, tuple[int, int]] = {}  # by line: drives that stopped, all drives
+        self._stop_results: dict[str, tuple[int, int]] = {}  # line: (stopped drives, all drives)
         self._has_left = False
         self._side_reader = SideReader(session.poller)
-        self._blocks = BLOCKS if screen.has_blocks else PLAIN_BLOCKS
+        self._how = how
+        self._trigger: Path | None = None  # the recording of the trigger whose curves are shown
 
     def show(self, seconds: float | None) -> None:
         """Draw and react to keys until the user quits, a signal comes, or `seconds` have passed."""
         begun = next_draw = next_tick = next_point = time.monotonic()
-        # Warnings on stderr would overwrite the screen.
+        # Show warnings on the screen, because on stderr they would overwrite it.
         every = SCROLL_S if self._screen.scrolls else DRAW_S
         with (
             self._screen,
@@ -140,17 +150,34 @@ class Monitor:
                 if now >= next_draw:
                     next_draw = max(next_draw + every, now)
                     self._session.hand_out()
+                    self._show_trigger()
                     self._screen.draw(self._picture())
                 key = wait_for_key(max(0.0, min(next_draw, next_tick, next_point) - time.monotonic()))
                 if key:
                     self._obey(key)
                     next_draw = 0.0
 
+    def _show_trigger(self) -> None:
+        """Once a trigger's recording is complete, draw it in a thread, so that no stop waits for it."""
+        writer, how = self._session.writer, self._how
+        if how is None or not isinstance(writer, TriggeredWriter) or writer.newest in (None, self._trigger):
+            return
+        newest = self._trigger = writer.newest
+        width, _ = self._screen.size
+
+        def draw() -> None:
+            lines = trigger_picture(newest, how, width - 2, self._screen.blocks)
+            if newest == self._trigger:  # otherwise, the recording of a later trigger is complete already
+                self._at.trigger = lines
+
+        with suppress(RuntimeError):  # no thread can start: the curves of the earlier trigger stay
+            threading.Thread(target=draw, daemon=True).start()
+
     def _show_message(self, text: str) -> None:
         self._at.message = text
 
     def await_stops(self) -> list[str]:
-        """Record until no stop is in progress; return the failures that the user has not acknowledged."""
+        """Wait for the stops in progress, and record rows meanwhile; return the unacknowledged failures."""
         if self._is_stopping:
             warn(STILL_STOPPING)
         while self._is_stopping:
@@ -167,7 +194,7 @@ class Monitor:
         if self._at.page:
             others = self._side_reader.read(self._chosen)
             return page(self._chosen, others, self._at, size, now_ns)
-        return overview(self._plant, self._at, size, now_ns, self._blocks)
+        return overview(self._plant, self._at, size, now_ns, self._screen.blocks)
 
     @property
     def _chosen(self) -> LiveDrive:
@@ -176,7 +203,8 @@ class Monitor:
     # ---- keys ----
 
     def _obey(self, key: str) -> None:
-        if self._on_yes and key not in _STOP_KEYS:  # a stop key replaces the pending question
+        key = key.translate(LATIN)
+        if self._on_yes and key not in _STOP_KEYS:  # a stop key is never an answer
             on_yes, self._on_yes, self._at.question = self._on_yes, None, ""
             if key in ("y", "Y"):  # Y is accepted for caps lock
                 on_yes()
@@ -189,11 +217,15 @@ class Monitor:
             DOWN: lambda: self._move(1),
             PAGE_UP: lambda: self._scroll(-PAGE),
             PAGE_DOWN: lambda: self._scroll(PAGE),
+            "k": lambda: self._move(-1),
+            "j": lambda: self._move(1),
+            " ": lambda: self._scroll(PAGE),
             ENTER: self._turn_page,
             ESCAPE: self._leave_page,
             "s": self._ask_to_stop,
             "S": self._ask_to_stop_all,
             "a": self._acknowledge,
+            "t": self._mark_trigger,
             "q": self._leave,
         }
         if key in actions:
@@ -219,8 +251,13 @@ class Monitor:
         if self._at.page:
             self._turn_page()
 
+    def _mark_trigger(self) -> None:
+        if self._how is not None:
+            self._session.poller.mark("key t", kind=TRIGGER)
+            self._at.message = "trigger by key t"
+
     def _acknowledge(self) -> None:
-        """Remove the failures that were on the screen, so that the remaining failures are shown."""
+        """Remove the failures that the screen showed, so that the screen has room for the other failures."""
         del self._at.failures[: self._at.failures_shown]
 
     def _leave(self) -> None:
@@ -262,7 +299,7 @@ class Monitor:
             self._carry_out(*stops[line])
 
     def _in_background(self, what: str, work: Callable[[], tuple[str, list[str]]]) -> None:
-        """Carry out a stop in a new thread, or in this one if no thread can be started."""
+        """Carry out a stop in a new thread, or in the calling thread if no thread can be started."""
         if not self._begin(what, work):
             self._carry_out(what, work)
 
@@ -302,34 +339,31 @@ class Monitor:
 
 
 UP, DOWN, PAGE_UP, PAGE_DOWN, ENTER, ESCAPE = "up", "down", "page up", "page down", "enter", "escape"
-KEYS = {  # keys by the escape sequences and letters that terminals send
+KEYS = {  # maps the bytes that a terminal sends to the key's name
     b"\x1b[A": UP,
     b"\x1bOA": UP,
-    b"k": UP,
     b"\x1b[B": DOWN,
     b"\x1bOB": DOWN,
-    b"j": DOWN,
     b"\x1b[5~": PAGE_UP,
     b"\x1b[6~": PAGE_DOWN,
-    b" ": PAGE_DOWN,
     b"\r": ENTER,
     b"\n": ENTER,
 }
 UNKNOWN = "unknown"
-# Any other escape sequence, or the start of a sequence. F4's sequence ends in S, which must not stop motors.
+# Other escape sequences, and their starts. They are dropped whole: F4's ends in S, the key that stops motors.
 _SEQUENCE = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*[@-Z\\-~]|O[ -~])")
 _BEGUN = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*|O)?")
 SPLIT_S = 0.05  # how long to wait for the rest of an escape sequence
 MOST_BYTES = 4  # limit of a character's bytes in UTF-8
 # Letters of the Russian and Ukrainian layouts, and the Latin letters on the same keys.
-LATIN = str.maketrans("йыіфнолЙЫІФНОЛ", "qssayjkQSSAYJK")
+LATIN = str.maketrans("йыіфнолеЙЫІФНОЛЕ", "qssayjktQSSAYJKT")
 
 
 @contextmanager
 def terminal_keys() -> Iterator[Callable[[float], str]]:
-    """Yield a function that waits up to n seconds for a key and returns its name or letter; "" for none.
+    """Yield a function that waits for a key, and returns the key's name or letter; "" if none is pressed.
 
-    The function raises OSError if the terminal is closed.
+    The function's argument is the longest wait in s. The function raises OSError if the terminal is closed.
     """
     assert sys.platform != "win32", "is_possible excludes it"
     import termios
@@ -373,7 +407,7 @@ def next_key(pressed: bytes) -> tuple[str, bytes]:
 
 
 def is_begun(pressed: bytes) -> bool:
-    """Return True for the start of a key or letter whose remaining bytes may still come."""
+    """Return True if these bytes start a key or letter whose other bytes may still come."""
     with suppress(UnicodeDecodeError):
         return bool(_BEGUN.fullmatch(pressed)) or (
             pressed != b"" and codecs.getincrementaldecoder("utf-8")().decode(pressed) == ""
@@ -384,7 +418,7 @@ def is_begun(pressed: bytes) -> bool:
 def _first_letter(pressed: bytes) -> tuple[str, bytes]:
     for length in range(1, MOST_BYTES + 1):
         with suppress(UnicodeDecodeError):
-            return pressed[:length].decode().translate(LATIN), pressed[length:]
+            return pressed[:length].decode(), pressed[length:]
     return "\ufffd", pressed[1:]
 
 

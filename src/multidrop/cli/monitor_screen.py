@@ -6,24 +6,23 @@ Important states are shown by words and marks, not only by colours.
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from math import ceil
 
 from multidrop.cli.support.polling import CURRENT, FAULT, FREQUENCY, STATE, LiveDrive, LivePlant, SideRead
-from multidrop.cli.support.screen import TextLine, cut, filled
+from multidrop.cli.support.screen import TextLine, cut, filled, sparkline
 from multidrop.cli.support.values import columns_of, counted, padded
 from multidrop.printable import printable
 
 LEAST_WIDTH, LEAST_HEIGHT = 60, 12
-WIDE, WIDEST = 100, 110  # columns: from WIDE on delays are shown too, from WIDEST on models
+WIDE, WIDEST = 100, 110  # columns needed to show delays (WIDE), and also models (WIDEST)
+LEAST_DRIVES = 3  # minimum number of drives in the overview; curves of a trigger get only the room below
 OLD_NOTE, NOT_POLLED = "old", "not polled"  # notes beside a register's value
 NEVER = "never"
-LEAST_VALUE, AROUND = 12, 13  # widths: of a register's value; of its age and all blanks together
-OLD = "?"  # mark before an old value
+LEAST_VALUE, AROUND = 12, 13  # minimum width of a value; width of its age and all blanks together
+OLD = "?"  # mark in front of an old value
 HISTORY = "LAST MINUTE"  # table heading
-BLOCKS, PLAIN_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*#@"
 STOPS = "s stop   S stop all   q quit"
 ACKNOWLEDGE = (f"a acknowledge FAILURES   {STOPS}",)
 HELP = (f"up/down choose   Enter registers   {STOPS}", f"up/down   Enter registers   {STOPS}")
@@ -40,19 +39,24 @@ class Position:
     question: str = ""
     message: str = ""
     failures: list[str] = field(default_factory=list)  # unacknowledged failures of stops
-    failures_shown: int = 0  # number of failures that had room on the screen
+    failures_shown: int = 0  # number of failures that the last picture showed
+    trigger: list[str] = field(default_factory=list)  # curves around the last trigger
 
 
 def overview(
     plant: LivePlant, at: Position, size: tuple[int, int], now_ns: int, blocks: str
 ) -> list[TextLine]:
-    """Draw one line per drive; if not all fit, draw the drives around the chosen one."""
+    """Draw one line of text per drive. If not all drives fit, draw those around the chosen drive."""
     width, height = size
     top = [_title(plant, width, now_ns), *_line_states(plant, width)]
     columns = _columns(plant, width)
     top.append(TextLine(_row(columns, {name: name for name in columns}, "")[:width], style="bold underline"))
     alarms = _alarms(at, size)
     room = height - len(top) - len(alarms) - 2
+    curves = [TextLine(cut(f" {printable(line)}", width)) for line in at.trigger]
+    if room < len(curves) + LEAST_DRIVES:
+        curves = []
+    room -= len(curves)
     first = _first_seen(at.chosen, len(plant.drives), room)
     rows = [
         _drive(drive, number == at.chosen, columns, width, now_ns, blocks)
@@ -61,7 +65,8 @@ def overview(
     hidden = len(plant.drives) - len(rows)
     notes = [f"{OLD} old value"] if any(OLD in row.plain for row in rows) else []
     note = "   ".join([*notes, *([f"{hidden} more drives: scroll"] if hidden else [])])
-    return [*top, *rows, *[TextLine()] * (room - len(rows)), *alarms, *_foot(at, width, HELP, note)]
+    empty = [TextLine()] * (room - len(rows))
+    return [*top, *rows, *empty, *curves, *alarms, *_foot(at, width, HELP, note)]
 
 
 def page(
@@ -69,7 +74,7 @@ def page(
 ) -> list[TextLine]:
     """Draw every register of one drive.
 
-    `others` has the values of unpolled registers, which side reads have fetched.
+    `others` has values of registers that are not polled. A SideReader has read them.
     """
     width, height = size
     drive = shown.polled.drive
@@ -82,12 +87,12 @@ def page(
         TextLine(cut(f" {_pace(shown)}", width)),
     ]
     names = [name for name, register in drive.registers.items() if register.readable]
-    polled = [poll.register.name for poll in shown.polled.polls]
+    polled = [poll.register.name for poll in shown.polled.series]
     names = [*polled, *(name for name in names if name not in polled)]
     longest = max(map(len, names), default=0)
     cells = [_register(shown, name, others, now_ns) for name in names]
     notes = max((len(note) for *_, note in cells), default=0)
-    room = max(LEAST_VALUE, width - longest - notes - AROUND)  # columns for values; notes are not shortened
+    room = max(LEAST_VALUE, width - longest - notes - AROUND)  # columns left for values
     values = max(LEAST_VALUE, min(room, max((columns_of(value) for value, *_ in cells), default=0)))
     rows = [
         _register_row(f"{name:<{longest}}", *cell, values, width)
@@ -212,7 +217,7 @@ def _register(
     drive: LiveDrive, name: str, others: Mapping[str, SideRead], now_ns: int
 ) -> tuple[str, str, str]:
     """Return a register's value, its age, and a note."""
-    if any(poll.register.name == name for poll in drive.polled.polls):
+    if any(poll.register.name == name for poll in drive.polled.series):
         miss = drive.missed.get(name)
         row = drive.newest.get(name)
         value = drive.shown(name) or (miss.status if miss else "not yet")
@@ -234,7 +239,7 @@ def _alarms(at: Position, size: tuple[int, int]) -> list[TextLine]:
     most = max(2, (height - 8) // 2)
     lines: list[str] = []
     at.failures_shown = 0
-    failures = list(at.failures)  # a copy, because a stop's thread may add a failure
+    failures = list(at.failures)  # a copy, because a stop's thread may add a failure at any moment
     for failure in failures:
         wrapped = textwrap.wrap(printable(failure), width - 4, break_long_words=True)
         if lines and len(lines) + len(wrapped) > most - 1:
@@ -267,28 +272,3 @@ def _age(seconds: float | None) -> str:
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
-
-
-def sparkline(
-    history: Iterable[float | None], width: int, blocks: str = BLOCKS, points: int | None = None
-) -> str:
-    """Draw a history in at most `width` columns, from its smallest value to its largest. None is a gap.
-
-    If the history has more points than columns, each column shows the mean of several points. `points` counts
-    all points so far, including those that the history has dropped. So the same points share a column in each
-    picture.
-    """
-    values = list(history)
-    share = max(1, ceil(len(values) / width)) if width > 0 else 0
-    if not share:
-        return ""
-    first = (len(values) if points is None else points) - len(values)
-    columns: dict[int, list[float]] = {}
-    for number, value in enumerate(values, first):
-        columns.setdefault(number // share, []).extend([] if value is None else [value])
-    means = [sum(column) / len(column) if column else None for column in columns.values()][-width:]
-    there = [mean for mean in means if mean is not None]
-    low, high = min(there, default=0.0), max(there, default=0.0)
-    low = min(low, 0.0)  # otherwise a steady value would look like zero, and noise like large changes
-    scale = (len(blocks) - 1) / (high - low) if high > low else 0.0
-    return "".join(" " if mean is None else blocks[round((mean - low) * scale)] for mean in means)

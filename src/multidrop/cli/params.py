@@ -18,6 +18,7 @@ from multidrop.cli.support.arguments import (
     add_target_arguments,
     add_writing_arguments,
     is_plant,
+    mistaken,
     target_of,
 )
 from multidrop.cli.support.output import print_text
@@ -27,9 +28,9 @@ from multidrop.drive.parameters import parameters_of
 from multidrop.errors import Unsupported, WriteForbidden
 from multidrop.families.registry import find_model
 from multidrop.params import NotWritten, ParameterSet, files
-from multidrop.printable import printable
+from multidrop.params.values import check_same_model
 
-ACTIONS = {  # by action: its module in this package ("" for this module), and its help
+ACTIONS = {  # action: (its module in this package, or "" for this module; its help text)
     "save": ("", "read all parameters of a drive into a new TOML or CSV file"),
     "diff": ("", "compare files and drives; exit status 1 if they differ"),
     "apply": ("", "write a file's parameters to a stopped drive, if they differ"),
@@ -87,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _save(arguments: argparse.Namespace) -> int:
     target, words = _drive_of(arguments, arguments.words)
     if len(words) != 1:
-        raise _mistaken(arguments, "give the drive, and one file to write")
+        raise mistaken(arguments, "give the drive, and one file to write")
     files.check_name(Path(words[0]))
     found = _read(target)
     params.save(found, words[0], type(target.drive))
@@ -99,7 +100,7 @@ def _save(arguments: argparse.Namespace) -> int:
 
 
 def _read(target: Target, codes: Sequence[str] | None = None) -> ParameterSet:
-    with _Progress("read") as progress, target.open_bus():
+    with _Progress() as progress, target.open_bus():
         return params.read(target.drive, codes, progress=progress)
 
 
@@ -117,7 +118,8 @@ def _diff(arguments: argparse.Namespace) -> int:
     else:
         one, words = _side(arguments, words)
         if isinstance(one, Target) and len(words) == 1 and not params.is_parameter_file(words[0]):
-            words = [one.words[0], *words]  # the second side may be another drive of the same plant
+            # the second side is one word: the name of a drive in the first side's plant file
+            words = [one.words[0], *words]
         other, words = _side(arguments, words)
         _check_no_more(arguments, words)
         first, second = _both(one, other)
@@ -137,7 +139,7 @@ def _diff(arguments: argparse.Namespace) -> int:
 def _side(arguments: argparse.Namespace, words: list[str]) -> tuple[Target | ParameterSet, list[str]]:
     """Return the drive or parameter file that the first words name, and the remaining words."""
     if not words:
-        raise _mistaken(arguments, "give two sides to compare: files, drives, or a file and a drive")
+        raise mistaken(arguments, "give two sides to compare: files, drives, or a file and a drive")
     if _is_file(words):
         return params.load(words[0]), words[1:]
     return _drive_of(arguments, words)
@@ -153,10 +155,11 @@ def _is_file(words: list[str]) -> bool:
 
 def _both(one: Target | ParameterSet, other: Target | ParameterSet) -> tuple[ParameterSet, ParameterSet]:
     """Return the parameters of both sides. If one side is a file, read only its parameters from the drive."""
-    models = [each.drive.model if isinstance(each, Target) else each.model for each in (one, other)]
-    if all(models) and models[0] != models[1]:
-        names = [each.drive.name if isinstance(each, Target) else each.source for each in (one, other)]
-        raise ValueError(f"{names[0]} has parameters of {models[0]}, and {names[1]} of {models[1]}")
+    sides = [
+        ParameterSet(each.drive.model, {}, source=each.drive.name) if isinstance(each, Target) else each
+        for each in (one, other)
+    ]
+    check_same_model(*sides)  # before the parameters are read, because reading takes long
     codes = [[*each.values] if isinstance(each, ParameterSet) else None for each in (one, other)]
     first = _read(one, codes[1]) if isinstance(one, Target) else one
     second = _read(other, codes[0]) if isinstance(other, Target) else other
@@ -164,7 +167,7 @@ def _both(one: Target | ParameterSet, other: Target | ParameterSet) -> tuple[Par
 
 
 def _family_of(one: Target | ParameterSet, other: Target | ParameterSet, first: ParameterSet) -> Any:
-    """Return the class that has the parameters' names and units; None for a model that is unknown here."""
+    """Return the drive class that declares the parameters' names and units; None for an unknown model."""
     for side in (one, other):
         if isinstance(side, Target):
             return type(side.drive)
@@ -180,7 +183,7 @@ def _family_of(one: Target | ParameterSet, other: Target | ParameterSet, first: 
 
 def _apply(arguments: argparse.Namespace) -> int:
     if not arguments.words or not _is_file(arguments.words):
-        raise _mistaken(arguments, "give a parameter file, and then the drive")
+        raise mistaken(arguments, "give a parameter file, and then the drive")
     if arguments.commissioning and not sys.stdin.isatty():
         raise WriteForbidden("nothing was sent: --commissioning is for a person at a terminal")
     given = params.load(arguments.words[0])
@@ -189,7 +192,7 @@ def _apply(arguments: argparse.Namespace) -> int:
     drive = target.drive
     with reporting_interruption(drive, "apply") as known, target.open_bus(arguments.audit):
         known.clear()
-        with _Progress("read") as progress:
+        with _Progress() as progress:
             made = params.plan(drive, given, also=arguments.also, progress=progress)
         if not arguments.json:
             print_text("\n".join(made.lines()) or f"{drive.name} has these parameters already")
@@ -272,18 +275,13 @@ def _drive_of(arguments: argparse.Namespace, words: Sequence[str]) -> tuple[Targ
 
 def _check_no_more(arguments: argparse.Namespace, words: Sequence[str]) -> None:
     if words:
-        raise _mistaken(arguments, f"unrecognized arguments: {' '.join(words)}")
-
-
-def _mistaken(arguments: argparse.Namespace, sentence: str) -> ValueError:
-    return ValueError(f"{sentence}; see `multidrop {arguments.command} --help`")
+        raise mistaken(arguments, f"unrecognized arguments: {' '.join(words)}")
 
 
 class _Progress:
-    """Shows progress in one line on a terminal's stderr, and removes it at the end."""
+    """Shows the progress of reading in one line on a terminal's stderr, and removes it at the end."""
 
-    def __init__(self, what: str) -> None:
-        self._what = what
+    def __init__(self) -> None:
         self._is_shown = sys.stderr.isatty()
 
     def __enter__(self) -> _Progress:
@@ -291,7 +289,7 @@ class _Progress:
 
     def __call__(self, done: int, total: int) -> None:
         if self._is_shown:
-            print(f"\r{printable(self._what)} {done} of {total}", end="", file=sys.stderr, flush=True)
+            print(f"\rread {done} of {total}", end="", file=sys.stderr, flush=True)
 
     def __exit__(self, *failure: object) -> None:
         if self._is_shown:

@@ -20,7 +20,7 @@ from multidrop.planning.suggestions import Suggestions, duration_text, reading_g
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine, planned_on
 
-LONG_CYCLE = 1.0  # in s; a longer cycle of all readings is probably not intended
+LONG_CYCLE = 1.0  # if a bus cycle of all readings takes more than this many s, it is probably not intended
 _NAMES = 3  # limit of registers named in a sentence
 
 
@@ -71,7 +71,7 @@ def _warnings(plan: _PredictedLine) -> list[str]:
 
 
 def _gains(plan: _PredictedLine) -> list[str]:
-    """Return sentences about the bus time that is saved if users' own classes declare readable gaps."""
+    """Return sentences about the bus time that `readable_gaps` would save for users' own classes."""
     gains = {
         polled.drive.name: reading_gain(polled.drive, polled.wanted)
         for polled in plan.line.drives
@@ -81,7 +81,7 @@ def _gains(plan: _PredictedLine) -> list[str]:
 
 
 def _long_cycle(plan: _PredictedLine) -> list[str]:
-    """Return a warning if all readings are polled, which is the default, and a cycle of them takes long."""
+    """Return a list with a warning if all readings of a drive are polled and a cycle exceeds LONG_CYCLE."""
     whole = [
         polled.drive
         for polled in plan.line.drives

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shutil
 import sys
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext, suppress
 from dataclasses import replace
+from logging import WARNING
 from math import ceil
 from pathlib import Path
 from typing import Any, TextIO
 
 from multidrop.capture import CaptureWriter, FlightRecorder, Tapped
+from multidrop.cli.monitor import ENTER, ESCAPE, is_possible, terminal_keys
 from multidrop.cli.support.arguments import (
     add_json_argument,
     add_plant_argument,
@@ -25,17 +28,21 @@ from multidrop.cli.support.arguments import (
     plant_of,
 )
 from multidrop.cli.support.files import check_capture, refuse_overwriting
-from multidrop.cli.support.output import print_text
-from multidrop.cli.support.polling import LiveDrive, LivePlant, Rotation, polling_session
+from multidrop.cli.support.output import logging_to, print_text, warn
+from multidrop.cli.support.polling import LiveDrive, LivePlant, Rotation, Triggering, polling_session
+from multidrop.cli.support.screen import blocks_of
 from multidrop.cli.support.signals import Interruption
+from multidrop.cli.support.triggers import add_trigger_arguments, trigger_picture, triggering_of
 from multidrop.cli.support.values import aligned, columns_of, counted, cut_to, shortened
 from multidrop.planning.prediction import Prediction, predict
 from multidrop.plant.model import Plant, PlantLine, planned_on
 from multidrop.poller import Poller
+from multidrop.polling.added_rows import EVENT, LONGEST_TEXT, TRIGGER
 from multidrop.polling.batch import Rows
 from multidrop.printable import printable
 from multidrop.recording import FORMATS
 from multidrop.recording.segments import parse_age, parse_size
+from multidrop.recording.triggered import TriggeredWriter
 
 _TAKE_S = 0.1  # pause between two deliveries of new rows, in s
 
@@ -44,10 +51,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_plant_argument(parser)
     add_port_option(parser)
     parser.add_argument(
-        "--realtime", action="store_true", help="schedule polling before this computer's normal programs"
+        "--realtime",
+        action="store_true",
+        help="run the polling thread before this computer's normal programs",
     )
     add_polling_arguments(parser, out=None, seconds=None)
     add_rotation_arguments(parser)
+    add_trigger_arguments(parser)
 
 
 def add_polling_arguments(parser: argparse.ArgumentParser, *, out: str | None, seconds: float | None) -> None:
@@ -80,22 +90,24 @@ def add_polling_arguments(parser: argparse.ArgumentParser, *, out: str | None, s
 
 def run(arguments: argparse.Namespace) -> int:
     rotation = rotation_of(arguments)
-    if arguments.out and not rotation:
+    if arguments.out and not rotation and not arguments.trigger:
         refuse_overwriting(arguments.out)
     plant = plant_of(arguments.plant, arguments)
     plant = replace(plant, realtime=arguments.realtime or plant.realtime)
-    return conclude(plant, follow(plant, arguments, rotation), arguments)
+    plant, triggering = triggering_of(plant, arguments)
+    return conclude(plant, follow(plant, arguments, triggering or rotation), arguments)
 
 
 def follow(
     plant: Plant,
     arguments: argparse.Namespace,
-    rotation: Rotation | None = None,
+    how: Rotation | Triggering | None = None,
     beside: Callable[[Poller], AbstractContextManager[object]] = nullcontext,
 ) -> dict[str, Any]:
     """Poll the plant as the polling arguments require; return the summary.
 
-    `beside` is a context that is entered while the plant is polled.
+    `how` says how the recording is split into files. `beside` returns a context that lasts while the plant
+    is polled.
     """
     if arguments.capture:
         check_capture(arguments.capture)
@@ -105,19 +117,28 @@ def follow(
     table = LiveTable(plant, sys.stdout) if show else None
     consumers = [table.add] if table else []
     with (
-        polling_session(plant, arguments.out, *consumers, rotation=rotation) as session,
+        polling_session(plant, arguments.out, *consumers, how=how) as session,
         ExitStack() as stack,
     ):
+        if table:
+            stack.enter_context(table.showing_warnings())
         taps = _Taps(session.poller, arguments, stack)
+        keys = stack.enter_context(Keys.of_terminal(session.poller, table, how)) if table else None
+        wait = keys.wait if keys else time.sleep
         with session.poller, beside(session.poller):
-            for _ in _ticks(arguments.seconds, session.interruption):
+            for _ in _ticks(arguments.seconds, session.interruption, wait):
                 session.hand_out()
                 taps.collect()
                 if table:
+                    if isinstance(session.writer, TriggeredWriter) and isinstance(how, Triggering):
+                        table.show_trigger(session.writer.newest, how)
                     table.draw_if_due(time.monotonic())
     if table:
         table.draw()
-    return session.poller.summary() | taps.summary()
+    summary = session.poller.summary() | taps.summary()
+    if session.writer and isinstance(how, Triggering):
+        summary["triggers"] = list(map(str, session.writer.files))
+    return summary
 
 
 class _Taps:
@@ -154,7 +175,8 @@ class _Taps:
 
 def conclude(plant: Plant, polled: Mapping[str, Any], arguments: argparse.Namespace) -> int:
     """Print the poller's summary beside the predicted rates; return the exit status."""
-    summary = {**polled, "recording": str(arguments.out) if arguments.out else None}
+    has_file = arguments.out and "triggers" not in polled
+    summary = {**polled, "recording": str(arguments.out) if has_file else None}
     for line in plant.lines:
         summary["lines"][line.name]["comparison"] = compare(line, summary["lines"][line.name])
     into = "segments of " if getattr(arguments, "rotate", None) else ""
@@ -162,10 +184,12 @@ def conclude(plant: Plant, polled: Mapping[str, Any], arguments: argparse.Namesp
     return 0 if summary["samples"] else 1
 
 
-def _ticks(seconds: float | None, interruption: Interruption) -> Iterator[None]:
+def _ticks(
+    seconds: float | None, interruption: Interruption, wait: Callable[[float], None]
+) -> Iterator[None]:
     end = None if seconds is None else time.monotonic() + seconds
     while not interruption.came and (end is None or time.monotonic() < end):
-        time.sleep(_TAKE_S if end is None else max(0.0, min(_TAKE_S, end - time.monotonic())))
+        wait(_TAKE_S if end is None else max(0.0, min(_TAKE_S, end - time.monotonic())))
         yield
 
 
@@ -197,17 +221,21 @@ def tap_text(summary: Mapping[str, Any]) -> Iterator[str]:
         yield f"captured in {summary['capture']}"
     for path in summary.get("flight_recordings", ()):
         yield f"trouble: see {path}"
+    if "triggers" in summary:
+        yield f"{counted(len(summary['triggers']), 'trigger')} recorded"
+        yield from (f"trigger: see {path}" for path in summary["triggers"])
     if summary.get("untapped_bytes"):
         yield f"{counted(summary['untapped_bytes'], 'byte')} not captured: this machine was too slow"
 
 
 # ---- the live table ----
 #
-# The monitor takes over the terminal and its keys, and can stop motors. The table of `poll` reads
-# no keys, and stays on the terminal above the summary.
+# The monitor takes over the terminal, and can stop motors. The table of `poll` stays on the terminal above
+# the summary, and its keys only add events.
 
 
 EVERY = 0.5  # pause between two drawings, in s
+LEAST_HEIGHT = 4  # a terminal shows a note only if it has more lines than this
 _UP_AND_CLEAR = "\x1b[{}F\x1b[J"
 
 
@@ -217,19 +245,58 @@ class LiveTable:
     Each drawing replaces the previous one.
     """
 
-    def __init__(self, plant: Plant, terminal: TextIO) -> None:
+    def __init__(self, plant: Plant, terminal: TextIO, heading: Callable[[], str] = str) -> None:
         self._plant = LivePlant(plant)
+        self._heading = heading  # returns a line above the table; "" for none
         self._terminal = terminal
+        self._channels = {(one.drive.name, channel.name) for one in plant.drives for channel in one.channels}
         self._samples: Counter[str] = Counter()
         self._misses: Counter[str] = Counter()
+        self.note = ""  # shown below the table
+        self._trigger: Path | None = None  # the recording of the trigger whose picture is shown
+        self._picture: list[str] = []
         self._drawn: list[str] = []  # lines of the previous drawing
         self._next_draw = 0.0
+        self._warnings: deque[str] = deque()  # warnings that are not shown yet; any thread may add one
+
+    @contextmanager
+    def showing_warnings(self) -> Iterator[None]:
+        """While the context lasts, show warnings of the log above the table.
+
+        If another thread printed them, the next drawing would overwrite them.
+        """
+        try:
+            with logging_to(self._warnings.append, "multidrop", WARNING):
+                yield
+        finally:
+            self._show_warnings()
+
+    def _show_warnings(self) -> None:
+        while self._warnings:
+            warn(self._warnings.popleft())
 
     def add(self, rows: Rows) -> None:
         added = list(rows)
         self._plant.add(added)
         for row in added:
-            (self._misses if row.value is None else self._samples)[row.drive] += 1
+            if row.drive != EVENT and (row.drive, row.register) not in self._channels:
+                (self._misses if row.value is None else self._samples)[row.drive] += 1
+
+    def show_trigger(self, newest: Path | None, how: Triggering) -> None:
+        """Show a picture of this trigger's recording below the table, until the next recording is ready."""
+        if newest is None or newest == self._trigger:
+            return
+        width = shutil.get_terminal_size().columns - 1
+        self._trigger = newest
+        self._picture = trigger_picture(newest, how, width, blocks_of(self._terminal))
+
+    def keep_drawing(self, now: float) -> None:
+        """Keep the last drawing on the screen; draw the next one below it, EVERY s after `now` or later.
+
+        A sentence that another part of the program prints between the two drawings stays visible too.
+        """
+        self._drawn = []
+        self._next_draw = now + EVERY
 
     def draw_if_due(self, now: float) -> None:
         """Draw the table, unless the previous drawing is younger than EVERY."""
@@ -239,19 +306,33 @@ class LiveTable:
 
     def draw(self) -> None:
         columns, height = shutil.get_terminal_size()
-        encoding = self._terminal.encoding or "utf-8"  # encode with `?`: escapes would be longer
+        # `?` replaces characters that the terminal cannot show, because escapes would be wider
+        encoding = self._terminal.encoding or "utf-8"
         shown = (printable(line).encode(encoding, "replace").decode(encoding) for line in self._lines())
         lines = [cut_to(line, columns - 1) for line in shown]
+        note = [self.note] if self.note and height > LEAST_HEIGHT else []
+        if height > LEAST_HEIGHT + len(self._picture):
+            note = [*self._picture, *note]
+        note = [cut_to(printable(line), columns - 1) for line in note]
+        height -= len(note)
         if len(lines) > height - 1:
             lines = [*lines[: height - 2], f"... and {counted(len(lines) - height + 2, 'more drive')}"]
-        # If the terminal was narrowed since, it has wrapped the lines of the previous drawing.
+        lines += note
+        # If the terminal has become narrower since the previous drawing, it has wrapped the lines of that
+        # drawing.
         rows = sum(max(1, ceil(columns_of(line) / columns)) for line in self._drawn)
-        back = _UP_AND_CLEAR.format(min(rows, height - 1)) if self._drawn else ""
+        back = _UP_AND_CLEAR.format(min(rows, height - 1 + len(note))) if self._drawn else ""
         with suppress(OSError):  # recording continues after the terminal is closed
+            if self._warnings:
+                print(back, end="", file=self._terminal, flush=True)
+                self._show_warnings()
+                back = ""
             print(back + "\n".join(lines), file=self._terminal, flush=True)
         self._drawn = lines
 
     def _lines(self) -> Iterator[str]:
+        if heading := self._heading():
+            yield heading
         rows = [("DRIVE", "SAMPLES", "MISSES", "NEWEST VALUES")]
         for drive in self._plant.drives:
             counts = str(self._samples[drive.name]), str(self._misses[drive.name])
@@ -259,8 +340,81 @@ class LiveTable:
         yield from aligned(rows, "<>><")
 
 
+class Keys:
+    """The keys of `poll`: `m` starts a comment, which gets the time of this key press; `t` is a trigger."""
+
+    def __init__(
+        self, poller: Poller, table: LiveTable, wait_for_key: Callable[[float], str], *, has_trigger: bool
+    ) -> None:
+        self._has_trigger = has_trigger
+        self._poller = poller
+        self._table = table
+        self._wait_for_key = wait_for_key
+        self._text: str | None = None  # the comment so far; None: no comment is being typed
+        self._begun = 0.0
+        self._show()
+
+    @classmethod
+    @contextmanager
+    def of_terminal(
+        cls, poller: Poller, table: LiveTable, how: Rotation | Triggering | None
+    ) -> Iterator[Keys | None]:
+        """Yield the keys of this terminal; None if its keys cannot be read, as in the background."""
+        if not (is_possible() and _is_in_foreground()):
+            yield None
+            return
+        with terminal_keys() as wait_for_key:
+            yield cls(poller, table, wait_for_key, has_trigger=isinstance(how, Triggering))
+        table.note = ""
+
+    def wait(self, seconds: float) -> None:
+        """Wait for `seconds` s, and carry out the keys that are pressed in this time."""
+        end = time.monotonic() + seconds
+        with suppress(OSError):  # the terminal is closed; the recording continues
+            while (left := end - time.monotonic()) > 0 and _is_in_foreground():
+                if key := self._wait_for_key(left):
+                    self.press(key)
+        time.sleep(max(0.0, end - time.monotonic()))
+
+    def press(self, key: str) -> None:
+        if self._text is None:
+            if key == "m":
+                self._text, self._begun = "", time.monotonic()
+            elif key == "t" and self._has_trigger:
+                self._poller.mark("key t", kind=TRIGGER)
+        elif key == ENTER:
+            with suppress(ValueError):  # an empty text is no comment
+                self._poller.mark(self._text, ago=time.monotonic() - self._begun)
+            self._text = None
+        elif key == ESCAPE:
+            self._text = None
+        elif key in BACKSPACES:
+            self._text = self._text[:-1]
+        elif len(key) == 1 and key.isprintable() and len(self._text) < LONGEST_TEXT:
+            self._text += key
+        self._show()
+
+    def _show(self) -> None:
+        trigger = "t: trigger; " if self._has_trigger else ""
+        keys = f"m: add a comment; {trigger}Ctrl-C: end"
+        self._table.note = keys if self._text is None else f"comment: {self._text}_"
+
+
+BACKSPACES = ("\x7f", "\b")
+
+
+def _is_in_foreground() -> bool:
+    """Return True if this process may read its terminal; in the background, reading would suspend it."""
+    if sys.platform == "win32":
+        return False
+    try:
+        return os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
+    except OSError:  # the terminal is not the controlling terminal of this process
+        return True
+
+
 def _values(drive: LiveDrive) -> Iterator[str]:
-    for poll in drive.polled.polls:
+    for poll in drive.polled.series:
         name = poll.register.name
         if name in drive.missed:
             yield f"{name}: {drive.missed[name].status}"
@@ -275,7 +429,7 @@ Figures = dict[str, Any]
 
 
 def compare(line: PlantLine, summary: dict[str, Any]) -> dict[str, Figures]:
-    """Return a line's measured rates, and its predictions with the manuals' and with measured delays."""
+    """Return a line's rates: measured, predicted with the manuals' delays, predicted with measured delays."""
     drives = summary["drives"]
     delays = {
         polled.drive: drives[polled.drive.name]["response_delay_ms"] / 1e3
@@ -283,7 +437,8 @@ def compare(line: PlantLine, summary: dict[str, Any]) -> dict[str, Figures]:
         if drives[polled.drive.name]["exchanges_per_second"]  # no delay was measured for a silent drive
     }
     polls = [poll for polled in line.drives for poll in polled.polls]
-    is_timed = any(poll.every is not None for poll in polls)  # True: no cycle time is measured
+    # if some registers have a period, the line has no bus cycle to measure
+    is_timed = any(poll.every is not None for poll in polls)
     cycles = (summary["samples"] + sum(summary["misses"].values())) / len(polls)
     by_delays = predict(planned_on(line, delays), delays, summary["switching_ms"] / 1e3)
     return {

@@ -1,4 +1,4 @@
-"""`multidrop ports`: lists this computer's serial ports with their adapters, and who may open each."""
+"""`multidrop ports`: lists the serial ports, their adapters, and whether the user may open them."""
 
 from __future__ import annotations
 

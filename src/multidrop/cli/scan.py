@@ -79,8 +79,8 @@ def run(arguments: argparse.Namespace) -> int:
     arguments.port = declared.port if declared else arguments.port
     rs485, settle = opening_of(arguments, declared)
     families = _families(arguments.model)
-    # A scan for all families uses only the settings of the built-in families. Settings of others would make
-    # it much longer.
+    # A scan for all families uses only the settings of the built-in families. The other families' settings
+    # would make the scan much longer.
     planned = _planned(arguments, list(families.values() if arguments.model else MODELS.values()))
     begun = time.monotonic()
     found, finished = _scan(arguments, rs485, settle, planned, list(families.values()))
@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
         record = {"port": arguments.port, "seconds": seconds, "finished": finished}
         print_text(json.dumps(record | _as_json(found) | {"plant": written}, indent=2))
     else:
-        print_text(_summary(len(drives), seconds, arguments.addresses))
+        print_text(_summary(len(drives), seconds, arguments.addresses, finished))
         if written:
             print_text(f"wrote {written}; next: multidrop poll {written}")
     if not finished:
@@ -122,7 +122,7 @@ def _scan(
 
 
 def _families(models: Sequence[str]) -> dict[str, type[Drive]]:
-    """Return families by the names that a plant file would use; model files have absolute paths."""
+    """Return the families by their names in a plant file. The name of a model file is its absolute path."""
     named = {}
     for text in models or (*MODELS, *RECOGNISABLE):
         path, colon, name = text.rpartition(":")
@@ -163,7 +163,7 @@ def _planned(arguments: argparse.Namespace, families: Sequence[type[Drive]]) -> 
 def _shown(findings: Iterator[Finding], silent: bool) -> Iterator[Finding]:
     """Print progress on stderr and, unless `silent`, findings as they come; yield the findings.
 
-    On a terminal, progress is one line that is redrawn. In a file, it is a line for every setting.
+    On a terminal, progress is one line that is redrawn. Otherwise, it is a line for every setting.
     """
     redraws = sys.stderr.isatty()
     shown = ""  # the setting in the progress line
@@ -182,7 +182,7 @@ def _shown(findings: Iterator[Finding], silent: bool) -> Iterator[Finding]:
             if not silent:
                 print_text(sentence(finding), flush=True)
             yield finding
-    finally:  # also executed after Ctrl-C
+    finally:  # runs after Ctrl-C too
         if shown and redraws:
             _redraw("")
 
@@ -229,9 +229,9 @@ def sentence(finding: Finding) -> str:
 # ---- output after the scan ----
 
 
-def _summary(drives: int, seconds: float, addresses: Sequence[int]) -> str:
+def _summary(drives: int, seconds: float, addresses: Sequence[int], finished: bool) -> str:
     text = f"{counted(drives, 'drive') if drives else 'no drives'} found in {_duration(seconds)}"
-    if not drives:
+    if not drives and finished:
         text += "; check their power, their addresses and A/B, and run `multidrop doctor` on the port"
     if addresses == list(ADDRESSES):
         text += f"; addresses above {ADDRESSES[-1]} were not tried (use --addresses 1-247)"
@@ -278,7 +278,7 @@ def _baudrates(text: str) -> list[int]:
     try:
         return [plain_whole(part) for part in text.split(",")]
     except ValueError:
-        raise ValueError(f"invalid baud rates {text!r}: write such as 9600,19200") from None
+        raise ValueError(f"invalid baud rates {text!r}: write numbers, such as 9600,19200") from None
 
 
 def _formats(text: str) -> list[str]:

@@ -5,23 +5,23 @@ from __future__ import annotations
 import argparse
 import logging
 import os
-import sys
 import threading
 import time
 import webbrowser
 from collections.abc import Callable
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from multidrop.cli.support.arguments import add_port_option, plant_of
 from multidrop.cli.support.demo_plant import Operator, demo_files, simulator
-from multidrop.cli.support.files import require_extra
-from multidrop.cli.support.log_thread import FORMATTERS, LogThread, add_log_argument
-from multidrop.cli.support.output import logging_by, print_text, warn
+from multidrop.cli.support.files import require_extra, write_new
+from multidrop.cli.support.log_thread import LogThread, add_log_argument, logging_to_stderr
+from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.signals import on_end_signals, on_reload_signal, run_loop
+from multidrop.cli.support.values import counted
 from multidrop.drive.known_state import can_show_fault
 from multidrop.drive.named_verbs import verbs_of
 from multidrop.plant.loader import load_plant
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from multidrop.gateway.reload import Read
     from multidrop.gateway.settings import ServeSettings
 
-DEMO_PORTS = (8750, 0)  # the usual port; if it is in use, any free port
-END_S = 4.7  # from the end signal until the process ends itself
+DEMO_PORTS = (8750, 0)  # try the usual port first, then any free port (0)
+END_S = 4.7  # if the process still runs this many s after the end signal, it ends itself
 ROLES = ("look", "stop", "write")
 
 
@@ -43,6 +43,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--demo", action="store_true", help="serve a simulated plant, and open its page")
     parser.add_argument("--no-browser", action="store_true", help="with --demo: do not open the page")
     parser.add_argument("--check", action="store_true", help="check the file and its [serve], then exit")
+    parser.add_argument(
+        "--modbus-map",
+        metavar="FILE",
+        help="write the addresses of the Modbus server to a .csv or .json file",
+    )
     add_log_argument(parser)
     parser.add_argument(
         "--new-token",
@@ -71,15 +76,32 @@ def run(arguments: argparse.Namespace) -> int:
         return read_plant(lambda: plant_of(arguments.plant, arguments), os.environ)
 
     plant, settings = read()
+    if arguments.modbus_map:
+        return _write_modbus_map(plant, settings, Path(arguments.modbus_map))
     if arguments.check:
         parts = ", ".join(settings.parts) or "none"
         for sentence in blind_spots(plant):
             warn(sentence)
         print_text(f"{plant.path}: no mistake found; {_url(settings, settings.port)}, parts: {parts}")
         return 0
-    with _logging(arguments.log, logging.INFO):
-        ready = partial(_announce, settings)
-        return _serve(plant, settings, ready, read)
+    with logging_to_stderr(arguments.log, _levels(logging.INFO)) as log:
+        return _serve(plant, settings, log, partial(_announce, settings), read)
+
+
+def _write_modbus_map(plant: Plant, settings: ServeSettings, path: Path) -> int:
+    """Write the table that `GET /api/modbus-map` returns, with the ports that the plant file names."""
+    from multidrop.gateway.modbus_server.address_map import address_map, to_csv, to_json
+    from multidrop.gateway.modbus_server.unit_ids import MAIN, Units
+
+    if path.suffix not in (".csv", ".json"):
+        raise ValueError(f"{path}: the name of an address map ends in .csv or .json")
+    modbus: Any = settings.parts.get("modbus")
+    if modbus is None:
+        raise ValueError(f"{plant.path} has no Modbus server: add [serve.modbus]")
+    rows = address_map(Units(plant, modbus), modbus, {MAIN: modbus.port, **modbus.ports}, settings.may)
+    write_new(path, to_json(rows) if path.suffix == ".json" else to_csv(rows))
+    print_text(f"{path}: {counted(len(rows), 'value')} of {counted(len({row[1] for row in rows}), 'drive')}")
+    return 0
 
 
 def serve_demo(*, is_shown: bool = True, log: str = "text") -> int:
@@ -88,7 +110,8 @@ def serve_demo(*, is_shown: bool = True, log: str = "text") -> int:
     with TemporaryDirectory(prefix="multidrop-") as directory:
         folder = Path(directory)
         path, faults = demo_files(folder)
-        with simulator(path, folder, faults), _logging(log, logging.WARNING), ExitStack() as stack:
+        logged = logging_to_stderr(log, _levels(logging.WARNING))
+        with simulator(path, folder, faults), logged as log_thread, ExitStack() as stack:
             plant = load_plant(path)
 
             def on_ready(gateway: Gateway) -> None:
@@ -98,17 +121,16 @@ def serve_demo(*, is_shown: bool = True, log: str = "text") -> int:
                 if is_shown:
                     threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
-            return _serve(plant, _demo_settings(plant, folder), on_ready)
+            return _serve(plant, _demo_settings(plant, folder), log_thread, on_ready)
 
 
 def blind_spots(plant: Plant) -> list[str]:
     """Return a sentence for each drive whose polled registers cannot show a fault."""
     found = []
-    for line in plant.lines:
-        for drive, polled in ((one.drive, [poll.register.name for poll in one.polls]) for one in line.drives):
-            if can_show_fault(drive, polled):
-                continue
-            others = [one.name for one in drive.readings() if can_show_fault(drive, [*polled, one.name])]
+    for one in plant.drives:
+        drive, polled = one.drive, [poll.register.name for poll in one.polls]
+        if not can_show_fault(drive, polled):
+            others = [each.name for each in drive.readings() if can_show_fault(drive, [*polled, each.name])]
             advice = f"poll {' or '.join(others[:3])} too" if others else "its family has no such register"
             found.append(f"{drive.name}: no polled register can show a fault: {advice}")
     return found
@@ -124,7 +146,7 @@ def _demo_settings(plant: Plant, folder: Path) -> ServeSettings:
     from multidrop.gateway.http.rights import May, Right
     from multidrop.gateway.settings import ServeSettings
 
-    drives = [polled.drive for line in plant.lines for polled in line.drives]
+    drives = [polled.drive for polled in plant.drives]
     writes = [
         f"{one.name}.{name}" for one in drives for name, found in one.registers.items() if found.writable
     ]
@@ -139,11 +161,20 @@ def _demo_settings(plant: Plant, folder: Path) -> ServeSettings:
 
 
 def _announce(settings: ServeSettings, gateway: Gateway) -> None:
-    print_text(f"ready {_url(settings, gateway.port)}", flush=True)
+    """Print the gateway's address: on standard error if some part of the gateway writes rows to stdout."""
+    ready = f"ready {_url(settings, gateway.port)}"
+    if getattr(settings.parts.get("influx"), "url", "") == "stdout":
+        warn(ready)
+    else:
+        print_text(ready, flush=True)
 
 
 def _serve(
-    plant: Plant, settings: ServeSettings, on_ready: Callable[[Gateway], None], read: Read | None = None
+    plant: Plant,
+    settings: ServeSettings,
+    log: LogThread,
+    on_ready: Callable[[Gateway], None],
+    read: Read | None = None,
 ) -> int:
     from dataclasses import replace
 
@@ -162,9 +193,7 @@ def _serve(
         gateway.end()
 
     async def live() -> None:
-        for handler in logging.getLogger("multidrop").handlers:
-            if isinstance(handler, LogThread):
-                supervisor().watch("log", handler.is_alive)
+        supervisor().watch("log", log.is_alive)
         on_end_signals(end)
         if read:
             on_reload_signal(gateway.reload.begin, end)
@@ -200,9 +229,6 @@ def _new_token(role: str | None, owner: str | None) -> int:
     return 0
 
 
-# ---- logs ----
-
-
-def _logging(form: str, level: int) -> AbstractContextManager[None]:
-    handler = LogThread(sys.stderr, FORMATTERS[form]())
-    return logging_by(handler, {"multidrop": level, "uvicorn": logging.WARNING, "asyncio": logging.WARNING})
+def _levels(level: int) -> dict[str, int]:
+    """Return the log levels by logger; `level` is that of the library's own messages."""
+    return {"multidrop": level, "uvicorn": logging.WARNING, "asyncio": logging.WARNING}

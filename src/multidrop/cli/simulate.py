@@ -7,16 +7,16 @@ import os
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from multidrop.cli.support.arguments import add_speed_option
 from multidrop.cli.support.output import print_text
 from multidrop.drive.line_settings import speaks_tcp
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine
-from multidrop.printable import plain_number
 from multidrop.sim import FaultyWire, SimulatedDrive, Simulator, load_faults, serve, simulated
 from multidrop.sim.faults import HELP, Faults
 from multidrop.sim.port import is_dead_link
 
-ANY_TCP = "tcp://127.0.0.1:0"  # any free TCP port of this computer, in place of a port that is not local
+ANY_TCP = "tcp://127.0.0.1:0"  # any free TCP port of this computer; replaces a port on another computer
 LOOPBACK = ("127.0.0.1", "localhost")
 NO_TERMINALS = (
     "this system has no pseudo-terminals for --ports DIR: remove --ports, and give each line a port such as "
@@ -39,20 +39,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--unpaced", action="store_true", help="answer at once, not at the pace of a wire")
     parser.add_argument("--faults", metavar="FILE", help="faults of lines and drives, as described below")
-    parser.add_argument(
-        "--speed",
-        metavar="N",
-        type=_speed,
-        default=1.0,
-        help="let simulated time pass N times as fast: wires, drives, motors and faults; default: 1",
-    )
+    add_speed_option(parser, "let simulated time pass N times as fast: wires, drives, motors and faults")
     parser.epilog = HELP
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
 
 
 def run(arguments: argparse.Namespace) -> int:
     plant = load_plant(arguments.plant)
-    names = [polled.drive.name for line in plant.lines for polled in line.drives]
+    names = [polled.drive.name for polled in plant.drives]
     faults = load_faults(arguments.faults, names) if arguments.faults else Faults()
     directory: Path | None = arguments.ports
     if directory is not None and not hasattr(os, "openpty"):
@@ -70,14 +64,6 @@ def run(arguments: argparse.Namespace) -> int:
     ]
     serve(wires, _announce, speed=arguments.speed)
     return 0
-
-
-def _speed(text: str) -> float:
-    """Return the factor by which simulated time is faster. Raises ValueError unless it is 0.1 to 100."""
-    speed = plain_number(text)
-    if not 0.1 <= speed <= 100:
-        raise ValueError(text)
-    return speed
 
 
 def _has_place(port: str) -> bool:

@@ -1,4 +1,4 @@
-"""`multidrop sniff`: prints and captures the traffic on a line, and sends nothing."""
+"""`multidrop sniff` and `decode`: print, capture or record the traffic on a line, and send nothing."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack, closing
+from importlib.metadata import version
 from io import FileIO
 from pathlib import Path
 from typing import Any, NoReturn
 
-from multidrop.capture import Capture, CaptureWriter, Pairing, Side, Sniffed
+from multidrop.capture import Capture, CaptureWriter, Decoding, Pairing, Side, Sniffed
 from multidrop.capture.decoding import ExchangeFormatter, RegisterLookup
 from multidrop.capture.decoding import line_of as captured_line
 from multidrop.cli.support.arguments import (
@@ -27,22 +28,36 @@ from multidrop.cli.support.arguments import (
     usual_settings,
     whole,
 )
-from multidrop.cli.support.files import check_capture
-from multidrop.cli.support.output import print_text
+from multidrop.cli.support.files import check_capture, refuse_overwriting
+from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.signals import noting_signals
+from multidrop.cli.support.values import counted
 from multidrop.core import FrameSpan, Kind, Splitter, Stream, must_take, refused_names, set_settings
 from multidrop.drive.line_settings import Settings
 from multidrop.errors import LineError
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant, PlantLine
+from multidrop.recording import FORMATS, open_writer
 from multidrop.transport.bridge import PORT_FAILURES
 from multidrop.transport.open_port import reason_of, unopened
 
-_SILENT_S = 0.5  # silence that is longer than any pause within a frame
-_GIVEN_UP_S = 1.5  # silence after which no reply to a request will come
+_SILENT_S = 0.5  # a silence, in s, that is longer than any pause within a frame
+_GIVEN_UP_S = 1.5  # silence, in s, after which a request counts as unanswered
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    if parser.get_default("command") == "decode":
+        _add_decode_arguments(parser)
+    else:
+        _add_sniff_arguments(parser)
+    add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    return _decode(arguments) if arguments.command == "decode" else _sniff(arguments)
+
+
+def _add_sniff_arguments(parser: argparse.ArgumentParser) -> None:
     add_line_arguments(parser)
     parser.add_argument("--replay", metavar="FILE", type=Path, help="read a capture instead of a port")
     parser.add_argument("--plant", metavar="PLANT.toml", help="for names and engineering units")
@@ -50,10 +65,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--baudrate", type=whole, metavar="N", help="default: the plant file's, or 9600")
     parser.add_argument("--format", metavar="8N1", help="default: the plant file's, or 8N1")
     parser.add_argument("--seconds", type=duration, metavar="S", help="how long; default: until Ctrl-C")
-    add_json_argument(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def _sniff(arguments: argparse.Namespace) -> int:
     if (arguments.port is None) == (arguments.replay is None):
         raise ValueError("name either a PORT to listen to, or a capture with --replay FILE")
     if arguments.out:
@@ -77,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _line(arguments: argparse.Namespace, plant: Plant | None) -> PlantLine | None:
-    """Return the line of the plant file to listen to; None without a plant file, or if it is not found.
+    """Return the plant file's line to listen to; None without a plant file, or if no line fits.
 
     With PLANT.toml instead of PORT, also set `arguments.port` to the line's port. With --plant, return the
     line with this port, or else the plant's only line.
@@ -99,7 +113,7 @@ def _name(port: str) -> str:
 
 
 def _settings(arguments: argparse.Namespace, line: PlantLine | None) -> Settings:
-    """Return the arguments' settings, completed by the settings of most of the line's drives."""
+    """Return the settings in the arguments. Replace a missing setting by that of most drives of the line."""
     usual = usual_settings(line)
     baudrate = usual.baudrate if arguments.baudrate is None else arguments.baudrate
     return Settings(baudrate, arguments.format or usual.format)
@@ -114,7 +128,7 @@ def _listen(listener: Listener, printer: TrafficPrinter, seconds: float | None) 
             if seconds is not None and now - begun >= seconds:
                 break
             if listener.receive():
-                received_at = time.monotonic()  # not `now`, because receiving may have taken long
+                received_at = time.monotonic()  # read again, because receiving may have taken long
             listener.stream.end(now - received_at > _SILENT_S)
             printer.show(listener.stream)
             if now - received_at > _GIVEN_UP_S:
@@ -126,11 +140,11 @@ def _listen(listener: Listener, printer: TrafficPrinter, seconds: float | None) 
 
 # ---- a port that is only read ----
 #
-# A device is opened read-only. A URL is opened by pyserial, with its `write` replaced: nothing is sent to a
-# socket, and only the serial settings to an rfc2217 server.
+# A device is opened read-only. A URL is opened by pyserial, and pyserial's `write` is replaced. So a
+# socket receives nothing, and an rfc2217 server only the serial settings.
 
 
-LISTEN_S = 0.05  # longest wait for bytes in one read
+LISTEN_S = 0.05  # longest wait for bytes in one read, in s
 _MOST = 4096  # limit of bytes per read
 
 
@@ -275,7 +289,7 @@ class TrafficPrinter:
 def replay(
     capture: Capture, plant: Plant | None, *, as_json: bool, out: CaptureWriter | None = None
 ) -> Counter[str]:
-    """Print the traffic in a capture; return the counts that `summary` prints, such as of exchanges."""
+    """Print the traffic in a capture; return its counts, such as that of exchanges, for `summary`."""
     printers: list[TrafficPrinter] = []
     for _ in capture:
         printers += [
@@ -300,9 +314,51 @@ _ALWAYS = ("exchanges", "unknown_bytes")  # counts that are printed even if 0
 
 
 def summary(counts: Mapping[str, int]) -> str:
-    """Return the numbers as text."""
+    """Return the counts as text."""
     return ", ".join(
         f"{counts.get(name, 0)} {words[counts.get(name, 0) != 1]}"
         for name, words in _COUNTED.items()
         if counts.get(name) or name in _ALWAYS
     )
+
+
+# ---- captures ----
+
+
+def _add_decode_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("capture", metavar="FILE", type=Path, help="a capture: pcap or pcapng")
+    parser.add_argument("--plant", metavar="PLANT.toml", help="for names and engineering units")
+    parser.add_argument(
+        "--out",
+        metavar="FILE",
+        type=Path,
+        help=f"a new recording: {', '.join(FORMATS)}; printed as text if not given",
+    )
+
+
+def _decode(arguments: argparse.Namespace) -> int:
+    if arguments.out:
+        refuse_overwriting(arguments.out)
+    plant = load_plant(arguments.plant) if arguments.plant else None
+    with Capture(arguments.capture) as capture:
+        if arguments.out:
+            counts = _record(capture, plant, arguments.out)
+        else:
+            counts = dict(replay(capture, plant, as_json=arguments.json))
+        if capture.truncated:
+            warn(
+                f"{capture.path} ends within a packet: "
+                f"its last {counted(capture.truncated, 'byte')} were skipped"
+            )
+    into = f"{counted(counts['rows'], 'row')} in {arguments.out}: " if arguments.out else ""
+    print_text(json.dumps({"summary": counts}) if arguments.json else into + summary(counts))
+    return 0
+
+
+def _record(capture: Capture, plant: Plant | None, out: Path) -> dict[str, Any]:
+    about = plant.metadata() if plant else {"multidrop": version("multidrop")}
+    decoding = Decoding(capture, plant)
+    with open_writer(out, {**about, "capture": str(capture.path)}) as writer:
+        for batch in decoding:
+            writer.write(batch)
+    return {**decoding.counts(), "rows": writer.rows}

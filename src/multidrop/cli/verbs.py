@@ -42,9 +42,9 @@ from multidrop.errors import LineError, Unsupported
 from multidrop.plant.model import Plant, PlantLine
 
 _DIRECTED = ("start", "jog")
-_FURTHER = {"set-frequency": ("HZ",)}  # further arguments after the drive
+_FURTHER = {"set-frequency": ("HZ",)}  # command: arguments after the drive
 _SHOWING_WATCHDOG = ("state", *_DIRECTED)  # commands that print how the motor reacts if this program dies
-_QUESTIONS = {  # asked before the first request; stops need no confirmation
+_QUESTIONS = {  # questions asked before the first request of a verb; stops need no confirmation
     "start": "Start the motor of",
     "jog": "Turn the motor of",
     "reset-fault": "Reset the fault of",
@@ -79,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _stop_time(text: str) -> float | None:
-    """Return the number of seconds in a text. If it is invalid, warn and return None: the stop is sent."""
+    """Return the seconds in a text. If it is invalid, only warn and return None: a stop must be sent."""
     try:
         return duration(text)
     except argparse.ArgumentTypeError as mistake:
@@ -126,7 +126,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _target(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
-    """Return the named drive and the words after it. A stop ignores such words with a warning."""
+    """Return the named drive and the words after it. For a stop, warn of these words and ignore them."""
     command = arguments.command
     if command not in STOPS:
         target, words = target_of(arguments)
@@ -142,7 +142,7 @@ def _target(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
 
 
 def _opened(target: Target, arguments: argparse.Namespace) -> Bus:
-    """Open the drive's port and return the bus. Raises LineError; OSError for a stop, which was not sent."""
+    """Open the drive's port and return the bus. If opening fails, raises LineError, or for a stop OSError."""
     audit = _audit_file(arguments)
     try:
         return target.open_bus(audit)
@@ -169,7 +169,7 @@ def _audit_file(arguments: argparse.Namespace) -> str | None:
 
 @contextmanager
 def _annotating(command: str, target: Target) -> Iterator[list[str]]:
-    """Add notes to a KeyboardInterrupt: the state of the verb, and the command that stops the motor."""
+    """Add notes to a KeyboardInterrupt: the requests sent so far, and the command that stops the motor."""
     try:
         with reporting_interruption(target.drive, command) as known:
             yield known
@@ -262,8 +262,8 @@ def names_plant(arguments: argparse.Namespace) -> bool:
 def stop_plant(arguments: argparse.Namespace, audit: str | None) -> int:
     """Stop the lines in parallel; print the results of each line's drives when the line is done.
 
-    Raises ValueError if the plant file has no drive without a mistake, or for a wrong name of a line. Then no
-    stop is sent.
+    Raises ValueError if the plant file has no drive that can be stopped, or if the named line does not exist.
+    Then no stop is sent.
     """
     try:
         lines = _lines(plant_of(arguments.words[0], arguments), arguments)
@@ -284,8 +284,7 @@ def stop_plant(arguments: argparse.Namespace, audit: str | None) -> int:
     if arguments.json:
         print_text(json.dumps([record for stop in stops for record in stop.records()], indent=2))
     results = [result for stop in stops for result in stop.results]
-    is_partial = getattr(arguments, "is_partial", False)
-    return FAILED if is_partial or not all(result.ok for result in results) else DONE
+    return DONE if all(result.ok for result in results) and not arguments.is_partial else FAILED
 
 
 def _lines(plant: Plant, arguments: argparse.Namespace) -> Sequence[PlantLine]:
@@ -301,7 +300,7 @@ def _lines(plant: Plant, arguments: argparse.Namespace) -> Sequence[PlantLine]:
 
 
 def _start_stops(stops: Sequence[_LineStop], finished: SimpleQueue[_LineStop]) -> None:
-    """Stop each line in its own thread, so that no line waits for another's port or deceleration.
+    """Stop each line in its own thread, so that no line waits for another line's port or motors.
 
     If no more threads can be started, stop the remaining lines here, one after another.
     """
@@ -347,7 +346,7 @@ class _LineStop:
 
     def so_far(self) -> list[str]:
         """Return a sentence for each drive: its result, or the state of its stop."""
-        known = {result.drive: _stop_sentence(result) for result in self.results}
+        known = {result.drive: stop_sentence(result) for result in self.results}
         if not known and self.bus:
             known = self.bus.stops_under_way()
         return [known.get(name, f"{name}: the stop was NOT sent") for name in self._names]
@@ -364,7 +363,8 @@ class _LineStop:
         return [polled.drive.name for polled in self.line.drives]
 
 
-def _stop_sentence(result: Stopped) -> str:
+def stop_sentence(result: Stopped) -> str:
+    """Return a stop's result as a sentence, with advice if no stop could be sent."""
     if result.seen is Seen.FAILED:
         return f"{result.drive}: the stop was NOT sent: {result.why}; {HARD_WIRED}"
     return str(result)

@@ -38,8 +38,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _row(wear: Wear) -> tuple[str, ...]:
-    *columns, last = map(str, _as_json(wear).values())
-    return *columns, last[:16].replace("T", " ")
+    """Return the cells of a row. The model is shown without the title that follows its ": "."""
+    port, address, model, *columns, last = map(str, _as_json(wear).values())
+    return port, address, model.partition(": ")[0], *columns, last[:16].replace("T", " ")
 
 
 def _as_json(wear: Wear) -> dict[str, object]:

@@ -16,9 +16,8 @@ from multidrop.core import RS485, Echo
 from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import Settings, check_port
 from multidrop.families.registry import find_model
-from multidrop.plant.drive_names import drive_meant
-from multidrop.plant.loader import PlantError, load_plant
-from multidrop.plant.model import Plant, PlantLine
+from multidrop.plant.loader import PlantError, load_plant, load_served_plant
+from multidrop.plant.model import Plant, PlantLine, drive_meant
 from multidrop.printable import plain_number, plain_whole
 from multidrop.toml_check import parse_duration
 
@@ -41,7 +40,7 @@ def add_json_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def argument(parse: Callable[[str], T], example: str = "") -> Callable[[str], T]:
-    """Return a type for argparse that calls `parse`. Its error is that of `parse`, or shows an example."""
+    """Return an argparse type that calls `parse`; argparse reports its ValueError to the user."""
 
     def parsed(text: str) -> T:
         try:
@@ -60,9 +59,17 @@ def _seconds(text: str) -> float:
     return seconds
 
 
+def _factor(text: str) -> float:
+    factor = plain_number(text)
+    if not 0.1 <= factor <= 100:
+        raise ValueError(text)
+    return factor
+
+
 whole = argument(plain_whole, "a whole number such as 10")
 number = argument(plain_number, "a number such as 42.5")
 duration = argument(_seconds, "a number of seconds above 0")
+_speed = argument(_factor, "a number from 0.1 to 100")
 
 
 def add_plant_argument(parser: argparse.ArgumentParser) -> None:
@@ -82,30 +89,43 @@ def add_port_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_speed_option(parser: argparse.ArgumentParser, meaning: str) -> None:
+    """Add --speed N: simulated time passes N times as fast as real time."""
+    parser.add_argument("--speed", metavar="N", type=_speed, default=1.0, help=f"{meaning}; default: 1")
+
+
 def plant_of(path: str, arguments: argparse.Namespace) -> Plant:
     """Load a plant, with the ports of --port. Raises ValueError for a mistake in the file or the options.
 
-    A stop gets the drives that have no mistake, with a warning for each mistake of the file; then
-    `arguments.is_partial` becomes True.
+    For a stop, a mistake in the file causes only a warning. The plant then has only the drives that can be
+    stopped, and `arguments.is_partial` is True.
     """
+    arguments.is_partial = False
+    load = load_served_plant if arguments.command == "serve" else load_plant
     try:
-        plant = load_plant(path)
+        plant = load(path)
     except PlantError as wrong:
         right = wrong.right
         if arguments.command not in STOPS or right is None or not any(line.drives for line in right.lines):
             raise
         plant, arguments.is_partial = right, True
-        warn(f"{wrong}\nonly drives of {path} without a mistake can be stopped; for others {HARD_WIRED}")
+        warn(f"{wrong}\na drive is not stopped if its line, model or address has a mistake: {HARD_WIRED}")
+    ports = ports_of(arguments)
+    return plant.with_ports(ports) if ports else plant
+
+
+def ports_of(arguments: argparse.Namespace) -> dict[str, str]:
+    """Return the ports of --port by line name. Raises ValueError if a line is named twice."""
     ports: dict[str, str] = {}
     for name, port in arguments.ports:
         if name in ports:
             raise ValueError(f"--port is given twice for line {name!r}: give it once")
         ports[name] = port
-    return plant.with_ports(ports) if ports else plant
+    return ports
 
 
 def is_plant(word: str) -> bool:
-    """Return True if a word in place of PORT names a plant file; only its suffix counts."""
+    """Return True if a word in place of PORT names a plant file. Only the word's suffix is checked."""
     return "://" not in word and word.lower().endswith(".toml")
 
 
@@ -144,9 +164,10 @@ def add_opening_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def opening_of(arguments: argparse.Namespace, line: PlantLine | None) -> tuple[RS485, float]:
-    """Return the RS-485 mode and the pause in s after opening: the line's, or the options' without a plant.
+    """Return the RS-485 mode, and the pause in s after opening.
 
-    Raises ValueError for an invalid mode or pause, and if these options are given with a plant file.
+    Both come from the line of the plant file, or from the options if there is no plant file. Raises
+    ValueError for an invalid mode or pause, and if these options are given with a plant file.
     """
     if line is None:
         rs485 = RS485(arguments.rs485 or "off")
@@ -161,7 +182,7 @@ def opening_of(arguments: argparse.Namespace, line: PlantLine | None) -> tuple[R
 def plant_at(arguments: argparse.Namespace) -> Plant | None:
     """Return the plant if a plant file is given in place of PORT; None if a port is given.
 
-    Raises ValueError for mistakes in the plant file, and for a plant's options with a port.
+    Raises ValueError for a mistake in the plant file, and for a plant file's option given with a port.
     """
     if arguments.port is None:
         raise ValueError(
@@ -283,9 +304,9 @@ def target_of(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
 def check_words(arguments: argparse.Namespace, words: Sequence[str], names: Sequence[str]) -> None:
     """Raise ValueError unless the number of words equals the number of names."""
     if missing := names[len(words) :]:
-        raise _mistaken(arguments, f"the following arguments are required: {', '.join(missing)}")
+        raise mistaken(arguments, f"the following arguments are required: {', '.join(missing)}")
     if words[len(names) :]:
-        raise _mistaken(arguments, f"unrecognized arguments: {' '.join(words[len(names) :])}")
+        raise mistaken(arguments, f"unrecognized arguments: {' '.join(words[len(names) :])}")
 
 
 def number_of(arguments: argparse.Namespace, name: str, text: str) -> float:
@@ -293,7 +314,7 @@ def number_of(arguments: argparse.Namespace, name: str, text: str) -> float:
     try:
         return plain_number(text)
     except ValueError:
-        raise _mistaken(arguments, f"argument {name}: {text!r} is not a number such as 42.5") from None
+        raise mistaken(arguments, f"argument {name}: {text!r} is not a number such as 42.5") from None
 
 
 def _by_plant(arguments: argparse.Namespace) -> Target:
@@ -304,9 +325,9 @@ def _by_plant(arguments: argparse.Namespace) -> Target:
     ]
     if given:
         raise ValueError(f"{given[0]} is not for plant files: set it in {path}")
-    drives = [polled.drive.name for line in plant.lines for polled in line.drives]
+    drives = [polled.drive.name for polled in plant.drives]
     if not names:
-        raise _mistaken(arguments, f"choose a drive of {path}: {', '.join(drives)}")
+        raise mistaken(arguments, f"choose a drive of {path}: {', '.join(drives)}")
     name = drive_meant(names[0], drives) if arguments.command in _STOPS_AND_LOOKS else names[0]
     line, drive = plant.find_drive(name)
     ports = [f"--port={name}={port}" for name, port in arguments.ports]
@@ -323,7 +344,7 @@ def _by_port(arguments: argparse.Namespace) -> Target:
     try:
         address = int(text, 16) if _HEX.fullmatch(text) else plain_whole(text)
     except ValueError:
-        raise _mistaken(arguments, f"argument ADDRESS: {text!r} is not a number such as 1") from None
+        raise mistaken(arguments, f"argument ADDRESS: {text!r} is not a number such as 1") from None
     settings = {name: getattr(arguments, name) for name in _SETTINGS}
     drive = family(address, ram=arguments.ram, **settings, **dict(arguments.option))
     words = [port, model, text]
@@ -333,7 +354,7 @@ def _by_port(arguments: argparse.Namespace) -> Target:
     return Target(drive, port, Echo.AUTO, RS485.OFF, 0.0, tuple(words), model)
 
 
-def _mistaken(arguments: argparse.Namespace, sentence: str) -> ValueError:
+def mistaken(arguments: argparse.Namespace, sentence: str) -> ValueError:
     return ValueError(f"{sentence}; see `multidrop {arguments.command} --help`")
 
 

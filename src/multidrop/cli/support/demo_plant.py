@@ -21,8 +21,9 @@ from multidrop.drive.family import Drive
 from multidrop.drive.state import Condition
 from multidrop.errors import BusError
 from multidrop.families.registry import find_model
+from multidrop.plant.loader import load_plant
 
-LINES = {  # by line: name, model and framing of its drives
+LINES = {  # line name: (name, model, framing) of each of its drives
     "pumps": (
         ("pump-1", "erman-er-g-220", "rtu"),
         ("pump-2", "erman-er-g-220", "rtu"),
@@ -49,20 +50,21 @@ LINES = {  # by line: name, model and framing of its drives
 }
 DRIVES = [name for drives in LINES.values() for name, *_ in drives]
 POLLED = ("status", "terminals", "output_frequency", "output_current", "fault", "last_fault")
-POLLED_OF = {"yd1000": ("status", "output_frequency")}  # at 9600 bit/s there is time for two requests
-SLOWLY = ("output_m01", "output_m02", "output_yabc", "output_virtual")  # settings of terminals, polled slowly
+# By model: the registers to poll instead of POLLED. At 9600 bit/s, a YD1000 has time for two requests.
+POLLED_OF = {"yd1000": ("status", "output_frequency")}
+SLOWLY = ("output_m01", "output_m02", "output_yabc", "output_virtual")  # settings of output terminals
 EVERY, SLOW = "450 ms", "2 s"
 MAXIMUM_HZ = 50
-TROUBLE = {  # faults that some drives simulate
+TROUBLE = {  # faults that are simulated for some drives
     "fan-1": 'trip = "30 s"\nfirst = "3 s"',
     "belt-5": 'trip = "50 s"',
     "belt-6": 'silence = "40 s"\nsilent_for = "3 s"\nfirst = "2 s"',
     "pump-2": 'silence = "70 s"',
     "fan-3": "loss = 0.02",
 }
-DRIFT = 0.25  # relative change of every simulated load
+DRIFT = 0.25  # each simulated load moves up and down by this fraction of the rated torque
 STEP_S = 0.8  # pause before the operator turns to the next drive of a line
-CALM = 3  # mean number of visits to a running motor for one change of its setpoint
+CALM = 3  # the operator changes the setpoint at one in CALM visits to a running motor, on average
 
 
 def demo_files(folder: Path) -> tuple[Path, Path]:
@@ -89,7 +91,7 @@ def _plant_tables(folder: Path) -> Iterator[str]:
 
 
 def _polled(family: type[Drive]) -> Iterator[str]:
-    """Yield entries of `poll`: the registers whose values have a name or a unit."""
+    """Yield the entries of a drive's key `poll`: registers whose values have a name or a unit."""
     wanted = POLLED_OF.get(family.model, POLLED)
     found = [family.registers[name] for name in wanted if name in family.registers]
     yield from (f'"{one.name}"' for one in found if one.step is not None or one.values is not None)
@@ -136,7 +138,7 @@ class Operator:
                 self._attempt(_look_after, drive)
 
     def _attempt(self, command: Callable[[Drive], None], drive: Drive) -> None:
-        # A drive may be silent, tripped, or too slow on a busy machine. Its next turn comes later.
+        # The drive may be silent, tripped, or too slow on a busy machine. The operator tries it again later.
         if not self._is_over.is_set():
             with suppress(BusError):
                 command(drive)
@@ -160,13 +162,21 @@ def _look_after(drive: Any) -> None:
 
 
 @contextmanager
-def simulator(plant: Path, ports: Path, faults: Path | None = None) -> Iterator[None]:
-    """Simulate the plant in a child process, so that simulator and poller do not share an interpreter."""
+def simulator(
+    plant: Path, ports: Path, faults: Path | None = None, *, speed: float = 1.0
+) -> Iterator[dict[str, str]]:
+    """Simulate the plant in a child process, and yield the lines' ports by name.
+
+    In one process, simulator and poller would share an interpreter, and would delay each other.
+    """
+    names = [line.name for line in load_plant(plant).lines]
     words = [sys.executable, "-X", "utf8", "-m", __name__, str(plant)]
     if hasattr(os, "openpty"):
         words += ["--ports", str(ports)]
     if faults is not None:
         words += ["--faults", str(faults)]
+    if speed != 1.0:
+        words += ["--speed", str(speed)]
     pipe = subprocess.PIPE
     # Ctrl-C must not reach the child, which must run longer than the polling. So it gets its own session, or
     # on Windows its own process group.
@@ -177,9 +187,13 @@ def simulator(plant: Path, ports: Path, faults: Path | None = None) -> Iterator[
         assert process.stdin is not None
         assert process.stdout is not None
         try:
-            if not process.stdout.readline().startswith("ready"):
-                raise OSError("the simulator did not start; its reason is above")
-            yield
+            found = {}
+            for name in names:
+                ready = f"ready {name} "
+                if not (said := process.stdout.readline().rstrip("\n")).startswith(ready):
+                    raise OSError("the simulator did not start; its reason is above")
+                found[name] = said.removeprefix(ready)
+            yield found
         finally:
             process.stdin.close()
 

@@ -28,7 +28,7 @@ def check_writable(path: Path) -> None:
     The check creates a file and removes it.
     """
     refuse_overwriting(path)
-    if path.exists() and not path.is_dir():  # a device or a pipe can be written without being created
+    if path.exists() and not path.is_dir():  # a device or a pipe is not created
         return
     new_file(path).close()
     path.unlink()
@@ -52,7 +52,7 @@ def write_new(path: Path, content: str | bytes) -> None:
 
 
 def check_capture(path: Path) -> None:
-    """Raise ValueError if no capture can be written there."""
+    """Raise ValueError if no capture can be written at this path."""
     if path.suffix != ".pcapng":
         raise ValueError(f"{path}: a capture's name must end in .pcapng")
     refuse_overwriting(path)
@@ -68,7 +68,7 @@ def warn_truncated(path: Path, rows: int, left_out: int) -> None:
 
 
 def check_no_segments(path: Path) -> None:
-    """Raise ValueError if the path is a folder, or a pattern for the segments of a recording."""
+    """Raise ValueError if the path is a folder, or names a recording that was split into segments."""
     if path.is_dir():
         kept = [*sorted(path.glob("rows/*.parquet")), *sorted(path.glob("rows.*.arrows"))]
         if not kept:

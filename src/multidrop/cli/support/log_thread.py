@@ -29,7 +29,7 @@ class LogThread(logging.Handler):
         self.setFormatter(formatter)
         self._stream = self._file = stream
         with suppress(OSError):  # a stream in memory has no file descriptor
-            # A duplicate descriptor, because at exit Python flushes `stream`, and would wait for a halted
+            # Write to a duplicate descriptor: at exit Python flushes `stream` and would wait for a halted
             # terminal.
             own = os.dup(stream.fileno())
             self._file = os.fdopen(own, "w", 1, encoding=stream.encoding, errors="backslashreplace")

@@ -14,7 +14,7 @@ from multidrop.printable import masked, printable
 
 
 def spell_out_unencodable() -> None:
-    """Let stdout escape characters that its encoding lacks, as stderr does. Pipes on Windows lack many."""
+    """Let stdout escape characters that its encoding lacks, as stderr does. Windows' pipes lack many."""
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
 

@@ -6,7 +6,7 @@ import re
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from enum import Flag
@@ -20,11 +20,13 @@ from multidrop.drive.known_state import StateReader
 from multidrop.drive.state import Condition, Direction
 from multidrop.errors import BusError
 from multidrop.plant.model import Plant, PlantLine, PolledDrive, current_for
+from multidrop.plant.triggers import TriggerSeries
 from multidrop.poller import Poller
 from multidrop.polling.batch import Row, Rows
 from multidrop.recording import open_writer
 from multidrop.recording.format import Metadata, RecordingWriter
 from multidrop.recording.segments import SegmentWriter
+from multidrop.recording.triggered import TriggeredWriter
 from multidrop.transport.statistics import LineStatistics, Statistics, line_statistics
 
 
@@ -32,6 +34,7 @@ class PollingSession(NamedTuple):
     poller: Poller  # not started yet
     interruption: Interruption
     hand_out: Callable[[], None]  # passes new rows to the recording and to all consumers
+    writer: RecordingWriter | None = None  # the recording
 
 
 class Rotation(NamedTuple):
@@ -42,10 +45,21 @@ class Rotation(NamedTuple):
     most: int | None = None  # limit of all segments' size, in bytes
 
 
-def _open(out: Path, metadata: Metadata, rotation: Rotation | None) -> RecordingWriter:
-    if rotation is None:
+class Triggering(NamedTuple):
+    """How triggers are recorded, each in its own file."""
+
+    pre: float  # s recorded before a trigger
+    post: float  # s recorded after it
+    conditions: Mapping[TriggerSeries, str]  # condition's channel: the condition's text
+    signals: Mapping[str, Sequence[TriggerSeries]]  # condition's text: the registers to draw
+
+
+def _open(out: Path, metadata: Metadata, how: Rotation | Triggering | None) -> RecordingWriter:
+    if how is None:
         return open_writer(out, metadata)
-    return SegmentWriter(out, metadata, every=rotation.every, keep=rotation.keep, most=rotation.most)
+    if isinstance(how, Triggering):
+        return TriggeredWriter(out, metadata, pre=how.pre, post=how.post, conditions=how.conditions)
+    return SegmentWriter(out, metadata, every=how.every, keep=how.keep, most=how.most)
 
 
 @contextmanager
@@ -53,18 +67,21 @@ def polling_session(
     plant: Plant,
     out: Path | None,
     *consumers: Callable[[Rows], None],
-    rotation: Rotation | None = None,
+    how: Rotation | Triggering | None = None,
 ) -> Iterator[PollingSession]:
     """Open the plant's ports, then its recording, and yield the session.
 
-    On leaving, record all remaining rows, and close recording and ports.
+    `how` says which rows are recorded in which files; None: all rows in one file.
+
+    When the context ends, record all remaining rows, and close recording and ports.
     """
     takers = list(consumers)
     with ExitStack() as stack:
         interruption = stack.enter_context(noting_signals())
-        poller = stack.enter_context(closing(Poller(plant)))  # first: if it fails, no recording is created
-        if out:
-            takers.append(stack.enter_context(_open(out, plant.metadata(), rotation)).write)
+        poller = stack.enter_context(closing(Poller(plant)))  # opened first: if it fails, no file is created
+        writer = stack.enter_context(_open(out, plant.metadata(), how)) if out else None
+        if writer:
+            takers.append(writer.write)
 
         def hand_out() -> None:
             while batch := poller.take():
@@ -72,19 +89,20 @@ def polling_session(
                     try:
                         take(batch)
                     except BaseException:
-                        takers.remove(take)  # later rows would leave a gap in a recording
+                        # this consumer lost the batch, so further rows would leave a hole in its recording
+                        takers.remove(take)
                         raise
 
         try:
-            yield PollingSession(poller, interruption, hand_out)
+            yield PollingSession(poller, interruption, hand_out, writer)
         finally:
-            hand_out()  # rows that the poller delivered while closing, also after a failure
+            hand_out()  # the rows that the poller delivered since the last call, even after a failure
 
 
 POINT_S = 0.25  # s between two points of a history
 HISTORY = 240  # limit of a history's points: those of the last minute
 RECENT = 5.0  # period in s over which rates are measured
-MISSED = 1.0  # age in s from which a value is old if newer requests for it failed
+MISSED = 1.0  # if the last request for a register failed, its value is old after this many s
 FREQUENCY, CURRENT, FAULT, STATE = "output_frequency", "output_current", "fault", "status"
 
 _NOTHING = Statistics(1.0, Counters())
@@ -96,11 +114,11 @@ class LiveDrive:
 
     line: PlantLine
     polled: PolledDrive
-    cycle: float = 0.0  # planned cycle time of its line, in s
-    line_utilisation: float = 1.0  # planned; from 1 on, polling leaves no spare line time
-    newest: dict[str, Row] = field(default_factory=dict)  # newest sample by register
-    missed: dict[str, Row] = field(default_factory=dict)  # misses that are newer than the register's sample
-    last_miss: str = ""  # status of the last miss, except misses whose request was not sent
+    cycle: float = 0.0  # planned cycle time of the drive's line, in s
+    line_utilisation: float = 1.0  # planned utilisation; at 1 and above, polling leaves no spare line time
+    newest: dict[str, Row] = field(default_factory=dict)  # newest sample of each register
+    missed: dict[str, Row] = field(default_factory=dict)  # register: its last miss, if newer than its sample
+    last_miss: str = ""  # status of the last miss whose request was sent
     so_far: Statistics = _NOTHING
     recent: Statistics = _NOTHING
     history: deque[float | None] = field(default_factory=lambda: deque(maxlen=HISTORY))
@@ -127,24 +145,25 @@ class LiveDrive:
         row = self.newest.get(name)
         if row is None or row.value is None:
             return ""
-        return value_text(self.polled.drive.register(name), row.value)
+        return value_text(self.polled.find_register(name), row.value)
 
     def age(self, now_ns: int) -> float | None:
         """Return how old the newest sample is, in s; None without any sample."""
-        newest = max((row.time_ns for row in self.newest.values()), default=None)
+        polled = (self.newest.get(poll.register.name) for poll in self.polled.polls)
+        newest = max((row.time_ns for row in polled if row), default=None)
         return None if newest is None else max(0.0, (now_ns - newest) / 1e9)
 
     def is_old(self, name: str, now_ns: int) -> bool:
         """Return True if a register's newest value is no longer current."""
         row = self.newest.get(name)
         age = 0.0 if row is None else (now_ns - row.time_ns) / 1e9
-        every = next((poll.every for poll in self.polled.polls if poll.register.name == name), None)
+        every = next((poll.every for poll in self.polled.series if poll.register.name == name), None)
         return age > (MISSED if name in self.missed else current_for(max(every or 0.0, self.cycle)))
 
     @property
     def why_silent(self) -> str:
-        """If every polled register is missed, return why; else ""."""
-        if not self.missed or len(self.missed) < len(self.polled.polls):
+        """If the last request for every polled register failed, return why; else ""."""
+        if any(poll.register.name not in self.missed for poll in self.polled.polls) or not self.missed:
             return ""
         return self.last_miss or max(self.missed.values(), key=lambda row: row.time_ns).status
 
@@ -186,7 +205,7 @@ class LiveDrive:
         return "reverse" if is_reverse else state.condition.value
 
     def _is_bare(self, row: Row) -> bool:
-        """Return True for a register of flags without a set flag, which names no state."""
+        """Return True for a register of flags in which no flag is set, so that it names no state."""
         values = self.polled.drive.register(row.register).values
         return not row.value and values is not None and issubclass(values, Flag)
 
@@ -220,10 +239,11 @@ class LivePlant:
 
     def add(self, rows: Iterable[Row]) -> None:
         for row in rows:
-            self._by_name[row.drive].add(row)
+            if drive := self._by_name.get(row.drive):  # an event has no drive
+                drive.add(row)
 
     def tick(self, now: float, statistics: dict[str, LineStatistics]) -> None:
-        """Take the poller's statistics at the time `now`, in s. Call this once a second."""
+        """Store the poller's statistics of the time `now`, in s. Call this once a second."""
         self._earlier.append((now, statistics))
         while now - self._earlier[0][0] > RECENT:
             self._earlier.popleft()
@@ -244,7 +264,8 @@ class LivePlant:
 # ---- side reads ----
 
 LEAST_PAUSE_S = 0.1  # least pause between two reads
-MOST_SHARE, LEAST_SHARE = 0.05, 0.01  # share of a line's time: with spare time, and on a full line
+# share of the line's time for side reads: on a line with spare time, and on a full line
+MOST_SHARE, LEAST_SHARE = 0.05, 0.01
 
 
 class SideRead(NamedTuple):

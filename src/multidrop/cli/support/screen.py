@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from math import ceil
 from types import TracebackType
 from typing import NamedTuple, Self, TextIO
 
@@ -16,6 +17,8 @@ COLOURS = {"red": "31", "yellow": "33", "white": "37", "on-red": "41"}
 ATTRIBUTES = {"bold": "1", "dim": "2", "underline": "4", "reverse": "7"}
 _OPEN, _CLOSE = "\x1b[?1049h\x1b[?25l", "\x1b[?25h\x1b[?1049l"  # enter and leave the alternate screen
 _HOME = "\x1b[H"
+BLOCKS, PLAIN_BLOCKS = "▁▂▃▄▅▆▇█", "_.-=+*#@"  # characters of sparklines, on Unicode terminals and on others
+LARGEST = 1e150  # larger values are not drawn, because their sums would overflow
 
 
 class TextLine(NamedTuple):
@@ -44,13 +47,13 @@ class Screen:
     def __init__(self, terminal: TextIO | None = None) -> None:
         self._terminal = terminal or sys.stdout
         self._encoding = self._terminal.encoding or "ascii"
-        self.has_blocks = "utf" in self._encoding.lower()
+        self.blocks = blocks_of(self._terminal)
         self.scrolls = os.environ.get("TERM", "").lower() in ("dumb", "unknown")
         self._codes = ATTRIBUTES | ({} if os.environ.get("NO_COLOR") else COLOURS)
 
     @property
     def size(self) -> tuple[int, int]:
-        """Return the columns and lines of a picture. If it scrolls, the terminal's last line stays empty."""
+        """Return a picture's columns and lines. On a terminal that scrolls, the last line stays empty."""
         width, height = shutil.get_terminal_size()
         return width, height - self.scrolls
 
@@ -98,3 +101,37 @@ class Screen:
     def _write(self, text: str) -> None:
         self._terminal.write(text)
         self._terminal.flush()
+
+
+def blocks_of(terminal: TextIO) -> str:
+    """Return the characters of sparklines that a terminal can show."""
+    return BLOCKS if "utf" in (terminal.encoding or "").lower() else PLAIN_BLOCKS
+
+
+def sparkline(
+    history: Iterable[float | None], width: int, blocks: str = BLOCKS, points: int | None = None
+) -> str:
+    """Draw a history in at most `width` columns, scaled from its smallest value to its largest.
+
+    None and values beyond LARGEST, such as infinity, are blanks.
+
+    If the history has more points than columns, each column shows the mean of several points. `points` is the
+    number of points recorded so far, including those that the history has dropped. With it, points that share
+    a column in one picture also share a column in the next.
+    """
+    values = list(history)
+    share = max(1, ceil(len(values) / width)) if width > 0 else 0
+    if not share:
+        return ""
+    first = (len(values) if points is None else points) - len(values)
+    columns: dict[int, list[float]] = {}
+    for number, value in enumerate(values, first):
+        drawn = [] if value is None or abs(value) > LARGEST else [value]
+        columns.setdefault(number // share, []).extend(drawn)
+    means = [sum(column) / len(column) if column else None for column in columns.values()][-width:]
+    there = [mean for mean in means if mean is not None]
+    low, high = min(there, default=0.0), max(there, default=0.0)
+    # without 0 in the range, a steady value would look like 0, and noise like large changes
+    low = min(low, 0.0)
+    span, highest = high - low or 1.0, len(blocks) - 1
+    return "".join(" " if mean is None else blocks[round((mean - low) / span * highest)] for mean in means)

@@ -48,7 +48,7 @@ def end_signals_interrupt() -> Iterator[None]:
 
     def close(number: int, frame: FrameType | None) -> None:
         nonlocal is_closed
-        if not is_closed:  # ignore further SIGHUPs: a shell and the system may send one each
+        if not is_closed:  # further SIGHUPs are ignored: both the shell and the system may send one
             is_closed = True
             raise KeyboardInterrupt
 
@@ -57,7 +57,7 @@ def end_signals_interrupt() -> Iterator[None]:
 
 
 class Interruption:
-    """Notes end signals: the first sets `came`. A second SIGINT or SIGTERM raises KeyboardInterrupt."""
+    """Records signals that end a command. The first sets `came`; a second SIGINT or SIGTERM raises."""
 
     def __init__(self) -> None:
         self.came = False
@@ -132,7 +132,8 @@ def run_loop(work: Coroutine[Any, Any, T]) -> T:
 
     try:
         with ExitStack() as stack:
-            with noting_signals() as interruption:  # Python prints a traceback for an incomplete event loop
+            # signals are only noted, because Python would print a traceback for an incomplete event loop
+            with noting_signals() as interruption:
                 runner = stack.enter_context(asyncio.Runner())
             if interruption.came:
                 raise KeyboardInterrupt
@@ -140,14 +141,14 @@ def run_loop(work: Coroutine[Any, Any, T]) -> T:
     except asyncio.CancelledError:
         raise KeyboardInterrupt from None
     finally:
-        work.close()  # Python prints a warning for a coroutine that never started
+        work.close()  # otherwise Python prints a warning that the coroutine never started
 
 
 @contextmanager
 def end_signals_cancel() -> Iterator[None]:
     """Cancel the running asyncio task at the first end signal, and then raise KeyboardInterrupt.
 
-    An exception raised directly inside a task, such as a library's, could leave other tasks waiting forever.
+    If a signal raised an exception directly inside a library's task, other tasks could wait forever.
     """
     import asyncio
 

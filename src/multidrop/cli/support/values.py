@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import textwrap
 from collections.abc import Iterable, Sequence
 from enum import Flag, IntEnum
@@ -12,12 +13,21 @@ from unicodedata import combining, east_asian_width
 from multidrop.cli.support.output import warn
 from multidrop.core import NumberFormat
 from multidrop.drive.register import Register, unnamed_bits
+from multidrop.drive.titles import chosen_language
 
 Row = Sequence[str]
 T = TypeVar("T", bound=float)
 WIDTH = 80  # characters of a line
-LONGEST_NAME = 24  # in columns; longer names are shortened so that tables fit a terminal
+# limit of a name's width in columns; longer names are shortened so that tables fit a terminal
+LONGEST_NAME = 24
 _PRECISIONS = {NumberFormat.F16: "half", NumberFormat.F32: "single", NumberFormat.F64: "double"}
+
+
+def user_title(register: Register[Any]) -> str:
+    """Return the register's title in the language of the environment; "" if it repeats the name."""
+    given = next(filter(None, map(os.environ.get, ("LC_ALL", "LC_MESSAGES", "LANG"))), "")
+    title = register.title_in(chosen_language([given]))
+    return "" if title == register.title else title
 
 
 def aligned(rows: Iterable[Row], alignment: str, between: str = "  ") -> list[str]:
@@ -39,7 +49,7 @@ def padded(text: str, side: str, width: int) -> str:
 
 
 def wrapped(text: str, first: str = "", rest: str = "", *, breaks_words: bool = True) -> list[str]:
-    """Wrap a text to WIDTH. `first` is put before the first line, `rest` before the others."""
+    """Wrap a text to WIDTH. `first` is put before the first line, `rest` before the other lines."""
     return textwrap.wrap(
         text,
         WIDTH,

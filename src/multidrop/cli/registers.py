@@ -1,28 +1,48 @@
-"""`multidrop read`: reads values of one drive and prints them with their units."""
+"""`multidrop read` and `write`: print values of one drive with their units, or write one register."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import sys
 from typing import Any
 
-from multidrop.cli.support.arguments import add_json_argument, add_target_arguments, target_of
+from multidrop.cli.support.arguments import (
+    add_json_argument,
+    add_target_arguments,
+    add_writing_arguments,
+    check_words,
+    target_of,
+)
 from multidrop.cli.support.output import print_text
-from multidrop.cli.support.values import Row, aligned, as_json, as_row
+from multidrop.cli.support.values import Row, aligned, as_json, as_row, nearest_value, user_title
+from multidrop.cli.support.writing import confirm, reporting_interruption
+from multidrop.control.rules import check_plain, raw_count, refused
 from multidrop.core import Status
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.text import Text
 from multidrop.errors import DriveException, NoValue
 
+_FURTHER = ("REGISTER", "VALUE")  # arguments of `write` after the drive
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_target_arguments(parser, "[REGISTER ...]")
-    parser.description = f"{parser.description} Without REGISTER, all readable registers are read."
+    if parser.get_default("command") == "write":
+        add_target_arguments(parser, *_FURTHER)
+        parser.description = f"{parser.description} VALUE is in the register's unit, or a name."
+        add_writing_arguments(parser)
+    else:
+        add_target_arguments(parser, "[REGISTER ...]")
+        parser.description = f"{parser.description} Without REGISTER, all readable registers are read."
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
+    return _run_write(arguments) if arguments.command == "write" else _run_read(arguments)
+
+
+def _run_read(arguments: argparse.Namespace) -> int:
     target, names = target_of(arguments)
     drive = target.drive
     texts = [drive.texts[name] for name in names if name in drive.texts]
@@ -41,7 +61,8 @@ def run(arguments: argparse.Namespace) -> int:
         shown = {one.name: _as_json(one, value) for one, value in (values | read_texts).items()}
         print_text(json.dumps(record | {"values": shown}, indent=2))
     else:
-        lines = aligned(map(_row, values, values.values()), "<><")
+        rows = [(*_row(one, value), user_title(one)) for one, value in values.items()]
+        lines = aligned(rows, "<><<")
         lines += aligned(map(_row, read_texts, read_texts.values()), "<<<")
         print_text("\n".join(lines))
     answers = (*values.values(), *read_texts.values())
@@ -49,18 +70,18 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _read(drive: Drive, wanted: list[Register[Any]]) -> dict[Register[Any], Any]:
-    """Return each register's value, the exception that the drive replied, or None if the value is invalid."""
+    """Return each register's value, or the drive's exception reply, or None for an invalid value."""
     try:
         found = drive.read_many(wanted)
     except NoValue as lack:
         found = dict(lack.values)
-    except DriveException:  # read the registers one by one to find which one caused it
+    except DriveException:  # read the registers one by one to find the one that caused the exception
         return {register: _read_one(drive, register) for register in wanted}
     return {register: found.get(register.name) for register in wanted}
 
 
 def _read_one(drive: Drive, wanted: Register[Any] | Text) -> Any:
-    """Return the value of a register or text, the drive's exception, or None if the value is invalid."""
+    """Return the value of a register or text, the drive's exception reply, or None for an invalid value."""
     try:
         return drive.read(wanted)
     except NoValue:
@@ -83,3 +104,26 @@ def _as_json(wanted: Register[Any] | Text, value: Any) -> dict[str, Any]:
     if value is None:
         return {"value": None, "reason": str(Status.NO_VALUE)}
     return {"value": value} if isinstance(wanted, Text) else as_json(wanted, value)
+
+
+def _run_write(arguments: argparse.Namespace) -> int:
+    target, words = target_of(arguments)
+    check_words(arguments, words, _FURTHER)
+    drive = target.drive
+    register = drive.register(words[0])
+    if register.never:
+        raise refused(drive, register, register.never)
+    value = nearest_value(register, register.parse(words[1]))
+    check_plain(drive, register, raw_count(drive, register, value))  # checked before the port is opened
+    confirm(f"Write {register.name} = {register.format(value)} to {drive.name} on {target.port}?", arguments)
+    with reporting_interruption(drive, "write") as known, target.open_bus(arguments.audit):
+        known.clear()
+        outcome = drive.try_write(register, value)
+        known.append(str(outcome))
+    if arguments.json:
+        held = outcome.asked if outcome.held is None else outcome.held
+        record = {"drive": drive.name, "register": register.name} | as_json(register, held)
+        print_text(json.dumps(record | {"outcome": outcome.effect.value}, indent=2))
+    else:
+        print_text(outcome, file=sys.stdout if outcome.ok else sys.stderr)
+    return 0 if outcome.ok else 1
