@@ -12,12 +12,7 @@ from captures import BEGIN, RTU, STEP, TEXT, rows, write
 from examples import usually
 
 from multidrop.capture import Capture, CaptureWriter, Decoding, Side
-from multidrop.core import (
-    Framing,
-    Message,
-    build_reply,
-    build_request,
-)
+from multidrop.core import Framing, Message, build_reply, build_request
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 from multidrop.polling.batch import Row
@@ -68,7 +63,7 @@ def _text(frame: bytes) -> str:
     return frame.decode().replace("\r\n", "\\r\\n") if frame[:1] == b":" else frame.hex(" ").upper()
 
 
-def test_several_registers_are_a_row_each(tmp_path: Path) -> None:
+def test_each_register_of_a_block_gets_its_own_row(tmp_path: Path) -> None:
     exchange = next(
         each for each in RTU if _text(each.request_frame) == "01 10 00 0C 00 02 04 00 C8 01 90 73 F8"
     )
@@ -103,15 +98,11 @@ def test_a_request_without_a_reply_is_a_miss_with_its_reason(tmp_path: Path) -> 
         capture.write(exchange.frame, Side.ANSWERING, 6, "hall-1")
     assert [
         (row.time_ns, row.uncertainty_ns, row.value, row.status) for row in rows(tmp_path / "a.pcapng")
-    ] == [
-        (1, None, None, "no reply"),
-        (2, None, None, "bad checksum"),
-        (4, 2, 5000, "ok"),
-    ]
+    ] == [(1, None, None, "no reply"), (2, None, None, "bad checksum"), (4, 2, 5000, "ok")]
 
 
 @pytest.mark.long
-def test_more_names_than_a_batch_can_hold_are_more_batches(tmp_path: Path) -> None:
+def test_names_beyond_the_limit_of_a_batch_start_another_batch(tmp_path: Path) -> None:
     """All 65536 holding registers are read, and then some input registers."""
     ends = {3: 65500, 4: 10_000}
     with CaptureWriter(tmp_path / "a.pcapng") as capture:
@@ -141,21 +132,21 @@ def frames_of(path: Path, exchanges: Iterable[tuple[Message, Message | None]]) -
 
 @pytest.mark.long
 @pytest.mark.parametrize(("data", "end"), usually((b"\0\7", (7, "ok")), (b"", (None, "no reply"))))
-def test_more_requests_than_are_cached_are_decoded(
+def test_requests_beyond_the_cache_size_are_decoded_too(
     tmp_path: Path, data: bytes, end: tuple[float | None, str]
 ) -> None:
-    """The decoder's hash table of requests has 16384 places, and is full at three quarters of them."""
+    """The decoder's hash table of requests has 16384 places, and counts as full at 12288 requests."""
     asked = [Message(1 + number % 2, 3, number // 2, 1) for number in range(13_000)]
     replies = (Message(each.address, 3, each.start, 1, data) if data else None for each in asked)
     path = frames_of(tmp_path / "a.pcapng", zip(asked, replies, strict=True))
-    told = asked if data else asked[:-1]  # it is unknown whether the last request was answered
+    told = asked if data else asked[:-1]  # the last request is still pending, and may be answered later
     assert [(row.drive, row.register, row.value, row.status) for row in rows(path)] == [
         (f"address {record.address}", f"holding_register_{record.start}", *end) for record in told
     ]
 
 
-def test_an_oversized_request_has_rows_for_a_reply_s_registers(tmp_path: Path) -> None:
-    """Noise, or a faulty master, may request all registers of a kind; a reply has at most 125 registers."""
+def test_an_oversized_request_gets_rows_only_for_as_many_registers_as_a_reply_holds(tmp_path: Path) -> None:
+    """Because of noise or a faulty master, a request may name all registers. A reply has at most 125."""
     path = tmp_path / "a.pcapng"
     with CaptureWriter(path) as capture:
         for time, function in enumerate((3, 4, 1, 2, 3)):
@@ -176,10 +167,10 @@ def test_an_oversized_request_has_rows_for_a_reply_s_registers(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("reply", "end"), [(Message(1, 3, 0, 100, bytes(200)), (0, "ok")), (None, (None, "no reply"))]
 )
-def test_more_rows_than_a_batch_can_hold_are_more_batches(
+def test_rows_beyond_the_limit_of_a_batch_start_another_batch(
     tmp_path: Path, reply: Message | None, end: tuple[float | None, str]
 ) -> None:
-    """All rows of an exchange are in the same batch."""
+    """The rows of one exchange are never divided between two batches."""
     count = 700 if reply else 701
     path = frames_of(tmp_path / "a.pcapng", [(Message(1, 3, 0, 100), reply)] * count)
     with Capture(path) as capture:

@@ -17,12 +17,12 @@ from captures import decimal, tshark
 from commands import Run
 from line_driver import MS, LineDriver
 from lines import PATIENCE, Faulty, LateWire, line, plant, polled, rows_of, served
+from motors import LATEST, fast_drives, real_drives, real_wires
 from recordings import recorded
-from variants import LATEST, fast_drives, real_drives, real_wires
 
 from multidrop.capture import Capture, CaptureWriter, Decoding, FlightRecorder, Side, Tapped
 from multidrop.capture import tap as flight
-from multidrop.capture.pcapng_writer import WRAPPINGS
+from multidrop.capture.pcapng import WRAPPINGS
 from multidrop.capture.tap import AnomalyWatch
 from multidrop.cli.poll import tap_text
 from multidrop.core import Exchange, Framing, Message, NumberFormat, Peer, Splitter, Status, Tap
@@ -85,7 +85,9 @@ def echoing_wires() -> list[Wire]:
 def captured(
     capture: Path, make: Callable[[], list[Wire]], drives: list[PolledDrive], enough: Counter[str]
 ) -> tuple[list[Row], list[Row]]:
-    """Poll until there are `enough` rows of each status; return the polled rows, and those of the capture."""
+    """Poll until each status has as many rows as in `enough`. Return the polled rows and the rows of the
+    capture.
+    """
     with served(make) as (path,):
         known = plant(line(path, *drives, name="hall-1"))
         poller = Poller(known)
@@ -106,7 +108,7 @@ def captured(
 
 
 def by_exchange(rows: list[Row]) -> dict[int, list[tuple[object, ...]]]:
-    """Return the rows of requests that were sent, by request time, without the monotonic clock."""
+    """Return the rows of requests that were sent, by request time, without their monotonic time."""
     found: dict[int, list[tuple[object, ...]]] = {}
     for row in rows:
         if row.status not in NEVER_ON_THE_LINE:
@@ -115,18 +117,18 @@ def by_exchange(rows: list[Row]) -> dict[int, list[tuple[object, ...]]]:
     return {time: sorted(found[time], key=str) for time in found}
 
 
-IN_DOUBT_NS = 100_000_000  # longer than any time-out: the value may answer an earlier request
+IN_DOUBT_NS = 100_000_000  # longer than any timeout; a value this late may answer an earlier request
 
 
 def by_time(rows: list[Row]) -> dict[int, list[tuple[object, ...]]]:
-    """Return `by_exchange` without values that may answer an earlier request, whose time they then have."""
+    """Return `by_exchange` of the rows, without values so late that they may answer an earlier request."""
     return by_exchange([row for row in rows if (row.uncertainty_ns or 0) < IN_DOUBT_NS])
 
 
 def check(rows: list[Row], decoded: list[Row]) -> None:
-    """Check that the capture has the poll's exchanges, except the last one, which may be incomplete.
+    """Check that the capture has all exchanges of the poll, except the last one, which may be incomplete.
 
-    Probes for an echo or for late replies, and repeated requests, are only in the capture.
+    Only the capture has repeated requests, and probes that check for an echo or a late reply.
     """
     recorded = list(by_time(rows).items())
     read = by_exchange(decoded)
@@ -136,7 +138,7 @@ def check(rows: list[Row], decoded: list[Row]) -> None:
 
 @dataclass(frozen=True)
 class Mixed:
-    """A poll of all variants at the pace of a real line."""
+    """A poll of all family variants, at the pace of a real line."""
 
     drives: list[PolledDrive]
     capture: Path
@@ -203,13 +205,9 @@ def epoch(time_ns: int) -> str:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "make",
-    [
-        pytest.param(rough_wires, id="rough"),
-        pytest.param(echoing_wires, id="echoing"),
-    ],
+    "make", [pytest.param(rough_wires, id="rough"), pytest.param(echoing_wires, id="echoing")]
 )
-def test_noise_echo_damage_and_late_replies_decode_as_in_the_poll(
+def test_a_capture_of_a_disturbed_line_decodes_to_the_polled_rows(
     tmp_path: Path, make: Callable[[], list[Wire]]
 ) -> None:
     drives = [polled(drive, drive.readings()) for drive in fast_drives()]
@@ -228,11 +226,25 @@ def test_a_damaged_reply_is_modbus_with_a_bad_checksum_in_wireshark(tmp_path: Pa
     assert noise["data.data"] == frame.hex()
 
 
-def test_uncollected_bytes_are_counted() -> None:
+ASK = Message(1, 3, 2, 1)
+GOOD = bytes.fromhex("01 03 02 13 88 B5 12")  # Delixi, part 2
+
+
+def new_peer() -> Peer:
+    return Peer(least_timeout=0.02, most_timeout=0.2)
+
+
+def asking(peer: Peer | None = None) -> Exchange:
+    """Return an exchange with the request ASK, on a line at 9600 baud."""
+    return Exchange(
+        Framing.RTU, ASK, peer or new_peer(), baudrate=9600, format="8N1", character=1e-3, silence=4e-3
+    )
+
+
+def test_bytes_lost_from_a_full_capture_buffer_are_counted() -> None:
     """Noise fills the tap's buffer until 4000 bytes are lost."""
     driver, tap, told = LineDriver(), Tap(), 0
-    peer = Peer(least_timeout=0.02, most_timeout=0.2)
-    driver.begin(Exchange(Framing.RTU, ASK, peer, baudrate=9600, format="8N1", character=1e-3, silence=4e-3))
+    driver.begin(asking())
     driver._line.tap = tap.c
     while not tap.lost:
         driver.receive(b"\xff" * 4000)
@@ -247,10 +259,9 @@ def test_uncollected_bytes_are_counted() -> None:
 
 
 def test_a_capture_has_the_noise_around_a_reply() -> None:
-    """950 bytes of noise precede the reply, and 400 follow it in the same piece: more than the line keeps."""
+    """The noise before the reply is longer than the line's buffer; more noise is received with the reply."""
     driver, tap = LineDriver(), Tap()
-    peer = Peer(least_timeout=0.02, most_timeout=0.2)
-    driver.begin(Exchange(Framing.RTU, ASK, peer, baudrate=9600, format="8N1", character=1e-3, silence=4e-3))
+    driver.begin(asking())
     driver._line.tap = tap.c
     driver.wait_until_write()
     driver.receive(b"\xff" * 950)
@@ -271,14 +282,11 @@ def times_of(packets: bytes) -> list[int]:
 
 
 def test_frames_have_the_times_of_their_exchange_after_clock_changes() -> None:
-    driver, tap = LineDriver(), Tap()
-    peer = Peer(least_timeout=0.02, most_timeout=0.2)
+    driver, tap, peer = LineDriver(), Tap(), new_peer()
     asked = []
     driver._line.tap = tap.c
     for ahead_ns in (HOUR_NS, 3 * HOUR_NS):
-        driver.begin(
-            Exchange(Framing.RTU, ASK, peer, baudrate=9600, format="8N1", character=1e-3, silence=4e-3)
-        )
+        driver.begin(asking(peer))
         driver.found.utc_ahead_ns = ahead_ns
         driver.wait_until_write()
         asked.append(driver.found.sent_ns + ahead_ns)
@@ -287,7 +295,7 @@ def test_frames_have_the_times_of_their_exchange_after_clock_changes() -> None:
         assert driver.completion.raw == GOOD
         asked.append(driver.found.first_ns + ahead_ns)
     driver.now += 5 * MS
-    driver.receive(b"\xff")  # outside of any exchange
+    driver.receive(b"\xff")  # a byte outside of any exchange
     found = times_of(b"".join(tap.take(WRAPPINGS, 0, 5 * HOUR_NS)))
     assert found == [*asked, driver.now + 5 * HOUR_NS]
 
@@ -305,7 +313,7 @@ class Flight:
         self.recorder = FlightRecorder(directory, ["hall-1"], **details)
 
     def pass_(self, seconds: float, *troubles: str) -> None:
-        """Let `seconds` pass with one byte per second on the line, then report these anomalies."""
+        """Let `seconds` s pass with one byte per second on the line, then report the anomalies `troubles`."""
         for _ in range(round(seconds)):
             self.seconds += 1
             time_ns = round(self.seconds * 1e9)
@@ -325,7 +333,7 @@ def seconds_in(path: Path) -> list[int]:
         ]
 
 
-def test_an_anomaly_writes_the_minutes_before_and_after_it(
+def test_an_anomaly_saves_the_minutes_before_and_after_it_to_a_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one_flight = Flight(tmp_path / "flights", monkeypatch, seconds=20)
@@ -343,7 +351,7 @@ def test_an_anomaly_writes_the_minutes_before_and_after_it(
 
 def test_two_recorders_may_write_in_the_same_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for _ in range(2):
-        one_flight = Flight(tmp_path, monkeypatch)  # both clocks start at the same time
+        one_flight = Flight(tmp_path, monkeypatch)  # the clocks of both recorders start at the same time
         one_flight.pass_(10, "hall-1: pump-1: bad checksum")
         one_flight.pass_(5)
     assert sorted(path.name for path in tmp_path.iterdir()) == [
@@ -352,7 +360,9 @@ def test_two_recorders_may_write_in_the_same_second(tmp_path: Path, monkeypatch:
     ]
 
 
-def test_a_line_in_trouble_does_not_fill_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flight_recordings_of_a_faulty_line_do_not_fill_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     one_flight = Flight(tmp_path, monkeypatch, seconds=20, most_files=3)
     (tmp_path / "flight-plan.pcapng").touch()  # a user's own file
     for _ in range(600):
@@ -365,11 +375,11 @@ def test_a_line_in_trouble_does_not_fill_the_disk(tmp_path: Path, monkeypatch: p
 
 @pytest.mark.parametrize("most_files", [0, -1])
 def test_a_flight_recorder_without_files_is_refused(tmp_path: Path, most_files: int) -> None:
-    with pytest.raises(ValueError, match=f"most_files = {most_files} would keep no capture"):
+    with pytest.raises(ValueError, match=f"most_files = {most_files}: it must be 1 or more"):
         FlightRecorder(tmp_path, ["hall-1"], most_files=most_files)
 
 
-def test_memory_stays_within_its_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flight_recorder_keeps_its_limit_of_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one_flight = Flight(tmp_path, monkeypatch, most_bytes=1000)
     one_flight.pass_(200, "hall-1: the port was lost")
     one_flight.recorder.close()
@@ -379,7 +389,9 @@ def test_memory_stays_within_its_limit(tmp_path: Path, monkeypatch: pytest.Monke
     assert seconds == list(range(seconds[0], 1201))
 
 
-def test_pending_anomalies_are_written_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pending_anomalies_are_written_when_the_recorder_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     one_flight = Flight(tmp_path, monkeypatch)
     one_flight.pass_(3)
     one_flight.recorder.close()
@@ -389,7 +401,7 @@ def test_pending_anomalies_are_written_at_the_end(tmp_path: Path, monkeypatch: p
     assert [seconds_in(path) for path in one_flight.recorder.written] == [list(range(1001, 1007))]
 
 
-def test_a_directory_that_cannot_be_made_raises_one_sentence(tmp_path: Path) -> None:
+def test_a_directory_that_cannot_be_made_raises_a_one_sentence_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RecordingError, match="cannot be written"):
         FlightRecorder(tmp_path / "file" / "flights", [])
@@ -398,19 +410,13 @@ def test_a_directory_that_cannot_be_made_raises_one_sentence(tmp_path: Path) -> 
 # ---- what counts as an anomaly ----
 
 
-ASK = Message(1, 3, 2, 1)
-GOOD = bytes.fromhex("01 03 02 13 88 B5 12")  # Delixi, part 2
-
-
 class Watched:
     """A drive, its line with a clock that the test sets, and the line's AnomalyWatch."""
 
     def __init__(self) -> None:
         self.line = LineDriver()
-        peer = Peer(least_timeout=0.02, most_timeout=0.2)
-        self._exchange = Exchange(
-            Framing.RTU, ASK, peer, baudrate=9600, format="8N1", character=1e-3, silence=4e-3
-        )
+        peer = new_peer()
+        self._exchange = asking(peer)
         self.port: Any = SimpleNamespace(lost=False)
         pump: Any = SimpleNamespace(name="pump-1")
         bus: Any = SimpleNamespace(line=self, drives=[pump], peer=lambda drive: peer)
@@ -423,7 +429,8 @@ class Watched:
     def told(self, reply: bytes) -> list[str]:
         """Carry out an exchange with this reply; return its anomalies.
 
-        It starts 1 s after the last one, when no late reply to that is possible."""
+        The exchange starts 1 s after the previous one, so that no late reply to the previous one is
+        possible."""
         self.line.now += 1000 * MS
         self.line.begin(self._exchange)
         self.line.wait_until_write()
@@ -446,15 +453,15 @@ def test_damaged_and_late_replies_are_anomalies() -> None:
     assert pump.told(GOOD) == ["hall-1: pump-1: late reply"]
 
 
-def test_a_drive_that_falls_silent_is_one_anomaly() -> None:
+def test_a_drive_that_falls_silent_causes_one_anomaly() -> None:
     pump = Watched()
-    assert [pump.told(b"") for _ in range(5)] == [[]] * 5  # it has never answered
+    assert [pump.told(b"") for _ in range(5)] == [[]] * 5  # no anomaly: the drive has never answered
     assert pump.told(GOOD) == []
     assert [pump.told(b"") for _ in range(5)] == [[], [], ["hall-1: pump-1: fell silent"], [], []]
     assert pump.told(GOOD) == []
 
 
-def test_a_lost_port_is_one_anomaly() -> None:
+def test_a_lost_port_causes_one_anomaly() -> None:
     pump = Watched()
     open_port = pump.port
     for lost in (SimpleNamespace(lost=True), None):
@@ -493,7 +500,7 @@ def test_a_poll_is_captured(tmp_path: Path, run: Run, mixed_plant: Path) -> None
 
 
 @pytest.mark.slow
-def test_a_flight_is_written_when_a_drive_s_replies_are_damaged(
+def test_the_flight_recorder_saves_a_capture_when_a_drive_s_replies_are_damaged(
     tmp_path: Path, run: Run, mixed_plant: Path, wire: Faulty
 ) -> None:
     wire.fate = lambda reply: reply[:-1] + bytes([reply[-1] ^ 1])

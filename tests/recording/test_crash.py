@@ -30,11 +30,11 @@ from multidrop.sim.memory import MemoryCell
 
 SEED = 6
 MOST_TOLD = 9  # limit of lines that a client reports before it is killed
-LONGEST_WAIT = 0.03  # s, limit from the last awaited line to the kill
+LONGEST_WAIT = 0.03  # limit in s of the time from the last awaited line to the kill
 
 
 class Counting(SimulatedDrive):
-    """A drive whose register `count` is the number of its reads, and which lists every written number."""
+    """A drive whose register `count` is the number of its reads. It lists every written number."""
 
     def __init__(self) -> None:
         super().__init__(Counted(1, name=NAME))
@@ -66,10 +66,12 @@ class Nursery:
         )
 
     def live(self, life: str, number: int, lines: int, seconds: float) -> int:
-        """Kill a client `seconds` after it has reported `lines` lines; return its exit status."""
+        """Start a client, kill it `seconds` s after it has reported `lines` lines, and return its exit
+        status.
+        """
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._process.stdin.write(f"{self._port} {self._directory} {life} {number}\n")
+        self._process.stdin.write(f"poll {self._port} {self._directory} {life} {number}\n")
         child = int(self._process.stdout.readline())
         try:
             until(lambda: len(told(self._directory, life)) >= lines)
@@ -102,9 +104,10 @@ def told(directory: Path, life: str) -> list[str]:
 
 
 def check_rows(rows: Sequence[Row]) -> None:
-    """Check that the count grows by one from value to value, or by more across rows without a value.
+    """Check that the count grows by one from value to value, and by at most one more for each row without a
+    value.
 
-    On a busy machine a drive may be treated as silent; then some rows report that it was not asked.
+    On a busy machine a drive may be treated as silent. Then some rows have a status "not asked".
     """
     samples = [row for row in rows if row.value is not None]
     assert all(before.monotonic_ns < after.monotonic_ns for before, after in pairwise(samples))
@@ -144,7 +147,9 @@ def check_ledger(directory: Path, sent: int, lives: int) -> None:
 
 
 def check_audit(directory: Path, numbers: Sequence[int], acknowledged: Sequence[int], lives: int) -> None:
-    """Check that the audit log has every acknowledged write as done, no write twice, and no unsent write."""
+    """Check that the audit log has each acknowledged write, as done, and neither a write twice nor an unsent
+    write.
+    """
     path = audit(directory)
     records = list(read_audit(path)) if path.exists() else []
     noted = [int(str(record["write"]).removeprefix("number = ")) for record in records]

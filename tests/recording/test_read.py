@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 import pyarrow as pa
+import pyarrow.ipc
 import pytest
 from batches import EXAMPLE, METADATA, counting, example
 from recordings import ABOUT, SCHEMA, record, recorded, row, rows_of
@@ -70,7 +73,7 @@ def test_the_wide_form_joins_rows_of_several_batches(path: Path) -> None:
             assert table[f"pump-1.{register}"][number] == expected.get((time, register))
 
 
-def test_columns_that_are_in_the_metadata_may_have_no_row(tmp_path: Path) -> None:
+def test_a_column_in_the_metadata_may_have_no_rows(tmp_path: Path) -> None:
     path = record(tmp_path / "run.arrows", [row(1, "pump", "output_frequency", 50.0)], ABOUT)
     wide = multidrop.open_recording(path).wide("fan.output_current", PUMP)
     assert pa.table(wide).column("fan.output_current").to_pylist() == [None]
@@ -106,7 +109,7 @@ def test_a_file_that_is_not_a_recording_is_an_error(tmp_path: Path) -> None:
         multidrop.open_recording(3)  # type: ignore[arg-type]
 
 
-def test_script_steps_are_public() -> None:
+def test_steps_of_verb_scripts_are_public_names() -> None:
     assert next(steps.read(Toy.output_current)) == Read(Toy.output_current)
     assert next(steps.wait(2.0)) == Wait(2.0)
 
@@ -125,3 +128,36 @@ def test_a_recording_shows_its_rows_drives_and_span(tmp_path: Path) -> None:
     about = r"^<recording .*run\.csv: 4 rows of 2 drives, 3\.000 s from .*>$"
     path = record(tmp_path / "run.csv", [row(at, f"pump-{at % 2}", "speed", 1.0) for at in range(4)])
     assert re.match(about, repr(multidrop.open_recording(path)))
+
+
+# ---- a machine without nanoarrow can still record ----
+
+
+WITHOUT = "import sys; sys.modules['nanoarrow'] = None; from multidrop.cli import main; sys.exit(main())"
+
+
+def without_nanoarrow(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", WITHOUT, *words]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_polling_and_recording_need_no_nanoarrow(tmp_path: Path) -> None:
+    for name in ("run.arrows", "run.csv"):
+        ran = without_nanoarrow("demo", "--seconds", "1", "--out", name, folder=tmp_path)
+        assert ran.returncode == 0, ran.stderr
+    assert pyarrow.ipc.open_stream(tmp_path / "run.arrows").read_all().num_rows > 5
+    assert len((tmp_path / "run.csv").read_text().splitlines()) > 5
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_reading_without_nanoarrow_names_the_missing_library(tmp_path: Path) -> None:
+    record(tmp_path / "run.arrows", [row(1, "pump", "output_frequency", 50.0)])
+    for words in (("report", "run.arrows"), ("convert", "run.arrows", "run.csv")):
+        ran = without_nanoarrow(*words, folder=tmp_path)
+        assert ran.returncode == 2
+        assert ran.stderr.startswith("multidrop: rows in Arrow's layout")
+        assert ran.stderr.count("\n") == 1
+    assert not (tmp_path / "run.csv").exists()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pyarrow as pa
 import pytest
-from disks import full_at
+from interruptions import full_at
 from recordings import ABOUT, row
 from tables import table
 
@@ -103,7 +103,7 @@ def test_other_metadata_starts_a_segment(tmp_path: Path) -> None:
     )
 
 
-def test_one_process_records_at_a_time(tmp_path: Path) -> None:
+def test_only_one_process_records_at_a_time(tmp_path: Path) -> None:
     path = tmp_path / "run.arrows"
     with SegmentWriter(path, ABOUT, every=60):
         with pytest.raises(ValueError, match=r"run\.arrows is being recorded by another process"):
@@ -128,7 +128,7 @@ def test_an_incomplete_batch_of_a_killed_writer_is_cut_off(tmp_path: Path) -> No
     (_, segment), *_ = segments_of(path)
     os.truncate(segment, segment.stat().st_size - 20)
     SegmentWriter(path, ABOUT, every=60).close()
-    assert pa.ipc.open_stream(segment.read_bytes()).read_all().num_rows == 3  # else pyarrow raises
+    assert pa.ipc.open_stream(segment.read_bytes()).read_all().num_rows == 3  # pyarrow refuses a cut end
 
 
 def test_a_longer_damaged_end_is_never_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,9 +154,7 @@ def test_a_full_disk_is_reported_and_the_segment_continues(tmp_path: Path) -> No
     assert read(path) == [*rows(0), *rows(2)]
 
 
-def test_a_failed_segment_leaves_no_file_and_its_number_is_skipped(
-    tmp_path: Path,
-) -> None:
+def test_a_failed_segment_leaves_no_file_and_its_number_is_skipped(tmp_path: Path) -> None:
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=60) as writer:
         with full_at(10), pytest.raises(RecordingError):
             writer.write(rows(0))
@@ -202,7 +200,7 @@ def test_the_current_segment_is_never_removed(tmp_path: Path, hand: Hand) -> Non
         assert names(tmp_path) == ["run.00000002.arrows"]
 
 
-def test_outlived_files_are_removed() -> None:
+def test_files_beyond_the_limit_of_age_or_size_are_removed() -> None:
     files = [StoredFile(Path(str(number)), number, number * 10.0, 100) for number in (3, 1, 2, 4)]
 
     def gone(now: float, keep: float | None, most: int | None) -> list[int]:
@@ -224,12 +222,12 @@ def test_a_clock_that_jumps_removes_no_segment() -> None:
         return [file.number for file in files if file not in gone]
 
     assert left(8 * DAY, week) == [3, 4, 5, 6, 7]
-    assert left(4000 * DAY, week) == [2, 3, 4, 5, 6, 7]  # after a jump, as if no time had passed
+    assert left(4000 * DAY, week) == [2, 3, 4, 5, 6, 7]  # the clock jumped ahead: the jump is not counted
     ahead = [*week, *(StoredFile(Path(str(n)), n, (4000 + n) * DAY, 100) for n in (8, 9))]
-    assert left(4010 * DAY, ahead) == [4, 5, 6, 7, 8, 9]  # ages grow from there
+    assert left(4010 * DAY, ahead) == [4, 5, 6, 7, 8, 9]  # since the jump, ages grow with the time
     corrected = [*ahead, StoredFile(Path("10"), 10, 10 * DAY, 100)]
-    assert left(11 * DAY, corrected) == [6, 7, 8, 9, 10]  # clock corrected: again those up to 5 days old
-    assert left(16.5 * DAY, corrected) == [5, 6, 7, 8, 9, 10]  # recording paused for longer than `keep`
+    assert left(11 * DAY, corrected) == [6, 7, 8, 9, 10]  # clock corrected: up to 5 days old are left
+    assert left(16.5 * DAY, corrected) == [5, 6, 7, 8, 9, 10]  # recording paused for more than `keep`
     booted_in_1970 = [*week, StoredFile(Path("8"), 8, 60.0, 100)]
     assert left(9 * DAY, booted_in_1970) == [1, 2, 3, 4, 5, 6, 7, 8]
     two = [file._replace(path=Path(f"tens/{file.number}"), end=file.end + 5) for file in week]

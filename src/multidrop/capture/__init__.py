@@ -9,12 +9,12 @@ requests from replies if both look alike (functions 05, 06 and 08):
 
 Broadcasts, ASCII frames, Delixi's own frames and bytes outside of frames are shown as bytes.
 
-`Tapped` taps polled lines: their traffic goes into a capture, or to a `FlightRecorder`, which keeps the last
-minutes and writes them into a file after an anomaly.
+`Tapped` taps polled lines: their traffic goes into a capture or to a `FlightRecorder`. A flight recorder
+keeps the traffic of the last minutes, and writes it into a file after an anomaly.
 
 `Capture` reads these files, and pcap and pcapng files of other programs: link type 250 (RTAC serial), link
 type 252, and packets of bytes without a header under other link types, such as the user types 147 to 162.
-Packets may have parts of frames, or several frames.
+A packet may hold a part of a frame, or several frames.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from multidrop.capture.pairing import Junk as Junk
 from multidrop.capture.pairing import Pairing as Pairing
 from multidrop.capture.pairing import Sniffed as Sniffed
 from multidrop.capture.pairing import SniffedExchange as SniffedExchange
-from multidrop.capture.pcapng_reader import Capture as Capture
-from multidrop.capture.pcapng_reader import CaptureError as CaptureError
-from multidrop.capture.pcapng_writer import CaptureWriter as CaptureWriter
+from multidrop.capture.pcapng import Capture as Capture
+from multidrop.capture.pcapng import CaptureError as CaptureError
+from multidrop.capture.pcapng import CaptureWriter as CaptureWriter
 from multidrop.capture.tap import FlightRecorder as FlightRecorder
 from multidrop.capture.tap import Tapped as Tapped
 from multidrop.core import Side as Side

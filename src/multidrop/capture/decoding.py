@@ -1,6 +1,6 @@
-"""Decode captures to columns: a row for every register that was read or written, and for every miss.
+"""Decode captures to columns: one row for each register that was read or written, and for each failed read.
 
-Rows are like those of a poll: `time` is the request's time stamp, and the drive took the value between the
+Rows are like those of a poll. `time` is the request's time stamp; the drive sampled the value between the
 time stamps of request and reply. A capture has only one clock, so `monotonic_ns` equals `time`.
 """
 
@@ -14,7 +14,7 @@ from datetime import datetime
 from typing import Any
 
 from multidrop.capture.pairing import Junk, Sniffed, SniffedExchange
-from multidrop.capture.pcapng_reader import Capture
+from multidrop.capture.pcapng import Capture
 from multidrop.core import (
     Columns,
     Decoded,
@@ -58,7 +58,7 @@ class Decoding:
             yield from line.rest()
 
     def counts(self) -> Counter[str]:
-        """Return how many exchanges, frames, unknown bytes and so on were decoded so far, on all lines."""
+        """Return the numbers of exchanges, frames, unknown bytes and so on, decoded so far on all lines."""
         return sum((Counter(line.decoder.counts()) for line in self._lines), Counter())
 
 
@@ -81,7 +81,7 @@ class _LineDecoding:
                 continue
             yield Batch(self._columns, self._drives, self._registers)
             self._columns = Columns(ROWS)
-            if done is Decoded.UNKNOWN:  # the decoder's table of requests is full
+            if done is Decoded.UNKNOWN:  # the decoder has no room for another request
                 self.decoder.forget()
                 self._begin()
 
@@ -122,8 +122,9 @@ _TABLES = {
     0x10: "holding_register",
 }
 _BITS = (0x01, 0x02, 0x05, 0x0F)
-_MOST = {NumberFormat.BIT: 2000, NumberFormat.U16: 125}  # limit per reply, even if the request asks for more
-_WRITES = {  # function code of a request: the write functions of registers that it may write
+# limit of values per reply, even if the request asks for more
+_MOST = {NumberFormat.BIT: 2000, NumberFormat.U16: 125}
+_WRITES = {  # by a request's function code: the write codes of the tables that it may write to
     0x05: (0x05,),
     0x06: (0x06,),
     0x0F: (0x05, 0x0F),
@@ -152,7 +153,9 @@ class RequestTarget:
 
 
 def line_of(plant: Plant | None, name: str) -> PlantLine | None:
-    """Return the plant's line with this name. If the plant has only one line, return that for any name."""
+    """Return the plant's line with this name. If the plant has only one line, return it whatever the name
+    is.
+    """
     lines = plant.lines if plant else ()
     named = [line for line in lines if line.name == name]
     return named[0] if named else lines[0] if len(lines) == 1 else None
@@ -312,7 +315,8 @@ def _number(place: RegisterPlace, data: bytes) -> float | int | None:
         number = place.register.number_in(data, place.at)
         return number if number is None or place.register.values is None else int(number)
     raw = raw_value(data, place.at, place.number_format)
-    return int(raw) if raw == raw else None  # NaN: the data ends before this register
+    # `raw == raw` is False for NaN, which means that the reply's data end before this register
+    return int(raw) if raw == raw else None
 
 
 def _shown(place: RegisterPlace, data: bytes) -> str:

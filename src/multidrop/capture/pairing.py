@@ -20,7 +20,8 @@ def _is_broadcast(framing: Framing, request: Message) -> bool:
 class SniffedExchange:
     """A request and its reply; either is None if it was not sniffed or never sent.
 
-    `is_sure` is False if the request may be a reply: replies to functions 05, 06 and 08 repeat the request.
+    `is_sure` is False if the frame taken for the request may be a reply: replies to functions 05, 06 and 08
+    are copies of their requests.
     """
 
     framing: Framing
@@ -56,7 +57,10 @@ class Pairing:
         self._junk: list[FrameSpan] = []
 
     def pair(self, spans: Iterable[FrameSpan]) -> Iterator[Sniffed]:
-        """Yield the exchanges in the spans. A request is kept until its reply or the next request comes."""
+        """Yield the exchanges in the spans.
+
+        A request stays pending until its reply or another request follows.
+        """
         for span in spans:
             if span.kind is Kind.JUNK:
                 yield from self._add_junk(span)
@@ -78,7 +82,7 @@ class Pairing:
                 self._asked = span
 
     def flush(self) -> Iterator[Sniffed]:
-        """Yield the pending request: no reply will come."""
+        """Yield the pending request as unanswered, then the pending junk."""
         if self._asked:
             asked, self._asked = self._asked, None
             self._counts["unanswered"] += 1

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from multidrop.capture.decoding import RegisterLookup, data_of, line_of
 from multidrop.capture.pairing import Pairing, Sniffed, SniffedExchange
-from multidrop.capture.pcapng_reader import Capture
+from multidrop.capture.pcapng import Capture
 from multidrop.core import Message, Splitter
 from multidrop.drive.family import Drive
 from multidrop.plant.model import Plant
@@ -18,9 +18,9 @@ from multidrop.sim import SimulatedDrive
 
 
 class CapturedReply(NamedTuple):
-    """The captured values of one reply or write; None if the drive did not reply."""
+    """The captured values of one reply or write. `values` is None if the drive did not reply."""
 
-    after_s: float  # since the capture's first exchange
+    after_s: float  # time in s since the capture's first exchange
     values: Mapping[str, float | None] | None
 
 
@@ -53,7 +53,7 @@ class Replay:
             if isinstance(sniffed, SniffedExchange) and sniffed.request and not sniffed.is_broadcast:
                 after_s = (sniffed.time_ns - found[0][1].time_ns) / 1e9
                 self._note(lookup, sniffed, sniffed.request, after_s)
-        names = {polled.drive.name for line in plant.lines for polled in line.drives}
+        names = {polled.drive.name for polled in plant.drives}
         if not self._replies.keys() & names:
             raise ValueError(f"{path} has no exchange with {', '.join(sorted(names))}")
 
@@ -73,7 +73,7 @@ class Replay:
         self._replies[target.drive].append(CapturedReply(after_s, values))
 
     def drive(self, drive: Drive) -> ReplayedDrive:
-        """Return a simulated drive with the captured values of the drive of this name."""
+        """Return a simulation of this drive with the values captured from the drive of the same name."""
         return ReplayedDrive(drive, self)
 
     def replies(self, name: str) -> list[CapturedReply]:
@@ -82,10 +82,11 @@ class Replay:
 
 
 class ReplayedDrive(SimulatedDrive):
-    """A drive with captured values. A register has its first captured value until the time of the second.
+    """A drive with captured values. Until its second captured value is due, a register has its first one.
 
-    It stays silent when the captured drive did, and always if the capture has no such drive. Registers that
-    were not captured keep their defaults. Replies have the family's delay, not the captured one.
+    The simulation is silent when the captured drive was silent, and always if the capture has no such drive.
+    Registers that were not captured keep their defaults. Replies have the family's response delay, not the
+    captured delay.
     """
 
     def __init__(self, drive: Drive, replay: Replay) -> None:
@@ -98,7 +99,7 @@ class ReplayedDrive(SimulatedDrive):
 
     def _store(self, reply: CapturedReply) -> None:
         for name, value in (reply.values or {}).items():
-            with suppress(ValueError):  # the count that means "no value" may be unknown
+            with suppress(ValueError):  # raised if the family knows no raw count that means "no value"
                 self.memory.set(self.drive.register(name), value)
 
     def answer(self, request: Message, now: float) -> Message | None:

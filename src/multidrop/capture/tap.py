@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Protocol, Self
 
 from multidrop.bus import Bus
-from multidrop.capture.pcapng_writer import TCP_WRAPPINGS, WRAPPINGS, CaptureWriter
+from multidrop.capture.pcapng import TCP_WRAPPINGS, WRAPPINGS, CaptureWriter
 from multidrop.core import Status, Tap, utc_minus_monotonic_ns
 from multidrop.drive.family import Drive
 from multidrop.recording.format import writing
@@ -64,7 +64,9 @@ class Tapped:
         return sum(tap.lost for tap in self._taps)
 
     def close(self) -> None:
-        """Pass the remaining traffic to the sinks. That the ports are closed now is not an anomaly."""
+        """Pass the remaining traffic to the sinks. A port that is already closed is not reported as an
+        anomaly.
+        """
         self._hand_on()
 
     def __enter__(self) -> Self:
@@ -74,8 +76,8 @@ class Tapped:
         self.close()
 
 
-AFTER_S = 2.0  # a file also has the traffic of this time after the anomaly
-PAUSE_S = 60.0  # least time between two files, so that a noisy line does not fill the disk
+AFTER_S = 2.0  # a file ends this many seconds after its anomaly
+PAUSE_S = 60.0  # least time in s between two files, so that a noisy line does not fill the disk
 _NAME = re.compile(r"flight-\d{8}T\d{6}Z\.pcapng")
 _MOST_NAMED = 20  # limit of anomalies in a file's comment
 
@@ -83,9 +85,10 @@ _MOST_NAMED = 20  # limit of anomalies in a file's comment
 class FlightRecorder:
     """Keeps the traffic of the last `seconds`, at most `most_bytes`, and writes it after an anomaly.
 
-    `AFTER_S` after an anomaly, but at least `PAUSE_S` after its last file, it writes a capture
-    `flight-<UTC>.pcapng` into `directory`, with the anomaly in the file's comment. It keeps the newest
-    `most_files` captures. `written` lists the files of this recorder. Methods raise RecordingError.
+    `AFTER_S` seconds after an anomaly, but at least `PAUSE_S` seconds after its last file, the recorder
+    writes a capture `flight-<UTC>.pcapng` into `directory`. The file's comment names the anomaly. The
+    recorder keeps the newest `most_files` captures. `written` lists the files of this recorder. Methods raise
+    RecordingError.
     """
 
     def __init__(
@@ -98,7 +101,7 @@ class FlightRecorder:
         most_files: int = 64,
     ) -> None:
         if most_files < 1:
-            raise ValueError(f"most_files = {most_files} would keep no capture")
+            raise ValueError(f"most_files = {most_files}: it must be 1 or more")
         self.directory = Path(directory)
         self.written: list[Path] = []
         self._lines = lines
@@ -132,7 +135,7 @@ class FlightRecorder:
             self._write(now)
 
     def close(self) -> None:
-        """Write a capture file if anomalies were recorded since the last file."""
+        """Write a capture file if anomalies were recorded since the last file was written."""
         if self._anomalies and now_ns() >= self._next_ns:
             self._write(now_ns())
 

@@ -24,7 +24,8 @@ from multidrop.recording.arrow_ipc import (
 )
 from multidrop.recording.rows import RecordedRows
 
-MOST_SPELLED = 1 << 28  # limit in bytes for a column's texts in a batch; a small file may expand
+# limit in bytes for a column's texts in a batch: a small file may repeat the code of a long text many times
+MOST_SPELLED = 1 << 28
 Buffers = tuple[Any, ...]
 
 
@@ -56,7 +57,7 @@ class BatchDecoder:
         self._names: dict[int, Names] = {}
 
     def decode(self, message: IpcMessage, header: FlatTable, body: memoryview) -> RecordedRows | None:
-        """Return the rows of a batch; return None after storing a dictionary.
+        """Return the rows of a batch. If the message is a dictionary, store it and return None.
 
         Raises ValueError, RuntimeError or struct.error if the message is damaged.
         """
@@ -64,7 +65,7 @@ class BatchDecoder:
             self._learn(header, body)
             return None
         if message.kind != RECORD_BATCH:
-            raise ValueError("there is a message that is not a batch of rows")
+            raise ValueError("a message is not a batch of rows")
         rows, buffers = _parts(header, body, sum(column.buffers for column, _ in self._columns))
         left = iter(buffers)
         columns = [
@@ -75,11 +76,11 @@ class BatchDecoder:
 
     @property
     def known(self) -> dict[int, Names]:
-        """The dictionaries decoded so far, by id. Callers may keep the returned mapping: it never changes."""
+        """The dictionaries decoded so far, by id. The returned mapping never changes later."""
         return self._names
 
     def columns(self, header: FlatTable, body: memoryview, names_of: dict[int, Names]) -> RecordedColumns:
-        """Return a batch's columns with codes in place of names; the codes are checked.
+        """Return a batch's columns, with valid codes in place of names.
 
         `names_of` are the dictionaries that `known` had before the batch. Raises the errors of `decode`, and
         ValueError for files of earlier versions, whose names have no codes.
@@ -98,17 +99,17 @@ class BatchDecoder:
             if identity is not None:
                 codes, known = wide_codes(data, rows, column.code_bits // 8), names_of.get(identity)
                 if known is None or (rows and greatest_code(codes) >= len(known)):
-                    raise ValueError("rows come before the dictionary that their codes need")
+                    raise ValueError("a batch of rows precedes the dictionary that its codes need")
                 found.append(codes)
                 names.append(known.listed)
             elif column.detail == SINGLE:
                 found.append(widen(data, bits or None, rows).cast("B").cast("q"))
             elif column.kind == UTF8 or len(data) < 8 * rows:
-                raise ValueError("its lengths do not fit together")
+                raise ValueError("the stated lengths do not match the data")
             else:
                 found.append(memoryview(data[: 8 * rows]).cast("d" if column.kind == FLOAT else "q"))
         if valid is not None and len(valid) * 8 < rows:
-            raise ValueError("its lengths do not fit together")
+            raise ValueError("the stated lengths do not match the data")
         return RecordedColumns._make([*found, valid, *names])
 
     def _decoded(
@@ -121,9 +122,9 @@ class BatchDecoder:
         if identity is not None:
             names = self._names.get(identity)
             if names is None:
-                raise ValueError("rows come before the dictionary that their codes need")
+                raise ValueError("a batch of rows precedes the dictionary that its codes need")
             if rows * names.spelling.longest > MOST_SPELLED:
-                raise ValueError(f"there is a batch of {rows} rows with names too long for so many")
+                raise ValueError(f"the names of a batch of {rows} rows are too long")
             return valid, *spell(wide_codes(data[0], rows, column.code_bits // 8), names)
         if column.kind == UTF8:
             _check_text(*data)
@@ -135,16 +136,16 @@ class BatchDecoder:
         """Replace a dictionary, or extend it if the message is a delta."""
         number, table = header.number(0, "<q"), header.table(1)
         if table is None or number not in self._ids:
-            raise ValueError("there are names of no column")
+            raise ValueError("a dictionary belongs to no column")
         count, (_, ends, text) = _parts(table, body, 3)
         _check_text(ends, text)
         if count and len(ends) < 4 * (count + 1):
-            raise ValueError("its lengths do not fit together")
+            raise ValueError("the stated lengths do not match the data")
         places = memoryview(ends)[: 4 * (count + 1)].cast("i") if count else [0]
         names = []
         for begin, end in pairwise(places):
             if not 0 <= begin <= end <= len(text):
-                raise ValueError("its lengths do not fit together")
+                raise ValueError("the stated lengths do not match the data")
             names.append(str(text[begin:end], "utf-8"))
         before = self._names.get(number) if header.number(2, "<?") else None
         learnt = Names([*(before.listed if before else ()), *names])
@@ -154,16 +155,16 @@ class BatchDecoder:
 def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[bytes]]:
     """Return a batch's number of rows and its `count` buffers.
 
-    The buffers are copies, because they are passed to the C core. A memoryview that the traceback of a
-    damaged batch still holds would crash the interpreter when it is collected.
+    The buffers are passed to the C core, so they are copies. Otherwise an error's traceback could keep a
+    memoryview of `body`, and the interpreter would crash when it collects the traceback.
     """
     if batch.table(3):
-        raise ValueError("its batches are compressed, which only pyarrow and polars read")
+        raise ValueError("its batches are compressed: only pyarrow and polars can read them")
     rows, places = batch.number(0, "<q"), batch.pairs(2)
-    if not 0 <= rows <= len(body):  # otherwise sums with `rows` could overflow
-        raise ValueError(f"there is a batch of {rows} rows in {len(body)} bytes")
+    if not 0 <= rows <= len(body):  # `rows` is checked because sums with it could overflow
+        raise ValueError(f"a batch states {rows} rows, but has only {len(body)} bytes")
     if len(places) != count:
-        raise ValueError(f"there is a batch of {len(places)} buffers")
+        raise ValueError(f"a batch has {len(places)} buffers, not {count}")
     return rows, [bytes(body[at : at + length]) for at, length in places]
 
 
@@ -171,7 +172,7 @@ def _check_filled(column: FileColumn, bits: bytes, rows: int) -> None:
     """Raise ValueError if a row lacks a value in this column, which must not have nulls."""
     filled = (1 << rows) - 1
     if int.from_bytes(bits, "little") & filled != filled:
-        raise ValueError(f"there is a row without a {column.name.decode()}")
+        raise ValueError(f"a row has no {column.name.decode()}")
 
 
 def _check_text(offsets: bytes, text: bytes) -> None:
@@ -179,5 +180,5 @@ def _check_text(offsets: bytes, text: bytes) -> None:
     if str(text, "utf-8").isascii():
         return
     for at in memoryview(offsets)[: len(offsets) // 4 * 4].cast("i"):
-        if 0 <= at < len(text) and text[at] & 0xC0 == 0x80:  # the text starts within a character
+        if 0 <= at < len(text) and text[at] & 0xC0 == 0x80:  # the row's text starts within a character
             raise ValueError("its text is not UTF-8")

@@ -36,7 +36,7 @@ MOST_NAMES = {DRIVE: 1 << 16, REGISTER: 1 << 16, STATUS: MOST_NARROW}  # limit o
 
 Names = tuple[str, ...]
 Column = Any  # memoryview, array or bytes: anything with a buffer
-Codes = dict[int, tuple[Column, Names]]  # by dictionary id: the rows' codes, and the names
+Codes = dict[int, tuple[Column, Names]]  # by dictionary id: codes, and the names they stand for
 
 
 def schema_message(metadata: dict[bytes, bytes]) -> bytes:
@@ -45,15 +45,15 @@ def schema_message(metadata: dict[bytes, bytes]) -> bytes:
 
 
 class Encoder:
-    """Encodes the rows of one file. A name keeps its code while its dictionary has room."""
+    """Encodes the rows of one file. A name keeps its code until its dictionary is full."""
 
     def __init__(self) -> None:
         self._statuses = CodeTable(STATUSES)
         self._codes: dict[int, dict[str, int]] = {number: {} for number in CODED}
-        self._dictionaries: dict[int, Names] = {}  # by id: the latest dictionaries in the file
+        self._dictionaries: dict[int, Names] = {}  # the newest dictionaries in the file, by id
 
     def encode(self, batch: Rows) -> bytes:
-        """Return a record batch of the rows, preceded by the dictionaries that the file lacks.
+        """Return a record batch of the rows, preceded by the dictionaries that the file still lacks.
 
         Call `forget_dictionaries` if the result could not be appended to the file.
         """
@@ -81,15 +81,15 @@ class _CodedRows(NamedTuple):
     """The columns of one record batch, with codes in place of names."""
 
     length: int
-    columns: tuple[tuple[bytes, Column], ...]  # each column's validity bitmap (b"": no nulls) and data
+    columns: tuple[tuple[bytes, Column], ...]  # a validity bitmap (b"": no nulls), and data, per column
     names: dict[int, Names]  # by dictionary id
 
 
 def _pieces(source: _BatchCodes | _RowCodes, begin: int, end: int) -> Iterator[_CodedRows]:
-    """Yield the rows as one batch, or as several if a column has more names than there are codes."""
+    """Yield the rows as one batch, or as several batches if a column has more names than there are codes."""
     codes = source.codes(begin, end)
     if codes is None:
-        middle = begin + (end - begin) // 16 * 8  # a multiple of 8 rows: bitmaps start at a whole byte
+        middle = begin + (end - begin) // 16 * 8  # a multiple of 8 rows, so bitmaps start at a whole byte
         yield from _pieces(source, begin, middle)
         yield from _pieces(source, middle, end)
         return
@@ -121,6 +121,7 @@ class _BatchCodes:
     def __init__(self, batch: Batch, statuses: CodeTable) -> None:
         columns = self._columns = batch.columns()
         self._statuses = statuses
+        statuses.know(columns.statuses)
         self.time, self.sent, self.uncertainty = columns.time, columns.monotonic_ns, columns.uncertainty_ns
         self.value = columns.value
         self.certain = self.valid = columns.valid

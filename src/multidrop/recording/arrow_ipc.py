@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, BinaryIO, NamedTuple
 
-PREFIX = struct.Struct("<4si")  # the continuation marker, and the length of the metadata
+PREFIX = struct.Struct("<4si")  # the continuation marker, then the length of the metadata
 CONTINUATION = b"\xff\xff\xff\xff"
 SCHEMA, DICTIONARY_BATCH, RECORD_BATCH = 1, 2, 3  # IpcMessage.header_type
 
@@ -96,7 +96,7 @@ def _message(file: BinaryIO, at: int, size: int) -> IpcMessage | None:
     body = at + PREFIX.size + length
     if marker != CONTINUATION or length < 0 or body > size:
         return None
-    if length == 0:  # the end marker
+    if length == 0:  # the end marker of the stream
         return IpcMessage(0, None, body, body)
     try:
         metadata = file.read(length)
@@ -120,7 +120,7 @@ class Structs(bytes):
 def build(root: Table) -> bytes:
     """Return the flatbuffer of this table."""
     out = bytearray(4)
-    waiting: deque[tuple[int, Any]] = deque([(0, root)])  # placeholders' positions, and targets
+    waiting: deque[tuple[int, Any]] = deque([(0, root)])  # positions of placeholders, each with its target
     while waiting:
         place, thing = waiting.popleft()
         if isinstance(thing, dict):
@@ -134,12 +134,14 @@ def build(root: Table) -> bytes:
 
 
 def _align(out: bytearray, size: int, ahead: int = 0) -> None:
-    """Append padding, so that the position `ahead` bytes after the end is a multiple of `size`."""
+    """Pad `out`, so that the position `ahead` bytes after its end is a multiple of `size`."""
     out += bytes(-(len(out) + ahead) % size)
 
 
 def _put_table(out: bytearray, table: Table, waiting: deque[tuple[int, Any]]) -> int:
-    """Append the vtable and the table; return the table's position. Larger fields come first: all align."""
+    """Append the vtable and the table; return the table's position. Larger fields are placed first, so that
+    all fields are aligned.
+    """
     fields = {number: value if isinstance(value, tuple) else _OFFSET for number, value in table.items()}
     in_order = sorted(fields, key=lambda number: -struct.calcsize(fields[number][0]))
     slots = [0] * (max(table, default=-1) + 1)
@@ -183,7 +185,7 @@ BUFFERS = {INT: 2, FLOAT: 2, TIMESTAMP: 2, UTF8: 3}  # number of buffers of a co
 
 
 class FileColumn(NamedTuple):
-    """A column: its name, type, the first field of the type (bits, precision or unit), and code width."""
+    """A column: name, type, the first field of the type (bits, precision or unit), and width of its codes."""
 
     name: bytes
     kind: int
@@ -193,20 +195,21 @@ class FileColumn(NamedTuple):
 
     @property
     def buffers(self) -> int:
-        """The number of the column's buffers in a batch. Columns of codes have two, as of numbers."""
+        """The number of the column's buffers in a batch: two for codes or numbers, three for texts."""
         return 2 if self.code_bits else BUFFERS[self.kind]
 
 
 COLUMNS = (
     FileColumn(b"time", TIMESTAMP, NANOSECONDS),
     FileColumn(b"monotonic_ns", INT, 64),
-    FileColumn(b"uncertainty_ns", FLOAT, SINGLE, nullable=True),  # rounded up: stays an upper bound
+    FileColumn(b"uncertainty_ns", FLOAT, SINGLE, nullable=True),  # rounded up, so it stays an upper bound
     FileColumn(b"drive", UTF8, code_bits=16),
     FileColumn(b"register", UTF8, code_bits=16),
     FileColumn(b"value", FLOAT, DOUBLE, nullable=True),
     FileColumn(b"status", UTF8, code_bits=8),
 )
-COLUMNS_BEFORE = (  # in files of versions up to 0.1, and of other programs that save our batches
+# columns in files written by versions up to 0.1, or made from batches by other programs
+COLUMNS_BEFORE = (
     *COLUMNS[:2],
     FileColumn(b"uncertainty_ns", INT, 64, nullable=True),
     *(FileColumn(name, UTF8) for name in (b"drive", b"register")),

@@ -65,7 +65,8 @@ class ArrowsReader(RecordingReader):
             for message in messages(file, size):
                 if not self._whole:
                     self.metadata = self._read_schema(message)
-                elif message.kind == DICTIONARY_BATCH:  # without its batch, other libraries would fail
+                # other libraries fail if a file ends with a dictionary without its batch
+                elif message.kind == DICTIONARY_BATCH:
                     continue
                 self._whole = message.end
         if not self._whole:
@@ -109,7 +110,9 @@ class ArrowsReader(RecordingReader):
 
 
 def _column(field: FlatTable) -> FileColumn:
-    """Return a column as the file describes it; `code_bits` is -1 for codes that we never write."""
+    """Return a column as the file describes it; `code_bits` is -1 if its codes have a type that this library
+    never writes.
+    """
     detail, coded = field.table(3), field.table(4)
     index = coded.table(1) if coded else None
     is_unsigned = index is not None and not index.number(1, "<?")
@@ -124,7 +127,7 @@ def _dictionary(field: FlatTable) -> int | None:
 
 
 def _described(*found: FileColumn) -> tuple[FileColumn, ...] | None:
-    """Return the columns of the version, present or earlier, that has exactly these columns, or None."""
+    """Return COLUMNS or COLUMNS_BEFORE, whichever equals the file's columns; None if neither does."""
     for known in (COLUMNS, COLUMNS_BEFORE):
         if found == tuple(column._replace(nullable=False) for column in known):
             return known
@@ -156,7 +159,8 @@ class ArrowsTail:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._file = path.open("rb", buffering=0)  # a buffer could return bytes that were cut off since
+        # unbuffered, because a buffer could still hold bytes that the writer has cut off
+        self._file = path.open("rb", buffering=0)
         try:
             reader = ArrowsReader(path)
             self.metadata = reader.metadata
@@ -181,7 +185,8 @@ class ArrowsTail:
                 return
             body = self._body(message)
             try:
-                if message.kind != RECORD_BATCH:  # read again with its batch, as a failed write cuts both off
+                # do not advance past a dictionary without its batch: a failed write removes both
+                if message.kind != RECORD_BATCH:
                     self._decoder.decode(message, message.header, body)
                     continue
                 place = BatchPlace(message, self._decoder.known)
@@ -200,7 +205,7 @@ class ArrowsTail:
         length, place = message.end - message.body, message.body
         if sys.platform != "win32":
             return memoryview(os.pread(self._file.fileno(), length, place))
-        with self.path.open("rb") as file:  # on Windows the path stays valid while the file is open
+        with self.path.open("rb") as file:  # Windows lacks pread, but cannot remove an open file
             file.seek(place)
             return memoryview(file.read(length))
 

@@ -6,7 +6,6 @@ import csv
 import os
 import re
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -14,12 +13,13 @@ from typing import BinaryIO
 
 from multidrop.iso_time import format_time, parse_time
 from multidrop.polling.batch import ROW_COLUMNS, Row, Rows
+from multidrop.printable import spreadsheet_text
 from multidrop.recording.format import AppendingWriter, Metadata, RecordingReader, dump_metadata, writing
 from multidrop.recording.rows import from_rows
+from multidrop.whole_file import whole_file
 
 HEADER = ",".join(ROW_COLUMNS) + "\n"
-WITH_UNITS = ",".join([*ROW_COLUMNS, "unit"]) + "\n"  # header of a file without a metadata file
-FORMULA = re.compile(r"'*[=+\-@\t\r\n]")  # text that needs an apostrophe in front
+WITH_UNITS = ",".join([*ROW_COLUMNS, "unit"]) + "\n"  # header of a .csv file that has no metadata file
 ESCAPED = re.compile(r"'+[=+\-@\t\r\n]")
 EXAMPLE = "2026-11-21T09:30:00.123456789Z,17,250000,pump-1,output_current,1.5,ok"
 BATCH_ROWS = 1 << 14
@@ -36,9 +36,10 @@ class CsvWriter(AppendingWriter):
         described = dump_metadata(metadata)
         super().__init__(path)
         try:
-            with writing(path):
-                _write_whole(metadata_path(path), described + "\n")
-            self._append(HEADER.encode())  # after the metadata: a .csv with a header always has its .csv.json
+            with writing(path), whole_file(metadata_path(path)) as part:
+                part.write_text(described + "\n", "utf-8")
+            # written after the metadata, so that a .csv with a header always has its .csv.json
+            self._append(HEADER.encode())
         except OSError:
             self.discard()
             raise
@@ -50,18 +51,6 @@ class CsvWriter(AppendingWriter):
     @property
     def files(self) -> tuple[Path, ...]:
         return self.path, metadata_path(self.path)
-
-
-def _write_whole(path: Path, text: str) -> None:
-    """Create the file with this text atomically, so that a crash leaves no incomplete file."""
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    except OSError:
-        with suppress(OSError):
-            part.unlink()
-        raise
 
 
 class CsvReader(RecordingReader):
@@ -90,7 +79,7 @@ class CsvReader(RecordingReader):
                     yield from_rows(some)
             except (csv.Error, ValueError, OverflowError) as error:
                 place = f"{self.path}, line {lines.line_num}"
-                raise ValueError(f"{place}: not a row of a recording: one is like {EXAMPLE}") from error
+                raise ValueError(f"{place}: not a row of a recording; a row looks like {EXAMPLE}") from error
 
 
 def _whole_lines(file: BinaryIO, size: int) -> int:
@@ -115,7 +104,7 @@ def _parse(cells: list[str]) -> Row:
         raise ValueError(len(cells))
     time, monotonic_ns, uncertainty_ns, drive, register, value, status = cells[: len(ROW_COLUMNS)]
     numbers = f"{monotonic_ns}{uncertainty_ns}{value}"
-    if not numbers.isascii() or "_" in numbers:  # Python would read 1_0 as 10
+    if not numbers.isascii() or "_" in numbers:  # checked, because Python would read 1_0 as 10
         raise ValueError(numbers)
     return Row(
         parse_time(time),
@@ -134,7 +123,9 @@ def lines_of(rows: Rows) -> bytes:
 
 
 def lines_with_units(rows: Rows, units: Mapping[tuple[str, str], str]) -> bytes:
-    """Return the rows as lines of a .csv file with a last column `unit`; `units` is by drive and register."""
+    """Return the rows as lines of a .csv file whose last column is `unit`; `units` is by (drive,
+    register).
+    """
     return "".join(
         f"{_line(row)[:-1]},{_quote(units.get((row.drive, row.register), ''))}\n" for row in rows
     ).encode()
@@ -150,12 +141,10 @@ def _line(row: Row) -> str:
 
 @lru_cache(maxsize=4096)
 def _quote(text: str) -> str:
-    """Quote a text that contains a comma, a quote or a line end (RFC 4180).
-
-    A text that could be a formula gets an apostrophe in front, even if it already starts with one.
+    """Quote a text with a comma, a quote or a line end (RFC 4180); put an apostrophe before a possible
+    formula.
     """
-    if FORMULA.match(text):
-        text = f"'{text}"
+    text = spreadsheet_text(text)
     return '"' + text.replace('"', '""') + '"' if set(text) & set(',"\r\n') else text
 
 

@@ -13,16 +13,16 @@ from typing import Any, Self
 
 from multidrop.polling.batch import Rows, schema, shown_span
 from multidrop.polling.tables import ArrowTable, WideRows
+from multidrop.recording.phases import PhaseColumn, phase_names
 
 Metadata = Mapping[str, Any]
-MOST_SHOWN = 16 << 20  # limit in bytes for files that a repr reads
+MOST_SHOWN = 16 << 20  # largest file, in bytes, that a repr reads
 METADATA_KEY = "multidrop"  # key in an Arrow schema's metadata
 
 
 class RecordingError(OSError):
-    """A recording cannot be written: the disk is full or read-only, or a library is missing.
-
-    `rows` is the number of rows that were written before the error, and that can be read.
+    """A recording cannot be written: the disk is full or read-only, or a library is missing. `rows` is the
+    number of readable rows, written before the error.
     """
 
     def __init__(self, path: Path, reason: str, rows: int = 0) -> None:
@@ -96,21 +96,21 @@ class AppendingWriter(RecordingWriter):
             self._file.close()
 
 
-_REASONS = {  # by exception type: our words for libraries' messages, which describe internals
+_REASONS = {  # by exception type: texts that replace a library's messages, which describe internals
     UnicodeDecodeError: "its text is not UTF-8",
-    struct.error: "its lengths do not fit together",
-    RuntimeError: "its lengths do not fit together",  # raised by nanoarrow
+    struct.error: "the stated lengths do not match the data",
+    RuntimeError: "the stated lengths do not match the data",  # nanoarrow raises it
 }
 
 
 class RecordingReader(ArrowTable):
-    """A recording with the rows that it had when it was opened; may be iterated over more than once.
+    """Reads the rows that a recording had when it was opened. Each iteration starts at the first row.
 
-    Tables of pandas or polars and the wide form hold all rows in memory. Arrow libraries accept the reader
-    itself: `pyarrow.table(reader)`.
+    Tables of pandas or polars and the wide form hold all rows in memory. Arrow libraries accept the
+    reader itself: `pyarrow.table(reader)`.
 
-    `truncated` is the number of skipped bytes at the end of the file. They are an incomplete batch: the
-    writer was killed, or the disk was full.
+    `truncated` is the number of skipped bytes at the end of the file: an incomplete batch, because the writer
+    was killed or the disk was full.
     """
 
     metadata: Metadata
@@ -137,13 +137,17 @@ class RecordingReader(ArrowTable):
         layout = schema()  # raises if nanoarrow is missing
         from nanoarrow.c_array_stream import CArrayStream
 
+        if names := phase_names(self.metadata):
+            column = PhaseColumn(names)
+            parts = [column.added(rows) for rows in self]
+            return CArrayStream.from_c_arrays(parts, column.schema).__arrow_c_stream__()
         return CArrayStream.from_c_arrays([rows.arrow() for rows in self], layout).__arrow_c_stream__()
 
     def wide(self, *columns: str) -> WideRows:
         """Return a table with a column per `drive.register` (all, or those in `columns`) and a row per time.
 
-        Only values that one request read share a row. A miss is null: see `WideRows`. Raises ValueError for
-        a column that is not in the recording, or if the recording is damaged.
+        Values share a row only if the same request read them. A miss is null: see `WideRows`. Raises
+        ValueError for a column that is not in the recording, or if the recording is damaged.
         """
         return WideRows((row for rows in self for row in rows), columns, self._registers())
 
@@ -167,7 +171,7 @@ class RecordingReader(ArrowTable):
         return ValueError(f"{path or self.path} is not a recording: {reason}")
 
     def _parse_metadata(self, text: bytes, path: Path | None = None) -> Metadata:
-        """Parse metadata of this file, or of that at `path`. Raises ValueError if it is not a JSON object."""
+        """Parse the metadata of this file, or of the file at `path`. Raises ValueError if it is invalid."""
         try:
             metadata = json.loads(text)
         except ValueError as error:
@@ -193,9 +197,11 @@ def already_there(path: Path) -> RecordingExists:
 
 
 def new_file(path: Path) -> FileIO:
-    """Create and open a file. Raises RecordingExists for an existing file, which may hold months of data.
+    """Create and open a file.
 
-    An existing device or pipe is opened, because it has no data to lose. Raises OSError.
+    Raises RecordingExists if the file exists, because it may hold months of data.
+
+    An existing device or pipe is opened, since opening it cannot lose data. Raises OSError.
     """
     mode = "wb" if path.exists() and not path.is_file() else "xb"
     try:
@@ -205,12 +211,14 @@ def new_file(path: Path) -> FileIO:
 
 
 class AppendFile:
-    """A new file. Raises RecordingExists if a file exists at the path. All methods raise OSError."""
+    """A new file to append to. Raises RecordingExists if a file exists at the path. All methods raise
+    OSError.
+    """
 
     def __init__(self, path: Path) -> None:
         self._file = new_file(path)
         self._length = 0
-        self._is_truncated = False  # the last piece is incomplete
+        self._is_truncated = False  # True: the last piece was appended only in part
 
     def append(self, piece: bytes | memoryview) -> None:
         """Append the whole piece. If this fails or a signal handler raises, restore the file's former length.

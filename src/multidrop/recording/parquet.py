@@ -27,7 +27,7 @@ from multidrop.recording.format import (
 )
 from multidrop.recording.rows import RecordedRows
 
-GROUP_ROWS = 1 << 17  # rows per group; a group is gathered in memory
+GROUP_ROWS = 1 << 17  # rows per group; a group is collected in memory
 TEXTS = ("drive", "register", "status")
 MOST_TEXT = 1 << 26  # limit in bytes for the texts of one column in a group
 MOST_OF_GROUP = 1 << 29  # limit in bytes for an unpacked group of rows
@@ -50,7 +50,7 @@ def _pyarrow(path: Path) -> Any:
 
 
 class ParquetWriter(RecordingWriter):
-    """Gathers rows, and writes them in large groups."""
+    """Collects rows in memory, and writes them in large groups."""
 
     def __init__(self, path: Path, metadata: Metadata) -> None:
         super().__init__(path)
@@ -104,12 +104,12 @@ class ParquetReader(RecordingReader):
         with self._open() as file:
             found = file.schema_arrow
         wanted = self._arrow.schema(schema())
-        has_units = found.names == [*wanted.names, "unit"]  # the format of a history's files
+        has_units = found.names == [*wanted.names, "unit"]  # files of a history have this further column
         self._columns = wanted.names
         if found.types[: len(wanted)] != wanted.types or not (has_units or found.names == wanted.names):
             raise self._not_a_recording("it is a Parquet file with other columns")
         self.metadata = self._parse_metadata((found.metadata or {}).get(METADATA_KEY.encode(), b"{}"))
-        if has_units and not self.metadata.get("drives"):  # written by a fleet's hub
+        if has_units and not self.metadata.get("drives"):  # a fleet's hub writes such files
             raise self._not_a_recording(
                 "it is a file of `multidrop hub`: read its folder with multidrop.History"
             )
@@ -118,7 +118,7 @@ class ParquetReader(RecordingReader):
         c_array = nanoarrow().c_array
         rows = 0
         with self._open(read_dictionary=TEXTS) as file:
-            # Do not read by groups: a damaged group may claim any size.
+            # Do not read whole groups, because a damaged group may state any size.
             batches = file.iter_batches(GROUP_ROWS, columns=self._columns)
             while (batch := self._next(batches, rows)) is not None:
                 yield RecordedRows(c_array(batch))
@@ -130,20 +130,19 @@ class ParquetReader(RecordingReader):
             try:
                 opened = self._arrow.parquet.ParquetFile(file, read_dictionary=read_dictionary)
             except (OSError, ValueError, self._arrow.ArrowException) as failure:
-                raise self._not_a_recording(f"it is no whole Parquet file; {UNREADABLE}") from failure
+                raise self._not_a_recording(f"it is not a complete Parquet file; {UNREADABLE}") from failure
             self._check_sizes(opened.metadata)
             yield opened
 
     def _check_sizes(self, described: Any) -> None:
-        """Raise ValueError for a group of rows that would take too much memory when unpacked.
-
-        Sizes of single columns are not read, because pyarrow aborts the process if a group is damaged.
+        """Raise ValueError for a group of rows that would take too much memory when unpacked. The sizes of
+        single columns are not read: pyarrow would abort the process if a group is damaged.
         """
         for number in range(described.num_row_groups):
             size = described.row_group(number).total_byte_size
             if size > MOST_OF_GROUP:
                 raise self._not_a_recording(
-                    f"a group of its rows takes {size} bytes unpacked, at most {MOST_OF_GROUP} are read"
+                    f"a group of its rows takes {size} bytes unpacked; the limit is {MOST_OF_GROUP}"
                 )
 
     def _next(self, batches: Iterator[Any], rows: int) -> Any:
@@ -158,7 +157,7 @@ class ParquetReader(RecordingReader):
         batch = self._with_texts(batch, rows)
         for field in self._arrow.schema(schema()):
             if not field.nullable and batch[field.name].null_count:
-                raise self._damaged(rows, f"there is a row without a {field.name}")
+                raise self._damaged(rows, f"a row has no {field.name}")
         return batch
 
     def _with_texts(self, batch: Any, rows: int) -> Any:

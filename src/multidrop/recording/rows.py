@@ -20,8 +20,9 @@ class RecordedRows(Rows):
         return int(self._array.length)
 
     def __iter__(self) -> Iterator[Row]:
-        columns = self._array.view().children
-        return map(Row._make, zip(*map(_values, columns), strict=True))
+        # A generator, because it keeps the array alive: nanoarrow frees the array's buffers even if
+        # memoryviews use them.
+        yield from map(Row._make, zip(*map(_values, self._array.view().children), strict=True))
 
     def __repr__(self) -> str:
         return f"<Rows: {shown_span([*self])}>"

@@ -20,12 +20,12 @@ from multidrop.recording.arrows import ArrowsReader, ArrowsWriter
 from multidrop.recording.format import Metadata, RecordingWriter, writing
 from multidrop.transport import clock
 
-MOST_CUT = 1 << 24  # limit of a truncated batch in bytes; a longer unreadable end is damage and is kept
+MOST_CUT = 1 << 24  # an unreadable end is cut off up to this size in bytes; a longer one is kept
 
 
-def segments_of(path: Path) -> list[tuple[int, Path]]:
-    """Return the segments of the recording `path` by number, the oldest first."""
-    name = re.compile(re.escape(path.stem) + r"\.(\d{8,})\.arrows")
+def segments_of(path: Path, suffix: str = ".arrows") -> list[tuple[int, Path]]:
+    """Return the number and the path of each segment of the recording `path`, the oldest first."""
+    name = re.compile(re.escape(path.stem) + r"\.(\d{8,})" + re.escape(suffix))
     found = [(name.fullmatch(file.name), file) for file in path.parent.iterdir()]
     return sorted((int(match[1]), file) for match, file in found if match)
 
@@ -34,10 +34,10 @@ class SegmentWriter(RecordingWriter):
     """A recording that starts a new segment each `every` s of the monotonic clock.
 
     A segment's file is created with its first rows. Whenever a segment starts, segments that ended more than
-    `keep` s ago are removed. Then the oldest are removed while all together take more than `most` bytes. The
-    segment in progress is never removed. New segments have numbers above `after`. Raises ValueError if
-    another process records there or the name does not end in .arrows, TypeError for metadata that JSON
-    cannot hold, and RecordingError.
+    `keep` s ago are removed. Then the oldest segments are removed while all segments together take more than
+    `most` bytes. The segment in progress is never removed. New segments have numbers above `after`. Raises
+    ValueError if another process records this recording or the name does not end in .arrows, TypeError for
+    metadata that JSON cannot hold, and RecordingError.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class SegmentWriter(RecordingWriter):
             except BlockingIOError:
                 raise ValueError(f"{self.path} is being recorded by another process") from None
             before = segments_of(self.path)
-        self.number = max([after, *(number for number, _ in before)])  # number of the newest segment
+        self.number = max([after, *(number for number, _ in before)])  # the highest segment number so far
         for _, newest in before[-1:]:
             _cut_truncated(newest)
         self._retire()
@@ -90,7 +90,7 @@ class SegmentWriter(RecordingWriter):
     def rotate(self, metadata: Metadata | None = None) -> None:
         """Close the open segment, or remove it if it has no rows. The next rows start a new segment.
 
-        The new segment has this metadata, or by default that of the last segment.
+        The new segment has this metadata, or by default the metadata of the last segment.
         """
         segment, self._segment = self._segment, None
         self._metadata = self._metadata if metadata is None else metadata
@@ -129,36 +129,38 @@ class SegmentWriter(RecordingWriter):
 
 
 def _cut_truncated(path: Path) -> None:
-    """Cut off an incomplete batch of a killed writer, because other libraries cannot read such a file."""
-    with suppress(OSError, ValueError):  # not a recording: keep it
+    """Remove an incomplete batch of a killed writer, because other libraries cannot read such a file."""
+    with suppress(OSError, ValueError):  # a file that is not a recording is kept
         truncated = ArrowsReader(path).truncated
         if 0 < truncated <= MOST_CUT:
             os.truncate(path, path.stat().st_size - truncated)
 
 
-AGES = {"s": 1.0, "min": 60.0, "h": 3600.0, "day": 86400.0, "week": 604800.0}  # unit: length in s
-SIZES = {"kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}  # unit: size in bytes
+AGES = {"s": 1.0, "min": 60.0, "h": 3600.0, "day": 86400.0, "week": 604800.0}  # length in s, by unit
+SIZES = {"kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}  # size in bytes, by unit
 
 
 class StoredFile(NamedTuple):
-    """A file of a recording in segments, for deciding which files to remove."""
+    """A file of a recording in segments: the facts that decide which files to remove."""
 
     path: Path
-    number: int  # segment number, of the last segment if the file has several
-    end: float  # time of its newest row, in s since 1970
+    number: int  # number of the segment, or of the file's last segment
+    end: float  # time of the file's newest row, in s since 1970
     size: int  # in bytes
 
 
 def outlived(
     files: Iterable[StoredFile], now: float, keep: float | None, most: int | None
 ) -> list[StoredFile]:
-    """Return the files to remove: those that are older than `keep` s, and the oldest beyond `most`.
+    """Return the files to remove: those older than `keep` s, then the oldest until at most `most` bytes are
+    left.
 
-    `now` is in s since 1970. `most` limits the bytes of all kept files together. None means unlimited. The
+    `now` is in s since 1970. None for `keep` or `most` means unlimited. The
     oldest file is the one with the lowest number, even if the clock was set back.
 
-    A file's age is the sum of the intervals between its end, the ends of all later files, and `now`. An
-    interval longer than `keep` is skipped: a clock jump or a pause in recording must not remove every file.
+    A file's age is the time from its end to `now`: the sum of the intervals between the ends of the later
+    files. An interval longer than `keep` is not counted, so that a clock jump or a pause in recording cannot
+    remove every file.
     """
     in_order = sorted(files, key=lambda file: file.number)
     ages = {} if keep is None else _ages(in_order, now, keep)
@@ -177,7 +179,8 @@ def _ages(files: Iterable[StoredFile], now: float, longest: float) -> dict[int, 
     """Return each file's age in s by number, without intervals that are negative or longer than `longest`."""
     ends: dict[int, float] = {}
     for file in files:
-        ends[file.number] = min(file.end, ends.get(file.number, file.end))  # a copy may have a later time
+        # Use the earlier end of a segment that is in two files, because a copied file may have a later time.
+        ends[file.number] = min(file.end, ends.get(file.number, file.end))
     ages, age, later = {}, 0.0, now
     for number in sorted(ends, reverse=True):
         step = later - ends[number]
@@ -211,9 +214,11 @@ _CLOSED_IN_CHILDREN = getattr(os, "O_CLOEXEC", 0) or getattr(os, "O_NOINHERIT", 
 
 
 class FileLock:
-    """A file lock, held until `close` or the end of the process. The file stays: removing it would be a race.
+    """A file lock, held until `close` or the end of the process.
 
-    Raises BlockingIOError while another process holds it, and OSError if the file cannot be created.
+    The file is never removed: a process that just opened it would lock a removed file.
+
+    Raises BlockingIOError while another process holds the lock, and OSError if the file cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
