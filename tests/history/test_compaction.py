@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from examples import usually
 from histories import DAY, METADATA, NOON, SECOND, check_buckets, random_rows, record, rows_in
 from kills import BoundProcess
 
-from multidrop import open_recording
+from multidrop import open_recording, whole_file
 from multidrop.history import compact as compact_module
 from multidrop.history import database
 from multidrop.history.compact import compact, main
@@ -35,6 +36,14 @@ def segments() -> list[list[Row]]:
     """Return the rows of five segments: two on each of two days, and one on the next day."""
     begins = (NOON, NOON + 600 * SECOND, NOON + DAY, NOON + DAY + 600 * SECOND, NOON + 2 * DAY)
     return [random_rows(seed, begin, 120) for seed, begin in enumerate(begins)]
+
+
+@pytest.fixture
+def rows(tmp_path: Path) -> list[list[Row]]:
+    """Record five segments in `tmp_path`; return their rows."""
+    made = segments()
+    record(tmp_path, made)
+    return made
 
 
 def check(folder: Path, rows: list[Row]) -> None:
@@ -58,7 +67,7 @@ def test_a_parquet_file_has_its_segment_s_rows(tmp_path: Path) -> None:
     compact(tmp_path, 2)
     (file,) = parquet_files(tmp_path / "rows")
     assert [path.name for path in tmp_path.glob("*.arrows")] == ["rows.00000002.arrows"]
-    recording = open_recording(file.path)  # pyarrow reads it like any recording
+    recording = open_recording(file.path)  # pyarrow reads the file like any recording
     assert recording.metadata == METADATA
     found = [row for batch in recording for row in batch]
     assert found == sorted(rows, key=lambda row: (row.drive, row.time_ns))
@@ -66,7 +75,7 @@ def test_a_parquet_file_has_its_segment_s_rows(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_tens_equal_those_of_plain_python(tmp_path: Path) -> None:
+def test_ten_second_summaries_equal_those_computed_in_plain_python(tmp_path: Path) -> None:
     rows = random_rows(1, NOON, 500)
     record(tmp_path, [rows])
     compact(tmp_path, 2)
@@ -90,7 +99,7 @@ def test_tens_equal_those_of_plain_python(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_past_hours_become_one_file_of_tens(tmp_path: Path) -> None:
+def test_ten_second_summaries_of_past_hours_are_merged_into_one_file(tmp_path: Path) -> None:
     begins = [NOON + 1200 * SECOND * number for number in range(5)]
     record(tmp_path, [random_rows(number, begin, 20) for number, begin in enumerate(begins)])
     compact(tmp_path, 6)
@@ -103,18 +112,21 @@ def test_past_hours_become_one_file_of_tens(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_past_days_become_one_file_of_tens(tmp_path: Path) -> None:
-    rows = segments()
-    record(tmp_path, rows)
+def test_ten_second_summaries_of_past_days_are_merged_into_one_file(
+    tmp_path: Path, rows: list[list[Row]]
+) -> None:
     compact(tmp_path, 6)
     tens = parquet_files(tmp_path / "tens")
     assert [(file.first, file.last) for file in tens] == [(1, 2), (3, 4), (5, 5)]
     assert len(parquet_files(tmp_path / "rows")) == 5
-    check(tmp_path, [row for some in rows for row in some])
+    check(tmp_path, [*chain(*rows)])
 
 
 @pytest.mark.long
-def test_one_database_is_opened_only_for_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("rows")
+def test_compaction_opens_one_database_and_only_if_there_is_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     opened: list[str] = []
 
     def noted(memory: str, spill: Path) -> Any:
@@ -122,7 +134,6 @@ def test_one_database_is_opened_only_for_work(tmp_path: Path, monkeypatch: pytes
         return connect(memory, spill)
 
     monkeypatch.setattr(database, "connect", noted)
-    record(tmp_path, segments())
     for _ in range(2):
         compact(tmp_path, 6)
         assert len(opened) == 1
@@ -148,15 +159,15 @@ class Breaker:
         return call
 
 
-# `apart` is the distance between interrupted steps. Each of five segments takes 10 steps. A distance of 3
-# covers each of the ten once or twice; 23, the default, covers a few steps of segments and of a merge.
+# Every `apart`-th step of compaction is interrupted. Each of the five segments takes 10 steps. With 7, each
+# of these 10 steps is interrupted in some segment. With 23, the default, a few steps are interrupted.
 @pytest.mark.long
-@pytest.mark.parametrize("apart", usually(23, 3))
+@pytest.mark.parametrize("apart", usually(23, 7))
 def test_compaction_interrupted_before_each_step_loses_no_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, apart: int
 ) -> None:
     rows = segments()
-    expected = [row for some in rows for row in some]
+    expected = [*chain(*rows)]
     for calls in range(0, 200, apart):
         folder = tmp_path / str(calls)
         record(folder, rows)
@@ -164,8 +175,9 @@ def test_compaction_interrupted_before_each_step_loses_no_row(
         with monkeypatch.context() as patched:
             for name in ("replace", "unlink", "mkdir"):
                 patched.setattr(Path, name, breaker.around(getattr(Path, name)))
-            for name in ("copy_out", "insert", "_on_disk"):
-                patched.setattr(compact_module, name, breaker.around(getattr(compact_module, name)))
+            steps = ((compact_module, "copy_out"), (compact_module, "insert"), (whole_file, "sync_to_disk"))
+            for module, name in steps:
+                patched.setattr(module, name, breaker.around(getattr(module, name)))
             try:
                 compact(folder, 6)
                 is_over = True
@@ -174,7 +186,7 @@ def test_compaction_interrupted_before_each_step_loses_no_row(
         check(folder, expected)
         compact(folder, 6)
         check(folder, expected)
-        assert not [*folder.rglob("*.part"), *folder.glob("*.arrows")]
+        assert not [*folder.rglob("*.tmp"), *folder.glob("*.arrows")]
         assert len(parquet_files(folder / "tens")) == 3
         if is_over:
             break
@@ -183,18 +195,19 @@ def test_compaction_interrupted_before_each_step_loses_no_row(
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_compaction_killed_at_any_step_loses_no_row(tmp_path: Path) -> None:
-    rows = segments()
-    record(tmp_path, rows)
-    expected = [row for some in rows for row in some]
-    words = [sys.executable, "-m", "multidrop.history.compact", str(tmp_path), "--below", "6"]
-    dice, delay = random.Random(1), 0.2
+def test_compaction_killed_at_any_step_loses_no_row(tmp_path: Path, rows: list[list[Row]]) -> None:
+    # `-m multidrop.history.compact` would lower the process's priority, which takes long on a busy machine.
+    code = "import duckdb; from multidrop.history.compact import main; print(flush=True); main()"
+    words = [sys.executable, "-c", code, str(tmp_path), "--below", "6"]
+    dice, delay = random.Random(1), 0.05
     for _ in range(40):
-        with BoundProcess(words) as child:
+        with BoundProcess(words, stdout=subprocess.PIPE, text=True) as child:
+            assert child.stdout is not None
+            child.stdout.readline()  # waits until compaction starts
             time.sleep(dice.uniform(0, delay))
             child.send_signal(signal.SIGKILL)
             ended = child.wait()
-        check(tmp_path, expected)
+        check(tmp_path, [*chain(*rows)])
         if ended == 0:
             break
         delay *= 1.3  # give a busy machine more time
@@ -203,8 +216,8 @@ def test_compaction_killed_at_any_step_loses_no_row(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_one_process_compacts_at_a_time(tmp_path: Path) -> None:
-    record(tmp_path, segments())
+@pytest.mark.usefixtures("rows")
+def test_only_one_process_compacts_at_a_time(tmp_path: Path) -> None:
     lock = FileLock(tmp_path / ".compact.lock")
     assert main([str(tmp_path), "--below", "6"]) == 0
     assert len(listing(tmp_path).segments) == 5
@@ -215,13 +228,11 @@ def test_one_process_compacts_at_a_time(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_the_readable_part_of_a_damaged_segment_is_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, rows: list[list[Row]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rows = segments()
-    record(tmp_path, rows)
     path = tmp_path / "rows.00000002.arrows"
     data = bytearray(path.read_bytes())
-    at = data.rindex(b"no reply")  # in the first batch's dictionary of statuses, the last one written
+    at = data.rindex(b"no reply")  # a text in the file's last status dictionary
     data[at] = 0xFF
     path.write_bytes(data)
     whole = _readable(path)
@@ -230,7 +241,7 @@ def test_the_readable_part_of_a_damaged_segment_is_read(
         before = rows_in(history)
         assert len(history.damage) == 1
         assert "is damaged" in history.damage[0]
-    assert sorted(before) == sorted([row for some in (rows[0], *rows[2:]) for row in some] + whole)
+    assert sorted(before) == sorted(chain(rows[0], *rows[2:], whole))
     compact(tmp_path, 6)
     assert str(path) in capsys.readouterr().err
     assert (tmp_path / "damaged" / path.name).read_bytes() == data
@@ -250,12 +261,12 @@ def _readable(path: Path) -> list[Row]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("content", usually(b"\0" * 5000, b"", b"\xff\xff\xff\xff"))
-def test_a_segment_without_a_head_hides_no_other_segment(tmp_path: Path, content: bytes) -> None:
+def test_a_segment_without_a_head_hides_no_other_segment(
+    tmp_path: Path, rows: list[list[Row]], content: bytes
+) -> None:
     """After a power cut a file may be empty or contain zeros."""
-    rows = segments()
-    record(tmp_path, rows)
     (tmp_path / "rows.00000002.arrows").write_bytes(content)
-    left = [row for some in (rows[0], *rows[2:]) for row in some]
+    left = [*chain(rows[0], *rows[2:])]
     with History(tmp_path) as history:
         assert sorted(rows_in(history)) == sorted(left)
         assert len(history.damage) == bool(content)
@@ -266,17 +277,15 @@ def test_a_segment_without_a_head_hides_no_other_segment(tmp_path: Path, content
 
 
 @pytest.mark.long
-def test_a_full_disk_leaves_the_segment(tmp_path: Path) -> None:
-    rows = segments()
-    record(tmp_path, rows)
+def test_a_segment_is_kept_if_the_disk_is_full(tmp_path: Path, rows: list[list[Row]]) -> None:
     words = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (900, 900));"
     words += f"from multidrop.history.compact import main; main([{str(tmp_path)!r}, '--below', '6'])"
     ended = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=False)
     assert ended.returncode
     assert len(listing(tmp_path).segments) == 5
-    check(tmp_path, [row for some in rows for row in some])
-    compact(tmp_path, 6)
-    check(tmp_path, [row for some in rows for row in some])
+    for _ in range(2):
+        check(tmp_path, [*chain(*rows)])
+        compact(tmp_path, 6)
 
 
 def test_compaction_runs_at_the_lowest_priority_if_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -293,8 +302,8 @@ def test_compaction_runs_at_the_lowest_priority_if_allowed(monkeypatch: pytest.M
 
 
 @pytest.mark.slow
-def test_compaction_leaves_its_recorder_s_real_time_scheduling() -> None:
-    """If this process may not use SCHED_RR, the test starts with the usual scheduling."""
+def test_compaction_does_not_inherit_the_real_time_scheduling_of_its_recorder() -> None:
+    """If this process may not use SCHED_RR, the recorder has the usual scheduling."""
     lines = (
         "import contextlib, os",
         "from multidrop.history.compact import be_low",

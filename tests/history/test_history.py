@@ -158,7 +158,7 @@ def test_a_range_may_be_given_in_ns_or_datetimes(tmp_path: Path) -> None:
         assert rows_in(history, None, moment.astimezone(timezone(timedelta(hours=3)))) == wanted
         with pytest.raises(ValueError, match="has no time zone"):
             history.read(None, moment.replace(tzinfo=None))
-        with pytest.raises(TypeError, match="a moment is UTC in ns or a datetime"):
+        with pytest.raises(TypeError, match="a time must be UTC in ns, or a datetime"):
             history.read(None, 1.5)  # type: ignore[arg-type]
 
 
@@ -193,7 +193,7 @@ def test_a_grid_covers_its_range() -> None:
         assert grid.step < 10 * SECOND or grid.is_of_tens
 
 
-def test_buckets_of_2_s_or_more_are_made_of_tens() -> None:
+def test_requested_buckets_of_2_s_or_more_use_the_ten_second_summaries() -> None:
     hour = NOON, NOON + 3600 * SECOND
     assert grid_of(*hour, 1800).is_of_tens
     assert grid_of(*hour, 1801).step < 2 * SECOND
@@ -225,20 +225,22 @@ def test_a_reader_sees_new_rows_exactly_once(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_replaced_files_lose_no_row_for_a_reader(tmp_path: Path) -> None:
-    """Files are compacted after the reader lists them and before it reads them: each row still comes once."""
+    """Files are compacted after the reader has listed them and before it reads them. Each row is still read
+    once.
+    """
     pytest.importorskip("duckdb", reason="needs duckdb")
     rows = [random_rows(number, NOON + number * 60 * SECOND, 200) for number in range(4)]
     record(tmp_path, rows)
     with History(tmp_path) as history:
         found = iter(history.read())
         first = list(next(found))
-        compact(tmp_path, 4)  # the first segment is open, the others are only listed
+        compact(tmp_path, 4)  # by now the reader has opened the first segment; the others are only listed
         assert first + [row for batch in found for row in batch] == flat(rows)
     with History(tmp_path) as history:
         found = iter(history.read())
         first = list(next(found))
         for path in tmp_path.glob("rows/00000003.*"):
-            path.unlink()  # as if it were too old
+            path.unlink()  # removes the file, as if it were too old
         left = first + [row for batch in found for row in batch]
     assert left == flat([*rows[:2], rows[3]])
 
@@ -292,7 +294,7 @@ def test_a_damaged_segment_hides_no_other(tmp_path: Path) -> None:
 def test_an_incomplete_end_of_a_closed_segment_is_reported(tmp_path: Path) -> None:
     rows = [random_rows(number, NOON + number * 60 * SECOND, 120) for number in range(2)]
     record(tmp_path, rows)
-    for number in (2, 1):  # the end of the newest may still be incomplete without damage
+    for number in (2, 1):  # an incomplete end of the newest segment is not damage
         path = tmp_path / f"rows.0000000{number}.arrows"
         path.write_bytes(path.read_bytes() + b"\0" * 7)
         with History(tmp_path) as history:
@@ -329,7 +331,9 @@ def test_export_without_duckdb_uses_pyarrow(tmp_path: Path, monkeypatch: pytest.
 def test_plots_of_a_growing_segment_have_all_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
-    """Queries for changing series and ranges use the cache; some ranges start earlier or much later."""
+    """Queries for varying series and ranges use the cache. Some ranges start before the cached rows, or long
+    after.
+    """
     monkeypatch.setattr(growing, "MOST_KEPT", most)
     monkeypatch.setattr(growing, "MOST_TENS", 3 if most else 0)
     dice = random.Random(most)
@@ -359,7 +363,7 @@ def test_cache_of_unknown_names_is_limited(tmp_path: Path, monkeypatch: pytest.M
             assert len(segment._kept._kept) == min(at + 1, 3)
 
 
-def test_tens_are_computed_for_requested_series_only(tmp_path: Path) -> None:
+def test_ten_second_summaries_are_computed_for_requested_series_only(tmp_path: Path) -> None:
     with SegmentWriter(tmp_path / "rows.arrows", METADATA, every=1e9) as writer, History(tmp_path) as history:
         for number, name in enumerate(SERIES[:2]):
             writer.write(from_rows(random_rows(number, NOON + number * 60 * SECOND, 200)))

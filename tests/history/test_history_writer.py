@@ -2,29 +2,49 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
 import logging
+import os
+import random
+import signal
+import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections import defaultdict
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager
+from math import inf, nan
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import histories
 import pytest
-from disks import full_at, read_only_directory
-from histories import DAY, METADATA, NOON, SECOND, batch, random_rows, record, rows_in
+from examples import usually
+from gateways import serving, simulated_plant
+from histories import DAY, METADATA, NOON, RUN, SECOND, STEP, batch, random_rows, record, rows_in
+from interruptions import full_at, read_only_directory
+from kills import BoundProcess
+from lines import PATIENCE, until
 
 from multidrop import History, Plant, Poller
 from multidrop.control import Seen
 from multidrop.core.columns import Names
 from multidrop.families import InnovertIBD
-from multidrop.history import HistoryWriter
+from multidrop.gateway import historian
+from multidrop.gateway.historian import MOST_BUCKETS, HistorySettings, as_json, build
+from multidrop.gateway.http.exports import Exports
+from multidrop.history import Buckets, HistoryWriter
 from multidrop.history import writer as writer_module
+from multidrop.history.compact import main as compact
 from multidrop.history.folder import HistoryFile, file_name, listing, parquet_files, widest
+from multidrop.recording import open_recording
 from multidrop.recording.format import AppendFile
 from multidrop.sim import Simulator, Wire, simulated
 from multidrop.transport import clock
 
-PATIENCE = 60.0
 NAMES = Names(["pump-1", "pump-2"])
 
 
@@ -44,13 +64,6 @@ def writers() -> Iterator[Callable[..., HistoryWriter]]:
     yield make
     for writer in made:
         writer.close()
-
-
-def until(is_so: Callable[[], object]) -> None:
-    end = time.monotonic() + PATIENCE
-    while not is_so():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def some(number: int, drive: int = 0) -> object:
@@ -88,7 +101,7 @@ def test_batches_of_two_pollers_are_recorded(tmp_path: Path, writers: Callable[.
 def test_the_writer_keeps_no_memory_of_the_core(
     tmp_path: Path, writers: Callable[..., HistoryWriter]
 ) -> None:
-    """The writer copies rows, because the core reuses a batch's memory."""
+    """Rows are copied, because the core reuses a batch's memory."""
     writer = writers(tmp_path)
     one = some(0)
     expected = list(one)
@@ -162,7 +175,7 @@ def test_a_hanging_disk_delays_no_polling(
     writer.take(some(0))
     assert is_hanging.wait(PATIENCE)
     for number in range(1, 31):
-        writer.take(some(number))  # must not wait for the disk
+        writer.take(some(number))  # this call must not wait for the disk
     assert writer.state().dropped == 20 * 20
     goes_on.set()
     writer.close()
@@ -193,7 +206,7 @@ def test_an_unwritable_folder_raises_permission_error_immediately() -> None:
         HistoryWriter(directory / "history", METADATA)
 
 
-def test_one_process_records_at_a_time(tmp_path: Path, writers: Callable[..., HistoryWriter]) -> None:
+def test_only_one_process_records_at_a_time(tmp_path: Path, writers: Callable[..., HistoryWriter]) -> None:
     writers(tmp_path)
     with pytest.raises(ValueError, match="is being recorded by another process"):
         HistoryWriter(tmp_path, METADATA)
@@ -298,10 +311,217 @@ def test_file_names_have_numbers_and_times() -> None:
     assert file_name(7, 9, 0, 1) == "00000007-00000009.19700101T000000Z-19700101T000001Z.parquet"
 
 
-def test_the_widest_file_hides_the_files_it_contains() -> None:
+def test_widest_omits_the_files_whose_rows_a_wider_file_contains() -> None:
     def file(first: int, last: int) -> HistoryFile:
         return HistoryFile(Path(f"{first}-{last}"), first, last, 0, 0)
 
     files = [file(1, 144), file(1, 1), file(2, 2), file(144, 144), file(145, 145)]
     files.sort(key=lambda one: (one.first, -one.last))
     assert [(one.first, one.last) for one in widest(files)] == [(1, 144), (145, 145)]
+
+
+# ---- SIGKILL of recorders and compaction at any moment: no written row is missing or doubled ----
+
+
+SUPPORT = os.pathsep.join(map(str, Path(histories.__file__).parents[1].iterdir()))
+
+
+def killed_recorder(folder: Path, run: int, dice: random.Random) -> int:
+    """Run a recorder for a while, and kill it; return the number of rows that it reported as written."""
+    words = [sys.executable, histories.__file__, str(folder), str(run)]
+    here = {**os.environ, "PYTHONPATH": SUPPORT}
+    with BoundProcess(words, stdout=subprocess.PIPE, text=True, env=here, start_new_session=True) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline()  # waits until the process records
+        with History(folder) as history:  # read during recording
+            check_runs(history, {}, NOON + run * RUN)
+        time.sleep(dice.uniform(0, 1.2))
+        if dice.random() < 0.5:
+            child.kill()  # kills only the recorder: compaction continues
+        else:
+            os.killpg(child.pid, signal.SIGKILL)
+        said = child.stdout.read().split("\n")[:-1]
+    return int(said[-1]) if said else 0
+
+
+def check_runs(history: History, written: dict[str, int], begin: int | None = None) -> int:
+    """Check that the history has at least the written rows of each run, without gaps. Return its number of
+    rows.
+
+    Rows before `begin` are ignored.
+    """
+    runs: dict[str, list[int]] = defaultdict(list)
+    for rows in history.read(None, begin):
+        for row in rows:
+            runs[row.drive].append(row.monotonic_ns // STEP)
+    for run, numbers in runs.items():
+        assert numbers == list(range(len(numbers))), run  # in order, without gaps or duplicates
+    for run, count in written.items():
+        assert len(runs.get(run, ())) >= count, run
+    return sum(map(len, runs.values()))
+
+
+def total_of_tens(history: History, runs: int) -> int:
+    names = [f"run-{run}.speed" for run in range(runs)]
+    found = history.buckets(names, NOON, NOON + (runs + 1) * RUN, points=1000)
+    return sum(sum(buckets.n) + sum(buckets.missed) for buckets in found.values())
+
+
+@pytest.mark.long
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", usually(3, 200))
+def test_kills_of_recorder_and_compaction_lose_no_row(tmp_path: Path, kills: int) -> None:
+    pytest.importorskip("duckdb", reason="needs duckdb")
+    dice = random.Random(kills)
+    written: dict[str, int] = {}
+    for run in range(kills):
+        written[f"run-{run}"] = killed_recorder(tmp_path, run, dice)
+        with History(tmp_path) as history:
+            name = f"run-{run}"
+            assert check_runs(history, {name: written[name]}, NOON + run * RUN) >= written[name]
+        if run < 15 or run % 20 == 0 or run == kills - 1:
+            with History(tmp_path) as history:
+                total = check_runs(history, written)
+                assert total_of_tens(history, run + 1) == total
+    assert sum(written.values()) > 100 * kills
+    for _ in range(1200):  # a remaining child of low priority may still compact
+        compact([str(tmp_path), "--below", "99999999"])
+        found = listing(tmp_path)
+        if not found.segments:
+            break
+        time.sleep(0.1)
+    assert not found.segments
+    assert len(found.rows) > kills // 2
+    assert any(file.first < file.last for file in found.tens)  # ten-second summaries of a day were merged
+    assert not [*tmp_path.rglob("*.tmp"), *(tmp_path / "damaged").iterdir()]
+    with History(tmp_path) as history:
+        assert check_runs(history, written) == total
+        assert total_of_tens(history, kills) == total
+
+
+# ---- the gateway's historian: settings, rows from polling, and answers to requests ----
+
+
+MS = 1_000_000
+
+
+def inside(folder: Path) -> SimpleNamespace:
+    """Return an object with those attributes of a gateway that a historian uses."""
+    return SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=folder)
+
+
+@asynccontextmanager
+async def historian_in(folder: Path) -> AsyncIterator[historian.Historian]:
+    """Yield a historian whose history is in this folder; it is closed at the end of the block."""
+    made = build(HistorySettings(), inside(folder))
+    try:
+        yield made
+    finally:
+        await made.close()
+
+
+def test_all_mistakes_of_the_history_table_are_reported_together() -> None:
+    with pytest.raises(ValueError, match="invalid time") as failure:
+        HistorySettings(keep="for ever", most="20", rotate="0 s")
+    lines = str(failure.value).splitlines()
+    assert [line.split(" = ")[0] for line in lines] == ["keep", "most", "rotate"]
+    assert "invalid time 'for ever': write 1 s to 100 years" in lines[0]
+    assert "invalid size '20': write 1 kB or more" in lines[1]
+    HistorySettings()
+
+
+def test_a_folder_that_cannot_be_created_raises_a_one_sentence_error(tmp_path: Path) -> None:
+    """The test uses /sys, where not even root may create a folder."""
+    with pytest.raises(OSError, match="folder /sys/history cannot be written: ") as failure:
+        build(HistorySettings(folder="/sys/history"), inside(tmp_path))
+    assert "Errno" not in str(failure.value)
+
+
+def test_infinity_and_nan_are_null_in_json() -> None:
+    """JSON has neither infinity nor NaN: a browser could not parse an answer that has them."""
+    found = as_json(Buckets(0, MS, [1, 2], [0, 0], [-inf, 1.0], [nan, 1.5], [inf, 2.0]))
+    assert [found[key] for key in ("least", "mean", "most")] == [[None, 1.0], [None, 1.5], [None, 2.0]]
+
+
+async def test_large_answers_are_made_outside_the_event_loop_or_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise a stop, which needs the asyncio loop, would wait for the computation."""
+    makers: list[int] = []
+
+    def noted(made: Buckets) -> dict[str, Any]:
+        makers.append(threading.get_ident())
+        return as_json(made)
+
+    monkeypatch.setattr(historian, "as_json", noted)
+    async with historian_in(tmp_path) as part:
+        many = [f"pump-{at}.speed" for at in range(3)]
+        found = json.loads(await part.series([*many, *many], 0, 1000, MOST_BUCKETS // 1000))
+        assert list(found["series"]) == many
+        assert len(makers) == 3
+        assert threading.get_ident() not in makers
+        with pytest.raises(ValueError, match="3 series of 70000 points exceed the limit of 200000 points"):
+            await part.series(many, 0, 1000, 70_000)
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+async def test_no_export_starts_in_the_event_loop(tmp_path: Path, kind: str) -> None:
+    """Otherwise, reading the metadata of thousands of files would block the loop for seconds."""
+    readers: list[int] = []
+
+    class Noted(History):
+        def parting_of(self, *of: Any) -> Any:
+            readers.append(threading.get_ident())
+            return super().parting_of(*of)
+
+    async with historian_in(tmp_path) as part:
+        part.history = Noted(part.history.folder)
+        await Exports().respond(part, [], 0, 1000, kind)
+        assert readers
+        assert threading.get_ident() not in readers
+
+
+async def test_unfinished_exports_of_a_killed_process_are_removed(tmp_path: Path) -> None:
+    left = tmp_path / "history" / ".export-x1y2"
+    left.mkdir(parents=True)
+    (left / "export.parquet").write_bytes(b"PAR1")
+    async with historian_in(tmp_path):
+        assert not left.exists()
+
+
+@pytest.mark.slow
+async def test_the_historian_records_and_answers(tmp_path: Path) -> None:
+    part = build(HistorySettings(folder="kept"), inside(tmp_path))
+    running = asyncio.create_task(part.run())
+    taken = batch(Names(["pump-1"]), 0, range(100), NOON, SECOND)
+    part.take(taken)
+    await asyncio.to_thread(until, lambda: part.state.rows)
+    assert part.state == (100, 0, None)
+    begin, end = NOON // MS, NOON // MS + 100_000
+    found = json.loads(await part.series(["pump-1.speed", "fan.speed"], begin, end, 10))
+    assert found["step_ms"] == 10_000
+    pump, fan = found["series"]["pump-1.speed"], found["series"]["fan.speed"]
+    assert pump["time"] == [begin + 10_000 * number for number in range(10)]
+    assert pump["least"] == [10.0 * number for number in range(10)]  # every tenth row is a miss
+    assert pump["most"] == [10.0 * number + 8 for number in range(10)]
+    assert pump["mean"] == [10.0 * number + 4 for number in range(10)]
+    assert fan["mean"] == [None] * 10
+    for kind in ("csv", "parquet"):
+        path = tmp_path / f"got.{kind}"
+        path.write_bytes(b"".join(part.export(["pump-1.speed"], begin, end, kind)))
+        assert [row for rows in open_recording(path) for row in rows] == list(taken)
+    with pytest.raises(ValueError, match="invalid series"):
+        part.export(["pump"], begin, end, "csv")
+    with pytest.raises(ValueError, match="neither csv nor parquet"):
+        part.export([], begin, end, "xlsx")
+    await part.close()
+    await asyncio.wait_for(running, 60)
+    assert [path.name for path in (tmp_path / "kept").glob("*.arrows")] == ["rows.00000001.arrows"]
+
+
+@pytest.mark.slow
+def test_duckdb_is_loaded_before_the_first_query(tmp_path: Path) -> None:
+    pytest.importorskip("duckdb", reason="needs duckdb")
+    serve = "[serve]\nlisten = '127.0.0.1:0'\n[serve.history]\n"
+    with simulated_plant(tmp_path, serve) as path, serving(path) as (process, _):
+        assert "duckdb" in Path(f"/proc/{process.pid}/maps").read_text()

@@ -25,13 +25,17 @@ STATES, OTHER_STATES = {"values": {"RUN": 1, "STOP": 2}}, {"values": {"STOP": 1,
 
 
 def described(about: dict[str, Any]) -> dict[str, Any]:
-    """Return a plant's metadata in which pump-1's register `load` is `about`, and pump-2's is in amperes."""
+    """Return a plant's metadata. `about` describes the register `load` of pump-1; that of pump-2 is in
+    amperes.
+    """
     drives = {"pump-1": {"registers": {"load": about}}, "pump-2": {"registers": {"load": AMPERE}}}
     return {"drives": drives}
 
 
 def recorded(folder: Path, *segments: dict[str, Any]) -> None:
-    """Record a segment per quantity, each with a value of its own during the first 30 s of a minute."""
+    """Record a segment per quantity. Each has a different value, during the first 30 s of a different
+    minute.
+    """
     with SegmentWriter(folder / "rows.arrows", {}, every=1e9) as writer:
         for number, about in enumerate(segments):
             writer.rotate(described(about))
@@ -53,7 +57,9 @@ def how(request: pytest.FixtureRequest) -> str:
 
 
 def kept(folder: Path, how: str, count: int) -> None:
-    """Keep the segments, compact each of them ("files"), or also merge the tens of their day ("days")."""
+    """Leave the segments as they are ("segments"), compact them ("files"), or also merge each day's summaries
+    ("days").
+    """
     if how == "segments":
         return
     pytest.importorskip("duckdb", reason="needs duckdb")
@@ -68,7 +74,7 @@ def of(
     folder: Path, points: int, begin: int = NOON, end: int = NOON + 300 * SECOND
 ) -> tuple[Buckets, Buckets]:
     with History(folder) as history:
-        for _ in range(2):  # the second time, facts about the files are cached
+        for _ in range(2):  # the second query uses cached facts about the files
             found = history.buckets([SERIES, OTHER], begin, end, points)
     return found[SERIES], found[OTHER]
 
@@ -202,7 +208,7 @@ def test_registers_with_different_value_names_have_two_columns(tmp_path: Path) -
 
 
 @pytest.mark.long
-def test_compacted_rows_say_their_units(tmp_path: Path) -> None:
+def test_compacted_rows_have_their_units(tmp_path: Path) -> None:
     duckdb = pytest.importorskip("duckdb", reason="needs duckdb")
     recorded(tmp_path, AMPERE, RAW, STATES, {})
     kept(tmp_path, "days", 4)

@@ -12,21 +12,23 @@ from multidrop.history.folder import SECOND_NS, TEN_NS
 STEPS_S = (10, 20, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400)
 MOST_POINTS = 100_000
 _BEFORE_ALL, _AFTER_ALL = -(1 << 64), 1 << 64  # ns: earlier and later than any time of a row
-_EMPTY = 0, 0, 0.0, math.inf, -math.inf  # numbers of values and misses; sum, least and most of the values
-FINE_NS = (
-    2 * SECOND_NS
-)  # shorter buckets are made from rows; others from ten-second summaries, at a hundredth of the cost
+# an empty bucket: number of values, number of misses; sum, least and greatest of the values
+_EMPTY = 0, 0, 0.0, math.inf, -math.inf
+# Shorter buckets are computed from rows. Others are computed from ten-second summaries, at a hundredth of the
+# cost.
+FINE_NS = 2 * SECOND_NS
 
 
 @dataclass(frozen=True)
 class Buckets:
     """A register's values in time buckets of equal length; each list has one entry per bucket.
 
-    Bucket i starts at `begin + i * step`, in ns. In a bucket without values, `least`, `mean` and `most` are
-    None, and `missed` is above 0 if the register was polled, else 0.
+    Bucket i starts at `begin + i * step`, in ns. In a bucket without values, `least`, `mean` and `most`
+    are None, and `missed` is above 0 if the register was polled, else 0.
 
-    All values have the register's newest quantity in the range; `unit` is its unit, if recorded. `left_out`
-    lists the units of excluded rows, which were recorded while the name belonged to another register.
+    A register's quantity is that which its values measure. All values are of the newest quantity in the
+    range, and `unit` is its unit, if recorded. `left_out` lists the units of excluded rows, which were
+    recorded while the name belonged to another register.
     """
 
     begin: int  # UTC in ns
@@ -66,7 +68,9 @@ class Grid:
         return self.step % TEN_NS == 0 and self.begin % TEN_NS == 0
 
     def bucket_of(self, time: int) -> tuple[int, int, int]:
-        """Return index, start and end of the bucket of `time`; outside the grid the index is -1."""
+        """Return index, start and end of the bucket that contains `time`; if `time` is outside the grid,
+        the index is -1.
+        """
         if time < self.begin:
             return -1, _BEFORE_ALL, self.begin
         if time >= self.end:
@@ -78,8 +82,8 @@ class Grid:
 def grid_of(begin: int, end: int, points: int) -> Grid:
     """Return a grid of at most `points` buckets that cover the range from `begin` to `end`, in ns.
 
-    Buckets that would take 2 s or more are rounded up to a multiple of 10 s, and the first may then start
-    before `begin`. Raises ValueError for an empty range, or for points outside 1 to 100000.
+    A bucket length of 2 s or more is rounded up to a multiple of 10 s; the first bucket may then start before
+    `begin`. Raises ValueError for an empty range, or for points outside 1 to 100000.
     """
     if not 1 <= points <= MOST_POINTS:
         raise ValueError(f"invalid points = {points}: write 1 to {MOST_POINTS}")
@@ -91,7 +95,7 @@ def grid_of(begin: int, end: int, points: int) -> Grid:
     for step in _handy_steps(least):
         first = begin // step * step
         needed = -(-(end - first) // step)
-        if needed <= max(points, 2):  # with points = 1, a range may still cross the start of a second bucket
+        if needed <= max(points, 2):  # with `points` = 1, a range may lie in two aligned buckets
             return Grid(first, step, needed)
     raise AssertionError("steps grow for ever")
 
@@ -103,7 +107,7 @@ def _handy_steps(least: int) -> Iterator[int]:
 
 
 class Accumulator:
-    """Sums up one register's values and misses in each bucket of a grid."""
+    """Collects one register's values and misses in each bucket of a grid."""
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid
@@ -112,7 +116,9 @@ class Accumulator:
         self._least, self._most = [math.inf] * grid.points, [-math.inf] * grid.points
 
     def add(self, bucket: int, n: int, missed: int, total: float, least: float, most: float) -> None:
-        """Add `n` values, with their sum, least and most, and `missed` misses to the bucket at this index."""
+        """Add `n` values and `missed` misses to the bucket at this index. `total`, `least` and `most` are the
+        sum, least and greatest of the values.
+        """
         self._missed[bucket] += missed
         if n:
             self._n[bucket] += n
@@ -146,7 +152,7 @@ class Accumulator:
             self.add(bucket, n, missed, total, least, most)
 
     def add_all(self, other: Accumulator) -> None:
-        """Add the values of another accumulator of the same grid."""
+        """Add the values of another accumulator with the same buckets."""
         gathered = zip(other._n, other._missed, other._sum, other._least, other._most, strict=True)
         for bucket, known in enumerate(gathered):
             self.add(bucket, *known)
@@ -187,7 +193,7 @@ class UnitBuckets:
         return self._by_unit.setdefault(unit, Accumulator(self._grid))
 
     def buckets(self, unit: str | None, left_out: Sequence[str]) -> Buckets:
-        """Return the buckets of the rows with this unit; with None, of rows with the newest row's unit."""
+        """Return the buckets of the rows with this unit. None selects the unit of the newest row."""
         if unit is None and self._by_unit:
             unit, *others = sorted(self._by_unit, key=self._newest_ns.__getitem__, reverse=True)
             parts, left_out = [self._by_unit[unit]], others

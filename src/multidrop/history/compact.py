@@ -22,6 +22,7 @@ from multidrop.history.quantities import units_of
 from multidrop.polling.batch import Rows
 from multidrop.recording.arrows import ArrowsReader
 from multidrop.recording.segments import FileLock, segments_of
+from multidrop.whole_file import UNFINISHED, whole_file
 
 MEMORY = "100MB"  # limit for DuckDB; the whole process takes about 80 MB more
 WITH_UNITS = """
@@ -73,20 +74,20 @@ def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
                 _compact_segment(database, folder, number, path)
         if merge_rows:
             rows = widest(parquet_files(folder / "rows"))
-            # before merging: a merged file would hide which of its parts lack tens
+            # before the merge, because a merged file would hide which of its parts lack tens
             _make_tens(database, folder, rows[:-1])
             for part in (part for run in finished(rows, 3600, set()) for part in _parts(run)):
-                _merge_rows(database, folder, part)
+                _merge(database, part, MERGED_ROWS, keeps_metadata=True)
         for seconds in (3600, 86400):
             tens = widest(parquet_files(folder / "tens"))
             for run in finished(tens, seconds, _without_tens(folder, tens)):
-                _merge(database, folder, run)
+                _merge(database, run, MERGED, keeps_metadata=False)
 
 
 def clean(folder: Path) -> None:
     """Remove the remains of a killed process: incomplete files, and files that newer files replace."""
     for directory in (folder / "rows", folder / "tens"):
-        for path in directory.glob(".*.part"):
+        for path in directory.glob(UNFINISHED):
             path.unlink()
     shutil.rmtree(folder / ".spill", ignore_errors=True)
     have = {file.first for file in parquet_files(folder / "rows")}
@@ -108,7 +109,7 @@ def _is_whole(path: Path) -> bool:
 
 def _put_away(folder: Path, path: Path, is_damaged: bool) -> None:
     """Remove a compacted segment, or move it to `damaged/` if it is damaged."""
-    with suppress(FileNotFoundError):  # the segment was already removed because of its age
+    with suppress(FileNotFoundError):  # the segment may have been removed already because of its age
         if is_damaged and path.stat().st_size:
             path.replace(folder / "damaged" / path.name)
         else:
@@ -153,36 +154,23 @@ def _readable(reader: ArrowsReader, damage: list[str]) -> Iterator[Rows]:
 
 def _write(database: Any, query: str, path: Path, metadata: dict[str, Any] | None = None) -> None:
     """Write a query's rows into a Parquet file, which gets its final name when it is on the disk."""
-    part = path.with_name(f".{path.name}.part")
-    copy_out(database, query, part, metadata)
-    _on_disk(part)
-    part.replace(path)
-    _on_disk(path.parent)
-
-
-def _on_disk(path: Path) -> None:
-    is_windows = sys.platform == "win32"
-    if is_windows and path.is_dir():  # Windows cannot open folders, and does not need to flush them
-        return
-    file = os.open(path, os.O_RDWR if is_windows else os.O_RDONLY)
-    try:
-        os.fsync(file)
-    finally:
-        os.close(file)
+    with whole_file(path) as part:
+        copy_out(database, query, part, metadata)
 
 
 def _without_tens(folder: Path, tens: list[HistoryFile]) -> set[int]:
-    """Return the numbers of all segments without ten-second summaries in the files `tens`."""
+    """Return the numbers of the segments whose ten-second summaries are in none of the files `tens`."""
     found = {number for number, _ in segments_of(folder / STEM)}
     found |= {file.first for file in parquet_files(folder / "rows")}
     return found - {number for file in tens for number in range(file.first, file.last + 1)}
 
 
 def finished(tens: list[HistoryFile], seconds: int, missing: set[int]) -> list[list[HistoryFile]]:
-    """Return the groups of files to merge: one group for each past period of `seconds`, an hour or a day.
+    """Return groups of files in `tens/` to merge: one group for each past hour or day, which lasts `seconds`
+    s.
 
-    A group is left out while a segment within it lacks tens: the merged file would hide that these tens are
-    missing.
+    A group is left out while a segment within it lacks tens: the merged file would hide that these tens
+    are missing.
     """
     runs = [list(run) for _, run in groupby(tens, key=lambda file: file.begin // seconds)]
     return [
@@ -192,11 +180,15 @@ def finished(tens: list[HistoryFile], seconds: int, missing: set[int]) -> list[l
     ]
 
 
-def _merge(database: Database, folder: Path, run: list[HistoryFile]) -> None:
+def _merge(database: Database, run: list[HistoryFile], query: str, *, keeps_metadata: bool) -> None:
+    """Merge these files into one file in their folder. With `keeps_metadata`, it gets the last file's
+    metadata.
+    """
     begin, end = min(file.begin for file in run), max(file.end for file in run)
-    name = file_name(run[0].first, run[-1].last, begin * 10**9, end * 10**9)
+    path = run[0].path.with_name(file_name(run[0].first, run[-1].last, begin * 10**9, end * 10**9))
     with database.cursor() as cursor:
-        _write(cursor, MERGED.format(with_units(file.path for file in run)), folder / "tens" / name)
+        metadata = kept_metadata(cursor, run[-1].path) if keeps_metadata else None
+        _write(cursor, query.format(with_units(file.path for file in run)), path, metadata)
     for file in run:
         file.path.unlink(missing_ok=True)
 
@@ -217,18 +209,6 @@ def _parts(run: list[HistoryFile]) -> Iterator[list[HistoryFile]]:
         yield part
 
 
-def _merge_rows(database: Database, folder: Path, part: list[HistoryFile]) -> None:
-    """Merge these rows files into one file, which gets the metadata of the last file."""
-    begin, end = min(file.begin for file in part), max(file.end for file in part)
-    name = file_name(part[0].first, part[-1].last, begin * 10**9, end * 10**9)
-    with database.cursor() as cursor:
-        metadata = kept_metadata(cursor, part[-1].path)
-        query = MERGED_ROWS.format(with_units(file.path for file in part))
-        _write(cursor, query, folder / "rows" / name, metadata)
-    for file in part:
-        file.path.unlink(missing_ok=True)
-
-
 def _make_tens(database: Database, folder: Path, rows: list[HistoryFile]) -> None:
     """Write the ten-second summaries that `tens/` lacks for these rows files."""
     missing = _without_tens(folder, widest(parquet_files(folder / "tens")))
@@ -241,9 +221,9 @@ def _make_tens(database: Database, folder: Path, rows: list[HistoryFile]) -> Non
 def be_low() -> None:
     """Lower this process's priority, if the system allows it.
 
-    A recorder may use SCHED_RR. This process would inherit that, and delay the recorder's polling.
+    A recorder may use SCHED_RR. This process would inherit SCHED_RR, and delay the recorder's polling.
     """
-    with suppress(OSError, AttributeError):  # Windows and macOS lack the function
+    with suppress(OSError, AttributeError):  # Windows and macOS lack sched_setscheduler
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     with suppress(OSError):
         os.nice(19)

@@ -11,12 +11,12 @@ from tempfile import mkdtemp
 from typing import Any
 
 from multidrop.extras import install_command
-from multidrop.history.series import Series
+from multidrop.history.quantities import Series
 from multidrop.polling.batch import Rows, assemble, schema
 from multidrop.recording.format import METADATA_KEY, Metadata
 from multidrop.recording.rows import RecordedRows
 
-MOST_INSERTED = 60_000  # limit of rows per insert; each takes 70 bytes, as its names are text
+MOST_INSERTED = 60_000  # limit of rows per insert; a row takes 70 bytes, because its names are text
 TABLE = (
     "create temp table recorded (time timestamptz_ns, monotonic_ns bigint, uncertainty_ns bigint,"
     " drive varchar, register varchar, value double, status varchar)"
@@ -123,7 +123,7 @@ def copy_out(
     metadata: Metadata | None = None,
     values: Mapping[str, Any] | None = None,
 ) -> int:
-    """Write a query's rows into a Parquet file; return the number of rows."""
+    """Write the rows that a query returns into a Parquet file; return the number of rows."""
     form = FORM
     if metadata is not None:
         form += f", kv_metadata {{{METADATA_KEY}: {quoted(json.dumps(metadata, ensure_ascii=False))}}}"
@@ -139,7 +139,8 @@ def rows_of(database: Any, query: str, values: Mapping[str, Any]) -> Iterator[Ro
         columns = [
             (
                 bytes(child.buffer(0)) if child.null_count else None,
-                *(bytes(child.buffer(number)) for number in range(1, child.n_buffers)),  # copies
+                # bytes() copies the buffer
+                *(bytes(child.buffer(number)) for number in range(1, child.n_buffers)),
             )
             for child in array.view().children
         ]

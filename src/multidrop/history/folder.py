@@ -72,9 +72,9 @@ def widest(files: list[HistoryFile]) -> list[HistoryFile]:
 
 @dataclass(frozen=True)
 class Listing:
-    """The current files of a history; each row is in one file."""
+    """The current files of a history; each row is in exactly one file."""
 
-    segments: dict[int, Path] = field(default_factory=dict)  # by number: segments not in `rows`
+    segments: dict[int, Path] = field(default_factory=dict)  # segments not in `rows`, by number
     rows: dict[int, HistoryFile] = field(default_factory=dict)
     tens: list[HistoryFile] = field(default_factory=list)
 
@@ -88,7 +88,8 @@ def listing(folder: Path) -> Listing:
     """List a history, or a recording in segments such as run.arrows. Raises OSError if neither exists."""
     if folder.suffix == ".arrows":
         return Listing(dict(segments_of(folder)))
-    segments = dict(segments_of(folder / STEM))  # first: see the order of listing in __init__
+    # the folder is listed before `rows/` and `tens/`: see rule 3 in the package's docstring
+    segments = dict(segments_of(folder / STEM))
     rows = {file.first: file for file in widest(parquet_files(folder / "rows"))}
     tens = widest(parquet_files(folder / "tens"))
     left = {number: path for number, path in segments.items() if number not in rows}

@@ -12,24 +12,24 @@ from typing import NamedTuple
 from multidrop.core.columns import find_codes
 from multidrop.history.buckets import Accumulator, Grid
 from multidrop.history.folder import TEN_NS
-from multidrop.history.series import Series
+from multidrop.history.quantities import Series
 from multidrop.polling.batch import Row
 from multidrop.recording.arrow_decoder import RecordedColumns
 from multidrop.recording.arrows import ArrowsTail, BatchPlace
 
 MOST_TENS = 4096  # limit of series whose tens are cached, because queries may name unknown series
 
-Ten = list[float]  # numbers of values and misses; sum, least and most of the values
+Ten = list[float]  # a summary: number of values, number of misses; sum, least and greatest of the values
 
 
 class SeriesTens:
-    """The ten-second summaries of one series, computed from all batches with numbers below `past`."""
+    """The ten-second summaries of one series, computed from all batches whose numbers are below `past`."""
 
     __slots__ = ("by_number", "past")
 
     def __init__(self) -> None:
         self.past = 0
-        self.by_number: dict[int, Ten] = {}  # key: number of the ten-second interval since 1970
+        self.by_number: dict[int, Ten] = {}  # by the number of ten-second intervals since 1970
 
     def add(self, time: int, value: float | None) -> None:
         """Add a row; None is a miss."""
@@ -52,9 +52,13 @@ class IndexedBatch(NamedTuple):
     least: int
     most: int
 
+    def may_have(self, begin: int, end: int) -> bool:
+        """Return True if the batch may have rows with begin <= time < end, in ns."""
+        return self.least < end and begin <= self.most
+
 
 class GrowingSegment:
-    """A segment, read as far as it is written. If reading stopped at damage, `damage` describes the damage.
+    """A segment, read up to its current end or to its first damaged part, which `damage` describes.
 
     Raises ValueError if the file is not a recording, and OSError.
     """
@@ -75,7 +79,7 @@ class GrowingSegment:
             self._holders += 1
 
     def let_go(self) -> None:
-        """Undo one call of `hold`, and close the file if no other `hold` remains."""
+        """Undo one call of `hold`. Close the file once all calls of `hold` are undone."""
         with self._changing:
             self._holders -= 1
             if not self._holders:
@@ -104,12 +108,12 @@ class GrowingSegment:
 
     def batches(self, begin: int, end: int) -> list[IndexedBatch]:
         """Return the batches that may have rows with begin <= time < end, in ns."""
-        return [batch for batch in self._batches if batch.least < end and begin <= batch.most]
+        return [batch for batch in self._batches if batch.may_have(begin, end)]
 
     def rows_of(
         self, batch: IndexedBatch, series: frozenset[Series] | None, begin: int, end: int
     ) -> list[Row]:
-        """Return a batch's rows of the series (None: of all) with begin <= time < end, in ns."""
+        """Return a batch's rows of these series (None: all series) with begin <= time < end, in ns."""
         columns = self._tail.again(batch.place)
         wanted = None if series is None else _codes(columns.drives, columns.registers, series)
         return list(_rows(columns, wanted, begin, end))
@@ -128,9 +132,7 @@ class GrowingSegment:
 
     def _batches_between(self, begin: int, end: int) -> range:
         """Return the numbers from the first to the last batch that may have rows in this time range."""
-        found = [
-            number for number, batch in enumerate(self._batches) if batch.least < end and begin <= batch.most
-        ]
+        found = [number for number, batch in enumerate(self._batches) if batch.may_have(begin, end)]
         return range(found[0], found[-1] + 1) if found else range(0)
 
     def _read(self, number: int, series: frozenset[Series]) -> Iterator[SeriesRow]:
@@ -169,7 +171,7 @@ def _is_valid(columns: RecordedColumns, at: int) -> bool:
 def _codes(
     drives: tuple[str, ...], registers: tuple[str, ...], series: frozenset[Series]
 ) -> frozenset[tuple[int, int]]:
-    """Return each series' pair of codes: the indexes of its drive and register in these names."""
+    """Return a pair of codes for each series: the indexes of its drive and its register in these names."""
     known = {drive for drive, _ in series}
     return frozenset(
         (drive_code, code)
@@ -181,7 +183,7 @@ def _codes(
 
 
 def _places(columns: RecordedColumns, wanted: frozenset[tuple[int, int]] | None) -> Sequence[int]:
-    """Return the indexes of the rows whose codes of drive and register are wanted; None means all rows."""
+    """Return the indexes of the rows whose drive and register are in `wanted`; None means all rows."""
     if wanted is None:
         return range(len(columns.time))
     return find_codes(columns.drive, columns.register, wanted)
@@ -221,7 +223,7 @@ class SeriesRows:
     """Rows of one series from a range of batches."""
 
     def __init__(self, first: int) -> None:
-        self.first = self.past = first  # batch numbers: of the first batch, and of the batch after the last
+        self.first = self.past = first  # numbers of the first batch, and of the batch after the last one
         self.times = array("q")
         self.values = array("d")
         self.valid = bytearray()
@@ -240,14 +242,15 @@ class KeptSeries:
 
     def __init__(self, read: Callable[[int, frozenset[Series]], Iterable[SeriesRow]]) -> None:
         self._read = read
-        self._kept: dict[Series, SeriesRows] = {}  # in the order of their last request
+        self._kept: dict[Series, SeriesRows] = {}  # the least recently requested series first
 
     def rows_of(self, series: Iterable[Series], batches: range) -> dict[Series, SeriesRows]:
         """Return each series' rows in these batches; cached rows of neighbouring batches may be included."""
         if not batches:
             return {}
         found = {one: self._found(one, batches) for one in series}
-        begin = min((rows.past for rows in found.values()), default=batches.stop)  # first batch to read
+        # number of the first batch that must be read
+        begin = min((rows.past for rows in found.values()), default=batches.stop)
         for number in range(begin, batches.stop):
             for row in self._read(number, frozenset(one for one in found if found[one].past <= number)):
                 found[row.series].add(row)
@@ -262,6 +265,8 @@ class KeptSeries:
         return sum(len(rows.times) for rows in self._kept.values())
 
     def _found(self, series: Series, batches: range) -> SeriesRows:
-        """Return the cached rows if they reach up to the batch `batches.start`; else an empty entry."""
+        """Return a series' cached rows if they include, or end just before, the batch `batches.start`; else
+        an empty entry.
+        """
         rows = self._kept.pop(series, None)
         return rows if rows and rows.first <= batches.start <= rows.past else SeriesRows(batches.start)

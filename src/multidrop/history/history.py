@@ -10,8 +10,7 @@ from pathlib import Path
 from multidrop.history.buckets import Buckets, Grid, UnitBuckets, grid_of
 from multidrop.history.database import MissingDuckDB
 from multidrop.history.folder import HistoryFile, Listing, listing
-from multidrop.history.quantities import OtherColumn, Parting, units_of
-from multidrop.history.series import Moment, Series, ns_of, parsed_series
+from multidrop.history.quantities import Moment, OtherColumn, Parting, Series, ns_of, parsed_series, units_of
 from multidrop.history.sources import (
     ALWAYS,
     MOST_TRIES,
@@ -35,13 +34,13 @@ from multidrop.recording.rows import from_rows
 class History:
     """The rows in a folder of `multidrop serve` or `HistoryWriter`, or in segments such as `run.arrows`.
 
-    Another process may write the history at the same time: every row appears once, about 0.3 s after polling.
-    A series is a drive and a register, such as "pump-1.output_frequency". A moment is UTC in ns, or a
-    datetime with a time zone.
+    Another process may write the history at the same time. Each row is read exactly once, and can be
+    read about 0.3 s after polling. A series is a drive and a register, such as
+    "pump-1.output_frequency". A moment is UTC in ns, or a datetime with a time zone.
 
-    Compacted files need duckdb (`pip install 'multidrop[history]'`). Methods raise ImportError if there are
-    such files and duckdb is missing, ValueError for an invalid series or range, and OSError. Any thread may
-    call them.
+    Compacted files need duckdb (`pip install 'multidrop[history]'`). Methods raise ImportError if there
+    are such files and duckdb is missing, ValueError for an invalid series or range, and OSError. Any
+    thread may call them.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -88,10 +87,10 @@ class History:
         begin: Moment | None = None,
         end: Moment | None = None,
     ) -> HistoryRows:
-        """Return the rows of the series (None: of all) with begin <= time < end (None: no limit).
+        """Return the rows of the series (None: all series) with begin <= time < end (None: no limit).
 
-        The rows come in the order of recording. If, in a part of the range, a name belonged to another
-        register (with another unit or other names of its numbers), the rows from that part are in a separate
+        The rows come in the order of recording. In a part of the range, a name may have belonged to another
+        register, with another unit or other names of its numbers. The rows from that part are in a separate
         column, such as "motor_load [A]", and `metadata` describes both columns. The result is a recording
         like `multidrop.open_recording` gives: `to_pandas()`, `to_polars()`, `wide()`, batches of rows, Arrow.
         """
@@ -99,7 +98,9 @@ class History:
         return HistoryRows(self, parsed_series(series), first, ALWAYS[1] if end is None else ns_of(end))
 
     def parting_of(self, series: Sequence[Series] | None, begin: int, end: int) -> Parting:
-        """Return the quantities of the series (None: of all) in the segments of this range."""
+        """Return the newest and the earlier quantities of the series (None: all series) in this range's
+        segments.
+        """
         parting = Parting({}, series)
         self._sources.again(lambda found: self._learnt(found, series, begin, end, parting))
         return parting
@@ -109,7 +110,7 @@ class History:
     ) -> Iterator[Rows]:
         """Yield the rows that `read` returns, for parsed series and times in ns."""
         found = self._sources.again(lambda found: self._learnt(found, series, begin, end, parting))
-        given = 0  # number of the last segment that was yielded
+        given = 0  # number of the last segment whose rows were yielded
         for number in sorted({*found.segments, *found.rows}):
             if number <= given:
                 continue
@@ -117,7 +118,7 @@ class History:
                 try:
                     yield from self._rows_of_segment(number, found, series, begin, end, parting)
                     break
-                except Replaced:  # raised before the segment's first row: another file has the rows now
+                except Replaced:  # raised before the segment's first row, so it can be read from its new file
                     found = self._sources.listing()
                     self._check_merged(number, found)
             else:
@@ -132,7 +133,7 @@ class History:
     def _learnt(
         self, found: Listing, series: Sequence[Series] | None, begin: int, end: int, parting: Parting
     ) -> Listing:
-        """Add the quantities of all listed segments to `parting`; return the listing."""
+        """Add the quantities of all listed segments to `parting`; return the same listing."""
         known = self._sources.known(found, begin, end)
         new = parting.unknown_of(known)
         if files := [found.rows[number] for number in new if number in found.rows and not known[number]]:
@@ -166,12 +167,12 @@ class History:
     ) -> dict[str, Buckets]:
         """Return each series' least, mean and greatest values in at most `points` buckets of the range.
 
-        `end` None means now. Single extreme values are kept, in `most` or `least`. Buckets of 2 s and more
-        are rounded up to whole tens of seconds, minutes, hours or days of UTC. Therefore the first may start
-        before `begin`, and the last may end after `end`.
+        `end` None means now. Each bucket keeps its extreme values in `most` and `least`. Buckets of 2 s and
+        more are rounded up to whole tens of seconds, minutes, hours or days of UTC. So the first bucket
+        may start before `begin`, and the last one may end after `end`.
 
-        If, in a part of the range, a name belonged to another register (with another unit or other names of
-        its numbers), only values of the newest quantity are included: see `unit` and `left_out`.
+        In a part of the range, a name may have belonged to another register, with another unit or other
+        names of its numbers. Only values of the newest quantity are included: see `unit` and `left_out`.
         """
         names = parsed_series(series)
         if not names:
@@ -193,7 +194,8 @@ class History:
         self, found: Listing, into: Mapping[Series, UnitBuckets], grid: Grid, parting: Parting
     ) -> None:
         everything = tuple(into)
-        # A file of tens may cover many segments. If their quantities differ, read each segment instead.
+        # A file of ten-second summaries may cover many segments. If their quantities differ, read each
+        # segment instead.
         tens = [file for file in found.tens if grid.is_of_tens and parting.is_whole(file.first, file.last)]
         reckoned = {number for file in tens for number in range(file.first, file.last + 1)}
         parted: dict[tuple[str, tuple[Series, ...]], list[HistoryFile]] = {(OF_TENS, everything): tens}
@@ -248,7 +250,7 @@ class History:
             with writer:
                 for batch in rows:
                     writer.write(batch)
-        except BaseException:  # also Ctrl-C: an incomplete file would look complete
+        except BaseException:  # also after Ctrl-C: remove the file, because it would look complete
             writer.discard()
             raise
         return writer.rows
@@ -294,7 +296,9 @@ class HistoryRows(RecordingReader):
 
 
 def _renamed(rows: list[Row], others: Iterable[OtherColumn]) -> list[Row]:
-    """Return a segment's rows; registers with an earlier quantity get the names of their own columns."""
+    """Return a segment's rows, in which registers with an earlier quantity have the names of their separate
+    columns.
+    """
     columns = {other.series: other.column for other in others}
     if not columns:
         return rows

@@ -1,15 +1,20 @@
-"""Quantities: what the values of a series measure, from the metadata of their segments.
+"""Series and quantities: the names of series, and what their values measure, from the metadata of segments.
 
-In a new segment, a name may belong to another drive or family. Values of two quantities are never combined.
+From one segment to the next, a name may pass to another drive or family. Values of two quantities are never
+combined.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple
 
-from multidrop.history.series import Series
+from multidrop.printable import is_whole
 
+Series = tuple[str, str]  # drive and register
+Moment = int | datetime
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 RAW, NAMED = "raw count", "names"
 
 
@@ -39,7 +44,9 @@ def known_by(metadata: object) -> Known:
 
 
 def units_of(metadata: object) -> dict[Series, str]:
-    """Return each series' text in the column `unit` of Parquet files, as in messages of a fleet's samples."""
+    """Return each series' text for the column `unit` of Parquet files. The samples that a fleet sends have
+    the same text.
+    """
     found = {}
     drives = _table(_table(metadata).get("drives"))
     for (drive, register), quantity in quantities_of(metadata).items():
@@ -77,18 +84,20 @@ def _number(text: object) -> object:
 
 
 class OtherColumn(NamedTuple):
-    """A column for rows of one file whose quantity is not the series' newest quantity."""
+    """A column for those rows of one file whose quantity is not the series' newest one."""
 
     series: Series
-    unit: str | None  # only rows with this unit are in the column; None: all rows of the file
+    unit: str | None  # the column has only the file's rows with this unit; None: all its rows
     column: str
 
 
 class Parting:
-    """The newest quantity of each series, and the series' earlier quantities. Buckets exclude their values.
+    """The newest quantity of each series, and the series' earlier quantities.
 
-    In rows, values of an earlier quantity get a column of their own, such as "load [A]". `series` None means
-    all series that the segments describe.
+    Buckets exclude values of earlier quantities.
+
+    When rows are read, values of an earlier quantity get a separate column, such as "load [A]". `series` None
+    means all series that the segments describe.
     """
 
     def __init__(self, known: Mapping[int, Known], series: Iterable[Series] | None = None) -> None:
@@ -135,7 +144,7 @@ class Parting:
         ]
 
     def described(self, metadata: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the metadata with a correct description of each column."""
+        """Return the metadata, corrected so that each column is described by the quantity of its values."""
         columns = {series: (series[1], quantity) for series, quantity in self.newest.items()}
         drives = {name: dict(_table(about)) for name, about in _table(metadata.get("drives")).items()}
         said = quantities_of(metadata)
@@ -165,3 +174,32 @@ class Parting:
     def _is_newest(self, series: Series, number: int) -> bool:
         quantities = self._known.get(number, {}).get(series, ())
         return all(quantity == self.newest[series] for quantity in quantities)
+
+
+# ---- arguments of a query ----
+
+
+def parsed_series(series: str | Iterable[str] | None) -> list[Series] | None:
+    """Return series as pairs of drive and register. Raises ValueError for an invalid name."""
+    if series is None:
+        return None
+    found = []
+    for name in [series] if isinstance(series, str) else series:
+        drive, point, register = name.rpartition(".")
+        if not (drive and point and register):
+            raise ValueError(
+                f"invalid series {name!r}: write a drive and a register, such as 'pump-1.motor_speed'"
+            )
+        found.append((drive, register))
+    return list(dict.fromkeys(found))
+
+
+def ns_of(moment: Moment) -> int:
+    """Convert a moment (UTC in ns, or a datetime with a time zone) to UTC in ns."""
+    if isinstance(moment, datetime):
+        if moment.tzinfo is None:
+            raise ValueError(f"{moment} has no time zone: write datetime(..., tzinfo=UTC)")
+        return (moment - _EPOCH) // timedelta(microseconds=1) * 1000
+    if not is_whole(moment):
+        raise TypeError(f"a time must be UTC in ns, or a datetime with a time zone, not {moment!r}")
+    return moment

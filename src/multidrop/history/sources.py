@@ -23,13 +23,12 @@ from multidrop.history.database import (
 )
 from multidrop.history.folder import HistoryFile, Listing, listing
 from multidrop.history.growing import GrowingSegment
-from multidrop.history.quantities import Known, OtherColumn, Quantity, known_by
-from multidrop.history.series import Series
+from multidrop.history.quantities import Known, OtherColumn, Quantity, Series, known_by
 from multidrop.polling.batch import Rows
 from multidrop.recording.format import Metadata
 
 T = TypeVar("T")
-ALWAYS = -(2**63), 2**63 - 1  # ns: a range that includes every time
+ALWAYS = -(2**63), 2**63 - 1  # in ns UTC: a range that includes every time
 MEMORY = "200MB"  # limit for DuckDB
 MOST_TRIES = 50  # limit of attempts to read files that are being replaced
 MOST_GROWING = 4  # limit of segments whose index is cached
@@ -37,15 +36,17 @@ FILES_AT_ONCE = 200  # files per query of metadata; a file's metadata may take 1
 
 
 class Replaced(Exception):
-    """A listed file is gone: compaction moved its rows to another file, or it was removed for its age."""
+    """A listed file no longer exists: compaction moved its rows to another file, or the file was removed
+    because of its age.
+    """
 
 
 class Sources:
-    """The open files of a history's folder; any thread may use it."""
+    """The open files of a history's folder; any thread may use this object."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.damage: dict[int, str] = {}  # key: segment number; value: a sentence
+        self.damage: dict[int, str] = {}  # a sentence for each damaged segment, by number
         self._growing: dict[int, GrowingSegment] = {}
         self._bounds: dict[int, tuple[int, int]] = {}  # first and last time of each closed segment
         self._known: dict[int, Known] = {}  # quantities by segment number
@@ -59,7 +60,7 @@ class Sources:
             self._database.close()
 
     def listing(self) -> Listing:
-        """List the current files of the history, and close files that are no longer part of it."""
+        """List the current files of the history, and close files that were removed from it."""
         found = listing(self.folder)
         with self._changing:
             for number in set(self._growing) - set(found.segments):
@@ -68,7 +69,8 @@ class Sources:
 
     @contextmanager
     def segment(self, number: int, found: Listing, begin: int, end: int) -> Iterator[GrowingSegment | None]:
-        """Yield a segment, read up to its current end, and keep its file open during the `with` block.
+        """Yield a segment whose rows were read up to its current end, and keep its file open during the
+        `with` block.
 
         Yield None if the segment has no rows in this range or cannot be read. Raises Replaced.
         """
@@ -77,7 +79,7 @@ class Sources:
             least, most = self._bounds.get(number, ALWAYS)
             if least < end and begin <= most:
                 segment = self._held(number, found.segments[number])
-            if segment and number < max(found.segments):  # closed: its bounds are final
+            if segment and number < max(found.segments):  # the segment is closed, so its bounds are final
                 self._bounds[number] = segment.bounds
                 if segment.left_out:
                     left_out = (
@@ -92,14 +94,17 @@ class Sources:
                 segment.let_go()
 
     def _held(self, number: int, path: Path) -> GrowingSegment | None:
-        """Return a segment; the caller must call its `let_go`. Cache the indexes of the newest segments."""
+        """Return a segment, whose `let_go` the caller must call. The indexes of the newest segments are
+        cached.
+        """
         segment = self._growing.get(number)
         if segment is None:
             try:
                 segment = GrowingSegment(path)
             except FileNotFoundError:
                 raise Replaced from None
-            except ValueError as error:  # the file's head is not written yet, or was lost in a power cut
+            # an empty file is not damaged: its start was not written yet, or was lost in a power cut
+            except ValueError as error:
                 if path.exists() and path.stat().st_size:
                     self.damage[number] = str(error)
                 return None
@@ -143,7 +148,7 @@ class Sources:
             return self._database.cursor()
 
     def again(self, act: Callable[[Listing], T]) -> T:
-        """Return act(listing). If it raises Replaced, call it again with a new listing."""
+        """Return `act(listing)`. If `act` raises Replaced, call it again with a new listing."""
         for _ in range(MOST_TRIES):
             try:
                 return act(self.listing())
@@ -163,7 +168,7 @@ def _parsed(text: str) -> object:
 
 @contextmanager
 def while_there(files: Sequence[HistoryFile]) -> Iterator[None]:
-    """Raise Replaced if the `with` block fails and a file in `files` no longer exists."""
+    """Convert an error of the `with` block to Replaced if a file in `files` no longer exists."""
     try:
         yield
     except Exception as failure:
@@ -196,10 +201,12 @@ def rows_of_file(
     end: int,
     renamed: Iterable[OtherColumn],
 ) -> Iterator[Rows]:
-    """Yield the series' rows (None: all) in order of request times. Raises Replaced before the first row."""
+    """Yield the rows of the series (None: all series) by request time. Raises Replaced only before the first
+    row.
+    """
     condition, values = _condition(series)
     with sources.cursor() as cursor, while_there([file]):
-        # Sorting reads the whole file before the first row is yielded, so Replaced is never raised later.
+        # Sorting reads the whole file before the first row is yielded, so Replaced is not raised after that.
         query = _ROWS.format(_columns(renamed), with_units([file.path]), condition) + " order by monotonic_ns"
         yield from rows_of(cursor, query, {"begin": begin, "end": end, **values})
 
@@ -232,7 +239,11 @@ def gather_files(
 def units_in_rows(
     sources: Sources, files: Sequence[HistoryFile], series: Sequence[Series] | None, begin: int, end: int
 ) -> dict[int, Known]:
-    """Return each file's quantities by its first segment, from the units in its rows. Raises Replaced."""
+    """Return the quantities in each file, by the number of its first segment. The file's rows state their
+    units.
+
+    Raises Replaced.
+    """
     condition, values = _condition(series)
     query = _UNITS.format(files=with_units(file.path for file in files), condition=condition)
     known: dict[str, dict[Series, list[Quantity]]] = {str(file.path): {} for file in files}
@@ -259,7 +270,8 @@ def write_parquet(
     metadata: Metadata,
     renamed: Mapping[int, Iterable[OtherColumn]],
 ) -> int:
-    """Write batches, and the files' rows of the series in this range; return the number of rows.
+    """Write a Parquet file of these batches, and of the files' rows of the series in this range. Return the
+    number of rows.
 
     `renamed` maps the first segment of a file to the columns that `rows_of_file` takes. Raises Replaced.
     """
@@ -297,7 +309,8 @@ def _condition(series: Sequence[Series] | None) -> tuple[str, dict[str, Any]]:
     marks = {name: f"${mark}" for mark, name in values.items() if mark[0] == "d"}
     others = {name: f"${mark}" for mark, name in values.items() if mark[0] == "r"}
     condition = f" and drive in ({', '.join(marks.values())}) and register in ({', '.join(others.values())})"
-    if len(drives) * len(registers) > len(series):  # some pairs are not wanted; pair by pair is slower
+    # some pairs of these drives and registers are not wanted, so select by pairs, which is slower
+    if len(drives) * len(registers) > len(series):
         pairs = ", ".join(f"({marks[drive]}, {others[register]})" for drive, register in series)
         condition += f" and (drive, register) in ({pairs})"
     return condition, values

@@ -21,8 +21,8 @@ from multidrop.transport import clock
 
 MOST_WAITING = 250_000  # limit of unwritten rows (12 MB); while the disk is slow, further rows are dropped
 WRITING_S = 0.4  # time between writes; each write makes a batch, and many small batches slow down queries
-TENDING_S = 60.0  # time between removals of old files
-HANGING_S = 5.0  # a write that takes longer is reported
+TENDING_S = 60.0  # time between removals of old files, in s
+HANGING_S = 5.0  # a write that takes longer than this (in s) is reported
 ENDING_S = 10.0  # how long `close` waits for the disk
 
 _log = logging.getLogger("multidrop.history")
@@ -67,7 +67,7 @@ class HistoryWriter:
         self._waiting_rows = 0
         self._ended: list[
             tuple[list[GatheredRows], Metadata]
-        ] = []  # rows of ended segments, and the metadata of the segment after each
+        ] = []  # for each ended segment: its unwritten rows, and the metadata of the segment that follows
         self._changing = threading.Lock()
         self._dropped = 0
         self._trouble: str | None = None
@@ -84,7 +84,7 @@ class HistoryWriter:
         return []
 
     def take(self, batch: Batch) -> None:
-        """Copy a batch's rows for the writing thread, in microseconds. Never raises because of the disk."""
+        """Copy a batch's rows for the writing thread, in microseconds. Disk errors are never raised here."""
         with self._changing:
             if self._over.is_set() or self._waiting_rows + len(batch) > MOST_WAITING:
                 self._dropped += len(batch)
@@ -103,7 +103,7 @@ class HistoryWriter:
         return HistoryState(self._segments.rows, self._dropped, self._hang() or self._trouble)
 
     def _hang(self) -> str:
-        """Return a sentence if a disk access hangs, else ""."""
+        """Return a sentence about the disk access that hangs, or "" if none does."""
         since_ns = self._busy_since_ns
         seconds = 0.0 if since_ns is None else (clock.now_ns() - since_ns) / 1e9
         return f"the disk has not answered for {seconds:.0f} s" if seconds > HANGING_S else ""
@@ -114,7 +114,7 @@ class HistoryWriter:
         return self._thread.is_alive()
 
     def close(self) -> None:
-        """Write the waiting rows and end the thread; wait at most 10 s for the disk."""
+        """Write the queued rows and end the thread; wait at most 10 s for the disk."""
         self._over.set()
         self._thread.join(ENDING_S)
 
@@ -160,7 +160,7 @@ class HistoryWriter:
                 _log.error("nothing is recorded: %s", failure)
             self._trouble = str(failure)
             self._rotate()
-            self._tended_ns = None  # remove old files at the next turn: this may free space
+            self._tended_ns = None  # remove old files at the next opportunity, because that may free space
             return
         if self._trouble:
             _log.warning("rows are recorded again; %d were lost so far", self._dropped)
@@ -192,7 +192,7 @@ class HistoryWriter:
 
 
 class Compactor:
-    """Runs a child process that compacts closed segments, and again when more segments are closed."""
+    """Starts a child process that compacts closed segments, and a new one once more segments are closed."""
 
     PAUSE_S = 60.0  # pause after a failed compaction
 
@@ -237,7 +237,7 @@ class Compactor:
         self._not_before_ns = clock.now_ns() + round(self.PAUSE_S * 1e9)
 
     def end(self) -> None:
-        """Kill the child process. That is safe, because compaction can be interrupted at each step."""
+        """Kill the child process; compaction can safely be interrupted at each step."""
         if self._child:
             self._child.kill()
             self._child.communicate()
