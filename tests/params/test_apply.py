@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from random import Random
+from threading import Timer
+from time import monotonic
 from typing import Any
 
 import pytest
-from disks import full_at
 from examples import usually
-from parameter_drives import factory_reset, obey_the_line, raw_of, set_at_random, with_parameters, writable
+from interruptions import full_at
+from killable_client import DRIVE
+from kills import BoundProcess
 from simulated_bus import SimulatedBus
+from simulated_pumps import factory_reset, obey_the_line, raw_of, set_at_random, with_parameters, writable
+from tables import table
 
 from multidrop import (
     YD1000,
+    Bus,
     CancelledByStop,
     DelixiModbus,
     DelixiNative,
@@ -26,7 +38,7 @@ from multidrop import (
 from multidrop.control import Ledger, read_audit
 from multidrop.families.registry import shipped_family
 from multidrop.families.yd1000 import COMMAND
-from multidrop.sim import MotorDrive
+from multidrop.sim import MotorDrive, Simulator, Wire
 from multidrop.sim.memory import MemoryCell
 from multidrop.sim.protocol import Reason, Refusal
 
@@ -48,7 +60,7 @@ def _state(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def made(family: type[Drive]) -> Drive:
-    """Return a drive of the family whose run source, if it has one, is the line."""
+    """Return a drive of the family. If the drive has a run source, it is the line."""
     return family(1, **({"confirmed": 1} if family.declared_in else {}))
 
 
@@ -136,7 +148,7 @@ def test_drive_that_obeys_its_panel_makes_apply_raise(
     [
         ({"9999": 1}, "yd1000 has no parameter 9999"),
         ({"0009": 65000}, r"0009: acceleration_time = 6500 is outside 0\.1 to 3600 s"),
-        ({"0009": 0, "0010": 1}, "values that are not written, and nothing was"),
+        ({"0009": 0, "0010": 1}, "has values that may not be written: "),
     ],
 )
 def test_one_invalid_value_refuses_the_whole_set(
@@ -165,7 +177,7 @@ def test_communication_parameters_are_written_only_if_named_in_also(monkeypatch:
     assert [change.parameter.code for change in left.plan.writes] == [
         "F803",
         "F801",
-    ]  # communication parameters in the order of the family
+    ]  # F801 (parity) is a communication parameter, so it is written last
     with pytest.raises(ValueError, match="--also F803: it is not the drive's address"):
         params.plan(drive, {"F803": 20}, also=["F803"])
     assert list(params.plan(drive, {"F802": 5}).left) == ["F802"]
@@ -251,7 +263,7 @@ def test_refused_write_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch)
     assert "value out of limits" in str(done.refused["P01.00"])
 
 
-def test_interrupted_application_is_reported_by_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_apply_is_reported_by_the_next_apply(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = attached(monkeypatch, YD1000(1), [])
     line.deafens = lambda request: request.function == 6 and request.start == 0x0010
     first = params.apply(drive, {"0009": 200, "0010": 200, "0018": 100})
@@ -264,7 +276,7 @@ def test_interrupted_application_is_reported_by_the_next(monkeypatch: pytest.Mon
     assert params.apply(drive, {"0009": 200}).earlier == []
 
 
-def test_motor_that_starts_meanwhile_ends_the_application(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_motor_that_starts_during_apply_ends_the_apply(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, sim = attached(monkeypatch, YD1000(1), [])
 
     def start(number: int, total: int, change: params.ParameterChange, not_written: object) -> None:
@@ -277,7 +289,7 @@ def test_motor_that_starts_meanwhile_ends_the_application(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("family", [YD1000, DelixiModbus])  # a Delixi is sent a stop before its first write
-def test_stop_ends_the_application(monkeypatch: pytest.MonkeyPatch, family: type[Drive]) -> None:
+def test_a_stop_during_apply_ends_the_apply(monkeypatch: pytest.MonkeyPatch, family: type[Drive]) -> None:
     values = {"0009": 200, "0010": 200} if family is YD1000 else {"P01.00": 5, "P01.01": 6}
     line, drive, _ = attached(monkeypatch, family(1), EXTRA[family])
     done = params.apply(drive, values, report=lambda *_: drive.stop())
@@ -297,8 +309,8 @@ def test_stop_while_the_plan_is_read_cancels_all_writes(monkeypatch: pytest.Monk
     assert {frame[6:11] for frame in line.written} == {"20 00"}  # only the stop
 
 
-@pytest.mark.parametrize("room", [0, 100, 130, 160, 200, 230])  # bytes: cuts each record of the journal
-def test_full_disk_ends_the_application_and_the_next_one_completes_it(
+@table("room", [0, 100, 130, 160, 200, 230])  # free bytes on the disk; each record is cut once
+def test_a_full_disk_ends_apply_and_the_next_apply_completes_the_writes(
     monkeypatch: pytest.MonkeyPatch, room: int
 ) -> None:
     line, drive, _ = attached(monkeypatch, ErmanERG220(1), [])
@@ -337,3 +349,88 @@ def test_refusal_of_a_ramp_time_suggests_only_existing_ways(monkeypatch: pytest.
         drive.write("acceleration_time", 30.0)
     way = "wait, set it on the drive's panel, or use `multidrop params apply --commissioning`"
     assert way in refusal.value.for_command_line()
+
+
+# ---- calls of apply that are killed ----
+
+
+CODES = [f"P0{group}.{index:02}" for group in (1, 2) for index in range(4)]
+
+
+class Lives:
+    """Applies a parameter file repeatedly, each time in a process that is killed after some seconds."""
+
+    def __init__(self, process: subprocess.Popen[str], port: str, file: Path, report: Path) -> None:
+        self._process = process
+        self._line = f"apply {port} {file} {report}\n"
+
+    def live(self, seconds: float) -> int:
+        """Apply the file in a process that is killed after `seconds`; return its status, 0 if complete."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(self._line)
+        self._process.stdin.flush()
+        life = int(self._process.stdout.readline())
+        killer = Timer(seconds, self._kill, [life])
+        killer.start()
+        status = int(self._process.stdout.readline())
+        killer.cancel()
+        return status
+
+    @staticmethod
+    def _kill(life: int) -> None:
+        with suppress(ProcessLookupError):
+            os.kill(life, signal.SIGKILL)
+
+
+@pytest.fixture
+def lives(tmp_path: Path) -> Iterator[tuple[Lives, object]]:
+    sim = with_parameters(DelixiNative(**DRIVE), CODES)
+    there = writable(sim.drive, CODES)
+    set_at_random(sim, there, Random(1))
+    program = Path(__file__).parents[1] / "support" / "processes" / "killable_client.py"
+    environment = os.environ | {"XDG_STATE_HOME": str(tmp_path / "state")}
+    with Simulator([Wire([sim], unpaced=True)]) as simulator:
+        port = simulator.wires[0].path
+        with Bus(port) as bus:
+            saved = params.read(bus.attach(DelixiNative, **DRIVE), [one.code for one in there])
+        params.save(saved, tmp_path / "saved.toml")
+        with BoundProcess(
+            [sys.executable, str(program)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+        ) as process:
+            yield Lives(process, port, tmp_path / "saved.toml", tmp_path / "report"), (sim, there)
+            process.kill()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("most", usually(10, 50))
+def test_the_writes_of_a_killed_apply_are_completed_by_the_next_apply(
+    lives: tuple[Lives, object], tmp_path: Path, most: int
+) -> None:
+    killed, (sim, there) = lives
+    random, kills, whole_s = Random(41), 0, 60.0
+    wanted = {one.code: raw_of(sim, one) for one in there}
+    while kills < most:
+        factory_reset(sim, there)
+        sim.counters.eeprom_writes.clear()
+        differing = {one.code for one in there if raw_of(sim, one) != wanted[one.code]}
+        begun = monotonic()
+        was_complete = False
+        while status := killed.live(random.uniform(0, whole_s) if kills or whole_s < 60 else whole_s):
+            assert status == signal.SIGKILL
+            kills += 1
+            written = {one.code: raw_of(sim, one) for one in there} == wanted
+            was_complete = written and not [*tmp_path.glob("state/**/applications/*.jsonl")]
+        whole_s = min(whole_s, monotonic() - begun)
+        assert {one.code: raw_of(sim, one) for one in there} == wanted
+        names = {one.code: one.name for one in there}
+        assert {names[code]: 1 for code in differing} == {
+            name: count for name, count in sim.counters.eeprom_writes.items() if name in names.values()
+        }
+        if not was_complete:  # if complete, `apply` returned its report before the kill
+            reported = (tmp_path / "report").read_text().splitlines()
+            assert differing <= {line.partition(":")[0] for line in reported}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import ClassVar
 
 import pytest
@@ -13,6 +15,7 @@ from multidrop.core import Message
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace, parameters_of
 from multidrop.drive.register import HOLDING
 from multidrop.families.registry import find_model
+from multidrop.params import files
 from multidrop.sim import SimulatedDrive
 
 
@@ -88,7 +91,7 @@ def test_group_without_replies_is_abandoned(monkeypatch: pytest.MonkeyPatch) -> 
     assert len(line.frames) < 5 * 10 * 8
 
 
-def test_silent_drive_raises_no_reply(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silent_drive_raises_the_error_no_reply(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, DelixiNative(1))
     asked: list[Message] = []
     line.deafens = lambda request: bool(asked.append(request)) or len(asked) > 20
@@ -100,7 +103,7 @@ def test_silent_drive_raises_no_reply(monkeypatch: pytest.MonkeyPatch) -> None:
 ADDRESSES = [
     ("delta-cp2000", "04-10", 0x040A),  # CP2000 manual p. 12.1-09-8
     ("powtran-pi130", "F0.01", 0xF001),  # PI130 manual p. 112
-    ("powtran-pi130", "F3.12", 0xF30C),  # PI500 manual p. 88, as the following
+    ("powtran-pi130", "F3.12", 0xF30C),  # PI500 manual p. 88, like the next ones
     ("powtran-pi130", "E3.21", 0xA315),
     ("powtran-pi130", "y1.30", 0xC11E),
     ("invt-goodrive", "P14.02", 0x0E02),  # Goodrive200A manual p. 138
@@ -132,7 +135,7 @@ def test_hazardous_and_unexplained_parameters_are_not_written(model: str, codes:
 
 
 def test_explained_parameters_of_a_delixi_e_are_written() -> None:
-    """The codes that DelixiCDIE100.cpp names, without those of command, identification and line."""
+    """DelixiCDIE100.cpp has these codes, and those of commands, motor identification and communication."""
     named = [f"P0.0.{index:02}" for index in (7, 8, *range(11, 19))] + [
         "P0.0.02",
         "P1.0.00",
@@ -180,3 +183,101 @@ def test_declared_parameters_are_stored_despite_a_ram_address() -> None:
 
     ramp = parameters_of(WithAlias)["P01"]
     assert (ramp.name, ramp.ram_address, ramp.kept, ramp.table) == ("ramp", None, Kept.EEPROM, HOLDING)
+
+
+# ---- parameter files: saved values load again, and an invalid file raises a one-sentence error ----
+
+
+GD20 = "GRUPO_PARAMETRO;CODIGO_FUNCAO;VALOR_PARAMETRO"
+FOUND = params.ParameterSet(
+    "yd1000", {"0009": 100, "F240": 7}, source="pump-1", title="YD1000", firmware="104", saved="2026-11-29"
+)
+
+
+@pytest.mark.parametrize("name", ["pump.toml", "pump.csv"])
+def test_saved_files_load_with_the_same_values(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    params.save(FOUND, path, YD1000)
+    found = params.load(path)
+    assert found.values == FOUND.values
+    assert (found.model, found.firmware, found.saved) == ("yd1000", "104", "2026-11-29")
+    assert found.source == str(path)
+    assert "acceleration_time" in path.read_text()
+    assert "10.0 s" in path.read_text()
+    assert params.is_parameter_file(path)
+
+
+def test_saving_to_an_existing_file_raises(tmp_path: Path) -> None:
+    (tmp_path / "pump.toml").write_text("")
+    with pytest.raises(ValueError, match="exists already, and is not replaced"):
+        params.save(FOUND, tmp_path / "pump.toml")
+    with pytest.raises(ValueError, match=r"name ends in \.toml or \.csv"):
+        params.save(FOUND, tmp_path / "pump.txt")
+
+
+def test_a_set_without_parameters_is_not_saved(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"pump-1 returned no value of its parameters, so .* is not written"):
+        params.save(params.ParameterSet("yd1000", {}, source="pump-1"), tmp_path / "pump.toml")
+    assert not (tmp_path / "pump.toml").exists()
+
+
+def test_file_that_is_too_long_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes(b"#" * (files.MOST_BYTES + 1))
+    with pytest.raises(ValueError, match="the parameter file has more than 1000000 bytes"):
+        params.load(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize("quote", ["", '"'])
+def test_backup_files_of_the_gd20_tool_are_loaded(tmp_path: Path, quote: str) -> None:
+    rows = [("CODIGO_FUNCAO", "GRUPO_PARAMETRO", "VALOR_PARAMETRO"), (3, 0, 5000), (12, 14, 3)]
+    text = "\r\n".join(";".join(f"{quote}{cell}{quote}" for cell in row) for row in rows)
+    (tmp_path / "bkp_result.csv").write_text(text)
+    found = params.load(tmp_path / "bkp_result.csv")
+    assert found.values == {"P00.03": 5000, "P14.12": 3}
+    assert found.model == "invt-goodrive"
+
+
+@table(
+    ("name", "text", "sentence"),
+    [
+        ("a.toml", "", r"is not a parameter file: it has no \[parameters\]"),
+        ("a.toml", '[[line]]\nname = "a"', "is a plant file, not a parameter file"),
+        ("a.toml", "format = 2\n[parameters]\nA = 1", "has format 2, but this version of multidrop reads"),
+        ("a.toml", 'format = "x"\n[parameters]\nA = 1', "format = 'x' is not 1"),
+        ("a.toml", "[parameters]\nA = 1.5", "A = 1.5 is not a raw count"),
+        ("a.toml", "[parameters]", "has no parameters"),
+        ("a.toml", "[parameters", "is not TOML"),
+        ("a.csv", "x;y\n1;2", "its first row does not name the columns code and raw"),
+        ("a.csv", "code;raw\nA;1\nA;2", "A is given twice"),
+        ("a.csv", "code;raw\nA;one", "'one' is not a whole number"),
+        ("a.csv", "# format: 7\ncode;raw\nA;1", "has format 7"),
+        ("a.csv", "code;raw\nA;" + 5000 * "9", "has 100 digits at most, and this one has 5000"),
+        ("a.csv", "# format: " + 5000 * "9" + "\ncode;raw\nA;1", "has 100 digits at most"),
+        ("a.csv", 'code;raw\n"' + 200_000 * "A" + '";1', "is not CSV: field larger than field limit"),
+        ("a.csv", f"{GD20}\n0;3;6000\n00;03;1", r"P00\.03 is given twice"),
+        ("a.csv", f"{GD20}\n0;3;99999999999", r"P00\.03 = 99999999999 is not a raw count"),
+        ("a.csv", "GRUPO_PARAMETRO;CODIGO_FUNCAO\n0;1", "lists parameters without values"),
+        ("a.csv", "", "is not a parameter file"),
+    ],
+)
+def test_invalid_file_raises_a_one_sentence_error(
+    tmp_path: Path, name: str, text: str, sentence: str
+) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=sentence) as raised:
+        params.load(tmp_path / name)
+    assert str(raised.value).startswith(str(tmp_path / name))
+    assert "\n" not in str(raised.value)
+
+
+def test_a_device_or_directory_is_not_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "port.csv")
+    for path in (tmp_path / "port.csv", tmp_path):
+        with pytest.raises(ValueError, match="is not a file, but a directory or a device"):
+            params.load(path)
+
+
+def test_missing_file_raises_a_one_sentence_error(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="cannot be read: No such file"):
+        params.load(tmp_path / "a.toml")
+    assert not params.is_parameter_file(tmp_path / "a.toml")

@@ -1,4 +1,4 @@
-"""Pictures and pages of a recording: the numbers in them; their look is not tested."""
+"""Pictures and pages of a recording: the numbers in them are tested, but not their appearance."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ REQUEST_9600 = 9 * 10 / 9600  # s: 8 characters of the request, and the first ch
 
 @pytest.fixture(scope="module", autouse=True)
 def _imported() -> None:
-    """Import matplotlib when these tests run: at collection, it would cost each worker 0.5 s."""
+    """Import matplotlib only when these tests run. At collection, it would cost each worker 0.5 s."""
     global np, Recording, load, plot, plot_page, png, report_page, _about, _drives
     global MOST_REASONS, delays, draw_rates, miss_shares, reasons_of, line_uses
     global MOST_DRIVES, MOST_LANES, MOST_PANELS, MOST_POINTS, thinned
@@ -45,7 +45,7 @@ def _imported() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seconds", [0.01, 0.3, 2, 7, 90, 4000, 200_000])
-def test_ticks_of_the_time_axis_differ(seconds: float) -> None:
+def test_neighbouring_ticks_of_the_time_axis_have_different_labels(seconds: float) -> None:
     from multidrop.report.style import day, label_time, new_figure
 
     figure, (axes,) = new_figure([2.0])
@@ -58,7 +58,7 @@ def test_ticks_of_the_time_axis_differ(seconds: float) -> None:
 
 
 def noisy_ramp() -> list[Row]:
-    """Return rows of a pump that runs up for 100 s; from 30 Hz on it misses every second value of `fault`."""
+    """Return rows of a pump whose speed rises for 100 s. From 30 Hz on, every second `fault` is a miss."""
     rows = []
     for tick in range(1000):
         second, hz = tick / 10, tick / 20
@@ -105,7 +105,7 @@ def test_series_have_every_value_and_every_miss(look: Recording) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".arrows", ".csv", ".parquet"])
-def test_every_format_is_read_alike(tmp_path: Path, suffix: str) -> None:
+def test_recordings_of_every_format_are_read_as_the_same_data(tmp_path: Path, suffix: str) -> None:
     with open_writer(tmp_path / f"it{suffix}", METADATA) as writer:
         writer.write(example())
     loaded = load(tmp_path / f"it{suffix}")
@@ -154,11 +154,11 @@ def test_faults_without_a_name_and_sets_of_fault_bits_are_shown(tmp_path: Path) 
 # ---- figures ----
 
 
-def test_the_response_delay_is_without_the_request(look: Recording) -> None:
+def test_the_response_delay_excludes_the_time_of_the_request(look: Recording) -> None:
     pump, fan = delays(look)
     assert pump.exact
     assert pump.seconds == pytest.approx(np.full(1000, 0.020 - REQUEST_9600))
-    assert not fan.exact  # its settings are unknown
+    assert not fan.exact  # the settings of this drive are unknown
     assert fan.quantile(0.5) == pytest.approx(0.0165)
     assert fan.quantile(1.0) == pytest.approx(0.021)
 
@@ -180,11 +180,11 @@ def test_misses_that_grow_with_speed_are_found(look: Recording) -> None:
     slow = shares[1][shares[0] < 28]
     fast = shares[1][shares[0] > 32]
     assert slow.max() == 0
-    assert fast == pytest.approx(np.full(len(fast), 0.25), abs=0.02)  # half of `fault`, one of two registers
+    assert fast == pytest.approx(np.full(len(fast), 0.25), abs=0.02)  # 0.25: half of `fault`
     assert miss_shares(look, "fan") is None
 
 
-# At 1 ms a character. Request and reply have 8 and 7 characters for one register, 8 and 9 for two.
+# A character takes 1 ms. A request has 8 characters; a reply has 7 for one register, and 9 for two.
 PLANNED: dict[str, Any] = {
     "hall-1": {
         "utilisation": 1.0,
@@ -201,7 +201,7 @@ PLANNED: dict[str, Any] = {
                         "every_ms": None,
                         "request_characters": 8,
                         "reply_characters": 9,
-                    },
+                    }
                 ],
             },
             "fan": {
@@ -215,7 +215,7 @@ PLANNED: dict[str, Any] = {
                         "every_ms": None,
                         "request_characters": 8,
                         "reply_characters": 7,
-                    },
+                    }
                 ],
             },
         },
@@ -224,7 +224,9 @@ PLANNED: dict[str, Any] = {
 
 
 def turns() -> list[Row]:
-    """Return rows of two registers of a pump and one of a fan, every 100 ms; the fan is lost half-way."""
+    """Return rows of two registers of a pump and one of a fan, every 100 ms. From half-way on, the fan is
+    silent.
+    """
     rows = []
     for tick in range(100):
         second = tick / 10
@@ -238,31 +240,34 @@ def turns() -> list[Row]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_utilisation_of_a_line(tmp_path: Path) -> None:
+def test_utilisation_of_a_line_is_computed_from_its_recording(tmp_path: Path) -> None:
     look = load(record(tmp_path / "it.arrows", turns(), ABOUT | {"planned": PLANNED}))
     (line,) = line_uses(look)
-    # pump: 14 ms to the reply's first character, 8 more; fan: 13 and 6; the silence is the longer of two.
+    # Pump: 14 ms to the reply's first character, then 8 ms; fan: 13 and 6 ms. The longer of two silences
+    # follows.
     assert line.needed[1:99] == pytest.approx(np.array([0.029, 0.032] * 49))
     assert line.needed[101:] == pytest.approx(np.full(49, 0.026))
     assert line.utilisation == pytest.approx((50 * 0.029 + 50 * 0.032 + 50 * 0.026) / 9.976, rel=0.01)
     assert line.rate("pump") == pytest.approx(10, rel=0.01)
     assert line.rate("fan") == pytest.approx(5, rel=0.01)
-    assert line.cycle == pytest.approx(9.976 * 3 / 250, rel=0.01)  # 3 registers in a cycle, 250 values in all
+    assert line.cycle == pytest.approx(9.976 * 3 / 250, rel=0.01)  # 3 registers in a cycle; 250 values
     page = report_page(look)
     assert "fan, exchanges/s" in page
     assert re.search(r"bus cycle, ms</td><td[^>]*>70\.0</td><td[^>]*>119\.\d</td>", page)
 
 
 def test_utilisation_of_a_port_without_a_wire_is_at_most_1(tmp_path: Path) -> None:
-    """Requests follow each other after 2 ms, because the port is a network's; a wire would need 32 ms."""
+    """The port is a network port with a request every 2 ms. On a wire, each exchange would need 32 ms."""
     rows = [row(tick / 500, "fan", "output_current", 1.0, ms=0.5) for tick in range(1000)]
     planned = {"hall-1": PLANNED["hall-1"] | {"drives": {"fan": PLANNED["hall-1"]["drives"]["fan"]}}}
     (line,) = line_uses(load(record(tmp_path / "it.arrows", rows, ABOUT | {"planned": planned})))
     assert 0.9 < line.utilisation <= 1.0 + 1e-9
 
 
-def test_utilisation_of_blocks_that_differ_from_the_plan(tmp_path: Path) -> None:
-    """In the first half, two requests read the pump's two registers; each reply has 7 characters."""
+def test_utilisation_counts_requests_that_differ_from_the_plan(tmp_path: Path) -> None:
+    """In the first half, the pump's two registers are read by two requests, although the plan has one
+    request.
+    """
     rows = [
         row(tick / 10 + (0.05 if name == "fault" and tick < 50 else 0), "pump", name, 1.0, ms=14.0)
         for tick in range(100)
@@ -283,7 +288,7 @@ def test_an_invalid_plan_is_ignored(tmp_path: Path, planned: Any) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_a_report_without_a_plan_says_so(tmp_path: Path) -> None:
+def test_the_report_states_that_the_recording_has_no_plan(tmp_path: Path) -> None:
     assert "does not carry a plan" in report_page(load(record(tmp_path / "it.arrows", turns())))
 
 
@@ -365,7 +370,7 @@ def test_drives_and_registers_can_be_chosen(look: Recording) -> None:
     assert "output_frequency, Hz" in [axes.get_title(loc="left") for axes in figure.axes]
 
 
-def test_drives_without_a_fault_take_no_room(tmp_path: Path) -> None:
+def test_without_a_fault_no_panel_of_faults_is_drawn_unless_requested(tmp_path: Path) -> None:
     rows = [row(at, "pump", name, 0) for at in range(3) for name in ("fault", "output_frequency")]
     look = load(record(tmp_path / "it.arrows", rows))
 
@@ -401,7 +406,7 @@ def test_a_fault_is_shaded_if_its_drive_is_plotted_alone(tmp_path: Path) -> None
 
 
 def test_lines_and_states_end_at_a_pause(tmp_path: Path) -> None:
-    """A suspended process records no rows, not even misses. A changed rate is not a pause."""
+    """A suspended process records no rows, not even misses: that is a pause. A changed rate is not."""
     times = [0.0, 0.1, 0.2, 10.2, 10.3, 10.4, 30.4, 50.4, 70.4]
     rows = [row(at, "pump", name, 1.0) for at in times for name in ("output_frequency", "status")]
     about = {"drives": {"pump": {"registers": {"status": {"values": {"runs": 1}}}}}}
@@ -448,14 +453,16 @@ def test_the_y_axis_includes_a_zero_near_the_values(tmp_path: Path) -> None:
         assert low == bottom if bottom is not None else 0 < low < least
 
 
-STATUS = {  # metadata of the families' status registers, as their documents have them
+STATUS = {  # metadata of status registers, as in the documents of these families
     "erman": {"STOPPED": 0, "RUNNING": 1, "ACCELERATING": 2, "DECELERATING": 3},
     "che": {"FORWARD": 1, "REVERSE": 2, "STANDBY": 3, "FAULT": 4},
 }
 
 
 def states(path: Path, rows: list[Row]) -> Recording:
-    """Return a recording of three drives whose `status` is an enumeration, another one, and a set of bits."""
+    """Return a recording of three drives. On two of them `status` is an enumeration, each with other names;
+    on the third it is a set of bits.
+    """
     meanings: dict[str, Any] = {
         name: {"unit": "", "values": names, "bits": False} for name, names in STATUS.items()
     }
@@ -465,7 +472,7 @@ def states(path: Path, rows: list[Row]) -> Recording:
 
 
 def drawn(axes: Any) -> dict[str, list[tuple[str, float, float]]]:
-    """Return the texts in each lane, by the lane's label, with start and end of their bars in s."""
+    """Return the texts in each lane, by the lane's label, each with the start and end of its bar in s."""
     lanes = {text.get_text(): [] for text in axes.get_yticklabels()}
     names = list(lanes)
     bars: dict[int, list[tuple[float, float]]] = {}
@@ -482,7 +489,7 @@ def drawn(axes: Any) -> dict[str, list[tuple[str, float, float]]]:
     return lanes
 
 
-def test_states_are_a_lane_for_each_drive_in_its_own_names(tmp_path: Path) -> None:
+def test_each_drives_states_have_a_lane_with_the_drives_own_names(tmp_path: Path) -> None:
     """The raw value 3 means decelerating on one drive, and standby on the other."""
     rows = [row(at, "erman", "status", value) for at, value in enumerate((0, 2, 1, 3, 3, 3))]
     rows += [row(at, "che", "status", value) for at, value in enumerate((3, 3, 1, None, 3, 7))]
@@ -491,7 +498,7 @@ def test_states_are_a_lane_for_each_drive_in_its_own_names(tmp_path: Path) -> No
         "erman": [("stopped", 0, 1), ("accelerating", 1, 2), ("running", 2, 3), ("decelerating", 3, 5)],
         "che": [("standby", 0, 2), ("forward", 2, 3), ("standby", 4, 5), ("", 5, 5)],
     }
-    (ticks,) = axes.lines  # the miss is marked in its drive's lane
+    (ticks,) = axes.lines  # the mark of the miss, in its drive's lane
     assert ticks.get_ydata()[0] == pytest.approx(1.4)
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["code 7"]
 
@@ -514,18 +521,18 @@ def test_no_state_has_the_colour_of_a_drive(tmp_path: Path) -> None:
 
 
 def test_a_state_of_one_row_is_drawn(tmp_path: Path) -> None:
-    """The state's pale bar is one pixel wide, and would be invisible without a dark edge."""
+    """The state's bar is pale and one pixel wide. Without a dark edge it would be invisible."""
     rows = [row(at, "che", "status", 3 if at == 500 else None) for at in range(1000)]
     (axes,) = plot(states(tmp_path, rows))[0].axes
     (bars,) = axes.collections
     assert bars.get_linewidth()[0] > 0
-    assert sum(bars.get_edgecolor()[0][:3]) < 1.5  # grey, and darker than half
+    assert sum(bars.get_edgecolor()[0][:3]) < 1.5  # darker than a medium grey
 
 
-def test_bits_are_a_lane_each_and_not_a_sum(tmp_path: Path) -> None:
+def test_each_bit_has_a_lane_instead_of_one_sum(tmp_path: Path) -> None:
     rows = [row(at, "yd", "status", value) for at, value in enumerate((0, 16, 18, 2, 2 + 64, 1e308, 0.5, 0))]
     (axes,) = plot(states(tmp_path, rows))[0].axes
-    assert drawn(axes) == {  # the first bit is set after 1 s
+    assert drawn(axes) == {  # bars start at 1 s, when the first bit is set
         "yd reverse": [("", 1, 4)],
         "yd jog": [],
         "yd run": [("", 0, 2)],
@@ -548,7 +555,7 @@ def test_an_unnamed_number_is_not_a_sum_of_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_lanes_without_room_in_a_panel_are_counted(tmp_path: Path) -> None:
+def test_lanes_that_do_not_fit_into_a_panel_are_counted(tmp_path: Path) -> None:
     bits = {f"B{bit}": 1 << bit for bit in range(16)}
     drives = [f"yd{number}" for number in range(80)]
     meaning = {"unit": "", "values": bits, "bits": True}
@@ -560,7 +567,7 @@ def test_lanes_without_room_in_a_panel_are_counted(tmp_path: Path) -> None:
     assert "(16 more lanes: choose with --drive)" in axes.get_title(loc="left")
 
 
-def test_drives_without_room_are_counted_and_stay_in_the_tables(tmp_path: Path) -> None:
+def test_drives_that_do_not_fit_into_the_picture_are_counted_and_stay_in_the_tables(tmp_path: Path) -> None:
     rows = [row(at, f"pump-{number}", "x", at) for at in range(2) for number in range(MOST_DRIVES + 2)]
     look = load(record(tmp_path / "it.arrows", rows, {}))
     assert plot(look)[1] == ["2 more drives"]
@@ -575,7 +582,7 @@ def test_drives_without_room_are_counted_and_stay_in_the_tables(tmp_path: Path) 
     [
         ("MOST_NAMES", 9, "names more than 9 drives, registers or statuses"),
         ("MOST_ROWS", 19, "is too large to draw: it has more than 19 rows"),
-        ("LONGEST_NAME", 5, "a name has 7 bytes: a recording's have at most 5"),
+        ("LONGEST_NAME", 5, "a name has 7 bytes: names in a recording have at most 5"),
     ],
 )
 def test_recording_too_large_to_draw_raises_value_error(
@@ -583,13 +590,14 @@ def test_recording_too_large_to_draw_raises_value_error(
 ) -> None:
     path = record(tmp_path / "it.arrows", [row(at, f"pump-{at:02}", "x", at) for at in range(20)], {})
     assert len(load(path).series) == 20
-    monkeypatch.setitem(load.__globals__, limit, value)
+    of_module = load.__globals__ if limit in load.__globals__ else load.__globals__["codes_of"].__globals__
+    monkeypatch.setitem(of_module, limit, value)
     with pytest.raises(ValueError, match=mistake):
         load(path)
 
 
 @pytest.mark.slow
-def test_states_that_change_faster_than_can_be_drawn_hide_none(tmp_path: Path) -> None:
+def test_states_that_change_faster_than_can_be_drawn_hide_no_fault(tmp_path: Path) -> None:
     rows = [row(at / 100, "che", "status", 1 + at % 2) for at in range(20_000)]
     rows[10_001] = row(100.01, "che", "status", 4)
     (axes,) = plot(states(tmp_path, rows))[0].axes
@@ -598,7 +606,7 @@ def test_states_that_change_faster_than_can_be_drawn_hide_none(tmp_path: Path) -
     assert order == ["fault"]
 
 
-def test_excess_reasons_are_combined(tmp_path: Path) -> None:
+def test_reasons_beyond_the_limit_are_combined_as_other_reasons(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", None, f"reason {at % 8}") for at in range(80)]
     rows += [row(at, "pump", "output_frequency", None, "no reply") for at in range(80)]
     (_, misses) = draw_rates(load(record(tmp_path / "it.arrows", rows))).axes
@@ -609,7 +617,7 @@ def test_excess_reasons_are_combined(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("_unpainted")
 @pytest.mark.slow
 @pytest.mark.long
-def test_series_without_room_are_named(run: Run, tmp_path: Path) -> None:
+def test_series_that_do_not_fit_into_the_picture_are_named(run: Run, tmp_path: Path) -> None:
     rows = [row(at, "pump", f"r{number}", at) for at in range(3) for number in range(MOST_PANELS + 2)]
     look = load(record(tmp_path / "it.arrows", rows))
     figure, left = plot(look)
@@ -626,8 +634,8 @@ def test_series_without_room_are_named(run: Run, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_series_without_room_are_named_once(tmp_path: Path) -> None:
-    """A register name whose values are numbers on one drive and states on another has two panels."""
+def test_series_that_do_not_fit_into_the_picture_are_named_only_once(tmp_path: Path) -> None:
+    """A register whose values are numbers on one drive and states on another has two panels."""
     rows = [row(0, "pump", f"r{number}", 1) for number in range(MOST_PANELS)]
     rows += [row(0, drive, "status", 1) for drive in ("pump", "che")]
     assert plot(states(tmp_path, rows))[1] == ["status"]
@@ -667,7 +675,7 @@ def test_a_recording_of_misses_only_has_a_report(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("_unpainted")
 @pytest.mark.parametrize(("value", "status"), [(0.0, "ok"), (None, "no reply")])
-def test_a_report_without_a_fault_says_so(tmp_path: Path, value: float | None, status: str) -> None:
+def test_the_report_states_that_there_was_no_fault(tmp_path: Path, value: float | None, status: str) -> None:
     rows = [row(at, "pump", "fault", value, status) for at in range(3)]
     look = load(record(tmp_path / "it.arrows", rows))
     assert look.series[0].faults() == []
@@ -688,7 +696,7 @@ def test_series_without_values_are_not_plotted(run: Run, tmp_path: Path) -> None
     assert run("plot", path, "--drive", "pump") == (
         2,
         "",
-        "multidrop: there is no value to draw, only misses: no reply 3; `multidrop report` tells more\n",
+        "multidrop: there is no value to draw, only misses: no reply 3; `multidrop report` shows more\n",
     )
     assert run("plot", path)[0] == 0
 
@@ -705,7 +713,7 @@ ODD: list[Any] = [10**400, None, True, -1, 1e308, "", "x", [], [1], {}, {"a": {}
 
 
 def with_odd(about: Any, odd: Any) -> Iterator[Any]:
-    """Yield copies of the metadata, each with another part replaced by `odd`."""
+    """Yield copies of the metadata, in each of which a different part is replaced by `odd`."""
     yield odd
     for key, part in about.items() if isinstance(about, dict) else enumerate(about) if about else ():
         if isinstance(part, dict | list):
@@ -724,12 +732,12 @@ def with_odd(about: Any, odd: Any) -> Iterator[Any]:
 @pytest.mark.slow
 @pytest.mark.parametrize("odd", usually(*ODD), ids=lambda odd: repr(odd)[:12])
 def test_invalid_parts_of_metadata_are_left_out_of_a_report(tmp_path: Path, odd: Any) -> None:
-    """All parts are read before a picture is drawn."""
+    """All parts of the report are made from the rest of the metadata, which is valid."""
     about = {"plant": "hall.toml", "planned": PLANNED, "drives": ABOUT["drives"]}
     rows = turns()[:30]
     for number, metadata in enumerate(with_odd(about, odd)):
         if not isinstance(metadata, dict):
-            continue  # the copy is not a recording
+            continue  # this copy cannot be a recording's metadata
         look = load(record(tmp_path / f"{number}.arrows", rows, metadata, pieces=1))
         assert all(
             np.isfinite([each.utilisation, each.rate("pump"), each.cycle or 0]).all()
@@ -771,7 +779,7 @@ def test_times_outside_the_calendar_print_one_sentence(run: Run, tmp_path: Path,
         assert run(command, path) == (
             2,
             "",
-            f"multidrop: {path} cannot be drawn: there are rows from before 1970 or after 2200\n",
+            f"multidrop: {path} cannot be drawn: it has rows from before 1970 or after 2200\n",
         )
 
 
@@ -812,7 +820,7 @@ def test_plot_and_report_need_only_the_recording(run: Run, ramp: Path, tmp_path:
         (("--out", "picture.jpg"), "picture.jpg: a plot's name must end in .png or .html"),
     ],
 )
-def test_mistakes_are_one_sentence(
+def test_mistakes_are_reported_in_one_sentence(
     run: Run, ramp: Path, tmp_path: Path, words: tuple[str, ...], sentence: str
 ) -> None:
     out = () if "--out" in words else ("--out", tmp_path / "it.png")
@@ -832,11 +840,7 @@ def test_a_history_s_folder_as_argument_prints_one_sentence(run: Run, tmp_path: 
         (tmp_path / name).touch()
     assert run(command, tmp_path, *out) == (2, "", f"{folder} {tmp_path}/rows.00000003.arrows, {by_program}")
     (tmp_path / "rows.00000003.arrows").unlink()
-    assert run(command, tmp_path, *out) == (
-        2,
-        "",
-        f"{folder} {tmp_path}/rows/00000002.parquet, {by_program}",
-    )
+    assert run(command, tmp_path, *out) == (2, "", f"{folder} {tmp_path}/rows/00000002.parquet, {by_program}")
 
 
 @pytest.mark.parametrize("command", ["plot", "report"])
@@ -852,7 +856,10 @@ def test_a_file_without_rows_or_not_a_recording_prints_one_sentence(
         pass
     status, _, err = run(command, empty)
     assert status == 2
-    assert "holds no rows" in err
+    assert "holds no rows: nothing was polled" in err
+    with empty.open("ab") as file:
+        file.write(b"\xff\xff\xff\xff\x10")
+    assert "holds no rows: it ends within the first one" in run(command, empty)[2]
 
 
 @pytest.mark.parametrize("command", ["plot", "report"])
@@ -863,3 +870,28 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(
     status, _, err = run(command, ramp)
     assert status == 2
     assert "pip install 'matplotlib>" in err
+
+
+def test_events_are_in_plots_and_reports(tmp_path: Path) -> None:
+    rows = [row(at, "pump-1", "output_frequency", float(at)) for at in range(9)]
+    comment = "bearing <b>changed</b>"
+    rows.insert(5, row(4.5, "event", "comment", None, comment))
+    about = {**ABOUT, "trigger": {"condition": "output_frequency > 3", "time_ns": UTC_0 + 4 * SECOND}}
+    recording = load(record(tmp_path / "run.arrows", rows, about))
+    assert [(event.kind, event.text) for event in recording.events] == [
+        ("trigger", "output_frequency > 3"),
+        ("comment", comment),
+    ]
+    assert recording.drives == ("pump-1",)
+    figure, _ = plot(recording)
+    texts = [text.get_text() for axes in figure.axes for text in axes.texts]
+    assert {"output_frequency > 3", comment} <= set(texts)
+    page = report_page(recording)
+    assert '<td class="short">bearing &lt;b&gt;changed&lt;/b&gt;</td>' in page
+    assert "1 miss" not in page
+
+
+def test_recording_of_events_alone_is_refused(tmp_path: Path) -> None:
+    path = record(tmp_path / "run.arrows", [row(1, "event", "comment", None, "nothing")])
+    with pytest.raises(ValueError, match="only events"):
+        load(path)

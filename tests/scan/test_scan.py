@@ -135,9 +135,7 @@ def whole_scan() -> tuple[Line, list[object]]:
 
 @pytest.mark.long
 @pytest.mark.story
-def test_all_eight_drives_are_found_at_their_settings(
-    whole_scan: tuple[Line, list[object]],
-) -> None:
+def test_all_eight_drives_are_found_at_their_settings(whole_scan: tuple[Line, list[object]]) -> None:
     _, findings = whole_scan
     assert drives(findings) == declared(*ALL_EIGHT)
     assert len(findings) == len(ALL_EIGHT)
@@ -203,7 +201,7 @@ class Echo(Line):
 
 @pytest.mark.long
 @pytest.mark.parametrize("families", [FAMILIES, [DelixiNative]], ids=["all", "own protocol"])
-def test_adapter_echo_is_no_drive_and_hides_no_drive(families: list[type]) -> None:
+def test_an_adapters_echo_is_not_reported_as_a_drive_and_hides_no_drive(families: list[type]) -> None:
     there = [each for each in ALL_EIGHT if type(each) in families and each.settings.baudrate in (9600, 19200)]
     line = Echo(Pair([simulated(each) for each in ALL_EIGHT]))
     plan = sweeps(families, addresses=range(1, 12), baudrates=[9600, 19200])
@@ -302,7 +300,7 @@ def test_all_eight_drives_are_found_with_echo_noise_and_a_crowd() -> None:
     one, twin = simulated(InnovertIBD(9)), simulated(InnovertIBD(9))
     one["output_current"], twin["output_current"] = 41.1, 77.7
     line = Everything(Shared([*map(simulated, ALL_EIGHT), one], twin))
-    findings = found(line, sweeps(FAMILIES))
+    findings = found(line, sweeps(FAMILIES, addresses=range(1, 13)))
     assert drives(findings) == declared(*ALL_EIGHT)
     assert {finding.address for finding in findings if not isinstance(finding, Found)} == {9}
     assert {type(finding) for finding in findings} == {Found, Crowd}
@@ -340,7 +338,7 @@ def test_drive_with_a_long_response_delay_is_found(delay: float) -> None:
 class Hesitant(SimulatedCHE):
     """A CHE that replies fast to the sweep and its probe, then slowly, like a busy converter or computer."""
 
-    hurried = 3  # fast replies to the probe, after the one to the sweep
+    hurried = 3  # number of fast replies to the probe, after the fast reply to the sweep
 
     @property
     def delay(self) -> float:
@@ -495,10 +493,13 @@ def test_port_that_supports_no_setting_raises_line_error() -> None:
 @table(
     ("asked", "sentence"),
     [
-        ({"baudrates": [300]}, "baud rate 300 is none that these families have: 1200, 2400, "),
-        ({"formats": ["7N1"]}, "format 7N1 is none that these families have: 7E1, "),
-        ({"addresses": [250]}, "no family has such an address"),
-        ({"baudrates": [1200], "formats": ["7E1"], "addresses": [40]}, "no family has such an address"),
+        ({"baudrates": [300]}, "none of these families has baud rate 300; they have 1200, 2400, "),
+        ({"formats": ["7N1"]}, "none of these families has format 7N1; they have 7E1, "),
+        ({"addresses": [250]}, "no family has one of these addresses"),
+        (
+            {"baudrates": [1200], "formats": ["7E1"], "addresses": [40]},
+            "no family has one of these addresses",
+        ),
     ],
 )
 def test_settings_that_no_family_has_raise_value_error(asked: dict[str, list[object]], sentence: str) -> None:

@@ -31,14 +31,14 @@ Report = Callable[[int, int, ParameterChange, NotWritten | None], None]
 class Applied:
     """The result of applying parameters: the writes made, and the parameters refused.
 
-    `earlier` has a sentence for each write of a previous, interrupted application. `failure` is the error
-    that ended this application early; call `apply` again to continue. An OSError comes from the journal or
-    the EEPROM ledger, for example on a full disk.
+    `earlier` has a sentence for each write of a previous, interrupted call. `failure` is the error that
+    ended this call early (None without one); call `apply` again to continue. An OSError comes from the
+    journal or the EEPROM ledger, for example on a full disk.
     """
 
     plan: ApplyPlan
     written: list[ParameterChange] = field(default_factory=list)
-    refused: dict[str, NotWritten] = field(default_factory=dict)  # by code
+    refused: dict[str, NotWritten] = field(default_factory=dict)  # parameter code: why it was not written
     earlier: list[str] = field(default_factory=list)
     failure: BusError | OSError | None = None
 
@@ -56,12 +56,13 @@ def apply(
     commissioning: bool = False,
     report: Report | None = None,
 ) -> Applied:
-    """Write the parameters that differ to a stopped drive; return the result.
+    """Write to a stopped drive all parameters that differ; return the result.
 
     Each parameter is written once, counted in the EEPROM ledger and read back. The drive's state is read
-    before each write; if the motor turns, the application ends. A stop of the drive ends it too. If the
-    process is killed, a second call writes the remaining parameters and reports the first call's writes. With
-    `commissioning`, a register may be written again within a minute. Raises as `plan` does.
+    before each write; if the motor turns, nothing more is written. A stop of the drive cancels the remaining
+    writes too. If the process is killed, a second call writes the remaining parameters and reports the first
+    call's writes. With `commissioning`, a register may be written again within a minute. Raises the errors
+    that `plan` raises.
     """
     stops = drive.stops_called[0]
     return _apply(plan(drive, values, also=also), stops, commissioning=commissioning, report=report)
@@ -76,13 +77,15 @@ def apply_plan(made: ApplyPlan, *, commissioning: bool = False, report: Report |
 
 
 def _apply(made: ApplyPlan, stops: int, *, commissioning: bool, report: Report | None) -> Applied:
-    """Write a plan's parameters; any stop of the drive after its first `stops` stops cancels the writes."""
+    """Write a plan's parameters; cancel the remaining writes once the drive was stopped more than `stops`
+    times.
+    """
     drive = made.drive
     journal = _Journal(drive)
     result = Applied(made, earlier=journal.earlier())
     call = drive.begin_call("application of parameters", stops)
     if made.writes:
-        if not check_stands(drive):  # the motor may have a run command at 0 Hz
+        if not check_stands(drive):  # the output frequency is 0 Hz, but the motor may have a run command
             call.check("the first parameter")
             drive.stop()
             call = drive.begin_call("application of parameters", stops + 1)
@@ -106,7 +109,7 @@ def _apply(made: ApplyPlan, stops: int, *, commissioning: bool, report: Report |
 
 
 def _write(change: ParameterChange, call: Call, result: Applied, journal: _Journal) -> NotWritten | None:
-    """Write one parameter and note the outcome in `result`; return why it was not written, or None."""
+    """Write one parameter, and record the outcome in `result`. Return why it was not written, or None."""
     drive, parameter = call.drive, change.parameter
     try:
         check_stands(drive)
@@ -142,9 +145,9 @@ def _refused(change: ParameterChange, why: NotWritten, result: Applied, journal:
 
 
 class _Journal:
-    """A file beside the EEPROM ledger that lists the writes of an application until the application ends.
+    """A file beside the EEPROM ledger that lists the writes of a call of `apply` until the call ends.
 
-    If the file exists at the start, it lists the writes of an interrupted application.
+    If the file exists at the start, it lists the writes of an interrupted call.
     """
 
     def __init__(self, drive: Drive) -> None:
@@ -153,7 +156,10 @@ class _Journal:
         self._path = Ledger().at(identity).path.parent / "applications" / f"{name}.jsonl"
 
     def earlier(self) -> list[str]:
-        """Return a sentence for an interrupted application, and one for each of its writes; else []."""
+        """Return a sentence about an interrupted call of `apply`, and a sentence for each of its writes.
+
+        Return [] if no call was interrupted.
+        """
         try:
             lines = self._path.read_text("utf-8", errors="replace").splitlines()
         except FileNotFoundError:
@@ -178,8 +184,8 @@ class _Journal:
     def note(self, **record: Any) -> None:
         """Append a record with one system call, so that a killed process leaves only whole records.
 
-        A line feed before the record separates it from one that a full disk has cut short. Raises OSError if
-        the record cannot be written.
+        A line feed before the record separates it from an earlier record that a full disk has cut short.
+        Raises OSError if the record cannot be written.
         """
         data = b"\n" + json.dumps(record).encode()
         with self._path.open("ab", buffering=0) as file:

@@ -12,7 +12,7 @@ from typing import Any
 from multidrop.drive.parameters import Parameter, parameters_of
 from multidrop.errors import Unsupported
 from multidrop.params.values import ParameterSet
-from multidrop.printable import plain_whole, printable
+from multidrop.printable import is_whole, plain_whole, printable
 from multidrop.toml_check import parse_document, read_bounded
 
 FORMAT = 1  # version of the file format; files with a higher number are refused
@@ -40,8 +40,9 @@ def is_parameter_file(path: Path | str) -> bool:
 def load(path: Path | str) -> ParameterSet:
     """Return the parameters in a TOML or CSV file. Raises ValueError if the file is invalid."""
     path = Path(path)
-    if path.exists() and not path.is_file():  # reading a serial port would block, and take its drives' bytes
-        raise ValueError(f"{path}: is no file, but a directory or a device; name a parameter file")
+    # Reading a serial port here would block, and would consume bytes from its drives.
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path}: is not a file, but a directory or a device; name a parameter file")
     try:
         data = read_bounded(path, MOST_BYTES, "parameter file")
         facts, values = _from_csv(data) if path.suffix.lower() == ".csv" else _from_toml(data)
@@ -61,7 +62,7 @@ def save(found: ParameterSet, path: Path | str, family: Any = None) -> None:
     path = Path(path)
     check_name(path)
     if not found.values:
-        raise ValueError(f"{found.source} answers for none of its parameters, so {path} is not written")
+        raise ValueError(f"{found.source} returned no value of its parameters, so {path} is not written")
     text = to_csv(found, family) if path.suffix.lower() == ".csv" else to_toml(found, family)
     try:
         with path.open("x", encoding="utf-8", newline="\n") as file:
@@ -111,14 +112,14 @@ def _from_toml(data: bytes) -> tuple[dict[str, str], dict[str, int]]:
 def _check_format(given: object) -> None:
     if isinstance(given, int) and given > FORMAT:
         raise ValueError(
-            f"has format {given}, and this version of multidrop reads format {FORMAT}: use a newer version"
+            f"has format {given}, but this version of multidrop reads format {FORMAT}: use a newer version"
         )
     if given not in (None, FORMAT):
         raise ValueError(f"format = {given!r} is not {FORMAT}")
 
 
 def _raw(code: str, raw: object) -> int:
-    if isinstance(raw, int) and not isinstance(raw, bool) and -(2**31) <= raw < 2**32:
+    if is_whole(raw) and -(2**31) <= raw < 2**32:
         return raw
     raise ValueError(f"{code} = {raw!r} is not a raw count, such as 100")
 
@@ -160,13 +161,13 @@ def _from_csv(data: bytes) -> tuple[dict[str, str], dict[str, int]]:
     elif not {"code", "raw"} <= {*names}:
         if GD20_COLUMNS - {"valor_parametro"} <= {*names}:
             raise ValueError("lists parameters without values; name the tool's backup, not its list")
-        raise ValueError("is not a parameter file: its first row has no code and raw")
+        raise ValueError("is not a parameter file: its first row does not name the columns code and raw")
     found: dict[str, int] = {}
     try:
         for row in rows:
             code = _gd20_code(row, names) if is_gd20 else (row[names["code"]] or "").strip()
             if code in found:
-                raise ValueError(f"{code} is there twice")
+                raise ValueError(f"{code} is given twice")
             found[code] = _raw(code, _whole(row[names["valor_parametro" if is_gd20 else "raw"]]))
     except csv.Error as failure:
         raise ValueError(f"is not CSV: {failure}") from failure
@@ -192,7 +193,7 @@ def _known(family: Any) -> Mapping[str, Parameter]:
 
 
 def _words(parameter: Parameter | None, raw: int) -> tuple[str, str, str]:
-    """Return name, value and factory value of a declared parameter as texts; empty texts for None."""
+    """Return a declared parameter's name, value and factory value as texts; three empty texts for None."""
     if parameter is None or not parameter.is_declared:
         return "", "", ""
     default = parameter.default_raw

@@ -1,4 +1,6 @@
-"""Plan the writes of a parameter set: which parameters, in which order, and why others are left out."""
+"""Plan the writes of a parameter set: which parameters to write, in which order, and why other
+parameters are left out.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ from multidrop.drive.state import Condition
 from multidrop.errors import Advice, Unsupported, WriteForbidden
 from multidrop.params.values import ParameterSet, Progress, check_same_model, parameter_of, read, text_of
 
-MOST_MISTAKES = 5  # mistakes listed in one error
+MOST_MISTAKES = 5  # limit of mistakes listed in one error
 
 
 class ParameterChange(NamedTuple):
@@ -33,9 +35,10 @@ class ParameterChange(NamedTuple):
 
 @dataclass(frozen=True)
 class ApplyPlan:
-    """The ordered writes that make a drive hold these values; `left`: why others are not written, by code.
+    """The writes, in order, that set a drive's parameters to the wanted values.
 
-    `notes` are sentences to show to the user who confirms the plan.
+    `left` gives, by code, the reason why a parameter is not written. `notes` are sentences to show to the
+    user who confirms the plan.
     """
 
     drive: Drive
@@ -57,7 +60,7 @@ def plan(
     also: Collection[str] = (),
     progress: Progress | None = None,
 ) -> ApplyPlan:
-    """Return the writes that `apply` would make; only reads from the drive.
+    """Return the writes that `apply` would make. Reads from the drive, but writes nothing.
 
     `also` lists codes of communication parameters (address, baud rate) to write as well; by default these are
     left out. Raises WriteForbidden if the motor runs or the drive is of another family. Raises ValueError for
@@ -93,13 +96,13 @@ def plan(
             except TypeError as mistake:
                 mistakes.append(f"{code}: {mistake}")
             except WriteForbidden as mistake:
-                if not mistake.rule.startswith(one.name):  # the refusal is not about this value
+                if not mistake.rule.startswith(one.name):  # the error is not about this parameter's value
                     raise
                 mistakes.append(f"{code}: {mistake.rule}")
     if mistakes:
         more = len(mistakes) - MOST_MISTAKES
         shown = "; ".join(mistakes[:MOST_MISTAKES]) + (f"; and {more} more" if more > 0 else "")
-        raise ValueError(f"{given.source} has values that are not written, and nothing was: {shown}")
+        raise ValueError(f"nothing was written: {given.source} has values that may not be written: {shown}")
     ordered, blocked = _ordered(drive, changes, present.values, bounds)
     left |= {change.parameter.code: _blocked(drive, change) for change in blocked}
     notes = _notes(given, present)
@@ -148,7 +151,7 @@ def check_stands(drive: Drive) -> bool:
 
 
 def _check_no_run_command(drive: Drive) -> None:
-    """Raise WriteForbidden if a run command is active at 0 Hz, or the panel or a terminal could give one."""
+    """Raise WriteForbidden if a run command is active at 0 Hz, or if the panel or a terminal may give one."""
     status = drive.registers.get("status")
     run = _member(status, "run")
     if status is not None and isinstance(run, Flag) and run in drive.read(status):
@@ -164,7 +167,7 @@ def _check_no_run_command(drive: Drive) -> None:
 
 
 def _member(register: Register[Any] | None, name: str) -> Any:
-    """Return the register's named value, ignoring case; None if the register has no value of this name."""
+    """Return the register's value with this name, in upper or lower case; None if there is none."""
     if register is None or register.values is None or not register.readable:
         return None
     members: Any = register.values
@@ -193,7 +196,7 @@ _STOP = Advice.call("stop")
 
 
 def _bounds(family: Any, known: Mapping[str, Parameter]) -> dict[str, str]:
-    """Return the codes of the parameters that limit these parameters, by register name."""
+    """Return the codes, by register name, of the parameters whose values limit the `known` ones."""
     names = {name for one in known.values() for name in (one.at_least, one.at_most) if name}
     return {one.name: code for code, one in parameters_of(family).items() if one.name in names}
 
@@ -201,9 +204,10 @@ def _bounds(family: Any, known: Mapping[str, Parameter]) -> dict[str, str]:
 def _ordered(
     drive: Drive, changes: list[ParameterChange], present: Mapping[str, int], bounds: Mapping[str, str]
 ) -> tuple[list[ParameterChange], list[ParameterChange]]:
-    """Return the changes, ordered so that each is within its limits when written, and the impossible changes.
+    """Sort the changes so that each value is within its limits when it is written.
 
-    Communication parameters come last, because the drive may not answer after they are written.
+    Return the sorted changes, and the changes whose values would never be within their limits. Communication
+    parameters come last, because the drive may not answer after they are written.
     """
     held = dict(present)
     last = drive.parameter_space.line if drive.parameter_space else ()

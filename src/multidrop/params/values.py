@@ -14,9 +14,9 @@ from multidrop.iso_time import format_time
 from multidrop.planning.blocks import Block, blocks, halves
 from multidrop.transport import clock
 
-ILLEGAL_FUNCTION = 1  # exception code: the drive cannot read any parameter
-GROUP_END = 10  # after this many unanswered reads in a row, read only the group's declared parameters
-READ_EXPIRY = 60.0  # s that a read may wait for its turn on a polled line
+ILLEGAL_FUNCTION = 1  # exception code: the drive does not support the function of this read
+GROUP_END = 10  # after this many unanswered reads in a row, the end of a group is assumed
+READ_EXPIRY = 60.0  # time limit, in s, for a read to wait until a polled line is free
 ATTEMPTS = 3
 
 Progress = Callable[[int, int], None]  # called with the number of parameters done, and the total
@@ -76,10 +76,11 @@ def read(
 ) -> ParameterSet:
     """Return all parameters of a drive, or those in `codes`, without those that the drive does not have.
 
-    Monitors in `codes` are left out too. Parameters are read in blocks; a refused block is split. Raises
-    Unsupported if the family has no rule for parameter addresses, ValueError for an unknown code,
-    WriteForbidden if the drive is of another family, and NoReply, BadReply, DriveException or LineError if
-    a read fails.
+    Monitor values in `codes` are left out too. Parameters are read in blocks; a refused block is split.
+
+    Raises Unsupported if the family has no rule for parameter addresses, ValueError for an unknown code, and
+    WriteForbidden if the drive is of another family. If a read fails, raises NoReply, BadReply,
+    DriveException or LineError.
     """
     family: Any = type(drive)
     if drive.bus is None:
@@ -108,13 +109,13 @@ def read(
 
 @dataclass
 class _Reader:
-    """Reads parameters, and learns which parameters the drive lacks and the longest block that it answers."""
+    """Reads parameters, and finds out which of them the drive lacks and how long a block it answers."""
 
     drive: Drive
     total: int
     progress: Progress | None
     values: dict[str, int] = field(default_factory=dict)
-    most: int = 0  # longest block that was answered after a longer one was refused; 0: not yet known
+    most: int = 0  # longest accepted block, once a longer one was refused; 0: no such refusal
     done: int = 0
     silent: int = 0  # number of reads in a row that were not answered
     group: str = ""  # group of the last parameter read
@@ -125,7 +126,7 @@ class _Reader:
             self._read(block)
 
     def _read(self, block: Block) -> bool:
-        """Read a block, in halves if it is refused. Return True if the drive has all its parameters."""
+        """Read a block, in halves if it is refused. Return True if the drive has all parameters in it."""
         kept = self._without_group_end(block)
         if kept is None:
             return False
@@ -139,7 +140,7 @@ class _Reader:
             if refusal.code == ILLEGAL_FUNCTION or self.drive.is_temporary(refusal.code):
                 raise
         except NoReply:
-            self._check_answers()  # raises unless the drive answers other reads
+            self._check_answers()  # raises an error unless the drive answers other reads
             self.silent += 1
         else:
             self._note(block.registers, raws)
@@ -149,16 +150,20 @@ class _Reader:
             self._note(block.registers, [None])
             return False
         is_whole = self._read_all(parts)
-        if is_whole:  # every part was answered, so only the block's length was refused
+        if is_whole:  # all parts were answered, so the drive refused only the block's length
             self.most = max(part.count for part in parts)
         return is_whole
 
     def _read_all(self, parts: Sequence[Block]) -> bool:
-        answered = [self._read(part) for part in parts]  # reads all parts, even after a refusal
+        # a list, so that all parts are read even if one is refused
+        answered = [self._read(part) for part in parts]
         return all(answered)
 
     def _without_group_end(self, block: Block) -> Block | None:
-        """Return the block without parameters past the apparent end of their group; None if it is empty."""
+        """Return the parameters of the block that are still to be read; None if there are none.
+
+        After GROUP_END unanswered reads in a group, only the group's declared parameters are read.
+        """
         kept: list[Parameter] = []
         for parameter in block.registers:
             assert isinstance(parameter, Parameter)
@@ -269,6 +274,6 @@ def check_same_model(first: ParameterSet, second: ParameterSet) -> None:
     """Raise ValueError if both sets state a model and the models differ."""
     if first.model and second.model and first.model != second.model:
         raise ValueError(
-            f"{first.source} has parameters of {first.model}, and {second.source} of {second.model}: "
-            "they are not comparable"
+            f"{first.source} has parameters of {first.model}, and {second.source} of {second.model}: they "
+            "cannot be compared"
         )

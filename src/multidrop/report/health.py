@@ -1,4 +1,4 @@
-"""Draw the health of a line: rates, misses over time, misses against output frequency, response delays."""
+"""Draw the health of lines: rates, misses over time, misses against output frequency, response delays."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from matplotlib.ticker import PercentFormatter
 
 from multidrop.core import UNASKED, Framing, Message, build_request, characters_on_wire, reply_length
 from multidrop.drive.line_settings import Settings
-from multidrop.report.load import Array, Recording, Series
+from multidrop.recording.series import Array
+from multidrop.report.load import Recording, Series
 from multidrop.report.style import (
     COLOURS,
     MOST_DRIVES,
@@ -26,22 +27,23 @@ from multidrop.report.style import (
     set_title,
 )
 
-MOST_REASONS = 6  # limit of reasons for misses in a picture; all others are drawn as one reason
-LEAST_IN_BIN = 20  # least number of values in a bin; with fewer, its share of misses is not significant
+MOST_REASONS = 6  # limit of reasons for misses in a picture; further reasons are drawn together
+# A bin with fewer requested values is left out, because its share of misses is not significant.
+LEAST_IN_BIN = 20
 BINS = 12  # number of bins of the output frequency
 FREQUENCY = "output_frequency"
-ROOM = 2.0  # length of an axis, as a multiple of the 99 % quantile of the delays
+ROOM = 2.0  # length of the axis of delays, as a multiple of their 99 % quantile
 SHORTEST_AXIS = 0.001  # least length of the axis of delays, in s
 SHADES = ("#B00020", "#E69F00", "#56B4E9", "#CC79A7", "#009E73", "#0072B2", "#999999")
 
 
 @dataclass(frozen=True)
 class DelaySeries:
-    """A drive's response delays in s, from the request's last bit to the reply's first."""
+    """A drive's response delays in s, from the last bit of a request to the first bit of its reply."""
 
     drive: str
     seconds: Array
-    exact: bool  # False: the delays include the time of the request, which is unknown
+    exact: bool  # False if the delays include the request's duration, which is unknown
 
     def quantile(self, part: float) -> float:
         return float(np.quantile(self.seconds, part))
@@ -50,13 +52,14 @@ class DelaySeries:
 def delays(recording: Recording) -> list[DelaySeries]:
     """Return the delays of every drive that answered.
 
-    The first reply after a lost request is left out: it may answer that request, so its delay is uncertain.
+    The first reply after a lost request is left out, because it may be a late reply to that request. Then its
+    delay is unknown.
     """
     found = []
     for drive in recording.drives:
         request = _request_seconds(recording, drive)
         answered = [(series, ~series.missed & ~_spans_loss(series)) for series in recording.of(drive)]
-        # An exchange reads several registers in one reply: count its time stamps once.
+        # One reply holds several registers, whose rows have the same time: count that time once.
         times = np.concatenate([series.time[there] for series, there in answered])
         stamps, firsts = np.unique(times, return_index=True)
         if len(stamps):
@@ -67,7 +70,7 @@ def delays(recording: Recording) -> list[DelaySeries]:
 
 
 def _spans_loss(series: Series) -> Array:
-    """Return an array with True for each value that may be the reply to an earlier, lost request."""
+    """Return an array with True for each value that may belong to an earlier, lost request."""
     asked = [number for number, status in enumerate(series.statuses) if not status.startswith(UNASKED)]
     lost = np.unique(series.time[series.missed & np.isin(series.status, asked)])
     next_lost = np.append(lost, np.iinfo(np.int64).max)[np.searchsorted(lost, series.time)]
@@ -77,7 +80,8 @@ def _spans_loss(series: Series) -> Array:
 def _request_seconds(recording: Recording, drive: str) -> float | None:
     """Return the time in s that a request and the first character of its reply take on the wire.
 
-    Return None if the recording's metadata lack the drive's settings."""
+    Return None if the recording's metadata lack the drive's line settings.
+    """
     about = recording.about(drive)
     try:
         baudrate, format = about["settings"].split()
@@ -90,7 +94,9 @@ def _request_seconds(recording: Recording, drive: str) -> float | None:
 
 
 def draw_delays(found: Sequence[DelaySeries]) -> Figure:
-    """Draw a box plot of the first MOST_DRIVES drives: quartiles, and whiskers to 1 % and 99 %."""
+    """Draw a box plot of the first MOST_DRIVES drives, with quartiles, and whiskers at the 1 % and 99 %
+    quantiles.
+    """
     found = found[:MOST_DRIVES]
     figure, (axes,) = new_figure([0.8 + 0.32 * len(found)])
     axes.boxplot(
@@ -116,7 +122,9 @@ def draw_delays(found: Sequence[DelaySeries]) -> Figure:
 
 
 def draw_rates(recording: Recording) -> Figure:
-    """Draw values per second of the first MOST_DRIVES drives; below, misses per second by reason."""
+    """Draw two plots: the values per second of the first MOST_DRIVES drives, and the misses per second of all
+    drives, by reason.
+    """
     figure, (rates, misses) = new_figure([2.2, 1.8], sharex=True)
     bins = TimeBins(recording.begin, recording.end)
     for number, drive in enumerate(recording.drives[:MOST_DRIVES]):
@@ -156,8 +164,9 @@ def reasons_of(recording: Recording, drive: str) -> Counter[str]:
 def miss_shares(recording: Recording, drive: str) -> tuple[Array, Array] | None:
     """Return output frequencies in Hz, and the drive's share of missed values near each frequency.
 
-    The frequency at a miss is the last frequency read before it. Values that were not requested do not count.
-    Return None if there are no misses, if the drive has no frequency register, or if its value is constant.
+    The frequency of a miss is the last one read before the miss. Values that were not requested are not
+    counted as missed. Return None if there are no misses, if the drive has no frequency register, or if
+    its frequency is constant.
     """
     (frequency, *_) = (*recording.of(drive, FREQUENCY), None)
     reasons = [reason for reason in reasons_of(recording, drive) if not reason.startswith(UNASKED)]
@@ -201,17 +210,17 @@ def draw_miss_shares(recording: Recording) -> Figure | None:
 
 _LINE_FIGURES = ("utilisation", "cycle_ms")
 _DRIVE_FIGURES = ("exchanges_per_second", "silence_ms", "character_ms")
-MOST_FIGURE = 1e9  # sanity limit of a plan's figures
+MOST_FIGURE = 1e9  # limit of the figures in a plan; a larger figure means that the plan is damaged
 
 
 @dataclass(frozen=True, eq=False)
 class LineUse:
-    """A line's answered exchanges: when each took place, and how long it occupied the line."""
+    """A line's answered exchanges: the time of each, and how long it occupied the line."""
 
     line: str
     planned: Mapping[str, Any]
-    time: Array  # ns UTC
-    needed: Array  # s: request, response delay, reply, silence; at most the measured time
+    time: Array  # times of the exchanges, ns UTC
+    needed: Array  # s for request, delay, reply and silence; at most the measured time
     asked: Mapping[str, int]  # number of answered exchanges, by drive
     values: int  # number of values in the replies
     seconds: float
@@ -222,7 +231,9 @@ class LineUse:
 
     @property
     def cycle(self) -> float | None:
-        """Seconds to read each register once; None if a register has its own rate, or without values."""
+        """The time in s in which each register is read once. None if a register has its own rate, or if there
+        are no values.
+        """
         blocks = [block for drive in self.planned["drives"].values() for block in drive["blocks"]]
         if any(block["every_ms"] is not None for block in blocks) or not self.values:
             return None
@@ -233,7 +244,7 @@ class LineUse:
 
 
 def line_uses(recording: Recording) -> list[LineUse]:
-    """Return the use of every line whose plan is in the recording; an empty list if a plan is damaged."""
+    """Return the use of each line whose plan is in the recording; [] if a plan is damaged."""
     try:
         plans = recording.metadata.get("planned", {})
         return [_line_use(recording, line, planned) for line, planned in plans.items()]
@@ -278,10 +289,10 @@ def _line_use(recording: Recording, line: str, planned: Mapping[str, Any]) -> Li
     time, needed, silence = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(time, kind="stable")
     time, needed, silence = time[order], needed[order], silence[order]
-    if len(time):  # between two exchanges the line keeps the longer of their silences
+    if len(time):  # the silence between two exchanges is the longer one of the two that they need
         needed = needed + np.maximum(silence, np.concatenate([silence[1:], silence[-1:]]))
-        # Some ports, such as a network's, are faster than their settings: limit the need to the measured
-        # time.
+        # Some ports, such as network ports, are faster than their baud rate: limit the needed time to the
+        # measured time.
         needed[:-1] = np.minimum(needed[:-1], np.diff(time) / 1e9)
     end = float(needed[-1]) if len(time) else 0.0
     return LineUse(line, planned, time, needed, asked, values, max(recording.seconds + end, 1e-9))
@@ -290,8 +301,8 @@ def _line_use(recording: Recording, line: str, planned: Mapping[str, Any]) -> Li
 def _exchanges(recording: Recording, name: str, drive: Mapping[str, Any]) -> tuple[Array, Array, int]:
     """Return the answered exchanges of a drive, and the number of values in their replies.
 
-    The first array has the time of each exchange in ns UTC, the second its seconds up to the reply's end.
-    Values with the same time were read by one exchange, whose registers may differ from the plan.
+    The first array has the time of each exchange in ns UTC, the second its duration in s, up to the reply's
+    end. Values with the same time were read by one exchange. Its registers may differ from the planned ones.
     """
     registers = [register for block in drive["blocks"] for register in block["registers"]]
     read = [(series, ~series.missed) for register in registers for series in recording.of(name, register)]
@@ -311,7 +322,7 @@ def _exchanges(recording: Recording, name: str, drive: Mapping[str, Any]) -> tup
     framing = Framing[recording.about(name)["framing"].upper()]
     requests = [Message(1, asked, at, count, bytes(4)) for asked, at, count in blocks.T.tolist()]
     characters = np.array([_characters(framing, request) for request in requests])[which]
-    # Rows only have the times of the request's start and of the reply's first character.
+    # Rows have only the times of the request's start and of the reply's first character, so add the rest.
     rest = (characters - 1) * drive["character_ms"] / 1e3
     return time, uncertainty / 1e9 + rest, len(times)
 

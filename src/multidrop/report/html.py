@@ -23,10 +23,11 @@ from multidrop.report.health import (
     reasons_of,
 )
 from multidrop.report.load import Recording, Series
+from multidrop.report.steps import StepValues, values_of
 from multidrop.report.style import MOST_DRIVES, png
 from multidrop.report.value_plot import FAULTS, plot
 
-SHORT = 32  # table cells with at most this many characters are not wrapped
+SHORT = 32  # a table cell with at most this many characters is not wrapped
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; }
@@ -54,6 +55,7 @@ def report_page(recording: Recording) -> str:
     parts = [
         _about(recording),
         *_drives(recording),
+        *_steps(recording),
         *_utilisation(line_uses(recording), recording),
         "<h2>Rates and misses</h2>",
     ]
@@ -63,7 +65,8 @@ def report_page(recording: Recording) -> str:
         parts.append("<h2>Misses against output frequency</h2>")
         parts.append("<p>Noise that comes with the motor's speed shows as a slope to the right.</p>")
         parts.append(_image(shares, "misses against output frequency"))
-    parts += [*_delays(delays(recording)), *_faults(recording), "<h2>Values</h2>", *_values(recording)]
+    parts += [*_delays(delays(recording)), *_faults(recording), *_events(recording)]
+    parts += ["<h2>Values</h2>", *_values(recording)]
     return _page(f"Report on {recording.path.name}", parts)
 
 
@@ -93,7 +96,7 @@ def _utc(time_ns: int) -> str:
 
 
 def _counts(series: Sequence[Series]) -> tuple[int, int]:
-    """Return the numbers of values and of misses in these series."""
+    """Return how many values and how many misses these series have."""
     misses = sum(int(one.missed.sum()) for one in series)
     return sum(len(one.time) for one in series) - misses, misses
 
@@ -143,9 +146,9 @@ def _utilisation(uses: Sequence[LineUse], recording: Recording) -> Iterator[str]
         yield "<p>The recording does not carry a plan: it was not made by polling a plant file.</p>"
         return
     yield (
-        "<p>What the answered exchanges had to take of the line: silence, request, response delay and "
-        "reply. What else was sent meanwhile, such as commands, is not recorded. The plan reckons with "
-        "the response delays that the drives' documents state.</p>"
+        "<p>The share of the line's time that the answered exchanges needed for silence, request, "
+        "response delay and reply. Other traffic, such as commands, is not recorded. The plan uses the "
+        "response delays that the drives' documents state.</p>"
     )
     yield _image(draw_utilisation(uses, recording), "utilisation over time")
     rows = []
@@ -159,6 +162,33 @@ def _utilisation(uses: Sequence[LineUse], recording: Recording) -> Iterator[str]
             for name, drive in planned["drives"].items()
         ]
     yield _table(["Line", "What", "#Planned", "#Measured"], rows)
+
+
+def _steps(recording: Recording) -> Iterator[str]:
+    if not recording.steps:
+        return
+    yield "<h2>Steps of the test</h2>"
+    yield (
+        "<p>A value has settled when it stays near the mean of the step's last fifth, within 2 % of its "
+        "change. The settling time counts from the start of the step. The slope is that of a straight "
+        "line, fitted by least squares.</p>"
+    )
+    heads = ["Drive", "Register", "Unit", "#Values", "#Mean", "#Least", "#Greatest"]
+    heads += ["#Settling, s", "#Slope, 1/s", "#Energy, kWh"]
+    for number, step in enumerate(recording.steps, 1):
+        found = values_of(recording, step)
+        begin, length = (step.begin - recording.begin) / 1e9, (step.end - step.begin) / 1e9
+        yield f"<h3>{number}. {_escape(step.what)}, from {begin:.1f} s, for {length:.1f} s</h3>"
+        if found:
+            yield _table(heads, [_step_row(values) for values in found])
+        else:
+            yield "<p>No value was read.</p>"
+
+
+def _step_row(values: StepValues) -> list[str]:
+    numbers = (values.mean, values.least, values.greatest, values.settling, values.slope, values.energy)
+    shown = ("" if number is None else f"{number:.6g}" for number in numbers)
+    return [values.drive, values.register, values.unit, str(values.values), *shown]
 
 
 def _percent(part: float) -> str:
@@ -213,6 +243,13 @@ def _faults(recording: Recording) -> Iterator[str]:
         yield "<p>No register called fault was polled.</p>"
 
 
+def _events(recording: Recording) -> Iterator[str]:
+    if recording.events:
+        yield "<h2>Events</h2>"
+        rows = [[_utc(event.time), event.kind, event.text] for event in recording.events]
+        yield _table(["Time, UTC", "Kind", "Text"], rows)
+
+
 def _values(recording: Recording) -> Iterator[str]:
     if not any(series.has_values for series in recording.series):
         yield "<p>There is none.</p>"
@@ -229,7 +266,7 @@ def _escape(text: str) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return an HTML table. A column whose head starts with # has numbers, which are aligned right."""
+    """Return an HTML table. A column whose head starts with # has numbers, which are aligned to the right."""
     kinds = [f' class="{_kind(column)}"' for column in zip(heads, *rows, strict=True)]
     head = "".join(
         f"<th{kind}>{_escape(text.removeprefix('#'))}</th>" for kind, text in zip(kinds, heads, strict=True)

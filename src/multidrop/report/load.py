@@ -3,27 +3,38 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib.figure import Figure
 
+from multidrop.polling.added_rows import EVENT
 from multidrop.polling.batch import ROW_COLUMNS
 from multidrop.recording import open_recording
+from multidrop.recording.phases import PHASE_DRIVE, phase_names
+from multidrop.recording.series import (
+    LARGEST_COUNT,
+    LATEST_NS,
+    Array,
+    Event,
+    checked_drives,
+    codes_of,
+    numbers_of,
+    rows_by_series,
+    trigger_of,
+    unit_of_register,
+)
 
-RAW = "raw count"  # unit of values without a known scale
-LARGEST = 1e150  # larger values are not drawn: matplotlib computes products of values
-LATEST_NS = 230 * 365 * 86400 * 10**9  # UTC; no dates can be computed for later times
-PAUSE_NS, PAUSE_STEPS = 2 * 10**9, 5  # a longer step between rows is a pause, as of a suspended process
-MOST_ROWS = 100_000_000  # limit of a recording's rows: so many take 5 GB of memory
-MOST_NAMES = 4096  # limit for the names of drives, of registers and of statuses
-LONGEST_NAME = 4096  # limit in bytes
-LARGEST_COUNT = 2**53  # largest count that a float64 holds exactly
-Array = NDArray[Any]
+LARGEST = 1e150  # larger values are not drawn, because matplotlib multiplies values
+# The time between two rows is a pause if it is longer than PAUSE_NS, and longer than PAUSE_STEPS times its
+# neighbours.
+PAUSE_NS, PAUSE_STEPS = 2 * 10**9, 5
+MOST_ROWS = 100_000_000  # limit of a recording's rows, which then take 5 GB of memory
+MOST_NAMES = 4096  # limit of the number of different names: of drives, of registers, and of statuses
 
 
 @dataclass(frozen=True)
@@ -46,7 +57,7 @@ class Series:
     uncertainty: Array  # float64, ns
     status: Array  # int, index into `statuses`
     statuses: tuple[str, ...]
-    metadata: Mapping[str, Any]  # of the register
+    metadata: Mapping[str, Any]  # metadata of the register
 
     @cached_property
     def missed(self) -> Array:
@@ -58,12 +69,14 @@ class Series:
 
     @cached_property
     def drawable(self) -> Array:
-        """The values, with NaN for misses and for values too large for a picture."""
+        """The values, with NaN for misses and for values too large to draw."""
         return np.where(np.abs(self.value) < LARGEST, self.value, np.nan)
 
     @cached_property
     def pauses(self) -> Array:
-        """For each row except the last: True if polling paused after the row (no values and no misses)."""
+        """An array with True for each row after which polling paused, so that neither values nor misses
+        follow. It has no entry for the last row.
+        """
         steps = np.diff(self.time)
         beside = np.maximum(np.append(steps[1:], 0), np.append(0, steps[:-1]))
         return np.asarray((steps > PAUSE_NS) & (steps / PAUSE_STEPS > beside) & (beside > 0))
@@ -81,11 +94,7 @@ class Series:
     @property
     def unit(self) -> str:
         """The unit to write on an axis: "raw count" if the scale is unknown, "" for named states."""
-        if self.names:
-            return ""
-        if "step" in self.metadata and self.metadata["step"] is None:
-            return RAW
-        return str(self.metadata.get("unit") or "")
+        return unit_of_register(self.metadata)
 
     def reasons(self) -> Counter[str]:
         numbers, counts = np.unique(self.status[self.missed], return_counts=True)
@@ -111,7 +120,7 @@ class Series:
         ]
 
     def name_of(self, value: float) -> str:
-        """Return the name of a raw value, the names of its set bits, or a text with the number."""
+        """Return a raw value's name, the names of its set bits, or else a text with the number."""
         if not value.is_integer() or not 0 <= value < LARGEST_COUNT:
             return f"code {value:g}"
         number = int(value)
@@ -135,6 +144,8 @@ class Recording:
     metadata: Mapping[str, Any]
     series: tuple[Series, ...]
     truncated: int  # number of skipped bytes at the recording's end
+    steps: tuple[TimeSpan, ...] = ()  # steps of a test run, each with its phase's name
+    events: tuple[Event, ...] = ()  # in the order of time
 
     @property
     def statuses(self) -> tuple[str, ...]:
@@ -171,6 +182,15 @@ class Recording:
         of_drive = self._by_drive.get(drive, ())
         return tuple(series for series in of_drive if register in ("", series.register))
 
+    def plot(self, *, drives: Sequence[str] = (), registers: Sequence[str] = ()) -> Figure:
+        """Return a picture of these drives and registers (default: all), which a notebook shows.
+
+        Raises ValueError for unknown names, and if there is no value to draw.
+        """
+        from multidrop.report.value_plot import plot  # which imports this file
+
+        return plot(self, drives, registers)[0]
+
     @cached_property
     def _by_drive(self) -> dict[str, list[Series]]:
         found: dict[str, list[Series]] = {}
@@ -187,8 +207,8 @@ def load(path: str | Path) -> Recording:
     rows = 0
     for batch in reader:
         children = dict(zip(ROW_COLUMNS, batch.arrow().view().children, strict=True))
-        columns = [_codes(children[name], known) for name, known in codes.items()]
-        parts.append(columns + [_numbers(children[name]) for name in ("time", "value", "uncertainty_ns")])
+        columns = [codes_of(children[name], known) for name, known in codes.items()]
+        parts.append(columns + [numbers_of(children[name]) for name in ("time", "value", "uncertainty_ns")])
         rows += len(batch)
         if rows > MOST_ROWS:
             raise ValueError(f"{path} is too large to draw: it has more than {MOST_ROWS} rows")
@@ -197,21 +217,20 @@ def load(path: str | Path) -> Recording:
                 f"{path} cannot be drawn: it names more than {MOST_NAMES} drives, registers or statuses"
             )
     if not rows:
-        raise ValueError(f"{path} holds no rows: nothing was polled while it was recorded")
+        why = (
+            "it ends within the first one" if reader.truncated else "nothing was polled while it was recorded"
+        )
+        raise ValueError(f"{path} holds no rows: {why}")
     drive, register, status, time, value, uncertainty = (
         np.concatenate(column) for column in zip(*parts, strict=True)
     )
     if not 0 <= time.min() <= time.max() < LATEST_NS:
-        raise ValueError(f"{path} cannot be drawn: there are rows from before 1970 or after 2200")
-    metadata = {**reader.metadata, "drives": _described(reader.metadata.get("drives"))}
+        raise ValueError(f"{path} cannot be drawn: it has rows from before 1970 or after 2200")
+    metadata = {**reader.metadata, "drives": checked_drives(reader.metadata.get("drives"))}
     drives, registers, statuses = map(tuple, codes.values())
-    pair = drive.astype(np.int64) * len(registers) + register
-    order = np.lexsort((time, pair))
-    starts = np.flatnonzero(np.diff(pair[order], prepend=-1))
-    first_seen = np.minimum.reduceat(order, starts)  # the row in which each series first appears
     series = []
-    groups = np.split(order, starts[1:])
-    for rows_of in (groups[at] for at in np.argsort(first_seen)):
+    # in the order in which the series first appear
+    for rows_of in sorted(rows_by_series(drive, register, time), key=np.min):
         drive_name, register_name = drives[drive[rows_of[0]]], registers[register[rows_of[0]]]
         about = metadata["drives"].get(drive_name, {}).get("registers", {}).get(register_name, {})
         series.append(
@@ -226,58 +245,27 @@ def load(path: str | Path) -> Recording:
                 about,
             )
         )
-    return Recording(Path(path), metadata, tuple(series), reader.truncated)
+    others = {EVENT, PHASE_DRIVE} if phase_names(metadata) else {EVENT}
+    polled = tuple(one for one in series if one.drive not in others)
+    if not polled:
+        raise ValueError(f"{path} holds no rows of drives, but only events or the phases of a test run")
+    phases = [one for one in series if one.drive == PHASE_DRIVE and one not in polled]
+    steps = [step for one in phases for step in _steps(one, int(time.max()) + 1)]
+    events = {event for one in series if one.drive == EVENT for event in _events(one)}
+    if trigger := trigger_of(metadata):
+        events.add(trigger)
+    in_order = sorted(events, key=lambda event: event.time)
+    return Recording(Path(path), metadata, polled, reader.truncated, tuple(steps), tuple(in_order))
 
 
-def _described(drives: object) -> dict[str, Any]:
-    """Return the metadata of drives and registers, without parts that `Plant.metadata` never writes."""
-    found = {}
-    for name, about in _tables(drives):
-        registers = {register: _checked(table) for register, table in _tables(about.get("registers"))}
-        found[name] = {**about, "registers": registers}
-    return found
+def _steps(phases: Series, end: int) -> list[TimeSpan]:
+    """Return the steps of a test run. A step ends at the start of the next one, or at the recording's end."""
+    begins = phases.time.tolist()
+    names = map(phases.name_of, phases.value.tolist())
+    return [TimeSpan(*span) for span in zip(begins, [*begins[1:], end], names, strict=True)]
 
 
-def _tables(tables: object) -> list[tuple[str, dict[str, Any]]]:
-    if not isinstance(tables, dict):
-        return []
-    return [(name, table) for name, table in tables.items() if isinstance(table, dict)]
-
-
-def _checked(register: dict[str, Any]) -> dict[str, Any]:
-    values = register.get("values")
-    if not isinstance(values, dict):
-        return {**register, "values": None}
-    return {**register, "values": {name: count for name, count in values.items() if _is_count(count)}}
-
-
-def _is_count(count: object) -> bool:
-    return isinstance(count, int) and not isinstance(count, bool) and 0 <= count < LARGEST_COUNT
-
-
-def _numbers(column: Any) -> Array:
-    """Return a column of numbers, with NaN for nulls."""
-    numbers = np.array(column.buffer(1))[: column.length]
-    if not column.null_count:
-        return numbers
-    valid = np.unpackbits(np.frombuffer(bytes(column.buffer(0)), np.uint8), bitorder="little")
-    return np.where(valid[: column.length] == 1, numbers.astype(float), np.nan)
-
-
-def _codes(column: Any, known: dict[str, int]) -> Array:
-    """Return each row's text as its code in `known`; texts that `known` lacks are added to it."""
-    ends = np.array(column.buffer(1))[: column.length + 1]
-    lengths = np.diff(ends)
-    if lengths.max(initial=0) > LONGEST_NAME:
-        raise ValueError(f"a name has {lengths.max()} bytes: a recording's have at most {LONGEST_NAME}")
-    width = int(lengths.max(initial=1)) or 1
-    padded = np.zeros((column.length, width), np.uint8)
-    text = np.frombuffer(bytes(column.buffer(2)), np.uint8)[ends[0] : ends[-1]]
-    padded[np.arange(width) < lengths[:, None]] = text
-    found, firsts, places = np.unique(
-        padded.view(f"S{width}").ravel(), return_index=True, return_inverse=True
-    )
-    for at in np.argsort(firsts):
-        known.setdefault(found[at].decode(errors="replace"), len(known))
-    numbers = np.array([known[text.decode(errors="replace")] for text in found.tolist()], np.int32)
-    return numbers[places] if len(found) else np.zeros(0, np.int32)
+def _events(series: Series) -> list[Event]:
+    """Return the events of one kind; their texts are stored as statuses."""
+    places = zip(series.time.tolist(), series.status.tolist(), strict=True)
+    return [Event(time, series.register, series.statuses[code]) for time, code in places]

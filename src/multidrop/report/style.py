@@ -13,19 +13,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from multidrop.printable import printable
-from multidrop.report.load import Array
+from multidrop.recording.series import Array
 
 # Okabe and Ito's colours without black and yellow. Further drives get the same colours, dashed.
-MOST_DRIVES = 100  # limit of a picture; tables list all drives
+MOST_DRIVES = 100  # limit of drives in a picture; tables list all drives
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#555555")
 DASHES = ("solid", "dashed", "dotted", "dashdot")
 TEXT = "#555555"
 FAULT = "#B00020"
 GRID = "#DDDDDD"
 FEWEST_BINS, MOST_BINS = 10, 120  # limits of the number of bins on the time axis
-BIN_NS = 2_000_000_000  # usual width of a bin; others keep the number of bins within the limits
+# usual width of a bin; it is changed to keep the number of bins within the limits
+BIN_NS = 2_000_000_000
 SHORTEST_NS = 1_000_000_000  # least length of the time axis
-WIDTH = 11.0  # of a figure, in inches
+WIDTH = 11.0  # width of a figure, in inches
 DPI = 110
 LEGEND_MARK, LEGEND_LETTER, LEGEND_ROW = 0.7, 0.09, 0.21  # sizes in inches
 
@@ -48,7 +49,7 @@ class TimeBins:
         return np.asarray(np.histogram(time, self._edges, weights=weights)[0] / self._seconds)
 
     def label(self, axes: Axes) -> None:
-        """Label the x axis, and limit it to the bins."""
+        """Label the x axis, and limit the axis to the bins."""
         label_time(axes)
         axes.set_xlim(*days(self._edges[[0, -1]].astype(np.int64)))
 
@@ -60,16 +61,23 @@ def label(text: str) -> str:
 
 
 def line_style(number: int) -> dict[str, Any]:
-    """Return matplotlib's colour and dashes for a drive's lines, the same in every picture."""
+    """Return matplotlib's colour and dashes for a drive's lines. They are the same in every picture."""
     return {
         "color": COLOURS[number % len(COLOURS)],
         "linestyle": DASHES[number // len(COLOURS) % len(DASHES)],
     }
 
 
+class NotebookFigure(Figure):
+    """A figure that a notebook shows by itself, even without pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        return png(self)
+
+
 def new_figure(heights: Sequence[float], **details: Any) -> tuple[Figure, list[Axes]]:
-    """Return a figure, and its axes one below the other, which have these heights in inches."""
-    figure = Figure(figsize=(WIDTH, sum(heights) + 0.6), layout="constrained", dpi=DPI)
+    """Return a figure and its axes, which lie one below the other and have these heights in inches."""
+    figure = NotebookFigure(figsize=(WIDTH, sum(heights) + 0.6), layout="constrained", dpi=DPI)
     axes = figure.subplots(len(heights), 1, squeeze=False, height_ratios=list(heights), **details)[:, 0]
     for one in axes:
         one.grid(visible=True, color=GRID, linewidth=0.6)
@@ -78,7 +86,7 @@ def new_figure(heights: Sequence[float], **details: Any) -> tuple[Figure, list[A
     return figure, list(axes)
 
 
-MOST_COLUMNS = 6  # limit for a legend
+MOST_COLUMNS = 6  # limit of columns in a legend
 
 
 def set_title(axes: Axes, text: str) -> None:
@@ -86,7 +94,7 @@ def set_title(axes: Axes, text: str) -> None:
 
 
 def add_legend(figure: Figure, handles: Sequence[Any]) -> None:
-    """Add a legend above the axes, as wide as fits; the figure grows by the legend's height."""
+    """Add a legend above the axes, with as many columns as fit; the figure grows by the legend's height."""
     longest = max((len(handle.get_label()) for handle in handles), default=0)
     columns = max(1, min(MOST_COLUMNS, int(WIDTH / (LEGEND_MARK + LEGEND_LETTER * longest))))
     rows = -(-len(handles) // columns)
@@ -95,7 +103,9 @@ def add_legend(figure: Figure, handles: Sequence[Any]) -> None:
 
 
 def mark_times(axes: Axes, time: Array, height: float, apart: int, **details: Any) -> None:
-    """Draw a tick at each time. Ticks in the same interval of `apart` ns would overlap: only one is drawn."""
+    """Draw a tick at each time, but only one tick in each interval of `apart` ns, because more would
+    overlap.
+    """
     if len(time):
         time = np.unique(time // max(1, apart)) * max(1, apart)
         axes.plot(days(time), np.full(len(time), height), "|", **details)

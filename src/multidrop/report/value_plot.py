@@ -1,4 +1,6 @@
-"""Draw a recording's values: a panel per quantity, states as lanes, and marks of faults and misses."""
+"""Draw a recording's values: a panel per register name and unit, states as lanes, and marks for faults and
+misses.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from multidrop.report.load import RAW, Array, Recording, Series
+from multidrop.recording.series import RAW, Array, Event
+from multidrop.report.load import Recording, Series
 from multidrop.report.style import (
     FAULT,
     GRID,
@@ -32,7 +35,7 @@ from multidrop.report.style import (
     set_title,
 )
 
-FIRST = (  # registers whose panels are drawn first if not all fit
+FIRST = (  # registers whose panels are drawn first, in case not all panels fit
     "output_frequency",
     "output_current",
     "motor_speed",
@@ -43,19 +46,22 @@ FIRST = (  # registers whose panels are drawn first if not all fit
     "heatsink_temperature",
 )
 MOST_PANELS = 8
-MOST_POINTS = 4000  # limit of points per curve: more cannot be seen
-FEW_POINTS = 200  # up to this number of points in a curve, each is drawn as a dot
+MOST_POINTS = 4000  # limit of points per curve: more points could not be distinguished
+FEW_POINTS = 200  # a curve with at most this many points is drawn with a dot for each
 FAULTS = "fault"
+MOST_EVENTS = 50  # limit of events, and of steps of a test run, in a picture
+STEP = "step"  # kind of the events that mark the steps
+LONGEST_EVENT = 30  # limit of an event's text in a picture
 
 CURVES_INCHES = 1.9
 
 
 class Panel(NamedTuple):
-    """A register name and unit with a panel of their own: amperes and per cent cannot share an axis."""
+    """A register name and unit that share a panel. Amperes and per cent cannot share an axis."""
 
     register: str
     unit: str
-    has_names: bool  # the raw values have names, so they are states
+    has_names: bool  # True if the raw values have names and are drawn as states
 
     @property
     def title(self) -> str:
@@ -68,7 +74,7 @@ class Content:
 
     panel: Panel
     series: list[Series]
-    lanes: list[Lane]  # empty: the panel has curves
+    lanes: list[Lane]  # the rows of states; empty if the panel has curves
     hidden: int  # number of lanes for which there is no room
 
     @property
@@ -79,7 +85,7 @@ class Content:
 def plot(
     recording: Recording, drives: Sequence[str] = (), registers: Sequence[str] = ()
 ) -> tuple[Figure, list[str]]:
-    """Return a picture of these drives and registers (default: all), and the names that did not fit into it.
+    """Return a picture of these drives and registers (default: all), and the names for which it had no room.
 
     Raises ValueError for unknown names, and if there is no value to draw.
     """
@@ -87,7 +93,7 @@ def plot(
     wanted = [series for series in chosen if not registers or series.register in registers]
     if not any(series.has_values for series in wanted):
         misses = _reasons(chosen)
-        raise ValueError(f"there is no value to draw, only misses: {misses}; `multidrop report` tells more")
+        raise ValueError(f"there is no value to draw, only misses: {misses}; `multidrop report` shows more")
     panels = _panels([series for series in wanted if series.register != FAULTS], registers)
     shown = panels if registers else panels[:MOST_PANELS]
     contents = [_content(panel, chosen) for panel in shown]
@@ -99,6 +105,9 @@ def plot(
     for content, one in zip(contents, axes[len(strip) :], strict=True):
         _draw(one, content, recording)
         _shade(one, content, faults)
+    starts = [Event(max(step.begin, recording.begin), STEP, step.what) for step in recording.steps]
+    _mark_events(axes, starts)
+    _mark_events(axes, recording.events)
     label_time(axes[-1])
     axes[-1].set_xlim(day(recording.begin), day(max(recording.end, recording.begin + 1_000_000)))
     _add_drives(figure, contents, recording, has_misses=any(series.missed.any() for series in chosen))
@@ -120,7 +129,9 @@ def _of_drives(recording: Recording, drives: Sequence[str], registers: Sequence[
 
 
 def _faults(chosen: Sequence[Series], *, is_alone: bool) -> list[Series]:
-    """Return the fault series of drives that had faults; all fault series if only those were chosen."""
+    """Return the fault series of drives that had faults. If only fault series were chosen, return all of
+    `chosen`.
+    """
     polled = [series for series in chosen if series.register == FAULTS]
     return [series for series in polled if series.faults()] or (polled if is_alone else [])
 
@@ -147,7 +158,7 @@ def _reasons(series: Sequence[Series]) -> str:
 
 
 def _panels(chosen: Sequence[Series], registers: Sequence[str]) -> list[Panel]:
-    """Return a panel for each register and unit, in the order of `registers`, or else of FIRST."""
+    """Return a panel for each register and unit, in the order of `registers` if given, else of FIRST."""
     found = dict.fromkeys(map(_panel, chosen))
     order = {name: at for at, name in enumerate(registers or FIRST)}
     return sorted(found, key=lambda panel: (order.get(panel.register, len(order)), panel.unit == RAW))
@@ -194,7 +205,9 @@ def _draw_curves(axes: Axes, panel: Panel, series: Sequence[Series], recording: 
 
 
 def _fit(axes: Axes, series: Sequence[Series]) -> None:
-    """Scale the y axis: whole numbers for raw counts, room around a constant value, and 0 if it is near."""
+    """Scale the y axis, with whole numbers for raw counts, with room around a constant value, and with 0 if
+    it is near.
+    """
     drawn = np.concatenate([one.drawable for one in series])
     seen = drawn[~np.isnan(drawn)]
     if not len(seen):
@@ -222,7 +235,7 @@ def _mark_misses(axes: Axes, series: Sequence[Series], recording: Recording) -> 
 
 
 def _draw_faults(axes: Axes, series: Sequence[Series]) -> None:
-    """Draw a row per drive with the drive's faults as bars, which have the faults' names."""
+    """Draw a row for each drive, with a named bar for each of the drive's faults."""
     set_title(axes, "faults" if any(one.faults() for one in series) else "faults: none")
     for row, one in enumerate(series):
         for span in one.faults():
@@ -234,8 +247,34 @@ def _draw_faults(axes: Axes, series: Sequence[Series]) -> None:
     axes.grid(visible=True, axis="x", color=GRID, linewidth=0.6)
 
 
+def _mark_events(axes: Sequence[Axes], events: Sequence[Event]) -> None:
+    """At each event, draw a line through all panels, and write its text on the last panel.
+
+    The line of a step of a test run is dashed.
+    """
+    for event in events[:MOST_EVENTS]:
+        at = day(event.time)
+        for one in axes:
+            one.axvline(at, color=TEXT, linestyle="--" if event.kind == STEP else ":", linewidth=0.9)
+        shown = event.text if len(event.text) <= LONGEST_EVENT else f"{event.text[: LONGEST_EVENT - 3]}..."
+        place: dict[str, Any] = {"xytext": (2, 2), "textcoords": "offset points", "annotation_clip": True}
+        text = axes[-1].annotate(
+            label(shown),
+            (at, 0.0),
+            xycoords=axes[-1].get_xaxis_transform(),
+            rotation=90,
+            va="bottom",
+            fontsize=7,
+            color=TEXT,
+            **place,
+        )
+        text.set_in_layout(False)  # otherwise the layout would reserve room for the text above the panel
+
+
 def _shade(axes: Axes, content: Content, faults: Sequence[Series]) -> None:
-    """Shade the times of each drive's faults: across a panel with the drive's curve, or across its lanes."""
+    """Shade the times of each drive's faults: across a panel with a curve of the drive, or across the drive's
+    lanes.
+    """
     shade: dict[str, Any] = {"color": FAULT, "alpha": 0.08, "lw": 0}
     for one in faults:
         rows = [row for row, lane in enumerate(content.lanes) if lane.drive == one.drive]
@@ -248,13 +287,15 @@ def _shade(axes: Axes, content: Content, faults: Sequence[Series]) -> None:
 
 
 def with_pauses(time: Array, value: Array, begins: Array) -> tuple[Array, Array]:
-    """Return the points with NaN inserted at the start of each pause, which interrupts the drawn line."""
+    """Return the points, with a NaN inserted at the start of each pause to interrupt the drawn line."""
     at = np.searchsorted(time, begins, side="right")
     return np.insert(time, at, begins + 1), np.insert(value, at, np.nan)
 
 
 def thinned(time: Array, value: Array) -> tuple[Array, Array]:
-    """Return at most MOST_POINTS points: the least and greatest value of each stretch, and its misses."""
+    """If there are more than MOST_POINTS points, return only the least and greatest value of each run of
+    rows. A run that has only misses keeps a miss.
+    """
     pieces = MOST_POINTS // 2
     if len(time) <= MOST_POINTS:
         return time, value
@@ -268,10 +309,10 @@ def thinned(time: Array, value: Array) -> tuple[Array, Array]:
     return time[kept], value[kept]
 
 
-# Tol's pale colours: no state has the colour of a drive.
+# Tol's pale colours, so that no state has the colour of a drive.
 COLOURS = ("#BBCCEE", "#CCDDAA", "#EEEEBB", "#CCEEFF", "#DDDDDD", "#FFCCCC")
 HATCHES = ("", "////", "....")  # patterns that distinguish states if there are more states than colours
-MOST_LANES = 64  # limit of a panel
+MOST_LANES = 64  # limit of lanes in a panel
 NARROWEST = 1 / 1500  # least width of a state, as a fraction of the time axis
 LETTER = 1 / 140  # width of a letter, as a fraction of the time axis
 LANE_INCHES = 0.24
@@ -280,20 +321,23 @@ MOST_TEXTS = 50  # limit of labels with the same name in one lane
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """The successive states of a drive's register, or of one bit of it, and their times."""
+    """The successive states of a drive's register, or of one of its bits, with their times."""
 
     drive: str
     title: str
-    is_bit: bool  # the state is on or off
+    is_bit: bool  # True if the lane shows one bit, whose states are on and off
     time: Array  # time of each row, ns UTC
     missed: Array
-    state: tuple[str, ...]  # names of the successive states; equal successive rows are one state
+    state: tuple[str, ...]  # names of the successive states; successive rows with equal values are one state
     begin: Array  # start of each state, ns UTC
     end: Array
 
 
 def lanes_of(series: Sequence[Series]) -> tuple[list[Lane], int]:
-    """Return a panel's lanes, and the number without room. Bits that are never set are dropped first."""
+    """Return a panel's lanes, and the number of lanes for which there is no room.
+
+    Bits that are never set are dropped first.
+    """
     found = list(chain.from_iterable(map(_lanes, series)))
     if len(found) > MOST_LANES:
         found = [lane for lane in found if lane.state] or found
@@ -303,7 +347,7 @@ def lanes_of(series: Sequence[Series]) -> tuple[list[Lane], int]:
 def _lanes(series: Series) -> Iterable[Lane]:
     if not series.is_bits:
         return [_lane(series, series.drive, series.value, series.name_of)]
-    with np.errstate(invalid="ignore"):  # infinite values are not counts
+    with np.errstate(invalid="ignore"):  # an infinite value cannot be converted to a count
         is_whole = series.value % 1 == 0
     is_count = is_whole & (series.value >= 0) & (series.value < 2**32)
     counts = np.where(is_count, series.value, 0.0).astype(np.int64)
@@ -322,7 +366,10 @@ def _lanes(series: Series) -> Iterable[Lane]:
 
 
 def _lane(series: Series, title: str, value: Array, name_of: Callable[[float], str]) -> Lane:
-    """Return a lane with a state for each run of equal values; it lasts until the next state or a pause."""
+    """Return a lane with a state for each run of equal values.
+
+    A state lasts until the next state or a pause.
+    """
     time = series.time
     differs = (value[1:] != value[:-1]) & ~(np.isnan(value[1:]) & np.isnan(value[:-1]))
     cuts = np.flatnonzero(differs | series.pauses)
@@ -379,7 +426,7 @@ def draw_lanes(axes: Axes, lanes: Sequence[Lane], recording: Recording) -> None:
 
 
 def name_bar(axes: Axes, text: str, at: float, row: int) -> None:
-    """Write a name at the start of a bar; it stays readable if the bar is shorter than the name."""
+    """Write a name at the start of a bar. The name stays readable even if it is longer than the bar."""
     box = {"facecolor": "white", "alpha": 0.75, "pad": 0.8, "linewidth": 0}
     place: dict[str, Any] = {"xytext": (3, 0), "textcoords": "offset points", "va": "center"}
     axes.annotate(text, (at, row), fontsize=7.5, clip_on=True, bbox=box, **place)
@@ -399,7 +446,9 @@ def _longest_first(lane: Lane) -> list[str]:
 
 
 def _merged(lane: Lane, name: str, span: int) -> tuple[Array, Array]:
-    """Return the starts and ends of a lane's bars for this state; gaps too narrow to see are closed."""
+    """Return the starts and ends of a lane's bars for this state. Bars whose gap would be invisible are
+    joined.
+    """
     of = np.array([state == name for state in lane.state])
     begin, end = lane.begin[of], lane.end[of]
     apart = np.concatenate([[True], begin[1:] - end[:-1] > span * NARROWEST / 2])

@@ -31,7 +31,7 @@ MOST_READINGS = 3  # number of readings that a drive must answer if its family h
 def identify(
     sweep: Sweep, address: int, families: Sequence[type[Drive]], ask: Ask
 ) -> tuple[list[Drive], str]:
-    """Return a drive object for each best-fitting family, and a sentence about the remaining doubt.
+    """Return a drive object for each best-fitting family, and a sentence about the remaining doubt or "".
 
     Several families may fit equally well; the list is empty if none fits.
     """
@@ -51,8 +51,8 @@ def identify(
 def candidate(family: type[Drive], settings: Settings, framing: Framing, address: int) -> Drive | None:
     """Return a drive object of the family with these settings; None if its manual does not allow them.
 
-    A drive can answer in the sweep's format although its own differs: in its stop bits, or on a
-    pseudo-terminal in its parity. If the family does not allow the sweep's format, the drive gets
+    A drive can answer in the sweep's serial format although its own format has other stop bits (on a
+    pseudo-terminal: another parity). If the family does not allow the sweep's format, the drive object gets
     the family's usual format.
     """
     if not family.speaks(framing) or address not in family.addresses:
@@ -79,7 +79,7 @@ def _score(drive: Drive, ask: Ask) -> int:
         try:
             held = _read(drive, setting, ask)
         except BusError:
-            return score  # not every firmware has this register
+            return score  # the failure is ignored, because not every firmware has this register
         if held != drive.address:
             raise WriteForbidden(f"{drive.name} holds {held:g} as its address")
         score += 1
@@ -93,11 +93,14 @@ def _resembles(drive: Drive, ask: Ask) -> bool:
 
 
 def _run(drive: Drive, script: Script[R], ask: Ask) -> R:
-    """Run a script that only reads; return its result. Raises WriteForbidden if it tries anything else."""
+    """Run a script that only reads; return its result.
+
+    Raises WriteForbidden if the script's next step is not a read.
+    """
 
     def do(step: Step) -> Any:
         if not isinstance(step, Read):
-            raise WriteForbidden(f"the look at {drive.title} does more than read")
+            raise WriteForbidden(f"the identification of {drive.title} may only read")
         return _read(drive, step.register, ask)
 
     return carry_out(script, do)
@@ -115,13 +118,13 @@ def _read(drive: Drive, register: Register[Any] | Text, ask: Ask) -> Any:
     return value
 
 
-MOST_TIMEOUT = 1.0  # timeout in s; only for a drive whose address is known
+MOST_TIMEOUT = 1.0  # limit of the timeout in s, used only for an address at which a drive has answered
 TRIES = 3
-LATE_NS = 500_000_000  # how long to wait for late replies
+LATE_NS = 500_000_000  # maximum wait for late replies
 SHORTEST_REPLY = 5  # size of an exception reply in bytes; fewer bytes are noise
 
-
-# Results for frames that answer another request.
+SILENT = (Failure.NO_REPLY, Failure.STALLED)  # results of exchanges in which no byte was received
+# Results that mean that a frame answers another request.
 _MISDIRECTED = (FrameFault.BAD_ADDRESS, FrameFault.BAD_FUNCTION, FrameFault.BAD_LENGTH)
 
 
@@ -141,7 +144,10 @@ class Scan(Protocol):
 
 
 class Probe:
-    """Finds out whether a drive answers at an address, which family it has, and whether it is alone."""
+    """Finds out whether a drive answers at an address, and its family.
+
+    Also finds out whether a second drive answers at the same address.
+    """
 
     def __init__(self, scan: Scan, sweep: Sweep, address: int) -> None:
         self._scan = scan
@@ -149,7 +155,8 @@ class Probe:
         self._address = address
         self._peer = scan.peer(LEAST_TIMEOUT, MOST_TIMEOUT)
         self.answers = self.damaged = self.followed = 0
-        self.whole_frame = ""  # a frame with a valid checksum that did not match the request, and why
+        # a frame with a valid checksum that did not match the request, and why not; "" if there was none
+        self.whole_frame = ""
         self.excess = 0.0
         self._answered = False  # whether the last request was answered
         self._has_missed = False  # whether any request was not answered
@@ -163,7 +170,7 @@ class Probe:
         self.followed += self._answered and completion.stale > 0
         self._answered = completion.result > 0
         self.answers += self._answered
-        self.damaged += not self._answered and completion.result != Failure.NO_REPLY
+        self.damaged += not self._answered and completion.result not in SILENT
         self._has_missed |= not self._answered
         if completion.result in _MISDIRECTED and is_whole(self._sweep.framing, completion.raw):
             self.whole_frame = f"{STATUSES[-completion.result]} (received {completion.raw.hex(' ').upper()})"
@@ -171,11 +178,12 @@ class Probe:
         return completion
 
     def found(self, families: Sequence[type[Drive]]) -> Found:
-        """Identify the drive, as far as reading can."""
+        """Identify the drive's family, as far as reads can."""
         # The drive's response delay is known, so a short timeout is enough.
         known = max(LEAST_TIMEOUT, 4 * self.response_delay)
         drives, guess = self._identify(families, LEAST_TIMEOUT, known)
-        if self._has_missed and not self._is_in_step():  # the drive or this computer became slower
+        # a missed reply shows that the drive or this computer became slower
+        if self._has_missed and not self._is_in_step():
             drives, guess = self._identify(families, MOST_TIMEOUT, MOST_TIMEOUT)
         documented = max((drive.response_delay for drive in drives), default=LEAST_TIMEOUT)
         self.excess = self.response_delay - documented
@@ -196,7 +204,7 @@ class Probe:
         return identify(self._sweep, self._address, families, self._reply)
 
     def _is_in_step(self) -> bool:
-        """Return False if a reply was late, and perhaps mistaken for the reply to another request."""
+        """Return False if a reply was late, and was perhaps mistaken for the reply to another request."""
         request, peer = self._sweep.request.to(self._address), self._scan.peer(MOST_TIMEOUT, MOST_TIMEOUT)
         found = self._scan.ask(self._sweep, request, peer, self._asked_ns + LATE_NS)
         return found.result > 0 and found.stale < SHORTEST_REPLY

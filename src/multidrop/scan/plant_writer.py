@@ -41,13 +41,13 @@ def plant_text(
         taken.setdefault(address, f"{device.models[0]}-{address}")
         tables.append("\n".join(lines) + "\n")
     if not taken:
-        raise ValueError("no drive of a known family was found: there is nothing to write a plant file of")
+        raise ValueError("no drive of a known family was found, so no plant file can be written")
     return "\n".join(tables)
 
 
 def _drive(device: Found, model: str, family: type[Drive]) -> Iterator[str]:
     drive = candidate(family, device.settings, device.framing, device.address)
-    assert drive is not None  # an identified drive has settings of its family
+    assert drive is not None  # an identified drive always has settings that its family allows
     yield "[[line.drive]]"
     if device.doubt:
         yield f"# {device.doubt}"
@@ -65,5 +65,5 @@ def _drive(device: Found, model: str, family: type[Drive]) -> Iterator[str]:
 
 
 def _text(value: str) -> str:
-    """Quote a path or name as a basic string of TOML, which has the same syntax as JSON for these."""
+    """Quote a path or name as a basic string of TOML. For these texts, JSON has the same syntax."""
     return json.dumps(value, ensure_ascii=False)

@@ -14,15 +14,15 @@ GUESS = "it only reads like one: look at its name plate"
 class Found:
     """A drive that answers; `models` are the equally likely families, empty if no family fits.
 
-    The settings are the first at which the drive answered. Its number of stop bits may differ, because a
-    drive also answers requests with another number of stop bits.
+    The settings are the first at which the drive answered. The drive's own number of stop bits may differ,
+    because a drive also answers requests with another number of stop bits.
     """
 
     address: int
     settings: Settings
     framing: Framing
     models: tuple[str, ...]
-    response_delay: float  # s
+    response_delay: float  # in s
     doubt: str = ""
 
 
@@ -41,7 +41,7 @@ class Crowd:
 
 @dataclass(frozen=True)
 class Noise:
-    """A setting that received invalid bytes at so many addresses that these are probably noise."""
+    """A line setting at which so many addresses gave invalid bytes that these are probably noise."""
 
     settings: Settings
     framing: Framing
@@ -51,7 +51,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Untried:
-    """A setting that was skipped because the port does not support it."""
+    """A line setting that was skipped because the port does not support it."""
 
     settings: Settings
     framing: Framing

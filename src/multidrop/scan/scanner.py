@@ -1,6 +1,7 @@
 """Scan a serial line: carry out sweeps one after another, and find drives by their replies.
 
-The caller passes the function that carries out exchanges. No clock is read: times come from completions.
+The caller passes the function that carries out exchanges. This module reads no clock: times come from
+the completions of exchanges.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ from multidrop.core import (
 )
 from multidrop.drive.family import Drive
 from multidrop.errors import LineError
-from multidrop.scan.identify import MOST_TIMEOUT, TRIES, Probe, is_whole
+from multidrop.scan.identify import MOST_TIMEOUT, SILENT, TRIES, Probe, is_whole
 from multidrop.scan.results import Crowd, Finding, Noise, Progress, Untried
 from multidrop.scan.sweep import Sweep
 
-NOISY = 1 / 3  # invalid bytes at more than this share of a sweep's addresses count as noise
-LEAST_NOISY = 4  # least number of addresses with invalid bytes that counts as noise
+NOISY = 1 / 3  # invalid bytes count as noise if more than this share of a sweep's addresses has them
+LEAST_NOISY = 4  # if fewer addresses than this have invalid bytes, the bytes never count as noise
 BEGUN = 2  # number of received characters after which a reply counts as started
-LATE = 8  # number of later requests during which a late reply is still matched to its request
+LATE = 8  # for this many later requests, a late reply is still matched to its request
 
 
 class CarryOut(Protocol):
@@ -51,10 +52,11 @@ class _Scan:
     def __init__(self, carry_out: CarryOut, families: Sequence[type[Drive]]) -> None:
         self._carry_out = carry_out
         self._families = families
-        self._peers: list[Peer] = []  # references that keep the peers alive while the C core uses them
+        self._peers: list[Peer] = []  # keeps the peers alive while the C core uses them
         self._found: set[tuple[int, Framing, int]] = set()
         self._crowded: set[tuple[int, Framing, int]] = set()
-        self._excess = 0.0  # s by which a drive's response delay exceeded its family's usual one
+        # the largest excess, in s, of a drive's response delay over its family's usual delay
+        self._excess = 0.0
         self._refusals: list[LineError] = []
 
     def run(self, sweeps: Sequence[Sweep]) -> Iterator[Finding]:
@@ -65,12 +67,14 @@ class _Scan:
             raise self._refusals[-1]
 
     def _learned(self, sweep: Sweep) -> Sweep:
-        """Return the sweep with a longer timeout if replies so far were slow (adapter or network)."""
+        """Return the sweep, with a longer timeout if the adapter or network has delayed earlier replies."""
         return replace(sweep, patience=sweep.patience + min(2 * self._excess, MOST_TIMEOUT))
 
     def _sweep(self, sweep: Sweep, left_after: float) -> Iterator[Finding]:
         addresses = [address for address in sweep.addresses if _key(sweep, address) not in self._found]
-        garbled: dict[int, str] = {}  # by address: a whole frame that did not match the request, or ""
+        # Maps an address with invalid replies to a whole frame that did not match the request, with the
+        # reason; to "" if no frame was whole.
+        garbled: dict[int, str] = {}
         peers: dict[int, Peer] = {}
         for number, address in enumerate(addresses, 1):
             peers[address] = self._sweep_peer(sweep)
@@ -82,10 +86,10 @@ class _Scan:
                 self._refusals.append(refusal)
                 yield Untried(sweep.settings, sweep.framing, refusal.reason)
                 return
-            came = completion.result != Failure.NO_REPLY
+            came = completion.result not in SILENT
             earlier = addresses[max(0, number - 1 - LATE) : number - 1]
             late = [before for before in earlier if before in peers and peers[before].late]
-            for suspect in late:  # the core has matched the late reply to this address
+            for suspect in late:  # the C core has matched a late reply to this address
                 del peers[suspect]
             late += _late(sweep, earlier, completion)
             for suspect in late + [address] * came:
@@ -110,7 +114,7 @@ class _Scan:
                 yield Crowd(address, sweep.settings, sweep.framing, whole_frame)
 
     def ask(self, sweep: Sweep, request: Message, peer: Peer, not_before_ns: int = 0) -> Completion:
-        """Carry out an exchange; return its completion, in which an echo of the request is not a reply."""
+        """Carry out an exchange; return its completion. An echo of the request does not count as a reply."""
         completion = self._once(sweep, sweep.framing, request, peer, not_before_ns)
         if sweep.framing is not Framing.TCP and completion.raw == build_request(sweep.framing, request):
             # A valid reply may equal this request. A request in another framing, which drives ignore, shows
@@ -141,7 +145,7 @@ class _Scan:
         return completion
 
     def _sweep_peer(self, sweep: Sweep) -> Peer:
-        """Return a peer whose timeout covers only a reply's start; a probe later reads the whole reply."""
+        """Return a peer whose timeout covers only the start of a reply; a probe reads whole replies later."""
         settings = sweep.settings
         length = reply_length(sweep.framing, sweep.request.to(sweep.addresses[0]))
         window = sweep.patience + (BEGUN - length) * settings.character
@@ -154,12 +158,15 @@ class _Scan:
 
 
 def _key(sweep: Sweep, address: int) -> tuple[int, Framing, int]:
-    """Return a drive's key. It lacks the format, so a drive that answers in several is reported once."""
+    """Return the key by which the scan recognises a drive.
+
+    It lacks the serial format, so that a drive that answers in several formats is reported once.
+    """
     return address, sweep.framing, sweep.settings.baudrate
 
 
 def _late(sweep: Sweep, earlier: Sequence[int], completion: Completion) -> list[int]:
-    """Return the earlier addresses whose late replies came during this exchange."""
+    """Return the `earlier` addresses whose late replies came during this exchange."""
     if completion.result > 0 or not completion.raw:
         return []
     found = []

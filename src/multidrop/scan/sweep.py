@@ -20,11 +20,12 @@ from multidrop.transport.peers import LEAST_TIMEOUT
 
 Setting = tuple[Settings, Framing]
 
-GATEWAY_PATIENCE = 1.0  # s within which a Modbus TCP gateway reports that a drive does not answer
+# maximum time in s that a Modbus TCP gateway takes to report that a drive does not answer
+GATEWAY_PATIENCE = 1.0
 ADDRESSES = range(1, 32)  # scanned by default
 _ILLEGAL_ADDRESS = 2  # exception code: illegal data address
-# In tables of these kinds, a reply with the value 0 equals an echo of the request. The register that holds
-# the drive's address is never 0.
+# In tables with these carriers, a reply with the value 0 is the same as an echo of the request. So a sweep
+# prefers registers of other tables, or the register with the drive's own address, which never holds 0.
 _ECHOED = (Carrier.LONG, Carrier.NUMBER)
 
 
@@ -55,13 +56,13 @@ class Sweep:
 
     @property
     def each(self) -> float:
-        """Seconds that the request to an address without a drive takes: line silence, request, timeout."""
+        """The time in s that an address without a drive takes: line silence, request, timeout."""
         request = len(build_request(self.framing, self.request.to(1)))
         return self.silence + request * self.settings.character + self.patience
 
     @property
     def needed(self) -> float:
-        """Seconds that the sweep takes if no drive answers."""
+        """The time in s that the sweep takes if no drive answers."""
         return len(self.addresses) * self.each
 
 
@@ -72,11 +73,13 @@ def sweeps(
     baudrates: Collection[int] = (),
     formats: Collection[str] = (),
 ) -> list[Sweep]:
-    """Return sweeps of all settings in these families' documents, the best chances per second first.
+    """Return sweeps of all line settings in these families' documents.
 
-    Every setting is swept first with a timeout for usual response delays, then with one for the longest
-    delays that the documents allow. `baudrates` and `formats` restrict the settings; empty means all. Raises
-    ValueError for a baud rate or format that is in no document, and if no sweep is left.
+    The sweeps with the highest chance of finding a drive per second come first.
+
+    Every setting is swept twice: first with a timeout for usual response delays, then with a timeout for the
+    longest delays that the documents allow. `baudrates` and `formats` restrict the settings; empty means all.
+    Raises ValueError for a baud rate or format that is in no document, and if no sweep is left.
     """
     settings = _settings(families)
     _check("baud rate", baudrates, {setting.baudrate for setting, _ in settings})
@@ -89,14 +92,16 @@ def sweeps(
         for likely in _sweeps(setting, weights, addresses)
     ]
     if not found:
-        raise ValueError("no family has such an address together with this baud rate and format")
+        raise ValueError(
+            "no family has one of these addresses together with one of these baud rates and formats"
+        )
     found.sort(key=lambda weighted: -weighted[0] / weighted[1].needed)
     brisk = [sweep for _, sweep in found]
     return brisk + [_patient(sweep) for sweep in brisk]
 
 
 def one_of_each_framing(planned: Sequence[Sweep]) -> list[Sweep]:
-    """For a port with a fixed format, keep two sweeps of each request: with a short and a long timeout."""
+    """Return two sweeps of each request, with a short and a long timeout, for a port with a fixed format."""
     brisk: dict[tuple[Framing, ScanRequest], Sweep] = {}
     patient: dict[tuple[Framing, ScanRequest], Sweep] = {}
     for sweep in planned:
@@ -121,7 +126,7 @@ def _check(what: str, given: Collection[Any], known: set[Any]) -> None:
     for one in given:
         if one not in known:
             choices = ", ".join(map(str, sorted(known)))
-            raise ValueError(f"{what} {one} is none that these families have: {choices}")
+            raise ValueError(f"none of these families has {what} {one}; they have {choices}")
 
 
 def _patient(sweep: Sweep) -> Sweep:
@@ -130,7 +135,7 @@ def _patient(sweep: Sweep) -> Sweep:
 
 
 def _settings(families: Sequence[type[Drive]]) -> dict[Setting, dict[type[Drive], float]]:
-    """Return each setting's families with likelihoods; a setting that a document names first is likelier."""
+    """Return, by setting, how likely each family uses it; each document's first setting is the likeliest."""
     found: dict[Setting, dict[type[Drive], float]] = {}
     for family in families:
         for framing in family.framings:
@@ -144,7 +149,7 @@ def _settings(families: Sequence[type[Drive]]) -> dict[Setting, dict[type[Drive]
 def _sweeps(
     setting: Setting, weights: dict[type[Drive], float], addresses: Sequence[int]
 ) -> Iterator[tuple[float, Sweep]]:
-    """Yield the fewest sweeps that reach every family at this setting, each with its likelihood."""
+    """Yield pairs (likelihood, sweep): the fewest sweeps that reach every family at this setting."""
     left = dict(weights)
     while left:
         register = _best(left)
@@ -158,7 +163,10 @@ def _sweeps(
 
 
 def _best(families: Collection[type[Drive]]) -> Register[Any] | None:
-    """Return the register that most families answer; among equals, the one that most families declare."""
+    """Return the register whose read is answered by drives of the most families.
+
+    Of several such registers, return the one that the most families declare.
+    """
     registers = (one for family in families for one in family.registers.values() if one.readable)
     return max(
         registers,
@@ -192,7 +200,7 @@ def _has(family: type[Drive], register: Register[Any]) -> bool:
 
 
 def _answers(family: type[Drive], register: Register[Any]) -> bool:
-    """Return True if the family has this register, or documents an exception for unknown registers."""
+    """Return True if drives of the family answer a read of this register, even if only by an exception."""
     if _has(family, register):
         return True
     reads = register.table in _addresses(family)
