@@ -1,4 +1,4 @@
-"""CSV tables: ambiguous cells become gaps, and so do facts that the table does not state."""
+"""CSV tables: ambiguous cells, and facts that the table does not state, are marked as gaps."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def row(folder: Path, header: str, cells: str) -> ImportedDevice:
 
 
 def found(device: ImportedDevice) -> list[str]:
-    """Return the gaps except those about address numbering and a missing table."""
+    """Return the device's gaps, except those about address numbering and a missing table."""
     return [gap for gap in gaps(device, "a") if gap not in UNPLACED]
 
 
@@ -73,13 +73,13 @@ def test_address_and_table_are_read_from_every_notation(
     assert said == [] if not gap else said[0].startswith(gap)
 
 
-def test_register_whose_address_exceeds_65535_is_lost(tmp_path: Path) -> None:
+def test_register_whose_address_exceeds_65535_is_reported_as_not_imported(tmp_path: Path) -> None:
     device = only(tmp_path, "t.csv", "name,address,type\na,103247,float\nb,5,uint16\n")
     assert list(entries(device)) == ["b"]
     assert omissions(device) == ["a: its address is not from 0 to 65535"]
 
 
-def test_decimal_address_in_a_column_with_hex_addresses_is_a_gap(tmp_path: Path) -> None:
+def test_decimal_address_in_a_column_with_hex_addresses_is_marked_as_a_gap(tmp_path: Path) -> None:
     device = only(tmp_path, "t.csv", "name,address,type\na,10,uint16\nb,1F,uint16\n")
     assert "its address 10 may be hex, as others of its column are" in gaps(device, "a")
     assert "b: it cannot be read:" in omissions(device)[0]
@@ -109,12 +109,12 @@ def test_unit_of_a_coil_is_left_out_and_reported_as_a_gap(tmp_path: Path) -> Non
         ("Decimal places", "1", 0.1, "its decimal 1 was taken as digits after the point: a step of 0.1"),
         ("decimal", "0.1", 0.1, "its decimal 0.1 was taken as a factor"),
         ("unit", "0.1V", None, "its unit '0.1V' begins with a number, which may be its step"),
-        ("scale", "1_0", None, "only its count is read: its scale '1_0' or offset '' is no number"),
-        ("scale", "\u0661", None, "only its count is read: its scale '\u0661' or offset '' is no number"),
-        ("scale", "x/10", None, "only its count is read: its scale 'x/10' or offset '' is no number"),
+        ("scale", "1_0", None, "only its count is read: its scale '1_0' or offset '' is not a number"),
+        ("scale", "\u0661", None, "only its count is read: its scale '\u0661' or offset '' is not a number"),
+        ("scale", "x/10", None, "only its count is read: its scale 'x/10' or offset '' is not a number"),
     ],
 )
-def test_scale_column_with_several_conventions_is_a_gap(
+def test_scale_column_with_several_conventions_is_marked_as_a_gap(
     tmp_path: Path, header: str, cell: str, step: float | None, gap: str
 ) -> None:
     device = row(tmp_path, f"address,type,{header}", f"0x10,uint16,{cell}")
@@ -129,14 +129,14 @@ def test_neuron_s_decimal_is_a_factor_and_its_bias_is_added(tmp_path: Path) -> N
     assert (gaps(device, "a"), omissions(device)) == ([], [])
 
 
-def test_second_scale_column_is_a_gap(tmp_path: Path) -> None:
+def test_second_scale_column_is_marked_as_a_gap(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,scale,gain", "0x10,uint16,0.1,10")
     assert found(device) == ["its gain 10 was not carried over beside its scale"]
     device = row(tmp_path, "address,type,data type", "0x10,uint16,int32")
     assert found(device) == ["the column data type was not carried over"]
 
 
-def test_offset_together_with_a_scale_is_a_gap(tmp_path: Path) -> None:
+def test_offset_together_with_a_scale_is_marked_as_a_gap(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,scale,offset", "0x10,uint16,0.1,-40")
     assert found(device) == ["its offset -40 was taken as added after the step"]
 
@@ -168,7 +168,7 @@ def test_offset_together_with_a_scale_is_a_gap(tmp_path: Path) -> None:
         ("type,bit", "bool,3", None, ""),
     ],
 )
-def test_missing_number_type_is_a_gap(
+def test_missing_number_type_is_marked_as_a_gap(
     tmp_path: Path, header: str, cells: str, number_format: str | None, gap: str
 ) -> None:
     device = row(tmp_path, f"address,{header}", f"0x10,{cells}")
@@ -177,13 +177,13 @@ def test_missing_number_type_is_a_gap(
     assert said == ([gap] if gap else [])
 
 
-def test_ambiguous_length_of_a_text_is_a_gap(tmp_path: Path) -> None:
+def test_ambiguous_length_of_a_text_is_marked_as_a_gap(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,length", "0x10,string,8")
     assert found(device) == ["its length was taken for registers, and may be characters"]
     assert found(row(tmp_path, "address,type,registers", "0x10,string,8")) == []
 
 
-def test_register_of_three_words_without_a_type_is_lost(tmp_path: Path) -> None:
+def test_register_of_three_words_without_a_type_is_reported_as_not_imported(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="a: its type of 3 registers has no number format"):
         row(tmp_path, "address,count", "0x10,3")
 
@@ -197,7 +197,9 @@ def test_register_of_three_words_without_a_type_is_lost(tmp_path: Path) -> None:
         ("", None, "the order of its words is not stated"),
     ],
 )
-def test_ambiguous_byte_order_is_a_gap(tmp_path: Path, cell: str, order: str | None, gap: str) -> None:
+def test_ambiguous_byte_order_is_marked_as_a_gap(
+    tmp_path: Path, cell: str, order: str | None, gap: str
+) -> None:
     device = row(tmp_path, "address,type,byte order", f"0x10,uint32,{cell}")
     assert (entries(device)["a"].get("order"), found(device)) == (order, [gap] if gap else [])
 
@@ -215,12 +217,14 @@ WRITTEN = ["it is written there; what a write does is not known here"]
         ("sometimes", ["its access 'sometimes' is not known; it is read here"]),
     ],
 )
-def test_write_access_and_unknown_access_are_gaps(tmp_path: Path, word: str, said: list[str]) -> None:
+def test_write_access_and_unknown_access_are_marked_as_gaps(
+    tmp_path: Path, word: str, said: list[str]
+) -> None:
     assert found(row(tmp_path, "address,type,access", f"0x10,uint16,{word}")) == said
 
 
 @table("word", ["W", "WO", "Write", "write only", "Write-only"])
-def test_write_only_register_is_lost(tmp_path: Path, word: str) -> None:
+def test_write_only_register_is_reported_as_not_imported(tmp_path: Path, word: str) -> None:
     with pytest.raises(ValueError, match="a: is only written: a command is never imported"):
         row(tmp_path, "address,type,access", f"0x10,uint16,{word}")
 
@@ -240,7 +244,7 @@ def test_columns_that_are_not_imported_are_reported(tmp_path: Path) -> None:
     assert omissions(device) == ["the column wobble: is not known here, and was not carried over"]
 
 
-def test_column_named_register_with_numbers_is_the_address(tmp_path: Path) -> None:
+def test_a_column_named_register_that_has_numbers_has_the_addresses(tmp_path: Path) -> None:
     device = only(tmp_path, "t.csv", "Register,Name,Type\n16,volts,uint16\n")
     assert entries(device)["volts"]["at"] == 16
 
@@ -275,7 +279,7 @@ def test_invalid_table_raises_value_error_with_the_reason(tmp_path: Path, text: 
 # ---- modpoll ----
 
 
-def test_missing_modpoll_byte_order_defaults_to_be_le_and_is_a_gap(tmp_path: Path) -> None:
+def test_missing_modpoll_byte_order_defaults_to_be_le_and_is_marked_as_a_gap(tmp_path: Path) -> None:
     text = "device,m,1\npoll,holding_register,0,4,{}\nref,a,0,uint32,{},V,0.1{}\n"
     device = only(tmp_path, "m.csv", text.format("", "r", ""))
     assert entries(device)["a"]["order"] == "CDAB"

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from commands import Run
 from imported import devices, entries, gaps, omissions, only
+from tables import table
 
 from multidrop.importers import ImportedDevice, read_devices
 
@@ -22,11 +23,11 @@ def entity(folder: Path, keys: str, kind: str = "sensor") -> ImportedDevice:
     return only(folder, "node.yaml", f"{CONTROLLER}{kind}:\n  - {item}\n")
 
 
-@pytest.mark.parametrize(
+@table(
     ("keys", "expected"),
     [
         ("value_type: U_WORD, bitmask: 0x00F0", {"part": "4-7"}),
-        ("value_type: S_WORD, bitmask: 0xFF00", {"part": "8-15"}),  # ESPHome ignores a masked number's sign
+        ("value_type: S_WORD, bitmask: 0xFF00", {"part": "8-15"}),  # masked numbers are unsigned in ESPHome
         ("value_type: S_WORD, bitmask: 0xFFFF", {"number_format": "I16"}),
         ("value_type: U_DWORD, bitmask: 0xFFFF", {"number_format": "U32", "part": "0-15"}),
         (
@@ -47,7 +48,7 @@ def test_entity_becomes_a_register(tmp_path: Path, keys: str, expected: dict[str
     assert gaps(device, "a") == []
 
 
-@pytest.mark.parametrize(
+@table(
     ("keys", "gap"),
     [
         ("byte_offset: 3", "only its count is read: its offset is half a register"),
@@ -61,7 +62,7 @@ def test_entity_becomes_a_register(tmp_path: Path, keys: str, expected: dict[str
         ("unit_of_measurement: '${unit}'", "its unit is ${unit}"),
     ],
 )
-def test_unsupported_changes_of_the_value_are_gaps(tmp_path: Path, keys: str, gap: str) -> None:
+def test_unsupported_changes_of_the_value_are_marked_as_gaps(tmp_path: Path, keys: str, gap: str) -> None:
     assert gaps(entity(tmp_path, keys), "a") == [gap]
 
 
@@ -70,7 +71,7 @@ def test_multiply_of_a_number_entity_becomes_a_divisor(tmp_path: Path) -> None:
     assert entries(entity(tmp_path, "multiply: 10", "number"))["a"] == {"at": 5, "step": 0.1}
 
 
-def test_binary_sensor_with_several_mask_bits_is_a_gap(tmp_path: Path) -> None:
+def test_binary_sensor_with_several_mask_bits_is_marked_as_a_gap(tmp_path: Path) -> None:
     one = entity(tmp_path, "bitmask: 0x8", "binary_sensor")
     assert (entries(one)["a"], gaps(one, "a")) == ({"at": 5, "part": "3"}, [])
     several = entity(tmp_path, "bitmask: 0xC", "binary_sensor")
@@ -80,11 +81,11 @@ def test_binary_sensor_with_several_mask_bits_is_a_gap(tmp_path: Path) -> None:
     )
 
 
-def test_inverted_switch_is_a_gap(tmp_path: Path) -> None:
+def test_inverted_switch_is_marked_as_a_gap(tmp_path: Path) -> None:
     assert "inverted was not carried over" in gaps(entity(tmp_path, "inverted: true", "switch"), "a")
 
 
-def test_text_sensor_without_response_size_is_a_gap(tmp_path: Path) -> None:
+def test_text_sensor_without_response_size_is_marked_as_a_gap(tmp_path: Path) -> None:
     device = entity(tmp_path, "register_count: 4", "text_sensor")
     assert entries(device)["a"]["length"] == 4
     assert gaps(device, "a") == ["its response_size is not stated; 8 bytes were assumed"]
@@ -95,7 +96,7 @@ def test_text_sensor_without_response_size_is_a_gap(tmp_path: Path) -> None:
     ]
 
 
-def test_custom_command_is_lost(tmp_path: Path) -> None:
+def test_custom_command_is_reported_as_not_imported(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="a: it is read by a custom_command, which is no read of registers"):
         entity(tmp_path, "custom_command: [1, 3]")
 
@@ -129,7 +130,9 @@ def test_controllers_with_the_same_bus_and_address_are_one_device(tmp_path: Path
     assert (first.title, second.title) == ("node", "node 2")
 
 
-def test_entity_without_a_controller_id_is_lost_if_there_are_several(tmp_path: Path) -> None:
+def test_an_entity_without_a_controller_id_is_not_imported_if_there_are_several_controllers(
+    tmp_path: Path,
+) -> None:
     controllers = FAST + "  - {id: slow, address: 2, modbus_id: m}\n"
     device = only(tmp_path, "node.yaml", node(controllers, VOLTS, AMPS))
     assert omissions(device) == [
@@ -169,7 +172,7 @@ def test_package_without_its_controller_has_an_unknown_address(run: Run, tmp_pat
     assert (status, "does not say the device's address" in err) == (2, True)
 
 
-@pytest.mark.parametrize(
+@table(
     ("text", "reason"),
     [
         (CONTROLLER, "`modbus_controller:` has no entity: none of sensor, binary_sensor"),

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from commands import Run
 from imported import devices, entries, gaps, omissions, only
+from tables import table
 
 from multidrop.importers import ImportedDevice, plant_text, read_devices
 
@@ -22,7 +23,7 @@ def sensor(folder: Path, keys: str, kind: str = "sensors") -> ImportedDevice:
     return only(folder, "configuration.yaml", hub)
 
 
-@pytest.mark.parametrize(
+@table(
     ("keys", "number_format"),
     [
         ("data_type: int", "I16"),
@@ -37,13 +38,15 @@ def sensor(folder: Path, keys: str, kind: str = "sensors") -> ImportedDevice:
         ('data_type: custom, count: 1, structure: ">H"', None),
     ],
 )
-def test_width_may_be_in_count_or_in_structure(tmp_path: Path, keys: str, number_format: str | None) -> None:
+def test_the_width_may_be_given_by_count_or_by_structure(
+    tmp_path: Path, keys: str, number_format: str | None
+) -> None:
     device = sensor(tmp_path, keys)
     assert entries(device)["a"].get("number_format") == number_format
     assert gaps(device, "a") == []
 
 
-def test_missing_or_contradictory_width_is_a_gap(tmp_path: Path) -> None:
+def test_missing_or_contradictory_width_is_marked_as_a_gap(tmp_path: Path) -> None:
     device = sensor(tmp_path, "data_type: float")
     assert entries(device)["a"]["number_format"] == "F16"
     assert "the width of its type float is not stated" in gaps(device, "a")[0]
@@ -52,9 +55,18 @@ def test_missing_or_contradictory_width_is_a_gap(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("keys", ["data_type: int, count: 3", "data_type: uint8", "data_type: custom"])
-def test_entity_of_unsupported_type_is_lost_and_the_error_names_the_type(tmp_path: Path, keys: str) -> None:
+def test_an_entity_of_unsupported_type_is_refused_and_the_error_names_the_type(
+    tmp_path: Path, keys: str
+) -> None:
     with pytest.raises(ValueError, match=r"a: its type \w+ has no number format"):
         sensor(tmp_path, keys)
+
+
+def test_the_count_of_virtual_entities_is_the_number_of_words_of_all_together(tmp_path: Path) -> None:
+    """Reported as home-assistant/core#97744."""
+    found = entries(sensor(tmp_path, "slave_count: 2, count: 6, data_type: int32, swap: word"))
+    assert [entry["at"] for entry in found.values()] == [5, 7, 9]
+    assert {(entry["number_format"], entry["order"]) for entry in found.values()} == {("I32", "CDAB")}
 
 
 def test_reverse_order_swaps_the_words(tmp_path: Path) -> None:
@@ -71,12 +83,12 @@ def test_nan_value_text_is_parsed_as_hex_without_a_prefix(tmp_path: Path) -> Non
     assert entries(sensor(tmp_path, "nan_value: 8000"))["a"]["invalid"] == 8000
 
 
-def test_min_value_0_and_precision_0_are_gaps(tmp_path: Path) -> None:
+def test_min_value_0_and_precision_0_are_marked_as_gaps(tmp_path: Path) -> None:
     assert gaps(sensor(tmp_path, "min_value: 0"), "a") == ["min_value was not carried over"]
     assert gaps(sensor(tmp_path, "precision: 0"), "a") == ["precision was not carried over"]
 
 
-def test_unit_given_as_a_secret_is_a_gap(tmp_path: Path) -> None:
+def test_unit_given_as_a_secret_is_marked_as_a_gap(tmp_path: Path) -> None:
     device = sensor(tmp_path, "unit_of_measurement: !secret unit")
     assert "unit" not in entries(device)["a"]
     assert gaps(device, "a") == ["its unit is !secret unit"]
@@ -103,7 +115,7 @@ def test_switch_is_read_at_its_verify_address(tmp_path: Path) -> None:
     ]
 
 
-def test_brightness_and_colour_registers_of_a_light_are_gaps(tmp_path: Path) -> None:
+def test_brightness_and_colour_registers_of_a_light_are_marked_as_gaps(tmp_path: Path) -> None:
     device = sensor(tmp_path, "brightness_address: 7, color_temp_address: 0", "lights")
     assert gaps(device, "a")[1:] == [
         "brightness_address was not carried over",
@@ -121,7 +133,7 @@ def indented(text: str, by: int) -> str:
     return "".join(f"{' ' * by}{line}\n" for line in text.splitlines())
 
 
-@pytest.mark.parametrize(
+@table(
     ("text", "port"),
     [
         (HUB, "tcp://10.0.0.5:502"),
@@ -158,7 +170,7 @@ switch:
 """
 
 
-def test_platform_layout_of_before_2021_is_imported(tmp_path: Path) -> None:
+def test_the_platform_layout_used_before_2021_is_imported(tmp_path: Path) -> None:
     found: dict[str, Any] = {}
     for device in devices(tmp_path, "old.yaml", LEGACY):
         assert (device.address, device.line.port) == (2, "/dev/ttyS0")
@@ -171,7 +183,7 @@ def test_platform_layout_of_before_2021_is_imported(tmp_path: Path) -> None:
     }
 
 
-@pytest.mark.parametrize(
+@table(
     ("text", "reason"),
     [
         ("a: 1\nb: 2\n", "and is no hub and no list of sensors: its keys are a, b"),
@@ -182,7 +194,7 @@ def test_platform_layout_of_before_2021_is_imported(tmp_path: Path) -> None:
         ("modbus:\n  - sensors: [{name: a}]\n", "a: it has no address"),
         (
             "modbus:\n  - sensors: [{name: a, address: x}]\n",
-            "a: it cannot be read: address = 'x' is no whole",
+            "a: it cannot be read: address = 'x' is not a whole",
         ),
         ("[]", "it is list"),
         ("- {name: a, address: 1, data_type: string}\n", "a: it has no count"),
@@ -197,7 +209,7 @@ def test_invalid_document_raises_value_error_with_the_reason(tmp_path: Path, tex
 # ---- line settings of hubs ----
 
 
-@pytest.mark.parametrize(
+@table(
     ("hub", "port"),
     [
         ("type: tcp, host: !secret inverter, port: 502", "tcp://HOST:502"),

@@ -25,12 +25,15 @@ from imported import (
     omissions,
     only,
 )
+from simulated_bus import SimulatedBus
+from tables import table
 
-from multidrop import load_family
+from multidrop import NoValue, load_family
 from multidrop.drive.register import Access, Register
 from multidrop.importers import family_text, family_writer, plant_text, read_devices
 from multidrop.importers.device import ImportedDevice, ImportedRegister
 from multidrop.importers.family_writer import declare
+from multidrop.sim import SimulatedDrive
 
 
 def loaded(folder: Path, device: ImportedDevice, *names: str) -> dict[str, Register[Any]]:
@@ -98,7 +101,7 @@ def test_table_with_other_column_names_becomes_a_loadable_family(tmp_path: Path)
     text = family_text(device, "own.csv")
     assert "# gap: speed: whether its address counts from 0 or 1; 0 was assumed" in text
     assert "# gap: temp_1: the comma of 0,1 was taken for a decimal point" in text
-    assert "# gap: odd: only its count is read: its scale 'x' or offset '' is no number" in text
+    assert "# gap: odd: only its count is read: its scale 'x' or offset '' is not a number" in text
     assert entries(device)["temp_1"]["step"] == 0.1
     assert list(loaded(tmp_path, device, "speed", "temp_1", "r_1st")) == ["speed", "temp_1", "r_1st"]
 
@@ -169,6 +172,40 @@ def test_sunspec_model_becomes_a_loadable_family(tmp_path: Path) -> None:
     assert registers["wh"].number_in(b"\xff" * 8, 0) is None
     assert registers["net"].number_in(b"\x80" + bytes(7), 0) is None
     assert registers["wh"].number_in(b"\x80" + bytes(7), 0) == 2.0**63
+
+
+# the points of SunSpec's model 101 in order, and a SolarEdge inverter's reply from evcc-io/evcc#15445
+POINTS = """
+    A AphA AphB AphC A_SF V1 V2 V3 PhVphA PhVphB PhVphC V_SF W W_SF Hz Hz_SF VA VA_SF VAr VAr_SF PF PF_SF
+    WH WH_SF DCA DCA_SF DCV DCV_SF DCW DCW_SF TmpCab TmpSnk TmpTrns TmpOt Tmp_SF
+"""
+SIGNED = {"W", "VA", "VAr", "PF", "DCW", "TmpCab", "TmpSnk", "TmpTrns", "TmpOt"}
+SCALED = {"A": "A_SF", "W": "W_SF", "Hz": "Hz_SF", "DCW": "DCW_SF", "TmpCab": "Tmp_SF", "TmpSnk": "Tmp_SF"}
+REPLY = """
+    024e 024e ffff ffff fffe 0933 ffff ffff 0933 ffff ffff ffff 3646 ffff c33e fffd 3665 ffff dba4 fffe
+    d907 fffe 00df f1da 0000 0d6b fffd 100a ffff 3719 ffff 8000 1049 8000 8000 fffe
+"""
+
+
+def test_values_of_a_published_sunspec_reply_are_right(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points: list[dict[str, Any]] = [{"name": name, "type": "uint16", "size": 1} for name in ("ID", "L")]
+    for name in POINTS.split():
+        kind = "sunssf" if name.endswith("_SF") else "int16" if name in SIGNED else "uint16"
+        point = {"name": name, "type": kind, "size": 1} if name != "WH" else {"name": name, "type": "acc32"}
+        points.append({"size": 2, **point, **({"sf": SCALED[name]} if name in SCALED else {})})
+    device = only(tmp_path, "101.json", {"id": 101, "group": {"name": "inverter", "points": points}})
+    (tmp_path / "inverter.toml").write_text(family_text(device, "inverter"))
+    sim = SimulatedDrive(load_family(tmp_path / "inverter.toml")(1))
+    for address, word in enumerate(bytes.fromhex(REPLY).hex(" ", 2).split(), 40002):
+        if (cell := sim.memory.readable(3, address)) is not None:
+            cell.raw = int(word, 16)
+    drive = SimulatedBus(monkeypatch, sim).attach(sim.drive)
+    found = {name: drive.read(drive.register(name)) for name in ("w", "dcw", "hz", "tmpsnk")}
+    assert found == pytest.approx({"w": 1389.4, "dcw": 1410.5, "hz": 49.982, "tmpsnk": 41.69})
+    with pytest.raises(NoValue):
+        drive.read(drive.register("tmpcab"))
 
 
 def test_scale_register_out_of_reach_is_reported_and_left_out(tmp_path: Path) -> None:
@@ -243,7 +280,7 @@ def bomb(levels: int) -> str:
     ("text", "told"),
     [
         *usually(
-            (bomb(9), "has more than 50000 entries, aliases counted as what they stand for"),
+            (bomb(9), "has more than 50000 entries, each alias counted as what it stands for"),
             ("modbus: [" + "1," * 60_000 + "]", "has more than 50000 entries"),
         ),
         ("a: &a [*a]\nmodbus: *a\n", "has more than 50000 entries"),
@@ -260,7 +297,7 @@ def test_costly_or_unsafe_yaml_is_refused(tmp_path: Path, text: str, told: str) 
         read_devices(tmp_path / "a.yaml")
 
 
-def test_registers_beyond_the_limit_of_a_family_are_lost(
+def test_registers_beyond_the_limit_of_a_family_are_reported_as_not_imported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Entries beyond the limit are not checked, because that would be slow for a large file."""
@@ -282,16 +319,16 @@ def test_registers_beyond_the_limit_of_a_family_are_lost(
 # ---- all kinds of files ----
 
 
-@pytest.mark.parametrize(
+@table(
     ("name", "text", "told"),
     [
         ("a.csv", "", "is empty"),
         ("a.csv", "x,y\n1,2\n", "no column is called address"),
         ("a.csv", "name,address\n", "has no row with an address"),
-        ("a.json", "[]", "is no wb-mqtt-serial template and no SunSpec model: it is a list"),
+        ("a.json", "[]", "is neither a wb-mqtt-serial template nor a SunSpec model: it is a list"),
         ("a.json", '{"a": {}}', "has no `device` with channels or parameters (wb-mqtt-serial)"),
         ("a.json", "{", "a.json: "),
-        ("a.json", '{"device": {"channels": 5}}', "is not laid out"),
+        ("a.json", '{"device": {"channels": 5}}', "does not have the structure"),
         ("a.toml", "a = 1", "has no [[inputs.modbus]] (Telegraf): it has a"),
         ("a.toml", "[[inputs.modbus]]", "[[inputs.modbus]] has no field"),
         ("a.toml", "a = ", "is not TOML"),
@@ -374,7 +411,7 @@ def test_invalid_controller_address_is_reported(tmp_path: Path) -> None:
             devices(tmp_path, "t.conf", plugin.format("tcp://hall") + plugin.format(controller))
 
 
-def test_telegraf_register_with_scattered_addresses_is_lost(tmp_path: Path) -> None:
+def test_telegraf_register_with_scattered_addresses_is_reported_as_not_imported(tmp_path: Path) -> None:
     field = '{{ name = "{}", byte_order = "ABCD", data_type = "UINT32", address = {} }}'
     listed = ", ".join(
         field.format(*each) for each in (("good", [4, 5]), ("split", [4, 9]), ("one", [4, 5, 6]))

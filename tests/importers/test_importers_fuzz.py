@@ -21,48 +21,10 @@ from readers import read
 ALL = [f"{suffix}\n{text}".encode() for suffix, texts in FILES.items() for text in texts]
 TOKENS = re.compile(rb"[A-Za-z_]+|[0-9.]+|\s+|.", re.DOTALL)
 ODD = (
-    *(
-        b"",
-        b"-1",
-        b"0",
-        b"65535",
-        b"65536",
-        b"1e999",
-        b"nan",
-        b"-0.0",
-        b"1e-320",
-        b"0x",
-        b"9" * 30,
-        b"18446744073709551615",
-        b"0x8000000000000000",
-        b"\xff",
-    ),
-    *(
-        b"null",
-        b"[]",
-        b"{}",
-        b'""',
-        b"true",
-        b"class",
-        b"None",
-        b"\n",
-        b'"',
-        b"." * 200,
-        b"a" * 300,
-        b"&a ",
-        b"*a",
-    ),
-    *(
-        b"\x1b[2J",
-        "\u202e".encode(),
-        "é".encode(),
-        b"[reading]",
-        b"string",
-        b"int64",
-        b"float64",
-        b"#WS",
-        b"1!",
-    ),
+    *(b"", b"\n", b'"', b"." * 200, b"a" * 300, b"&a ", b"*a", b"9" * 30, b"\xff", b"\x1b[2J"),
+    *b"-1 0 65535 65536 1e999 nan -0.0 1e-320 0x 18446744073709551615 0x8000000000000000 null [] {}".split(),
+    *b'"" true class None [reading] string int64 float64 #WS 1!'.split(),
+    *("\u202e".encode(), "é".encode()),
 )
 ENOUGH = 20.0  # limit of CPU time in s, generous for a slow machine
 
@@ -109,7 +71,6 @@ ANYTHING = st.one_of(
     st.lists(st.integers(-2, 70_000), max_size=3),
     st.dictionaries(st.text(max_size=4), st.integers(), max_size=2),
 )
-
 
 PLAUSIBLE: dict[str, st.SearchStrategy[Any]] = {
     "address": st.sampled_from(
@@ -185,7 +146,7 @@ ROWS = st.lists(st.lists(st.text("0123456789!#.BLWS,;xH-au\t \"'", max_size=8), 
 def test_imported_device_gives_a_family_that_loads(
     tmp_path: Path, channels: Any, points: Any, sensors: Any, entities: Any, rows: Any
 ) -> None:
-    """The YAML files are written as JSON, which YAML parsers accept."""
+    """The YAML files contain JSON, which YAML parsers accept."""
     platform = [{"platform": "modbus_controller", **entity} for entity in entities]
     documents = {
         ".json": (
@@ -240,19 +201,9 @@ HOSTILE = {
     "aliases": b".yaml\na: &a [1]\nmodbus: [" + b"*a," * 200_000 + b"]",
 }
 
-
-COSTLY = (  # up to a second each; the first always runs
-    "a row of a million cells",
-    "aliases",
-    *(
-        "many tables",
-        "many rows of one name",
-        "too many rows",
-        "many devices",
-        "many entries",
-        "large groups",
-    ),
-    "lists in lists of yaml",
+COSTLY = (  # files that take up to a second each; the short run tries only the first
+    *("a row of a million cells", "aliases", "many tables", "many rows of one name", "too many rows"),
+    *("many devices", "many entries", "large groups", "lists in lists of yaml"),
 )
 
 
@@ -274,7 +225,7 @@ before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 read("import", Path(sys.argv[1]).read_bytes(), Path(sys.argv[2]))
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 """
-MOST_MEMORY = 400_000  # KiB, for a file of at most 5 MB; a row of a million empty cells takes 150,000
+MOST_MEMORY = 400_000  # limit in KiB for a file of up to 5 MB; a row of a million empty cells needs 150,000
 
 
 @pytest.mark.long

@@ -12,7 +12,7 @@ from tables import table
 from multidrop.importers import csv_tables, esphome, home_assistant, sunspec, telegraf, wb
 from multidrop.importers.device import KeyTable, Treatment, uncarried
 
-# Keys typed from each program's documentation and schemas, independent of the importers.
+# Keys copied from each program's documentation and schemas, not from the importers.
 SCHEMAS: dict[str, tuple[KeyTable, str]] = {
     "home assistant: sensors": (
         home_assistant.KEYS["sensors"],
@@ -107,10 +107,7 @@ SCHEMAS: dict[str, tuple[KeyTable, str]] = {
         telegraf.BLOCK_KEYS["request"],
         "slave_id byte_order register measurement optimization optimization_max_register_fill fields tags",
     ),
-    "telegraf: a metric": (
-        telegraf.BLOCK_KEYS["metric"],
-        "slave_id byte_order measurement fields tags",
-    ),
+    "telegraf: a metric": (telegraf.BLOCK_KEYS["metric"], "slave_id byte_order measurement fields tags"),
     "telegraf: workarounds": (
         telegraf.WORKAROUND_KEYS,
         "pause_after_connect pause_between_requests close_connection_after_gather one_request_per_field "
@@ -174,14 +171,14 @@ def test_every_key_of_a_source_schema_has_a_treatment(source: str) -> None:
     assert set(table.values()) <= set(Treatment)
 
 
-@pytest.mark.parametrize("columns", [IOBROKER_COLUMNS, NEURON_COLUMNS])
+@table("columns", [IOBROKER_COLUMNS, NEURON_COLUMNS])
 def test_every_column_of_a_known_table_layout_has_a_treatment(columns: str) -> None:
     carried = {alias for aliases in csv_tables.CARRIED.values() for alias in aliases}
     known = carried | csv_tables.IRRELEVANT | csv_tables.GAPS
     assert [column for column in columns.split() if column not in known] == []
 
 
-def test_unknown_key_is_a_gap_unless_it_is_empty() -> None:
+def test_keys_that_are_not_carried_over_are_reported_unless_empty() -> None:
     table = home_assistant.KEYS["sensors"]
     given = {"name": "a", "icon": "x", "min_value": 0, "max_value": None, "zero_suppress": False, "new": 1}
     assert uncarried(given, table) == [
@@ -204,10 +201,7 @@ UNKNOWN: dict[str, tuple[str, str | dict[str, Any]]] = {
         'data_type = "INT16", novel = 1}]\n',
     ),
     "wb-mqtt-serial": ("w.json", {"device": {"channels": [{"name": "a", "address": 1, "novel": 1}]}}),
-    "sunspec": (
-        "s.json",
-        {"group": {"points": [{"name": "a", "type": "int16", "size": 1, "novel": 1}]}},
-    ),
+    "sunspec": ("s.json", {"group": {"points": [{"name": "a", "type": "int16", "size": 1, "novel": 1}]}}),
 }
 
 

@@ -1,4 +1,4 @@
-"""Telegraf's inputs.modbus: types whose meaning depends on the style, unit ids, texts, line settings."""
+"""Import of Telegraf's inputs.modbus: unit ids, texts, line settings, and types that depend on the style."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from imported import devices, entries, gaps, omissions, only
+from tables import table
 
 from multidrop.importers import ImportedDevice, plant_text, read_devices
 
@@ -25,7 +26,7 @@ def of_a_request(folder: Path, keys: str, more: str = "") -> ImportedDevice:
     return only(folder, "t.conf", HEAD + request + more)
 
 
-@pytest.mark.parametrize(
+@table(
     ("keys", "expected"),
     [
         ('byte_order = "AB", data_type = "FLOAT32", scale = 0.1, address = [11003]', {"step": 0.1}),
@@ -55,12 +56,12 @@ def test_float32_in_the_other_styles_is_a_float(tmp_path: Path) -> None:
     assert entries(only(tmp_path, "t.conf", HEAD + metric))["b"]["number_format"] == "F32"
 
 
-def test_float64_without_ieee_in_the_register_style_is_lost(tmp_path: Path) -> None:
+def test_float64_without_ieee_in_the_register_style_is_reported_as_not_imported(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="a: its type FLOAT64 has no number format"):
         of_registers(tmp_path, 'byte_order = "ABCD", data_type = "FLOAT64", address = [5, 6, 7, 8]')
 
 
-def test_missing_type_and_output_type_are_gaps(tmp_path: Path) -> None:
+def test_missing_type_and_output_type_are_marked_as_gaps(tmp_path: Path) -> None:
     assert gaps(of_a_request(tmp_path, "address = 5"), "a") == ["its type is not stated; UINT16 was assumed"]
     device = of_a_request(tmp_path, 'address = 5, type = "INT16", scale = 0.1, output = "INT64"')
     assert gaps(device, "a") == ["output was not carried over"]
@@ -73,13 +74,13 @@ def test_text_in_the_low_bytes_is_imported(tmp_path: Path, place: str, order: st
     assert (entries(device)["a"]["length"], entries(device)["a"].get("order")) == (4, order)
 
 
-def test_text_in_the_high_bytes_is_lost(tmp_path: Path) -> None:
+def test_text_in_the_high_bytes_is_reported_as_not_imported(tmp_path: Path) -> None:
     workaround = '[inputs.modbus.workarounds]\nstring_register_location = "upper"\n'
     with pytest.raises(ValueError, match="a: a text whose string_register_location is upper"):
         of_a_request(tmp_path, 'address = 5, type = "STRING", length = 4', workaround)
 
 
-def test_fields_of_another_than_the_stated_style_are_ignored(tmp_path: Path) -> None:
+def test_fields_of_a_style_other_than_the_stated_one_are_ignored(tmp_path: Path) -> None:
     both = f'{HEAD}configuration_type = "request"\ncoils = [{{ name = "old", address = [1] }}]\n'
     request = (
         '[[inputs.modbus.request]]\nslave_id = 1\nfields = [{ name = "new", address = 1, type = "INT16" }]\n'
@@ -102,7 +103,7 @@ def test_required_pauses_of_a_device_are_reported(tmp_path: Path) -> None:
     assert omissions(device) == ["workarounds: pause_after_connect was not carried over"]
 
 
-@pytest.mark.parametrize(
+@table(
     ("line", "expected"),
     [
         ('controller = "tcp://gate:4001"\ntransmission_mode = "RTUoverTCP"', {"port": "socket://gate:4001"}),
@@ -129,7 +130,7 @@ def test_slave_ids_0_and_255_are_valid_addresses(tmp_path: Path, unit: int) -> N
     assert only(tmp_path, "t.conf", text + field).address == unit
 
 
-@pytest.mark.parametrize(
+@table(
     ("text", "reason"),
     [
         ("[agent]\n", "has no [[inputs.modbus]] (Telegraf): it has agent"),
@@ -141,7 +142,7 @@ def test_slave_ids_0_and_255_are_valid_addresses(tmp_path: Path, unit: int) -> N
         ),
         (
             HEAD + 'coils = [{ name = "a", address = "x" }]\n',
-            "a: it cannot be read: address = 'x' is no whole",
+            "a: it cannot be read: address = 'x' is not a whole",
         ),
         (
             HEAD.replace("= 1", "= 900") + 'coils = [{ name = "a", address = [1] }]\n',

@@ -8,8 +8,10 @@ from typing import Any
 
 import pytest
 from imported import devices, entries, gaps, omissions, only
+from tables import table
 
-from multidrop.importers import ImportedDevice, read_devices
+from multidrop import load_family
+from multidrop.importers import ImportedDevice, family_text, read_devices
 
 
 def channel(folder: Path, **keys: Any) -> ImportedDevice:
@@ -38,7 +40,7 @@ def test_registers_of_a_subdevice_are_shifted_for_each_channel_that_uses_it(tmp_
     assert places(device) == [
         ("first_voltage", 0x110),
         ("first_energy", 0x120),
-        ("second_voltage", 0x210 + 2),  # a stride counts subdevices
+        ("second_voltage", 0x210 + 2),  # each further subdevice adds one stride to the address
         ("second_energy", 0x220 + 4),
     ]
     assert omissions(device) == []
@@ -71,7 +73,9 @@ def test_subdevice_that_contains_itself_is_cut_off(tmp_path: Path) -> None:
         ({"name": "X", "address": 1}, "subdevice ch: no channel uses it, so its address is not known"),
     ],
 )
-def test_subdevices_of_unknown_address_are_lost(tmp_path: Path, used: dict[str, Any], reason: str) -> None:
+def test_subdevices_of_unknown_address_are_reported_as_not_imported(
+    tmp_path: Path, used: dict[str, Any], reason: str
+) -> None:
     document = with_subdevice({"name": "Known", "address": 7}, used)
     device = only(tmp_path, "w.json", document)
     assert ("known", 7) in places(device)
@@ -79,11 +83,11 @@ def test_subdevices_of_unknown_address_are_lost(tmp_path: Path, used: dict[str, 
     assert reason in omissions(device)
 
 
-@pytest.mark.parametrize(
+@table(
     ("keys", "expected"),
     [
         ({"address": "5:4:2"}, {"part": "4-5"}),
-        ({"address": "5:0"}, {}),  # no width: all bits of the format
+        ({"address": "5:0"}, {}),  # no width is stated, so all bits are used
         ({"address": "5:8", "format": "u8"}, {"part": "8-15"}),
         (
             {"address": "5:8:4", "format": "s16"},
@@ -95,7 +99,7 @@ def test_subdevices_of_unknown_address_are_lost(tmp_path: Path, used: dict[str, 
         ({"format": "s8"}, {"number_format": "I8"}),
     ],
 )
-def test_bits_of_a_register_become_its_part(
+def test_bits_of_a_register_are_imported_as_a_part_of_the_word(
     tmp_path: Path, keys: dict[str, Any], expected: dict[str, Any]
 ) -> None:
     device = channel(tmp_path, **keys)
@@ -112,7 +116,7 @@ def test_low_byte_format_of_a_written_register_selects_its_low_byte(tmp_path: Pa
     assert entries(channel(tmp_path, reg_type="holding", format="u8"))["a"] == {"at": 5, "part": "0-7"}
 
 
-@pytest.mark.parametrize(
+@table(
     ("keys", "invalid"),
     [
         ({"format": "float", "error_value": "0x7FC00000"}, "NaN"),
@@ -128,7 +132,7 @@ def test_error_value_is_decoded_in_the_registers_format(
     assert (entries(device)["a"]["invalid"], gaps(device, "a")) == (invalid, [])
 
 
-@pytest.mark.parametrize(
+@table(
     ("keys", "gap"),
     [
         (
@@ -145,15 +149,17 @@ def test_error_value_is_decoded_in_the_registers_format(
         ({"format": "bcd8"}, "its format bcd8 has fewer digits than its registers hold"),
     ],
 )
-def test_keys_that_are_not_imported_are_gaps(tmp_path: Path, keys: dict[str, Any], gap: str) -> None:
+def test_keys_that_are_not_imported_are_marked_as_gaps(
+    tmp_path: Path, keys: dict[str, Any], gap: str
+) -> None:
     assert gaps(channel(tmp_path, **keys), "a") == [gap]
 
 
-def test_text_without_its_size_is_a_gap(tmp_path: Path) -> None:
+def test_text_without_its_size_is_marked_as_a_gap(tmp_path: Path) -> None:
     assert gaps(channel(tmp_path, format="string8"), "a") == ["string_data_size is not stated; 1 was assumed"]
 
 
-def test_parts_of_a_composite_channel_are_gaps(tmp_path: Path) -> None:
+def test_parts_of_a_composite_channel_are_marked_as_gaps(tmp_path: Path) -> None:
     parts = [{"reg_type": "input", "address": at} for at in (5, 7)]
     device = only(tmp_path, "w.json", {"device": {"channels": [{"name": "a", "consists_of": parts}]}})
     assert places(device) == [("a", 5), ("a_2", 7)]
@@ -175,7 +181,9 @@ def test_value_names_with_text_numbers_are_imported(tmp_path: Path) -> None:
         ({"format": "string8", "word_order": "little_endian"}, "a text whose word_order is little_endian"),
     ],
 )
-def test_text_in_an_unsupported_order_is_lost(tmp_path: Path, keys: dict[str, Any], reason: str) -> None:
+def test_text_in_an_unsupported_order_is_reported_as_not_imported(
+    tmp_path: Path, keys: dict[str, Any], reason: str
+) -> None:
     with pytest.raises(ValueError, match=f"a: {reason}"):
         channel(tmp_path, string_data_size=8, **keys)
 
@@ -219,7 +227,7 @@ def test_configuration_gives_a_device_for_each_slave(tmp_path: Path) -> None:
     assert places(relay) == [("k1", 0)]
 
 
-@pytest.mark.parametrize(
+@table(
     ("document", "reason"),
     [
         ({"device_type": "x"}, "has no `device` with channels or parameters (wb-mqtt-serial)"),
@@ -244,3 +252,22 @@ def test_refusal_names_the_file(tmp_path: Path) -> None:
     (tmp_path / "w.json").write_text("{}")
     with pytest.raises(ValueError, match=re.escape(str(tmp_path / "w.json"))):
         read_devices(tmp_path / "w.json")
+
+
+def test_translations_of_names_become_titles(tmp_path: Path) -> None:
+    """For a parameter, its `title` is translated. For a channel of a subdevice, two names are translated
+    and joined: the subdevice's and the channel's.
+    """
+    words = {"Voltage": "Напряжение", "First": "Первый", "mode_title": "Режим", "Energy": ""}
+    document = with_subdevice({"name": "First", "device_type": "ch"}, {**VOLTAGE, "address": 1})
+    document["device"]["parameters"] = {"mode": {"title": "mode_title", "address": 2}}
+    document["device"]["translations"] = {"ru": words, "en": {"mode_title": "Mode"}, "zh": []}
+    path = tmp_path / "w.toml"
+    path.write_text(family_text(only(tmp_path, "w.json", document), "w.json"), "utf-8")
+    registers = load_family(path).registers
+    assert {name: register.title_in("ru") for name, register in registers.items()} == {
+        "first_voltage": "Первый Напряжение",
+        "first_energy": "first energy",
+        "voltage": "Напряжение",
+        "mode": "Режим",
+    }

@@ -1,4 +1,4 @@
-"""The pytest plugin, as a package of a user has it: the tests of the page `Test your own program`."""
+"""The pytest plugin, used by another package: by the tests on the page `Test your own program`."""
 
 from __future__ import annotations
 

@@ -21,8 +21,14 @@ from multidrop.drive.register import (
     setting,
 )
 from multidrop.sim import EncodedDrive, SimulatedDrive, encoded, simulated
+from multidrop.sim.motor import Motor, Phase, Rating
 
 ON, OFF = b"\xff\x00", b"\x00\x00"
+
+
+def test_a_family_instead_of_a_drive_is_refused() -> None:
+    with pytest.raises(TypeError, match=r"Toy is a family, not a drive: write Toy\(1\) for address 1"):
+        simulated(Toy)  # type: ignore[arg-type]
 
 
 class Own(Drive):
@@ -176,7 +182,7 @@ def test_broadcast_write_is_carried_out_without_a_reply(sim: SimulatedDrive) -> 
     assert (sim.counters.broadcasts, sim.counters.requests) == (3, 0)
 
 
-def test_drive_class_without_broadcasts_ignores_a_broadcast() -> None:
+def test_a_drive_whose_class_has_no_broadcasts_ignores_a_broadcast() -> None:
     class Deaf(Own):
         broadcasts = False
 
@@ -229,7 +235,9 @@ def every_register() -> list[tuple[Register[float], int]]:
 
 
 @table(("register", "at"), every_register())
-def test_encoded_drive_reads_the_code_of_drive_table_and_register(register: Register[float], at: int) -> None:
+def test_an_encoded_drive_returns_a_code_of_drive_table_and_register(
+    register: Register[float], at: int
+) -> None:
     sim = EncodedDrive(Own(7))
     table, where = register.table, register.address + at
     numbers = {COIL: 1, DISCRETE: 2, HOLDING: 3, INPUT: 4}
@@ -262,3 +270,164 @@ def test_simulated_value_can_be_set_by_name_or_as_text() -> None:
     assert (sim["fault"], sim["output_current"]) == (Fault.OVERCURRENT, 2.5)
     with pytest.raises(ValueError, match="fault has no 'three'; it takes none, overcurrent"):
         sim["fault"] = "three"
+
+
+# ---- the simulated motor's physics on simulated time ----
+
+
+RATING = Rating(frequency=50, voltage=400, current=10, power=4, torque=26, pole_pairs=2)
+
+
+@pytest.fixture
+def motor() -> Motor:
+    motor = Motor(RATING)
+    motor.acceleration_time = 10  # s from 0 to 50 Hz: 5 Hz/s
+    motor.deceleration_time = 5  # s from 50 Hz to 0: 10 Hz/s
+    motor.target = 40
+    return motor
+
+
+@pytest.fixture
+def turning(motor: Motor) -> Motor:
+    """Return the motor at 40 Hz, 100 s after its start."""
+    motor.run()
+    motor.run_to(100)
+    return motor
+
+
+def test_motor_has_no_voltage_until_run_is_called(motor: Motor) -> None:
+    motor.run_to(1000)
+    assert (motor.frequency, motor.current, motor.voltage, motor.phase) == (0, 0, 0, Phase.STOPPED)
+
+
+@pytest.mark.parametrize(
+    ("now", "frequency", "phase"),
+    [
+        (0.5, 2.5, Phase.ACCELERATING),
+        (4, 20, Phase.ACCELERATING),
+        (8, 40, Phase.CONSTANT),
+        (100, 40, Phase.CONSTANT),
+    ],
+)
+def test_motor_accelerates_along_its_ramp(motor: Motor, now: float, frequency: float, phase: Phase) -> None:
+    motor.run()
+    motor.run_to(now)
+    assert motor.frequency == pytest.approx(frequency)
+    assert motor.phase is phase
+
+
+def test_ramp_is_the_same_in_one_step_or_many(motor: Motor) -> None:
+    motor.run()
+    for step in range(1, 401):
+        motor.run_to(step / 100)
+    assert motor.frequency == pytest.approx(20)
+
+
+def test_stop_ramps_down_and_then_removes_the_voltage(turning: Motor) -> None:
+    turning.stop()
+    turning.run_to(102)
+    assert turning.frequency == pytest.approx(20)
+    assert turning.phase is Phase.DECELERATING
+    turning.run_to(104)
+    assert (turning.frequency, turning.phase, turning.energised) == (0, Phase.STOPPED, False)
+
+
+def test_lower_target_is_reached_along_the_deceleration_ramp(turning: Motor) -> None:
+    turning.target = 30
+    turning.run_to(100.5)
+    assert turning.frequency == pytest.approx(35)
+    turning.run_to(110)
+    assert turning.frequency == 30
+
+
+def test_reversal_decelerates_to_zero_first(turning: Motor) -> None:
+    turning.run(-1)
+    turning.run_to(104)  # 4 s from 40 Hz to 0, at 10 Hz/s
+    assert turning.frequency == pytest.approx(0)
+    turning.run_to(106)  # 2 s in reverse, at 5 Hz/s
+    assert turning.frequency == pytest.approx(-10)
+    turning.run_to(104 + 8)
+    assert turning.frequency == pytest.approx(-40)
+
+
+def test_coast_removes_the_voltage_while_the_shaft_runs_down(turning: Motor) -> None:
+    speed = turning.speed
+    turning.coast()
+    assert (turning.frequency, turning.current, turning.voltage) == (0, 0, 0)
+    turning.run_to(101)
+    assert 0 < turning.speed < speed * 1.1
+    turning.run_to(200)
+    assert turning.speed == 0
+
+
+def test_target_is_limited_to_the_maximum_frequency(motor: Motor) -> None:
+    motor.target = 400
+    motor.run()
+    motor.run_to(1000)
+    assert motor.frequency == 50
+
+
+def test_voltage_follows_frequency_and_current_follows_load(turning: Motor) -> None:
+    assert turning.voltage == pytest.approx(400 * 40 / 50)
+    light = turning.current
+    turning.load = 1.0
+    assert light < turning.current
+    assert turning.current == pytest.approx(10 * math.hypot(0.3, 1.0))
+    assert turning.power == pytest.approx(4 * 40 / 50)
+
+
+def test_dc_bus_voltage_falls_under_load_and_rises_while_braking(motor: Motor) -> None:
+    idle = motor.dc_bus_voltage
+    assert idle == pytest.approx(400 * math.sqrt(2))
+    motor.run()
+    motor.run_to(100)
+    assert motor.dc_bus_voltage < idle
+    motor.stop()
+    motor.run_to(101)
+    assert motor.dc_bus_voltage > idle
+
+
+def test_heatsink_warms_under_load_and_cools_at_rest(motor: Motor) -> None:
+    motor.load = 0.95
+    motor.run()
+    motor.run_to(10)
+    assert 25 < motor.heatsink < 30
+    motor.run_to(3600)
+    assert motor.heatsink == pytest.approx(25 + 35 * (motor.current / 10) ** 2)
+    motor.coast()
+    motor.run_to(7200)
+    assert motor.heatsink == pytest.approx(25, abs=0.01)
+
+
+def test_fault_prevents_a_run_until_reset_which_starts_nothing(turning: Motor) -> None:
+    turning.trip(7)
+    turning.run()
+    turning.jog()
+    turning.run_to(110)
+    assert (turning.frequency, turning.fault, turning.energised) == (0, 7, False)
+    turning.reset()
+    turning.run_to(120)
+    assert (turning.frequency, turning.fault, turning.energised) == (0, 0, False)
+    turning.run()
+    turning.run_to(200)
+    assert turning.frequency == 40
+
+
+def test_fault_record_keeps_the_four_latest_faults(motor: Motor) -> None:
+    for code in range(1, 6):
+        motor.trip(code)
+    assert [motor.fault_record(number) for number in range(1, 6)] == [5, 4, 3, 2, 0]
+
+
+def test_run_time_counts_only_while_the_motor_runs(motor: Motor) -> None:
+    motor.run_to(10_000)
+    motor.run()
+    motor.run_to(17_200)
+    assert motor.run_seconds == 7200
+
+
+def test_run_to_an_earlier_time_changes_nothing(motor: Motor) -> None:
+    motor.run()
+    motor.run_to(4)
+    motor.run_to(3)
+    assert motor.frequency == pytest.approx(20)

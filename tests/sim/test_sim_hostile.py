@@ -10,6 +10,7 @@ from typing import Any
 import checksums
 import pytest
 from lines import timeline, until
+from tables import table
 from toy import Toy
 
 from multidrop.cli import main
@@ -28,7 +29,7 @@ from multidrop.transport.prepared import make_exchange
 READ = checksums.rtu("01 03 00 02 00 01")
 REPLY = checksums.rtu("01 03 02 00 00")
 START = checksums.rtu("01 06 10 00 C4 00")  # start command of a YD1000
-WHOLE = 5.0  # s, enough for every delayed byte to arrive
+WHOLE = 5.0  # in this many s every delayed byte arrives
 
 
 class LineClient:
@@ -65,12 +66,12 @@ def test_same_seed_gives_the_same_faults() -> None:
     assert story(1) == story(1) != story(2)
 
 
-@pytest.mark.parametrize(("fault", "length"), [("drop", -1), ("flip", 0), ("repeat", 1)])
+@table(("fault", "length"), [("drop", -1), ("flip", 0), ("repeat", 1)])
 def test_damaged_frame_has_exactly_one_fault(fault: str, length: int) -> None:
     line = LineClient(**{fault: 0.5})
     found = [line.bytes_after() for _ in range(200)]
     damaged = [each for each in found if each not in (REPLY, b"")]
-    assert 20 < len(damaged) < 80  # about a quarter: reply damaged, request not
+    assert 20 < len(damaged) < 80  # about a quarter: the reply is damaged, but not the request
     assert {len(each) - len(REPLY) for each in damaged} == {length}
     if fault == "flip":
         assert {bits(each, REPLY) for each in damaged} == {1}
@@ -148,7 +149,7 @@ def two_drives(**faults: Any) -> LineClient:
 FLAKY_READ, FLAKY_REPLY = checksums.rtu("02 03 00 02 00 01"), checksums.rtu("02 03 02 00 00")
 
 
-@pytest.mark.parametrize("fault", ["loss", "damage", "delay"])
+@table("fault", ["loss", "damage", "delay"])
 def test_a_fault_of_one_drive_affects_only_its_replies(fault: str) -> None:
     line = two_drives(**{fault: 1}, late=3.0)
     usual = LineClient().after()[0][0]
@@ -178,7 +179,7 @@ def test_trip_fault_trips_a_running_motor_and_drift_changes_its_load() -> None:
     line = LineClient(sim, drives={"flaky": DriveFaults(trip=20.0, first=10.0, drift=0.2)})
     loads = set()
     for _ in range(3):
-        line.after()  # a motor at rest does not trip
+        line.after()  # no trip, because the motor is at rest
         loads.add(sim.motor.load)
     assert sim.motor.fault == 0
     assert len(loads) == 3
@@ -188,14 +189,16 @@ def test_trip_fault_trips_a_running_motor_and_drift_changes_its_load() -> None:
     assert sim.motor.fault == overload_code(sim.drive)
 
 
-@pytest.mark.parametrize("model", MODELS.values())
+@table("model", MODELS.values())
 def test_overload_code_of_every_family_is_valid(model: type[Drive]) -> None:
     drive = model(1)
     assert 0 < overload_code(drive) < 0x10000
 
 
 def test_trip_fault_for_a_drive_without_a_motor_is_refused() -> None:
-    with pytest.raises(ValueError, match="flaky has no simulated motor: remove its trip and drift"):
+    with pytest.raises(
+        ValueError, match="flaky has no simulated motor, so it takes no trip and no drift: remove them"
+    ):
         two_drives(trip=1.0)
 
 
@@ -205,13 +208,13 @@ def test_trip_fault_for_a_drive_without_a_motor_is_refused() -> None:
 @pytest.mark.parametrize("port", ["link", "socket://127.0.0.1:0"])
 def test_port_that_hung_up_is_reopened_at_its_path(port: str, tmp_path: Path) -> None:
     where = str(tmp_path / port) if port == "link" else port
-    wire = FaultyWire([simulated(Toy(1))], Faults(hang_up=1, away=0.1, rename=1), port=where, unpaced=True)
+    wire = FaultyWire([simulated(Toy(1))], Faults(hang_up=1, away=0.02, rename=1), port=where, unpaced=True)
     with Simulator([wire]) as sim:
         path = sim.wires[0].path
         names = set()
         while (
             wire.struck["hang_up"] < 5
-        ):  # a client that connects while the port closes is reset and not counted
+        ):  # a client that connects while the port closes is disconnected, and not counted
             line = opened(path)
             names.add(Path(path).resolve())
             with pytest.raises(LineError):
@@ -275,7 +278,7 @@ def test_all_mistakes_of_a_faults_file_are_reported_together(tmp_path: Path) -> 
     assert str(mistake.value).splitlines() == [
         f"{path}: {sentence}"
         for sentence in (
-            "unknown key 'flips'; did you mean 'flip'?",
+            "unknown key 'flips'; did you mean flip?",
             "seed = 'x' is not right; write seed = 7",
             "delay = True is not right; write delay = 0.01",
             'away = 3 is not right; write away = "1 s"',
@@ -295,7 +298,7 @@ def test_drive_tables_of_a_faults_file_set_the_drives_faults(tmp_path: Path) -> 
     with pytest.raises(ValueError, match="unknown key") as mistake:
         load_faults(path, {"pump-1"})
     assert str(mistake.value).splitlines() == [
-        f"{path}: unknown key 'pump-2'; did you mean 'pump-1'?",
+        f"{path}: unknown key 'pump-2'; did you mean pump-1?",
         f'{path}: drive "pump-1": loss = 3 is not a rate; write one from 0 to 1, such as 0.01',
     ]
 

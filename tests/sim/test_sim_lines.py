@@ -4,26 +4,35 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import select
+import signal
 import socket
 import struct
+import subprocess
+import threading
 import time
 from contextlib import ExitStack
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import checksums
 import pytest
 from kills import descriptors, threads
-from lines import until
+from lines import Own, until
+from peers import require_module, require_program
 from ptys import opened, receive
 from tables import table
+from toy import Toy
 
+from multidrop import YD1000, Bus, NoReply
 from multidrop.core import Framing, Message, build_request, parse_reply, reply_length, set_settings
+from multidrop.drive import Drive
 from multidrop.families.delixi_native import DelixiNative
 from multidrop.families.erman_er_g_220 import ErmanERG220
 from multidrop.families.innovert_ibd import InnovertIBD
-from multidrop.families.invt_che import InvtCHE
-from multidrop.sim import EncodedDrive, Simulator, Wire, encoded, serve, simulated
+from multidrop.families.invt_che import InvtCHE, parameter
+from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, encoded, serve, simulated
 
 READ = Message(1, 0x03, 0x3000, 2)  # a read of a CHE
 
@@ -109,7 +118,7 @@ def test_second_tcp_client_is_served_after_the_first_resets_its_connection() -> 
 
 
 class Broken(Wire):
-    """A wire with a mistake in the test's own code."""
+    """A wire whose method `distort` raises an exception."""
 
     def distort(self, reply: bytes) -> bytes:
         raise ZeroDivisionError("a mistake of the test's own")
@@ -158,7 +167,7 @@ def test_valid_frame_after_garbage_is_answered() -> None:
     with Simulator([wire()]) as sim, opened(sim.wires[0].path) as fd:
         for garbage in (b"\x00", bytes(range(256)), b":::" * 2000, b"\xff" * 5000):
             os.write(fd, garbage)
-            time.sleep(0.03)  # more than the silence that ends a frame on an unpaced wire
+            time.sleep(0.03)  # longer than the silence that ends a frame on an unpaced wire
             assert exchange(fd, READ).data == expected()
 
 
@@ -205,3 +214,195 @@ def test_terminated_simulator_process_removes_its_link(tmp_path: Path) -> None:
         process.join()
     assert process.exitcode == 0
     assert not link.is_symlink()
+
+
+# ---- the simulator's thread: it ends on request, and a failing drive affects no other wire ----
+
+
+PATIENCE = 60.0
+
+
+def test_signal_ends_serve_even_if_its_handler_has_not_run() -> None:
+    """The signal goes to another thread, so that its handler does not run before the main thread sleeps."""
+
+    def terminate() -> None:
+        time.sleep(0.05)
+        signal.pthread_kill(threading.get_ident(), signal.SIGTERM)
+
+    def end_at_last() -> None:
+        if not over.wait(PATIENCE):
+            late.append(True)
+            simulators[0].interrupt()
+
+    over = threading.Event()
+    late: list[bool] = []
+    simulators: list[Simulator] = []
+    threads = [threading.Thread(target=each) for each in (terminate, end_at_last)]
+
+    def begin(simulator: Simulator) -> None:
+        simulators.append(simulator)
+        for thread in threads:
+            thread.start()
+
+    serve([Wire([simulated(Own(1))])], begin)
+    over.set()
+    for thread in threads:
+        thread.join()
+    assert not late
+
+
+class Ill(Exception):
+    """Raised by a simulated drive."""
+
+
+class Brief(Toy):
+    response_timeout = 0.05
+
+
+class IllDrive(EncodedDrive):
+    def receive(self, frame: Any) -> Any:
+        raise Ill("of this drive")
+
+
+def test_failing_drive_gives_no_reply_and_other_wires_continue(caplog: pytest.LogCaptureFixture) -> None:
+    wires = [Wire([drive], unpaced=True) for drive in (IllDrive(Toy(1)), EncodedDrive(Toy(1)))]
+    simulator = Simulator(wires)
+
+    def ask() -> None:
+        with simulator, Bus(wires[0].path) as ill, Bus(wires[1].path) as well:
+            for _ in range(2):
+                with pytest.raises(NoReply):
+                    (ill.drives[0] if ill.drives else ill.attach(Brief, 1)).read(Toy.output_current)
+                drive = well.drives[0] if well.drives else well.attach(Toy, 1)
+                drive.read(Toy.output_current)
+            assert isinstance(simulator.failure, Ill)
+
+    with pytest.raises(Ill, match="of this drive"):
+        ask()
+    assert [record.name for record in caplog.records if record.levelname == "ERROR"] == ["multidrop.sim"]
+
+
+def test_ended_simulator_thread_logs_its_failure(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    simulator = Simulator([Wire([EncodedDrive(Toy(1))])])
+
+    def fail(*details: object) -> None:
+        raise Ill("of select")
+
+    monkeypatch.setattr(select, "select", fail)
+    simulator.__enter__()
+    until(lambda: isinstance(simulator.failure, Ill))
+    with pytest.raises(Ill, match="of select"):
+        simulator.__exit__()
+    assert "no drive answers any more" in caplog.text
+
+
+@pytest.mark.slow
+def test_speed_makes_simulated_time_pass_faster() -> None:
+    """With `speed=20` a motor's ramp of 10 s takes less than one second."""
+    sim = simulated(YD1000(1))
+    with Simulator([Wire([sim])], speed=20) as simulator, Bus(simulator.wires[0].path) as bus:
+        fan = bus.attach(YD1000, 1)
+        fan.set_frequency(50.0)
+        fan.start()
+        until(lambda: fan.read(fan.output_frequency) == 50.0)
+        assert sim.now > 10 * time.monotonic()  # `now` is the time of the simulator's clock
+
+
+@table("speed", [0, -1, float("inf"), float("nan")])
+def test_speed_that_is_not_positive_is_refused(speed: float) -> None:
+    with pytest.raises(ValueError, match="is not a positive number"):
+        Simulator([], speed=speed)
+
+
+# ---- masters by other authors read and write simulated drives: mbpoll over RTU, pymodbus over ASCII ----
+
+
+class MyCHE(InvtCHE):
+    acceleration_time = parameter(11, "s", step=0.1)
+
+
+def mbpoll(
+    sim: SimulatedDrive, options: str, *values: int, wait: str = "10"
+) -> subprocess.CompletedProcess[str]:
+    """Run mbpoll once against this drive to read, or to write the values; `wait` is its timeout in s.
+
+    The option -P is none, because a pty stores no parity.
+    """
+    program = require_program("mbpoll")
+    baudrate, address = str(sim.drive.settings.baudrate), str(sim.drive.address)
+    with Simulator([Wire([sim])]) as simulator:
+        line = [program, "-q", "-m", "rtu", "-b", baudrate, "-P", "none", "-o", wait, "-a", address, "-0"]
+        line += [*options.split(), simulator.wires[0].path, *map(str, values)]
+        return subprocess.run(line, capture_output=True, text=True, timeout=120)
+
+
+def values(done: subprocess.CompletedProcess[str]) -> list[str]:
+    """Return the text behind "[address]:" in mbpoll's output."""
+    assert done.returncode == 0, done.stderr
+    return [line.split()[1] for line in done.stdout.splitlines() if line.startswith("[")]
+
+
+@table(
+    ("drive", "name", "value", "options", "shown"),
+    [
+        (ErmanERG220(1), "output_frequency", 28.5, "-r 1 -c 1 -t 3 -1", ["285"]),
+        (ErmanERG220(31), "maximum_frequency", 60, "-r 3 -c 1 -t 4 -1", ["600"]),
+        (InvtCHE(247), "output_voltage", 231, "-r 12291 -c 1 -t 4 -1", ["231"]),
+        (InnovertIBD(1), "output_current", 2.5, "-r 3 -c 1 -t 4 -1", ["25"]),
+    ],
+)
+def test_mbpoll_reads_registers_of_a_simulated_drive(
+    drive: Drive, name: str, value: float, options: str, shown: list[str]
+) -> None:
+    sim = simulated(drive)
+    sim[name] = value
+    assert values(mbpoll(sim, options)) == shown
+
+
+@table(
+    ("drive", "options", "raw", "name", "value"),
+    [
+        (ErmanERG220(1), "-r 2 -t 4", [285], "frequency", 28.5),
+        (ErmanERG220(1), "-r 12 -t 4", [200, 400], "deceleration_time", 40),
+        (ErmanERG220(1), "-r 0 -t 0", [1], "start_coil", 1),
+        (MyCHE(1), "-r 11 -t 4", [70], "acceleration_time", 7),
+        (InnovertIBD(1), "-r 107 -t 4", [200], "acceleration_time", 20),
+    ],
+)
+def test_mbpoll_writes_a_register_of_a_simulated_drive(
+    drive: Drive, options: str, raw: list[int], name: str, value: float
+) -> None:
+    sim = simulated(drive)
+    done = mbpoll(sim, options, *raw)
+    assert done.returncode == 0, done.stderr
+    assert sim[name] == value
+
+
+def test_mbpoll_reports_the_drives_exception() -> None:
+    done = mbpoll(simulated(InvtCHE(1)), "-r 32779 -c 1 -t 4 -1")
+    assert done.returncode == 1
+    assert "Illegal data address" in done.stderr
+
+
+def test_mbpoll_times_out_if_the_drive_does_not_reply() -> None:
+    done = mbpoll(simulated(InnovertIBD(1)), "-r 50 -c 1 -t 4 -1", wait="0.1")
+    assert done.returncode == 1
+    assert "timed out" in done.stderr
+
+
+def test_pymodbus_reads_and_writes_over_ascii() -> None:
+    client = require_module("pymodbus.client")
+    framer = require_module("pymodbus").FramerType.ASCII
+    sim = simulated(InnovertIBD(240, framing="ascii"))
+    with Simulator([Wire([sim])]) as simulator:
+        master = client.ModbusSerialClient(simulator.wires[0].path, framer=framer, baudrate=9600, timeout=60)
+        assert master.connect()
+        try:
+            assert master.read_holding_registers(22, count=1, device_id=240).registers == [0x1800]
+            assert not master.write_register(107, 200, device_id=240).isError()
+            assert master.read_holding_registers(107, count=2, device_id=240).registers == [200, 100]
+        finally:
+            master.close()
+    assert sim["acceleration_time"] == 20

@@ -1,4 +1,7 @@
-"""Convert register tables of other programs into family files; missing facts become comments "gap: ..."."""
+"""Convert register tables of other programs into family files.
+
+In the family file, a comment "gap: ..." marks each fact that the register table lacks.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +61,7 @@ def _make_titles_unique(devices: list[ImportedDevice], stem: str) -> None:
 
 
 def all_devices(path: Path) -> list[ImportedDevice]:
-    """Return all devices, even without importable registers. Raises the errors of `read_devices`."""
+    """Return all devices, even those without importable registers. Raises the errors of `read_devices`."""
     read = _READERS.get(path.suffix.lower())
     if read is None:
         raise ValueError(f"{path}: its suffix is not one of {', '.join(_READERS)}")
@@ -68,10 +71,10 @@ def all_devices(path: Path) -> list[ImportedDevice]:
             settle(device)
     except KeyError as missing:
         key = printable(str(missing.args[0]))[:200]
-        raise ValueError(f"{path} is not laid out as its kind of file is: a {key} is missing") from missing
+        raise ValueError(f"{path} does not have the structure of such a file: {key} is missing") from missing
     except (AttributeError, TypeError, IndexError, OverflowError, RecursionError) as failure:
         kind = f"{type(failure).__name__} {printable(str(failure))[:200]}"
-        raise ValueError(f"{path} is not laid out as its kind of file is: {kind}") from failure
+        raise ValueError(f"{path} does not have the structure of such a file: {kind}") from failure
     except ValueError as mistake:
         raise ValueError(f"{path}: {printable(str(mistake))[:1000]}") from mistake
     return devices

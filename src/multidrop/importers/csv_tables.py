@@ -1,6 +1,6 @@
 """CSV and TSV tables: layouts of ioBroker, modpoll and Neuron, and any table whose column names are known.
 
-If programs use a column name with different meanings, the most frequent one is assumed and noted as a gap.
+If programs use a column name with different meanings, the most frequent one is assumed and noted in `gaps`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from multidrop.importers.numbers import (
     words_of,
 )
 
-CARRIED = {  # names of columns, in lower case and without _, the most specific first
+CARRIED = {  # by key: its column names in lower case and without _, the most specific first
     "name": (
         *("name", "register name", "signal name", "parameter name", "register", "description", "parameter"),
         *("tag", "signal", "variable", "point", "title"),
@@ -76,7 +76,7 @@ GAPS = frozenset(
     }
 )
 _SPARE = frozenset(alias for key in ("name", "note", "at") for alias in CARRIED[key])
-# A second column for the same key may contradict the first.
+# Columns that may affect a value. They include further columns for an imported key, which may contradict it.
 _VALUE_COLUMNS = GAPS | frozenset(alias for aliases in CARRIED.values() for alias in aliases) - _SPARE
 _KNOWN = IRRELEVANT | _VALUE_COLUMNS | _SPARE
 _NUMBER = re.compile(r"[0-9]{1,9}")
@@ -91,7 +91,7 @@ _ORDERS = {
 _STEP_COLUMNS = ("factor", "scale", "divisor", "gain", "decimal")
 _WHOLE = re.compile(r"(?:(u|unsigned)|signed)?int(?:eger)?(\d*)(?:t|bits?)?")
 _BIT_TYPES = frozenset({"bit", "bool", "boolean", "binary", "coil", "flag"})
-_NAMED_TABLES = (  # the first matching prefix of a cell decides
+_NAMED_TABLES = (  # prefix of a cell, and the table it means; the first matching prefix decides
     *(("holding", "holding"), ("hr", "holding"), ("4x", "holding")),
     *(("discrete", "discrete"), ("input status", "discrete"), ("input contact", "discrete")),
     *(("input coil", "discrete"), ("di", "discrete"), ("1x", "discrete"), ("contact", "discrete")),
@@ -101,8 +101,8 @@ _NAMED_TABLES = (  # the first matching prefix of a cell decides
 _FUNCTIONS = {1: "coil", 2: "discrete", 3: "holding", 4: "input"}
 _WRITES = {5: "coil", 6: "holding", 15: "coil", 16: "holding"}
 _BARE_HEX = re.compile(r"(?=[0-9]*[a-fA-F])[0-9a-fA-F]{1,8}")
-_REFERENCE = re.compile(r"[0134][0-9]{4,5}")  # 40001 or 400001: digit of the table, then number from 1
-_ACCESS = {  # cell: whether the register is read, whether it is written
+_REFERENCE = re.compile(r"[0134][0-9]{4,5}")  # 40001 or 400001: the table's digit, then a number from 1
+_ACCESS = {  # for each cell: whether the register can be read, and whether it can be written
     **dict.fromkeys(("r", "ro", "read", "readonly", "rd"), (True, False)),
     **dict.fromkeys(("w", "wo", "write", "writeonly"), (False, True)),
     **dict.fromkeys(
@@ -124,7 +124,7 @@ def read_table(text: str, stem: str) -> list[ImportedDevice]:
         raise ValueError("has zero bytes; save it as CSV UTF-8")
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if not lines:
-        raise ValueError("is empty: it has no line but comments")
+        raise ValueError("is empty: it has only comments")
     head = lines[0] if re.search("[,;\t]", lines[0]) else "\n".join(lines[:MOST_TITLES])
     delimiter = max((",", ";", "\t"), key=head.count)
     try:
@@ -143,7 +143,7 @@ def read_table(text: str, stem: str) -> list[ImportedDevice]:
 def _columns(rows: list[list[str]], stem: str) -> list[ImportedDevice]:
     layout = _Layout(rows)
     devices: dict[int | None, ImportedDevice] = {}
-    table = ImportedDevice(stem)  # only counts the entries, to limit their number
+    table = ImportedDevice(stem)  # used only to count the entries against their limit
     unknown: set[str] = set()
     for row in rows[1:]:
         cells, further = layout.cells(row), layout.further(row)
@@ -190,11 +190,13 @@ class _Layout:
         return found
 
     def further(self, row: list[str]) -> set[str]:
-        """Return the names of the columns that are not imported but have a value in this row."""
+        """Return the names of the columns that have a value in this row and are not imported."""
         return {name for place, name in self._others.items() if place < len(row) and row[place].strip()}
 
     def gaps(self, cells: Cells, further: set[str]) -> list[str]:
-        """Return a row's gaps: unimported columns that may affect the value, unclear lengths or addresses."""
+        """Return sentences about a row's unknown facts: unimported columns that may affect the value,
+        unclear lengths or addresses.
+        """
         columns = further & _VALUE_COLUMNS
         if _parse_tag(cells["at"]):
             columns -= {"precision"}  # a tag's precision is only the number of digits shown
@@ -212,14 +214,16 @@ def _names(row: list[str]) -> list[str]:
 
 
 def _plain_name(cell: str) -> tuple[str, str]:
-    """Return a column's name and the text in its brackets, such as those of `Address (hex)`."""
+    """Return a column's name and the text in brackets after it, such as "hex" in `Address (hex)`."""
     name = re.sub(r"[_\s]+", " ", cell).strip().lower()
     match = re.fullmatch(r"([^(\[]*[^(\[ ])\s*[(\[]([^)\]]*)[)\]].*", name)
     return (match[1], match[2].strip()) if match else (name, "")
 
 
 def _places(header: list[str]) -> dict[str, int]:
-    """Return the indexes of the imported columns, by key. A column that fits two keys goes to the first."""
+    """Return the indexes of the imported columns, by key. A column that fits two keys is used for the first
+    key.
+    """
     found: dict[str, int] = {}
     for key, aliases in CARRIED.items():
         for alias in aliases:
@@ -247,7 +251,9 @@ def _row(devices: dict[int | None, ImportedDevice], cells: Cells, gaps: list[str
 
 
 def _placed(name: str, cells: Cells, tag: _Tag | None) -> ImportedRegister:
-    """Return a register at the row's address; add gaps if its table or the address numbering is ambiguous."""
+    """Return a register at the row's address; add sentences to `gaps` if the register's table or the address
+    numbering is ambiguous.
+    """
     register = ImportedRegister(name, 0)
     stated = _table(register, cells)
     given = tag.address if tag else cells["at"]
@@ -269,7 +275,9 @@ def _assume_number(register: ImportedRegister, stated: str | None) -> None:
 
 
 def _referred(register: ImportedRegister, given: str, stated: str | None, cells: Cells) -> tuple[int, str]:
-    """Return address and table of a number such as 40001; a plain address if other cells contradict 40001."""
+    """Return the address and the table that a number such as 40001 means. If other cells contradict that
+    table, take the number as a plain address.
+    """
     address, table = Counting(None).address_in_cell(given, None, "holding")
     is_bit = table in ("coil", "discrete")
     if (stated not in (None, table)) or (is_bit and stated is None and _is_number(cells)):
@@ -300,7 +308,9 @@ def _steps(cells: Cells) -> list[tuple[str, str]]:
 
 
 def _table(register: ImportedRegister, cells: Cells) -> str | None:
-    """Return the table that a row states, or None. Adds a gap if the cell is ambiguous or unknown."""
+    """Return the table that a row states, or None. Adds a sentence to `gaps` if the cell is ambiguous or
+    unknown.
+    """
     if function := cells.get("function"):
         codes = {int(code, 0) for code in re.findall(r"0x[0-9a-f]{1,4}|(?!0\d)\d{1,5}", function.lower())}
         tables = {(_FUNCTIONS | _WRITES).get(code) for code in codes}
@@ -354,7 +364,7 @@ def _fill(device: ImportedDevice, register: ImportedRegister, cells: Cells, tag:
 
 
 def _access(register: ImportedRegister, given: str) -> None:
-    """Set whether the register is read and written; add a gap for an unknown word."""
+    """Set whether the register can be read and written; add a sentence to `gaps` for an unknown word."""
     words = re.sub(r"subscribe|static|only|[^a-z]", "", given.lower())
     if not given:
         return
@@ -415,7 +425,9 @@ def _number(device: ImportedDevice, register: ImportedRegister, cells: Cells, ta
 
 
 def _part(register: ImportedRegister, kind: str, cells: Cells, tag: _Tag | None) -> str:
-    """Return the bits that the register uses of its word, "" for all; add a gap if the number is missing."""
+    """Return the bits of the word that the register uses ("" for all). Add a sentence to `gaps` if the row
+    lacks the bit number.
+    """
     if tag and tag.part:
         return tag.part
     stated = re.fullmatch(r"([0-9]{1,2})(?:\s*(?:-|\.\.|:|to)\s*([0-9]{1,2}))?", cells.get("bit", ""))
@@ -431,7 +443,7 @@ def _part(register: ImportedRegister, kind: str, cells: Cells, tag: _Tag | None)
 
 
 def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
-    """Return the number format of a row; add a gap if the type or width is missing."""
+    """Return the number format of a row; add a sentence to `gaps` if the type or width is missing."""
     length = cells.get("length", "")
     words = int(length) if _NUMBER.fullmatch(length) else 0
     signed = _SIGNED.get(cells.get("signed", "").lower())
@@ -442,7 +454,7 @@ def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
         what = "type and sign are" if signed is None else "type is"
         register.gaps.append(f"its {what} not stated; {assumed}{16 * (words or 1)} was assumed")
         return format_of_width(assumed, words or 1)
-    kind = re.sub(r"^(\d+)bits?(.*)$", r"\2\1", kind)  # such as "16 bit unsigned"
+    kind = re.sub(r"^(\d+)bits?(.*)$", r"\2\1", kind)  # "16 bit unsigned" becomes "unsigned16"
     if match := _WHOLE.fullmatch(kind):
         kind = f"{'uint' if match[1] else 'int'}{match[2]}"
     if found := format_of_width(kind, words or 1):
@@ -461,7 +473,7 @@ def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
 
 
 def _order(register: ImportedRegister, given: str) -> str:
-    """Return the byte order that a cell states; add a gap if the cell states no byte order."""
+    """Return the byte order that a cell states; add a sentence to `gaps` if the cell states no byte order."""
     word = re.sub(r"[^a-z]|endian|first", "", given.lower())
     if not given:
         register.gaps.append("the order of its words is not stated")
@@ -471,7 +483,9 @@ def _order(register: ImportedRegister, given: str) -> str:
 
 
 def _scale(register: ImportedRegister, cells: Cells, *, is_neuron: bool) -> None:
-    """Set step and offset; if a column's meaning varies by program, add a gap with the assumed meaning."""
+    """Set step and offset; if a column's meaning varies by program, add a sentence to `gaps` with the assumed
+    meaning.
+    """
     found = _steps(cells)
     key, given = found[0] if found else ("scale", "")
     offset = cells.get("offset", "")
@@ -479,7 +493,7 @@ def _scale(register: ImportedRegister, cells: Cells, *, is_neuron: bool) -> None
         step = _step(register, key, given, is_neuron=is_neuron)
         shift = number(offset, 0)
     except ValueError:
-        register.lacks = f"its {key} {given[:40]!r} or offset {offset[:40]!r} is no number"
+        register.lacks = f"its {key} {given[:40]!r} or offset {offset[:40]!r} is not a number"
         return
     if step not in (0, 1):
         register.details["step"] = step
@@ -519,9 +533,11 @@ def _step(register: ImportedRegister, key: str, given: str, *, is_neuron: bool) 
 
 _TAG = re.compile(r"([0-9]{1,6})!([0-9]{1,9})(?:[.](\d{1,6})([HLDE]?))?(?:#([A-Z]{1,2}))?")
 _TAG_ORDERS = {  # Neuron's Modbus TCP page, section #ENDIAN: LL means the byte order 1,2,3,4
-    **{"L": "", "LL": "", "LB": "BADC", "BL": "CDAB", "BB": "DCBA", "B": "DCBA"},
+    **{"L": "", "LL": "", "LB": "BADC", "BL": "CDAB", "BB": "DCBA", "B": "DCBA"}
 }
-_TAG_TEXT_ORDERS = {"": "", "H": "", "L": "BA", "D": "B"}  # E: one character per register, in the high byte
+# Byte orders of texts, by the letter at the end of the tag. Texts with the letter E (one character per
+# register, in the high byte) are not imported.
+_TAG_TEXT_ORDERS = {"": "", "H": "", "L": "BA", "D": "B"}
 
 
 @dataclass(frozen=True)
@@ -544,7 +560,7 @@ def _parse_tag(cell: str) -> _Tag | None:
 
 
 def _tag_order(register: ImportedRegister, tag: _Tag, number: str) -> str:
-    """Return a number's byte order; add a gap if the tag does not state it."""
+    """Return a number's byte order; add a sentence to `gaps` if the tag does not state it."""
     if tag.order in _TAG_ORDERS:
         return _TAG_ORDERS[tag.order]
     if tag.order:

@@ -13,18 +13,19 @@ from typing import Any
 from multidrop.drive.declaration_check import UNIT_IDS
 from multidrop.drive.family import TAKEN_NAMES, Drive
 from multidrop.families.files.registers import OF_ENUMERATIONS, unusable
+from multidrop.printable import is_whole
 
 UNKNOWN_HOST = "HOST"
 _HOST = re.compile(r"[A-Za-z0-9_.:-]{1,200}|\[[0-9A-Fa-f:.]{1,100}\]")
-_PORT = re.compile(r"[^!${}\s][^${}]*")  # neither a YAML tag nor a variable
+_PORT = re.compile(r"[^!${}\s][^${}]*")  # a port's name that is neither a YAML tag nor a variable
 _PARITIES = {"n": "N", "none": "N", "e": "E", "even": "E", "o": "O", "odd": "O"}
-# Serial formats if the family states none; ASCII frames may have 7 data bits.
+# Serial formats of a family that states none, by framing; ASCII frames may have 7 data bits.
 _FORMATS = {"rtu": ("8N1", "8E1", "8O1", "8N2"), "ascii": ("7E1", "7O1", "7N2", "8N1", "8E1", "8O1", "8N2")}
 
 
 @dataclass(frozen=True)
 class LineSettings:
-    """A line's settings as far as the source states them; "" (port, format) and 0 (baud rate): unknown."""
+    """A line's settings. An unknown port or format is "", an unknown baud rate 0."""
 
     port: str = ""
     baudrate: int = 0
@@ -32,7 +33,7 @@ class LineSettings:
     framing: str = "rtu"
 
     def drive_keys(self) -> dict[str, Any]:
-        """Return a drive's line keys for a plant file; on a network line that is only the framing."""
+        """Return a drive's line settings as keys of a plant file; on a network line, only the framing."""
         found: dict[str, Any] = {"framing": self.framing} if self.framing != "rtu" else {}
         if self.is_network:
             return found
@@ -71,7 +72,7 @@ def network_settings(
 ) -> LineSettings:
     """Return the settings of a network line: Modbus TCP, or serial frames over a socket.
 
-    An unknown host becomes the placeholder HOST; an invalid port number becomes 502.
+    If the host is unknown, it becomes the placeholder HOST; an invalid port number becomes 502.
     """
     number = _whole(port)
     known = host if isinstance(host, str) and _HOST.fullmatch(host) else UNKNOWN_HOST
@@ -81,15 +82,15 @@ def network_settings(
 
 
 def _whole(given: Any) -> int:
-    """Return a whole number, also from text; 0 for any other value."""
+    """Return a whole number, which may be given as text; 0 for any other value."""
     if isinstance(given, str) and re.fullmatch(r"[0-9]{1,9}", given.strip()):
         given = int(given)
-    return given if isinstance(given, int) and not isinstance(given, bool) and 0 < given < 10**9 else 0
+    return given if is_whole(given) and 0 < given < 10**9 else 0
 
 
 WRITTEN = "it is written there; what a write does is not known here"
 ONLY_WRITTEN = "is only written: a command is never imported"
-MOST_ENTRIES = 20_000  # limit per file
+MOST_ENTRIES = 20_000  # limit of entries per file
 _LONGEST_NAME = 50
 _DECIMAL = re.compile(r"-?[0-9]{1,19}")
 _ANY_BASE = re.compile(r"0[xX][0-9a-fA-F]{1,8}|0|[1-9][0-9]{0,5}")
@@ -107,7 +108,7 @@ KeyTable = Mapping[str, Treatment]
 
 
 def key_table(*, carried: str = "", irrelevant: str = "", gap: str = "") -> KeyTable:
-    """Return a table from key to treatment; each argument lists one treatment's keys, separated by spaces."""
+    """Return the treatment of each key. An argument lists the keys of one treatment, separated by spaces."""
     return {
         **dict.fromkeys(carried.split(), Treatment.CARRIED),
         **dict.fromkeys(irrelevant.split(), Treatment.IRRELEVANT),
@@ -116,14 +117,11 @@ def key_table(*, carried: str = "", irrelevant: str = "", gap: str = "") -> KeyT
 
 
 def uncarried(entry: Mapping[Any, Any], table: KeyTable) -> list[str]:
-    """Return a sentence for each key of an entry that is not imported although it may affect the value.
+    """Return a sentence for each key of an entry that may affect the value but is not imported.
 
-    This includes keys missing from the table. Keys with empty or false values are ignored.
+    Keys that the table lacks are included. Keys with empty or false values are ignored.
     """
-    known = {
-        Treatment.GAP: "{} was not carried over",
-        None: "{} is not known here, and was not carried over",
-    }
+    known = {Treatment.GAP: "{} was not carried over", None: "{} is not known here, and was not carried over"}
     found = ((str(key)[:40], table.get(key)) for key, value in entry.items() if not is_empty(value))
     return [known[treatment].format(key) for key, treatment in found if treatment in known]
 
@@ -135,37 +133,41 @@ def is_empty(value: Any) -> bool:
 
 @dataclass
 class ImportedRegister:
-    """One register, with its address as sent. `gaps` are sentences about unknown facts.
+    """One register, with its address as sent in a request. `gaps` are sentences about unknown facts.
 
-    `lacks` names a fact that the value depends on and that a register cannot declare; if set, only the raw
-    count is imported. Family files get readings only; `is_written` and `of_writes` are for coverage reports.
+    `lacks` names a fact that the value depends on and that a register cannot declare; if set, only the
+    raw count is imported. In a family file, each register is only read; `is_written` and `of_writes` are for
+    coverage reports.
     """
 
     name: str
     address: int
     table: str = "holding"
-    details: dict[str, Any] = field(default_factory=dict)  # keys of a family file, in this order
+    details: dict[str, Any] = field(default_factory=dict)  # its keys in the family file, in this order
     gaps: list[str] = field(default_factory=list)
     lacks: str = ""
     is_read: bool = True
     is_written: bool = False
-    of_writes: dict[str, Any] = field(default_factory=dict)  # further details of a written register
+    of_writes: dict[str, Any] = field(default_factory=dict)  # further details if the register is written
 
     def note_write(self, *, is_written: bool = True) -> None:
-        """Record whether the source program writes the register; if so, add a gap: the effect is unknown."""
+        """Record whether the source program writes the register; if so, add a sentence to `gaps`: the effect
+        is unknown.
+        """
         self.is_written = is_written
         if is_written:
             self.gaps.append(WRITTEN)
 
     def put_names(self, key: str, pairs: Mapping[Any, Any]) -> None:
-        """Add names of the register's values or bits; add a gap if a register cannot have these names.
+        """Add names of the register's values or bits; add a sentence to `gaps` if a register cannot have
+        these names.
 
         If a value or bit has several names, the first is used.
         """
         names, found = UniqueNames(OF_ENUMERATIONS), dict[str, int]()
         for spelt, given in pairs.items():
             number = int(given) if isinstance(given, str) and _DECIMAL.fullmatch(given) else given
-            if isinstance(number, bool) or not isinstance(number, int) or number in found.values():
+            if not is_whole(number) or number in found.values():
                 continue
             found[names.free(str(spelt))] = number
         if len(found) < len(pairs):
@@ -177,7 +179,9 @@ class ImportedRegister:
 
 @dataclass(frozen=True)
 class Lost:
-    """An entry that could not be imported, and why. `is_entry` is False for lost keys and other facts."""
+    """An entry that could not be imported, and why. `is_entry` is False if only a key or another fact was
+    lost.
+    """
 
     name: str
     reason: str
@@ -198,13 +202,13 @@ class ImportedDevice:
     commands: list[ImportedRegister] = field(default_factory=list)
     lost: list[Lost] = field(default_factory=list)
     readable: range = range(0)  # holding registers that a read may span, including unnamed registers
-    together: int = 0  # most registers per read request; 0: not stated
+    together: int = 0  # limit of registers in one read request; 0: not stated
     line: LineSettings = UNKNOWN_LINE
     names: UniqueNames = field(default_factory=lambda: UniqueNames())
 
     def add(self, found: ImportedRegister, *, is_text: bool = False) -> None:
         """Add a register under a unique name; record an invalid register as lost."""
-        if isinstance(found.address, bool) or not isinstance(found.address, int):
+        if not is_whole(found.address):
             self.lose(found.name, f"its address {str(found.address)[:40]!r} is not a whole number")
             return
         if not 0 <= found.address <= 0xFFFF:
@@ -225,7 +229,9 @@ class ImportedDevice:
 
     @contextmanager
     def entry(self, name: str) -> Iterator[None]:
-        """In the block, record the entry as lost on an error. Raises ValueError after too many entries."""
+        """Record the entry as lost if the `with` block raises an error. Raises ValueError after too many
+        entries.
+        """
         if len(self.registers) + len(self.texts) + len(self.lost) >= MOST_ENTRIES:
             raise ValueError(f"has more than {MOST_ENTRIES} entries, which no device has")
         try:
@@ -267,6 +273,6 @@ def unit_address(given: Any, key: str) -> int | None:
     if given is None:
         return None
     number = int(given.strip(), 0) if isinstance(given, str) and _ANY_BASE.fullmatch(given.strip()) else given
-    if isinstance(number, bool) or not isinstance(number, int) or number not in UNIT_IDS:
+    if not is_whole(number) or number not in UNIT_IDS:
         raise ValueError(f"{key} = {str(given)[:40]!r} is not a unit id from {UNIT_IDS[0]} to {UNIT_IDS[-1]}")
     return number

@@ -119,7 +119,7 @@ def _parts(document: Any) -> Iterator[dict[str, Any]]:
 
 
 def _kind_of(entity: Mapping[str, Any]) -> str:
-    """Return the kind of an entity in a bare list: the first kind that has all its keys."""
+    """Return the kind of an entity whose list states none: the first kind that allows all of its keys."""
     return next((kind for kind, table in KEYS.items() if entity.keys() <= table.keys()), "sensor")
 
 
@@ -134,7 +134,7 @@ def _substitutions(document: Any) -> dict[str, str]:
 
 
 def _substituted(value: Any, known: Mapping[str, str], depth: int) -> Any:
-    """Return a value with each ${name} replaced if the document itself defines the name."""
+    """Return the value, with each ${name} replaced whose name the document itself defines."""
     if isinstance(value, str) and "$" in value and not isinstance(value, YamlTag):
         return re.sub(r"\$(?:\{(\w+)\}|(\w+))", lambda name: known.get(name[1] or name[2], name[0]), value)
     if depth < 5 and known:
@@ -198,7 +198,9 @@ class _Devices:
             _add(device, kind, name, entry)
 
     def _device_of(self, given: Any) -> ImportedDevice:
-        """Return a controller's device by id; its address is unknown if another file declares it."""
+        """Return the device of the controller with this id. Its address is unknown if another file declares
+        the controller.
+        """
         if given is None and self._by_controller:
             return next(iter(self._by_controller.values()))
         return self._by_controller.setdefault(
@@ -257,7 +259,9 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
 
 
 def _filters(register: ImportedRegister, filters: Any) -> None:
-    """Combine factors and offsets, in order, into a step and an offset; add a gap for any other filter."""
+    """Combine factors and offsets, in order, into a step and an offset; add a sentence to `gaps` for any
+    other filter.
+    """
     step, offset = Fraction(1), Fraction(0)
     others: list[str] = []
     for each in _listed(filters):
@@ -301,7 +305,8 @@ def _text(device: ImportedDevice, register: ImportedRegister, entry: Mapping[str
 
 def _number(device: ImportedDevice, register: ImportedRegister, kind: str, entry: Mapping[str, Any]) -> bool:
     """Set the register's number format; return False if the register cannot be imported."""
-    is_flag = kind in ("binary_sensor", "switch")  # always one 16-bit word, whatever other keys state
+    # flags are read from one 16-bit word, even if other keys state another width
+    is_flag = kind in ("binary_sensor", "switch")
     given = "U_WORD" if is_flag else str(entry.get("value_type", "U_WORD"))
     found = _FORMATS.get(given.removesuffix("_R"))
     if found is None:

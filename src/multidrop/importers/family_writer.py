@@ -26,7 +26,7 @@ _MOST_POINTS = 20  # limit of dots in a text; the TOML parser is slow on a line 
 
 _ORDER = (
     *("unit", "values", "bits", "step", "offset", "number_format", "order", "part", "invalid"),
-    *("scale_register", "length", "place", "note"),
+    *("scale_register", "length", "place", "note", "title"),
 )
 
 
@@ -124,7 +124,7 @@ def entry_line(register: ImportedRegister) -> str:
 
 
 def _value(value: Any) -> str:
-    """Return a value as TOML on one line."""
+    """Return a value in TOML's notation, on one line."""
     if isinstance(value, dict):
         return f"{{ {', '.join(_pairs(value))} }}"
     if isinstance(value, list):
@@ -136,8 +136,8 @@ def _value(value: Any) -> str:
 
 
 def _pairs(value: dict[str, Any]) -> Iterator[str]:
-    for name, number in value.items():
-        yield f"{name} = {_value(number)}"
+    for name, given in value.items():
+        yield f"{name} = {_value(given)}"
 
 
 def _comment(text: str) -> str:
@@ -165,7 +165,9 @@ def _keep(
     most: int,
     kind: str,
 ) -> dict[str, Any]:
-    """Drop the entries of `listed` that no family can declare; return the other declarations by name."""
+    """Drop the entries of `listed` that no family can declare. Return the declarations of the others, by
+    name.
+    """
     held: dict[str, Any] = {}
     kept: list[ImportedRegister] = []
     for found in listed:
@@ -210,13 +212,13 @@ def declare_text(found: ImportedRegister) -> Text:
 
 
 def _settle_together(device: ImportedDevice, held: dict[str, Register[Any]]) -> None:
-    """Drop scale registers, then whole registers, until one class can declare all remaining registers."""
+    """Make the registers fit into one class: drop first references to scale registers, then registers."""
     by_name = {found.name: found for found in device.registers}
     gaps = {HOLDING: device.readable} if device.readable else {}
     while wrong := _refused_together({**held, "readable_gaps": gaps}):
         named = {name: sentence for name, sentence in wrong.items() if name in by_name}
         if not named:
-            raise ValueError(f"its registers are not one family: {'; '.join(wrong.values())}")
+            raise ValueError(f"its registers cannot form one family: {'; '.join(wrong.values())}")
         for name, sentence in named.items():
             found = by_name[name]
             if found.details.pop("scale_register", None):
@@ -229,7 +231,9 @@ def _settle_together(device: ImportedDevice, held: dict[str, Register[Any]]) -> 
 
 
 def _refused_together(members: dict[str, Any]) -> dict[str, str]:
-    """Return the errors, by register name, of a class with these members; an empty dict if it is valid."""
+    """Return the errors, by register name, of a class with these members; an empty dict if the class is
+    valid.
+    """
     try:
         type("Imported", (Drive,), {"__doc__": "Of an importer.", **members})
     except DeclarationError as refusal:

@@ -33,14 +33,15 @@ _TYPES = {
     **{"int16": "I16", "int32": "I32", "int64": "I64", "uint16": "U16", "uint32": "U32", "uint64": "U64"},
     **{"float16": "F16", "float32": "F32", "float64": "F64"},
 }
-_LEGACY_TYPES = {  # types of before 2022, when `count` stated the number of registers
+_LEGACY_TYPES = {  # types used before 2022, when `count` stated the number of registers
     "int": {1: "I16", 2: "I32", 4: "I64"},
     "uint": {1: "U16", 2: "U32", 4: "U64"},
     "float": {1: "F16", 2: "F32", 4: "F64"},
 }
 _STRUCTURES = {"h": "I16", "H": "U16", "i": "I32", "I": "U32", "l": "I32", "L": "U32", "q": "I64", "Q": "U64"}
 _STRUCTURES |= {"e": "F16", "f": "F32", "d": "F64"}
-_ENTITY = "name slave device_address address scan_interval"  # keys that each importer's function reads itself
+# keys that the code for each kind of entity reads
+_ENTITY = "name slave device_address address scan_interval"
 _SHOWN = "unique_id device_class lazy_error_count entity_category icon friendly_name hub"
 _SWITCH = key_table(
     carried=f"{_ENTITY} write_type command_on command_off verify", irrelevant=f"{_SHOWN} optimistic"
@@ -66,7 +67,7 @@ VERIFY_KEYS = key_table(carried="address input_type state_on state_off", irrelev
 _DEFAULT_TABLES = {"sensors": "holding", "binary_sensors": "coil"}
 _NOT_READ = ("climates", "covers")
 _LEGACY_KINDS = {"sensor": "sensors", "binary_sensor": "binary_sensors", "switch": "switches"}
-_LEGACY_LISTS = {"registers": "", "inputs": "", "coils": "coil"}  # key of a list: table of its entries
+_LEGACY_LISTS = {"registers": "", "inputs": "", "coils": "coil"}  # the table of a list's entries, by key
 MOST_REPEATED = 1000  # limit of virtual_count
 _DEEPEST = 4  # limit of nested packages
 
@@ -233,7 +234,9 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
 
 
 def _verify(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
-    """Use the switch's state register if it has one; add a gap if on and off are not 1 and 0."""
+    """Take the switch's state from its separate state register, if it has one. Add a sentence to `gaps` if
+    that register's values for on and off are not 1 and 0.
+    """
     on, off = entry.get("command_on", 1), entry.get("command_off", 0)
     verify = entry.get("verify")
     if isinstance(verify, dict):
@@ -277,7 +280,7 @@ def _sensor(device: ImportedDevice, register: ImportedRegister, entry: Mapping[s
 
 
 def _swap(register: ImportedRegister, entry: Mapping[str, Any]) -> str:
-    """Return the byte order stated by `swap`, or by `reverse_order` in files of before 2021."""
+    """Return the byte order that `swap` states, or `reverse_order` in files from before 2021."""
     given = str(entry.get("swap") or "none")
     if given not in _SWAPS:
         register.lacks = f"its swap {given[:40]}"
@@ -290,10 +293,13 @@ def _swap(register: ImportedRegister, entry: Mapping[str, Any]) -> str:
 
 
 def _format(register: ImportedRegister, kind: str, entry: Mapping[str, Any]) -> str | None:
-    """Return the number format of a data type, or None if it has none; add a gap for a doubtful width."""
+    """Return a data type's number format, or None if it has none. Add a sentence to `gaps` if the width is
+    doubtful.
+    """
     registers = whole(entry, "count", 1)
     if kind in _LEGACY_TYPES:
-        if kind == "float" and "count" not in entry:  # int is 16 bits in every version
+        # only for floats, because an int has 16 bits in every version
+        if kind == "float" and "count" not in entry:
             width = "one register was assumed, as Home Assistant did"
             register.gaps.append(f"the width of its type {kind} is not stated; {width}")
         return _LEGACY_TYPES[kind].get(registers)

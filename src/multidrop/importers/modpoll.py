@@ -11,8 +11,8 @@ _TABLES = {
     **{"coil": "coil", "discrete_input": "discrete"},
     **{"holding_register": "holding", "input_register": "input"},
 }
-_ORDERS = {"BE_BE": "", "BE_LE": "CDAB", "LE_BE": "BADC", "LE_LE": "DCBA"}  # by modpoll's BYTES_WORDS
-_CELLS = 7  # cells of a row: its word, name, address, type, access, unit, scale
+_ORDERS = {"BE_BE": "", "BE_LE": "CDAB", "LE_BE": "BADC", "LE_LE": "DCBA"}  # by modpoll's names, BYTES_WORDS
+_CELLS = 7  # limit of a row's cells: keyword, name, address, type, access, unit, scale
 _FLAGS = re.compile(r"bool(8|16)?")
 _STRING = re.compile(r"string([0-9]{1,4})")
 
@@ -36,7 +36,7 @@ def read_modpoll(rows: list[list[str]]) -> list[ImportedDevice]:
                     raise ValueError(f"row {number} has more than {_CELLS} cells")
                 _reference(devices[-1], cells, table, order)
         else:
-            raise ValueError(f"is no table of modpoll: row {number} is {','.join(row)[:40]!r}")
+            raise ValueError(f"is not a modpoll table: row {number} is {','.join(row)[:40]!r}")
     return devices
 
 
@@ -57,7 +57,8 @@ def _reference(device: ImportedDevice, cells: list[str], table: str, order: str)
         device.lose(name, f"which bits {kind} means is not known")
         return
     if text := _STRING.fullmatch(kind):
-        register.details = {"length": (int(text[1]) + 1) // 2}  # the poll's order is not for texts
+        # without a byte order, because that of the poll does not apply to texts
+        register.details = {"length": (int(text[1]) + 1) // 2}
         device.add(register, is_text=True)
         return
     kind = kind.lower()

@@ -19,7 +19,8 @@ _KINDS: Mapping[str, Mapping[str, str]] = {
     "bcd": {"16": "BCD16", "32": "BCD32"},
 }
 _NAMED = {"word": "U16", "dword": "U32", "lword": "U64", "double": "F64", "lreal": "F64", "short": "I16"}
-_NAMED |= {"ushort": "U16", "dint": "I32", "udint": "U32", "lint": "I64", "ulint": "U64"}  # IEC 61131
+# names of IEC 61131
+_NAMED |= {"ushort": "U16", "dint": "I32", "udint": "U32", "lint": "I64", "ulint": "U64"}
 _NAMED |= {"sunssf": "I16", "count": "U16", "pad": "U16", "raw16": "U16"}
 _ANY_WIDTH = {"int": "I", "signed": "I", "uint": "U", "unsigned": "U", "bcd": "BCD"}
 _ANY_WIDTH |= dict.fromkeys(("enum", "bitfield", "bitmap", "hex"), "U")
@@ -37,7 +38,9 @@ def number_format(kind: str) -> str | None:
 
 
 def format_of_width(kind: str, words: int) -> str | None:
-    """Return the number format for `words` 16-bit words of a type without a width; None for other types."""
+    """Return the number format of a type that states no width, for `words` 16-bit words. None for other
+    types.
+    """
     letter = _ANY_WIDTH.get(kind.strip().lower())
     return f"{letter}{16 * words}" if letter and words in (1, 2, *((4,) if letter != "BCD" else ())) else None
 
@@ -47,12 +50,14 @@ def words_of(number: str) -> int:
 
 
 def bits_text(low: int, high: int) -> str:
-    """Return the bits of a part as a family file writes them: 3, or 0-7."""
+    """Return a range of bits as a family file writes it: 3, or 0-7."""
     return str(low) if low == high else f"{low}-{high}"
 
 
 def put_number(details: dict[str, Any], number: str, order: str = "") -> None:
-    """Set the number format and byte order in `details`; `order` is stated for four bytes, such as "CDAB"."""
+    """Set the number format and byte order in `details`. `order` is the byte order of a four-byte number,
+    such as "CDAB".
+    """
     if number != "U16":
         details["number_format"] = number
     if words_of(number) == 1:
@@ -62,7 +67,7 @@ def put_number(details: dict[str, Any], number: str, order: str = "") -> None:
 
 
 def scaled(details: dict[str, Any], step: Any, offset: Any = 0) -> None:
-    """Set step and offset in `details`, unless 1 and 0; ignore a step of 0. Raises ValueError."""
+    """Set step and offset in `details`; omit a step of 1 or 0, and an offset of 0. Raises ValueError."""
     step, offset = number(step, 1, "scale"), number(offset, 0, "offset")
     if step not in (0, 1):
         details["step"] = step
@@ -71,7 +76,9 @@ def scaled(details: dict[str, Any], step: Any, offset: Any = 0) -> None:
 
 
 def number(given: Any, default: float, key: str = "number") -> float:
-    """Return a number, also from text; `default` if `given` is empty. Raises ValueError for other values."""
+    """Return a number, which may be given as text; `default` if `given` is empty. Raises ValueError for other
+    values.
+    """
     if given in (None, ""):
         return default
     text = str(given).strip()
@@ -79,7 +86,7 @@ def number(given: Any, default: float, key: str = "number") -> float:
         text = text.replace(",", ".")
     found = float(text) if _REAL.fullmatch(text) else math.nan
     if not math.isfinite(found):
-        raise ValueError(f"{key} = {str(given)[:40]!r} is no number")
+        raise ValueError(f"{key} = {str(given)[:40]!r} is not a number")
     return int(found) if found == int(found) and abs(found) < 1e15 else found
 
 
@@ -95,7 +102,7 @@ def whole(entry: Mapping[str, Any], key: str, default: int | None = None) -> int
         return default
     text = str(given).strip()
     if isinstance(given, bool) or not isinstance(given, (int, str)) or not _WHOLE.fullmatch(text):
-        raise ValueError(f"{key} = {str(given)[:40]!r} is no whole number")
+        raise ValueError(f"{key} = {str(given)[:40]!r} is not a whole number")
     return int(text, 16) if text[:2].lower() == "0x" else int(text)
 
 

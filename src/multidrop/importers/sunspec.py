@@ -17,9 +17,9 @@ GROUP_KEYS = key_table(
     carried="name label points groups", irrelevant="type count desc detail notes comments standards"
 )
 MODEL_KEYS = key_table(carried="id group", irrelevant="label desc detail notes comments standards")
-MOST_REPEATED = 1000  # most repetitions of a point
+MOST_REPEATED = 1000  # limit of the repetitions of a point
 FIRST = 40000  # assumed start address, because a model's file does not state it
-# Counts that mean "not implemented" (SunSpec information model specification, data types).
+# Raw counts that mean "not implemented" (SunSpec information model specification, data types).
 _INVALID = {
     **{"int16": 0x8000, "uint16": 0xFFFF, "acc16": 0, "enum16": 0xFFFF, "bitfield16": 0xFFFF},
     **{"int32": 0x80000000, "uint32": 0xFFFFFFFF, "acc32": 0, "enum32": 0xFFFFFFFF, "bitfield32": 0xFFFFFFFF},
@@ -44,7 +44,7 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
     device = ImportedDevice(title)
     reason = f"its place in the device is not in its file: {FIRST} is assumed, so mend every `at`"
     device.lose("the model", reason, is_entry=False)
-    names: dict[str, str] = {}  # register names by point name, of points that are scale factors
+    names: dict[str, str] = {}  # for points that are scale factors: the names of their registers
     address = FIRST
     for point in group["points"]:
         size, count = _size(point), whole(point, "count", 1)
@@ -54,7 +54,8 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
                 _add(device, point, name, address + at * size, names)
         address += size * count
     if FIRST < address <= 0x10000:
-        device.readable = range(FIRST, address)  # a model is one block without holes
+        # one read may span any registers of a model, because a model is one block without holes
+        device.readable = range(FIRST, address)
     for register in device.registers:
         _tie(register, names)
     device.lose_keys("the model", document, MODEL_KEYS)
@@ -65,7 +66,9 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
 
 
 def _size(point: Mapping[str, Any]) -> int:
-    """Return a point's number of registers. Raises ValueError without it: later addresses depend on it."""
+    """Return a point's number of registers. Raises ValueError if it is not stated, because the addresses of
+    later points depend on it.
+    """
     try:
         return whole(point, "size")
     except KeyError:
@@ -124,7 +127,9 @@ def _add(
 
 
 def _tie(register: ImportedRegister, names: Mapping[str, str]) -> None:
-    """Set the register's step from the point's scale factor, or name the register that holds the factor."""
+    """Set the register's step, if the point states its scale factor, or else the name of the register with
+    the factor.
+    """
     scale = register.details.pop("scale_register", None)
     if isinstance(scale, int):
         register.details["step"] = 10**scale if 0 <= scale <= 10 else float(f"1e{scale}")

@@ -27,7 +27,7 @@ _REGISTER_STYLE = {
     "coils": "coil",
     "discrete_inputs": "discrete",
 }
-_ORDERS = {  # the plugin uses the four orders of ABCD also for 16 and 64 bits
+_ORDERS = {  # by the plugin's names; an order of four bytes also applies to numbers of 16 and 64 bits
     **dict.fromkeys(("ABCD", "AB", "ABCDEFGH", "MSW", "MSW-BE"), ""),
     **dict.fromkeys(("BADC", "BADCFEHG", "MSW-LE"), "BADC"),
     **dict.fromkeys(("CDAB", "GHEFCDAB", "LSW-BE"), "CDAB"),
@@ -114,7 +114,9 @@ def _lose_settings(device: ImportedDevice, plugin: Mapping[str, Any]) -> None:
 
 
 def _line(plugin: Mapping[str, Any]) -> LineSettings:
-    """Return the line of a plugin's controller, such as file:///dev/ttyUSB0 or tcp://host:port, and mode."""
+    """Return the line settings from a plugin's mode and controller, such as file:///dev/ttyUSB0 or
+    tcp://host:port.
+    """
     controller, mode = str(plugin.get("controller", "")), str(plugin.get("transmission_mode", ""))
     if controller.startswith("tcp://"):
         try:
@@ -224,7 +226,9 @@ def _plain_type(style: str, kind: str, words: int) -> str:
 
 
 def _part(kind: str, field: Mapping[str, Any]) -> tuple[str, str]:
-    """Return which bits of the word a type narrower than 16 bits uses ("" for all), and the number's type."""
+    """Return the bits of the word that a type narrower than 16 bits uses ("" for all), and the number's
+    type.
+    """
     if kind == "BIT":
         return str(whole(field, "bit", 0)), "UINT16"
     if kind in ("INT8L", "UINT8L", "INT8H", "UINT8H"):

@@ -1,7 +1,7 @@
 """Import wb-mqtt-serial's device templates and its configuration from JSON.
 
-Use your own templates, since most published ones are not free to copy. The key tables follow its JSON schemas
-and README.
+Import your own templates, because most published ones may not be copied. The key tables follow its JSON
+schemas and README.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from multidrop.drive.titles import LANGUAGES
+from multidrop.families.files.registers import LONGEST_TITLE
 from multidrop.importers.device import (
     UNKNOWN_LINE,
     ImportedDevice,
@@ -40,7 +42,8 @@ _FORMATS = {
     **{"float": "F32", "double": "F64"},
     **{"bcd8": "BCD16", "bcd16": "BCD16", "bcd24": "BCD32", "bcd32": "BCD32"},
 }
-_WIDTHS = {"u8": 8, "s8": 8, "u24": 24, "s24": 24}  # width of a format narrower than its words
+# width in bits of each format that is narrower than its words
+_WIDTHS = {"u8": 8, "s8": 8, "u24": 24, "s24": 24}
 _TEXTS = {"string": "B", "char8": "B", "string8": ""}  # B: one character per register, in the low byte
 _ORDERS = {"big_endian": False, "little_endian": True}
 _ORDER_OF = {(False, False): "", (True, False): "CDAB", (False, True): "BADC", (True, True): "DCBA"}
@@ -60,8 +63,8 @@ CHANNEL_KEYS = {
 }
 DEVICE_KEYS = key_table(
     carried="name protocol channels parameters subdevices setup max_read_registers title shift stride "
-    "slave_id",
-    irrelevant="response_timeout id enabled groups translations device_type deprecated hw "
+    "slave_id translations",
+    irrelevant="response_timeout id enabled groups device_type deprecated hw "
     "read_rate_limit_ms max_reg_hole max_bit_hole min_read_registers max_write_registers "
     "response_timeout_ms device_timeout_ms password device_max_fail_cycles max_write_fail_time_s "
     "preserve_setup_order enable_wb_continuous_read force_frame_timeout "
@@ -86,7 +89,7 @@ def read_wb(document: Any) -> list[ImportedDevice]:
     """Return a template's device, or a configuration's devices. Raises ValueError for other documents."""
     if not isinstance(document, dict):
         kind = type(document).__name__
-        raise ValueError(f"is no wb-mqtt-serial template and no SunSpec model: it is a {kind}")
+        raise ValueError(f"is neither a wb-mqtt-serial template nor a SunSpec model: it is a {kind}")
     if isinstance(ports := document.get("ports"), list):
         return [device for port in ports for device in _of_port(port)]
     template = document.get("device", document)
@@ -140,7 +143,7 @@ def _device(
     most = template.get("max_read_registers")
     device.together = most if isinstance(most, int) and 1 <= most <= MOST_READ else 0
     shift, stride = whole(template, "shift", 0), whole(template, "stride", 0)
-    _Walk(device, template, "modbus-io" in protocol).add(template, "", shift, stride, 0)
+    _Walk(device, template, "modbus-io" in protocol).add(template, (), shift, stride, 0)
     device.lose_keys("the device", template, DEVICE_KEYS)
     return device
 
@@ -153,29 +156,53 @@ class _Walk:
         self._is_shifted = is_shifted
         self._subdevices: dict[str, Mapping[str, Any]] = {}
         self._unused: set[str] = set()
+        self._words: dict[str, dict[str, str]] = {language: {} for language in LANGUAGES}
         self._declare(template)
 
     def _declare(self, template: Mapping[str, Any]) -> None:
+        given = template.get("translations")
+        translations: dict[str, Any] = given if isinstance(given, dict) else {}
+        for language, words in self._words.items():
+            found = translations.get(language)
+            for text, translation in found.items() if isinstance(found, dict) else ():
+                if isinstance(translation, str) and translation.strip():
+                    words.setdefault(text, translation.strip())
         for each in template.get("subdevices") or ():
             kind = str(each["device_type"])
             self._subdevices[kind] = each["device"]
             self._unused.add(kind)
 
-    def add(self, template: Mapping[str, Any], prefix: str, shift: int, stride: int, depth: int) -> None:
+    def add(
+        self, template: Mapping[str, Any], outer: tuple[str, ...], shift: int, stride: int, depth: int
+    ) -> None:
+        """Add a template's entries; `outer` names the channels that contain it, the outermost first."""
         for key in ("channels", "parameters"):
             for name, entry in _flat(_listed(template.get(key))):
-                with self._device.entry(f"{prefix}{name}"):
-                    self._entry(f"{prefix}{name}", entry, shift, stride, depth)
+                with self._device.entry(" ".join((*outer, name))):
+                    self._entry((*outer, name), entry, shift, stride, depth)
         if template.get("setup"):
             reason = "writes at every start are never sent, for they wear the EEPROM"
             self._device.lose("setup", reason, is_entry=False)
         for kind in sorted(self._unused) if depth == 0 else ():
             self._device.lose(f"subdevice {kind}", "no channel uses it, so its address is not known")
 
-    def _entry(self, name: str, entry: Mapping[str, Any], shift: int, stride: int, depth: int) -> None:
+    def _titles(self, path: tuple[str, ...], entry: Mapping[str, Any]) -> dict[str, str]:
+        """Return the translated titles of an entry by language; `path` ends with its name."""
+        *outer, name = path
+        found = {}
+        for language, words in self._words.items():
+            if own := words.get(name) or words.get(str(entry.get("title"))):
+                found[language] = " ".join([*(words.get(one, one) for one in outer), own])[:LONGEST_TITLE]
+        return found
+
+    def _entry(
+        self, path: tuple[str, ...], entry: Mapping[str, Any], shift: int, stride: int, depth: int
+    ) -> None:
+        name = " ".join(path)
         if "device_type" not in entry and "oneOf" not in entry:
             if {"address", "write_address"} & entry.keys():
-                _add(self._device, name, entry, shift, stride, self._is_shifted)
+                titles = self._titles(path, entry)
+                _add(self._device, name, titles, entry, shift, stride, self._is_shifted)
             elif "consists_of" not in entry:
                 self._device.lose(name, "it has no address")
             return
@@ -193,7 +220,7 @@ class _Walk:
             self._declare(inner)
             self._unused.discard(kind)
             further = shift + whole(entry, "shift", 0)
-            self.add(inner, f"{name} ", further, whole(entry, "stride", 0), depth + 1)
+            self.add(inner, path, further, whole(entry, "stride", 0), depth + 1)
 
 
 def _listed(found: Any) -> list[tuple[str, Any]]:
@@ -216,7 +243,13 @@ def _flat(listed: list[tuple[str, Any]]) -> Iterator[tuple[str, Mapping[str, Any
 
 
 def _add(
-    device: ImportedDevice, name: str, entry: Mapping[str, Any], shift: int, stride: int, is_shifted: bool
+    device: ImportedDevice,
+    name: str,
+    titles: dict[str, str],
+    entry: Mapping[str, Any],
+    shift: int,
+    stride: int,
+    is_shifted: bool,
 ) -> None:
     kind, format = str(entry.get("reg_type", "holding")), str(entry.get("format", "u16"))
     table = _TABLES.get(kind)
@@ -238,6 +271,8 @@ def _add(
     if is_number and format in _TEXTS:
         _text(device, register, format, entry)
         return
+    if titles:
+        register.details["title"] = titles
     if entry.get("units"):
         register.details["unit"] = str(entry["units"])
     register.note_write(is_written=table in ("holding", "coil") and not entry.get("readonly"))
@@ -274,24 +309,26 @@ def _number(
 
 
 def _number_of_bits(register: ImportedRegister, format: str, bits: tuple[int, int] | None) -> tuple[str, str]:
-    """Return the number format, and which bits of it the format or the address selects ("" for all)."""
+    """Return the number format, and the bits of the number that the template's format or address selects (""
+    for all).
+    """
     number = _FORMATS[format]
     own = _WIDTHS.get(format, 16 * words_of(number))
     if bits is None and (own == 16 * words_of(number) or number == "I8"):
         return number, ""
     shift, width = bits or (0, own)
     width = width or own
-    words = -(-max(own, shift + width) // 16)  # as many registers as the bits span
+    words = -(-max(own, shift + width) // 16)  # number of registers that the bits span
     if number[0] not in "UI" or words not in (1, 2, 4):
         register.lacks = f"its bits {shift} to {shift + width - 1} of the format {format}"
         return number, ""
-    sign = number[0] if width == own else "U"  # selected bits are unsigned
+    sign = number[0] if width == own else "U"  # a number that is made of only some bits is unsigned
     part = "" if (shift, width) == (0, 16 * words) else bits_text(shift, shift + width - 1)
     return f"{sign}{16 * words}", part
 
 
 def _invalid(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
-    """Set the raw counts that mean "no value"; for a float the source states them as bit patterns."""
+    """Set the raw counts that mean "no value". For a float, the template states them as bit patterns."""
     number = str(register.details.get("number_format", ""))
     bits = 8 if number == "I8" else 16 * words_of(number)
     found: list[float | str] = []
@@ -333,7 +370,9 @@ def _text(device: ImportedDevice, register: ImportedRegister, format: str, entry
 
 
 def _place(address: Any) -> tuple[int, tuple[int, int] | None]:
-    """Split "register:shift:width" into the address and (shift, width), or None; width 0 means not stated."""
+    """Split "register:shift:width" into the address and the pair (shift, width). The pair is None if it is
+    missing; a width of 0 means that none is stated.
+    """
     register, *bits = str(address).split(":")
     at = whole({"address": register}, "address")
     if not bits:

@@ -12,7 +12,9 @@ MOST_NODES = 50_000  # node limit; an alias counts as all nodes of its expansion
 
 
 class YamlTag(str):
-    """A tagged value as spelt in the file, such as `!secret host`; its real value is not in the file."""
+    """A tagged value as spelt in the file, such as `!secret host`; the value that it stands for is not in
+    the file.
+    """
 
 
 def parse_yaml(text: str) -> Any:
@@ -41,12 +43,12 @@ def parse_yaml(text: str) -> Any:
                 self.count_again(node)
             if self.left < 0:
                 raise ValueError(
-                    f"has more than {MOST_NODES} entries, aliases counted as what they stand for"
+                    f"has more than {MOST_NODES} entries, each alias counted as what it stands for"
                 )
             return node
 
         def count_again(self, node: Any) -> None:
-            """Count the nodes of an alias's expansion, up to the limit."""
+            """Count the nodes of an alias's expansion again, up to the limit."""
             pending = [node]
             while pending and self.left >= 0:
                 self.left -= 1

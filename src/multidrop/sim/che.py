@@ -12,7 +12,7 @@ CONTROL, SETPOINT = 0x1000, 0x2000
 STARTS = range(1, 5)
 FULL = 10_000  # raw setpoint for 100 %
 DEVICE_CODE = 0x0101  # CHE, universal
-_MODBUS_FAULTS = {1: 2, 2: 4, 3: 5, 6: 8, 0x11: 3, 0x12: 6}  # keys: exception codes; values: register 5001H
+_MODBUS_FAULTS = {1: 2, 2: 4, 3: 5, 6: 8, 0x11: 3, 0x12: 6}  # exception code: value of register 5001H
 
 
 def _signed(raw: int) -> int:
@@ -34,7 +34,7 @@ class SimulatedCHE(MotorDrive):
         **MODBUS.codes,
         Reason.VALUE: 0x12,
         Reason.LOCKED: 0x12,
-        Reason.CANNOT: 1,  # according to the manual also for a drive in fault
+        Reason.CANNOT: 1,  # the manual uses this code also for a command during a fault
         Reason.DAMAGED: 0x11,  # manual, section 11.1: a receive error is answered with a fault frame
     }
 
@@ -55,7 +55,7 @@ class SimulatedCHE(MotorDrive):
     def accept(self, cell: MemoryCell, raw: int) -> int:
         if self.now < self._busy_until:
             raise Refusal(Reason.BUSY)
-        if cell.address == SETPOINT:  # the drive accepts negative setpoints; multidrop sends none
+        if cell.address == SETPOINT:  # the drive accepts negative setpoints, but multidrop sends none
             if not -FULL <= _signed(raw) <= FULL:
                 raise Refusal(Reason.VALUE)
             return raw

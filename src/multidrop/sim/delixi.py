@@ -7,7 +7,8 @@ from multidrop.sim.memory import MemoryCell
 from multidrop.sim.motor_drive import MotorDrive
 from multidrop.sim.protocol import COMMAND, SET, STORE, Reason, Refusal
 
-MOST_GAP = 10e-3  # longest gap in s between two bytes; stated only in part 3 of the document
+# longest silence in s within a frame; only the third part of Delixi's document states it
+MOST_GAP = 10e-3
 UNDER_VOLTAGE = 7  # fault number of POFF
 
 BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400)  # indexed by P04.28
@@ -21,9 +22,9 @@ BY_LINE = {RUN_SOURCE: 2, FREQUENCY_SOURCE: 1}
 class SimulatedDelixi(MotorDrive):
     """Delixi in standard Modbus. The manual documents no exceptions: a request that fails gets no reply.
 
-    Assumptions beyond the document: during a fault, or unless P00.00 is 2, a run command is confirmed and has
-    no effect. The setpoint is 0 unless P00.01 is 1. A start ends a jog. The longest gap within a frame is
-    that of part 3.
+    Assumptions beyond the document: during a fault, or unless P00.00 is 2, a run command is confirmed
+    and has no effect. The setpoint is 0 unless P00.01 is 1. A start ends a jog. The longest silence
+    within a frame is the one that the document's third part states for Delixi's own protocol.
     """
 
     functions = (0x03, 0x06)
@@ -60,10 +61,11 @@ class SimulatedDelixi(MotorDrive):
 class SimulatedDelixiNative(MotorDrive):
     """Delixi in its own protocol: replies to writes repeat the request, replies to queries have the value.
 
-    While `locked` is set, writes of parameters are refused with FEH. A start during a fault is refused with
-    F0H. The manual does not say what happens to a run command if P00.00 is not 2; here F0H refuses it. It
-    does not say either how P00.01 affects K = 04; here the setpoint that was written last is used. Faults
-    from 10 on are shown as hex digits that look like the printed decimal number, also in the fault records.
+    While `locked` is set, writes of parameters are refused with FEH. A start during a fault is refused
+    with F0H. The manual does not say what happens to a run command if P00.00 is not 2; here it is
+    refused with F0H. Nor does the manual say how P00.01 affects K = 04; here the setpoint that was
+    written last is used. A fault number, also in the fault records, is sent as hex digits that equal its
+    printed decimal digits.
     """
 
     begins = BY_LINE
@@ -83,7 +85,7 @@ class SimulatedDelixiNative(MotorDrive):
         return super().accept(cell, raw)
 
     def changed(self, cell: MemoryCell) -> None:
-        if cell.name == "stored_frequency":  # the latest written setpoint is used
+        if cell.name == "stored_frequency":  # the setpoint that was written last applies: copy it
             self.memory.set(self.drive.register("frequency"), self["stored_frequency"])
         super().changed(cell)
 
@@ -108,5 +110,5 @@ class SimulatedDelixiNative(MotorDrive):
 
 
 def _printed(fault: int) -> int:
-    """Return the raw count whose hex digits are the fault's decimal digits: fault 10 is 00000010H."""
+    """Return the raw count whose hex digits are the number's decimal digits: fault 10 is 00000010H."""
     return int(str(fault), 16)

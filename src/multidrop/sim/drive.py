@@ -21,8 +21,10 @@ from multidrop.sim.protocol import PROTOCOLS, Reason, Refusal
 from multidrop.sim.receiver import Frame
 
 MOST_REMEMBERED = 10_000  # limit of a drive's recorded writes, to save memory
-_COUNTED_AS = {0x06: 0x03, 0x10: 0x03}  # write function: the read function whose length limit applies to it
-# Longest gap within a frame in s: serial-line guide 2.5.2.1; Delixi, part 3; generous over a network.
+# maps the function code of a write to that of a read with the same length limit
+_COUNTED_AS = {0x06: 0x03, 0x10: 0x03}
+# Longest silence within a frame, in s. Sources: the Modbus serial-line guide, 2.5.2.1; the third part of
+# Delixi's document; for TCP an assumed long time.
 GAPS = {Framing.ASCII: 1.0, Framing.DELIXI: 10e-3, Framing.TCP: 10.0}
 
 
@@ -43,15 +45,18 @@ class DriveCounters:
     replies: int = 0  # refusals included
     refusals: int = 0
     broadcasts: int = 0
-    damaged: int = 0  # damaged frames with this drive's address
-    early: int = 0  # frames that came too soon after a reply
+    damaged: int = 0  # number of damaged frames with this drive's address
+    early: int = 0  # number of frames that came too soon after a reply
     functions: Counter[int] = field(default_factory=Counter)
     eeprom_writes: Counter[str] = field(default_factory=Counter)
     writes: deque[Written] = field(default_factory=lambda: deque(maxlen=MOST_REMEMBERED))
 
 
 def _most_cells(drive: Drive) -> dict[int, int]:
-    """Return how many cells a request may cover, by reading function code; at least the longest register."""
+    """Return the most cells that one request may access, by the function code of reads.
+
+    A register that is longer than the family's limit can still be read whole.
+    """
     most: dict[int, int] = {}
     held = [(register.table, len(register.reach)) for register in drive.registers.values()]
     for table, words in [*held, *((text.table, 1) for text in drive.texts.values())]:
@@ -68,8 +73,9 @@ class SimulatedDrive:
     """
 
     functions: ClassVar[Collection[int] | None] = None  # supported function codes; None: all of the protocol
-    codes: ClassVar[Mapping[Reason, int] | None] = None  # by reason; None: the protocol's exception codes
-    needs_silence: ClassVar[bool] = False  # the manual says that a frame without silence before it is ignored
+    # exception codes by reason; None: those of the protocol
+    codes: ClassVar[Mapping[Reason, int] | None] = None
+    needs_silence: ClassVar[bool] = False  # True: ignore a frame without silence before it
 
     def __init__(self, drive: Drive, *, response_delay: float | None = None) -> None:
         self.drive = drive
@@ -122,7 +128,7 @@ class SimulatedDrive:
         return raw
 
     def _accept_long(self, raws: Mapping[MemoryCell, int]) -> None:
-        """Raise Refusal for a value of several words outside its span, if all its words are written."""
+        """Raise Refusal if a write sets all words of a register to a value outside the register's span."""
         for register in {cell.register for cell in raws if cell.register and cell.register.words > 1}:
             cells = self.memory.of(register)
             if all(cell in raws for cell in cells):
@@ -132,7 +138,7 @@ class SimulatedDrive:
                     raise Refusal(Reason.VALUE)
 
     def changed(self, cell: MemoryCell) -> None:
-        """React to a changed cell, whether it was written over the line or from outside."""
+        """React to a cell that was written over the line, or set by the user of the simulator."""
 
     def wore(self) -> None:
         """React to a write to the EEPROM."""
@@ -142,17 +148,17 @@ class SimulatedDrive:
 
     @property
     def delay(self) -> float:
-        """Seconds from the request's end to the reply's start; at least the silence after an RTU frame."""
+        """The time in s from the request's end to the reply's start: at least the silence after a frame."""
         return max(self.response_delay, self.silence)
 
     @property
     def silence(self) -> float:
-        """Seconds of silence that the drive needs around an RTU frame; text frames need none."""
+        """The silence in s that the drive needs around an RTU frame; text frames need none."""
         return self.drive.needed_silence() if self.drive.framing is Framing.RTU else 0.0
 
     @property
     def most_gap(self) -> float:
-        """Seconds of silence within a frame after which the drive discards its start."""
+        """The silence in s within a frame after which the drive discards the bytes received before."""
         return GAPS.get(self.drive.framing, self.drive.settings.t3_5)
 
     def receive(self, frame: Frame) -> Message | None:
@@ -252,7 +258,10 @@ class SimulatedDrive:
             self.changed(cell)
 
     def wears(self, cell: MemoryCell, function: int, address: int) -> bool:
-        """Return True if a write to this cell may wear the EEPROM: also for a setting of unknown memory."""
+        """Return True if a write to this cell may wear the EEPROM.
+
+        That includes settings whose memory the document does not state, unless they are coils.
+        """
         register = cell.register
         if register is None or (function, address) in self.memory.aliases:
             return False
@@ -262,12 +271,12 @@ class SimulatedDrive:
 
 
 def encoded(address: int, table: Table, register_address: int) -> int:
-    """Return an EncodedDrive's count, made of drive, table and register address; a coil is its lowest bit."""
+    """Return an EncodedDrive's raw count at these addresses in this table; a coil has its lowest bit."""
     return (address * 257 + register_address * 31 + (table.read or table.write or 0)) & 0x7FFF
 
 
 def proof(drive: Drive, register: Register[Any]) -> float:
-    """Return the register's value on an EncodedDrive as a row shows it; NaN if the count means "no value"."""
+    """Return the value that an EncodedDrive returns for this register; NaN for "no value"."""
     if register in drive.known_counts():
         return register.coding.value_of(_known(drive, register))
     size = 2 if register.table.carrier is Carrier.WORD else 4
@@ -284,7 +293,7 @@ def _known(drive: Drive, register: Register[Any]) -> int:
 
 
 class EncodedDrive(SimulatedDrive):
-    """A drive whose raw counts identify drive, table and register: see `encoded`.
+    """A drive whose raw counts depend on its address, the table and the register: see `encoded`.
 
     Writes are confirmed but change no count.
     """

@@ -25,7 +25,8 @@ class SimulatedERMAN(MotorDrive):
     """
 
     functions = (0x01, 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F, 0x10)
-    codes = {  # 03 for a wrong address: all examples have it, contrary to section 5's table
+    # All examples in the manual have 03 for an invalid address; the table in section 5 has another code.
+    codes = {
         Reason.FUNCTION: 1,
         Reason.READ_ADDRESS: 3,
         Reason.WRITE_ADDRESS: 3,
@@ -37,7 +38,7 @@ class SimulatedERMAN(MotorDrive):
         self.memory.make_writable(COIL, COILS)
 
     def takes_broadcast(self, request: Message) -> bool:
-        return True  # section 6 says that address 0 is the broadcast, without restrictions
+        return True  # section 6 allows every request to address 0
 
     def _start(self, on: int) -> None:
         if not on:
@@ -73,5 +74,5 @@ class SimulatedERMAN(MotorDrive):
     }
     shows = {
         "status": _state,
-        "last_fault": lambda self: self.motor.fault_record(1),  # a reset does not clear it
+        "last_fault": lambda self: self.motor.fault_record(1),  # not cleared by a reset
     }

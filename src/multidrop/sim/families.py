@@ -57,6 +57,11 @@ FAMILIES: Mapping[type[Drive], type[SimulatedDrive]] = {
 
 
 def simulated(drive: Drive, *, response_delay: float | None = None) -> SimulatedDrive:
-    """Return a simulation of the drive: for a user's class or family file, of the general class."""
+    """Return a simulation of the drive; for a user's class or family file, a plain SimulatedDrive.
+
+    Raises TypeError for a family instead of a drive.
+    """
+    if isinstance(drive, type):
+        raise TypeError(f"{drive.__name__} is a family, not a drive: write {drive.__name__}(1) for address 1")
     kinds = (kind for family, kind in FAMILIES.items() if isinstance(drive, family))
     return next(kinds, SimulatedDrive)(drive, response_delay=response_delay)

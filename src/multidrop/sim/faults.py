@@ -11,7 +11,7 @@ from typing import Any
 from multidrop.toml_check import Key, TomlPlace, duration_of, read_document
 
 MOST_BURST = 4096
-RATE, DURATION, WHOLE = (int, float), str, int  # types of the file's values
+RATE, DURATION, WHOLE = (int, float), str, int  # types of the values in a fault file
 
 
 def _rate(means: str, example: str = "0.01") -> Any:
@@ -56,8 +56,8 @@ class DriveFaults:
 class Faults:
     """Rates of a simulated line's faults, and the faults of its drives by name.
 
-    At most one of `drop`, `flip` and `repeat` happens to a frame, so that each of the three checksums detects
-    it. A reply later than its family's response timeout cannot be distinguished from the reply to the next
+    At most one of `drop`, `flip` and `repeat` happens to a frame. So the checksum of every framing detects
+    the fault. A reply that comes after its family's response timeout looks like the reply to the next
     identical request.
     """
 
@@ -97,7 +97,8 @@ def _keys(kind: type) -> dict[str, Key]:
 
 
 def _help(kind: type) -> str:
-    lines = zip(_keys(kind).values(), fields(kind), strict=False)  # without the field `drives`
+    # zip ends before the field `drives`, which has no key
+    lines = zip(_keys(kind).values(), fields(kind), strict=False)
     return "".join(f"  {key.example:<20}{one.metadata['means']}\n" for key, one in lines)
 
 
@@ -109,9 +110,10 @@ HELP = (
 
 
 def load_faults(path: Path | str, drives: Collection[str] | None = None) -> Faults:
-    """Read faults from a TOML file; its tables may name only these `drives`, or any if None.
+    """Read faults from a TOML file.
 
-    Raises ValueError that lists all mistakes in the file.
+    The file's tables may name only these `drives`; None allows any name. Raises ValueError with all mistakes
+    in the file.
     """
     path = Path(path)
     place = TomlPlace(path)

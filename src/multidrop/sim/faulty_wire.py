@@ -24,13 +24,14 @@ DAMAGES: Mapping[str, Callable[[bytes, int, int], bytes]] = {
     "flip": lambda frame, at, bit: frame[:at] + bytes([frame[at] ^ 1 << bit]) + frame[at + 1 :],
     "repeat": lambda frame, at, bit: frame[: at + 1] + frame[at:],
 }
-DRIFT_S = 20.0  # s, period of a drifting load
+DRIFT_S = 20.0  # period of a drifting load, in s
 
 
 class FaultyWire(Wire):
     """A wire with `faults`, which may be changed at any time; `struck` counts the faults that occurred.
 
-    To hang up, the port must be a link or a TCP port: a bare pty cannot be reopened under its name.
+    The fault `hang_up` removes the port. It needs a link to a pty or a TCP port, because a bare pty cannot be
+    reopened under its name.
     """
 
     def __init__(
@@ -44,19 +45,25 @@ class FaultyWire(Wire):
     ) -> None:
         super().__init__(drives, name=name, port=port, unpaced=unpaced)
         if faults.hang_up and port == "pty":
-            raise ValueError(f"{name}: a port that hangs up must be a link or a TCP port, to come back there")
+            raise ValueError(
+                f"{name}: a port that hangs up must be a link or a TCP port, so that it can come back under "
+                f"its name"
+            )
         self._by_name = {sim.drive.name: sim for sim in drives}
         for drive, own in faults.drives.items():
             sim = self._by_name.get(drive)
             if sim and (own.trip or own.drift) and not isinstance(sim, MotorDrive):
-                raise ValueError(f"{name}: {drive} has no simulated motor: remove its trip and drift")
+                raise ValueError(
+                    f"{name}: {drive} has no simulated motor, so it takes no trip and no drift: remove them"
+                )
         self.faults = faults
         self.struck: Counter[str] = Counter()
         self._random = random.Random(f"{faults.seed} {name}")
         self._stray: list[Transmission] = []  # noise and echoes in transmission to the client
-        self._held: Transmission | None = None  # a reply held back until the next reply
-        self._back_at: float | None = None  # time at which the removed port returns; None: present
-        self._due: dict[tuple[str, str], float] = {}  # time of the next silence or trip, by drive and event
+        self._held: Transmission | None = None  # a reply that is delayed until the next reply
+        # time at which the removed port returns; None while the port is there
+        self._back_at: float | None = None
+        self._due: dict[tuple[str, str], float] = {}  # (drive, event): time of its next silence or trip
         self._loads: dict[str, float] = {}  # mean load of each drive whose load drifts
 
     def _strikes(self, fault: str, of: Faults | DriveFaults | None = None) -> bool:
@@ -67,7 +74,7 @@ class FaultyWire(Wire):
         return True
 
     def _damaged(self, frame: bytes) -> bytes:
-        """Return the frame, perhaps with one fault: more than one might escape a checksum."""
+        """Return the frame with at most one fault, because a checksum might miss several faults."""
         for fault, damage in DAMAGES.items():
             if self._strikes(fault):
                 return damage(frame, self._random.randrange(len(frame)), self._random.randrange(8))
@@ -91,7 +98,7 @@ class FaultyWire(Wire):
         super().receive(self._damaged(chunk), now, baudrate)
 
     def _pass_time(self, sim: SimulatedDrive, faults: DriveFaults, now: float) -> None:
-        """Silence the drive, trip its motor and change its load, as its faults state."""
+        """Silence the drive, trip its motor and change its load if its `faults` are due."""
         name = sim.drive.name
         if self._is_due(name, "silence", faults, now):
             sim.deaf_until = max(sim.deaf_until, now + faults.silent_for)
@@ -197,14 +204,15 @@ class FaultyWire(Wire):
         return min(times, default=None)
 
     def _hang_up(self, now: float) -> None:
-        self.where = self.path  # reopen a TCP port under the same number
-        self._name = os.path.realpath(self.path)  # the pty's own name, behind the link
+        self.where = self.path  # so that a TCP port is reopened under the same number
+        self._name = os.path.realpath(self.path)  # the name of the pty to which the link leads
         self.close()
         self._back_at = now + self._up_to(self.faults.away)
 
     def _come_back(self) -> None:
         self._back_at = None
-        taken = _ptys_up_to(self._name) if self._strikes("rename") else []  # forces another pty name
+        # ptys that occupy the former name, so that the new pty gets another name
+        taken = _ptys_up_to(self._name) if self._strikes("rename") else []
         try:
             self.open()
         finally:
@@ -213,7 +221,7 @@ class FaultyWire(Wire):
 
 
 def _ptys_up_to(name: str) -> list[int]:
-    """Open ptys until this name is taken (new ones get the lowest free number); return their descriptors."""
+    """Open ptys until one has this name; return their descriptors. A new pty gets the lowest free number."""
     taken: list[int] = []
     while name.startswith("/dev/pts/"):
         taken += os.openpty()
@@ -223,7 +231,7 @@ def _ptys_up_to(name: str) -> list[int]:
 
 
 def overload_code(drive: Drive) -> int:
-    """Return the family's fault code for an overload, or of its first named fault, or 1."""
+    """Return the family's fault code for an overload, or else that of its first named fault, or else 1."""
     for name in ("fault", "last_fault", "fault_record_1"):
         register = drive.registers.get(name)
         if register is not None and register.values is not None:

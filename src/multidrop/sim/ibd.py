@@ -13,7 +13,7 @@ BY_PARAMETER, BY_LINE, RUN_BY_LINE = 0, 5, 2
 STOP, RUN, JOG = 1, 2, 3  # values of bits 1 and 0 of 2000H
 ALWAYS_SEEN = 1 << 11 | 1 << 12  # bits of PrA.22 that are set in the manual's example
 LARGEST = {107: 36000, 108: 36000}  # assumed maxima of Prb.07 and Prb.08; the manual states none
-OUTPUTS = {323: 1 << 8, 324: 1 << 9, 325: 1 << 10, 328: 1 << 13}  # Prd.23, .24, .25, .28: bit of PrA.22
+OUTPUTS = {323: 1 << 8, 324: 1 << 9, 325: 1 << 10, 328: 1 << 13}  # Prd.nn: the output's bit in PrA.22
 RUNNING, FAULT, ACCELERATING, DECELERATING = 1, 3, 7, 8  # output functions, as set in Prd.23 to .28
 BAUDRATES = (4800, 9600, 19200, 38400)
 FORMATS = ("8N1", "8E1", "8O1")
@@ -31,7 +31,7 @@ class SimulatedIBD(MotorDrive):
     """
 
     functions = (0x03, 0x06)
-    needs_silence = True  # table "message in RTU mode"
+    needs_silence = True  # according to the manual's table "message in RTU mode"
     codes = {}
     begins = {
         FREQUENCY_SOURCE: BY_LINE,
@@ -59,7 +59,10 @@ class SimulatedIBD(MotorDrive):
         return self.word(source) / 100 if source is not None else 0.0
 
     def _control(self, bits: int) -> None:
-        """Carry out a control word. The manual is ambiguous; here BIT3 and BIT2 form one number."""
+        """Carry out a control word.
+
+        The manual is ambiguous about BIT3 and BIT2; here they form one number.
+        """
         if bits & 0x10:
             self.motor.reset()
         action = bits & 0x03

@@ -19,7 +19,8 @@ from multidrop.drive.number_format import arranged, bits_of
 from multidrop.drive.register import Access, Carrier, Register, Table
 from multidrop.drive.text import Text
 
-_ALSO_WRITES = {0x05: 0x0F, 0x06: 0x10}  # function that writes one cell: function that writes several
+# maps a function code that writes one cell to the code that writes several cells
+_ALSO_WRITES = {0x05: 0x0F, 0x06: 0x10}
 _DELIXI_ALSO_WRITES = {0x05: 0x06, 0x06: 0x05}  # 05 writes to RAM, 06 to EEPROM
 _DELIXI_STORES = 0x06
 _MASKS = {Carrier.BIT: 0x1, Carrier.WORD: 0xFFFF, Carrier.NUMBER: 0xFFFF, Carrier.LONG: 0xFFFF_FFFF}
@@ -46,11 +47,13 @@ class Memory:
     def __init__(self, drive: type[Drive], framing: Framing) -> None:
         self._framing = framing
         self._also = _DELIXI_ALSO_WRITES if framing is Framing.DELIXI else _ALSO_WRITES
-        self._cells: dict[tuple[object, int], MemoryCell] = {}  # tables read by the same function share cells
-        self._read: dict[tuple[int, int], MemoryCell | None] = {}  # None: unreadable, even in a gap
+        # cells by read function (tables with the same read function share cells) and address
+        self._cells: dict[tuple[object, int], MemoryCell] = {}
+        # cells by function and address; None: unreadable, also as part of a longer read
+        self._read: dict[tuple[int, int], MemoryCell | None] = {}
         self._gaps = [(table.read, table, addresses) for table, addresses in drive.readable_gaps.items()]
         self._written: dict[tuple[int, int], MemoryCell] = {}
-        self.aliases: set[tuple[int, int]] = set()  # (function, address): writes there spare the EEPROM
+        self.aliases: set[tuple[int, int]] = set()  # (function, address) of writes that do not wear EEPROM
         for register in drive.registers.values():
             self.declare(register)
         for text in drive.texts.values():
@@ -71,7 +74,8 @@ class Memory:
             if _is_better(register, cell.register):
                 cell.register = register
             if table.read is not None and register.access is Access.COMMAND:
-                self._read.setdefault((table.read, cell.address), None)  # unless declared readable
+                # mark the address as unreadable, unless another register makes it readable
+                self._read.setdefault((table.read, cell.address), None)
             elif table.read is not None:
                 self._read[table.read, cell.address] = cell
             if register.access is Access.READING:
@@ -183,7 +187,10 @@ def _space(table: Table) -> object:
 
 
 def _is_better(register: Register[Any], known: Register[Any] | None) -> bool:
-    """Return True if a cell's `register` should replace `known`: writable ones first, then whole words."""
+    """Return True if `register` should replace `known` in a cell.
+
+    Writable registers take precedence, then registers that use whole words.
+    """
     if known is None or register.access is not Access.READING:
         return True
     return known.part is not None and register.part is None
@@ -202,7 +209,7 @@ def _no_value(register: Register[Any]) -> tuple[int, int]:
         return pattern, mask
     if register.is_float:
         return bits_of(math.nan, register.number_format), register.coding.mask
-    raise ValueError(f"{register.name} has no count that means no value")
+    raise ValueError(f"{register.name} has no raw count that stands for a missing value")
 
 
 def pack(table: Table, raw: int) -> bytes:

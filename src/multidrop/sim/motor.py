@@ -1,7 +1,7 @@
 """A simulated motor and its power stage: ramps, voltage and current, temperature, faults.
 
-Only physics: no registers, and time is an argument. Only `run` and `jog` start the motor, and not during a
-fault.
+The model has no registers, and gets the time as an argument. Only `run` and `jog` start the motor, and not
+during a fault.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ MAGNETISING = 0.3  # no-load current as a fraction of the rated current
 ACCELERATING_TORQUE = 0.5  # fraction of the rated torque, added to the load while accelerating
 BRAKING_TORQUE = 0.3
 SLIP = 0.04  # slip at rated torque
-HEATING = 35.0  # heatsink's K above ambient at rated current
-WARMING_TIME = 120.0  # s, thermal time constant
-RUN_OUT_TIME = 10.0  # s for which the shaft coasts from the rated frequency to rest
+HEATING = 35.0  # heatsink temperature above ambient at rated current, in K
+WARMING_TIME = 120.0  # thermal time constant in s
+RUN_OUT_TIME = 10.0  # time in s in which the shaft coasts from the rated frequency to rest
 REGENERATION = 0.06  # relative rise of the DC bus voltage while braking
 SAG = 0.02  # relative fall of the DC bus voltage at rated current
 
@@ -35,7 +35,7 @@ class Rating:
     """The nameplate data of a motor."""
 
     frequency: float = 50.0  # Hz
-    voltage: float = 400.0  # V; the mains have the same voltage
+    voltage: float = 400.0  # rated voltage in V; the mains have the same voltage
     current: float = 5.0  # A
     power: float = 2.2  # kW
     torque: float = 14.6  # Nm
@@ -49,15 +49,15 @@ class Motor:
     time. The ramp times, in s, are those from 0 to the maximum frequency, and back to 0.
     """
 
-    def __init__(self, rating: Rating | None = None, *, now: float = 0.0) -> None:
+    def __init__(self, rating: Rating | None = None) -> None:
         self.rating = rating or Rating()
-        self.now = now
-        self.target = 0.0  # Hz; negative: against `direction`
+        self.now = 0.0
+        self.target = 0.0  # in Hz; a negative target reverses `direction`
         self.jog_frequency = 5.0
         self.maximum_frequency = self.rating.frequency
         self.acceleration_time = 10.0
         self.deceleration_time = 10.0
-        self.load = 0.4  # load as a fraction of the rated torque
+        self.load = 0.4  # torque of the load as a fraction of the rated torque
         self.ambient = 25.0  # degrees Celsius
         self.direction = 1  # 1 forward, -1 reverse
         self.frequency = 0.0  # output frequency in Hz, negative in reverse
@@ -98,7 +98,7 @@ class Motor:
         self._brakes = self.energised = True
 
     def coast(self) -> None:
-        """Switch the voltage off and let the shaft run out."""
+        """Switch the voltage off; the shaft coasts to rest."""
         self._goal = 0.0
         self._brakes = False
         self.frequency = 0.0
@@ -140,7 +140,7 @@ class Motor:
             self.energised = False
 
     def _approach(self, goal: float, ramp_time: float, seconds: float) -> float:
-        """Ramp towards `goal` for at most `seconds`; return the unused seconds."""
+        """Ramp towards `goal` for at most `seconds`; return the seconds that remain once it is reached."""
         distance = abs(goal - self.frequency)
         needed = distance * ramp_time / self.maximum_frequency
         if needed <= seconds:
@@ -203,7 +203,7 @@ class Motor:
         return abs(self.shaft) * 60 / self.rating.pole_pairs * (1 - SLIP * max(self.torque, 0.0))
 
 
-# Functions that compute monitor values, by register name.
+# Maps the name of a monitor register to the function that computes its value.
 MONITORS: Mapping[str, Callable[[Motor], float]] = {
     "output_frequency": lambda motor: abs(motor.frequency),
     "reference_frequency": lambda motor: abs(motor.target),

@@ -17,7 +17,7 @@ from multidrop.sim.memory import MemoryCell
 from multidrop.sim.motor import MONITORS, RATED, Motor, Rating
 from multidrop.sim.protocol import Reason, Refusal
 
-COMMANDS: Mapping[str, Callable[[Motor], None]] = {  # actions by name of a control word
+COMMANDS: Mapping[str, Callable[[Motor], None]] = {  # maps the name of a control word to its action
     "FORWARD": lambda motor: motor.run(1),
     "REVERSE": lambda motor: motor.run(-1),
     "JOG_FORWARD": lambda motor: motor.jog(1),
@@ -34,8 +34,10 @@ class MotorDrive(SimulatedDrive):
     """A simulated drive with a motor. A monitor register set by `drive[name] = value` keeps that value."""
 
     obeys: ClassVar[Mapping[str, Callable[[Any, int], None]]] = {}
-    shows: ClassVar[Mapping[str, Callable[[Any], int]]] = {}  # by register: function for its raw count
-    begins: ClassVar[Mapping[int, int]] = {}  # initial raw counts, by address of holding registers
+    shows: ClassVar[
+        Mapping[str, Callable[[Any], int]]
+    ] = {}  # maps a register's name to a function that returns its raw count
+    begins: ClassVar[Mapping[int, int]] = {}  # address of holding register: raw count at power-up
 
     def __init__(
         self, drive: Drive, *, response_delay: float | None = None, rating: Rating | None = None
@@ -90,7 +92,7 @@ class MotorDrive(SimulatedDrive):
         return float(self.memory.get(register))
 
     def run_or_stop(self, action: int, direction: int | None) -> None:
-        """Carry out the action of a control word, numbered as usual: 0 none, 1 stop, 2 run, 3 jog."""
+        """Carry out the action of a control word: 0 none, 1 stop, 2 run, 3 jog."""
         if action == 1:
             self.motor.stop()
         elif action == 2:
@@ -169,7 +171,7 @@ class ProfileDrive(MotorDrive):
             self.memory.set(register, self.memory.get(self.drive.register("reference")))
 
     def rises(self, word: int, bits: int) -> bool:
-        """Return True if this word sets one of the bits, and the previous word had none of them set."""
+        """Return True if this control word sets one of the bits, and the previous one set none of them."""
         return bool(word & bits) and not self.word_before & bits
 
     def power_cycle(self) -> None:

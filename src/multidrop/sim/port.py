@@ -11,8 +11,7 @@ from urllib.parse import urlsplit
 from multidrop.control.eeprom_ledger import default_path
 from multidrop.core import get_settings, set_settings
 from multidrop.drive.line_settings import Settings
-from multidrop.transport.port_identity import of_address
-from multidrop.transport.simulated_ports import SimulatedPort, is_simulated
+from multidrop.transport.port_identity import SimulatedPort, is_simulated, of_address
 
 MOST_READ = 4096
 
@@ -28,8 +27,8 @@ def is_dead_link(link: Path) -> bool:
 class PtyPort:
     """A pty whose other end a client opens by its path.
 
-    A descriptor of the client's end stays open here, so that the pty outlives its clients. Of a client's
-    settings only the baud rate has an effect: a pty stores no parity.
+    This object keeps the client's end open, so that the pty outlives its clients. Of a client's settings,
+    only the baud rate has an effect: a pty stores no parity.
     """
 
     def __init__(self, settings: Settings, link: Path | None) -> None:
@@ -63,7 +62,9 @@ class PtyPort:
             return b""
 
     def write(self, data: bytes) -> None:
-        with contextlib.suppress(BlockingIOError):  # if no client reads, bytes are lost, as on a real line
+        with contextlib.suppress(
+            BlockingIOError
+        ):  # without a reading client, bytes are lost, as on a real line
             os.write(self._master, data)
 
     def baudrate(self) -> int | None:
@@ -134,7 +135,7 @@ class TCPPort:
         self._listener.close()
 
 
-SimulatedEnd = PtyPort | TCPPort  # non-blocking ends
+SimulatedEnd = PtyPort | TCPPort  # both are non-blocking
 
 
 def open_port(where: str, settings: Settings) -> SimulatedEnd:

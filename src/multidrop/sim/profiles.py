@@ -24,7 +24,6 @@ from multidrop.sim.motor import Phase
 from multidrop.sim.motor_drive import COMMANDS, ProfileDrive
 from multidrop.sim.protocol import Reason, Refusal
 
-_NO_OFF = ProfidriveControl.NO_OFF2 | ProfidriveControl.NO_OFF3
 _RUN = (
     ProfidriveControl.ENABLE_OPERATION
     | ProfidriveControl.ENABLE_RAMP
@@ -34,7 +33,9 @@ _RUN = (
 
 
 class SimulatedProfidrive(ProfileDrive):
-    """PROFIdrive: inhibited after power-up, a trip, OFF2 or OFF3, until a word has only OFF1 active.
+    """PROFIdrive. After power-up, a trip, OFF2 or OFF3, switching on is inhibited.
+
+    A control word in which OFF1 is active, but not OFF2 or OFF3, allows it again.
 
     `off2` and `off3` are commands from another source, such as a terminal. In local control, or if the word's
     remote bit is 0, only the OFF bits have an effect. A word that clears bit 3 lets the motor coast. The
@@ -114,11 +115,11 @@ _STATES = {DISABLED: 0x40, READY: 0x21, SWITCHED_ON: 0x23, ENABLED: 0x27}
 
 
 class SimulatedCiA402(ProfileDrive):
-    """CiA 402: a word moves at most one state up; "disable voltage" and a trip lead to the lowest state.
+    """CiA 402. A control word moves up one state at most; "disable voltage" and a trip lead to the lowest.
 
-    With the standard's factory settings, as here, "shutdown" coasts and "disable operation" ramps down. A
-    drive in local control ignores all words. `stays_off` prevents switching on, as missing mains voltage
-    does.
+    The factory settings are the standard's: "shutdown" coasts, and "disable operation" ramps down.
+    A drive in local control ignores all words. `stays_off` prevents switching on, as missing mains
+    voltage does.
     """
 
     stays_off = False
@@ -218,10 +219,10 @@ EXTERNAL_FAULT = 49  # fault code of EF, an external fault
 
 
 class SimulatedDelta(ProfileDrive):
-    """Delta: a run command during a fault is ignored. While the reset bit is set, it resets every fault.
+    """Delta: a run command during a fault is ignored. While the reset bit is set, every fault is reset.
 
-    The manuals do not mention that effect of the bit; it is simulated to detect a client that leaves the bit
-    set.
+    The manuals do not say that the bit has a lasting effect. The simulation assumes it, so that tests detect
+    a client that leaves the bit set.
     """
 
     def pass_time(self, now: float) -> None:
@@ -257,7 +258,7 @@ _STARTS = (InvtControl.FORWARD, InvtControl.REVERSE, InvtControl.JOG_FORWARD, In
 
 
 class SimulatedInvt(ProfileDrive):
-    """INVT: a start during a fault is refused. If `jog_needs_own_stop`, a normal stop ends no jog."""
+    """INVT: a start during a fault is refused. If `jog_needs_own_stop`, a normal stop does not end a jog."""
 
     jog_needs_own_stop = False
     _jogs = False
@@ -306,7 +307,7 @@ class SimulatedInovance(SimulatedInvt):
 
 
 class SimulatedYaskawa(ProfileDrive):
-    """Yaskawa: the motor runs while a run bit is set, also right after a reset.
+    """Yaskawa: the motor runs while a run bit is set, even immediately after a reset.
 
     A read of more than `most_answered` registers is refused with exception 03, as on an A1000.
     """
@@ -346,7 +347,7 @@ class SimulatedYaskawa(ProfileDrive):
 
 
 class SimulatedOptidrive(ProfileDrive):
-    """Optidrive E3: the motor runs while bit 0 is set and digital input 1 is on, also right after a reset.
+    """Optidrive E3: the motor runs while bit 0 is set and digital input 1 is on, even after a reset.
 
     `is_enabled` is that input. With `is_first_reading`, register 6 has the layout of the first guide: the
     fault code in the low byte, the state in the high byte.

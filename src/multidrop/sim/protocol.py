@@ -1,7 +1,7 @@
 """Carry out the function codes of a protocol on a simulated drive.
 
-The protocols are Modbus (application protocol V1.1b3) and Delixi's own (RS-485 communication protocol, part
-3).
+The protocols are Modbus (application protocol V1.1b3) and Delixi's own (the third part of Delixi's document
+"RS-485 communication protocol").
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ NO_DATA = bytes(4)  # unused D3..D0
 
 
 class Reason(Enum):
-    """A reason to refuse a request. A family has its own exception code for it, or does not reply."""
+    """A reason to refuse a request. Each family has an exception code for the reason, or does not reply."""
 
     FUNCTION = "no such function"
     READ_ADDRESS = "nothing to be read there"
@@ -93,7 +93,8 @@ def _write_coils(sim: SimulatedDrive, request: Message) -> Message:
 
 
 def _write_several(sim: SimulatedDrive, request: Message, raws: list[int]) -> Message:
-    sim.check_count({0x0F: 0x01, 0x10: 0x03}[request.function], request.count)  # limited as reads are
+    # writes have the same length limit as reads
+    sim.check_count({0x0F: 0x01, 0x10: 0x03}[request.function], request.count)
     sim.write(request.function, request.start, raws)
     return Message(request.address, request.function, request.start, request.count)
 

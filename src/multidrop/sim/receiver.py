@@ -1,7 +1,7 @@
-"""Split received bytes into requests, as a drive does. The input is bytes with times, the output frames.
+"""Split received bytes into requests, as a drive does. The input is bytes with times; the output is frames.
 
-Invalid bytes affect only the frames that they damage. Buffers are bounded. Silence ends an RTU frame, so a
-request is damaged if other bytes follow it without a pause, unless these bytes start another request.
+Invalid bytes affect only the frames that they damage. Buffers are bounded. Silence ends an RTU frame, so
+bytes that follow a request without a pause damage it, unless they start another request.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class Frame:
     body: bytes
     message: Message | None
     intact: bool
-    begin: float  # s, time of the first bit
-    end: float  # s, time of the last bit
+    begin: float  # time of the first bit, in s
+    end: float  # time of the last bit, in s
     transaction: int = 0  # transaction id of a Modbus TCP frame
 
     @property
@@ -45,7 +45,8 @@ class Frame:
 class Receiver:
     """Receives frames of one framing and baud rate. A silence of `most_gap` s ends a frame.
 
-    `character` is the duration of a character in s, or 0 if the line has no timing.
+    `character` is the transmission time of a character in s; 0 on a line that is simulated without
+    timing.
     """
 
     def __init__(self, framing: Framing, character: float, most_gap: float) -> None:
@@ -53,7 +54,7 @@ class Receiver:
         self.character = character
         self.most_gap = most_gap
         self._buffer = bytearray()
-        self._end = float("-inf")  # s, time of the last received bit
+        self._end = float("-inf")  # time of the last received bit, in s
         cuts = {Framing.RTU: self._cut_rtu, Framing.TCP: self._cut_tcp}
         self._cut = cuts.get(framing, self._cut_text)
 
@@ -63,7 +64,10 @@ class Receiver:
         return self._end + self.most_gap if self._buffer else None
 
     def feed(self, chunk: bytes, now: float) -> list[Frame]:
-        """Return the frames that this chunk completes. Its first bit came at `now` s or later."""
+        """Return the frames that this chunk completes.
+
+        The chunk's first bit starts at `now` s, or after the previous chunk's last bit if that is later.
+        """
         frames = self.silence(now)
         self._end = max(now, self._end) + len(chunk) * self.character
         self._buffer += chunk
@@ -72,14 +76,14 @@ class Receiver:
         return frames
 
     def silence(self, now: float) -> list[Frame]:
-        """Return the frame that silence until `now` has ended, if any: not a valid request."""
+        """Return [frame] if the silence until `now` has ended a frame without a valid request; else []."""
         if not self._buffer or now < self._end + self.most_gap:
             return []
         rest = bytes(self._buffer)
         self._buffer.clear()
         if self.framing is not Framing.RTU or not LEAST_RTU <= len(rest) <= MOST_RTU:
             return []
-        if _first_request(rest) is not None:  # a valid request followed by other bytes: ignored
+        if _first_request(rest) is not None:  # ignore a valid request that other bytes followed
             return []
         intact = crc16(rest[:-2], len(rest) - 2) == int.from_bytes(rest[-2:], "little")
         return [self._frame(rest[:-2], None, intact, 0, len(rest))]
@@ -93,7 +97,11 @@ class Receiver:
         return Frame(body, message, intact, end - length * self.character, end)
 
     def _cut_rtu(self) -> Frame | None:
-        """Return the next request; None if there is none, or while bytes after it may become a request."""
+        """Return the next request; None if there is none yet.
+
+        Other bytes that follow a request damage it, unless they start another request. While too few of these
+        bytes have arrived to decide, return None.
+        """
         data = bytes(self._buffer[-MOST_RTU:])
         while (found := _first_request(data)) is not None:
             at, used, message = found
@@ -156,8 +164,8 @@ class Receiver:
 def _first_request(data: bytes) -> tuple[int, int, Message] | None:
     """Return index, length and message of the first valid request in `data`; None if there is none.
 
-    If an earlier byte may start a request that is still incomplete, a later request counts only if it ends at
-    the end of `data`.
+    Valid bytes may lie inside a longer request that is still incomplete. While an earlier byte may be the
+    start of such a request, return only a request that ends at the end of `data`.
     """
     pending = False
     for at, code in enumerate(data[1:]):

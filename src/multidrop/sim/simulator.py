@@ -41,13 +41,14 @@ class Simulator:
         self._is_over = False
         self._is_open = False
         self._wakes: list[tuple[float, int]] = []  # heap of (time, number of the wire)
-        self._planned: dict[int, float] = {}  # valid wake-up by wire; other heap entries are outdated
-        self._attended: dict[int, tuple[SimulatedEnd, int]] = {}  # by wire, the registered port
+        # Maps each wire's number to its next wake-up. Other times in the heap are outdated.
+        self._planned: dict[int, float] = {}
+        self._attended: dict[int, tuple[SimulatedEnd, int]] = {}  # the port registered for each wire
 
     def __enter__(self) -> Self:
         try:
             self._start()
-        except BaseException:  # __exit__ is not called if __enter__ fails
+        except BaseException:  # Python does not call __exit__ if __enter__ fails
             self._end()
             raise
         return self
@@ -99,7 +100,7 @@ class Simulator:
             raise
 
     def forked(self) -> None:
-        """Give a forked child its own wake-up sockets, so that it cannot interrupt its parent's simulator."""
+        """Create new wake-up sockets in a forked child, which must not interrupt its parent's simulator."""
         self._interrupted, self._interrupter = socket.socketpair()
 
     def close(self) -> None:
@@ -143,8 +144,8 @@ class Simulator:
     def _sleep(self) -> None:
         """Wait for received bytes or the next wake-up time.
 
-        Calls select() on the selector's own descriptor, because select() is accurate to a microsecond and
-        epoll_wait() only to a millisecond.
+        This calls select() on the selector's own descriptor, because select() is accurate to a microsecond,
+        but epoll_wait() only to a millisecond.
         """
         limit = max(0.0, self._wakes[0][0] - self._now()) / self._speed if self._wakes else None
         if isinstance(self._selector, selectors.SelectSelector):
@@ -172,7 +173,7 @@ class Simulator:
             self._advance(number)
 
     def _advance(self, number: int) -> None:
-        """Deliver the bytes due at the client, and plan the wire's next wake-up."""
+        """Send the client the bytes that are due, and plan the wire's next wake-up."""
         wire = self.wires[number]
         try:
             data = wire.advance(self._now())

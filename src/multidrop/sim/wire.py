@@ -16,14 +16,14 @@ from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.port import SimulatedEnd, open_port
 from multidrop.sim.receiver import Frame, Receiver
 
-CHUNK = 1e-3  # s; characters that end within this time are delivered together
-ROUNDING = 1e-6  # fraction of a character; keeps rounding errors from delaying a due byte
-UNPACED_GAP = 20e-3  # s of silence that end a frame on an unpaced wire
+CHUNK = 1e-3  # characters that end within this time, in s, are delivered together
+ROUNDING = 1e-6  # tolerance, in character times: rounding errors must not delay a due byte
+UNPACED_GAP = 20e-3  # a silence of this many s ends a frame on an unpaced wire
 
 
 @dataclass
 class Transmission:
-    """A reply in transmission: its n-th character ends n character times after `begin`."""
+    """A reply in transmission. Its n-th character ends n character times after `begin`."""
 
     data: bytes
     begin: float
@@ -40,7 +40,7 @@ class Transmission:
         return self.begin + min(len(self.data), self.sent + group) * self.character
 
     def take(self, now: float) -> bytes:
-        """Return the characters that have ended by `now` and were not yet returned."""
+        """Return the characters whose last bit was sent by `now`, except those already returned."""
         if now < self.begin:
             return b""
         passed = len(self.data)
@@ -52,7 +52,7 @@ class Transmission:
 
 
 class ReceiverGroup:
-    """Drives that share a receiver, because framing, baud rate and longest gap in a frame are equal."""
+    """Drives that share a receiver, because they have the same framing, baud rate and longest silence."""
 
     def __init__(self, receiver: Receiver, settings: Settings) -> None:
         self.receiver = receiver
@@ -89,10 +89,10 @@ class Wire:
         self.name = name
         self.where = port
         self.port: SimulatedEnd | None = None  # None while closed
-        self._pace = 0.0 if unpaced else 1.0  # factor of every duration
+        self._pace = 0.0 if unpaced else 1.0  # factor by which every duration is multiplied
         self._groups = self._group()
         self._outgoing: list[Transmission] = []  # replies to send, ordered by start time
-        self._quiet_since = -math.inf  # s, end of the last reply
+        self._quiet_since = -math.inf  # time in s at which the last reply ended
         self._baudrate: int | None = None
 
     def _group(self) -> list[ReceiverGroup]:
@@ -115,7 +115,7 @@ class Wire:
         return f"<Wire {self.name} of {len(self.drives)} drives>"
 
     def receive(self, chunk: bytes, now: float, baudrate: int | None = None) -> None:
-        """Receive bytes from the client at `now` s; `baudrate` is None if the client's is unknown."""
+        """Receive bytes from the client at `now` s. `baudrate` is the client's; None if it is unknown."""
         if baudrate != self._baudrate:
             for group in self._groups:
                 group.receiver.forget()
@@ -137,13 +137,13 @@ class Wire:
             if now < self._outgoing[0].end:
                 break
             self._quiet_since = self._outgoing.pop(0).end
-            if self._outgoing:  # replies queue: each waits until the previous reply ends
+            if self._outgoing:  # the next reply waits until this reply has ended
                 self._outgoing[0].begin = max(self._outgoing[0].begin, self._quiet_since)
         return bytes(received)
 
     @property
     def wake(self) -> float | None:
-        """The time in s at which to call `advance` next; None if only received bytes require it."""
+        """The time in s at which to call `advance` next; None if nothing is due until bytes are received."""
         times = [at for group in self._groups if (at := group.receiver.silent_at) is not None]
         if self._outgoing:
             times.append(self._outgoing[0].next_at)

@@ -15,11 +15,12 @@ TIMEOUT_SETTING = 0x0803
 COMMANDED, BY_FREQUENCY, RESET, EMERGENCY_STOP, COAST, RUN, REVERSE, JOG, DC_BRAKE, SECOND_RAMP = (
     1 << bit for bit in range(15, 5, -1)
 )
-PRESET_BITS = {1 << 3: 1, 1 << 2: 2, 1 << 1: 4, 1 << 0: 8}  # control bit: part of the preset's number
+# maps a control bit to the value that it adds to the preset's number
+PRESET_BITS = {1 << 3: 1, 1 << 2: 2, 1 << 1: 4, 1 << 0: 8}
 PRESET_SPEEDS = (0x0018, 0x0019, 0x0020, 0x0021, 0x0022, 0x0023, 0x0024)  # addresses of Sr1 to Sr7
 PANEL_ONLY = (0x0001, 0x0007, 0x0015)
 BAUDRATES = (1200, 2400, 4800, 9600)  # indexed by F800
-RESTART_TIME = 2.0  # s for which requests are ignored after a reset
+RESTART_TIME = 2.0  # time in s after a reset in which requests are ignored
 EMERGENCY_STOPPED, COMMUNICATION_LOST = 0x11, 0x18
 HELD = (0x1200, 0x1201)  # addresses frozen from a trip until the reset
 
@@ -28,14 +29,15 @@ class SimulatedYD1000(MotorDrive):
     """YD1000. Without bit 15 the panel is in control: the motor runs while `panel_runs` is set.
 
     A value outside its limits in section 6 is refused, also if the limit is another parameter's value. A
-    write to a parameter marked "panel only" is confirmed but not stored (6.1; by section 8.1, 0007H
-    initialises).
+    write to a parameter marked "panel only" is confirmed but not stored (6.1). This includes 0007H, although
+    section 8.1 says that writing it initialises the drive.
 
-    The notes leave some facts open, which are taken from related drives. From the VF-S15: exception codes are
-    those of Modbus. From the VF-S11: the fault codes; an emergency stop is a fault; a reset restarts the
-    drive, which then ignores the line for 2 s and drops its commands. Also assumed: the bits of the preset
-    speeds form a number, the second ramp has the times of the first, and the brake has priority over run and
-    sets the frequency to 0 immediately.
+    The notes leave some facts open; these facts come from related drives. Exception codes are those of
+    Modbus, as on the VF-S15. Fault codes are those of the VF-S11. As on the VF-S11, an emergency stop is a
+    fault, and a reset restarts the drive. The drive then ignores the line for 2 s and drops its commands.
+
+    Three facts are only assumed. The bits of the preset speeds form a number. The second ramp has the times
+    of the first ramp. The brake has priority over run, and sets the frequency to 0 immediately.
     """
 
     functions = (0x03, 0x06)
@@ -43,14 +45,14 @@ class SimulatedYD1000(MotorDrive):
 
     _panel_runs = False
     _in_force = 0  # control word in force
-    _message_at = math.inf  # s, time of the last message; no timeout before the first
+    _message_at = math.inf  # time of the last message in s; inf: no message yet, so no timeout
 
     def prepare(self) -> None:
         self.memory.make_readable(HOLDING, [CONTROL])
 
     @property
     def panel_runs(self) -> bool:
-        """True while the panel commands run; has an effect only while the line is not in control."""
+        """True while the panel commands the motor to run. Ignored while the line is in control."""
         return self._panel_runs
 
     @panel_runs.setter
@@ -110,7 +112,7 @@ class SimulatedYD1000(MotorDrive):
 
     def _control(self, word: int) -> None:
         direction = -1 if word & REVERSE else 1
-        if not word & COMMANDED:  # without bit 15 no other bit has an effect (8.1)
+        if not word & COMMANDED:  # other bits have an effect only together with bit 15 (8.1)
             panel = self.motor.run if self.panel_runs else self.motor.stop
             panel()
         elif word & RESET:
@@ -131,11 +133,11 @@ class SimulatedYD1000(MotorDrive):
         self._in_force = word if word & COMMANDED else 0
 
     def _restart(self) -> None:
-        """Drop all state except the EEPROM's, and ignore the line for RESTART_TIME."""
+        """Drop all state that is not in the EEPROM, and ignore the line for RESTART_TIME."""
         self.motor.coast()
         self.motor.reset()
         self.deaf_until = self.now + RESTART_TIME
-        self._message_at = math.inf  # the timeout starts again with the first message
+        self._message_at = math.inf  # the next message restarts the timeout
         for address in (CONTROL, COMMUNICATION_FREQUENCY, PANEL_FREQUENCY):
             cell = self.memory.writable(0x06, address)
             if cell:
