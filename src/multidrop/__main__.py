@@ -9,7 +9,7 @@ def main() -> int:
         from multidrop.cli import main
     except (KeyboardInterrupt, RuntimeError) as interruption:
         if not isinstance(interruption.__cause__ or interruption, KeyboardInterrupt):
-            raise  # only a RuntimeError from a class statement can have a KeyboardInterrupt as its cause
+            raise  # a real error, not the RuntimeError of a class statement that Ctrl-C interrupted
         print("multidrop: interrupted", file=sys.stderr)
         return 130
     return main()

@@ -27,22 +27,26 @@ class LineError(BusError, OSError):
 
 
 class PortLost(LineError):
-    """The port vanished, or is not back yet; it may be reopened later."""
+    """The port vanished, and is not back yet; it may be reopened later."""
 
 
 class NoSuchPort(LineError, ValueError):
-    """The port's name is invalid, whatever is plugged in: a mistake of the caller."""
+    """The port's name is invalid, so no port can have it: a mistake of the caller."""
 
 
 class NoReply(BusError, TimeoutError):
-    """No byte came within the drive's timeout."""
+    """No byte came within the drive's timeout.
 
-    def __init__(self, drive: str, where: str = "", hint: str = "") -> None:
+    `code` is the exception code with which a gateway reports the silent drive; 0 without such a report.
+    """
+
+    def __init__(self, drive: str, where: str = "", hint: str = "", code: int = 0) -> None:
         super().__init__(
             f"{drive} does not answer{where}: check its address, baud rate, format, wiring, and that it has "
             f"power{hint}"
         )
         self.drive = drive
+        self.code = code
 
 
 class BadReply(BusError):
@@ -94,11 +98,11 @@ class Unconfirmed(BusError):
 
 
 class Unsupported(BusError):
-    """The family's document does not define this verb or fact."""
+    """The family's document does not define this verb or this value."""
 
 
 class NotVerified(BusError):
-    """The drive confirmed the write but did not do it: it holds another value, or tripped."""
+    """The drive confirmed the write but did not carry it out: it holds another value, or tripped."""
 
     def __init__(self, drive: str, what: str, reason: str) -> None:
         super().__init__(f"{drive}: {what} did not take effect: {reason}")
@@ -134,7 +138,7 @@ class NotMaster(BusError):
     """Not sent: this process is not the master of the line, or it hears another master.
 
     `heard` has the bytes of another master. `is_sent` says whether a part of the request was sent, as on a
-    port that takes a few bytes at a time; no drive accepts such a part as a request.
+    port that takes a few bytes at a time. No drive accepts such a part as a request.
     """
 
     def __init__(self, drive: str, port: str, *, heard: bytes = b"", is_sent: bool = False) -> None:
@@ -167,7 +171,7 @@ class NotAttached(ValueError):
 
 
 class Advice(NamedTuple):
-    """What to do after a refusal, worded for a program, the command line, and a drive of a plant file.
+    """What to do after a refusal: one text each for a program, the command line, and a plant file's drive.
 
     `plant` is empty if it is the same as `command`.
     """
@@ -178,12 +182,12 @@ class Advice(NamedTuple):
 
     @classmethod
     def call(cls, verb: str) -> Advice:
-        """Advise to call a verb of the drive."""
+        """Return the advice to call a verb of the drive."""
         return cls(f"call {verb}()", f"run `multidrop {verb.replace('_', '-')}`")
 
     @classmethod
     def declare(cls, option: str, value: object) -> Advice:
-        """Advise to declare an option of the drive."""
+        """Return the advice to declare an option of the drive."""
         return cls(
             f"declare {option} = {value}",
             f"add --option {option}={value}",
@@ -191,11 +195,12 @@ class Advice(NamedTuple):
         )
 
 
-ANOTHER_FAMILY = "another family is at its address"  # the `rule` with which even a stop may be refused
+# the `rule` of a WriteForbidden that may refuse even a stop
+ANOTHER_FAMILY = "another family is at its address"
 
 
 class WriteForbidden(BusError, ValueError):
-    """The library did not send the write; the fields have the register, the rule, and the manual's section.
+    """The library did not send the write; its fields hold the register, the rule, and the manual's section.
 
     `is_budget` is True if the write was refused only to save the register's EEPROM, so that it may be sent
     later.
@@ -219,7 +224,7 @@ class WriteForbidden(BusError, ValueError):
         self.is_budget = is_budget
 
     def for_command_line(self, *, in_plant: bool = False) -> str:
-        """Return the sentence with the command-line form of its advice."""
+        """Return the error's sentence with the advice for the command line."""
         if self.advice is None:
             return str(self)
         typed = (in_plant and self.advice.plant) or self.advice.command
@@ -227,4 +232,4 @@ class WriteForbidden(BusError, ValueError):
 
 
 class CheckAgain(Exception):
-    """A drive answered once like another family: check its identity again after the stops of other drives."""
+    """A drive answered as one of another family would. Check it again, after the stops of other drives."""

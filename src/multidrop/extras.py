@@ -1,23 +1,28 @@
-"""Optional libraries: the command that installs those of an extra."""
+"""The pip command that installs the optional libraries of one or more extras."""
 
 from __future__ import annotations
 
 import shlex
 
 
-def install_command(extra: str) -> str:
-    """Return the pip command for an extra's libraries.
+def install_command(*extras: str) -> str:
+    """Return the pip command for the libraries of these extras.
 
     The command names each library, because pip finds `multidrop[extra]` only in the directory of the sources.
-    The extra's name follows as a shell comment.
+    The names of the extras follow as a shell comment.
     """
-    from importlib.metadata import PackageNotFoundError, requires  # most programs never need it
+    # imported here, because most programs never need it
+    from importlib.metadata import PackageNotFoundError, requires
 
     try:
         found = [one.partition(";") for one in requires("multidrop") or ()]
     except PackageNotFoundError:
         found = []
-    wanted = [name.strip() for name, _, marker in found if f'extra == "{extra}"' in marker.replace("'", '"')]
-    if not wanted:
-        return f"pip install 'multidrop[{extra}]'"
-    return f"pip install {shlex.join(wanted)}  # multidrop[{extra}]"
+    markers = [f'extra == "{extra}"' for extra in extras]
+    wanted = [
+        name.strip()
+        for name, _, given in found
+        if any(marker in given.replace("'", '"') for marker in markers)
+    ]
+    named = f"multidrop[{','.join(extras)}]"
+    return f"pip install {shlex.join(wanted)}  # {named}" if wanted else f"pip install '{named}'"

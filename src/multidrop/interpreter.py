@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-_MODULES = ("_interpreters", "_xxsubinterpreters")  # the module's name since Python 3.13, and before
+_MODULES = ("_interpreters", "_xxsubinterpreters")  # the module's names: since Python 3.13, and before
 
 
 def refuse_other_interpreters() -> None:

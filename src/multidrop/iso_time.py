@@ -16,7 +16,7 @@ def format_time(time_ns: int) -> str:
 
 
 def parse_time(text: str) -> int:
-    """Return the ns since 1970 (UTC). Raises ValueError if the text is not as from `format_time`."""
+    """Return the ns since 1970 (UTC). Raises ValueError unless the text has the form of `format_time`."""
     second, dot, rest = text.partition(".")
     if not dot or len(rest) != 10 or rest[-1] != "Z":
         raise ValueError(text)

@@ -1,16 +1,20 @@
-"""Make text from files and arguments safe for a terminal, a page or a log; parse numbers in it."""
+"""Make texts from files and arguments safe to show; parse numbers, and suggest a name for a wrong one."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
+from typing import TypeGuard
 
 # Stricter than int() and float(), which also accept `1_0` for 10, and digits of all scripts.
 _WHOLE = re.compile(r"[+-]?[0-9]+")
 _NUMBER = re.compile(
     r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(nan|inf)", re.IGNORECASE | re.ASCII
 )
-MOST_DIGITS = 100  # Python's own limit is 4300, and its error message advises to change it
-_LOGIN = re.compile(r"(?<=://)[^\s\"]*@")  # up to the last @, because a password may contain one
+# limit of a number's digits, below Python's limit of 4300, whose error message would confuse users
+MOST_DIGITS = 100
+_FORMULA = re.compile(r"'*[=+\-@\t\r\n]")
+_LOGIN = re.compile(r"(?<=://)[^\s\"]*@")  # up to the last @, because a password may contain an @
 
 
 def masked(text: str) -> str:
@@ -29,17 +33,54 @@ def printable(text: str) -> str:
     return "".join(mark if mark.isprintable() else repr(mark)[1:-1] for mark in text)
 
 
+def spreadsheet_text(text: str) -> str:
+    """Return the text for a cell of a CSV file.
+
+    A text that a spreadsheet could evaluate as a formula gets an apostrophe in front, even if it already
+    starts with apostrophes.
+    """
+    return f"'{text}" if _FORMULA.match(text) else text
+
+
 def plain_whole(text: str) -> int:
-    """Return the whole number that a text has in decimal digits. Raises ValueError for any other text."""
+    """Parse a whole number in decimal digits. Raises ValueError for any other text."""
     if not _WHOLE.fullmatch(text.strip(" ")):
-        raise ValueError(f"{text!r} is no whole number in decimal digits, such as 10")
+        raise ValueError(f"{text!r} is not a whole number in decimal digits, such as 10")
     if len(text) > MOST_DIGITS:
         raise ValueError(f"a whole number has {MOST_DIGITS} digits at most, and this one has {len(text)}")
     return int(text)
 
 
 def plain_number(text: str) -> float:
-    """Return the number that a text such as "42.5", "nan" or "inf" has. Raises ValueError for other texts."""
+    """Parse a number such as "42.5", "nan" or "inf". Raises ValueError for any other text."""
     if not _NUMBER.fullmatch(text.strip(" ")):
-        raise ValueError(f"{text!r} is no number in decimal digits, such as 42.5")
+        raise ValueError(f"{text!r} is not a number in decimal digits, such as 42.5")
     return float(text)
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Return True for an int or a float. True and False are no numbers here, although bool is an int."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def is_whole(value: object) -> TypeGuard[int]:
+    """Return True for an int that is not a bool."""
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def nearest_names(name: str, known: Iterable[str], most: int) -> list[str]:
+    """Return the known names that are most like a wrong name, the most similar first."""
+    from difflib import get_close_matches  # imported here: only mistakes need it
+
+    return get_close_matches(name, [*known], n=most)
+
+
+def did_you_mean(name: str, known: Iterable[str], otherwise: str = "", most: int = 2) -> str:
+    """Return a hint with the known names that are most like a wrong name.
+
+    If no known name is similar, return `otherwise`; if that is empty, list all known names.
+    """
+    known = [*known]
+    if near := nearest_names(name, known, most):
+        return f"did you mean {' or '.join(near)}?"
+    return otherwise or f"there are {', '.join(known) or 'none'}"

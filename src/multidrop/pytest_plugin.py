@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_load_initial_conftests(early_config: pytest.Config) -> None:
-    """Keep pytest from rewriting the assertions in all of multidrop, as in any plugin's distribution."""
+    """Keep pytest from rewriting multidrop's assertions, as it otherwise would because of this plugin."""
     hook: Any = early_config.pluginmanager.rewrite_hook
     getattr(hook, "_must_rewrite", set()).discard("multidrop")
 
@@ -92,7 +92,8 @@ def _simulate(
     for name in faults.drives:
         loaded.find_drive(name)  # raises ValueError for an unknown drive
     make = simulated if capture is None else Replay(capture, loaded).drive
-    serial = "socket://127.0.0.1:0" if faults.hang_up else "pty"  # a pty cannot reopen under its old name
+    # a pty cannot be reopened under its old name
+    serial = "socket://127.0.0.1:0" if faults.hang_up else "pty"
     lines = {}
     for line in loaded.lines:
         port = "tcp://127.0.0.1:0" if line.port.lower().startswith("tcp:") else serial
