@@ -1,25 +1,24 @@
-"""The fuzzers' corpora: each line of corpus/PARSER.txt is an input, with its name and its bytes in hex."""
+"""The fuzzers' corpora: a line of corpus.txt is an input of a parser, with its name and its bytes in hex."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-FOLDER = Path(__file__).resolve().parent / "corpus"
+CORPUS = Path(__file__).resolve().with_name("corpus.txt")
 
 
 def load(parser: str) -> dict[str, bytes]:
     """Return the inputs in a parser's corpus, by name; {} if the parser has no corpus yet."""
-    path = FOLDER / f"{parser}.txt"
-    if not path.exists():
-        return {}
-    lines = (line.partition(" ") for line in path.read_text("ascii").splitlines())
-    return {name: bytes.fromhex(text) for name, _, text in lines}
+    inputs = (line.split(" ") for line in CORPUS.read_text("ascii").splitlines())
+    return {name: bytes.fromhex(text) for owner, name, text in inputs if owner == parser}
 
 
 def save(parser: str, inputs: dict[str, bytes]) -> None:
     """Replace a parser's corpus by these inputs."""
-    lines = (f"{name} {data.hex()}\n" for name, data in sorted(inputs.items()))
-    (FOLDER / f"{parser}.txt").write_text("".join(lines), "ascii")
+    lines = CORPUS.read_text("ascii").splitlines(keepends=True)
+    others = [line for line in lines if not line.startswith(f"{parser} ")]
+    own = [f"{parser} {name} {data.hex()}\n" for name, data in inputs.items()]
+    CORPUS.write_text("".join(sorted(others + own)), "ascii")
 
 
 def unpack(parser: str, folder: Path) -> None:

@@ -61,6 +61,13 @@ static inline struct md_message request_of(const uint8_t bytes[REQUEST_BYTES])
     case 0x05: case 0x06: case 0x08: request.data_len = 2; break;
     case 0x0F: request.data_len = (uint16_t)((request.count + 7) / 8 % 251); break;
     case 0x10: request.data_len = (uint16_t)(2 * request.count % 251); break;
+    case 0x16: request.data_len = 4; break;
+    case 0x2B:
+        request.data_len = 3;
+        request.data[2] = request.data[1];
+        request.data[1] = request.data[0];
+        request.data[0] = 0x0E; /* device identification */
+        break;
     default: break;
     }
     if (framing_of(bytes[0]) == MD_DELIXI)

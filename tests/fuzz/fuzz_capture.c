@@ -1,4 +1,4 @@
-/* Pass hostile capture files through the reader of packets, the splitter and the decoder to columns.
+/* Decode hostile capture files into columns, with the reader of packets, the splitter and the decoder.
  *
  * An input is a byte with the kind of file, link type and clock, a byte with the size of buffers, and the
  * file's packets: pcap without its header, or pcapng. */
@@ -146,7 +146,7 @@ static size_t frame_in(const uint8_t *packet, size_t len, int link)
     return at < len ? at : len;
 }
 
-/* Also repairs the lengths of the packets before the selected one. The frame's length is fixed. */
+/* Select the frame of a packet, and repair the lengths of earlier packets. The frame's length is fixed. */
 int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
 {
     if (size < HEADER)

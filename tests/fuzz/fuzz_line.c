@@ -31,11 +31,11 @@ struct scene {
     int number; /* number of the exchange */
     int64_t now, begun, ends; /* present time; start of the exchange; when it must have ended */
     int64_t last_heard, silence; /* last activity on the line, and the silence required after it */
-    /* numbers of received bytes: before the exchange, before its request was sent, and after that */
+    /* bytes received before the exchange; in it, before and after its request was sent */
     size_t left_over, before, after;
     struct answer answers[ANSWERS];
     uint64_t exchanges[DRIVES];
-    int16_t origin[HEARD]; /* of each byte after the request: number of the replied exchange */
+    int16_t origin[HEARD]; /* for each byte after the request: the exchange to which it replies */
     uint8_t heard[HEARD];
     struct md_tap tap;
     /* how often each byte value went over the line: according to the tap, and in fact */
@@ -202,7 +202,8 @@ static void hear(const uint8_t *bytes, size_t len, int origin)
     check_line();
 }
 
-/* Return what the line wants to do next. Reads of the port find it empty; an exchange that is done ends. */
+/* Return the line's next action. If the line wants to read now, report an empty port and repeat. If the
+ * exchange is done, end it. */
 static int want(void)
 {
     int wanted = MD_DONE;
@@ -219,7 +220,7 @@ static int want(void)
             end();
         return wanted;
     }
-    must(wanted == MD_DONE); /* fails: the line reads the empty port forever */
+    must(wanted == MD_DONE); /* if this fails, the line reads the empty port forever */
     return wanted;
 }
 
@@ -227,9 +228,10 @@ static int want(void)
 static int64_t longest(void)
 {
     const struct md_exchange *exchange = &scene.exchange;
-    int64_t most = exchange->drive->most_timeout_ns;
-    return 3 * most + (2 * MD_MOST_FRAME + md_reply_length(exchange->framing,
-                                                           &exchange->request)) * exchange->character_ns;
+    const struct md_drive *drive = exchange->drive;
+    int64_t most = drive->patience_ns > drive->most_timeout_ns ? drive->patience_ns : drive->most_timeout_ns;
+    return 3 * most + (2 * MD_MOST_FRAME + md_longest_reply(exchange->framing,
+                                                            &exchange->request)) * exchange->character_ns;
 }
 
 static void begin(const uint8_t *bytes, uint8_t silence, uint8_t turnaround)
@@ -263,6 +265,22 @@ static void begin(const uint8_t *bytes, uint8_t silence, uint8_t turnaround)
     want();
 }
 
+/* Fill the data of a reply that is too short for the number of the exchange. */
+static void fill_short(struct md_message *reply)
+{
+    static const uint16_t lengths[] = {[0x07] = 1, [0x0B] = 4, [0x0C] = 1, [0x11] = 1, [0x16] = 4, [0x18] = 2,
+                                       [0x2B] = 6};
+    uint8_t code = reply->data[1];
+    reply->data_len = reply->function < sizeof lengths / sizeof *lengths ? lengths[reply->function] : 0;
+    if (reply->function == 0x16) /* repeats its request */
+        return;
+    memset(reply->data, 0, reply->data_len);
+    if (reply->function == 0x2B) { /* an identification without objects */
+        reply->data[0] = 0x0E;
+        reply->data[1] = code;
+    }
+}
+
 /* The request was sent: add the drive's pending reply, whose value is the number of the exchange. */
 static void ask(void)
 {
@@ -277,8 +295,8 @@ static void ask(void)
         reply.data_len = (uint16_t)((request->count * bits + 7) / 8);
         for (int i = 0; i < reply.data_len; i++)
             reply.data[i] = (uint8_t)(i % 2 ? scene.number : scene.number >> 8);
-    } else if (scene.exchange.framing != MD_DELIXI && request->function >= 0x0F)
-        reply.data_len = 0;
+    } else if (scene.exchange.framing != MD_DELIXI && (request->function > 8 || request->function == 7))
+        fill_short(&reply);
     else if (scene.exchange.framing == MD_DELIXI && request->function == 7)
         reply.data[3] = (uint8_t)scene.number;
     else if (scene.exchange.framing == MD_DELIXI && request->function == 3)

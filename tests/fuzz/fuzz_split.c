@@ -73,7 +73,8 @@ static struct md_piece piece_of(const uint8_t *data, size_t size, size_t at, siz
                              .is_after_pause = data[at] >> 3 & 1};
 }
 
-/* Check that a stream that forgets its past after each piece gives the same frames as the whole stream. */
+/* Check that a stream from which used bytes are discarded after each piece gives the same frames as the whole
+ * stream. */
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 {
     if (size > MOST)
@@ -112,7 +113,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     return 0;
 }
 
-/* Select a piece; often as the reply to the piece before it, which may be a request. */
+/* Select a piece. Often declare it the reply to the piece before it, which may be a request. */
 int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
 {
     size_t len = 0, count = 0, before = 0, before_len = 0;

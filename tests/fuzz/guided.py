@@ -20,12 +20,12 @@ from readers import read
 import multidrop.capture
 import multidrop.families.files
 import multidrop.families.registry
-import multidrop.fleet.samples.message
 import multidrop.gateway.modbus_server.protocol
 import multidrop.gateway.modbus_server.server
 import multidrop.importers
 import multidrop.plant.model
 import multidrop.recording
+import multidrop.samples.message
 import multidrop.sim.faulty_wire
 import multidrop.toml_check
 from multidrop.capture import decoding
@@ -44,11 +44,9 @@ MODULES = (  # modules that several readers use: always instrumented
     multidrop.toml_check,
     multidrop.families.registry,
     multidrop.sim.faulty_wire,
-    multidrop.fleet.samples.message,
-    multidrop.fleet.samples.message,
+    multidrop.samples.message,
     multidrop.gateway.modbus_server.protocol,
     multidrop.gateway.modbus_server.server,
-    multidrop.gateway.modbus_server.protocol,
     tomllib._parser,
 )
 
@@ -64,7 +62,7 @@ def instrument(module: types.ModuleType) -> None:
 
 def main() -> None:
     name, *arguments = sys.argv[1:]
-    decoding.ROWS = 2048  # limit of a batch, so that inputs fill several; one request may ask for 2000
+    decoding.ROWS = 2048  # rows of a batch: few, but enough for a request of 2000
     for package in PACKAGES.get(name, ()):
         for found in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
             instrument(importlib.import_module(found.name))

@@ -20,7 +20,7 @@ from multidrop.gateway.modbus_server.protocol import Garbage, MbapRequest, take_
 from multidrop.gateway.modbus_server.server import ModbusServer
 from multidrop.gateway.modbus_server.settings import ModbusSettings
 
-MOST = 260  # limit for a frame in bytes
+MOST = 260  # bytes; limit of a frame's length
 UNITS = {1: InvtCHE(1, name="mill"), 2: ErmanERG220(2, name="well")}
 REFUSED = 0x80
 
@@ -109,7 +109,7 @@ async def answered(requests: list[MbapRequest]) -> None:
 
 
 def check(request: MbapRequest, answer: bytes) -> None:
-    """Check the answer's header against its request, and its length against its header."""
+    """Check the answer's header against its request, and the answer's length against its header."""
     transaction, protocol, length, unit, function = struct.unpack(">HHHBB", answer[:8])
     assert (transaction, protocol, unit) == (request.transaction, 0, request.unit)
     assert len(answer) == 6 + length <= MOST

@@ -1,4 +1,4 @@
-/* The mutator of all C harnesses: mutates, then repairs lengths, byte counts and checksums of frames.
+/* The mutator of all C harnesses: mutate an input, then repair lengths, byte counts and checksums of frames.
  *
  * It repairs only the fields that a receiver checks first, so that mutated frames pass these checks.
  * Sometimes it leaves one of these fields wrong, to test the handling of a frame with a single mistake. */

@@ -21,13 +21,13 @@ from multidrop.drive.line_settings import SERIAL_ADDRESSES
 from multidrop.drive.register import Access
 from multidrop.families.files import FamilyError
 from multidrop.families.files.loader import load_family
-from multidrop.fleet.samples.message import MOST_ROWS, ROWS, MessageError, unpack
 from multidrop.importers import SUFFIXES, ImportedDevice, family_text, plant_text, read_devices
 from multidrop.planning.blocks import blocks
 from multidrop.plant.loader import PlantError, load_plant
 from multidrop.plant.model import Plant
 from multidrop.polling.batch import Row, Rows
 from multidrop.recording import Metadata, open_recording, open_writer, repair
+from multidrop.samples.message import MOST_ROWS, ROWS, MessageError, unpack
 from multidrop.sim.faults import load_faults
 
 PLANT = """
@@ -97,7 +97,7 @@ def read_family(path: Path) -> None:
 
 
 def read_import(path: Path) -> None:
-    """Import a file of another program, whose first line is its suffix, and load the imported families."""
+    """Import another program's file, and load the imported families; the input's first line is the suffix."""
     first, _, contents = path.read_bytes().partition(b"\n")
     suffix = first.decode(errors="replace")
     source = path.with_name(f"imported{suffix if suffix in SUFFIXES else '.csv'}")
@@ -210,7 +210,7 @@ def _is_kept(found: Row, written: Row) -> bool:
     return is_near and found._replace(uncertainty_ns=0) == written._replace(uncertainty_ns=0)
 
 
-READERS: dict[str, tuple[str, Callable[[Path], None]]] = {  # by reader: suffix of its file, and function
+READERS: dict[str, tuple[str, Callable[[Path], None]]] = {  # suffix of the file, and function, by reader
     "plant": (".toml", read_plant),
     "family": (".toml", read_family),
     "import": (".txt", read_import),

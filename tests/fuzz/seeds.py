@@ -15,15 +15,15 @@ sys.path.extend(map(str, (Path(__file__).parents[1] / "support").iterdir()))
 
 import pyarrow as pa
 from batches import counting, example
-from families import METER, METER_CSV
 from frames import PRINTED, Printed
 from imported import FILES
+from profile_families import METER, METER_CSV
 from readers import PLANT
 
 from multidrop.capture import CaptureWriter, Side
 from multidrop.core import Framing, Message
-from multidrop.fleet.samples.message import RowBuffer
 from multidrop.recording import open_writer
+from multidrop.samples.message import RowBuffer
 
 EXCHANGES = [each for each in PRINTED if each.request is not None]
 RTU = [exchange for exchange in EXCHANGES if exchange.framing is Framing.RTU]
@@ -190,7 +190,7 @@ def requests() -> Iterator[bytes]:
 
 
 def samples() -> Iterator[bytes]:
-    """Yield messages with samples of a fleet: compressed, and one without compression from pyarrow."""
+    """Yield messages with samples of a fleet: compressed ones, and one of pyarrow without compression."""
     for batch in (example(), counting(3)):
         buffer = RowBuffer()
         buffer.add(batch.columns())
