@@ -1,7 +1,7 @@
-"""Does a test fail for every small mistake in these files? `python tests/mutation/run.py [FILE...]`
+"""Does a test fail for every small mistake in these files? `python tools/mutation/run.py [FILE...]`
 
-explained.toml lists the mutants that behave as the original, with reasons. Fails on a survivor that is
-not listed, and on a listed mutant that is killed.
+explained.toml lists the mutants that behave as the original, with reasons. This program fails if another
+mutant survives (all tests pass), or if a listed mutant is killed.
 """
 
 from __future__ import annotations

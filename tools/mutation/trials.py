@@ -137,7 +137,7 @@ def scratch() -> Iterator[Path]:
 
 
 def attempt(tree: Path, path: str, text: str) -> str | None:
-    """Run the trials of a file with this text in place of its own; restore the file afterwards.
+    """Run the trials of a file whose content is replaced by `text`; restore the file afterwards.
 
     Return how the mutant ended, such as "killed", or None if it survives."""
     original = (tree / path).read_text()

@@ -60,7 +60,7 @@ class Mutant:
     function: str
     before: str
     after: str
-    nth: int  # among equal edits in this function, from 1
+    nth: int  # number among the equal edits in this function, from 1
     number: int  # line number
     text: str  # text of the whole file
 
@@ -126,7 +126,7 @@ def _blank(source: str, spans: list[tuple[int, int]]) -> str:
 
 
 def _c(source: str) -> tuple[str, list[Edit]]:
-    """Blank the parts of a C source that are not mutated; return that, and the edits of whole statements."""
+    """Return the C source with its unmutated parts blanked, and the edits of conditions and statements."""
     outside = r'/\*.*?\*/|"(?:\\.|[^"])*"|^#[^\n]*'
     bare = _blank(source, [match.span() for match in re.finditer(outside, source, re.DOTALL | re.MULTILINE)])
     return bare, [*_c_conditions(bare), *_c_statements(bare)]
@@ -175,7 +175,7 @@ def _c_statements(bare: str) -> Iterator[Edit]:
 
 
 def _python(source: str) -> tuple[str, list[Edit]]:
-    """Blank the parts of a Python source that are not mutated; return that, and edits of expressions."""
+    """Return the Python source with its unmutated parts blanked, and the edits of expressions."""
     starts = [0]
     for line in source.split("\n"):
         starts.append(starts[-1] + len(line) + 1)
