@@ -7,6 +7,7 @@ with the drives of that file.
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import os
 import re
@@ -39,7 +40,7 @@ PACKAGES = (
     "multidrop",
     *(
         f"multidrop.{name}"
-        for name in ("drive", "families.profiles", "sim", "recording", "capture", "scan", "params")
+        for name in ("drive", "families.profiles", "sim", "recording", "capture", "scan", "params", "runs")
     ),
 )
 
@@ -71,7 +72,7 @@ NOT_RUN = {
     "multidrop serve --demo": "runs until it is stopped: tests/gateway/test_serve.py",
     "multidrop serve plant.toml": "runs until it is stopped: tests/gateway/test_serve.py",
     "pip install '.[fleet]'": "installs",
-    "multidrop fleet demo": "takes half a minute: tests/fleet/test_fleet_demo.py runs it",
+    "multidrop fleet demo": "takes half a minute: tests/fleet/test_fleet_command.py runs it",
     "multidrop fleet": "needs servers: tests/fleet/test_drills.py and test_fleet_command.py run it",
     "export MULTIDROP_NATS": "names servers: tests/support/fleet/fleet_drills.py does it",
     "multidrop hub nats://": "needs servers: tests/fleet/test_hub_command.py runs it",
@@ -84,18 +85,20 @@ NOT_RUN = {
     "multidrop read /dev/ttyUSB0 invt-goodrive": "needs that drive: tests/families/test_responders.py",
     "multidrop sniff /dev/ttyUSB1": "needs a line with another master: tests/cli/test_cli_sniff.py",
 }
-PROGRAMS = ("openssl", "chmod", "echo")  # other programs that are run
-COMPUTED = "multidrop plan"  # deterministic figures; those of other commands are measured
+PROGRAMS = ("openssl", "chmod", "echo")  # programs other than multidrop that blocks may run
+COMPUTED = "multidrop plan"  # its figures are computed, so they must be equal; other commands measure theirs
 STATUS = {"multidrop plan full.toml": 1}  # expected exit status, if not 0
 SHORTER = (  # replacements that shorten long runs
     (r"--seconds \d+", "--seconds 1"),
     (r"seconds=\d+", "seconds=0.5"),
+    (r'dwell = "\d+ s"', 'dwell = "1 s"'),
+    (r'silence = "\d+ s"', 'silence = "30 s"'),  # for busy machines
     (r"--addresses 1-4", "--addresses 1-3 --quick"),
     (r"(multidrop scan /dev/ttyUSB0)", r"\1 --addresses 1-2 --baudrates 9600 --formats 8N1 --quick"),
     (r"(?m)(multidrop poll plant.toml --out run.arrows)$", r"\1 --seconds 1"),
-    (r'Bus\("(/dev/ttyUSB\d)"', r'Bus("\1", expiry=30'),  # expiry of writes, for busy machines
+    (r'Bus\("(/dev/ttyUSB\d)"', r'Bus("\1", expiry=30'),  # a longer expiry of writes, for busy machines
 )
-NEEDED = {  # by the page that states the need
+NEEDED = {  # module that a block needs, by a text that occurs in the block
     "import polars\n": "polars",
     "import pandas\n": "pandas",
     "import duckdb\n": "duckdb",
@@ -131,7 +134,13 @@ def named(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
-RUN = [page for page in PAGES if {block.language for block in blocks(page)} & LANGUAGES - {"text", "c"}]
+# Translations have the blocks of their English pages: see the last section.
+RUN = [
+    page
+    for page in PAGES
+    if {block.language for block in blocks(page)} & LANGUAGES - {"text", "c"}
+    and page.parent.name not in ("ru", "zh")
+]
 
 
 class Session:
@@ -185,7 +194,7 @@ class Session:
 
     def _serve(self, link: str, drives: list[Any]) -> None:
         wire = Wire([simulated(drive) for drive in drives], port=link, unpaced=True)
-        self._stack.enter_context(Simulator([wire]))
+        self._stack.enter_context(Simulator([wire], speed=10))  # so that motors stop soon
 
     def _run_commands(self, text: str, *, has_prompt: bool) -> None:
         commands: list[tuple[str, list[str]]] = []
@@ -246,7 +255,7 @@ def spaced(line: str) -> str:
 
 
 def shape(line: str) -> str:
-    """Return the line with each number as 0 and without time units, because these are measured."""
+    """Return the line with 0 for each number, and without time units, because measured figures vary."""
     plural = re.sub(r"\b1 miss\b", "1 misses", line)
     return spaced(re.sub(r"\d+(\.\d+)?( (ms|us))?", "0", plural))
 
@@ -322,7 +331,7 @@ def test_mentioned_commands_parse(mentioned: str, monkeypatch: pytest.MonkeyPatc
         assert main(words) == 0
 
 
-def test_links_exist() -> None:
+def test_links_on_the_pages_have_existing_targets() -> None:
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", prose(page)):
             is_there = target.startswith("https://") or (page.parent / target).exists()
@@ -386,7 +395,8 @@ def test_every_page_is_in_the_contents() -> None:
 
 def test_every_status_is_in_the_reference() -> None:
     known = {status for status in core.STATUSES if status and not status.startswith("exception")}
-    assert known == set(page_table("reference/statuses.md")) - {"exception 01", "exception FF"}
+    exceptions, of_channels = {"exception 01", "exception FF"}, {"input too old"}
+    assert known == set(page_table("reference/statuses.md")) - exceptions - of_channels
 
 
 def test_every_column_is_in_the_reference() -> None:
@@ -399,9 +409,9 @@ def test_every_key_of_a_plant_file_is_in_the_reference() -> None:
     from multidrop.plant import loader
 
     page = "reference/plant-file.md"
-    assert list(page_table(page, "## `[[line]]`")) == list(loader._LINE)
-    assert set(page_table(page, "## `[[line.drive]]`")) == set(loader._DRIVE)
-    assert list(page_table(page, "## An entry of `poll`")) == list(loader._POLL)
+    assert list(page_table(page, "## `[[line]]`")) == list(loader.LINE_KEYS)
+    assert set(page_table(page, "## `[[line.drive]]`")) == set(loader.DRIVE_KEYS)
+    assert list(page_table(page, "## An entry of `poll`")) == list(loader.POLL_KEYS)
 
 
 def test_every_family_is_in_the_reference() -> None:
@@ -422,7 +432,7 @@ def test_every_extra_is_in_the_reference() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
     text = (DOCS / "reference" / "cli.md").read_text("utf-8")
     rows = text.partition("| for | install |")[2].partition("\n\n")[0].splitlines()[2:]
-    given = {word for row in rows for word in re.findall(r"`(\w+)`", row.split("|")[2])}
+    given = {word for row in rows for word in re.findall(r"`([\w-]+)`", row.split("|")[2])}
     assert given == set(extras) - {"bench", "docs", "test"}
 
 
@@ -444,7 +454,7 @@ def test_timing_diagram_text_fits_its_box(monkeypatch: pytest.MonkeyPatch) -> No
     for name in diagrams.DIAGRAMS:
         boxes = re.findall(r"<rect x=.*? width='([\d.]+)'.*?<text[^>]*>([^<]*)<", diagrams.draw(name))
         assert boxes
-        letter = 7.0  # px, of a wide font such as DejaVu Sans
+        letter = 7.0  # px, width of a letter in a wide font such as DejaVu Sans
         assert [text for width, text in boxes if len(text) * letter > float(width)] == []
 
 
@@ -466,3 +476,63 @@ def test_sphinx_builds_without_a_warning(tmp_path: Path) -> None:
     ]
     done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "COLUMNS": "80"})
     assert (done.returncode, done.stderr) == (0, "")
+
+
+# ---- compare the Russian and Chinese pages with the English pages that they translate ----
+
+
+TRANSLATED = ("ru", "zh")
+README = (ROOT / "README.md").read_text("utf-8")
+ENGLISH = {
+    "before-you-connect-a-motor.md": (ROOT / "docs" / "before-you-connect-a-motor.md").read_text("utf-8"),
+    "quick-start.md": README.partition("\n## Families\n")[0],
+}
+TRANSLATIONS = [(language, page) for language in TRANSLATED for page in ENGLISH]
+of_each_page = pytest.mark.parametrize(("language", "page"), TRANSLATIONS)
+PARTS = re.compile(r"^(#+|-|\d+\.) |^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def translation(language: str, page: str) -> str:
+    return (ROOT / "docs" / language / page).read_text("utf-8")
+
+
+def sections(text: str) -> list[str]:
+    return re.split(
+        r"^## ", re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL), flags=re.MULTILINE
+    )
+
+
+def codes(section: str) -> set[str]:
+    """Return the words between backticks, and the figures of a section."""
+    plain = re.sub(r"\]\([^)]*\)", "]", section)
+    found = re.findall(r"`([^`]+)`|(?<![\w.])(\d+(?:\.\d+)?)(?!\w|\.\d)", plain)
+    return {" ".join((code or figure).split()) for code, figure in found}
+
+
+def revision(text: str) -> str:
+    """Return a short digest of a page; line breaks do not change it."""
+    return hashlib.sha256(" ".join(text.split()).encode()).hexdigest()[:8]
+
+
+@of_each_page
+def test_translation_has_the_headings_list_items_and_code_blocks_of_its_page(
+    language: str, page: str
+) -> None:
+    assert PARTS.findall(translation(language, page)) == PARTS.findall(ENGLISH[page])
+
+
+@of_each_page
+def test_each_section_has_the_names_and_figures_of_the_english_section(language: str, page: str) -> None:
+    pairs = zip(sections(translation(language, page)), sections(ENGLISH[page]), strict=True)
+    assert [codes(own) ^ codes(other) for own, other in pairs if codes(own) != codes(other)] == []
+
+
+@of_each_page
+def test_translation_names_the_present_revision_of_its_page(language: str, page: str) -> None:
+    assert f"<!-- translates revision {revision(ENGLISH[page])} -->" in translation(language, page)
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/before-you-connect-a-motor.md"])
+def test_english_page_links_its_translations_at_its_top(page: str) -> None:
+    top = (ROOT / page).read_text("utf-8").partition("\n\n##")[0]
+    assert all(re.search(rf"\]\((docs/)?{language}/", top) for language in TRANSLATED)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import ast
 import re
-import tokenize
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from sources import ROOMS, ROOT, comments, files, loop_variables, parsed, place
+from sources import ROOMS, ROOT, comments, files, loop_variables, place
 from tables import table
 
 import multidrop
@@ -23,7 +21,7 @@ TEXT = (".py", ".c", ".h", ".md", ".toml")
 PAGES = [path for path in ROOT.glob("*") if path.suffix in TEXT]
 
 
-def test_no_class_name_stands_for_two_things() -> None:
+def test_no_two_classes_have_the_same_name() -> None:
     places: dict[str, list[Path]] = defaultdict(list)
     for path in files("src"):
         for name in CLASS.findall(path.read_text("utf-8")):
@@ -49,21 +47,17 @@ CONSTRUCTIONS = {
     "because": r", for (?:it|they|there|that|this|the|a|no|which)\b",
 }
 STUMBLES = re.compile("|".join(CONSTRUCTIONS.values()), re.IGNORECASE)
-MOST_STUMBLES = 6.0  # per 1,000 words of a room's text
+MOST_STUMBLES = 6.0  # limit of hits per 1,000 words of the text of one folder
 PROSE_ROOMS = sorted(
     {path.name for path in (ROOT / "src" / "multidrop").iterdir() if path.is_dir() and path.name[0] != "_"}
 )
 
 
 def python_text(path: Path) -> Iterator[str]:
-    """Yield the docstrings and comments of a Python file."""
-    for node in ast.walk(parsed(path)):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            yield ast.get_docstring(node) or ""
-    with path.open("rb") as source:
-        yield from (
-            token.string for token in tokenize.tokenize(source.readline) if token.type == tokenize.COMMENT
-        )
+    """Yield the docstrings and comments of a Python file; regular expressions take a tenth of ast's time."""
+    source = path.read_text("utf-8")
+    yield from re.findall(r'^ *"""(.*?)"""', source, re.MULTILINE | re.DOTALL)
+    yield from re.findall(r"(?:^ *|  )#.*", source, re.MULTILINE)
 
 
 def text_of(path: Path) -> str:
@@ -90,11 +84,11 @@ def room_files(room: str) -> list[Path]:
 
 
 @pytest.mark.parametrize("room", [*PROSE_ROOMS, *(room for room in ROOMS if room != "src")])
-def test_a_room_reads_at_the_first_time(room: str) -> None:
+def test_each_package_stays_below_the_limit_of_unclear_phrases(room: str) -> None:
     assert stumbles(room_files(room)) <= MOST_STUMBLES
 
 
-def test_stumbles_are_counted(tmp_path: Path) -> None:
+def test_unclear_phrases_are_counted_per_1000_words(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("Nothing is told of it, where nobody looks at `what is` there.\n")
     assert stumbles([page]) == pytest.approx(1000 * 6 / 10)
@@ -113,9 +107,11 @@ def test_no_line_is_too_long(room: str) -> None:
 
 
 def is_long_by_nature(path: Path, line: str) -> bool:
-    """Return True if the line may be long: a row of a table, or code of a C program outside the core."""
-    if path.suffix == ".md":
-        return line.startswith("|")
+    """Return True if the line may be long: a row of a table, a text of the gateway's page, or code of a C
+    program outside the core.
+    """
+    if path.suffix == ".md" or path.name == "texts.toml":
+        return line.startswith(("|", "ru = ", "zh = ", '["'))
     return path.suffix in (".c", ".h") and path.parts[-2] != "csrc" and not re.search(r"/\*|^ \*", line)
 
 

@@ -1,10 +1,12 @@
-"""Check the public names: they are listed once, load lazily, have a readable repr, and are strictly typed."""
+"""Check the public names: one list, lazy loading, readable repr, strict types. Check portability too."""
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from importlib import import_module
 from importlib.metadata import version
 from inspect import signature
@@ -14,6 +16,8 @@ from traceback import format_exception
 
 import pytest
 from batches import example
+from peers import require_module
+from tables import table
 from toy import Toy
 
 import multidrop
@@ -28,7 +32,7 @@ def run(*words: str) -> str:
     return subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True).stdout
 
 
-def test_public_name_is_its_modules_object() -> None:
+def test_public_name_is_the_object_of_its_module() -> None:
     for name in NAMES:
         home = import_module(multidrop._HOMES[name])
         assert getattr(multidrop, name) is getattr(home, name)
@@ -76,7 +80,7 @@ def test_family_is_declared_with_public_names() -> None:
 # ---- repr in a debugger ----
 
 
-def test_repr_of_drive_and_bus() -> None:
+def test_repr_of_drive_and_bus_shows_name_address_and_port() -> None:
     drive = Toy(3, name="pump-3")
     assert repr(drive) == "<Toy 'pump-3', address 3, rtu, 9600 8N1, not attached>"
     with Bus("loop://") as bus:
@@ -87,11 +91,11 @@ def test_repr_of_drive_and_bus() -> None:
     assert repr(bus) == "<Bus loop://, closed: pump-3>"
 
 
-def test_repr_of_batch() -> None:
+def test_repr_of_batch_shows_counts_and_time_span() -> None:
     assert repr(example()) == "<Batch: 5 rows of 3 drives, 3.000 s from 2026-11-21T09:30:00.123+00:00>"
 
 
-def test_repr_of_poller() -> None:
+def test_repr_of_poller_shows_its_state() -> None:
     poller = Poller(Plant((), Path()))
     assert repr(poller) == "<Poller not started; no lines>"
     poller.close()
@@ -112,7 +116,7 @@ def test_help_of_a_verb_has_its_signature() -> None:
     assert str(signature(Toy(1).stop)) == "()"
 
 
-def test_a_missing_port_is_one_sentence() -> None:
+def test_a_missing_port_is_reported_in_one_sentence() -> None:
     with pytest.raises(multidrop.LineError, match="/dev/ttyUSB77: there is no such port") as caught:
         Bus("/dev/ttyUSB77")
     lines = "".join(format_exception(caught.value))
@@ -125,9 +129,7 @@ def test_a_missing_port_is_one_sentence() -> None:
 
 ROOT = Path(__file__).parents[2]
 
-
 PAGES = [ROOT / "README.md", ROOT / "docs" / "howto" / "coming-from.md"]
-
 
 SCRIPTS = {
     **{
@@ -138,7 +140,6 @@ SCRIPTS = {
     },
     **{path.stem: path.read_text("utf-8") for path in (ROOT / "examples").glob("*.py")},
 }
-
 
 TYPES = """
 from multidrop import Bus, InnovertIBD
@@ -153,7 +154,6 @@ with Bus("/dev/ttyUSB0") as bus:
     pump.write(pump.acceleration_time, "fast")
     pump.red("output_current")
 """
-
 
 FOUND = [
     'note: Revealed type is "float"',
@@ -196,3 +196,129 @@ def test_values_have_the_types_of_their_registers(tmp_path: Path) -> None:
     found = mypy(tmp_path)
     for sentence in FOUND:
         assert sentence in found
+
+
+# ---- check portability: every opened text file has an encoding, and every module imports without POSIX ----
+
+
+SOURCE = Path(multidrop.__file__).parent
+TEXT_MODES = frozenset("rwaxt+")
+
+
+def lacks_encoding(call: ast.Call) -> bool:
+    """Return True if the call opens text without an encoding. `x.open()` without a mode is not counted."""
+    name = ast.unparse(call.func)
+    options = {keyword.arg for keyword in call.keywords}
+    modes = {
+        mode.value for mode in call.args if isinstance(mode, ast.Constant) and isinstance(mode.value, str)
+    }
+    if "encoding" in options:
+        return False
+    if name.endswith(".read_text"):
+        return not call.args
+    if name.endswith(".write_text"):
+        return len(call.args) < 2
+    if name in ("open", "os.fdopen"):
+        return not any("b" in mode for mode in modes)
+    is_text = name.endswith(".open") and any(mode and set(mode) <= TEXT_MODES for mode in modes)
+    names_text = not options.isdisjoint({"text", "universal_newlines"})
+    return is_text or (names_text and not name.endswith("._replace"))
+
+
+def lacking(source: str) -> Iterator[int]:
+    """Return the line numbers of calls that open text without an encoding."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call) and lacks_encoding(node):
+            yield node.lineno
+
+
+@pytest.mark.long
+def test_every_opened_text_file_has_an_explicit_encoding() -> None:
+    found = [
+        f"{path.relative_to(SOURCE)}:{line}"
+        for path in sorted(SOURCE.rglob("*.py"))
+        for line in lacking(path.read_text("utf-8"))
+    ]
+    assert found == []
+
+
+@pytest.mark.long
+@table(
+    "call",
+    ["p.read_text()", "p.write_text(text)", "open(name)", 'p.open("w")', "subprocess.run([], text=True)"],
+)
+def test_call_without_encoding_is_detected(call: str) -> None:
+    assert list(lacking(call)) == [1]
+
+
+@pytest.mark.long
+@table(
+    "call",
+    [
+        'p.read_text("utf-8")',
+        'open(name, "rb")',
+        "os.open(name, 0)",
+        "port.open()",
+        'p.open("w", encoding=e)',
+    ],
+)
+def test_call_with_encoding_is_not_reported(call: str) -> None:
+    assert list(lacking(call)) == []
+
+
+# ---- other systems ----
+
+
+# Import everything normally first, which loads the dependencies. Then import multidrop again as if on
+# Windows.
+PROGRAM = """
+import importlib, os, pkgutil, select, signal, socket, sys, time
+import multidrop
+
+def import_all():
+    failed, names = [], []
+    for found in pkgutil.walk_packages(multidrop.__path__, "multidrop.", onerror=failed.append):
+        if found.name.endswith(("__main__", "._core")):
+            continue
+        try:
+            importlib.import_module(found.name)
+            names.append(found.name)
+        except Exception as failure:
+            if "needs Python" in str(failure):  # an extra that this Python cannot have
+                continue
+            failed.append(f"{found.name}: {failure!r}")
+    return failed, names
+
+failed, names = import_all()
+assert not failed, failed
+for name in [*names, "multidrop"]:
+    del sys.modules[name]
+for module in ("fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"):
+    sys.modules[module] = None
+for module, lacking in {
+    os: ("register_at_fork", "fork", "openpty", "ttyname", "getuid", "geteuid", "pread", "statvfs", "killpg",
+         "O_CLOEXEC", "O_NOCTTY", "O_NONBLOCK", "uname"),
+    time: ("clock_gettime", "clock_gettime_ns", "CLOCK_MONOTONIC", "CLOCK_REALTIME"),
+    socket: ("AF_UNIX", "SOCK_SEQPACKET", "SO_REUSEPORT", "TCP_USER_TIMEOUT"),
+    signal: ("SIGHUP", "SIGUSR1", "SIGKILL", "pthread_kill", "setitimer"),
+    select: ("poll", "epoll"),
+}.items():
+    for name in lacking:
+        if hasattr(module, name):
+            delattr(module, name)
+sys.platform = "win32"
+import multidrop
+failed, names = import_all()
+print(len(names), *failed, sep="\\n")
+"""
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_every_module_can_be_imported_without_posix() -> None:
+    require_module("matplotlib")
+    ran = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    count, *failed = ran.stdout.splitlines()
+    assert failed == []
+    assert int(count) > 200

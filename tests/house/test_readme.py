@@ -1,26 +1,32 @@
-"""Check that README is short, has the same installation commands as .ci/run, and a working example.
+"""Check README, the examples and the container files: commands, names and ports agree with the sources.
 
 test_docs.py runs the code of all pages.
 """
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
 
 import patient
 import pytest
+import yaml
 from lines import PATIENCE
+from nats_clusters import server_program
 from sources import files, run_time_imports
 from tables import table
 
-from multidrop.cli import main
+from multidrop.cli import COMMANDS, main
 from multidrop.control import read_audit
 from multidrop.families import MODELS
+from multidrop.gateway.parts import PARTS
 from multidrop.recording import open_recording
 
 ROOT = Path(__file__).parents[2]
@@ -55,7 +61,7 @@ def test_the_bench_extra_installs_all_that_benchmarks_import() -> None:
     assert imported - ours - set(sys.stdlib_module_names) - installed == set()
 
 
-def test_setup_equals_ci() -> None:
+def test_setup_commands_in_readme_equal_those_of_ci_run() -> None:
     patterns = re.findall(r"grep -m1 -E '([^']+)' README\.md", (ROOT / ".ci" / "run").read_text("utf-8"))
     found = [next(line for line in README.splitlines() if re.search(pattern, line)) for pattern in patterns]
     assert sorted(found) == sorted(SETTING_UP)
@@ -89,7 +95,6 @@ def test_readme_lists_every_family() -> None:
 
 EXAMPLES = ROOT / "examples"
 
-
 PAGES = "\n".join(page.read_text("utf-8") for page in (ROOT / "docs").rglob("*.md"))
 
 
@@ -109,13 +114,13 @@ def run(directory: Path, name: str, *words: str, through: tuple[str, ...] = (pat
 
 @table("path", sorted(EXAMPLES.glob("*.py")))
 def test_example_is_linked_and_tested(path: Path) -> None:
-    if path.name != "simulated_plant.py":  # imported by the others
+    if path.name != "simulated_plant.py":  # a module that the other examples import
         assert f"examples/{path.name}" in PAGES
         assert f'"{path.name}"' in Path(__file__).read_text("utf-8")
 
 
 @pytest.mark.long
-def test_a_logger_to_parquet(tmp_path: Path) -> None:
+def test_logger_example_records_to_parquet(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     run(tmp_path, "logger.py", "--seconds", "1")
     rows = [row for batch in open_recording(tmp_path / "log.parquet") for row in batch]
@@ -123,14 +128,14 @@ def test_a_logger_to_parquet(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_test_bench_measures_each_step_and_records(tmp_path: Path) -> None:
+def test_test_bench_example_measures_and_records_each_step(tmp_path: Path) -> None:
     lines = run(tmp_path, "test_bench.py", "0.5").splitlines()
     assert [line.partition(":")[0] for line in lines] == ["10.0 Hz", "20.0 Hz", "30.0 Hz"]
     assert {row.drive for batch in open_recording(tmp_path / "bench.arrows") for row in batch} == {"fan"}
 
 
 @pytest.mark.slow
-def test_own_device(tmp_path: Path) -> None:
+def test_own_device_example_runs(tmp_path: Path) -> None:
     printed = run(tmp_path, "own_device.py")
     assert "temperature  21.4 degC" in printed
     assert "FILTER" in printed
@@ -139,21 +144,21 @@ def test_own_device(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_asyncio(tmp_path: Path) -> None:
+def test_asyncio_example_runs(tmp_path: Path) -> None:
     lines = run(tmp_path, "asyncio_poll.py", "1").splitlines()
     assert "tick" in lines
     assert any(line.endswith(" rows") for line in lines)
 
 
 @pytest.mark.long
-def test_two_lines(tmp_path: Path) -> None:
+def test_two_lines_example_polls_both_lines(tmp_path: Path) -> None:
     printed = run(tmp_path, "two_lines.py", "4")
     for name in ("pump-1: ", "pump-2: ", "fan-1: ", "hall-1: ", "hall-2: "):
         assert name in printed
 
 
 @pytest.mark.slow
-def test_pump_stops_when_its_program_ends(tmp_path: Path) -> None:
+def test_pump_example_stops_its_motor_when_the_program_ends(tmp_path: Path) -> None:
     printed = run(tmp_path, "pump.py", "1")
     assert "failed" not in printed
     assert printed.splitlines()[-1] == "the output frequency is now 0.0 Hz"
@@ -163,10 +168,132 @@ def test_pump_stops_when_its_program_ends(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_noise_hunt(tmp_path: Path) -> None:
-    printed = run(tmp_path, "noise_hunt.py", "5", through=())  # this example loses replies
+def test_noise_hunt_example_finds_bad_checksums(tmp_path: Path) -> None:
+    printed = run(tmp_path, "noise_hunt.py", "5", through=())  # waits for lost replies, so without patient.py
     assert "pump-1: " in printed
     assert "bad checksum" in printed
     capture = tmp_path / "noise" / "all.pcapng"
     assert main(["decode", str(capture), "--out", str(tmp_path / "again.csv")]) == 0
     assert sum(len(batch) for batch in open_recording(tmp_path / "again.csv"))
+
+
+# ---- the files in packaging/containers agree with the command line and the sources ----
+
+
+FOLDER = ROOT / "packaging" / "containers"
+FILES = {name: yaml.safe_load((FOLDER / name).read_text()) for name in ("compose.yaml", "fleet.yaml")}
+SERVICES = {
+    f"{file}: {name}": service for file, found in FILES.items() for name, service in found["services"].items()
+}
+OURS = {name: service for name, service in SERVICES.items() if service["image"] == "localhost/multidrop"}
+PLANT = tomllib.loads((FOLDER / "plant.toml").read_text())
+CONTAINERFILE = (FOLDER / "Containerfile").read_text()
+
+
+def mounts(service: dict[str, Any]) -> dict[str, str]:
+    """Return the sources of a service's volumes by their target."""
+    found = [volume.split(":") for volume in service.get("volumes", ())]
+    return {target: source for source, target, *_ in found}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", OURS)
+def test_commands_parse_and_read_only_mounted_files(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    words: list[str] = OURS[name]["command"]
+    module: Any = importlib.import_module(f"multidrop.cli.{COMMANDS[words[0]][0]}")
+    if hasattr(module, "ACTIONS"):
+        module = importlib.import_module(f"{module.__name__}.{module.ACTIONS[words[1]][0]}")
+    ran: list[object] = []
+    monkeypatch.setattr(module, "run", lambda arguments: len(ran.append(arguments) or ""))
+    assert main(words) == 0
+    assert len(ran) == 1
+    targets = mounts(OURS[name])
+    for path in (Path(word) for word in words if word.startswith("/")):
+        assert str(path) in targets or any(str(parent) in targets for parent in path.parents)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("file", FILES)
+def test_volumes_are_files_of_the_sources_or_declared(file: str) -> None:
+    found = FILES[file]
+    sources = [source for service in found["services"].values() for source in mounts(service).values()]
+    files = [source for source in sources if source.startswith(".")]
+    assert [source for source in files if not (FOLDER / source).exists()] == []
+    assert {*sources} - {*files} == {*found["volumes"]}
+    builds = [service["build"] for service in found["services"].values() if "build" in service]
+    for build in builds:
+        assert (FOLDER / build["context"]).resolve() == ROOT
+        assert (ROOT / build["dockerfile"]).exists()
+
+
+@pytest.mark.long
+def test_all_ports_are_on_this_computer_only_and_match() -> None:
+    services = FILES["compose.yaml"]["services"]
+    page = PLANT["serve"]["listen"]
+    (scraped,) = yaml.safe_load((FOLDER / "prometheus.yml").read_text())["scrape_configs"]
+    assert scraped["static_configs"] == [{"targets": [page]}]
+    assert f"http://{page}/health" in services["gateway"]["healthcheck"]["test"][-1]
+    (source,) = yaml.safe_load((FOLDER / "grafana/datasources/prometheus.yml").read_text())["datasources"]
+    listens = {word.partition("=")[0]: word.partition("=")[2] for word in services["prometheus"]["command"]}
+    assert source["url"] == f"http://{listens['--web.listen-address']}"
+    broker = urlsplit(PLANT["serve"]["mqtt"]["broker"])
+    assert f"listener {broker.port} {broker.hostname}" in (FOLDER / "mosquitto.conf").read_text().splitlines()
+    hosts = {urlsplit(f"//{page}").hostname, broker.hostname, urlsplit(source["url"]).hostname}
+    hosts |= {urlsplit(line["port"]).hostname for line in PLANT["line"]}
+    hosts.add(services["grafana"]["environment"]["GF_SERVER_HTTP_ADDR"])
+    assert hosts == {"127.0.0.1"}
+    assert {service["network_mode"] for service in SERVICES.values()} == {"host"}
+
+
+@pytest.mark.long
+def test_grafana_and_prometheus_read_the_shipped_dashboard_and_rules() -> None:
+    services = FILES["compose.yaml"]["services"]
+    (provider,) = yaml.safe_load((FOLDER / "grafana/dashboards/multidrop.yml").read_text())["providers"]
+    of_grafana, of_prometheus = mounts(services["grafana"]), mounts(services["prometheus"])
+    assert of_grafana[f"{provider['options']['path']}/dashboard.json"].endswith("/prometheus/dashboard.json")
+    (rules,) = yaml.safe_load((FOLDER / "prometheus.yml").read_text())["rule_files"]
+    assert of_prometheus[f"/etc/prometheus/{rules}"].endswith("/prometheus/alerts.yml")
+    assert services["prometheus"]["command"][0] == "--config.file=/etc/prometheus/prometheus.yml"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", SERVICES)
+def test_each_container_has_no_rights_beyond_its_volumes(name: str) -> None:
+    service = SERVICES[name]
+    assert (service["cap_drop"], service["read_only"]) == (["ALL"], True)
+    assert service["security_opt"] == ["no-new-privileges:true"]
+
+
+def test_the_plant_can_be_served_and_simulated(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["serve", "--check", str(FOLDER / "plant.toml")]) == 0
+    assert "parts: history, mqtt" in capsys.readouterr().out
+    assert {urlsplit(line["port"]).scheme for line in PLANT["line"]} == {"tcp"}
+
+
+@pytest.mark.long
+def test_the_image_has_the_sources_the_extras_and_an_init_process() -> None:
+    copied = re.findall(r"(?m)^COPY (?!--)(.+) \S+$", CONTAINERFILE)
+    assert [path for paths in copied for path in paths.split() if not (ROOT / path).exists()] == []
+    (extras,) = re.findall(r"'\.\[(.+)\]'", CONTAINERFILE)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    known = project["optional-dependencies"]
+    assert {*extras.split(",")} <= {*known}
+    libraries = {library for extra in extras.split(",") for library in known[extra]}
+    assert [name for name in (*PARTS, "serve") if not {*known.get(name, ())} <= libraries] == []
+    assert 'ENTRYPOINT ["tini", "--", "multidrop"]' in CONTAINERFILE  # process 1 ignores the kernel's timer
+    assert re.search(r"(?m)^USER 10001$", CONTAINERFILE)
+
+
+@pytest.mark.long
+def test_nats_accepts_the_configuration_of_each_server(tmp_path: Path) -> None:
+    servers = {name: one for name, one in SERVICES.items() if "nats" in one["image"]}
+    urls = OURS["fleet.yaml: gateway-1"]["environment"]["MULTIDROP_NATS"].split(",")
+    environments = [server["environment"] for server in servers.values()]
+    assert [f"nats://127.0.0.1:{one['PORT']}" for one in environments] == urls
+    text = (FOLDER / "nats.conf").read_text()
+    assert re.findall(r"nats-route://127\.0\.0\.1:(\d+)", text) == [one["ROUTES"] for one in environments]
+    (tmp_path / "nats.conf").write_text(text.replace('"/data"', f'"{tmp_path}"'))
+    for one in environments:
+        check = [server_program(), "-t", "-c", tmp_path / "nats.conf"]
+        checked = subprocess.run(check, env=one, capture_output=True, text=True, check=False)
+        assert checked.returncode == 0, checked.stderr

@@ -1,7 +1,8 @@
-"""Check the developer tools: command-line mistakes, names in .ci/run, corpora, mutants, tests' processes."""
+"""Check the developer tools and the tests: help, names in .ci/run, corpora, mutants, processes, tables."""
 
 from __future__ import annotations
 
+import ast
 import re
 import shutil
 import subprocess
@@ -11,88 +12,20 @@ from pathlib import Path
 
 import corpora
 import pytest
-from c_programs import CC, SANITIZERS, STRICT
 from harness import HERE, command
 from kills import BoundProcess
 from mutation.edits import mutants
 from mutation.trials import core_names
+from peers import CC, SANITIZERS, STRICT
 from readers import READERS, read
 from tables import table
-
-pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parents[2]
 TESTS = ROOT / "tests"
 TOOLS = ROOT / "tools"
-LINUX = "multidrop-0.1.0-cp311-abi3-manylinux2014_x86_64.manylinux_2_17_x86_64.whl"
-WINDOWS = "multidrop-0.1.0-cp311-abi3-win_amd64.whl"
-
-# Arguments to the message that they print, in a folder with two wheels, a file and an empty folder.
-MISTAKES = {
-    "bare": "bare: it takes RELEASE WHEEL, and was given nothing",
-    f"bare stable {LINUX} {LINUX}": f"bare: it takes RELEASE WHEEL, and was given: stable {LINUX} {LINUX}",
-    "bare stable none.whl": "bare: there is no wheel none.whl: make one with `tools/wheels`",
-    "bare stable file": "bare: file is not a wheel: its name must end with .whl",
-    f"bare stable {WINDOWS}": f"bare: {WINDOWS} is the wrong wheel: use *manylinux*_x86_64.whl",
-    "booted": "booted: it takes RELEASE WHEEL, and was given nothing",
-    "booted stable none.whl": "booted: there is no wheel none.whl: make one with `tools/wheels`",
-    f"booted stable {WINDOWS}": f"booted: {WINDOWS} is the wrong wheel: use *manylinux*_x86_64.whl",
-    "foreign": "foreign: it takes MACHINE WHEEL [WORD]..., and was given nothing",
-    f"foreign sparc {LINUX}": "foreign: unknown machine sparc: name arm64 or armhf",
-    "foreign arm64 none.whl": "foreign: there is no wheel none.whl: make one with `tools/wheels`",
-    f"foreign arm64 {LINUX}": f"foreign: {LINUX} is the wrong wheel: use *manylinux*_aarch64.whl",
-    "foreign armhf empty": "foreign: empty is not a wheel: its name must end with .whl",
-    "kernel/build": "build: it takes FOLDER, and was given nothing",
-    "musl": "musl: it takes make FOLDER WHEEL [PACKAGE]..., or FOLDER WORD..., and was given nothing",
-    "musl make new": "musl: make takes FOLDER WHEEL [PACKAGE]..., and was given: new",
-    "musl make empty none.whl": "musl: empty exists already: name a new folder",
-    "musl make new none.whl": "musl: there is no wheel none.whl: make one with `tools/wheels`",
-    f"musl make new {LINUX}": f"musl: {LINUX} is the wrong wheel: use *musllinux*_x86_64.whl",
-    "musl none -V": "musl: none is not a folder made by `tools/musl make`",
-    "musl empty -V": "musl: empty is not a folder made by `tools/musl make`",
-    "wine": "wine: it takes make FOLDER WHEEL [PACKAGE]..., test FOLDER, or FOLDER WORD..., and was given",
-    "wine make new": "wine: make takes FOLDER WHEEL [PACKAGE]..., and was given: new",
-    "wine make empty none.whl": "wine: empty exists already: name a new folder",
-    "wine make new none.whl": "wine: there is no wheel none.whl: make one with `tools/wheels`",
-    f"wine make new {LINUX}": f"wine: {LINUX} is the wrong wheel: use *win_amd64.whl",
-    "wine test": "wine: test takes FOLDER, and was given nothing",
-    "wine test empty": "wine: empty is not a folder made by `tools/wine make`",
-    "wine test none": "wine: none is not a folder made by `tools/wine make`",
-    "wine build new": "wine: build is not a folder made by `tools/wine make`",
-    "wine file -V": "wine: file is not a folder made by `tools/wine make`",
-    "wheels dist": "wheels: error: unrecognized arguments: dist",
-    "wheels --only sparc": "wheels: error: argument --only: invalid choice: 'sparc'",
-    "wheels --out file": "wheels: error: file is not a folder: name an empty or a new one with --out",
-    "wheels --out .": "wheels: error: . contains sdists or wheels already: name an empty folder with --out",
-    "wheels --out new --python pithon": "wheels: error: there is no interpreter pithon to try a wheel with",
-    "wheels --out new --only windows --python python3": "wheels: error: --python tries the wheel of x86_64",
-}
 
 
-@pytest.mark.parametrize("words", MISTAKES)
-def test_mistake_prints_one_sentence_and_starts_nothing(tmp_path: Path, words: str) -> None:
-    for name in (LINUX, WINDOWS, "file"):
-        (tmp_path / name).touch()
-    (tmp_path / "empty").mkdir()
-    there = sorted(tmp_path.rglob("*"))
-    tool, *others = words.split()
-    program = [sys.executable] if tool == "wheels" else []
-    ran = subprocess.run(
-        [*program, TOOLS / tool, *others],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-    )
-    assert ran.returncode == 2, ran.stderr
-    assert ran.stdout == ""
-    *usage, sentence = ran.stderr.splitlines()
-    assert sentence.startswith(MISTAKES[words])
-    assert not usage or (tool == "wheels" and usage[0].startswith("usage: "))
-    assert sorted(tmp_path.rglob("*")) == there
-
-
+@pytest.mark.long
 @table("tool", ["bare", "booted", "foreign", "kernel/build", "musl", "wheels", "wine"])
 def test_help_is_the_header_of_the_tool(tool: str) -> None:
     ran = subprocess.run([TOOLS / tool, "--help"], capture_output=True, text=True, check=True, timeout=60)
@@ -107,8 +40,9 @@ def test_help_is_the_header_of_the_tool(tool: str) -> None:
 CI = (ROOT / ".ci" / "run").read_text("utf-8")
 
 
+@pytest.mark.long
 def test_paths_in_ci_run_exist() -> None:
-    """A pattern without a file, and a name that a brace expands to, must not be left behind by a rename."""
+    """A rename must leave no pattern without a file, and no name of a brace expansion without a file."""
     code = re.sub(r"(?m)^ *#.*", "", CI)
     patterns = re.findall(r"(?<![\w/$])(?:bench|csrc|docs|tests)/[\w*.,{}/-]+", code)
     echo = subprocess.run(
@@ -124,6 +58,7 @@ def benchmarks() -> list[str]:
     return [line.split()[0] for line in here_document.splitlines()]
 
 
+@pytest.mark.long
 def test_test_names_in_ci_run_exist() -> None:
     tests = {
         name
@@ -145,21 +80,28 @@ def test_test_names_in_ci_run_exist() -> None:
 HARNESSES = sorted(path.stem.removeprefix("fuzz_") for path in HERE.glob("fuzz_*.c"))
 
 
+@pytest.mark.long
 def test_every_parser_has_a_small_corpus() -> None:
     assert len(HARNESSES) == 6
-    assert {path.stem for path in corpora.FOLDER.iterdir()} == {*HARNESSES, *READERS}
+    owners = {line.split(" ")[0] for line in corpora.CORPUS.read_text("ascii").splitlines()}
+    assert owners == {*HARNESSES, *READERS}
     inputs = [data for name in (*HARNESSES, *READERS) for data in corpora.load(name).values()]
     assert len(inputs) > 500
     assert sum(map(len, inputs)) < 300_000
 
 
+@pytest.mark.long
 def test_a_corpus_is_unpacked_and_saved_unchanged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     corpora.unpack("frame", tmp_path / "inputs")
     inputs = {path.name: path.read_bytes() for path in (tmp_path / "inputs").iterdir()}
-    text = (corpora.FOLDER / "frame.txt").read_bytes()
-    monkeypatch.setattr(corpora, "FOLDER", tmp_path)
+    text = corpora.CORPUS.read_bytes()
+    copy = tmp_path / "corpus.txt"
+    copy.write_bytes(text)
+    monkeypatch.setattr(corpora, "CORPUS", copy)
+    corpora.save("frame", {})
+    assert corpora.load("frame") == {}
     corpora.save("frame", inputs)
-    assert (tmp_path / "frame.txt").read_bytes() == text
+    assert copy.read_bytes() == text
     assert corpora.load("no such parser") == {}
 
 
@@ -171,12 +113,13 @@ def test_the_core_survives_its_corpus(tmp_path: Path, name: str) -> None:
     build = command(name, tmp_path / name, "replay.c", CC, *STRICT, *SANITIZERS)
     built = subprocess.run(build, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr
-    replay = [tmp_path / name, corpora.FOLDER / f"{name}.txt"]
+    replay = [tmp_path / name, corpora.CORPUS, name]
     run = subprocess.run(replay, capture_output=True, text=True, check=False, timeout=60)
     assert run.returncode == 0, run.stderr[-3000:]
     assert run.stderr.split() == list(corpora.load(name))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", READERS)
 def test_a_reader_survives_its_corpus(tmp_path: Path, name: str) -> None:
     for data in corpora.load(name).values():
@@ -186,8 +129,7 @@ def test_a_reader_survives_its_corpus(tmp_path: Path, name: str) -> None:
 # ---- mutation ----
 
 
-EXPLAINED = tomllib.loads((ROOT / "tests" / "mutation" / "explained.toml").read_text("utf-8"))["mutant"]
-
+EXPLAINED = tomllib.loads((ROOT / "tools" / "mutation" / "explained.toml").read_text("utf-8"))["mutant"]
 
 C = """\
 static int clamp(int *at, int most) /* not < mutated */
@@ -199,12 +141,11 @@ static int clamp(int *at, int most) /* not < mutated */
 }
 """
 
-
 OF_C = {
     "if (*at <= most)",
     "if (*at >= most)",
     "if (!(*at < most))",
-    ";",  # return -1; *at += 0x0F; return most ? 1 : *at;
+    ";",  # in place of each of the three statements
     "return 1;",
     "return 0;",
     "return -0;",
@@ -218,7 +159,6 @@ OF_C = {
     "return most ? 0 : *at;",
 }
 
-
 PYTHON = '''\
 def most(found: list[int] | None, limit: int = 9) -> int:
     """Not - mutated."""
@@ -227,7 +167,6 @@ def most(found: list[int] | None, limit: int = 9) -> int:
     at = min(found) + limit  # nor < this
     return at
 '''
-
 
 OF_PYTHON = {
     "def most(found: list[int] | None, limit: int = 10) -> int:",
@@ -244,14 +183,16 @@ OF_PYTHON = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("path", "source", "made"), [("a.c", C, OF_C), ("a.py", PYTHON, OF_PYTHON)])
-def test_mutants_of_a_source(path: str, source: str, made: set[str]) -> None:
+def test_each_source_has_the_expected_mutants(path: str, source: str, made: set[str]) -> None:
     found = mutants(path, source)
     assert {each.after for each in found} == made
     assert len({each.text for each in found}) == len(found)
     assert {each.function for each in found} == {"clamp" if path == "a.c" else "most"}
 
 
+@pytest.mark.long
 def test_a_condition_of_several_lines_is_negated_as_a_whole() -> None:
     (negated,) = (
         mutant.after for mutant in mutants("a.c", "    if (a\n        || b)\n") if "!(" in mutant.after
@@ -259,6 +200,7 @@ def test_a_condition_of_several_lines_is_negated_as_a_whole() -> None:
     assert negated == "if (!(a || b))"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_explained_mutants_exist() -> None:
     files = {each["file"] for each in EXPLAINED}
@@ -268,6 +210,7 @@ def test_explained_mutants_exist() -> None:
         assert (row["file"], row["function"], row["line"], row["becomes"], row.get("nth", 1)) in names
 
 
+@pytest.mark.long
 def test_mutation_trials_compile_existing_files() -> None:
     assert all((ROOT / "csrc" / f"{name}.c").exists() for name in core_names(ROOT))
     assert {"frame", "waiter_epoll", "wakeup"} <= {*core_names(ROOT)}
@@ -279,12 +222,94 @@ def test_mutation_trials_compile_existing_files() -> None:
 SLEEPS = [sys.executable, "-c", "import time; time.sleep(3600)"]
 
 
+@pytest.mark.long
 def test_failing_block_kills_its_process() -> None:
     with pytest.raises(ZeroDivisionError), BoundProcess(SLEEPS) as process:
         raise ZeroDivisionError
     assert process.returncode
 
 
+@pytest.mark.long
 def test_no_test_starts_an_unbound_process() -> None:
     unbound = "with subprocess." + "Popen("
     assert [str(path) for path in TESTS.rglob("*.py") if unbound in path.read_text("utf-8")] == []
+
+
+# ---- check that a table test tries every row and names the rows that fail ----
+
+
+def notes(caught: pytest.ExceptionInfo[BaseExceptionGroup[BaseException]]) -> list[list[str]]:
+    return [failure.__notes__ for failure in caught.value.exceptions]
+
+
+def test_every_failing_row_is_reported() -> None:
+    tried = []
+
+    @table("number", range(5))
+    def is_even(number: int) -> None:
+        tried.append(number)
+        assert number % 2 == 0
+
+    with pytest.raises(BaseExceptionGroup, match="2 of 5 rows failed") as caught:
+        is_even()
+    assert tried == [0, 1, 2, 3, 4]
+    assert notes(caught) == [["in the row (1,)"], ["in the row (3,)"]]
+
+
+def test_row_fails_if_it_is_skipped_or_an_expected_error_is_missing() -> None:
+    @table(("one", "other"), [(1, 2), (2, 2), (3, 3)], ids=["a", "b", "c"])
+    def differ(one: int, other: int) -> None:
+        if one == 3:
+            pytest.skip("three")
+        with pytest.raises(ZeroDivisionError):
+            _ = 1 / (one - other + 1)
+
+    with pytest.raises(BaseExceptionGroup, match="2 of 3 rows failed") as caught:
+        differ()
+    assert notes(caught) == [["in the row 'b'"], ["in the row 'c'"]]
+
+
+@table("left", [0, 1])
+@table("right", [0, 1])
+@pytest.mark.parametrize("sum_", [0, 1, 2])
+def test_tables_accept_nested_tables_and_fixtures(left: int, right: int, sum_: int, tmp_path: object) -> None:
+    assert (left + right == sum_) is (sum_ - left == right)
+
+
+@table("rows", [[], [(1, 2)]], ids=["none", "too wide"])
+def test_empty_or_ill_formed_table_is_rejected(rows: list[tuple[int, int]]) -> None:
+    with pytest.raises(AssertionError):
+        table(["only"], rows)
+
+
+# ---- find tests that define an inner function but never call it: these pass without testing anything ----
+
+
+FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+def never_named(tree: ast.AST) -> list[str]:
+    """Return the inner functions that their outer function never names, with line numbers."""
+    found = []
+    for outer in ast.walk(tree):
+        if isinstance(outer, FUNCTIONS):
+            named = {node.id for node in ast.walk(outer) if isinstance(node, ast.Name)}
+            inner = [node for node in outer.body if isinstance(node, FUNCTIONS)]
+            lost = [one for one in inner if one.name not in named and not one.decorator_list]
+            found += [f"{one.name} in {outer.name}, line {one.lineno}" for one in lost]
+    return found
+
+
+@pytest.mark.long
+def test_inner_functions_are_used() -> None:
+    found = {}
+    for path in sorted(TESTS.rglob("*.py")):
+        if lost := never_named(ast.parse(path.read_text("utf-8"))):
+            found[str(path.relative_to(TESTS))] = lost
+    assert found == {}
+
+
+def test_unused_inner_function_is_detected() -> None:
+    told = "def test_it():\n    async def main(): assert False\n"
+    assert never_named(ast.parse(told)) == ["main in test_it, line 2"]
+    assert never_named(ast.parse(told + "    run(main())\n")) == []

@@ -1,17 +1,18 @@
-"""Check the import rules between rooms (packages of src/multidrop) by parsing the sources."""
+"""Check the import rules between rooms (packages of src/multidrop), and the pages that name their files."""
 
 from __future__ import annotations
 
+import ast
 import re
+from fnmatch import fnmatch
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
-from sources import PACKAGE, ROOT, files, run_time_imports, type_imports
+from sources import PACKAGE, ROOT, files, parsed, run_time_imports, type_imports
+from tables import table
 
 import multidrop
-
-pytestmark = pytest.mark.long  # concerns only the package's authors
 
 FILES = files("src")
 OUTSIDE = {
@@ -20,26 +21,27 @@ OUTSIDE = {
 }
 # floors, the lowest first: a room may import from itself and from rooms on lower floors
 FLOORS = [
-    {"errors", "exposition", "extras", "printable", "iso_time", "interpreter", "supervisor"},
+    {"errors", "exposition", "extras", "printable", "iso_time", "interpreter", "supervisor", "whole_file"},
     {"toml_check"},
     {"core"},
     {"drive"},
     {"families", "modbus_device", "steps"},
-    {"planning"},
+    {"planning", "channels"},
     {"transport", "plant"},
     {"control"},
     {"bus"},
     {"polling"},
     {"poller"},
     {"recording", "sim", "scan", "importers", "params"},
-    {"capture", "report", "history"},
+    {"capture", "report", "history", "runs", "samples"},
     {"gateway", "fleet"},
-    {"cli", "pytest_plugin"},
+    {"cli", "pytest_plugin", "modbus_connection"},
     {"__init__", "__main__"},
 ]
-TOUCHING_THE_SYSTEM = {"transport", "recording", "history", "sim", "gateway", "fleet", "cli"}
+TOUCHING_THE_SYSTEM = {"transport", "recording", "history", "samples", "sim", "gateway", "fleet", "cli"}
 FILES_TOUCHING_THE_SYSTEM = {
     "supervisor.py",
+    "whole_file.py",
     "core/fork.py",
     "core/port.py",
     "control/eeprom_ledger.py",
@@ -47,6 +49,8 @@ FILES_TOUCHING_THE_SYSTEM = {
     "control/exit_hook.py",
     "control/latches.py",
     "params/apply.py",
+    "polling/added_rows.py",
+    "polling/row_source.py",
     "gateway/clock.py",
     "gateway/http/connections.py",
     "gateway/gateway.py",
@@ -56,18 +60,17 @@ FILES_TOUCHING_THE_SYSTEM = {
     "gateway/live/views.py",
 }
 
-
 CLIENTS = {  # rooms that import only public names, and the commands that import them
-    "gateway": {"cli/serve.py"},
+    "gateway": {"cli/serve.py", "cli/schema.py"},
     "fleet": {
-        *(f"cli/fleet/{name}.py" for name in ("commands", "connection", "drain", "init", "look")),
-        *(f"cli/fleet/{name}.py" for name in ("rights", "serve", "watch")),
+        *(f"cli/fleet/{name}.py" for name in ("commands", "connection", "gateway", "setup", "views")),
         "cli/fleet/demo.py",
         "cli/hub.py",
     },
 }
 ROOMS = (
     "core",
+    "channels",
     "drive",
     "families",
     "plant",
@@ -77,23 +80,28 @@ ROOMS = (
     "recording",
     "history",
     "params",
+    "samples",
 )
 OPEN = {
     f"multidrop.{name}"
     for name in (
         *ROOMS,
         "control.commands",
+        "samples.sample_tables",
         "errors",
         "exposition",
         "extras",
+        "iso_time",
         "printable",
         "supervisor",
         "toml_check",
+        "whole_file",
     )
 }
 TIED = (  # groups of files whose annotations refer to each other
     {"drive/family.py", "drive/verbs.py"},
     {"polling/batch.py", "polling/tables.py"},
+    {"report/load.py", "report/value_plot.py"},
     {"sim/drive.py", "sim/protocol.py"},
     {
         f"gateway/{name}.py"
@@ -128,19 +136,23 @@ def upwards(path: Path, modules: set[str]) -> set[str]:
     return {name for name in others if floor(name) >= floor(room(path))}
 
 
+@pytest.mark.long
 def test_public_names_are_listed_before_they_are_loaded() -> None:
     assert set(multidrop.__all__) <= set(dir(multidrop))
 
 
-def test_every_room_has_its_floor() -> None:
+@pytest.mark.long
+def test_every_package_has_a_layer() -> None:
     assert {room(path) for path in FILES} <= set().union(*FLOORS)
 
 
+@pytest.mark.long
 def test_only_core_imports_the_compiled_module() -> None:
     found = {str(path.relative_to(PACKAGE)) for path in FILES if "_core" in rooms(run_time_imports(path))}
     assert {name for name in found if not name.startswith("core/")} == set()
 
 
+@pytest.mark.long
 def test_only_listed_files_use_the_system() -> None:
     outside = {str(path.relative_to(PACKAGE)): run_time_imports(path) & OUTSIDE for path in FILES}
     allowed = {name for name in outside if name.split("/")[0] in TOUCHING_THE_SYSTEM}
@@ -148,25 +160,29 @@ def test_only_listed_files_use_the_system() -> None:
     assert offenders({name: found for name, found in outside.items() if name not in allowed}) == {}
 
 
+@pytest.mark.long
 def test_families_import_only_drive() -> None:
     families = sorted({*(PACKAGE / "families").glob("*.py")} - {PACKAGE / "families" / "registry.py"})
     found = {path.name: rooms(run_time_imports(path)) - {"drive", "families"} for path in families}
     assert offenders(found) == {}
 
 
-def test_imports_point_downwards() -> None:
+@pytest.mark.long
+def test_imports_come_only_from_lower_layers() -> None:
     found = {str(path.relative_to(PACKAGE)): upwards(path, run_time_imports(path)) for path in FILES}
     assert offenders(found) == {}
 
 
-def test_type_imports_point_downwards() -> None:
-    """Imports for annotations, too, come only from rooms below."""
+@pytest.mark.long
+def test_type_imports_come_only_from_lower_layers() -> None:
+    """This rule applies also to imports for annotations."""
     found = {str(path.relative_to(PACKAGE)): upwards(path, type_imports(path)) for path in FILES}
     assert offenders(found) == {}
 
 
+@pytest.mark.long
 def test_no_import_cycles_between_files() -> None:
-    """Check for cycles, including imports for annotations. Two such files need a third one below them."""
+    """Imports for annotations count too. Move what two files of a cycle need into a third file below them."""
     ties = {name: min(group) for group in TIED for name in group}
     graph: dict[str, set[str]] = {}
     for path in FILES:
@@ -180,6 +196,7 @@ def test_no_import_cycles_between_files() -> None:
     TopologicalSorter(graph).prepare()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("client", CLIENTS)
 def test_clients_use_only_public_names(client: str) -> None:
     """Check that users could write such a client too, because it imports only public names."""
@@ -199,12 +216,14 @@ def _is_public(name: str, client: str) -> bool:
     return is_own or name in OPEN or name.removeprefix("multidrop.") in multidrop.__all__
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("client", CLIENTS)
 def test_only_listed_commands_import_a_client(client: str) -> None:
     found = {str(path.relative_to(PACKAGE)) for path in FILES if client in rooms(_imported(path))}
     assert {name for name in found if not name.startswith(f"{client}/")} <= CLIENTS[client]
 
 
+@pytest.mark.long
 def test_files_are_short() -> None:
     """Check that each file keeps the length limit, or is listed with a reason; a longer file has two jobs."""
     lines = {
@@ -214,6 +233,7 @@ def test_files_are_short() -> None:
     assert {name for name, count in lines.items() if count > MOST_LINES_OF_A_FILE} == set()
 
 
+@pytest.mark.long
 def test_no_test_imports_another_test() -> None:
     tests = files("tests")
     names = {path.stem for path in tests if path.name.startswith("test_")}
@@ -225,11 +245,12 @@ def _imported(path: Path) -> set[str]:
     return run_time_imports(path) | type_imports(path)
 
 
-def test_drive_and_planning_are_pure() -> None:
-    """Check that the rooms `drive` and `planning` import no module for clocks or ports."""
+@pytest.mark.long
+def test_packages_without_io_import_no_clocks_or_ports() -> None:
+    """Check that the rooms `drive`, `planning` and `channels` import no module for clocks or ports."""
     ports = {"multidrop.core.port", "multidrop.core.capture"}
     outside = OUTSIDE | ports | {"datetime", "random", "threading", "pathlib", "asyncio"}
-    pure = [path for path in FILES if room(path) in ("drive", "planning")]
+    pure = [path for path in FILES if room(path) in ("drive", "planning", "channels")]
     assert offenders({str(path.relative_to(PACKAGE)): _imported(path) & outside for path in pure}) == {}
 
 
@@ -261,6 +282,7 @@ def core() -> dict[str, str]:
     return {path.stem: re.sub(r"/\*.*?\*/", "", path.read_text("utf-8"), flags=re.DOTALL) for path in found}
 
 
+@pytest.mark.long
 def test_no_call_cycles_between_core_files() -> None:
     graph = calls(core())
     assert graph["api"] >= {"engine", "turn"}
@@ -268,12 +290,14 @@ def test_no_call_cycles_between_core_files() -> None:
     TopologicalSorter(graph).prepare()
 
 
+@pytest.mark.long
 def test_a_cycle_of_calls_is_detected() -> None:
     graph = calls({"a": "int md_a(void)\n{\n    md_b();\n}", "b": "void md_b(void)\n{\n    md_a();\n}"})
     with pytest.raises(CycleError):
         TopologicalSorter(graph).prepare()
 
 
+@pytest.mark.long
 def test_pure_files_of_the_core_use_no_system() -> None:
     code = core()
     engine = {"engine", "clock", "wakeup", "port", "rs485", "api", "row_queue", "mastership"}
@@ -282,6 +306,7 @@ def test_pure_files_of_the_core_use_no_system() -> None:
     assert offenders({name: set(SYSTEM.findall(code[name])) for name in PURE}) == {}
 
 
+@pytest.mark.long
 def test_python_calls_each_function_of_its_headers() -> None:
     headers = "".join((ROOT / "csrc" / f"{name}.h").read_text("utf-8") for name in HEADERS_OF_PYTHON)
     declared = set(CALLED.findall(re.sub(r"/\*.*?\*/", "", headers, flags=re.DOTALL)))
@@ -292,6 +317,7 @@ def test_python_calls_each_function_of_its_headers() -> None:
     assert declared - called == set()
 
 
+@pytest.mark.long
 def test_no_function_of_the_core_is_long() -> None:
     bodies = {
         f"{name}: {head}": body.count("\n") + 1
@@ -300,3 +326,59 @@ def test_no_function_of_the_core_is_long() -> None:
     }
     assert len(bodies) > 300
     assert {name: lines for name, lines in bodies.items() if lines > MOST_LINES} == {}
+
+
+# ---- the architecture page lists every file, and its walkthroughs name existing code ----
+
+
+ARCHITECTURE = ROOT / "docs" / "reference" / "architecture.md"
+WALKS = sorted((ROOT / "docs" / "reference").glob("walk-*.md"))
+STEP = re.compile(r"`(?:(?:src/multidrop/)?([\w/]+\.py):([\w.]+)|(?:csrc/)?(\w+\.c))`")
+
+
+def steps(walk: Path) -> list[tuple[str, str]]:
+    """Return the steps of a walkthrough: each file with its function or class ("" for a C file)."""
+    return [(file or c_file, name) for file, name, c_file in STEP.findall(walk.read_text("utf-8"))]
+
+
+def defined(path: Path) -> set[str]:
+    """Return the functions and classes of a module, and the methods of its classes as `Class.method`."""
+    names = set()
+    for node in parsed(path).body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            names.add(node.name)
+        if isinstance(node, ast.ClassDef):
+            methods = [each for each in node.body if isinstance(each, ast.FunctionDef | ast.AsyncFunctionDef)]
+            names |= {f"{node.name}.{each.name}" for each in methods}
+    return names
+
+
+def missing(walk: Path) -> list[str]:
+    """Return the steps whose file, function or class does not exist."""
+    return [
+        f"{file}:{name}"
+        for file, name in steps(walk)
+        if not (ROOT / "csrc" / file if file.endswith(".c") else PACKAGE / file).exists()
+        or (name and name not in defined(PACKAGE / file))
+    ]
+
+
+def test_every_file_has_a_row_on_the_architecture_page() -> None:
+    """Check that a row names each file, the folder in which it is, or a pattern that matches it."""
+    rows = [line.split("|")[1] for line in ARCHITECTURE.read_text("utf-8").splitlines() if line[:1] == "|"]
+    named = {name.rstrip("/") for row in rows for name in re.findall(r"`([^`]+)`", row)}
+    places = [*PACKAGE.iterdir(), *(ROOT / "csrc").glob("*.c"), ROOT / "csrc" / "windows"]
+    rooms = {path.name for path in places if path.name[0] != "_" and path.suffix in ("", ".py", ".c")}
+    assert {room for room in rooms if not any(fnmatch(room, name) for name in named)} == set()
+
+
+@table("walk", WALKS, ids=[walk.stem for walk in WALKS])
+def test_each_step_of_a_walkthrough_names_existing_code(walk: Path) -> None:
+    assert len(steps(walk)) > 8
+    assert missing(walk) == []
+
+
+def test_step_of_a_walkthrough_that_names_missing_code_is_detected(tmp_path: Path) -> None:
+    walk = tmp_path / "walk.md"
+    walk.write_text("`poller.py:Poller.take_off`, `nowhere.c`, `poller.py:Poller`, `csrc/line.c`")
+    assert missing(walk) == ["poller.py:Poller.take_off", "nowhere.c:"]
