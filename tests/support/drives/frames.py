@@ -66,10 +66,7 @@ MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
     ),
     "01 0F 00 00 00 09 02 01 01 25 2C": (  # E4: like E3, valid but never to be sent
         Message(1, 0x0F, 0, 9, bytes([0x01, 0x01])),
-        {
-            "01 0F 00 00 00 09 95 CD": Message(1, 0x0F, 0, 9),
-            "01 8F 03 04 31": Message(1, 0x0F, exception=3),
-        },
+        {"01 0F 00 00 00 09 95 CD": Message(1, 0x0F, 0, 9), "01 8F 03 04 31": Message(1, 0x0F, exception=3)},
     ),
     "01 10 00 0C 00 02 04 00 C8 01 90 73 F8": (
         Message(1, 0x10, 12, 2, words(200, 400)),

@@ -1,6 +1,7 @@
 """The drives behind a responder, independent of the library: registers, and the writes that start motors.
 
-Typed from the documents. A write that cancels a stop also counts as a write that moves the motor.
+All values are typed from the documents. A write that cancels a stop also counts as a write that moves the
+motor.
 """
 
 from __future__ import annotations
@@ -147,7 +148,7 @@ class ResponderDrive:
         self.kind = kind
         self.address = address
         self.ramp = ramp
-        self.runs = False  # True after a run command, False after a stop
+        self.runs = False  # True from a run command until a stop
         self._stands_at = 0.0
         self.switch_on()
 

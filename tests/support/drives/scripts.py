@@ -37,10 +37,11 @@ def frame(drive: Drive, register: Register[Any], value: Any) -> str:
 class Wire:
     """A drive whose replies are set by the test.
 
-    `says` has a value by register name, or a list of values for successive reads, the last of which repeats.
-    An exception among the values is raised. `loses` lists, by frame, exceptions that its first writes raise.
-    `turns` has, by frame, updates of `says` after a write. A written value is read back unless `says` has a
-    value. Rules between registers apply as on a bus; their reads are not recorded in `reads`.
+    `says` has a value by register name, or a list of values for successive reads; further reads get the last
+    value. An exception among the values is raised. `loses` has, by frame, the exceptions that the first
+    writes of this frame raise. `turns` has, by frame, the changes of `says` after a write of this frame. A
+    written value is read back unless `says` has a value. Rules between registers apply as on a bus; their
+    reads are not recorded in `reads`.
     """
 
     def __init__(

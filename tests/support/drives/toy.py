@@ -80,7 +80,7 @@ class PatientToy(Toy):
     """A toy with long timeouts for busy test machines, even after fast replies."""
 
     response_timeout = 60.0
-    response_delay = 15.0  # s; a learned timeout is at least four times as long
+    response_delay = 15.0  # s; a learned timeout is at least four times this delay
 
 
 class Unsure(Toy):
@@ -90,7 +90,7 @@ class Unsure(Toy):
 
 
 def family(registers: int, **declared: Any) -> type[Drive]:
-    """Return a drive class that declares only adjacent registers r0, r1, ..., `registers` of them."""
+    """Return a drive class that declares only `registers` adjacent registers r0, r1, ..."""
     readings = {f"r{at}": reading(at) for at in range(registers)}
     return type("Plain", (Drive,), {"__doc__": "Of this test.", **readings, **declared})
 

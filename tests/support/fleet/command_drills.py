@@ -45,7 +45,7 @@ class CommandRecord(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """Numbers from comparing the drives' writes with the results reported to clients."""
+    """Counts from comparing the writes that drives received with the results that clients received."""
 
     told: Counter[str]
     ways: Counter[str]

@@ -10,12 +10,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout, suppress
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from functools import partial
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from unittest.mock import patch
 
 from kills import kill_all
@@ -32,6 +32,23 @@ from multidrop.fleet.servers.connections import ServerPath
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
 PATIENCE_S = 120.0
 JUDGED_S = 11.0  # s; an election may start 9 s after a process died
+SOON_S = 2.0  # s; for a drill before the next `settle`, which waits for elections
+
+
+class CommandEnd(NamedTuple):
+    """The exit status and the output of a command."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def run_here(environment: Mapping[str, str], *words: str) -> CommandEnd:
+    """Run a `multidrop` command in this process, because a new one would take a second of CPU to start."""
+    out, err = StringIO(), StringIO()
+    with patch.dict(os.environ, environment), redirect_stdout(out), redirect_stderr(err):
+        status = main([*words])
+    return CommandEnd(status, out.getvalue(), err.getvalue())
 
 
 class FleetProcesses:
@@ -53,12 +70,9 @@ class FleetProcesses:
         made = self.run("init", str(folder / "plant.toml"))
         assert made.returncode == 0, made.stderr
 
-    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
+    def run(self, *words: str) -> CommandEnd:
         """Run `multidrop fleet` with these arguments."""
-        command = [sys.executable, "-m", "multidrop", "fleet", *words]
-        return subprocess.run(
-            command, env=self._environment, capture_output=True, text=True, check=False, timeout=PATIENCE_S
-        )
+        return run_here(self._environment, "fleet", *words)
 
     def status(self) -> dict[str, Any]:
         return fleet_status(self._environment)
@@ -129,11 +143,11 @@ class FleetDrill(FleetProcesses):
         self.wait(self.are_leaders_home, "each node leads one bucket of the leases")
         time.sleep(1.0)
 
-    def _start_what_died(self) -> None:
+    def _start_what_died(self, besides: Collection[str] = ()) -> None:
         """Restart dead gateways, because the kernel kills those that a busy machine suspends too long."""
         for name in GATEWAYS:
             running = self.gateways.get(name)
-            if running is None or running.poll() is not None:
+            if name not in besides and (running is None or running.poll() is not None):
                 self.start(name)
 
     def are_leaders_home(self) -> bool:
@@ -156,14 +170,20 @@ class FleetDrill(FleetProcesses):
         """Perform the action; return each line's longest gap (s) without requests in the next `seconds`."""
         self.hall.reset()
         deed()
+        killed = [name for name in GATEWAYS if self.gateways[name].poll() is not None]
         time.sleep(seconds)
-        self.wait(lambda: self.hall.are_polled(1.0), "all lines are polled again")
+
+        def are_polled() -> bool:
+            self._start_what_died(besides=killed)
+            return self.hall.are_polled(1.0)
+
+        self.wait(are_polled, "all lines are polled again")
         return self.hall.gaps()
 
     # ---- actions ----
 
     def do_nothing(self) -> None:
-        """Do nothing, to measure this machine's usual gaps."""
+        """Do nothing, to measure the gaps between requests that are usual on this machine."""
 
     def kill_gateway(self) -> None:
         self.kill(self.random.choice(GATEWAYS))
@@ -204,7 +224,7 @@ class FleetDrill(FleetProcesses):
         node.go_on()
 
     def leader_alone(self, group: Sequence[str], others: Sequence[str]) -> Node:
-        """Return a node that leads one bucket of this group and none of the others."""
+        """Return a node that leads one bucket of `group`, and no bucket of `others`."""
         bucket = self.random.choice(group)
         while True:
             leads = {node.name: node.leads() for node in self.nats.nodes}
@@ -293,16 +313,12 @@ LOOK_S = 0.25  # s between queries; one query uses as much CPU as a gateway does
 
 
 def fleet_status(environment: Mapping[str, str]) -> dict[str, Any]:
-    """Return the fleet's state as a dict; it is empty if the servers give none, as during an election.
-
-    The query runs in this process, because tests repeat it often.
-    """
+    """Return the fleet's state as a dict; empty if the servers return no state, as during an election."""
     time.sleep(LOOK_S)
-    with patch.dict(os.environ, environment), redirect_stdout(StringIO()) as out:
-        status = main(["fleet", "status", "--json"])
-    if status and not out.getvalue():
+    status, out, _ = run_here(environment, "fleet", "status", "--json")
+    if status and not out:
         return {"gateways": {}, "lines": {}}
-    found: dict[str, Any] = json.loads(out.getvalue())
+    found: dict[str, Any] = json.loads(out)
     silent = {name for name, gateway in found["gateways"].items() if gateway["says"] is None}
     lost = any(gateway["says"]["lost"] for gateway in found["gateways"].values() if gateway["says"])
     is_unpolled = any(line["master"] in {None, *silent} for line in found["lines"].values())
@@ -333,7 +349,7 @@ class Cuts:
         self._lost(others, some)
 
     def gateway(self) -> None:
-        """Cut a gateway off everything, also its lines, which leaves unsent frames in its socket buffers."""
+        """Cut a gateway off from everything, even its lines; unsent frames stay in its socket buffers."""
         self.dice.choice(self.gateways).cut()
 
     def gateway_from_nodes(self) -> None:
@@ -383,7 +399,7 @@ def cut(drill: FleetDrill, name: str, seconds: float = 0.0) -> None:
 
 @contextmanager
 def drilled_in_network(folder: Path, lines: int = 12, seed: int = 1) -> Iterator[FleetDrill]:
-    """Yield a fleet like `drilled`, in network namespaces; skip or fail if the machine allows none."""
+    """Yield a fleet in network namespaces; skip or fail the test if the machine allows no namespaces."""
     with (
         network(NODES + len(GATEWAYS)) as made,
         cluster(folder / "nats", places=made.namespaces[:NODES]) as nats,
@@ -426,10 +442,7 @@ MACHINES: dict[str, Callable[[MachineDrill], None]] = {
 @contextmanager
 def drilled_on_machines(folder: Path, lines: int = 12, seed: int = 1) -> Iterator[MachineDrill]:
     """Yield a fleet on three simulated machines; skip or fail if the machine allows no namespaces."""
-    with (
-        network(NODES) as made,
-        cluster(folder / "nats", places=made.namespaces) as nats,
-    ):
+    with network(NODES) as made, cluster(folder / "nats", places=made.namespaces) as nats:
         places = dict(zip(GATEWAYS, made.namespaces, strict=True))
         drill = MachineDrill(folder, nats, lines, seed, places, made.address)
         try:

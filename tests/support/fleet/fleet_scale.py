@@ -12,22 +12,24 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from nats_clusters import Cluster
-
+from multidrop.fleet.leases.lease import boottime_ns
+from multidrop.fleet.leases.member import Member
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Bucket
 from multidrop.fleet.servers.connections import paths_of
 from multidrop.fleet.servers.plant_store import store
-from multidrop.fleet.servers.setup import set_up
+from multidrop.fleet.servers.setup import open_all, set_up
 
-PROGRAM = Path(__file__).with_name("member_process.py")
+if TYPE_CHECKING:
+    from nats_clusters import Cluster
+
 PATIENCE_S = 240.0
 
 
 class MemberProcess:
-    """A process of gateways; records each gateway's number of lines and the time of the last change."""
+    """A process that runs gateways; records each gateway's number of lines and when it changed last."""
 
     def __init__(self, urls: Sequence[str], gateways: Sequence[str]) -> None:
         self.gateways = list(gateways)
@@ -35,7 +37,7 @@ class MemberProcess:
         self.changed_s = 0.0  # time of the last change, CLOCK_MONOTONIC
         self.is_ready = False
         self.polled: dict[str, list[str]] = {}
-        command = [sys.executable, str(PROGRAM), ",".join(urls), *gateways]
+        command = [sys.executable, __file__, ",".join(urls), *gateways]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -166,3 +168,70 @@ def groups(gateways: int, processes: int) -> list[list[str]]:
     """Return the names of gateways, split evenly among the processes."""
     found = [f"gw-{at:02}" for at in range(gateways)]
     return [found[at::processes] for at in range(processes)]
+
+
+# ---- the process: gateways' state machines on fake lines; `python fleet_scale.py URLS NAME...` ----
+
+
+LOOK_S = 0.02
+
+
+class NoLines:
+    """Fake lines that open and close immediately."""
+
+    async def take(self, line: str, description: Any) -> None:
+        pass
+
+    async def let_go(self, line: str) -> None:
+        pass
+
+    def port_loss(self, line: str) -> None:
+        return None
+
+
+class NoMastership:
+    """A fake mastership that raises the same errors as the engine."""
+
+    def extend(self, until_ns: int) -> None:
+        if until_ns <= boottime_ns():
+            raise ValueError("armed at a time that is past")
+
+    def end(self) -> None:
+        pass
+
+
+def report(**what: object) -> None:
+    print(json.dumps(what), flush=True)
+
+
+async def live(urls: list[str], names: list[str]) -> None:
+    members = []
+    for name in names:
+        paths = paths_of(urls)
+        await open_all(paths)
+        members.append(Member(name, paths, NoLines(), NoMastership()))
+    tasks = [asyncio.create_task(member.run()) for member in members]
+    asks = asyncio.create_task(answer(members))
+    counts = dict.fromkeys(names, 0)
+    report(ready=True)
+    while not any(task.done() for task in (*tasks, asks)):
+        for member in members:
+            if counts[member.name] != len(member.polled):
+                counts[member.name] = len(member.polled)
+                report(gateway=member.name, at=time.monotonic(), lines=counts[member.name])
+        await asyncio.sleep(LOOK_S)
+    for task in tasks:
+        task.cancel()
+    for result in await asyncio.gather(*tasks, return_exceptions=True):
+        if isinstance(result, Exception):
+            raise result
+
+
+async def answer(members: list[Member]) -> None:
+    while await asyncio.to_thread(sys.stdin.readline):
+        for member in members:
+            report(gateway=member.name, polled=sorted(member.polled), margin_s=member.lease.left_s)
+
+
+if __name__ == "__main__":
+    asyncio.run(live(sys.argv[1].split(","), sys.argv[2:]))

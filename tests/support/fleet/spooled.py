@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from functools import lru_cache
 from itertools import count
 from pathlib import Path
 from typing import Any
 
-from completions import add_miss, add_rows, new_completion
+from batches import add_miss, add_rows, new_completion
+from nats_clusters import Cluster
 
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
-from multidrop.fleet.samples.message import unpack
-from multidrop.fleet.samples.spool import Spool
+from multidrop.fleet.errors import FleetError
+from multidrop.fleet.samples import samples_stream
+from multidrop.fleet.samples.samples_stream import create_stream, samples_path
+from multidrop.fleet.servers.connections import ServerPath
 from multidrop.polling.batch import Batch
+from multidrop.samples.message import unpack
+from multidrop.samples.spool import Spool
 
 NOON = 1_795_262_400_000_000_000  # 2026-11-21 12:00 UTC
 STEP = 10_000_000  # ns between requests
@@ -27,7 +34,7 @@ def numbered(first: int, count: int, drives: Names = DRIVES) -> Batch:
     """Return a batch of `count` exchanges with ten registers each, in the core's memory as after a poll.
 
     Exchange `n` was sent at `n * STEP` of the monotonic clock, to drive `n % 4`; register `r` has the value
-    `n % 60000 + r`. Each tenth is a miss.
+    `n % 60000 + r`. Every tenth exchange is a miss.
     """
     columns = Columns(10 * count)
     layouts = [
@@ -75,6 +82,19 @@ def exchanges_in(rows: list[tuple[Any, ...]]) -> list[int]:
     found = [row[1] // STEP for row in rows]
     assert found == [number for number in found[::10] for _ in range(10)]
     return found[::10]
+
+
+# ---- a connection to NATS servers with an empty stream of samples ----
+
+
+@asynccontextmanager
+async def empty_stream(servers: Cluster) -> AsyncIterator[ServerPath]:
+    """Yield an open ServerPath to the servers, on which the stream of samples is empty."""
+    async with samples_path(servers.urls) as path:
+        with suppress(FleetError):
+            await samples_stream._ask(path, "STREAM.DELETE.samples", {})
+        await create_stream(path, replicas=1)
+        yield path
 
 
 # ---- a process that fills a spool: `python spooled.py FOLDER FIRST` ----

@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 @dataclass(frozen=True)
 class Settings:
-    """The part's settings, which say how it fails."""
+    """The part's settings, which select how the part fails."""
 
     breaks: str = "always"
 

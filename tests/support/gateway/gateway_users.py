@@ -30,7 +30,7 @@ VIEWERS, STALLED, MASTERS = 5, 10, 2
 SCRAPE_S = QUERY_S = 1.0
 MASTER_S = 0.02  # s between a Modbus master's requests
 PASS_EVERY = 10  # one in ten requests of the second master reads an unpolled register
-ASKED_ONES = 200  # requests that a stalled viewer sends without reading
+ASKED_ONES = 200  # requests that a stalled viewer sends without reading a reply
 PATIENCE_S = 30.0
 ROUND_S = 1.0  # s before a user reconnects
 WORDS, COMMON, COMMON_WORDS = 10, 0xF000, 6  # number of polled registers; common block: address, size
@@ -75,7 +75,7 @@ def serve_tables(place: Place, rotate: str) -> str:
 
 
 class Users:
-    """All users; `counts` has the number of each result, `failures` that of each unexpected result."""
+    """All users; `counts` has the number of each result, `failures` the number of each unexpected result."""
 
     def __init__(self, place: Place) -> None:
         self.place = place

@@ -26,7 +26,7 @@ from multidrop.gateway import settings as settings_module
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Right, Token, new_token
 from multidrop.gateway.live import frames
-from multidrop.gateway.settings import ServeSettings, read_plant
+from multidrop.gateway.settings import ServeSettings, read_plant, read_settings
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 for module, name in (  # longer timeouts, because the test machine may be busy
@@ -174,6 +174,15 @@ def served(
 
 
 @contextmanager
+def gateway_of(path: Path) -> Iterator[Gateway]:
+    """Run the gateway of a plant file in a thread."""
+    plant = Plant.load(path)
+    gateway = Gateway(plant, read_settings(plant, {}))
+    with running(gateway):
+        yield gateway
+
+
+@contextmanager
 def running(gateway: Gateway) -> Iterator[asyncio.AbstractEventLoop]:
     """Run a gateway in a thread, at ten times the usual frame rate; yield its event loop.
 
@@ -194,6 +203,9 @@ def _running(gateway: Gateway) -> Iterator[asyncio.AbstractEventLoop]:
     loops: list[asyncio.AbstractEventLoop] = []
 
     async def live() -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        task.set_name("main of the test")
         loops.append(asyncio.get_running_loop())
         await gateway.run(ready.set)
 
@@ -205,7 +217,7 @@ def _running(gateway: Gateway) -> Iterator[asyncio.AbstractEventLoop]:
         finally:
             ready.set()
 
-    thread = threading.Thread(target=work, daemon=True)
+    thread = threading.Thread(target=work, name="gateway under test", daemon=True)
     thread.start()
     assert ready.wait(PATIENCE)
     try:

@@ -99,9 +99,9 @@ class FakeLine:
 
 
 def plant_of(*drives: tuple[str, Drive], polled: bool = True) -> Plant:
-    """Return a plant of drives, given with line names, that polls all readable registers, without a rate.
+    """Return a plant that polls all readable registers of these drives, each given with its line's name.
 
-    Without a rate, because a server's calculation of poll rates would dominate a short test.
+    The registers have no rates, because the server's calculation with rates would dominate a short test.
     """
     lines: dict[str, list[PolledDrive]] = {}
     for line, drive in drives:

@@ -1,9 +1,10 @@
 """Poll several lines in a forked process whose lease a test renews, and which the test suspends.
 
-Each line of standard input starts one process: FD LEASE GUARD BEYOND PORT... Its process id is printed. FD is
-an inherited socket: the process requests each renewal with one byte, and a renewal is one byte. LEASE and
-GUARD are in s. BEYOND is how many seconds the process may send after its lease expired: 0, except to test
-without the check before each write.
+Each line of standard input starts one process, and has its arguments: FD LEASE GUARD TIMER BEYOND PORT... The
+process's id is printed. FD is an inherited socket. Over this socket the process requests each renewal of its
+lease with one byte, and the test grants it with one byte. LEASE, GUARD, TIMER and BEYOND are in s. TIMER
+takes the place of GUARD for the kernel's timer. BEYOND is the time for which the process may send after its
+lease has expired. It is 0, except in tests without the check of the clock before each write.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def live(
     observer: socket.socket, lease: float, guard: float, timer: float, beyond: float, ports: list[str]
 ) -> None:
     mastership = Mastership(guard)
-    mastership.guard_s = timer  # for the kernel's timer only: claims still use `guard`
+    mastership.guard_s = timer  # used only by the kernel's timer; claims still use `guard`
     drives = [
         PolledDrive(Counted(1, name=f"drive-{n}"), (Polled(Counted.number, None),)) for n in range(len(ports))
     ]
@@ -58,7 +59,7 @@ def live(
             observer.send(b"?")
             if not observer.recv(1):
                 return
-            with suppress(ValueError):  # a renewal that arrives after a suspension is invalid
+            with suppress(ValueError):  # ValueError: a renewal arrived too late, after a suspension
                 mastership.extend(asked_ns + round((lease + beyond) * 1e9))
             poller.take()
             time.sleep(lease / 3)

@@ -170,7 +170,7 @@ class Fence:
             if _await_death(master, 0):
                 return False
             if now_s() > end:
-                _signal(master, signal.SIGUSR1)  # prints the stack of each of its threads
+                _signal(master, signal.SIGUSR1)  # the master prints the stack of each of its threads
                 time.sleep(1.0)
                 requests = self.far.requests - asked
                 raise AssertionError(
@@ -186,9 +186,9 @@ class Fence:
                 seen_s = now_s()
         _signal(master, signal.SIGSTOP)
         while (left := seen_s + self._lease + self._guard - now_s()) > 0:
-            if self._grant(left):  # a renewal that it requested before the suspension
+            if self._grant(left):  # grants a renewal that the master requested before the suspension
                 seen_s = now_s()
-        # Take over: grant no renewals from here on.
+        # From here on another master takes over: grant no renewals.
         self.far.settle(1.0)
         before = self.far.requests
         time.sleep(chance.uniform(0, 0.02))

@@ -1,12 +1,15 @@
-"""Raise KeyboardInterrupt or another exception before a chosen line or bytecode of the code under test."""
+"""Raise an exception before a chosen line or bytecode of the code under test; simulate full disks."""
 
 from __future__ import annotations
 
+import os
+import resource
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import Any
 
@@ -16,42 +19,25 @@ PACKAGE = str(Path(multidrop.__file__).parent)
 
 
 def interrupted_at(nth: int, counts: Callable[[FrameType], bool]) -> AbstractContextManager[list[str]]:
-    """Raise KeyboardInterrupt before the nth line in frames for which `counts` is true, if there is one."""
+    """Raise KeyboardInterrupt before the nth executed line in frames for which `counts` is true."""
     return failing_at(nth, counts, KeyboardInterrupt())
 
 
-def failing_at(
-    nth: int, counts: Callable[[FrameType], bool], failure: BaseException
-) -> AbstractContextManager[list[str]]:
-    """Raise `failure` before the nth line for which `counts(frame)` is true; yield a list for its place."""
-
-    def fail() -> None:
-        raise failure
-
-    return calling_at(nth, counts, fail, "line")
-
-
 @contextmanager
-def calling_at(
-    nth: int, counts: Callable[[FrameType], bool], call: Callable[[], object], event: str = "opcode"
-) -> Iterator[list[str]]:
-    """Call `call` before the nth opcode or line for which `counts(frame)` is true.
-
-    Yields a list to which the place of this opcode or line is added.
-    """
+def failing_at(nth: int, counts: Callable[[FrameType], bool], failure: BaseException) -> Iterator[list[str]]:
+    """Raise `failure` before the nth line for which `counts(frame)` is true; yield a list for its place."""
     left, before = nth, sys.gettrace()
     found: list[str] = []
 
-    def trace(frame: FrameType, happens: str, argument: object) -> Any:
+    def trace(frame: FrameType, event: str, argument: object) -> Any:
         nonlocal left
         is_counted = counts(frame)
-        frame.f_trace_opcodes = is_counted and event == "opcode"
-        if happens == event and is_counted and left:
+        if event == "line" and is_counted and left:
             left -= 1
             if left == 0:
-                found.append(f"{frame.f_code.co_qualname}, line {frame.f_lineno}, opcode {frame.f_lasti}")
-                call()
-        return trace if is_counted or happens != "call" else None
+                found.append(place(frame))
+                raise failure
+        return trace if is_counted or event != "call" else None
 
     sys.settrace(trace)
     try:
@@ -60,37 +46,60 @@ def calling_at(
         sys.settrace(before)
 
 
+def place(frame: FrameType) -> str:
+    return f"{frame.f_code.co_qualname}, line {frame.f_lineno}, opcode {frame.f_lasti}"
+
+
 # ---- before each bytecode ----
+
+
+@contextmanager
+def calling_at(
+    nth: int, counts: Callable[[FrameType], bool], call: Callable[[], object]
+) -> Iterator[list[str]]:
+    """Call `call` before the nth opcode in frames for which `counts` is true; yield a list for its place.
+
+    `counts` is called once per frame, because a call for each opcode would double the time of such a test.
+    """
+    left, before = nth, sys.gettrace()
+    found: list[str] = []
+
+    def enter(frame: FrameType, event: str, argument: object) -> Any:
+        if not counts(frame):
+            return None
+        frame.f_trace_opcodes, frame.f_trace_lines = True, False
+        return step
+
+    def step(frame: FrameType, event: str, argument: object) -> Any:
+        nonlocal left
+        if event == "opcode":
+            left -= 1
+            if left == 0:
+                sys.settrace(None)
+                found.append(place(frame))
+                call()
+        return step
+
+    sys.settrace(enter)
+    try:
+        yield found
+    finally:
+        sys.settrace(before)
 
 
 class Interruption(BaseException):
     """Raised instead of KeyboardInterrupt, which would end the test run."""
 
 
-@contextmanager
-def interrupted_before(nth: int, failure: type[BaseException] = Interruption) -> Iterator[list[str]]:
+def interrupted_before(
+    nth: int, failure: type[BaseException] = Interruption
+) -> AbstractContextManager[list[str]]:
     """Raise `failure` before the package's nth bytecode on this thread; yield a list for its place."""
-    left = nth
-    found: list[str] = []
 
-    def trace(frame: FrameType, event: str, argument: object) -> Any:
-        nonlocal left
-        if not frame.f_code.co_filename.startswith(PACKAGE):
-            return None
-        frame.f_trace_opcodes, frame.f_trace_lines = True, False
-        if event == "opcode" and not found:
-            left -= 1
-            if left == 0:
-                found.append(f"{frame.f_code.co_qualname}, line {frame.f_lineno}")
-                raise failure
-        return trace
+    def fail() -> None:
+        raise failure
 
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        yield found
-    finally:
-        sys.settrace(before)
+    return calling_at(nth, lambda frame: frame.f_code.co_filename.startswith(PACKAGE), fail)
 
 
 def every(step: int, act: Callable[[int], bool]) -> int:
@@ -106,3 +115,35 @@ def interrupted(act: Callable[[], object], nth: int, places: set[str]) -> bool:
         act()
     places.update(found)
     return bool(found)
+
+
+# ---- simulate full and read-only disks: needs no mount, and works for root too ----
+
+
+NOBODY = 65534
+
+
+@contextmanager
+def full_at(size: int) -> Iterator[None]:
+    """Limit files of this process to `size` bytes; writes beyond the limit are cut off."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@contextmanager
+def read_only_directory() -> Iterator[Path]:
+    """Yield a directory that rejects new files; root becomes `nobody`, because root can write anywhere."""
+    user = os.geteuid()
+    with TemporaryDirectory() as directory:
+        Path(directory).chmod(0o555)
+        if user == 0:
+            os.seteuid(NOBODY)
+        try:
+            yield Path(directory)
+        finally:
+            os.seteuid(user)
+            Path(directory).chmod(0o755)

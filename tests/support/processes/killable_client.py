@@ -1,21 +1,28 @@
-"""Poll, record and write in a forked process until killed, and report the rows and writes on disk.
+"""Run a client in a forked process that may be killed at any moment.
 
-Each line of standard input, PORT DIRECTORY LIFE NUMBER, forks such a process; its id and its exit status are
-printed. It records into DIRECTORY/LIFE.arrows and .csv, and writes NUMBER and the following numbers to the
-drive. As soon as a call has returned, it appends to DIRECTORY/LIFE.told:
+Each line of standard input forks such a process, which is fast, because everything is imported. Its id is
+printed and, when it ends, its exit status. The lines are:
+    poll PORT DIRECTORY LIFE NUMBER    poll, record into DIRECTORY/LIFE.arrows and .csv, and write NUMBER
+                                       and the following numbers to the drive, until killed
+    apply PORT FILE REPORT             apply a parameter file; record own and earlier writes in REPORT
+
+As soon as a call has returned, a polling client appends to DIRECTORY/LIFE.told:
     rows N      both recordings have N rows
     wrote N     the number N was written
-All these processes share the EEPROM ledger and the audit log in DIRECTORY.
+All polling clients share the EEPROM ledger and the audit log in DIRECTORY.
 """
 
 from __future__ import annotations
 
 import os
 import sys
+import time
 import traceback
 from itertools import count
 from pathlib import Path
+from typing import Any
 
+from multidrop import Bus, BusError, DelixiNative, params
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive, Framing
@@ -26,10 +33,12 @@ from multidrop.recording import open_writer
 
 METADATA = {"plant": "counted.toml"}
 NAME = "counted"
+DRIVE: Any = {"address": 1, "baudrate": 38400}  # the drive to which parameters are applied
+TRIES = 20  # attempts per call, because a busy machine may miss replies
 
 
 class Counted(Drive):
-    """A drive that counts its reads, and has a writable register, `number`, not declared as RAM or EEPROM."""
+    """A drive that counts its reads; its register `number` is writable, but not declared as RAM or EEPROM."""
 
     framings = (Framing.RTU,)
     baudrates = (115_200,)
@@ -49,7 +58,7 @@ def audit(directory: Path) -> Path:
     return directory / "audit.jsonl"
 
 
-def live(port: str, directory: Path, life: str, number: int) -> None:
+def poll(port: str, directory: Path, life: str, number: int) -> None:
     log = (directory / f"{life}.told").open("wb", buffering=0)
     drive = Counted(1, name=NAME)
     polled = PolledDrive(drive, (Polled(Counted.count, None),))
@@ -66,18 +75,45 @@ def live(port: str, directory: Path, life: str, number: int) -> None:
             log.write(b"wrote %d\n" % at)
 
 
+def apply(port: str, file: str, report: str) -> None:
+    reported: list[str] = []
+    for _ in range(TRIES):
+        try:
+            with Bus(port, expiry=60) as bus:
+                drive = bus.attach(DelixiNative, **DRIVE)
+                result = params.apply(drive, params.load(file), commissioning=True)
+        except BusError:
+            time.sleep(0.1)
+            continue
+        reported += [*(change.parameter.code for change in result.written), *result.earlier]
+        if result.ok:
+            break
+    else:
+        raise SystemExit("the application does not end")
+    Path(report).write_text("\n".join(reported))
+
+
 def main() -> None:
     for line in sys.stdin:
-        port, directory, life, number = line.split()
         process = os.fork()
         if process == 0:
+            status = 1
             try:
-                live(port, Path(directory), life, int(number))
+                live(*line.split())
+                status = 0
             except BaseException:
                 traceback.print_exc()
-            os._exit(1)
+            os._exit(status)
         print(process, flush=True)
         print(os.waitpid(process, 0)[1], flush=True)
+
+
+def live(action: str, port: str, *words: str) -> None:
+    if action == "apply":
+        apply(port, *words)
+    else:
+        directory, life, number = words
+        poll(port, Path(directory), life, int(number))
 
 
 if __name__ == "__main__":

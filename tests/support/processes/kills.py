@@ -14,10 +14,7 @@ class BoundProcess(subprocess.Popen[AnyStr]):
     """A process that is killed if its `with` block fails, whereas `Popen` would wait for its end."""
 
     def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        failure: BaseException | None,
-        traceback: TracebackType | None,
+        self, kind: type[BaseException] | None, failure: BaseException | None, traceback: TracebackType | None
     ) -> None:
         if failure is not None:
             self.kill()

@@ -1,4 +1,4 @@
-"""Limit the number of test examples: a tenth by default, all if the variable THOROUGH is set."""
+"""Limit the number of test examples: a tenth by default, all if the environment variable THOROUGH is set."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def examples(number: int) -> int:
 
 
 def usually(tried: object, *others: object) -> list[Any]:
-    """Return pytest parameters, of which all but the first are marked `long`."""
+    """Return the arguments as pytest parameters; all but the first are marked `long`."""
     return [tried, *(_long(other) for other in others)]
 
 
 def in_turn(each: Iterable[object], cases: Sequence[object]) -> list[Any]:
-    """Return all pairs of `each` and `cases`, marked `long` except one case for each of `each`."""
+    """Return all pairs of `each` and `cases`; for each entry of `each`, all but one are marked `long`."""
     return [
         (one, case) if number % len(cases) == nth else _long((one, case))
         for number, one in enumerate(each)
@@ -38,7 +38,7 @@ def every_third(cases: Sequence[object]) -> list[Any]:
 
 
 def every_fourth(each: Iterable[object], cases: Sequence[object], tried: Sequence[object]) -> list[Any]:
-    """Return every fourth pair of `each` and `cases`, and `tried`; all but `tried` are marked `long`."""
+    """Return the pairs `tried`, and every fourth pair of `each` and `cases`, which is marked `long`."""
     return [
         pytest.param(one, case, id=f"{one}-{_case_id(case)}", marks=() if is_tried else pytest.mark.long)
         for number, one in enumerate(each)

@@ -10,7 +10,7 @@ from itertools import count
 from math import isclose
 from pathlib import Path
 
-from completions import add_miss, add_rows, new_completion
+from batches import add_miss, add_rows, new_completion
 
 from multidrop.core import Columns, Field, NumberFormat, RowLayout, Status
 from multidrop.core.columns import Names
@@ -29,7 +29,7 @@ METADATA = {"plant": "завод.toml", "drives": {"pump-1": {"registers": {"spe
 
 
 def batch(names: Names, drive: int, numbers: Iterable[int], begin: int, step: int) -> Batch:
-    """Return a batch with a row per number, in the core's memory as after a poll; each tenth is a miss.
+    """Return a batch with a row per number, in the core's memory as after a poll; every tenth row is a miss.
 
     A row's request was sent at `number * step` ns of the monotonic clock, which is UTC minus `begin`.
     """

@@ -173,7 +173,7 @@ select:
 output:
   - { platform: modbus_controller, id: speed, address: 60, register_type: holding, value_type: U_WORD }
 """
-FILES = {  # by suffix, which selects the importer
+FILES = {  # file contents by suffix, which selects the importer
     ".tsv": (IOBROKER,),
     ".csv": (MODPOLL, NEURON, OWN),
     ".toml": (TELEGRAF,),

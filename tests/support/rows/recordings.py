@@ -64,7 +64,7 @@ SCHEMA = pa.schema(
     ]
 )
 
-FILE_SCHEMA = pa.schema(  # schema of .arrows: dictionary-encoded names, rounded-up uncertainty
+FILE_SCHEMA = pa.schema(  # schema of .arrows: names are dictionary-encoded, the uncertainty is rounded up
     [
         *(SCHEMA.field(name) for name in ("time", "monotonic_ns")),
         pa.field("uncertainty_ns", pa.float32()),
@@ -77,7 +77,7 @@ FILE_SCHEMA = pa.schema(  # schema of .arrows: dictionary-encoded names, rounded
 
 
 def is_kept(found: Row, written: Row) -> bool:
-    """Return True if .arrows returned the written row; its uncertainty may be slightly larger."""
+    """Return True if the row found in .arrows is the written row; its uncertainty may be slightly larger."""
     bound, least = found.uncertainty_ns, written.uncertainty_ns
     if bound is None or least is None:
         is_near = bound is least

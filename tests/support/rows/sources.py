@@ -11,7 +11,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[3]
 PACKAGE = ROOT / "src" / "multidrop"
 ROOMS = ("src", "csrc", "tests", "bench", "docs")
-BUILT = {"_build", "__pycache__", "corpus"}
+BUILT = {"_build", "__pycache__"}
 
 
 def files(*rooms: str, suffixes: tuple[str, ...] = (".py",)) -> list[Path]:

@@ -1,7 +1,7 @@
 """Table tests: one test calls a function with every row, and reports all failing rows.
 
 A row costs only its check, whereas each test of `pytest.mark.parametrize` costs some extra milliseconds in
-each test process. Use the latter for rows that need a fresh fixture or may be skipped.
+each test process. Use `parametrize` for rows that need a fresh fixture or may be skipped.
 """
 
 from __future__ import annotations
@@ -20,7 +20,10 @@ FAILURES = (Exception, pytest.fail.Exception, pytest.skip.Exception)  # a skippe
 def table(
     names: str | Sequence[str], rows: Iterable[Any], ids: Iterable[object] | None = None
 ) -> Callable[[Test], Test]:
-    """Return a decorator that calls a test with each row as arguments `names`; it reports failing rows."""
+    """Return a decorator that calls a test with each row as arguments `names`; it reports failing rows.
+
+    The test's attribute `rows` has the rows.
+    """
     columns = [name.strip() for name in names.split(",")] if isinstance(names, str) else list(names)
     several = not isinstance(names, str) or len(columns) > 1
     values = [tuple(row) if several else (row,) for row in rows]
@@ -45,6 +48,7 @@ def table(
         signature = inspect.signature(test)
         others = [one for name, one in signature.parameters.items() if name not in columns]
         walked.__signature__ = signature.replace(parameters=others)  # type: ignore[attr-defined]
+        walked.rows = values  # type: ignore[attr-defined]
         return walked
 
     return decorate

@@ -22,7 +22,7 @@ from peers import require_module, require_program
 
 from multidrop import Drive, InvtCHE, Plant, PlantLine, Polled, PolledDrive
 from multidrop.control import CommandOutcome, CommandResult
-from multidrop.gateway.http.rights import Caller, May
+from multidrop.gateway.http.rights import Caller, May, Tokens
 from multidrop.gateway.live.alarms import Alarms
 from multidrop.gateway.live.hub import KeptRow, Known, Shown
 from multidrop.gateway.parts import PartContext
@@ -118,7 +118,7 @@ class Published(NamedTuple):
 
 
 def has(topic: str, payload: bytes | None = None) -> Callable[[Published], bool]:
-    """Return a predicate for messages on this topic, with this payload unless `payload` is None."""
+    """Return a predicate for messages on this topic; `payload` None allows any payload."""
     return lambda received: received.topic == topic and payload in (None, received.payload)
 
 
@@ -154,13 +154,18 @@ class Listener:
                 self._received.put(Published(topic, kept == "1", bytes.fromhex(payload)))
 
     def wait_for(self, wanted: Callable[[Published], object]) -> Published:
-        """Wait for the next message that `wanted` accepts and return it; `all` keeps every message."""
+        """Return the next message that `wanted` accepts; every received message is kept in `all`."""
         ends = time.monotonic() + PATIENCE_S
         while True:
             received = self._received.get(timeout=max(0.0, ends - time.monotonic()))
             self.all.append(received)
             if wanted(received):
                 return received
+
+    def drain(self) -> None:
+        """Move all messages received so far to `all`."""
+        while not self._received.empty():
+            self.all.append(self._received.get())
 
     def close(self) -> None:
         self._process.kill()
@@ -264,7 +269,7 @@ def inside(folder: Path, fan: Drive = FAN) -> Any:
     hub: Any = ScriptedHub(fan.name)
     commands: Any = RecordedCommands()
     ask: Any = SimpleNamespace()
-    return PartContext(plant, hub, commands, ask, folder, "0.2", Alarms())
+    return PartContext(plant, hub, commands, ask, folder, "0.2", Alarms(), Tokens())
 
 
 def without_fan(known: Any) -> Plant:

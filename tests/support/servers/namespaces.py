@@ -127,7 +127,7 @@ def network(number: int) -> Iterator[Network]:
 
 
 def why_none() -> str:
-    """Return why this machine allows no network namespaces, or ""."""
+    """Return the reason if this machine allows no network namespaces, else ""."""
     if os.geteuid() != 0 or shutil.which("ip") is None:
         return "network namespaces need root and the program ip"
     trial = ["ip", "link", "add", f"mdt{os.getpid() % 100_000}", "type", "bridge"]
@@ -136,7 +136,9 @@ def why_none() -> str:
     return f"this system makes no network of its own: {tried.stderr.strip()}" if tried.returncode else ""
 
 
-LOCK = Path(tempfile.gettempdir()) / f"multidrop-network-{os.getuid()}"
+OWN_NETWORK = Path("/proc/self/ns/net")  # each network namespace has its own inode number
+NETWORK = OWN_NETWORK.stat().st_ino if OWN_NETWORK.exists() else 0
+LOCK = Path(tempfile.gettempdir()) / f"multidrop-network-{os.getuid()}-{NETWORK}"
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Run real nats-server processes in temporary folders: clusters, and Debian's old version."""
+"""Run nats-server processes in temporary folders: clusters, and Debian's old version."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class Node:
         self.process.wait()
 
     def pause(self) -> None:
-        """Suspend the server; wait until all its threads are suspended, because each could still answer."""
+        """Suspend the server, and wait until all its threads are suspended: until then, one could answer."""
         os.kill(self.process.pid, signal.SIGSTOP)
         os.waitid(os.P_PID, self.process.pid, os.WSTOPPED)
 
@@ -154,11 +154,7 @@ class Cluster:
     """NATS servers that form a cluster."""
 
     def __init__(
-        self,
-        folder: Path,
-        number: int = 3,
-        program: str | None = None,
-        places: Sequence[Namespace] = (),
+        self, folder: Path, number: int = 3, program: str | None = None, places: Sequence[Namespace] = ()
     ) -> None:
         found = program or server_program()
         ports = [free_ports(3) for _ in range(number)]

@@ -1,9 +1,9 @@
 """A network serial port that prints the bytes received for its line, and replies to them.
 
-Reads return 0. Every other request is confirmed with a copy, as for a single write.
+Reads return 0. The reply to any other request is a copy of the request, as for a single write.
 
 It prints its TCP port first. Each further line is a connection's number and the bytes for the serial line, in
-hexadecimal. A connection that sends END is closed after everything received has been printed.
+hexadecimal. If a client sends END, the server prints all received bytes, then closes the connection.
 Usage: network_server.py {rfc2217,socket} ADDRESS
 """
 

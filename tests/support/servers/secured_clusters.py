@@ -14,7 +14,7 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from fleet_drills import fleet_status
+from fleet_drills import CommandEnd, fleet_status, run_here
 from kills import kill_all
 from nats_clusters import Cluster, Node, server_program, started_cluster
 from peers import require_program
@@ -149,16 +149,9 @@ def secured_cluster(
         yield running
 
 
-def multidrop(servers: SecuredCluster, user: str, *words: str) -> subprocess.CompletedProcess[str]:
+def multidrop(servers: SecuredCluster, user: str, *words: str) -> CommandEnd:
     """Run a `multidrop` command as this user."""
-    return subprocess.run(
-        [sys.executable, "-m", "multidrop", *words],
-        env=servers.environment(user),
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=PATIENCE_S,
-    )
+    return run_here(servers.environment(user), *words)
 
 
 def until(condition: Callable[[], bool], what: str) -> None:
@@ -175,6 +168,7 @@ class SecuredFleet:
         self.servers = servers
         self.hall = SerialHall(6)
         self.running: dict[str, subprocess.Popen[bytes]] = {}
+        self._started: dict[str, tuple[tuple[str, str], dict[str, str]]] = {}  # arguments of `start`
         self._folder = folder
         (folder / "plant.toml").write_text(self.hall.plant())
         made = multidrop(servers, "operator", "fleet", "init", str(folder / "plant.toml"))
@@ -183,6 +177,7 @@ class SecuredFleet:
     def start(self, name: str, kept: str = "", **environment: str) -> None:
         """Start a gateway; `kept` names another folder to use."""
         kept = kept or name
+        self._started[kept] = (name, kept), environment
         words = ["fleet", "serve", name, "--folder", str(self._folder / kept)]
         with (self._folder / f"{kept}.log").open("ab") as log:
             self.running[kept] = subprocess.Popen(
@@ -198,8 +193,21 @@ class SecuredFleet:
     def status(self, user: str = "viewer") -> dict[str, Any]:
         return fleet_status(self.servers.environment(user))
 
+    def kill(self, name: str) -> None:
+        process = self.running.pop(name)
+        process.kill()
+        process.wait()
+
     def wait_for_polling(self) -> None:
-        until(lambda: self.hall.are_polled(0.5), "all lines are polled")
+        """Wait until all lines are polled; restart gateways that the kernel killed on a busy machine."""
+
+        def are_polled() -> bool:
+            for kept, process in list(self.running.items()):
+                if process.poll() == -signal.SIGKILL:
+                    self.start(*self._started[kept][0], **self._started[kept][1])
+            return self.hall.are_polled(0.5)
+
+        until(are_polled, "all lines are polled")
 
     def close(self) -> None:
         kill_all(self.running.values())

@@ -1,7 +1,7 @@
-"""Serial servers for many lines that record which master sends when; each connection counts as a master.
+"""Serial servers for many lines; they record which master sends when. Each connection counts as a master.
 
-If a request comes on an old connection after the first request on a newer connection, that is an overlap. Old
-connections stay open so that overlaps are detected.
+A request on an old connection after the first request on a newer connection is an overlap. Old connections
+stay open so that overlaps are detected.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 REQUEST = 8  # bytes of a Modbus RTU read
-MAKE = {0x02BC: 1, 0x02BE: 1}  # registers that identify an INNOVERT IBD: 9600 baud, address 1
+MAKE = {0x02BC: 1, 0x02BE: 1}  # INNOVERT IBD: baud rate (1: 9600) and address, which identify it
 
 
 @dataclass

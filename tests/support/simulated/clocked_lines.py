@@ -1,4 +1,4 @@
-"""Run a poller and a simulated line on a simulated clock: an hour takes seconds.
+"""Run a poller and a simulated line on a simulated clock: a simulated hour takes seconds.
 
 The poller is real, with its thread, plan and schedule. The line's state machine and its turns are the core's
 own code (csrc/line.c, csrc/turn.c). The descriptor, the core's thread and the clock are simulated: time
@@ -15,20 +15,12 @@ from types import SimpleNamespace
 from typing import Any, Protocol
 
 import pytest
-from completions import copied
+from batches import copied
 from lines import PATIENCE, line, plant, rows_of
 from multidrop._core import ffi, lib
 
 from multidrop import bus, poller
-from multidrop.core import (
-    Completion,
-    Exchange,
-    Message,
-    Peer,
-    RowQueue,
-    TransactionIds,
-    Transactions,
-)
+from multidrop.core import Completion, Exchange, Message, Peer, RowQueue, TransactionIds, Transactions
 from multidrop.drive import Drive
 from multidrop.drive.line_settings import speaks_tcp
 from multidrop.errors import LineError
@@ -66,7 +58,7 @@ class ClockedWire(FaultyWire):
 
 
 class ClockedRowQueue(RowQueue):
-    """A row queue that, instead of waiting for a call, lets simulated time advance."""
+    """A row queue without real waits: `await_calls` advances simulated time instead."""
 
     pass_time: Callable[[float], None]
 
@@ -230,7 +222,7 @@ class ClockedPort:
 class ClockedLine:
     """Replaces line.Line: the interface that the bus uses."""
 
-    only_settings = None  # no restriction on drives' settings
+    only_settings = None  # drives may have any settings
     why_closing = ""
     mastership = None
     may_send = True
@@ -264,7 +256,7 @@ class ClockedLine:
     def end(self) -> bool:
         return self.queue is not None and self.queue.end()
 
-    def note_foreign(self) -> None:
+    def note_news(self) -> None:
         pass
 
     def note_stall(self) -> None:
@@ -314,13 +306,7 @@ class ClockedLines:
         return clocked
 
     def _line(
-        self,
-        port: str,
-        echo: object,
-        ids: TransactionIds,
-        rs485: object,
-        mastership: None,
-        settle: float,
+        self, port: str, echo: object, ids: TransactionIds, rs485: object, mastership: None, settle: float
     ) -> ClockedLine:
         return ClockedLine(self, port, ids)
 
@@ -328,7 +314,7 @@ class ClockedLines:
         self.now = self._limit = BEGIN_NS
         self.wires = dict(wires)
         self.ports: dict[str, ClockedPort | None] = {}
-        self.opened: list[str] = []  # a port's name for each time it was opened
+        self.opened: list[str] = []  # names of opened ports, in the order of opening
         self._queue: ClockedRowQueue | None = None
         self._leaving = False
         self._failure: BaseException | None = None
@@ -346,13 +332,13 @@ class ClockedLines:
 
     @property
     def wire(self) -> ClockedWire:
-        """Return the wire, of which there must be only one."""
+        """Return the only wire; there must be exactly one."""
         (wire,) = self.wires.values()
         return wire
 
     @property
     def port(self) -> ClockedPort | None:
-        """Return the port, of which there must be only one; None while it is closed."""
+        """Return the port of the only wire; None while the port is closed."""
         return next(iter(self.ports.values()), None)
 
     def __enter__(self) -> ClockedLines:
@@ -458,7 +444,7 @@ class ClockedLines:
             if self._queue and self._queue.has_called:
                 return
             self.now = min(max(wake, self.now + 1), end_ns)
-        if wake <= end_ns:  # otherwise no event is due before the end
+        if wake <= end_ns:  # False if no event is due before the end
             self._settle()
 
     def _settle(self) -> int:

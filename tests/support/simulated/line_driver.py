@@ -5,20 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from completions import copied, new_completion
+from batches import copied, new_completion
 from frames import words
 from multidrop._core import ffi, lib
 
-from multidrop.core import (
-    Completion,
-    Exchange,
-    Failure,
-    Framing,
-    Message,
-    Peer,
-    Transactions,
-    build_reply,
-)
+from multidrop.core import Completion, Exchange, Failure, Framing, Message, Peer, Transactions, build_reply
 
 MS = 1_000_000
 
@@ -69,7 +60,7 @@ class LineDriver:
 
     @property
     def is_out_of_step(self) -> bool:
-        """Return True after bytes that are no Modbus TCP header, after which the engine closes the port."""
+        """Return True if received bytes were no Modbus TCP header; the engine then closes the port."""
         return bool(self._line.is_out_of_step)
 
     @property
@@ -86,7 +77,7 @@ class LineDriver:
         lib.md_line_begin(self._line, exchange.c, self.found, self.now)
 
     def take(self, most: int = 513, held_up: int = 0) -> bytes:
-        """Take up to `most` bytes of the line's request, as a write that takes `held_up` ns; return them."""
+        """Return up to `most` bytes of the line's request, taken as by a write that lasts `held_up` ns."""
         tx = bytes(ffi.buffer(self._line.tx, self._line.tx_len))[self._line.tx_at :][:most]
         begun = self.now
         self.now += held_up

@@ -23,7 +23,7 @@ from multidrop.sim import SimulatedDrive, Simulator, Wire, proof, serve
 
 ANY_PORT = "socket://127.0.0.1:0"  # a free port; works without pseudo-terminals
 PATIENCE = 120.0  # s, longest wait for events that are immediate on an idle machine
-# Timeouts that a busy test machine could exceed, with longer values.
+# Statuses of misses that a delay of the test machine alone can cause.
 HOST_LATE = {
     str(status)
     for status in (
@@ -44,7 +44,7 @@ def until(met: Callable[[], Any], patience: float = PATIENCE) -> None:
     while not met():
         assert monotonic() < end, f"not met within {patience:g} s"
         sleep(pause_s)
-        pause_s = min(1.2 * pause_s, 0.04)  # check less often, because a check may be costly
+        pause_s = min(1.2 * pause_s, 0.04)  # check less and less often, because a check may be costly
 
 
 class Faulty(Wire):
@@ -95,7 +95,7 @@ class LateWire(Wire):
 
 @contextmanager
 def served(make: Callable[[], Sequence[Wire]]) -> Iterator[list[str]]:
-    """Run the wires that `make` returns in another process, which imports `make`; yield their paths."""
+    """Start a process that imports `make` and simulates the wires that it returns; yield their paths."""
     ours, theirs = multiprocessing.Pipe()
     context = multiprocessing.get_context("spawn")
     process = context.Process(target=_serve, args=(make, theirs), daemon=True)

@@ -139,7 +139,7 @@ class Responder:
 
         self._jobs.append(run_and_notify)
         os.write(self._waker, b"\0")
-        done.wait()  # if a signal handler interrupts this wait, the job still completes
+        done.wait()  # the job completes even if a signal handler interrupts this wait
 
     def release(self, line: ResponderLine) -> None:
         """Send the replies that `hold` has held back on this line."""
@@ -277,7 +277,7 @@ class ReceivedFrame:
 
 
 def split(buffer: bytes) -> tuple[bytes, DriveRequest | None, bytes]:
-    """Return the first frame, b"" if incomplete, its request (None if the checksum is wrong), the rest."""
+    """Return the first frame (b"" if incomplete), its request (None if the checksum is wrong), the rest."""
     if buffer[:1] == b":":
         end = buffer.find(b"\n") + 1
         frame, rest = buffer[:end], buffer[end:]
@@ -311,7 +311,7 @@ def _standard(body: bytes) -> DriveRequest:
 
 
 def reply(drive: ResponderDrive, asked: DriveRequest, frame: bytes, exception: int = 0) -> bytes:
-    """Carry out a request; return the drive's reply, with `exception` if that is not 0."""
+    """Carry out a request; return the drive's reply, which has `exception` if that is not 0."""
     if drive.kind.protocol == DELIXI:
         return _delixi_reply(drive, asked, frame, exception)
     head = f"{asked.address:02X}"
@@ -363,7 +363,7 @@ class ResponderLine:
         self._last = 0.0  # time of the latest bytes in s
 
     def hold(self, requests: int) -> None:
-        """Answer this many more requests, then hold back replies until `release`."""
+        """Answer this many more requests; then hold back all replies until `release` is called."""
         self.held.clear()
         self._hold_in, self._is_holding = requests + 1, False
 

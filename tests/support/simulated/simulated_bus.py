@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from completions import completed
+from batches import completed
 
 from multidrop import bus
 from multidrop.core import (

@@ -13,10 +13,16 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
+from random import Random
 from typing import Any
+
+from multidrop.drive import Drive
+from multidrop.drive.parameters import Parameter, parameters_of
+from multidrop.runs import RunPlan, load_test
+from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 sys.path.extend(map(str, Path(__file__).parents[1].iterdir()))
 
@@ -24,7 +30,7 @@ from kills import BoundProcess
 
 from multidrop import Plant
 from multidrop.families.profiles.delta import DeltaControl
-from multidrop.sim import MotorDrive, Wire, serve, simulated
+from multidrop.sim import serve
 
 FAMILY = """[family]
 title = "A pump with Delta's words"
@@ -203,3 +209,116 @@ def main(path: str) -> None:
 
 if __name__ == "__main__":
     main(sys.argv[1])
+
+
+# ---- simulated drives with parameters that their class does not declare, and their factory reset ----
+
+
+def with_parameters(drive: Drive, codes: Iterable[str] = ()) -> MotorDrive:
+    """Return the drive's simulation, to which parameters with these codes of its family are added."""
+    sim = simulated(drive)
+    assert isinstance(sim, MotorDrive)
+    for code in codes:
+        sim.memory.declare(parameters_of(type(drive))[code])
+    return sim
+
+
+def writable(drive: Drive, codes: Iterable[str]) -> list[Parameter]:
+    return [one for code, one in parameters_of(type(drive)).items() if _is_there(code, one, codes)]
+
+
+def _is_there(code: str, one: Parameter, codes: Iterable[str]) -> bool:
+    return not one.never and (one.is_declared or code in codes)
+
+
+def raw_of(sim: MotorDrive, one: Parameter) -> int:
+    return sim.memory.of(one)[0].raw
+
+
+def factory_reset(sim: MotorDrive, parameters: Iterable[Parameter]) -> None:
+    """Set parameters to their factory values; if the manual prints none, to 0 or to their least value."""
+    for one in parameters:
+        low = one.span[0] if one.span else 0
+        sim.memory.set(one, one.default if one.default is not None else low)
+    sim.set_up()
+
+
+def set_at_random(sim: MotorDrive, parameters: list[Parameter], random: Random) -> None:
+    """Set parameters to random values within their limits."""
+    for one in parameters:
+        if one.values is None and not (one.at_least or one.at_most):
+            low, high = one.coding.raw_span if one.span is None else map(one.coding.count_of, one.span)
+            sim.memory.set_raw(one, random.randint(int(low), min(int(high), 0xFFFF)))
+    sim.set_up()
+
+
+def obey_the_line(sim: MotorDrive) -> None:
+    """Let the line command the motor, if the drive's run source is a register."""
+    source = sim.drive.registers.get("run_source")
+    if source is not None and source.values is not None:
+        sim["run_source"] = next(one for one in source.values if one.name.lower() == "line")
+
+
+# ---- test files on a simulated plant: their text, and the simulator of their lines ----
+
+
+CHE = {"model": "invt-che", "maximum_frequency": 50, "poll": ["output_frequency", "output_current", "fault"]}
+STEPS = """
+[[phase]]
+name = "start"
+[[phase.step]]
+frequency = { fan = 10.0 }
+start = ["fan"]
+
+[[phase]]
+name = "steps"
+[[phase.step]]
+frequency = { fan = [20.0, 30.0] }
+dwell = "2 s"
+"""
+
+
+def write_test(folder: Path, text: str = STEPS, **drives: dict[str, Any]) -> Path:
+    """Write a plant file and a test file; return the path of the test file.
+
+    `drives` are keys of each drive's table by its name, by default of a `fan`. The line's port is a link in
+    the folder.
+    """
+    plant = [f'[[line]]\nname = "hall"\nport = "{folder}/hall"']
+    for address, (name, keys) in enumerate((drives or {"fan": CHE}).items(), 1):
+        plant += ["[[line.drive]]", f'name = "{name}"', f"address = {address}"]
+        plant += [
+            f"{key} = {str(value) if isinstance(value, list) else repr(value)}" for key, value in keys.items()
+        ]
+    (folder / "plant.toml").write_text("\n".join(plant) + "\n")
+    path = folder / "test.toml"
+    path.write_text(f'plant = "plant.toml"\n{text}')
+    return path
+
+
+def far_ends(plan: RunPlan) -> list[Any]:
+    """Return the simulated drives of a plan's line; their motors take 0.2 s to ramp up or down."""
+    sims = [simulated(polled.drive) for polled in plan.plant.lines[0].drives]
+    for sim in sims:
+        for name in ("acceleration_time", "deceleration_time"):
+            if name in sim.drive.registers and isinstance(sim, MotorDrive):
+                sim[name] = 0.2
+        if isinstance(sim, MotorDrive):
+            sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2
+    return sims
+
+
+@contextmanager
+def simulated_test(
+    path: Path, *, speed: float = 1.0, unpaced: bool = False
+) -> Iterator[tuple[RunPlan, list[Any]]]:
+    """Simulate the plant of a test file; yield the test and the simulated drives."""
+    plan = load_test(path)
+    sims = far_ends(plan)
+    with Simulator([Wire(sims, port=plan.plant.lines[0].port, unpaced=unpaced)], speed=speed):
+        yield plan, sims
+
+
+def turning(sims: list[Any]) -> list[str]:
+    """Return the names of the drives whose simulated motors are not switched off."""
+    return [sim.drive.name for sim in sims if sim.motor.energised]

@@ -15,9 +15,9 @@ from multidrop.core import Completion, Exchange, Message
 from multidrop.drive import Condition, Direction, Drive, Script, State, read, write
 from multidrop.drive.register import Kept, reading, setting
 from multidrop.drive.verbs import verb
-from multidrop.errors import (
-    BusError,
-)
+from multidrop.errors import BusError
+from multidrop.families import InvtCHE
+from multidrop.sim import simulated
 
 STOPS: dict[str, Callable[[Message], bool]] = {  # by family: whether a request is its documented stop
     "erman-er-g-220": lambda each: each.function == 5 and each.start == 1 and each.data != b"\0\0",
@@ -73,7 +73,7 @@ def all_stopped(line: SimulatedBus, sims: list[Any]) -> bool:
 
 
 def first(line: SimulatedBus, begun: int, met: Callable[[Message], bool]) -> int | None:
-    """Return how many frames after `begun` precede the first write that `met` accepts; None if none."""
+    """Return how many frames from `begun` on precede the first write that `met` accepts, or None."""
     wanted = (at for at, (each, _) in enumerate(line.frames[begun:]) if is_write(each) and met(each))
     return next(wanted, None)
 
@@ -107,6 +107,24 @@ class Meanwhile:
             self.failure = failure
 
 
+def che_drives(
+    monkeypatch: pytest.MonkeyPatch, count: int = 1, *, hz: float = 20, runs_s: float | None = None
+) -> tuple[SimulatedBus, list[Any], list[Any]]:
+    """Return a simulated bus, its CHE drives, whose setpoints are written, and their simulations.
+
+    If `runs_s` is given, all motors have been running for this many seconds.
+    """
+    sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in range(1, count + 1)]
+    line = SimulatedBus(monkeypatch, *sims)
+    drives: list[Any] = [line.attach(sim.drive) for sim in sims]
+    for drive in drives:
+        drive.set_frequency(hz)
+        if runs_s is not None:
+            drive.start()
+    line.sleep(runs_s or 0)
+    return line, drives, sims
+
+
 def plain_stop(drive: Drive) -> tuple[Any, Any]:
     register = drive.registers.get("control") or drive.register("stop_coil")
     assert register.harmless
@@ -122,7 +140,7 @@ def started_while(
 ) -> tuple[SimulatedBus, Any, Meanwhile, int, BaseException | None]:
     """Start a drive while another thread acts after `frames` frames.
 
-    Returns the bus, the drive, the action, the number of earlier frames, and the error of the start, if any.
+    Returns the bus, the drive, the action, the number of frames before the start, and its error or None.
     """
     line, drive, _ = one(monkeypatch, MAKE[model](1), ledger=tmp_path / f"wear-{frames}")
     drive.set_frequency(20)

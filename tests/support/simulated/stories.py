@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from clocked_lines import BEGIN_NS, NEVER, ClockedLines, ClockedPort, ClockedWire, transactions_of
 from lines import polled, proof, proofs, rows_of
-from variants import REASONS
+from motors import REASONS
 
 from multidrop import bus, poller
 from multidrop.bus import Bus
@@ -140,7 +140,7 @@ def _polls(drive: Drive, every: float | None) -> PolledDrive:
 
 
 def _longest_gap(rows: Sequence[Row]) -> float:
-    """Return the bus cycle in s, measured as the longest time between two values of one register."""
+    """Return the bus cycle in s, measured as the longest time between successive values of a register."""
     times: dict[tuple[str, str], list[int]] = {}
     for row in rows:
         times.setdefault((row.drive, row.register), []).append(row.monotonic_ns)
@@ -149,9 +149,9 @@ def _longest_gap(rows: Sequence[Row]) -> float:
 
 # ---- paths that delay all bytes and keep their order, such as a modem, a gateway, a stalled network ----
 
-Delay = Callable[[float], float]  # from the time in s at which bytes enter the path to their delay in s
+Delay = Callable[[float], float]  # takes the s at which bytes enter the path; returns their delay in s
 
-SECONDS = 150.0  # s of a run; longer than 120 s, for which pending requests are remembered
+SECONDS = 150.0  # duration of a run; longer than the 120 s for which a line remembers pending requests
 TAIL = 20.0  # s; every drive must reply during these last seconds plus TURNS times the delay
 TURNS = 20
 
@@ -278,7 +278,7 @@ class PathLine:
 def bus_over(
     wire: PathWire, delay: Delay, sims: Sequence[SimulatedDrive], monkeypatch: pytest.MonkeyPatch
 ) -> tuple[Bus, PathLine]:
-    """Open a bus over such a path to these simulated drives; return the bus and its line."""
+    """Open a bus over a delaying path to these simulated drives; return the bus and its line."""
     wire.delay = delay
     wire.open()
     line = PathLine(wire)
@@ -294,7 +294,7 @@ def bus_over(
 
 
 def read_truly(opened: Bus, line: PathLine, drives: Sequence[Drive]) -> None:
-    """Read four registers of each drive in turn, repeatedly; check that each value is the register's."""
+    """Read four registers of each drive in turn, repeatedly; check that each value is of its register."""
     asked = [(drive, register) for drive in drives for register in drive.readings()[:4]]
     read: Counter[str] = Counter()
     with opened:

@@ -1,4 +1,5 @@
-/* A client by another author: libmodbus reads a server on 127.0.0.1; the argument is its port.
+/* A client by another author: libmodbus reads a server. The argument is a port of 127.0.0.1 for Modbus TCP,
+ * or the path of a serial port for RTU, with settings that no drive has.
  *
  * Each line of standard input is a request, each line of standard output its result:
  *   "UNIT FUNCTION START COUNT"   function 1 to 4: "words W W W", or bits
@@ -47,9 +48,11 @@ static void write_one(modbus_t *client, int function, int start, int value)
 int main(int argc, char **argv)
 {
     int unit, function, start, count;
-    modbus_t *client = argc == 2 ? modbus_new_tcp("127.0.0.1", atoi(argv[1])) : NULL;
+    modbus_t *client = argc != 2           ? NULL
+                       : argv[1][0] == '/' ? modbus_new_rtu(argv[1], 1200, 'O', 8, 2)
+                                           : modbus_new_tcp("127.0.0.1", atoi(argv[1]));
     if (!client || modbus_set_response_timeout(client, 30, 0) || modbus_connect(client)) {
-        perror("libmodbus_tcp_client");
+        perror("libmodbus_client");
         return 1;
     }
     while (scanf("%d %d %d %d", &unit, &function, &start, &count) == 4) {

@@ -1,0 +1,91 @@
+"""Modbus clients by other authors: the program mbpoll, and libmodbus in a C program of the tests."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+from lines import PATIENCE
+from peers import build_with_libmodbus, require_program
+
+SOURCE = Path(__file__).parents[1] / "programs" / "libmodbus_client.c"
+TYPES = {1: "0", 2: "1", 3: "4", 4: "3", 5: "0", 6: "4"}  # mbpoll's option -t by function code
+NO_REPLY = -1
+CODES = {  # exception codes by libmodbus's texts for them
+    "Illegal function": 1,
+    "Illegal data address": 2,
+    "Illegal data value": 3,
+    "Slave device or server failure": 4,
+    "Acknowledge": 5,
+    "Slave device or server is busy": 6,
+    "Gateway path unavailable": 10,
+    "Target device failed to respond": 11,
+}
+
+
+class Mbpoll:
+    """The program mbpoll, started for each request.
+
+    `where` is a host or a serial port; `options` are further options of the program.
+    """
+
+    def __init__(self, where: str, *options: str) -> None:
+        self._command = [require_program("mbpoll"), "-q", "-o", "10", "-0", *options]
+        self._where = where
+
+    def _run(self, unit: int, function: int, start: int, *words: object) -> str:
+        asked = map(str, ("-a", unit, "-t", TYPES[function], "-r", start, *words))
+        command = [*self._command, *asked]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+        return done.stdout + done.stderr
+
+    def read(self, unit: int, function: int, start: int, count: int) -> list[int] | int:
+        """Return the words or bits read, or an exception code, or NO_REPLY."""
+        shown = self._run(unit, function, start, "-c", count, "-1", self._where)
+        found = {int(at): int(word) for at, word in re.findall(r"^\[(\d+)\]:\s+(\d+)", shown, re.M)}
+        return [*found.values()] if [*found] == [*range(start, start + count)] else _code(shown)
+
+    def write(self, unit: int, function: int, start: int, value: int) -> int:
+        """Write a value; return 0, or an exception code, or NO_REPLY."""
+        shown = self._run(unit, function, start, self._where, value)
+        return 0 if "Written 1 references" in shown else _code(shown)
+
+    def close(self) -> None:
+        """Do nothing: each request is a process of its own."""
+
+
+def _code(shown: str) -> int:
+    return next((code for words, code in CODES.items() if words in shown), NO_REPLY)
+
+
+class Libmodbus:
+    """The library libmodbus in a C program; `where` is a port of 127.0.0.1 or the path of a serial port."""
+
+    def __init__(self, where: int | str, built: Path) -> None:
+        self._process = subprocess.Popen(
+            [build_with_libmodbus(SOURCE, built), str(where)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def _ask(self, *numbers: int) -> list[str]:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        print(*numbers, file=self._process.stdin, flush=True)
+        return self._process.stdout.readline().split()
+
+    def read(self, unit: int, function: int, start: int, count: int) -> list[int] | int:
+        """Return the words or bits read, or an exception code, or NO_REPLY."""
+        said, *words = self._ask(unit, function, start, count)
+        return int(words[0]) if said == "error" else [int(word) for word in words]
+
+    def write(self, unit: int, function: int, start: int, value: int) -> int:
+        """Write a value; return 0, or an exception code, or NO_REPLY."""
+        said, *words = self._ask(unit, function, start, value)
+        return int(words[0]) if said == "error" else 0
+
+    def close(self) -> None:
+        with self._process:
+            self._process.kill()
