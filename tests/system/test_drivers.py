@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
+import signal
+from pathlib import Path
 
 import pytest
-from rig import Guest
-
-pytestmark = pytest.mark.slow
+from rig import Guest, boot
 
 KINDS = ("ftdi", "cp210x", "ch341", "pl2303", "acm")
 USB = pytest.mark.parametrize("kind", KINDS)
@@ -20,6 +20,7 @@ def is_near(baudrate: int, wanted: int) -> bool:
     return abs(baudrate - wanted) <= wanted / 50
 
 
+@pytest.mark.slow
 @USB
 def test_settings_are_those_of_the_drive_at_both_ends(guest: Guest, kind: str) -> None:
     facts = guest.run("settings", kind=kind, wanted=SETTINGS)
@@ -30,11 +31,13 @@ def test_settings_are_those_of_the_drive_at_both_ends(guest: Guest, kind: str) -
             assert is_near(speed, baudrate)
 
 
+@pytest.mark.slow
 def test_a_speed_that_the_adapter_does_not_have_is_refused(guest: Guest) -> None:
     (fact,) = guest.run("settings", kind="cp210x", wanted=[(12345, "8E1")])
     assert "does not take the baud rate" in fact["read"]
 
 
+@pytest.mark.slow
 @USB
 def test_failed_usb_transfers_lose_no_reply(guest: Guest, kind: str) -> None:
     assert guest.run("broken_transfers", kind=kind) == {"528.0": 30}
@@ -43,6 +46,7 @@ def test_failed_usb_transfers_lose_no_reply(guest: Guest, kind: str) -> None:
 # ---- doctor, and ports that cannot be opened ----
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_doctor_advises_only_settings_that_the_driver_has(guest: Guest) -> None:
     """Only ftdi_sio has a latency timer and needs low latency. No driver has an RS-485 mode."""
@@ -67,6 +71,7 @@ def test_doctor_advises_only_settings_that_the_driver_has(guest: Guest) -> None:
     }
 
 
+@pytest.mark.slow
 def test_a_port_that_cannot_be_opened_gives_the_reason(guest: Guest) -> None:
     found = guest.run("refused_ports") | guest.run("absent_uart")
     for name, reason in {
@@ -88,6 +93,7 @@ def test_a_port_that_cannot_be_opened_gives_the_reason(guest: Guest) -> None:
 # ---- the 16550A ----
 
 
+@pytest.mark.slow
 def test_a_16550_has_the_settings_of_the_drive(guest: Guest) -> None:
     wanted = [(1200, "8N1"), (9600, "8E1"), (19200, "8O1"), (57600, "8E2"), (115200, "8N1"), (9600, "7E1")]
     for (baudrate, form), fact in zip(wanted, guest.run("uart", wanted=wanted), strict=True):
@@ -96,12 +102,14 @@ def test_a_16550_has_the_settings_of_the_drive(guest: Guest) -> None:
         assert "does not take the baud rate" in fact["read"]
 
 
+@pytest.mark.slow
 def test_a_16550_switches_rts_and_has_no_mode_of_its_own(guest: Guest) -> None:
     found = guest.run("uart_modes")
     assert found["rts-up"] == found["rts-down"] == RIGHT
     assert "the driver has no RS-485 mode" in found["kernel"]
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_a_16550_refuses_a_speed_without_a_divisor(guest: Guest) -> None:
     (fact,) = guest.run("uart", wanted=[(76800, "8N1")])
@@ -111,6 +119,7 @@ def test_a_16550_refuses_a_speed_without_a_divisor(guest: Guest) -> None:
 # ---- RTS ----
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["rts-up", "rts-down"])
 @USB
 def test_rts_lets_the_transceiver_send_at_each_request(guest: Guest, kind: str, mode: str) -> None:
@@ -119,6 +128,7 @@ def test_rts_lets_the_transceiver_send_at_each_request(guest: Guest, kind: str, 
     assert found["missing"] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.long
 @pytest.mark.parametrize("mode", ["rts-up", "rts-down"])
 @pytest.mark.parametrize("baudrate", [9600, 38400, 115200])
@@ -131,9 +141,10 @@ def test_rts_never_changes_before_the_last_bit_has_left(
     assert found["missing"] == found["early"] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.long
 def test_the_rs485_mode_of_a_driver_raises_rts_for_each_request(guest: Guest) -> None:
-    """The UART's registers show RTS at each byte that is sent, and that it falls between requests."""
+    """The UART's registers show RTS at each byte that is sent, and the fall of RTS between requests."""
     found = guest.run("rs485_mode")
     if found is None:
         pytest.skip("tools/kernel/build found no linux-headers-amd64")
@@ -167,12 +178,75 @@ def check_no_wrong_value(guest: Guest, kind: str, family: str, seconds: float) -
     assert found["counts"].keys() <= {"good", "NoReply", "LineBusy", "BadReply"}
 
 
+@pytest.mark.slow
 def test_a_stalled_adapter_gives_no_wrong_value(guest: Guest) -> None:
     check_no_wrong_value(guest, "ftdi", "ErmanERG220", 8.0)
 
 
+@pytest.mark.slow
 @pytest.mark.long
-@pytest.mark.parametrize("family", ["ErmanERG220", "YD1000", "InvtCHE"])
+@pytest.mark.parametrize("family", ["ErmanERG220", "YD1000", "InvtCHE", "Meter"])
 @pytest.mark.parametrize("kind", ["ftdi", "acm"])
 def test_no_family_reads_a_wrong_value_from_a_stalled_adapter(guest: Guest, kind: str, family: str) -> None:
     check_no_wrong_value(guest, kind, family, 18.0)
+
+
+# ---- adapters that stall, with their Linux drivers: commands, signals and stops during a stall ----
+
+
+START, STOP = "01050000ff00", "01050001ff00"  # start of the frames that set these coils of drive 1
+LONG_S = 20.0  # the kernel's own limit is 30 s
+
+
+@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["ftdi", "cp210x", "ch341", "pl2303", "acm"])
+def test_a_start_that_a_stalled_adapter_holds_is_discarded(guest: Guest, kind: str) -> None:
+    found = guest.run("start_in_stall", kind=kind)
+    assert found["close"] < LONG_S
+    assert not any(frame.startswith(START) for frame in found["left after the close"])
+
+
+@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("kind", ["ftdi", "acm"])
+def test_signal_ends_a_poll_of_a_stalled_adapter_in_time(guest: Guest, kind: str, number: int) -> None:
+    found = guest.run("end_of_stalled_poll", kind=kind, signals=[number])
+    assert found["seconds"] < LONG_S
+
+
+@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["ftdi", "cp210x", "ch341", "pl2303", "acm"])
+def test_a_stop_in_a_stall_follows_one_read_at_most(guest: Guest, kind: str) -> None:
+    found = guest.run("stop_in_stall", kind=kind, seconds=6.0)
+    places = [at for at, frame in enumerate(found["frames"]) if frame.startswith(STOP)]
+    assert places[0] <= 1
+    assert "CommandOutcome.DONE" in found["stop"]
+    assert found["misses"]["not sent: port stalled"] > 0
+    assert "port lost" not in found["misses"]
+
+
+# ---- a computer that sleeps (S3), with QEMU's USB adapter and its Linux driver. Each test boots a guest ----
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("names", ["tty", "by-id"])
+def test_a_poll_continues_after_the_computer_has_slept(built: Path, names: str) -> None:
+    """The adapter gets another tty name, because its old name is still in use when it comes back."""
+    with boot(built) as guest:
+        found = guest.run("sleep_in_poll", names=names)
+    assert found["slept"] > 1
+    assert found["ttys"] == ["/dev/ttyUSB0", "/dev/ttyUSB1"]
+    assert found["wrong"] == []
+    assert found["came back"]
+
+
+@pytest.mark.long
+def test_no_write_is_repeated_after_the_computer_has_slept(built: Path) -> None:
+    with boot(built) as guest:
+        found = guest.run("sleep_in_write")
+    assert found["slept"] > 1
+    assert len(found["values"]) > 2
+    assert found["values"] == sorted(set(found["values"]))

@@ -14,10 +14,10 @@ from usbip import EPROTO, Connection, USBDevice, endpoint, interface
 PARITIES = "NOEMS"
 STOP_BITS = "112"
 DTR, RTS = 1, 2
-ANSWER_S = 0.002  # from the end of a request to its reply
+ANSWER_S = 0.002  # time from the end of a request to its reply
 PIECE = 8  # characters of a reply that reach the adapter together
 USB_FRAME_S = 0.001
-ERROR_BITS = {"parity": 0x04, "framing": 0x08, "break": 0x10}  # of a 16550's line status register
+ERROR_BITS = {"parity": 0x04, "framing": 0x08, "break": 0x10}  # bits of a 16550's line status register
 
 
 class Adapter(USBDevice):
@@ -36,7 +36,7 @@ class Adapter(USBDevice):
         self.latency = 0.016
         self.log: list[dict[str, Any]] = []
         self.is_stalled = False  # the adapter takes no bytes
-        self.broken = 0  # number of next transfers to the guest that fail
+        self.broken = 0  # how many of the next transfers to the guest will fail
         self.damaged: list[str] = []  # kinds of damage for the next replies
         self.rts_missing = 0  # number of transfers at whose start RTS kept the transceiver from sending
         self.rts_early = 0  # how often RTS cut a transfer off
@@ -202,7 +202,10 @@ class FTDI(Adapter):
         return 0 if self.is_sending else 0x60
 
     def _tick(self) -> None:
-        """Send the status alone: each latency period, but unlike a real chip only while RTS matters."""
+        """At the end of each latency period without data, send only the status.
+
+        A real chip always does so; this one only if RTS switches its transceiver.
+        """
         if self.ins and not self._received:
             sequence, _ = self.ins.popleft()
             self.complete(sequence, 0, bytes((self.STATUS, self._line_status)))

@@ -8,6 +8,9 @@ from time import monotonic
 import multidrop
 from multidrop.sim import EncodedDrive, SimulatedDrive, Wire, simulated
 
+NOMINAL = (1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
+MOST_DEVIATION = 0.03  # largest relative deviation of an adapter's baud rate from the drives' nominal rate
+
 
 class FarEnd:
     """Modbus RTU devices that share no code with multidrop.
@@ -80,7 +83,9 @@ class SimulatedEnd(FarEnd):
 
     def feed(self, data: bytes, baudrate: int, format: str) -> bytes:
         self.requests.append(data)
-        self._wire.receive(data, monotonic(), baudrate)
+        nominal = [rate for rate in NOMINAL if abs(baudrate - rate) <= rate * MOST_DEVIATION]
+        rate = nominal[0] if nominal else baudrate
+        self._wire.receive(data, monotonic(), rate or None)  # QEMU's adapter does not report its baud rate
         return self._wire.advance(monotonic())
 
 

@@ -5,7 +5,7 @@
 FOLDER is the run's folder with QEMU's sockets. The first line of the output is the port to connect to. The
 first line of each connection is JSON:
 
-- {"plug_in": "ftdi", "serial": "A1", ...} is an adapter. After the answer "ok\\n" the guest gives this
+- {"plug_in": "ftdi", "serial": "A1", ...} plugs an adapter in. After the answer "ok\\n" the guest gives this
   connection to vhci_hcd.
 - {"do": "stall", "serial": "A1", "value": true} carries out an action of an adapter, or of this process if
   there is no serial number. The answer is one JSON line.
@@ -137,7 +137,7 @@ class Hardware:
                 lines.readline()
 
     def do_registers(self, name: None) -> list[str]:
-        """Return the registers of the UARTs that the guest has written, and their speeds, in order."""
+        """Return the UART registers that the guest has written, and the speeds that it has set, in order."""
         return (self._folder / "registers").read_text("utf-8").splitlines()
 
 

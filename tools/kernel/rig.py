@@ -28,7 +28,7 @@ from multidrop import _core
 HERE = Path(__file__).resolve().parent
 SCENARIOS = HERE.parents[1] / "tests/system/guest"
 BOOT_S = 600.0
-PATIENCE_S = 60.0  # beyond a scenario's own limit
+PATIENCE_S = 60.0  # s, added to a scenario's own limit
 
 
 class ScenarioFailed(AssertionError):
@@ -118,7 +118,7 @@ def _console(folder: Path) -> str:
 
 
 def _qemu(built: Path, folder: Path, ports: str) -> list[str]:
-    """Return the command. It does not use KVM, which may exist without being able to run a guest."""
+    """Return QEMU's command. It does not use KVM, which may exist without being able to run a guest."""
     words = f"""
     qemu-system-x86_64 -nodefaults -no-user-config -M q35 -accel tcg,thread=multi -smp 2 -m 512 -display none
     -no-reboot -kernel {built}/vmlinuz -initrd {built}/initrd.gz -serial file:{folder}/console

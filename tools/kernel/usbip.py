@@ -48,7 +48,7 @@ def interface(number: int, endpoints: int, *, kind: tuple[int, int, int] = (255,
 
 
 class Connection(NamedTuple):
-    """What a USB device gets when it is plugged in: its connection, serial number and timers."""
+    """The resources of a plugged-in USB device: its connection, serial number and timers."""
 
     sock: socket.socket  # to the guest's vhci_hcd
     serial: str  # the device's serial number; "": it has none
@@ -72,10 +72,10 @@ class USBDevice:
     # ---- a subclass implements these ----
 
     def offered(self) -> None:
-        """React to the guest's waiting for data: a transfer was added to `ins`."""
+        """Called when the guest waits for data: a transfer was added to `ins`."""
 
     def take(self) -> None:
-        """Take the data that the guest has sent, from `outs`."""
+        """Take from `outs` the data that the guest has sent."""
 
     def on_control(self, kind: int, request: int, value: int, index: int, size: int, data: bytes) -> bytes:
         """Return the answer to a control request that is not a standard one."""

@@ -18,13 +18,22 @@ from typing import Any
 import plug
 
 from multidrop import Drive, reading, setting
-from multidrop.cli import doctor, main, monitor, poll, read, report, serve  # noqa: F401 - before forks
+from multidrop.cli import (  # noqa: F401 - imported before forks
+    doctor,
+    main,
+    monitor,
+    poll,
+    recordings,
+    registers,
+    serve,
+)
 from multidrop.core import Framing
 from multidrop.families.registry import find_model
 from multidrop.sim import proof
 
 KINDS = ("ftdi", "cp210x", "ch341", "pl2303", "acm")
 BAUDRATES = (9600, 1200, 12345, 19200, 38400, 57600, 76800, 115200, 230400, 250000, 921600)
+ATTEMPTS = 40  # number of attempts at a call that may fail on a busy computer
 TCGETS2 = 0x802C542A
 
 
@@ -54,8 +63,14 @@ def attempt(call: Callable[..., object], *arguments: Any, **options: Any) -> Any
 
 
 def insist(call: Callable[..., object], *arguments: Any) -> None:
-    """Repeat a call until it succeeds: on a busy computer a write may expire before it is sent."""
-    plug.wait_until(lambda: not isinstance(attempt(call, *arguments), str))
+    """Repeat a call until it succeeds: on a busy computer a write may expire before it is sent.
+
+    Raises the call's last error if none of its attempts succeeds.
+    """
+    for _ in range(ATTEMPTS - 1):
+        if not isinstance(attempt(call, *arguments), str):
+            return
+    call(*arguments)
 
 
 def kernel_settings(path: str) -> tuple[int, str]:
@@ -77,7 +92,7 @@ def kernel_settings(path: str) -> tuple[int, str]:
 class Command:
     """A command of multidrop in a process that is forked, because an interpreter takes seconds to start here.
 
-    `user` is the user and group id to run it as, with the additional `groups`.
+    It runs under the user id and group id `user`; `groups` are additional groups.
     """
 
     def __init__(self, *words: str, user: int = 0, groups: Sequence[int] = ()) -> None:
@@ -144,7 +159,7 @@ def write_plant(lines: dict[str, tuple[str, Iterable[int]]], more: str = "") -> 
 
 
 class Poll:
-    """`multidrop poll` of a plant of encoded drives, in a process."""
+    """`multidrop poll` in a process; each value of the plant's drives identifies its register and drive."""
 
     def __init__(self, lines: dict[str, tuple[str, Iterable[int]]]) -> None:
         self.out = Path(f"/tmp/poll-{time.monotonic_ns()}.csv")
@@ -167,7 +182,7 @@ class Poll:
     def wait_for(
         self, status: str, lines: Iterable[str], after: int = 0, patience: float = plug.PATIENCE_S
     ) -> int:
-        """Wait for a row with this status of each line, after the first `after` rows; return the count."""
+        """Wait until each line has a row with this status after the first `after` rows; return the count."""
         wanted = set(lines)
 
         def is_there() -> bool:
@@ -206,7 +221,7 @@ def is_right(row: dict[str, str]) -> bool:
 
 
 def statuses(rows: list[dict[str, str]]) -> dict[str, list[str]]:
-    """Return the statuses of each line, without repetitions."""
+    """Return the statuses of each line in order, without consecutive repetitions."""
     found: dict[str, list[str]] = {}
     for row in rows:
         found.setdefault(row["drive"].partition("-")[0], []).append(row["status"])

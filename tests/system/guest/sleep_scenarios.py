@@ -1,6 +1,6 @@
 """The computer sleeps (S3). The adapter is QEMU's usb-serial: vhci_hcd forbids a sleep while it has a device.
 
-Only the first sleep of a boot lasts, so each scenario needs its own boot.
+Only the first sleep after a boot lasts, so each scenario needs its own boot.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def _plugged_in(**far_end: Any) -> dict[str, str]:
 
 
 def _sleep() -> float:
-    """Sleep; return how long, in s."""
+    """Let the computer sleep; return the duration in s."""
     before = time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic()
     plug.do("wake", SLEEP_S)
     Path("/sys/power/state").write_text("mem", "ascii")
@@ -35,7 +35,7 @@ def _sleep() -> float:
 
 
 def sleep_in_poll(names: str) -> dict[str, Any]:
-    """Sleep during a poll of a port that is named by "tty" or "by-id"."""
+    """Let the computer sleep during a poll of a port that is named by "tty" or "by-id"."""
     found = _plugged_in(family=FAMILY, addresses=[1, 2], encoded=True)
     poll = Poll({"a": (found[names], [1, 2])})
     seen = poll.wait_for("ok", "a")
@@ -50,7 +50,7 @@ def sleep_in_poll(names: str) -> dict[str, Any]:
 
 
 def sleep_in_write() -> dict[str, Any]:
-    """Sleep while a thread writes 1, 2, 3 ... on a busy line; return the values on the line."""
+    """Let the computer sleep while a thread writes 1, 2, 3 ...; return the values seen on the line."""
     name = _plugged_in()["by-id"]
     written = []
     is_over = threading.Event()

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import Any
 
 import plug
-from common import FAMILY, Poll, attempt, insist
+from common import FAMILY, Poll, attempt, insist, write_plant
 
-from multidrop import Bus, ErmanERG220
+from multidrop import Bus, ErmanERG220, Poller
+
+FRAME = 8  # length in bytes of each of these drives' requests
 
 
 def end_of_stalled_poll(kind: str, signals: list[int]) -> dict[str, Any]:
@@ -47,3 +50,27 @@ def start_in_stall(kind: str) -> dict[str, Any]:
     adapter.do("stall", False)
     time.sleep(2)
     return facts | {"left after the close": adapter.state["requests"][count:]}
+
+
+def stop_in_stall(kind: str, seconds: float) -> dict[str, Any]:
+    """Call a stop in the middle of a stall of a polled line.
+
+    Return the stop's result, the frames sent after the stall, and the line's misses.
+    """
+    adapter = plug.Adapter(kind, f"stop-{kind}", family=FAMILY, addresses=[1, 2])
+    stopped: list[str] = []
+    with Poller(write_plant({"a": (adapter.path, [1, 2])})) as poller:
+        pump = poller["a-1"]
+        insist(pump.set_frequency, 30.0)
+        adapter.do("stall", True)
+        time.sleep(seconds / 2)
+        count = len(adapter.state["requests"])
+        stopping = threading.Thread(target=lambda: stopped.append(str(attempt(pump.stop))))
+        stopping.start()
+        time.sleep(seconds / 2)
+        adapter.do("stall", False)
+        stopping.join()
+        misses = poller.summary()["lines"]["a"]["misses"]
+    sent = bytes.fromhex("".join(adapter.state["requests"][count:]))
+    frames = [sent[at : at + FRAME].hex() for at in range(0, len(sent), FRAME)]
+    return {"stop": stopped[0], "frames": frames, "misses": misses}

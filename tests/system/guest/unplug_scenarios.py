@@ -1,4 +1,4 @@
-"""What happens if adapters are unplugged, reset, or plugged in elsewhere, and if replies are damaged."""
+"""Scenarios: adapters are unplugged, reset or plugged in elsewhere, and replies are damaged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs scenarios in the guest. A JSON line from the host names a scenario, a JSON line returns its facts."""
+"""Runs scenarios in the guest. Each request of the host, and each result, is one line of JSON."""
 
 from __future__ import annotations
 
