@@ -1,4 +1,4 @@
-"""Rules for all tests: no test writes into the EEPROM ledger of the user who runs it."""
+"""Fixtures and hooks for all tests. No test writes into the EEPROM ledger of the user who runs it."""
 
 import asyncio
 import gc
@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from importlib import import_module
+from importlib.util import find_spec
 from inspect import iscoroutinefunction
 from itertools import count, islice
 from pathlib import Path
@@ -22,42 +23,48 @@ from peers import require_module
 
 from multidrop.cli import main
 
-# Compiled tests are kept in any case, in folders that git ignores: all workers would compile each of them,
-# and each program that a test starts all that it imports.
+# Write compiled modules even if the environment forbids that. Otherwise each worker would compile all tests,
+# and each program that a test starts would compile its imports. git ignores these folders.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-gc.disable()  # until all tests are collected: searching them for garbage takes a fifth of the time
+# Commands print titles in the language of the user, and tests expect English.
+os.environ["LC_ALL"] = "C.UTF-8"
+
+gc.disable()  # garbage collections would take a fifth of the time in which tests are collected
+
+if not os.environ.get("CI") and not find_spec("pyarrow"):  # in CI a missing pyarrow is an error
+    collect_ignore_glob = ["samples/*", "gateway/forward/*"]
 
 ALL_TESTS = sorted(Path(__file__).parent.glob("*/test_*.py"))
 COMPILED_BEFORE = any((test.parent / "__pycache__").exists() for test in ALL_TESTS)
 
-# A busy machine is slow, and nothing is wrong with it.
+# Hypothesis must not report slow examples as failures, because a busy machine is slow.
 settings.register_profile(
     "any machine", max_examples=examples(100), deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("any machine")
 
-# A shell's background job ignores SIGINT, and so would the programs that it tests.
+# A shell's background job ignores SIGINT, and the programs that tests start would inherit this.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(optionalhook=True)  # of xdist
 def pytest_xdist_auto_num_workers() -> int:
-    """Return one more than the processors, at most 12: some tests wait, and each worker collects all."""
+    """Return the number of workers: one per processor and one more, because some tests wait; at most 12."""
     return min(len(os.sched_getaffinity(0)) + 1, 12)
 
 
 @pytest.hookimpl(optionalhook=True)  # of xdist
 def pytest_configure_node(node: Any) -> None:
-    """Tell a worker whether it has to compile its share of the tests."""
+    """Pass to a worker whether it must write the bytecode of its share of the test modules."""
     node.workerinput["compiles"] = not COMPILED_BEFORE
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compile a share of the tests: pytest rewrites their assertions, and keeps what it compiled.
+    """Compile this worker's share of the test files if none are compiled yet; pytest caches the result.
 
-    Each worker would compile all of them at the same time.
+    Otherwise all workers would compile every test file at the same time.
     """
     given = getattr(config, "workerinput", {})
     if not given.get("compiles"):
@@ -66,33 +73,35 @@ def pytest_configure(config: pytest.Config) -> None:
     for test in ALL_TESTS[number :: given["workercount"]]:
         if str(test.parent) not in sys.path:
             sys.path.insert(0, str(test.parent))
-        with suppress(BaseException):  # whoever collects it is told what is wrong with it
+        with suppress(BaseException):  # pytest reports the error when it collects this file
             import_module(test.stem)
 
 
-@pytest.hookimpl(trylast=True)  # when what is not wanted has been left out
+@pytest.hookimpl(trylast=True)  # runs after deselected tests were removed
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Deal the slow tests out, so that every worker begins with its share of them."""
+    """Distribute the slow tests, so that every worker starts with its share of them."""
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     slow = [item for item in items if item.get_closest_marker("slow")]
     others = iter([item for item in items if not item.get_closest_marker("slow")])
     dealt: list[pytest.Item] = []
     for worker in range(workers):
-        share = (len(items) - len(dealt)) // (workers - worker)  # as --dist worksteal gives them out
+        share = (len(items) - len(dealt)) // (
+            workers - worker
+        )  # tests that --dist worksteal gives this worker
         begins = slow[worker::workers]
         dealt += [*begins, *islice(others, max(0, share - len(begins)))]
     items[:] = [*dealt, *others]
 
 
 def pytest_collection_finish() -> None:
-    """Exclude all that pytest keeps to the end from garbage collections, also in forked children."""
+    """Exclude pytest's permanent objects from garbage collections, here and in forked child processes."""
     gc.freeze()
     gc.enable()
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Count no lines where that takes minutes more, or where a full disk is tried."""
+    """Pause the measurement of coverage during tests that it would slow down by minutes or make fail."""
     coverage = sys.modules.get("coverage")
     counting = coverage.Coverage.current() if coverage else None
     if counting is None or _is_counted(item):
@@ -108,7 +117,7 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Run an `async def` test on an event loop of its own, by `run_test` of its module if that has one."""
+    """Run an `async def` test with its module's function `run_test`, or else with `asyncio.run`."""
     if not iscoroutinefunction(pyfuncitem.obj):
         return None
     arguments = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
@@ -117,7 +126,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
 
 def _is_counted(item: pytest.Item) -> bool:
-    """Return False for stories, and for tests marked so."""
+    """Return False for tests marked `story` or `uncounted`, during which no coverage is measured."""
     return not (item.get_closest_marker("story") or item.get_closest_marker("uncounted"))
 
 
@@ -127,7 +136,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def _gathered() -> Iterator[None]:
-    """Collect garbage after each file, and exclude the rest from later collections: imports stay anyway."""
+    """Collect garbage after each test file; exclude the remaining objects, such as imports, from then on."""
     yield
     gc.collect()
     gc.freeze()
@@ -147,7 +156,7 @@ def _turns_awaited(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def _patient_module() -> Iterator[None]:
-    """Do the same as `_patient` for a line that all tests of a module share."""
+    """Use the same time-outs as `_patient`, for a line that all tests of a module share."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         be_patient(monkeypatch.setattr, monkeypatch.setitem)
         yield
@@ -166,7 +175,7 @@ def _unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def _laid_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lay pictures out without rendering pixels, in half the time: texts and their places can be checked."""
+    """Lay out pictures without rendering pixels, which halves the time; texts and places can be checked."""
     require_module("matplotlib")
 
     def savefig(figure: Any, file: IO[bytes], **options: object) -> None:
@@ -178,7 +187,7 @@ def _laid_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def _states(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Return a source of new directories; pytest's own numbering takes as long as a small test."""
+    """Return paths for new directories; pytest's own `tmp_path` would take as long as a small test."""
     whole = tmp_path_factory.mktemp("states")
     return (whole / str(number) for number in count())
 
@@ -192,7 +201,7 @@ def _own_state(_states: Iterator[Path]) -> None:
 
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Status, output and errors of a command."""
+    """Return a function that runs a command and returns its exit status, output and errors."""
 
     def run(*words: object) -> tuple[int, str, str]:
         status = main([str(word) for word in words])

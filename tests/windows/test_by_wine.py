@@ -1,7 +1,7 @@
 """multidrop on Windows, with Wine: Ctrl-C, port names, ports that vanish, consoles, paths.
 
-`MULTIDROP_WINE=FOLDER pytest -n 0 -m "" tests/windows` runs these; without a folder that `tools/wine make`
-has filled they are skipped.
+`MULTIDROP_WINE=FOLDER pytest -n 0 -m "" tests/windows` runs these tests. They are skipped without a folder
+that `tools/wine make` has filled.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def wine() -> Iterator[Wine]:
-    """Give Wine, whose server survives vanishing terminals because it is in another session."""
+    """Yield a Wine folder. Its server is in another session, so it survives vanishing terminals."""
     found = Wine(Path(FOLDER))
     subprocess.run(["wineserver", "-w"], env=found.environment, check=True)
     with BoundProcess(["wineserver", "-f", "-p"], env=found.environment) as server:
@@ -318,7 +318,7 @@ def test_console_prints_all_letters(wine: Wine, plant: Path) -> None:
 
 @pytest.mark.parametrize("form", ["8E1", "8O1", "8N2"])
 def test_a_port_is_set_to_parity_and_stop_bits(wine: Wine, pump: MotorDrive, form: str) -> None:
-    """Check that both are accepted; terminals do not show them on the wire."""
+    """Check only that the port accepts both settings: a pseudo-terminal has no wire that shows them."""
     ran = wine.run("-m", "multidrop", "state", "COM5", "invt-che", 1, "--format", form)
     assert ran.returncode == 0, ran.stderr
 
@@ -363,7 +363,7 @@ def test_recording_of_a_killed_poll_is_readable(wine: Wine, pump: MotorDrive, pl
 # ---- ports that vanish ----
 
 
-def test_a_port_that_vanishes_and_comes_back(wine: Wine, plant: Path) -> None:
+def test_port_that_vanishes_is_polled_again_when_it_comes_back(wine: Wine, plant: Path) -> None:
     out = plant.with_name("rows.arrows")
     with ExitStack() as stack:
         cable = stack.enter_context(ExitStack())
