@@ -30,7 +30,7 @@ LEASE_NS = 3600 * 1_000_000_000
 
 
 def silence(baudrate: int) -> float:
-    """Return multidrop's silence between two exchanges in s, with one bit time for a second stop bit."""
+    """Return the silence that multidrop keeps between exchanges, plus one bit for a second stop bit, in s."""
     drive = Played(1, baudrate=baudrate)
     return drive.needed_silence() + drive.settings.bit
 
@@ -71,7 +71,7 @@ def missed(batch: Batch) -> int:
 
 
 def dropped(poller: Poller) -> int:
-    """Return the number of dropped rows, faster than `summary` does for thousands of drives."""
+    """Return the number of dropped rows; for thousands of drives this is faster than `summary`."""
     return poller._row_queue.dropped
 
 
@@ -120,11 +120,11 @@ def reading(job: Job) -> Iterator[Callable[[int], dict[str, float]]]:
 
 
 def lateness_ms(job: Job, *, realtime: bool = False) -> tuple[int, numpy.ndarray]:
-    """Return the number of good exchanges, and each value's delay in ms from its reply's first byte.
+    """Return the number of good exchanges, and the ms from each reply's first byte until a value is taken.
 
     The consumer sleeps on the poller's descriptor, and takes the rows as soon as it wakes.
     """
-    _replied_ns(decoder(1)())  # imports modules now, which would delay the first values
+    _replied_ns(decoder(1)())  # imports modules now, because later imports would delay values
     late = [numpy.empty(0)]
     with polling(job, realtime=realtime) as poller:
         end = time.monotonic() + job.seconds
@@ -164,7 +164,7 @@ def decoder(drives: int) -> Callable[[], Batch]:
 
     def decode() -> Batch:
         columns = Columns(BATCH_ROWS)
-        add, into = lib.md_columns_add, columns.c  # what the core's thread calls, with little Python code
+        add, into = lib.md_columns_add, columns.c  # called directly, as by the core's thread
         for block, found in turns[: BATCH_ROWS // REGISTERS]:
             add(into, block.c, found, 0)
         return Batch(columns, *names)

@@ -8,6 +8,7 @@
 #include <netinet/in.h>
 #include <netinet/tcp.h>
 #include <poll.h>
+#include <sched.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -115,9 +116,10 @@ int main(int argc, char **argv)
     static const struct option known[] = {
         {"seconds", 1, NULL, 's'},    {"drives", 1, NULL, 'n'},  {"registers", 1, NULL, 'r'},
         {"silence-us", 1, NULL, 'q'}, {"spin-us", 1, NULL, 'p'}, {"asleep-us", 1, NULL, 'a'},
-        {NULL, 0, NULL, 0}};
+        {"realtime", 0, NULL, 't'},   {NULL, 0, NULL, 0}};
+    struct sched_param priority = {.sched_priority = 1}; /* as multidrop's core */
     double seconds = 3, silence_us = 0, spin_us = 60, asleep_us = 0; /* silence_us 0: no silence */
-    int drives = 16, registers = 10, key;
+    int drives = 16, registers = 10, is_realtime = 0, key;
     while ((key = getopt_long(argc, argv, "", known, NULL)) != -1) {
         double number = optarg ? strtod(optarg, NULL) : 0;
         switch (key) {
@@ -127,13 +129,14 @@ int main(int argc, char **argv)
         case 'q': silence_us = number; break;
         case 'p': spin_us = number; break;
         case 'a': asleep_us = number; break;
+        case 't': is_realtime = 1; break;
         default: optind = argc;
         }
     }
     if (optind >= argc || drives < 1 || drives > MOST_DRIVES || registers < 1 || registers > 125) {
         fprintf(stderr,
                 "usage: bare_master [--seconds S] [--drives N] [--registers N] [--silence-us N (0: unpaced)]"
-                        " [--spin-us N] [--asleep-us N (after a request)] PORT\n");
+                        " [--spin-us N] [--asleep-us N (after a request)] [--realtime] PORT\n");
         return 2;
     }
     int fd = open_line(argv[optind]);
@@ -142,6 +145,10 @@ int main(int argc, char **argv)
         return 1;
     }
     prctl(PR_SET_TIMERSLACK, 1UL, 0UL, 0UL, 0UL);
+    if (is_realtime && sched_setscheduler(0, SCHED_FIFO, &priority)) {
+        perror("bare_master: SCHED_FIFO");
+        return 1;
+    }
 
     uint8_t requests[MOST_DRIVES][REQUEST];
     for (int i = 0; i < drives; i++)

@@ -14,7 +14,7 @@ CHARACTER_BITS = 10
 class Job:
     """Read all registers of the addresses 1 to `drives` in turn, for `seconds`.
 
-    With baud rate 0, the line's player does not wait for the times of characters."""
+    With baud rate 0, the simulated line does not wait for the time that characters take on a wire."""
 
     port: str
     baudrate: int

@@ -68,7 +68,7 @@ def _polling_drives(lines: Mapping[str, Sequence[Drive]], every: float | None) -
 def polling_lines(
     ports: Sequence[str], baudrate: int, drives: int = 16, every: float | None = None
 ) -> Iterator[Poller]:
-    """Yield a poller of `drives` drives, with addresses from 1, on each port; baud rate 0: without waits."""
+    """Yield a poller of `drives` drives with addresses from 1 on each port; baud rate 0 means no waits."""
 
     def drive(port: str, address: int) -> Drive:
         name = _name(port, address)
@@ -108,7 +108,7 @@ class Mixed:
 
 
 def mixed() -> Mixed:
-    """Return a line with one drive of each family and framing, with its documented factory settings."""
+    """Return a line with one drive of each family and framing, each with its documented factory settings."""
     kinds = [(family, framing) for family in MODELS.values() for framing in family.framings]
     drives = [
         family(at, name=f"{family.model} {framing}", framing=framing)
@@ -130,7 +130,7 @@ def mixed() -> Mixed:
             )
         )
         for drive in drives
-        for demanded in [drive.needed_silence() + drive.settings.bit]  # multidrop waits longer around ASCII
+        for demanded in [drive.needed_silence() + drive.settings.bit]  # the silence is longer around ASCII
     ]
     return Mixed(drives, words, len(exchanges), predict(exchanges, lateness=0).cycle)
 
@@ -154,10 +154,10 @@ class Judged:
     exchanges: int = 0  # requests that were sent
     samples: int = 0
     wrong: int = 0  # values that belong to another register
-    beyond: int = 0  # of `wrong`: replies that came later than three time-outs
+    beyond: int = 0  # wrong values whose reply was later than three time-outs
     late: int = 0  # replies that were recognised after their time-out
     misses: Counter[str] = field(default_factory=Counter)
-    asked_ns: dict[tuple[str, int], int] = field(default_factory=dict)  # unanswered, by drive and value
+    asked_ns: dict[tuple[str, int], int] = field(default_factory=dict)  # unanswered requests
 
 
 def judge(ports: Sequence[str], exchanges: int, drives: int) -> Judged:

@@ -21,7 +21,7 @@ from bench.masters.jobs import REGISTERS, TIMEOUT_S, Job, expected
 from bench.support.programs import compiled, module
 
 Read = Callable[[int], Sequence[float]]
-Poll = Callable[[], tuple[int, int]]  # good exchanges, failures
+Poll = Callable[[], tuple[int, int]]  # returns the numbers of good and of failed exchanges
 
 
 @contextmanager
@@ -229,14 +229,14 @@ def measure(master: str, job: Job) -> dict[str, Any]:
     return result
 
 
-def measure_bare(job: Job, silence: float, asleep: float = 0.0) -> dict[str, Any]:
-    """Run bare_master.c; return the same values as `measure`.
+def measure_bare(job: Job, silence: float, asleep: float = 0.0, *, realtime: bool = False) -> dict[str, Any]:
+    """Run bare_master.c, with realtime scheduling if wanted; return the same values as `measure`.
 
     It waits `silence` s before each request, and sleeps `asleep` s after it.
     """
     command = [compiled("masters/bare_master.c"), "--seconds", job.seconds, "--drives", job.drives]
     command += ["--registers", REGISTERS, "--silence-us", silence * 1e6]
-    command += ["--asleep-us", asleep * 1e6, job.port]
+    command += ["--asleep-us", asleep * 1e6, *["--realtime"] * realtime, job.port]
     result: dict[str, Any] = json.loads(subprocess.check_output([str(word) for word in command]))
     return result | {"version": ""}
 

@@ -1,6 +1,6 @@
 """multidrop as a master on Windows: `python windows_master.py JOB`. JOB is a Job as JSON.
 
-Prints the result as JSON. It runs without the package `bench`, and needs only players/replay.py of it.
+Prints the result as JSON. It runs without the package `bench`, and imports only its file players/replay.py.
 """
 
 from __future__ import annotations

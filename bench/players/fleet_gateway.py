@@ -1,8 +1,8 @@
 """A gateway with known samples: `python -m bench.players.fleet_gateway NAME FOLDER TOLD URL...`
 
-It appends numbered exchanges to its spool in FOLDER, and forwards them to the NATS servers at URL. Into the
-file TOLD it writes lines with a run's first number and the count of exchanges that are stored. With `-` for
-TOLD it only forwards. It may be killed at any moment.
+It appends numbered exchanges to its spool in FOLDER, and forwards them to the NATS servers at URL. It also
+writes lines into the file TOLD. Each line has the number of this run's first exchange, and how many exchanges
+are stored so far. If TOLD is `-`, the gateway only forwards. It may be killed at any moment.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from multidrop.core import Names
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.samples.samples_stream import samples_path
-from multidrop.fleet.samples.spool import Spool
+from multidrop.samples.spool import Spool
 
 EXCHANGES = 100  # per batch
 RATE = 1000  # exchanges per second, with 10 values each
-GAP = 1_000_000  # difference of the first numbers of two runs
+GAP = 1_000_000  # difference between the first numbers of successive runs
 
 
 async def live(name: str, folder: Path, told: str, urls: list[str]) -> None:

@@ -1,7 +1,7 @@
 """Simulated lines with all families and faults, in a separate process.
 
-Drives of eight variants have values that encode drive and register (EncodedDrive), so each value proves
-its origin. A ninth drive on each line has a motor, because starts cause noise.
+Drives of eight variants have values that encode drive and register (EncodedDrive), so each value shows
+which register it belongs to. A ninth drive on each line has a motor, because starts cause noise.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MOTOR = "fan"
 EVERY = 2.0  # s, period of each drive's first register; the other registers have no rate
 PATIENCE = 30.0  # s, limit for the simulator's start
 BEAT = 5e-3  # s, between two measurements of delays
-LONG = 30e-3  # s; a longer delay of the simulator may make a reply miss its time-out
+LONG = 30e-3  # s; after a longer delay of the simulator, a reply may miss its time-out
 
 
 def write_plant(directory: Path, lines: int) -> Path:
@@ -114,10 +114,10 @@ def hostile_wires(plant: Path, faults: Faults) -> list[Wire]:
 
 @contextmanager
 def running(make: Callable[..., Sequence[Wire]], *arguments: object) -> Iterator[RunningPlant]:
-    """Simulate the wires that `make(*arguments)` returns in a separate process, which calls `make`."""
+    """Start a process that calls `make(*arguments)` and simulates the returned wires."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    late = context.Array("d", 2)  # the longest delay; the time of the last long delay
+    late = context.Array("d", 2)  # the longest delay in s; the time of the last long delay
     process = context.Process(target=_simulate, args=(make, arguments, theirs, late), daemon=True)
     process.start()
     try:
@@ -149,7 +149,7 @@ def _simulate(
 
 
 def _watch(late: SynchronizedArray[float]) -> None:
-    """Measure the delays of this process, and of the kernel's worker for a pty, forever.
+    """Measure forever how late this process, and the kernel's worker for a pty, get to run.
 
     A simulated drive that receives a request late also replies late.
     """

@@ -1,4 +1,4 @@
-"""Declarations of the drives that paced_line.c and responders.c play, as a user declares own families."""
+"""Families of the drives that paced_line.c and responders.c simulate, declared as users declare theirs."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ class Played(Drive):
 
 
 class NoTime(Settings):
-    """Settings with characters that take almost no time, but not 0: plans still prefer fewer characters."""
+    """Settings with characters that take almost no time; not 0, so that plans prefer fewer characters."""
 
     @property
     def character(self) -> float:
@@ -32,7 +32,7 @@ class NoTime(Settings):
 
 
 class Unpaced(Played):
-    """The same drive on a line without waits, on which the host's own cost is measured."""
+    """The drive `Played` on a line without waits, to measure only the host's own cost."""
 
     response_delay = 0.0
 

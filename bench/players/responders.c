@@ -131,7 +131,7 @@ static int64_t through_path(struct line *line, int64_t at_ns)
         if (since_ns < options.stall_us * 1000)
             due_ns += options.stall_us * 1000 - since_ns;
     }
-    if (due_ns <= line->last_due_ns) /* make times distinct: the heap does not keep the order of equal ones */
+    if (due_ns <= line->last_due_ns) /* make times distinct: the heap may reorder equal times */
         due_ns = line->last_due_ns + 1;
     line->last_due_ns = due_ns;
     return due_ns;
@@ -148,7 +148,7 @@ static void answer(struct line *line, const uint8_t *request, int64_t came_ns)
     }
     if (happens(options.twice_permille) && reply.len <= MOST_REPLY / 2) {
         twice++;
-        memcpy(reply.bytes + reply.len, reply.bytes, reply.len); /* both copies in succession, as on a wire */
+        memcpy(reply.bytes + reply.len, reply.bytes, reply.len); /* the copy follows directly, as on a wire */
         reply.len = (uint16_t)(2 * reply.len);
     }
     reply.due_ns = came_ns + (REQUEST + reply.len) * character_ns + options.delay_us * 1000;

@@ -1,4 +1,4 @@
-"""Run responders.c, which plays drives on many lines, as a context manager."""
+"""A context manager that runs responders.c, which simulates drives on many lines."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bench.support.programs import FRAMES, compiled, talking
 
 @contextmanager
 def responders(kind: str, count: int, *options: object) -> Iterator[tuple[list[str], list[int]]]:
-    """Play `count` lines; yield their ports, and the descriptors that a child process must inherit."""
+    """Simulate `count` lines; yield their ports, and the descriptors that a child process must inherit."""
     program = compiled("players/responders.c", *FRAMES)
     if kind == "pty":
         with talking([program, "--ptys", count, *options]) as talker:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-PIECE = 64  # limit in bytes for a piece that is forwarded as a whole
+PIECE = 64  # bytes that are forwarded at a time, at most
 
 
 class SlowWay:

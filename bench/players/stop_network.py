@@ -76,7 +76,7 @@ class Network:
         return socket.socket(fileno=fd)
 
     def cut(self) -> None:
-        """From now on, lose all packets to the responder; packets from it still arrive."""
+        """Drop all packets to the responder from now on; its own packets still arrive."""
         _ip("neigh", "replace", FAR, "lladdr", NOBODY, "dev", self._near, "nud", "permanent")
 
     def mend(self) -> None:
@@ -103,7 +103,7 @@ def network() -> Iterator[Network | None]:
 
 
 def cut_networks(chance: random.Random, rounds: int, is_long: bool) -> Counters:
-    """Cut the network just before a START is sent, and restore it after the client has the error."""
+    """Cut the network just before a START is sent, and restore it after the client reported a failure."""
     counters = Counters()
     with network() as made:
         if made is None:
@@ -129,7 +129,7 @@ def _cut_one(
 ) -> None:
     """Start a motor twice, to count the reads before a start; then start it while the network is cut.
 
-    Count a frame that moves the motor after the client reported that the start failed."""
+    If a frame moves the motor after the client reported a failed start, `counters` counts this frame."""
     looks = 0
     for _ in range(2):
         begun = len(line.log)

@@ -25,7 +25,7 @@ PATIENCE = 150.0  # s, limit for a client's end
 
 @dataclass
 class Counters:
-    """The numbers of requested stops (one for each motor) and of their results."""
+    """The number of requested stops (one for each motor), and the number of each result."""
 
     rounds: int = 0
     asked: int = 0
@@ -33,7 +33,7 @@ class Counters:
     moved: int = 0  # frames that move a motor after its stop
     unsent: int = 0  # stops that never reached the wire
     excused: int = 0  # motors that turn after an aborted stop that was reported
-    first_ms: list[float] = field(default_factory=list)  # from the request to the first stop frame
+    first_ms: list[float] = field(default_factory=list)  # ms from each request to the first stop frame
     stories: list[str] = field(default_factory=list)
 
     @property
@@ -111,7 +111,7 @@ class Victim:
         ]
 
     def judge(self, counters: Counters, what: str, *, excuse: bool = False) -> None:
-        """Count the results of this episode's stops; `excuse`: the client reported an aborted stop."""
+        """Count the results of this episode's stops. Set `excuse` if the client reported an aborted stop."""
         counters.rounds += 1
         for line in self.lines:
             for address, drive in line.drives.items():

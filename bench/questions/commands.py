@@ -1,4 +1,4 @@
-"""The rate of polling a line while threads read from its drives without pause.
+"""The polling rate of a line while threads read from its drives without pause.
 
 16 drives at the pace of a wire are polled as fast as the line allows. Each thread calls `drive.read_many`
 in a loop; its exchanges have priority over polling.

@@ -1,4 +1,4 @@
-"""The share of device templates that the library can represent, and the reasons why it cannot do the rest.
+"""The share of device templates that the library can represent, and why it cannot represent the others.
 
 Reads a folder with files of other programs, in any format that `multidrop import` reads. Each entry is
 declared as its program uses it, for reading or writing; the library accepts or rejects the declaration.
@@ -45,7 +45,7 @@ class Coverage:
 
     def __init__(self, devices: Iterable[ImportedDevice]) -> None:
         self.by_device = [(device, holdings(device)) for device in devices]
-        self.refused = Counter[str]()  # by reason: devices whose entries are representable, but not together
+        self.refused = Counter[str]()  # devices by reason: each entry is representable, but not all together
         self.whole = sum(self._is_whole(entries) for _, entries in self.by_device)
 
     def _is_whole(self, entries: list[Holding]) -> bool:
@@ -61,7 +61,7 @@ class Coverage:
         return [entry for _, entries in self.by_device for entry in entries]
 
     def needed(self) -> Iterator[tuple[str, int, int]]:
-        """Yield each detail with the number of entries that need it, and of those that are representable."""
+        """Yield each detail, the number of entries that need it, and how many of them are representable."""
         for key, words in DETAILS.items():
             needing = [entry for entry in self.entries if key in entry.details]
             yield words, len(needing), sum(entry.is_whole for entry in needing)

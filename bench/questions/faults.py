@@ -33,7 +33,7 @@ WIRE_MS = CHARACTERS * 10 / BAUDRATE * 1e3 + 2
 def measured(master: str, drives: int, arguments: argparse.Namespace, **fault: Any) -> tuple[float, float]:
     """Let a master poll a line with this fault; return replies per second, and the share of good exchanges.
 
-    Replies before the settling time are not counted."""
+    Replies during the settling time at the start are not counted."""
     settle_ms = round(arguments.settle * 1000)
     with paced_line(baudrate=BAUDRATE, drives=drives, settle_ms=settle_ms, **fault) as line:
         own = rivals.measure(master, Job(line.path, BAUDRATE, arguments.settle + arguments.seconds, drives))

@@ -1,9 +1,10 @@
 """Does a suspended master send requests on lines that another master has taken over? Counted by the drives.
 
 A process polls 10 socket:// lines under a lease, and is suspended (SIGSTOP) at a random moment. Another
-process takes over when, by its own clock, the last renewal is older than lease and guard. Then the first
-process continues. The first one runs in three kinds: with the clock check and the kernel's timer, with the
-check only, and without either. Exits with 1 if a request got through with both, or if none did without.
+process takes over when, by its own clock, the last renewal is older than lease plus guard time. Then the
+first process continues. There are three kinds of first processes: with clock check and kernel timer, with the
+clock check only, and without both. Exits with 1 if a request got through in the first kind, or if none got
+through in the third.
 """
 
 from __future__ import annotations

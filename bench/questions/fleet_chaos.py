@@ -87,7 +87,7 @@ class Chaos:
         return Process(self.folder, name, *words)
 
     def await_told(self) -> None:
-        """Wait until each gateway has noted stored samples. Earlier attacks could not lose any."""
+        """Wait until each gateway has noted stored samples, because attacks before that can lose none."""
         ends = time.monotonic() + PATIENCE_S
         while not all(sum(runs.values()) for runs in told(self.folder).values()):
             for gateway in self.gateways:
@@ -196,7 +196,7 @@ class Chaos:
         async with samples_path(self.servers.urls) as path:
             for name, gateway in zip(GATEWAYS, self.gateways, strict=True):
                 stored = [int(file.name[:12]) for file in (self.folder / name).glob("*.arrows")]
-                if not stored:  # the gateway was always killed before it stored a sample
+                if not stored:  # each run of the gateway was killed before it stored a sample
                     continue
                 log = subject_of(name, _log_of(self.folder / name))
                 while True:
@@ -241,7 +241,7 @@ def in_parquet(folder: Path) -> Numbers:
 def in_postgres(database: Postgres) -> Numbers:
     query = f"""
         select d.name, (e.time_ns - {NOON}) / {STEP}, count(*), min(array_length(e.values, 1))
-        from multidrop.exchanges e join multidrop.families d on d.id = e.drive group by 1, 2"""
+        from multidrop.exchanges e join multidrop.drives d on d.id = e.drive group by 1, 2"""
     found: Numbers = {name: Counter() for name in GATEWAYS}
     for drive, number, rows, registers in database.ask(query):
         assert registers == 10
@@ -250,7 +250,7 @@ def in_postgres(database: Postgres) -> Numbers:
 
 
 def compare(of: dict[str, dict[int, int]], kept: Numbers) -> tuple[int, int, int, int]:
-    """Return how many exchanges were noted, how many of these are missing, and counts of gaps and doubles."""
+    """Return the numbers of exchanges that are noted, missing, absent between stored ones, and doubled."""
     missing = holes = 0
     for name, runs in of.items():
         numbers = kept[name]

@@ -2,8 +2,8 @@
 
 The rows resemble those of a real plant, which are less regular than a simulator's. On each line, the drives
 are read in turn, ten registers per request, every 12 ms or slightly more. Speeds, currents and voltages
-change by one or two steps in three of five polls, temperatures in one of three. 5 of 1000 requests get no
-reply.
+change by one or two steps in three of five polls, and temperatures in one of three polls. Five of 1000
+requests get no reply.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from postgres_clusters import Postgres, postgres
 from bench.support import tables
 from multidrop import PlantLine
 from multidrop.fleet.samples.hub import Commit, SampleSink
-from multidrop.fleet.samples.message import Packed, RowBuffer, unpack
 from multidrop.fleet.samples.parquet_sink import ParquetSink
-from multidrop.fleet.samples.polled_units import PolledUnits
 from multidrop.fleet.samples.postgres_sink import PostgresSink
-from multidrop.fleet.samples.spool import SpoolFolder
 from multidrop.polling import BatchColumns
+from multidrop.samples.message import Packed, RowBuffer, unpack
+from multidrop.samples.polled_units import PolledUnits
+from multidrop.samples.spool import SpoolFolder
 
 UTC = 1_795_253_399_123_456_789
 DRIVES = 16  # per line
@@ -145,7 +145,7 @@ def messages() -> Iterator[tuple[object, ...]]:
 def stores(folder: Path) -> Iterator[tuple[object, ...]]:
     """Write the same half million rows of 500 lines to each store, in two commits."""
     found = [columns_of(65536, 500, random.Random(seed)) for seed in range(8)]
-    units = units_of(found[0])  # the first message will do: all have the same drives
+    units = units_of(found[0])  # of the first message, because all messages have the same drives
     sent = [one.data for columns in found for one in packed(columns, units)]
     rows = sum(len(columns.time) for columns in found)
     spool = SpoolFolder(folder / "spool", "gateway-1")
@@ -192,7 +192,7 @@ def commit(sink: SampleSink, sent: list[bytes]) -> None:
 
 
 def narrow(database: Postgres, sent: list[bytes]) -> int:
-    """Write the obvious table, for comparison: a row per value, an index by drive, register and time."""
+    """Write a simple table for comparison: a row per value, an index by drive, register and time."""
     import psycopg
 
     database.ask(

@@ -1,9 +1,9 @@
 """A poller's memory, and the CPU instructions per exchange, to estimate the load of small computers.
 
-valgrind counts the instructions of the polling process in two runs of different lengths; their difference is
-polling without start and end. valgrind does not count the kernel's instructions: the kernel's time is
-measured in a run without valgrind.
-`python -m bench.questions.footprint JOB` is the process that polls.
+valgrind counts the instructions of the polling process in two runs of different lengths. The difference of
+the two counts is the cost of polling alone, without start and end. valgrind does not count the kernel's
+instructions: the kernel's time is measured in a run without valgrind. `python -m bench.questions.footprint
+JOB` is the process that polls.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ BOARDS = {
 class Job:
     ports: list[str]
     seconds: float
-    record: str = ""  # path of a recording; "": rows are discarded
+    record: str = ""  # path of the recording; "": no recording
 
 
 # ---- the process that polls: it imports only modules that a user's program imports ----

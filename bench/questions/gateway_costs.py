@@ -1,9 +1,9 @@
 """Measure the CPU time of each kind of work of `multidrop serve`, alone and with warm caches.
 
 A gateway's hub without polling has 31 drives with 10 values each. The script calls its protocols as asyncio
-would. Before each measurement the hub gets new rows with other values. The table has the least time
-of many measurements, which other processes disturbed least. It includes neither the kernel's time nor the
-effect of cold caches: see `gateway_load` for these.
+would. Before each measurement the hub gets new rows with other values. The table has the shortest time of
+many measurements, because other processes disturb that one least. The times leave out the kernel's time and
+the effect of cold caches: see `gateway_load` for these.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ class FakeTransport(asyncio.Transport):
 class Worker:
     """A gateway that is not started, with a method for each kind of its work, for all drives."""
 
-    def __init__(self, folder: Path) -> None:
-        self.plant = Plant.load(write_plant(folder, LINES))
+    def __init__(self, folder: Path, lines: tuple[int, ...] = LINES) -> None:
+        self.plant = Plant.load(write_plant(folder, lines))
         self.gateway = Gateway(self.plant, ServeSettings(port=0))
         self.drives = [polled.drive.name for line in self.plant.lines for polled in line.drives]
         self._names = Names(self.drives), Names(POLLED)

@@ -4,9 +4,11 @@ A simulated plant has 31 drives with 10 values each at 10 Hz. Measurements of th
 Poller that records, the gateway alone, and the gateway with its users. The users are five viewers, ten more
 viewers that do not read, a scraper of metrics, history queries, an MQTT listener and two Modbus masters.
 
-Then all motors are stopped over HTTP many times, without and with the users. Times are from the request to
-the last drive's stop, as the simulator received it, and to the HTTP answer. `--minutes 60` continues with
-the users, and prints a row per minute.
+Then all motors are stopped over HTTP many times: without and with the users, and beside hostile clients.
+There are three kinds of hostile clients: 300 connections that send 50 requests each and read no answers; such
+connections, and 20 new ones each second; 63 Modbus clients that read without pause. Three times are measured
+from the request: to the first drive's stop and to the last drive's stop, as the simulator received them, and
+to the HTTP answer. `--minutes 60` continues with the users, and prints a row per minute.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterd
 from gateway_users import GatewayUsers, Place, gateway_users, place_of, serve_tables
 from simulated_pumps import POLLED, SimulatedPumps, free_ports, simulated_pumps, write_plant
 
+from bench.players.hostile_clients import KINDS
 from bench.support import tables
 from bench.support.programs import module
 from multidrop import Plant, Poller
@@ -183,6 +186,15 @@ def serving(plant: Path, place: Place, before: Sequence[str]) -> Iterator[Gatewa
 
 
 @contextmanager
+def hostile_clients(kind: str, place: Place) -> Iterator[None]:
+    port = place.modbus if "Modbus" in kind else place.http
+    words = module("bench.players.hostile_clients", kind, port)
+    with subprocess.Popen(words, stdin=subprocess.PIPE):  # the block's end closes standard input
+        time.sleep(SETTLE_S)
+        yield
+
+
+@contextmanager
 def broker(folder: Path, port: int) -> Iterator[None]:
     path = folder / "mosquitto.conf"
     path.write_text(BROKER_CONF.format(port))
@@ -261,7 +273,10 @@ class Hall:
                     yield self.slice("serve, users", gateway, seconds)
 
     def stops(self, rounds: int) -> Iterator[tuple[object, ...]]:
-        """Stop all drives in alternating rounds without and with the users; yield a row for each."""
+        """Stop all drives in alternating rounds without and with the users, then beside hostile clients.
+
+        Yields a row for each round.
+        """
         found: dict[str, list[tuple[float, float, float]]] = {"alone": [], "users": []}
         with serving(self.plant, self.place, self.before) as gateway:
             time.sleep(SETTLE_S)
@@ -269,6 +284,9 @@ class Hall:
                 found["alone"] += [self.stop(gateway) for _ in range(STOPS_IN_A_ROW)]
                 with self.users():
                     found["users"] += [self.stop(gateway) for _ in range(STOPS_IN_A_ROW)]
+            for kind in KINDS:
+                with hostile_clients(kind, self.place):
+                    found[kind] = [self.stop(gateway) for _ in range(rounds)]
         for at, what in enumerate(("first stop on the wire", "last stop on the wire", "answer")):
             for name, stops in found.items():
                 times = sorted(one[at] * 1e3 for one in stops)

@@ -1,13 +1,13 @@
-"""The cost of a day of 310 series at 10 Hz: to record, to compact, to store and to plot.
+"""The cost to record, compact, store and plot a history: a day of 310 series at 10 Hz.
 
-`python -m bench.questions.history DIRECTORY` makes such a day there, in segments of ten minutes. The first
-segment is recorded as .arrows, in batches of 0.2 s, and compacted by the process that a gateway starts for
-this. DuckDB makes the other segments from generated rows with the same queries. After the first hour their
-rows are at 1 Hz, which gives the same number of ten-second summaries. The last half segment, at 10 Hz, is
-not compacted, as if it were still recorded.
+`python -m bench.questions.history DIRECTORY` writes such a day into DIRECTORY, in segments of ten minutes.
+The first segment is recorded as .arrows, in batches of 0.2 s, and compacted by the process that a gateway
+starts for this. DuckDB makes the other segments from generated rows with the same queries. After the first
+hour their rows are at 1 Hz, which gives the same number of ten-second summaries. The last half segment, at 10
+Hz, is not compacted, as if it were still recorded.
 
-Then the script makes the queries of the gateway's page. If the directory already has such a day, the script
-only makes the queries.
+Then the script measures the queries that the gateway's page makes. If DIRECTORY already has such a day, the
+script only measures the queries.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def make_day(folder: Path, hours: int) -> None:
 
 
 def asked(ask: Callable[[], object]) -> tuple[float, float, float, float]:
-    """Measure a query: return ms of the first, median and maximum of 20 more, and the CPU time of one."""
+    """Return a query's times in ms: first call, median and maximum of 20 more calls, CPU time per call."""
     found = []
     for _ in range(21):
         begun, used = time.perf_counter(), time.process_time()
@@ -192,7 +192,7 @@ def main() -> None:
 
 
 def _merge(folder: Path, hours: int) -> None:
-    """Add a second of the next day and compact, so that the day's ten-second summaries become one file."""
+    """Store one second of the next day's rows, then merge the day's ten-second summaries into one file."""
     with connect("100MB", folder / ".making") as database:
         made(database, 30 * 3600, 30 * 3600 + 1)
         number = hours * 3600 // SEGMENT_S + 5

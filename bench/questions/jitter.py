@@ -1,6 +1,6 @@
 """How late are requests that are due at a fixed rate, on an idle computer?
 
-Compared, in alternating measurements, with a C program that sleeps until each request's time.
+Measurements of multidrop alternate with those of a C program that sleeps until each request's time.
 `python -m bench.questions.jitter JOB` is the process that polls.
 """
 

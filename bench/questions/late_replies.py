@@ -2,8 +2,9 @@
 
 Each line has several drives with four blocks of equal length, and each value encodes its drive and register.
 Replies are late by up to three time-outs, lost, or doubled. In the first part, a drive's late reply may come
-after the replies to later requests, which no real line does; in the second part, replies keep their order.
-In the last part, all replies come over a network path that delays them for longer, and keeps their order.
+after its replies to later requests, which does not happen on a real line. In the second part, replies keep
+their order. In the last part, all replies come over a network path that delays them for longer, and keeps
+their order.
 """
 
 from __future__ import annotations

@@ -162,7 +162,7 @@ class Round:
         self.count(given=1)
         try:
             if chance.random() < 0.3:
-                motor.set_frequency(chance.randrange(1, 5))  # at a low frequency it stops soon
+                motor.set_frequency(chance.randrange(1, 5))  # at a low frequency, the motor stops soon
             getattr(motor, chance.choice(["start", "stop", "state"]))()
         except BusError:
             self.count(failed=1)
@@ -178,7 +178,7 @@ class Round:
     def told(self) -> tuple[int, int]:
         """Return the number of exchanges, and of rows that the summary counts but that were not taken.
 
-        At this time all removed drives were added again, so the summary has every drive.
+        The threads have added all removed drives again by now, so the summary has every drive.
         """
         summary = self.poller.summary()
         lost = summary["samples"] + summary["misses"] - self.counts["rows"]
@@ -232,7 +232,7 @@ def main() -> int:
                     or this_round.counts["given"] != this_round.counts["ended"]
                 ):
                     failures.append(f"round {number + 1}: a value is another's, or a row or command is lost")
-    half = seen[len(seen) // 2]  # half-way, buffers have their final size
+    half = seen[len(seen) // 2]  # after half of the rounds, buffers have their final size
     if seen[-1][0] - half[0] > MOST_GROWTH_KB or seen[-1][1:] != seen[0][1:]:
         failures.append(f"memory, descriptors or threads grow: half-way {half}, at last {seen[-1]}")
     print("\n" + ("\n".join(failures) or "nothing misattributed, nothing lost, nothing grows"))

@@ -1,9 +1,9 @@
 """The host's cost of an exchange when one process polls many lines.
 
-Before every measurement, a minimal epoll loop in C polls the same number of lines, and ratios are to that
-loop. The client runs on one processor and the responders on another. On the same processor, the responders
-would interrupt a slower client every few exchanges. Numbers of lines beyond a limit of the system are
-skipped, and the limit is printed. A default run takes a quarter of an hour.
+Before every measurement, a minimal epoll loop in C polls the same number of lines. Ratios compare multidrop
+with that loop. The client runs on one processor and the responders on another. On the same processor, the
+responders would interrupt a slower client every few exchanges. Numbers of lines beyond a limit of the system
+are skipped, and the limit is printed. A default run takes a quarter of an hour.
 `python -m bench.questions.many_lines JOB` is the process that polls.
 """
 

@@ -1,10 +1,11 @@
 """How old are the values on the gateway's page in Chromium: in 1 or 9 tabs, on a slow network, after a kill?
 
 `multidrop serve` polls 31 drives on three simulated lines, with ten values of each every 0.1 s. A frame's age
-is the viewer's clock minus the frame's time, at its arrival and until the next frame arrives. The age of
-values is that of the drive whose newest value is the oldest. All ages are sampled every 10 ms. A slow network
-is simulated by Chromium (Network.emulateNetworkConditions), which counts whole packets of 1500 bytes, and
-then by a relay that counts bytes.
+is the viewer's clock minus the frame's time. It is measured when the frame arrives, and then every 10 ms
+until the next frame arrives. The age of values is computed every 10 ms too: it is the age of the newest value
+of a drive, for the drive with the greatest such age. A slow network is simulated by Chromium
+(Network.emulateNetworkConditions), which counts whole packets of 1500 bytes, and then by a relay that counts
+bytes.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ Wanted = list[tuple[Drive, float | None]]  # drives, and the period in s at whic
 class Case:
     name: str
     predicted: float  # predicted cycle in s
-    known: float  # predicted from the response delays that were measured, in s
+    known: float  # cycle predicted from the measured response delays, in s
     measured: float
     missed: int  # missed values; each failed exchange costs a time-out
 
@@ -68,7 +68,7 @@ def exchanges(wanted: Wanted) -> list[Planned]:
 
 
 def case(name: str, port: str, wanted: Wanted, seconds: float) -> Case:
-    """Poll a line; return the predicted and the measured cycle of the drives without a rate."""
+    """Poll a line; return the predicted and measured cycles of the drives that are polled without a rate."""
     drives = tuple(PolledDrive(drive, polls(drive, every)) for drive, every in wanted)
     plant = Plant((PlantLine("line", port, None, None, drives),), Path("plant.toml"))
     watched = next(drive for drive, every in wanted if every is None)
@@ -88,14 +88,14 @@ def case(name: str, port: str, wanted: Wanted, seconds: float) -> Case:
 
 
 def middle(times: Sequence[int]) -> float:
-    """Return the median of the per-second mean periods, in s, of these times in ns."""
+    """Return the usual period in s between times in ns: the median of the mean periods of each second."""
     most = len(times) - 1
     step = min(most, max(1, round(1e9 * most / (times[-1] - times[0]))))
     return median(times[at + step] - times[at] for at in range(0, most - step + 1, step)) / step / 1e9
 
 
 def cycle(wanted: Wanted, delays: dict[Drive, float]) -> float:
-    """Return the predicted cycle of the drives without a rate in s; `delays` has response delays in s."""
+    """Return the predicted cycle of drives polled without a rate, in s; `delays` are response delays in s."""
     return next(1 / rate.reached for rate in predict(exchanges(wanted), delays).rates if rate.every is None)
 
 

@@ -2,8 +2,8 @@
 
 Exits with 1 in these cases:
 
-- A value belongs to another register. Exception: the simulator was delayed so long that replies came after
-  the response time-out, when no client can recognise them.
+- A value belongs to another register, unless the simulator was delayed beyond the response time-out: no
+  client can recognise such late replies.
 - A value is missing without a row that gives the reason.
 - The recording differs from the polled rows.
 - Memory, descriptors or threads grow.
@@ -38,8 +38,8 @@ from multidrop.toml_check import parse_duration
 PLAYERS = Path(__file__).parents[1] / "players"
 MOST_GROWTH_KB = 2048  # limit for resident memory after the first period
 COMMAND_EVERY = 20.0  # s between the start and the stop of a motor
-IN_FLIGHT = 2  # number of latest slots of a register whose rows may not be taken yet
-HELD_UP = 1.0  # s; a delay of the line in this time before a wrong value excuses it
+IN_FLIGHT = 2  # number of a register's latest slots whose rows may still be in flight
+HELD_UP = 1.0  # s; a wrong value is excused if the line was delayed this soon before it
 HEAD: tuple[str, ...] = (
     "hours",
     "exchanges",
@@ -181,7 +181,7 @@ class Soak:
         return period
 
     def unexplained(self, overrun: int) -> int:
-        """Return how many due values have neither a row nor are among the `overrun` skipped ones."""
+        """Return how many due values have no row and are not among the `overrun` skipped values."""
         slots = int((time.monotonic() - self.begun) / plants.EVERY) - IN_FLIGHT
         return max(0, sum(max(0, slots - self.slots[key]) for key in self.timed) - overrun)
 

@@ -28,7 +28,7 @@ from bench.support import tables
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 ALL = [(kind, address) for address, kind in enumerate((*KINDS, "yd1000"), 1)]
-LOOKS: dict[str, tuple[int, ...]] = {  # by family: exception codes to return to a stop's first reads
+LOOKS: dict[str, tuple[int, ...]] = {  # exception codes that answer a stop's first reads, by family
     "erman-er-g-220": (2,),
     "invt-che": (0x11, 0x06),
     "innovert-ibd": (6,),
@@ -38,7 +38,7 @@ LOOKS: dict[str, tuple[int, ...]] = {  # by family: exception codes to return to
     "fan": (1,),
 }
 MOST_LOOKS = 8  # limit of the reads that a start makes before its write
-LATE, PATIENCE = 0.6, 3.0  # s: delay of replies, which is too late to confirm a stop; limit for a stop
+LATE, PATIENCE = 0.6, 3.0  # s: delay that makes replies too late to confirm a stop; limit for a stop
 CUT_SHORT = "cut short"  # words in the output of a client whose stops were aborted
 PAUSE = 2.5  # s; longer than the expiry of a start, and than each of its reads
 Attack = Callable[[random.Random, int, bool], Counters]
@@ -49,9 +49,10 @@ def _in_turn(chance: random.Random) -> Iterator[str]:
 
 
 def signals(number: int, leaving: bool) -> Attack:
-    """Return an attack by `number` signals at random moments, while the client waits or ends.
+    """Return an attack by `number` signals at random moments.
 
-    Three signals may abort the client's stops.
+    The signals reach a client that is exiting (with `leaving`), or one that is idle. If a client gets three
+    signals and reports that its stops were aborted, a motor that still turns is not counted as a failure.
     """
 
     def attack(chance: random.Random, rounds: int, is_long: bool) -> Counters:
@@ -111,7 +112,7 @@ def race(chance: random.Random, rounds: int, is_long: bool) -> Counters:
 
 
 def deaf(chance: random.Random, rounds: int, is_long: bool) -> Counters:
-    """Leave the line's requests unanswered for a while after stops are requested."""
+    """Request stops while the line answers nothing for a while."""
     counters = Counters()
     for _ in range(rounds):
         seconds = chance.uniform(2.0, 20.0) if is_long else 1.2
@@ -129,7 +130,7 @@ def deaf(chance: random.Random, rounds: int, is_long: bool) -> Counters:
 
 
 def two_lines(*, polls: bool) -> Attack:
-    """Return an attack by a signal, which must stop the motors of two lines with slowly stopping drives."""
+    """Return an attack by a signal that must stop the motors of two lines, whose drives stop slowly."""
 
     def attack(chance: random.Random, rounds: int, is_long: bool) -> Counters:
         counters = Counters()

@@ -29,7 +29,7 @@ from multidrop.core import (
 
 EXCHANGES = 256
 READ_TEN = Message(1, 3, 0, 10)
-REPLY = bytes.fromhex("010308010001F401F4003225C4")  # ERMAN ER-G-220, section 6, FC03
+REPLY = bytes.fromhex("010308010001F401F4003225C4")  # from ERMAN ER-G-220's document, section 6, FC03
 
 
 TEN_VALUES = RowLayout(0, [Field(at, NumberFormat.U16, at, 1, 10) for at in range(10)])

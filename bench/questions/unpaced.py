@@ -1,7 +1,8 @@
 """The host's CPU time per exchange, on lines without waits: on a pty and over TCP.
 
-A minimal write-poll-read loop in C runs before every measurement, and ratios are to that loop. Both ends of
-the line run on the same processor, which makes results vary least. A default run takes six minutes.
+A minimal write-poll-read loop in C runs before every measurement. Ratios compare multidrop with that loop.
+Both ends of the line run on the same processor, because results then vary least. A default run takes six
+minutes.
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
 """Each master's utilisation of a paced line, its requests that came too early, and its cost on the host.
 
-A minimal master in C with multidrop's silences runs before every measurement; differences and ratios are to
-that master. Figures are medians of all measurements, and counts are sums. A default run takes a quarter of
-an hour.
+A minimal master in C with multidrop's silences runs before every measurement. Differences and ratios compare
+each master with that minimal master. Figures are medians of all measurements, and counts are sums. A default
+run takes a quarter of an hour.
 
-With `--beside N`, each master runs beside N busy loops. Differences and ratios are then to multidrop without
-loops, measured before each master. The simulated line has realtime scheduling, which needs root: otherwise
-the line itself would be late.
+With `--beside N`, each master runs beside N busy loops. Differences and ratios then compare it with multidrop
+without busy loops, measured before each master. The simulated line has realtime scheduling, which needs root:
+otherwise the line itself would be late. A kernel thread with normal scheduling passes on a pty's bytes. With
+`--tcp` the line is a TCP connection, which needs no such thread.
 """
 
 from __future__ import annotations
@@ -22,8 +23,10 @@ from bench.support.programs import busy_loops, paced_line
 
 BARE = "bare C"
 QUIET = "multidrop, quiet"  # multidrop without busy loops
+BARE_REALTIME = "bare C, realtime"
+TCP_START_MS = 1500  # start of a run, not counted: a new connection delays single bytes
 ASLEEP = "bare C, asleep"  # sleeps until 1.5 characters before a reply's end, as multidrop does
-BESIDE = (BARE, "multidrop", "multidrop, realtime", "pymodbus", "minimalmodbus")
+BESIDE = (BARE, BARE_REALTIME, "multidrop", "multidrop, realtime", "pymodbus", "minimalmodbus")
 
 
 def columns(yard: str) -> tuple[str, ...]:
@@ -45,14 +48,19 @@ def columns(yard: str) -> tuple[str, ...]:
     )
 
 
-def measured(master: str, baudrate: int, seconds: float, loops: int = 0) -> dict[str, Any]:
+def measured(
+    master: str, baudrate: int, seconds: float, loops: int = 0, *, tcp: bool = False
+) -> dict[str, Any]:
     """Let a master poll for `seconds`; return what the simulated drives and the master measured."""
-    is_realtime = {"realtime": True} if loops else {}
-    with busy_loops(0 if master == QUIET else loops), paced_line(baudrate=baudrate, **is_realtime) as line:
+    options: dict[str, Any] = {"realtime": True} if loops else {}
+    if tcp:
+        options |= {"tcp": True, "settle_ms": TCP_START_MS}
+    with busy_loops(0 if master == QUIET else loops), paced_line(baudrate=baudrate, **options) as line:
         job = Job(line.path, baudrate, seconds)
-        if master in (BARE, ASLEEP):
+        if master in (BARE, BARE_REALTIME, ASLEEP):
             asleep = job.wire - 1.5 * job.character if master == ASLEEP else 0.0
-            own = rivals.measure_bare(job, adapter.silence(baudrate), asleep)
+            silence = adapter.silence(baudrate)
+            own = rivals.measure_bare(job, silence, asleep, realtime=master == BARE_REALTIME)
         else:
             own = rivals.measure("multidrop" if master == QUIET else master, job)
     report = line.report
@@ -98,10 +106,11 @@ def row(baudrate: int, master: str, slices: list[dict[str, Any]], bare: list[dic
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--baudrates", type=int, nargs="+", default=[9600, 38400, 115200])
-    parser.add_argument("--masters", nargs="+", choices=(*rivals.MASTERS, BARE, ASLEEP))
+    parser.add_argument("--masters", nargs="+", choices=(*rivals.MASTERS, BARE, BARE_REALTIME, ASLEEP))
     parser.add_argument("--seconds", type=float, default=3.0, help="of a slice")
     parser.add_argument("--slices", type=int, default=5)
     parser.add_argument("--beside", metavar="N", type=int, default=0, help="number of busy loops")
+    parser.add_argument("--tcp", action="store_true", help="the line is a TCP connection, not a pty")
     arguments = parser.parse_args()
     loops, seconds = arguments.beside, arguments.seconds
     yard = QUIET if loops else BARE
@@ -114,7 +123,7 @@ def main() -> None:
         + beside
     )
     for baudrate in arguments.baudrates:
-        pacing = measured(BARE, baudrate, seconds, loops)["pacing"]
+        pacing = measured(BARE, baudrate, seconds, loops, tcp=arguments.tcp)["pacing"]
         late = ", ".join(f"{name} {pacing[name]:.1f}" for name in ("p50", "p99", "max"))
         print(f"the line's own lateness per byte at {baudrate}: {late} us")
     print(flush=True)
@@ -124,8 +133,8 @@ def main() -> None:
         slices: dict[str, list[dict[str, Any]]] = {master: [] for master in masters}
         yards: dict[str, list[dict[str, Any]]] = {master: [] for master in masters}
         for master in masters * arguments.slices:
-            yards[master].append(measured(yard, baudrate, seconds, loops))
-            slices[master].append(measured(master, baudrate, seconds, loops))
+            yards[master].append(measured(yard, baudrate, seconds, loops, tcp=arguments.tcp))
+            slices[master].append(measured(master, baudrate, seconds, loops, tcp=arguments.tcp))
         rows += [row(baudrate, master, slices[master], yards[master]) for master in masters]
         every = [each for master in masters for each in yards[master]]
         rows.append(row(baudrate, yard, every, every))

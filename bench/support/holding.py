@@ -34,7 +34,7 @@ DETAILS = {  # properties that an entry may need: their names in the printed tab
 
 @dataclass(frozen=True)
 class Holding:
-    """Whether an entry is representable, representable only for reading, or not, with the reason."""
+    """Whether an entry can be represented fully, only for reading, or not at all, with the reason."""
 
     entry: ImportedRegister | None  # None: the importer could not convert the entry to a register
     is_held: bool
