@@ -37,7 +37,7 @@ def printed(*words: str) -> str:
 
 
 class Sections(Directive):
-    """A section for each name, with the output of a command for it."""
+    """Adds a section for each name, which shows the output of a command for this name."""
 
     def run(self) -> list[nodes.Node]:
         found: list[nodes.Node] = []

@@ -1,6 +1,6 @@
-"""Show docstrings as they are written here: paragraphs, lists, indented code, names in backticks.
+"""Convert this project's docstrings for Sphinx: paragraphs, lists, indented code, names in backticks.
 
-They are not reStructuredText, so characters that it would read as markup are escaped.
+The docstrings are plain text, so characters that reStructuredText would read as markup are escaped.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def to_rst(lines: list[str]) -> list[str]:
 
 
 def _paragraph(lines: list[str]) -> list[str]:
-    """Return a paragraph; an indented one, or a table, is kept as it is."""
+    """Return a paragraph as reStructuredText; indented lines and tables become literal blocks."""
     if lines[0].startswith((" ", "|")):
         return ["::", "", *(f"    {line}" for line in lines)]
     return list(_with_items(lines))

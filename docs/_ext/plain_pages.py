@@ -1,4 +1,4 @@
-"""Use plain Markdown on pages: lists of links and names become tables of contents and documentation."""
+"""Convert plain Markdown pages for Sphinx: add tables of contents, and the documentation of public names."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def with_contents(text: str) -> str:
 
 
 def with_names(text: str) -> str:
-    """Return a page with the documentation of public names in place of their lists."""
+    """Return a page in which the documentation of public names replaces each list of such names."""
     return _NAMES.sub(_directive, text)
 
 

@@ -42,8 +42,8 @@ def _defined(node: ast.stmt) -> Iterator[str]:
         yield from (target.id for target in node.targets if isinstance(target, ast.Name))
 
 
-IN_PARTS = {"Drive", "Poller"}  # whose base classes are not documented separately
-INTERNAL = "forked, leave, part, tended, peer, peers"  # methods that other rooms call
+IN_PARTS = {"Drive", "Poller"}  # classes that are documented with the members of their base classes
+INTERNAL = "forked, leave, part, tended, peer, peers"  # undocumented: only other rooms call these methods
 
 
 class PublicNames(Directive):

@@ -12,7 +12,7 @@ STEP, TOP, LEFT, WIDTH, HEIGHT = 90, 40, 330, 170, 40  # of the boxes, in px
 
 
 def names(kind: str) -> list[str]:
-    """Return the names of an enum of the core, in order, without its count."""
+    """Return the names in an enum of the core, in order; its last member, the count, is left out."""
     elements = ffi.typeof(f"enum {kind}").elements
     return [elements[number].removeprefix("MD_").replace("_", " ").lower() for number in sorted(elements)][
         :-1

@@ -19,7 +19,7 @@ class Span:
     begin: float
     end: float
     text: str
-    kind: str  # of COLOURS; "wait": a dimension with arrows
+    kind: str  # a key of COLOURS; "wait" is drawn as a dimension with arrows
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Diagram:
     note: str = ""
 
 
-# Times in ms at 9600 baud, 8N1: a read of ten registers, response delay 2 ms (not to scale if it says so).
+# Times in ms at 9600 baud, 8N1: a read of ten registers, response delay 2 ms. Some diagrams are not to scale.
 DIAGRAMS = {
     "exchange": Diagram(
         46,

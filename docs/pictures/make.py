@@ -24,7 +24,7 @@ from diagrams import DIAGRAMS, draw
 
 HERE = Path(__file__).parent
 WIDTH, HEIGHT = 110, 24  # characters
-SHOWN_S = 20  # of the demo, whose last full screen is the picture
+SHOWN_S = 20  # s for which the demo runs; its last full screen is the picture
 COMMAND = [str(Path(sys.executable).with_name("multidrop"))]
 
 PLANT = """
@@ -88,7 +88,7 @@ FONT = "ui-monospace,'DejaVu Sans Mono',Menlo,Consolas,monospace"
 
 
 def _svg(screen: str) -> str:
-    """Return a picture of a terminal whose lines have the escape sequences of `cli/support/screen.py`."""
+    """Return an SVG of a terminal's screen, given as text with the escapes of `cli/support/screen.py`."""
     width, height = WIDTH * CHARACTER + 2 * MARGIN, HEIGHT * LINE + BAR + MARGIN
     parts = [
         f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {width:.0f} {height}' "

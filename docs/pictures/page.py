@@ -1,7 +1,8 @@
 """Take the picture of the page of `multidrop demo --web`: `python docs/pictures/page.py`.
 
-It takes more than a minute, because the last minute is in the picture. With a file name, a width and a height
-it takes the picture of another window. Needs `pip install '.[serve]' playwright` and Chromium.
+This takes more than a minute, because the page's plots show the last minute. With a file name, a width and a
+height as arguments, the picture has this size and is saved under this name. Needs `pip install '.[serve]'
+playwright` and Chromium.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from playwright.sync_api import sync_playwright
 
 HERE = Path(__file__).parent
 COMMAND = [str(Path(sys.executable).with_name("multidrop")), "demo", "--web", "--no-browser"]
-MINUTE_S = 62.0  # until the gateway has kept a whole minute
-SHOWN_MS = 5_000  # of the page, until its plots are drawn
+MINUTE_S = 62.0  # s until the gateway has the values of a whole minute
+SHOWN_MS = 5_000  # ms until the page has drawn its plots
 
 
 def main(out: Path = HERE / "page.png", width: int = 1440, height: int = 900, place: str = "") -> None:
