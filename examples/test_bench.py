@@ -33,7 +33,7 @@ LIMIT_A = 30.0
 
 
 class LimitExceeded(Exception):
-    """The test may not continue."""
+    """Raised to end the test: the current is too high, or no current was read."""
 
 
 def record_step(poller: Poller, writer: RecordingWriter, seconds: float) -> list[float]:
