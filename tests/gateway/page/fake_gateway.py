@@ -324,7 +324,8 @@ def audit(handler: Any, gateway: FakeGateway, _: object) -> None:
         entry(900, write="stop", outcome="confirmed", by="anna by page from 10.0.0.14"),
         *(entry(7200 + n, drive=("labeller", "mixer-2")[n % 2], write="stop", outcome="unconfirmed",
                 why="no reply", by="anna by page from 10.0.0.14") for n in range(84)),
-        entry(7300, write="start", outcome="unconfirmed", why="no reply", by="scada by http from 10.0.0.2"),
+        # More than a day ago: the page shows its date too.
+        entry(90000, write="start", outcome="unconfirmed", why="no reply", by="scada by http from 10.0.0.2"),
     ]})  # fmt: skip
 
 
