@@ -321,6 +321,22 @@ def test_closing_a_stalled_port_takes_bounded_time_and_discards_a_command(
     assert ("waiting 0.75 s for its adapter" in caplog.text) != must_discard
 
 
+def test_a_stalled_port_is_closed_although_no_descriptor_is_left(
+    terminal: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(fd: int) -> int:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    found = Line(terminal).open()
+    port = found._opened._serial
+    monkeypatch.setattr(clock, "sleep", lambda seconds: None)
+    monkeypatch.setattr(Serial, "out_waiting", 8)
+    monkeypatch.setattr(os, "dup", fail)
+    found.close()
+    assert port is not None
+    assert not port.is_open
+
+
 def test_a_lost_port_states_why_before_it_is_reopened(terminal: str, monkeypatch: pytest.MonkeyPatch) -> None:
     found = Line(terminal).open()
     core = SimpleNamespace(lost=True, lost_error=0, called_off=True, is_stalled=False, stop=lambda: None)

@@ -360,7 +360,9 @@ class OpenPort:
             self.bridge = None
         if self._serial:
             connection = connection_of(self._serial)
-            last = os.dup(self._serial.fileno()) if self._holds_bytes_now() else None
+            last = None
+            with suppress(*PORT_FAILURES):  # os.dup fails if the process has no descriptor left
+                last = os.dup(self._serial.fileno()) if self._holds_bytes_now() else None
             with suppress(*PORT_FAILURES):
                 self._serial.close()
             if last is not None:
