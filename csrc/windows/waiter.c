@@ -13,6 +13,7 @@ enum { WAKEUP, TIMER, OBJECTS };
 
 struct md_waiter {
     HANDLE objects[OBJECTS];
+    int has_files; /* 1: the files of file.c belong to this waiter's thread */
 };
 
 /* Windows before 10 1803 has only normal timers, which are up to 16 ms late. */
@@ -41,8 +42,10 @@ void md_waiter_free(struct md_waiter *waiter)
 /* `owner` NULL: `fd` is the wake-up event. */
 int md_waiter_add(struct md_waiter *waiter, int fd, void *owner)
 {
-    if (owner)
+    if (owner) {
+        waiter->has_files = 1;
         return md_file_add(fd, owner);
+    }
     waiter->objects[WAKEUP] = handle_of(fd);
     return 0;
 }
@@ -62,13 +65,13 @@ void md_waiter_remove(struct md_waiter *waiter, int fd)
 int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t timeout_ns)
 {
     LARGE_INTEGER span = {.QuadPart = -(timeout_ns + 99) / 100}; /* negative: from now on */
-    int n = md_files_ready(ready, room - 1);
+    int most_files = waiter->has_files ? room - 1 : 0, n = md_files_ready(ready, most_files);
     DWORD count = timeout_ns < 0 ? TIMER : OBJECTS, most = timeout_ns && !n ? INFINITE : 0, ended;
     if (timeout_ns > 0 && !n)
         SetWaitableTimer(waiter->objects[TIMER], &span, 0, NULL, NULL, FALSE);
     do {
         ended = WaitForMultipleObjectsEx(count, waiter->objects, FALSE, most, TRUE);
-        n += md_files_ready(ready + n, room - 1 - n);
+        n += md_files_ready(ready + n, most_files - n);
     } while (ended == WAIT_IO_COMPLETION && !n && most); /* only a write has completed */
     if (ended == WAIT_OBJECT_0 + WAKEUP)
         ready[n++] = NULL;
