@@ -143,6 +143,19 @@ def test_rts_never_changes_before_the_last_bit_has_left(
 
 @pytest.mark.slow
 @pytest.mark.long
+@USB
+def test_rts_falls_after_a_request_that_the_adapter_does_not_take(guest: Guest, kind: str) -> None:
+    """The transceiver must not occupy the line. Closing the port then discards the request."""
+    found = guest.run("rts_in_stall", kind=kind)
+    assert all("stalled: its adapter takes no bytes" in result for result in found["results"])
+    held, after = found["held"], found["after"]
+    assert held["rts_given_up"] >= 1
+    assert after["sent"] == held["sent"]
+    assert after["rts_missing"] == 0
+
+
+@pytest.mark.slow
+@pytest.mark.long
 def test_the_rs485_mode_of_a_driver_raises_rts_for_each_request(guest: Guest) -> None:
     """The UART's registers show RTS at each byte that is sent, and the fall of RTS between requests."""
     found = guest.run("rs485_mode")

@@ -39,11 +39,13 @@ class Adapter(USBDevice):
         self.broken = 0  # how many of the next transfers to the guest will fail
         self.damaged: list[str] = []  # kinds of damage for the next replies
         self.rts_missing = 0  # number of transfers at whose start RTS kept the transceiver from sending
-        self.rts_early = 0  # how often RTS cut a transfer off
+        self.rts_lateness: list[float] = []  # s from each request's last bit to the fall of RTS; < 0: cut off
+        self.rts_given_up = 0  # how often RTS fell although the adapter had not taken the request
         self._sends_with = sends_with
         self._received: deque[int] = deque()  # characters that the line has sent to the guest
         self._errors = 0  # ERROR_BITS of characters in `_received`
         self._free_at = 0.0  # when the line will have sent all characters
+        self._is_rts_due = False  # RTS has not fallen since the last request
         self._room_at = 0.0  # when the adapter can take the next transfer
         self._is_flush_due = False
 
@@ -78,6 +80,7 @@ class Adapter(USBDevice):
     def _send(self, data: bytes) -> None:
         is_missing = self._sends_with is not None and bool(self.lines & RTS) != bool(self._sends_with)
         self.rts_missing += is_missing
+        self._is_rts_due = True
         self._free_at = max(monotonic(), self._free_at) + len(data) * self.character
         self.log.append(
             {"what": "sent", "bytes": data.hex(), "baudrate": self.baudrate, "format": self.format}
@@ -103,16 +106,23 @@ class Adapter(USBDevice):
             self.timers.at(when, self._hear, piece, errors if has_error else 0)
 
     def set(self, baudrate: int = 0, format: str = "", lines: int | None = None) -> None:
-        """Change settings and control lines; count a change of RTS that cuts off a request."""
+        """Change settings and control lines; record when RTS falls after a request."""
         before = self.baudrate, self.format, self.lines
         self.baudrate, self.format = baudrate or self.baudrate, format or self.format
         self.lines = self.lines if lines is None else lines
-        if self._sends_with is not None and (before[2] ^ self.lines) & RTS:
-            ends_sending = bool(self.lines & RTS) != bool(self._sends_with)
-            self.rts_early += ends_sending and (self.is_sending or bool(self.outs))
+        is_rts_changed = self._sends_with is not None and (before[2] ^ self.lines) & RTS
+        if is_rts_changed and bool(self.lines & RTS) != bool(self._sends_with):
+            self._rts_falls()
         if (self.baudrate, self.format, self.lines) != before:
             rts = self.lines >> 1 & 1
             self.log.append({"what": "set", "baudrate": self.baudrate, "format": self.format, "rts": rts})
+
+    def _rts_falls(self) -> None:
+        if self.outs:
+            self.rts_given_up += 1
+        elif self._is_rts_due:
+            self.rts_lateness.append(monotonic() - self._free_at)
+        self._is_rts_due = False
 
     def _set_lines(self, mask: int, lines: int) -> None:
         self.set(lines=self.lines & ~mask | lines & mask)
@@ -174,7 +184,8 @@ class Adapter(USBDevice):
         return {
             "baudrate": self.baudrate,
             "format": self.format,
-            "rts_early": self.rts_early,
+            "rts_lateness": self.rts_lateness,
+            "rts_given_up": self.rts_given_up,
             "rts_missing": self.rts_missing,
             "waiting": len(self.outs),
             "damaged": self.damaged,

@@ -62,6 +62,19 @@ def attempt(call: Callable[..., object], *arguments: Any, **options: Any) -> Any
         return f"{type(failure).__name__}: {failure}"
 
 
+def until_answered(call: Callable[..., object], *arguments: Any) -> Any:
+    """Return what attempt() returns; repeat the call while a driver gives up its adapter.
+
+    pl2303 gives its adapter 100 ms to answer a USB request. An emulated adapter on a busy computer may need
+    longer.
+    """
+    for _ in range(ATTEMPTS):
+        result = attempt(call, *arguments)
+        if "its adapter failed" not in str(result):
+            break
+    return result
+
+
 def insist(call: Callable[..., object], *arguments: Any) -> None:
     """Repeat a call until it succeeds: on a busy computer a write may expire before it is sent.
 
@@ -144,14 +157,17 @@ FAMILY = "ErmanERG220"
 POLLED = ("output_frequency", "output_current")
 
 
-def write_plant(lines: dict[str, tuple[str, Iterable[int]]], more: str = "") -> str:
-    """Write a plant file of lines, each with its port and addresses; return the file's path."""
+def write_plant(lines: dict[str, tuple[str, Iterable[int]]], more: str = "", every: str = "500 ms") -> str:
+    """Write a plant file of lines, each with its port and addresses; return the file's path.
+
+    With `every` = "" the drives are polled as fast as possible.
+    """
     text = more
     for line, (port, addresses) in lines.items():
         text += f'[[line]]\nname = "{line}"\nport = "{port}"\n'
         for address in addresses:
             text += f'[[line.drive]]\nname = "{line}-{address}"\nmodel = "{MODEL}"\naddress = {address}\n'
-            text += 'every = "500 ms"\n'
+            text += f'every = "{every}"\n' if every else ""
             text += f"poll = {list(POLLED)}\n".replace("'", '"')
     path = Path("/tmp/plant.toml")
     path.write_text(text, "utf-8")

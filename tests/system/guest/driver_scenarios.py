@@ -13,7 +13,7 @@ from collections import Counter
 from typing import Any
 
 import plug
-from common import KINDS, Command, Meter, attempt, kernel_settings, right, run
+from common import KINDS, Command, Meter, attempt, kernel_settings, right, run, until_answered
 
 import multidrop
 from multidrop import Bus
@@ -35,7 +35,7 @@ def settings(kind: str, wanted: list[tuple[int, str]]) -> list[dict[str, Any]]:
     adapter = plug.Adapter(kind, f"set-{kind}")
     facts = []
     for baudrate, format in wanted:
-        read = attempt(_values, adapter.path, baudrate, format)
+        read = until_answered(_values, adapter.path, baudrate, format)
         state = adapter.state
         facts.append(
             {
@@ -50,19 +50,38 @@ def settings(kind: str, wanted: list[tuple[int, str]]) -> list[dict[str, Any]]:
 def rts(kind: str, mode: str, baudrate: int, count: int) -> dict[str, Any]:
     """Read with RTS that switches a transceiver; return the adapter's record of RTS."""
     adapter = plug.Adapter(kind, f"rts-{kind}", sends_with=int(mode == "rts-up"))
-    good = 0
     with Bus(adapter.path, baudrate=baudrate, format="8N1", rs485=mode) as bus:
         meter = bus.attach(Meter, address=2)
-        for _ in range(count):
-            good += attempt(meter.read, meter.a) == 0x210
+        results = Counter(str(attempt(meter.read, meter.a)) for _ in range(count))
     state = adapter.state
     return {
-        "good": good,
+        "results": results,
         "missing": state["rts_missing"],
-        "early": state["rts_early"],
+        "early": sum(lateness < 0 for lateness in state["rts_lateness"]),
+        "lateness": [round(1000 * lateness, 2) for lateness in sorted(state["rts_lateness"])],
         "sent": sum(event["what"] == "sent" for event in state["log"]),
         "levels": [event["rts"] for event in state["log"] if event["what"] == "set"],
     }
+
+
+def rts_in_stall(kind: str) -> dict[str, Any]:
+    """Read while the adapter takes no bytes; return its record of RTS during the stall, and after it."""
+    adapter = plug.Adapter(kind, f"still-{kind}", sends_with=1)
+
+    def record() -> dict[str, Any]:
+        state = adapter.state
+        sent = sum(event["what"] == "sent" for event in state["log"])
+        return {"sent": sent, "rts_given_up": state["rts_given_up"], "rts_missing": state["rts_missing"]}
+
+    with Bus(adapter.path, baudrate=9600, format="8N1", rs485="rts-up") as bus:
+        meter = bus.attach(Meter, address=2)
+        meter.read(meter.a)
+        adapter.do("stall", True)
+        results = [str(attempt(meter.read, meter.a)) for _ in range(3)]
+        held = record()
+    adapter.do("stall", False)
+    time.sleep(0.5)  # a request that the driver has kept would be sent now
+    return {"results": results, "held": held, "after": record()}
 
 
 def broken_transfers(kind: str) -> Counter[str]:

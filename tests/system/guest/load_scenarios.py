@@ -1,0 +1,109 @@
+"""A measurement beside busy processes: how regularly a line is polled, with and without realtime.
+
+Linux's serial drivers pass received bytes to a work of the kernel, flush_to_ldisc. The kernel's own trace
+shows how late that work starts.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import plug
+from common import FAMILY, write_plant
+
+from multidrop import Poller
+
+WARM_UP_S = 1.0
+TRACING = Path("/sys/kernel/tracing")
+EVENTS = ("workqueue_queue_work", "workqueue_execute_start")
+QUEUED = re.compile(r" (\d+\.\d+): workqueue_queue_work: work struct=(\w+) function=flush_to_ldisc ")
+STARTED = re.compile(r" (\d+\.\d+): workqueue_execute_start: work struct (\w+): function flush_to_ldisc")
+
+
+@contextmanager
+def _busy_processes(count: int) -> Iterator[None]:
+    children = []
+    for _ in range(count):
+        child = os.fork()
+        if child == 0:
+            while True:
+                pass
+        children.append(child)
+    try:
+        yield
+    finally:
+        for child in children:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+
+
+@contextmanager
+def _traced_works() -> Iterator[list[float]]:
+    """Yield a list that at the end holds how late each flush_to_ldisc started, in ms."""
+    late: list[float] = []
+    if not (TRACING / "trace").exists():
+        subprocess.run(["mount", "-t", "tracefs", "tracefs", TRACING], check=True)
+    (TRACING / "trace").write_text("", "ascii")
+    for event in EVENTS:
+        (TRACING / "events/workqueue" / event / "enable").write_text("1", "ascii")
+    try:
+        yield late
+    finally:
+        for event in EVENTS:
+            (TRACING / "events/workqueue" / event / "enable").write_text("0", "ascii")
+    queued: dict[str, float] = {}
+    for line in (TRACING / "trace").read_text("ascii").splitlines():
+        if found := QUEUED.search(line):
+            queued[found[2]] = float(found[1])
+        elif (found := STARTED.search(line)) and found[2] in queued:
+            late.append(1000 * (float(found[1]) - queued.pop(found[2])))
+
+
+def _spread(times: Sequence[float]) -> dict[str, float]:
+    ordered = sorted(times)
+    places = {"p50": len(ordered) // 2, "p99": len(ordered) * 99 // 100, "most": len(ordered) - 1}
+    return {name: round(ordered[at], 2) for name, at in places.items()}
+
+
+def _polled(plant: str, seconds: float, *, realtime: bool) -> dict[str, Any]:
+    """Poll for `seconds`; return the rate, the times between requests, and how late works start, in ms."""
+    sent: set[int] = set()
+    with Poller(plant, realtime=realtime) as poller, _traced_works() as late:
+        begun = time.monotonic_ns() + round(WARM_UP_S * 1e9)
+        for batch in poller:
+            sent.update(row.monotonic_ns for row in batch)
+            if time.monotonic_ns() > begun + seconds * 1e9:
+                break
+    times = sorted(when for when in sent if begun <= when <= begun + seconds * 1e9)
+    gaps = [(after - before) / 1e6 for before, after in pairwise(times)]
+    return {"requests per s": round(len(times) / seconds, 1), "gap": _spread(gaps), "work": _spread(late)}
+
+
+def cadence(kind: str, loops: int, seconds: float, rounds: int) -> dict[str, list[dict[str, Any]]]:
+    """Poll two drives in turn: alone, then beside `loops` busy processes, without and with realtime.
+
+    `kind` is that of a USB adapter, or "8250" for QEMU's UART.
+    """
+    far_end: dict[str, Any] = {"serial": "uart", "family": FAMILY, "addresses": [1, 2]}
+    if kind == "8250":
+        plug.do("connect", far_end)
+        path = "/dev/ttyS1"
+    else:
+        path = plug.Adapter(kind, f"load-{kind}", family=FAMILY, addresses=[1, 2]).path
+    plant = write_plant({"a": (path, [1, 2])}, every="")
+    cases = {"alone": (0, False), "busy": (loops, False), "busy, realtime": (loops, True)}
+    found: dict[str, list[dict[str, Any]]] = {name: [] for name in cases}
+    for _ in range(rounds):
+        for name, (count, realtime) in cases.items():
+            with _busy_processes(count):
+                found[name].append(_polled(plant, seconds, realtime=realtime))
+    return found
