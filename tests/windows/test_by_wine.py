@@ -207,6 +207,29 @@ def test_ctrl_c_ends_a_poll_with_a_complete_recording(wine: Wine, pump: MotorDri
     assert "ok" in statuses(out)
 
 
+REALTIME = """
+import sys
+from multidrop import Poller
+from multidrop.core import wake_lateness
+from multidrop.core.port import _engine
+with Poller(sys.argv[1], realtime=True) as poller:
+    batches = iter(poller)
+    while all(row.status != "ok" for row in next(batches)):
+        pass
+    print(_engine.is_realtime, len(wake_lateness(0.02, realtime=True)))
+    while all(row.status != "ok" for row in next(batches)):
+        pass
+print(_engine.is_realtime)
+"""
+
+
+def test_a_poll_gets_realtime_scheduling_and_returns_it(wine: Wine, pump: MotorDrive, plant: Path) -> None:
+    """Wine grants it, so this test shows only that the calls work, not how they change times."""
+    ran = wine.run("-c", REALTIME, plant)
+    assert ran.stdout.split() == [b"True", b"10", b"False"], ran.stderr
+    assert b"realtime" not in ran.stderr
+
+
 CLIENT = """
 import time
 from multidrop import Bus, InvtCHE
