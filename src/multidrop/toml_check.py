@@ -3,81 +3,18 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, TypeVar
 
 from multidrop.printable import did_you_mean, is_number, masked, nearest_names, printable
+from multidrop.toml_document import DocumentError, Lines, Steps, line_numbers
 
 T = TypeVar("T")
-
-MOST_PARTS = 100  # limit of parts in a dotted key
-
-
-def read_document(path: Path, what: str) -> dict[str, Any]:
-    """Return the tables of a TOML file. If that fails, raises ValueError; its text does not name the path.
-
-    A byte order mark before the text is skipped, because some editors write one. A device is refused: reading
-    a serial port would block forever, and would take bytes from its drives.
-    """
-    try:
-        if path.is_char_device():
-            raise ValueError(f"is a device, not a {what}")
-        data = path.read_bytes()
-    except OSError as failure:
-        raise ValueError(f"the {what} cannot be read: {failure.strerror}") from failure
-    return parse_document(data)
-
-
-def read_bounded(path: Path, most: int, what: str) -> bytes:
-    """Return a file's bytes, at most `most`. If that fails, raises ValueError; its text lacks the path."""
-    try:
-        with path.open("rb") as file:
-            data = file.read(most + 1)
-    except OSError as failure:
-        raise ValueError(f"the {what} cannot be read: {failure.strerror}") from failure
-    if len(data) > most:
-        raise ValueError(f"the {what} has more than {most} bytes")
-    return data
-
-
-def parse_document(data: bytes) -> dict[str, Any]:
-    """Return the tables of a TOML file's bytes. Raises ValueError if the bytes are not valid TOML."""
-    try:
-        text = data.decode("utf-8-sig")
-        _check_keys(text)
-        document = tomllib.loads(text)
-        fits = _fits(document)
-    except UnicodeDecodeError as failure:
-        raise ValueError(f"is not text in UTF-8, from byte {failure.start} on") from failure
-    except RecursionError as failure:
-        raise ValueError("is nested too deeply") from failure
-    except ValueError as failure:
-        raise ValueError(f"is not TOML: {failure}") from failure
-    if not fits:
-        raise ValueError("is not TOML: a number does not fit into 64 bits")
-    return document
-
-
-def _check_keys(text: str) -> None:
-    """Raise ValueError for a key with very many parts: tomllib's time grows with their number squared."""
-    if text.count(".") > MOST_PARTS:
-        pieces = re.split(r"[=,{}\[\]\n]+", text)
-        if any(piece.count(".") > MOST_PARTS for piece in pieces):
-            raise ValueError(f"a key or a text has more than {MOST_PARTS} dots")
-
-
-def _fits(value: Any) -> bool:
-    """Return True if every integer fits into 64 bits, as TOML requires."""
-    if isinstance(value, dict):
-        return all(map(_fits, value.values()))
-    if isinstance(value, list):
-        return all(map(_fits, value))
-    return not isinstance(value, int) or -(2**63) <= value < 2**63
 
 
 @dataclass(frozen=True)
@@ -129,38 +66,11 @@ def _key_schema(key: Key) -> dict[str, Any]:
     return {**alternatives, **key.keywords, "description": key.example}
 
 
-# a table's path: for each level, the name of the array, and the table's number in it
-Steps = tuple[tuple[str, int], ...]
-
-
 class ConfigError(str):
     """An error as text, with its place first; `sentence` lacks the place, `line` is the file's line or 0."""
 
     sentence: str
     line: int
-
-
-def line_numbers(path: Path) -> dict[tuple[Steps, str], int]:
-    """Return the line numbers of keys, by their table's path and their name; "" is the table's header."""
-    if not path.is_file():  # reading a serial port would block
-        return {}
-    found: dict[tuple[Steps, str], int] = {}
-    counts: Counter[tuple[Steps, str]] = Counter()
-    steps: Steps = ()
-    for number, line in enumerate(path.read_text("utf-8-sig", "replace").splitlines(), 1):
-        if header := _HEADER.match(line):
-            *above, last = header[1].split(".")
-            outer = tuple(step for name, step in zip(above, steps, strict=False) if name == step[0])
-            counts[outer, last] += 1
-            steps = (*outer, (last, counts[outer, last]))
-            found[steps, ""] = number
-        elif entry := _ENTRY.match(line):
-            found.setdefault((steps, entry[1]), number)
-    return found
-
-
-_HEADER = re.compile(r"\s*\[\[?\s*([\w.-]+)\s*\]")
-_ENTRY = re.compile(r"\s*([\w-]+)\s*=")
 
 
 def grouped(errors: Sequence[str]) -> tuple[str, ...]:
@@ -190,51 +100,71 @@ class TomlPlace:
     labels: tuple[str, ...] = ()
     config_errors: list[str] = field(default_factory=list)
     seen: dict[tuple[object, ...], str] = field(default_factory=dict)
-    lines: Callable[[], Mapping[tuple[Steps, str], int]] = dict  # see `line_numbers`
+    lines: Callable[[], Lines] = dict  # see `line_numbers`
     steps: Steps = ()
 
-    def inside(self, kind: str, tables: list[Any]) -> Iterator[tuple[Any, TomlPlace]]:
-        """Yield each table with its place, which is labelled with the table's name or else its number."""
+    @classmethod
+    def in_file(cls, path: Path) -> TomlPlace:
+        """Return the place of a whole file. Errors then have line numbers; the first error reads the file."""
+        return cls(path, lines=cache(partial(line_numbers, path)))
+
+    def inside(self, kind: str, tables: list[Any], key: str = "") -> Iterator[tuple[Any, TomlPlace]]:
+        """Yield each table with its place, which is labelled with the table's name or else its number.
+
+        `key` is the key of the tables, if it is not `kind`.
+        """
         for number, table in enumerate(tables, 1):
             name = table.get("name") if isinstance(table, dict) else None
             label = f'{kind} "{name}"' if name and isinstance(name, str) else f"{kind} number {number}"
-            yield table, replace(self, labels=(*self.labels, label), steps=(*self.steps, (kind, number)))
+            steps = (*self.steps, (key or kind, number))
+            yield table, replace(self, labels=(*self.labels, label), steps=steps)
 
-    def within(self, *labels: str) -> TomlPlace:
-        """Return a place inside this place, with these labels appended."""
-        return replace(self, labels=(*self.labels, *labels))
+    def within(self, label: str, *tables: str) -> TomlPlace:
+        """Return the place of a table inside this place; `tables` are the keys that lead to it."""
+        steps = (*self.steps, *((table, 1) for table in tables))
+        return replace(self, labels=(*self.labels, label), steps=steps)
 
-    def of_file(self, path: Path, *labels: str) -> TomlPlace:
-        """Return a place in another file that this file refers to; its errors are added to the same list."""
-        return TomlPlace(path, labels, self.config_errors, self.seen)
+    def of_file(self, path: Path) -> TomlPlace:
+        """Return the place of another file that this file names; its errors are added to the same list."""
+        return TomlPlace(path, (), self.config_errors, self.seen)
 
     def wrong(self, sentence: object, key: str = "") -> None:
         """Add an error at this place, or at one of its keys.
 
         Unprintable characters are escaped, and passwords in URLs removed.
         """
-        line = self._line(key)
-        text = ": ".join(filter(None, (", ".join(self.labels), str(sentence))))
+        self._add(str(sentence), self._line(key or self._first_word(str(sentence))))
+
+    def _add(self, sentence: str, line: int) -> None:
+        text = ": ".join(filter(None, (", ".join(self.labels), sentence)))
         error = ConfigError(f"{self.path}{f':{line}' if line else ''}: {printable(masked(text))}")
-        error.sentence, error.line = str(sentence), line
+        error.sentence, error.line = sentence, line
         self.config_errors.append(error)
 
-    def _line(self, key: str) -> int:
-        """Return the line of a key or its table, or of the key that holds this place; 0 if it is unknown."""
-        places = [(self.steps, key), (self.steps, "")]
-        if self.steps:
-            *outer, (name, _) = self.steps
-            places += [(tuple(outer), name), (tuple(outer), "")]
-        lines = self.lines()
-        return next((lines[place] for place in places if place in lines), 0)
+    def _first_word(self, sentence: str) -> str:
+        """Return the key with which a sentence such as "every = 5 is not right" starts; "" if none."""
+        word = re.split(r"[^\w-]", sentence, maxsplit=1)[0]
+        return word if (self.steps, word) in self.lines() else ""
 
-    def once(self, *what: object, sentence: str) -> None:
+    def _line(self, key: str) -> int:
+        """Return the line of a key or its table, or else of the innermost table around it; 0 if unknown."""
+        lines, steps = self.lines(), self.steps
+        while True:
+            for name in (key, ""):
+                if (steps, name) in lines:
+                    return lines[steps, name]
+            if not steps:
+                return 0
+            *outer, (key, _) = steps
+            steps = tuple(outer)
+
+    def once(self, *what: object, sentence: str, key: str = "") -> None:
         """Add the error `sentence` if `what` was seen before.
 
         `{first}` in the sentence becomes the first place of `what`.
         """
         if what in self.seen:
-            self.wrong(sentence.format(first=self.seen[what]))
+            self.wrong(sentence.format(first=self.seen[what]), key)
         self.seen.setdefault(what, ", ".join(self.labels))
 
     def attempt(self, make: Callable[..., T], *arguments: Any, hint: str = "", key: str = "") -> T | None:
@@ -244,14 +174,16 @@ class TomlPlace:
         """
         try:
             return make(*arguments)
+        except DocumentError as mistake:
+            self._add(str(mistake), mistake.line)
         except (ValueError, TypeError) as mistake:
             self.wrong(f"{mistake}{hint}", key)
-            return None
+        return None
 
     def check(self, table: Any, keys: Mapping[str, Key]) -> dict[str, Any]:
         """Return the entries with a known key and a valid value; add an error for every other entry."""
         if not isinstance(table, dict):
-            self.wrong(f"{table!r} is not a table with {', '.join(keys)}")
+            self.wrong(f"{_shown(table)} is not a table with {', '.join(keys)}")
             return {}
         meant = self.unknown(table, keys)
         good = {}
@@ -261,7 +193,8 @@ class TomlPlace:
                 if key.needed and name not in meant:
                     self.wrong(f"{name!r} is missing; add {key.example}")
             elif not key.takes(value):
-                self.wrong(f"{name} = {value!r} is not right; write {key.example}", name)
+                if name not in meant:
+                    self.wrong(f"{name} = {_shown(value)} is not right; write {key.example}", name)
             elif isinstance(value, str) and not value.isprintable():
                 self.wrong(f"{name} = {value!r} has characters that do not print; leave them out", name)
             else:
@@ -278,6 +211,13 @@ class TomlPlace:
         return meant
 
 
+def _shown(value: Any) -> str:
+    """Return a value as text for an error, without the end of a long table or list."""
+    text = repr(value)
+    return text if len(text) <= MOST_SHOWN or isinstance(value, str) else f"{text[:MOST_SHOWN]}..."
+
+
+MOST_SHOWN = 60  # limit of a table's or a list's characters in an error
 _SHORTEST, _LONGEST = 100e-6, 86400.0  # limits of a duration in s
 _DURATION = r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|h)"
 _TOO_SHORT = r"0*\d{0,2}(\.\d+)?\s*us"

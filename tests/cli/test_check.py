@@ -178,7 +178,7 @@ def test_mistakes_of_a_family_file_are_reported_once_for_all_drives(run: Run, tm
     assert status == 2
     reported = [line for line in err.splitlines() if "fan.toml" in line]
     assert len(reported) == 2
-    assert all('plant.toml:4: line "L", drive "f1": ' in line for line in reported)
+    assert all('plant.toml:6: line "L", drive "f1": ' in line for line in reported)
 
 
 def test_check_reports_no_missing_span_for_a_coil(run: Run, tmp_path: Path) -> None:

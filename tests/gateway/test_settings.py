@@ -22,9 +22,9 @@ NAMES = ("pump-1", "pump-2", "fan-1")
 def mistakes(folder: Path, serve: str) -> list[str]:
     with pytest.raises(PlantError) as wrong:
         read_settings(written(folder, serve), {})
-    start = f"{folder / 'plant.toml'}: "
-    assert all(mistake.startswith(start) for mistake in wrong.value.mistakes)
-    return [mistake.removeprefix(start) for mistake in wrong.value.mistakes]
+    start = re.compile(re.escape(str(folder / "plant.toml")) + r":\d+: ")
+    assert all(start.match(mistake) for mistake in wrong.value.mistakes)
+    return [start.sub("", mistake, count=1) for mistake in wrong.value.mistakes]
 
 
 def test_without_a_serve_table_only_this_machine_may_look(tmp_path: Path) -> None:
@@ -109,6 +109,44 @@ verbs = ["pump-1.fly"]
         f"[serve]: audit {tmp_path}/no/such/folder/audit.jsonl cannot be written: No such file or directory",
     ]
     assert sorted(found) == sorted(expected)
+
+
+PLACED = """\
+[serve]
+lisen = "127.0.0.1:8750" # wrong
+names = ["http://plant.example/"] # wrong
+tokens = "none" # wrong
+audit = "no/such/folder/audit.jsonl" # wrong
+[serve.may]
+look = "everybody" # wrong
+write = ["pump-9.setpoint"] # wrong
+family.invt-chf = { write = ["setpoint"] } # wrong
+[[serve.limit]]
+drive = "pump-1"
+register = "output_current"
+above = 1
+for = "5" # wrong
+[[serve.limit]] # wrong
+drive = "pump-1"
+register = "output_curent"
+above = 1
+[serve.mqqt] # wrong
+[serve.mqtt]
+every = "1 day" # wrong
+password = 3 # wrong
+[serve.modbus]
+listen = "1502" # wrong
+units = { pump-1 = 700 } # wrong
+"""
+
+
+def test_each_mistake_of_the_serve_table_names_the_line_of_its_key(tmp_path: Path) -> None:
+    plant = written(tmp_path, PLACED)
+    with pytest.raises(PlantError) as wrong:
+        read_settings(plant, {})
+    lines = plant.path.read_text().splitlines()
+    named = {int(one.removeprefix(str(plant.path)).split(":")[1]) for one in wrong.value.mistakes}
+    assert named == {number for number, line in enumerate(lines, 1) if line.endswith("# wrong")}
 
 
 @table(

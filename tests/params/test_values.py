@@ -246,7 +246,7 @@ def test_backup_files_of_the_gd20_tool_are_loaded(tmp_path: Path, quote: str) ->
         ("a.toml", 'format = "x"\n[parameters]\nA = 1', "format = 'x' is not 1"),
         ("a.toml", "[parameters]\nA = 1.5", "A = 1.5 is not a raw count"),
         ("a.toml", "[parameters]", "has no parameters"),
-        ("a.toml", "[parameters", "is not TOML"),
+        ("a.toml", "[parameters", r"a\.toml:1: is not TOML"),
         ("a.csv", "x;y\n1;2", "its first row does not name the columns code and raw"),
         ("a.csv", "code;raw\nA;1\nA;2", "A is given twice"),
         ("a.csv", "code;raw\nA;one", "'one' is not a whole number"),

@@ -276,15 +276,15 @@ def test_all_mistakes_of_a_faults_file_are_reported_together(tmp_path: Path) -> 
     with pytest.raises(ValueError, match="is not a duration") as soon:
         parse_duration("soon")
     assert str(mistake.value).splitlines() == [
-        f"{path}: {sentence}"
-        for sentence in (
-            "unknown key 'flips'; did you mean flip?",
-            "seed = 'x' is not right; write seed = 7",
-            "delay = True is not right; write delay = 0.01",
-            'away = 3 is not right; write away = "1 s"',
-            f"late = {soon.value}",
-            "drop = 1.5 is not a rate; write one from 0 to 1, such as 0.01",
-            "burst = 0 is not from 1 to 4096 characters",
+        f"{path}:{line}: {sentence}"
+        for line, sentence in (
+            (2, "unknown key 'flips'; did you mean flip?"),
+            (5, "seed = 'x' is not right; write seed = 7"),
+            (7, "delay = True is not right; write delay = 0.01"),
+            (6, 'away = 3 is not right; write away = "1 s"'),
+            (3, f"late = {soon.value}"),
+            (1, "drop = 1.5 is not a rate; write one from 0 to 1, such as 0.01"),
+            (4, "burst = 0 is not from 1 to 4096 characters"),
         )
     ]
 
@@ -298,8 +298,8 @@ def test_drive_tables_of_a_faults_file_set_the_drives_faults(tmp_path: Path) -> 
     with pytest.raises(ValueError, match="unknown key") as mistake:
         load_faults(path, {"pump-1"})
     assert str(mistake.value).splitlines() == [
-        f"{path}: unknown key 'pump-2'; did you mean pump-1?",
-        f'{path}: drive "pump-1": loss = 3 is not a rate; write one from 0 to 1, such as 0.01',
+        f"{path}:1: [drive]: unknown key 'pump-2'; did you mean pump-1?",
+        f'{path}:3: drive "pump-1": loss = 3 is not a rate; write one from 0 to 1, such as 0.01',
     ]
 
 
@@ -315,7 +315,7 @@ def test_an_invalid_faults_file_is_refused(text: str | None, sentence: str, tmp_
     path = tmp_path / "faults.toml"
     if text is not None:
         path.write_text(text)
-    with pytest.raises(ValueError, match=f"^{re.escape(str(path))}: {sentence}"):
+    with pytest.raises(ValueError, match=rf"^{re.escape(str(path))}(:1)?: {sentence}"):
         load_faults(path)
 
 
@@ -337,6 +337,6 @@ def test_simulate_command_reports_a_mistake_in_the_faults_file(
     words = ["simulate", str(plant), "--ports", str(tmp_path / "ports"), "--faults", str(faults)]
     assert main(words) == 2
     assert capsys.readouterr().err == (
-        f"multidrop: {faults}: drop = 2 is not a rate; write one from 0 to 1, such as 0.01\n"
+        f"multidrop: {faults}:1: drop = 2 is not a rate; write one from 0 to 1, such as 0.01\n"
     )
     assert not (tmp_path / "ports").exists()

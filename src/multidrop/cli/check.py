@@ -27,7 +27,7 @@ from multidrop.families.files.notation import TABLES
 from multidrop.families.registry import find_model
 from multidrop.plant.loader import PlantError, load_plant, port_or_address
 from multidrop.plant.model import Plant
-from multidrop.toml_check import read_document
+from multidrop.toml_document import read_document
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -150,14 +150,15 @@ def _check_followed(plant: Plant, settings: ServeSettings) -> None:
 
     Raises PlantError for settings that need lines in the file.
     """
-    place = TomlPlace(plant.path)
+    place = replace(TomlPlace.in_file(plant.path), steps=(("serve", 1),))
     for name, other in NOT_FOLLOWED.items():
         if name in settings.parts:
-            place.wrong(f"[serve.{name}] needs lines in this plant file; {other}")
+            place.wrong(f"[serve.{name}] needs lines in this plant file; {other}", name)
     if getattr(settings.parts.get("mqtt"), "rows", False):
-        place.wrong("rows = true of [serve.mqtt] needs lines in this plant file")
+        place.wrong("rows = true of [serve.mqtt] needs lines in this plant file", "mqtt")
     if MAY_KEYS.keys() & plant.serve.get("may", {}).keys():
-        place.wrong("[serve.may] lists need lines in this plant file; [fleet.may] is for a fleet's drives")
+        sentence = "[serve.may] lists need lines in this plant file; [fleet.may] is for a fleet's drives"
+        place.wrong(sentence, "may")
     if place.config_errors:
         raise PlantError(tuple(place.config_errors))
 
@@ -167,34 +168,39 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
 
     In a plant without lines, names of drives and lines are not checked.
     """
-    place = TomlPlace(plant.path, ("[serve]",))
+    root = TomlPlace.in_file(plant.path)
+    place = root.within("[serve]", "serve")
     folders = Folders(plant.path, environment)
     given = place.check(dict(plant.serve), _SERVE)
     listen = given.get("listen", LISTEN)
-    host, port = place.attempt(parse_address, listen, f'listen = "{LISTEN}"') or ("127.0.0.1", 0)
+    host, port = place.attempt(parse_address, listen, f'listen = "{LISTEN}"', key="listen") or (
+        "127.0.0.1",
+        0,
+    )
     names = tuple(filter(None, (place.attempt(_name, name) for name in given.get("names", ()))))
     tls = _tls(given, folders, place)
     tokens = _tokens(given, folders, place)
     usual = "token" if "tokens" in given else "anyone"
-    may = _may(given.get("may", {}), usual, plant, place.of_file(plant.path, "[serve.may]"))
+    may = _may(given.get("may", {}), usual, plant, root.within("[serve.may]", "serve", "may"))
     behind_proxy = given.get("behind_proxy", False)
     if may.look == "token" and not tokens and "tokens" not in given:
-        place.wrong('look = "token" of [serve.may] needs a file of tokens; add tokens = "tokens"')
+        place.wrong('look = "token" of [serve.may] needs a file of tokens; add tokens = "tokens"', "may")
     is_safe = behind_proxy or {"tokens", "certificate", "key"} <= given.keys()  # files are checked above
     if not is_loopback(host) and not is_safe and "listen" in given:
         place.wrong(
             f'listen = "{given["listen"]}" is open to other machines: that needs tokens, certificate and '
-            "key, or behind_proxy = true; or listen on 127.0.0.1"
+            "key, or behind_proxy = true; or listen on 127.0.0.1",
+            "listen",
         )
     audit = folders.state / given.get("audit", "audit.jsonl")
-    place.attempt(_check_audit, audit)
+    place.attempt(_check_audit, audit, key="audit")
     limits = read_limits(given.get("limit", ()), plant, place)
     parts = {
-        name: _part(name, given[name], plant, place.of_file(plant.path, f"[serve.{name}]"))
+        name: _part(name, given[name], plant, root.within(f"[serve.{name}]", "serve", name))
         for name in PARTS
         if name in given
     }
-    _check_ports((host, port), parts, place)
+    _check_ports((host, port), parts, root)
     if place.config_errors:
         raise PlantError(tuple(place.config_errors))
     digest = _digest(folders.find(given[key]) for key in ("certificate", "key")) if tls else ""
@@ -227,8 +233,8 @@ def _name(name: object) -> str:
 def _tls(given: Mapping[str, Any], folders: Folders, place: TomlPlace) -> ssl.SSLContext | None:
     paths = {key: folders.find(given[key]) for key in ("certificate", "key") if key in given}
     if len(paths) == 1:
-        place.wrong(f"{next(iter(paths))} alone is not enough: give certificate and key")
-    found = [place.attempt(_check_readable, f"{key} {path}", path) for key, path in paths.items()]
+        place.wrong(f"{next(iter(paths))} alone is not enough: give certificate and key", next(iter(paths)))
+    found = [place.attempt(_check_readable, f"{key} {path}", path, key=key) for key, path in paths.items()]
     if found != [True, True]:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -239,7 +245,7 @@ def _tls(given: Mapping[str, Any], folders: Folders, place: TomlPlace) -> ssl.SS
         is_mismatch = getattr(failure, "reason", "") == "KEY_VALUES_MISMATCH"
         wrong = "must be a certificate and a key in PEM, without password"
         why = "do not belong together" if is_mismatch else wrong
-        place.wrong(f"certificate {paths['certificate']} and key {paths['key']} {why}")
+        place.wrong(f"certificate {paths['certificate']} and key {paths['key']} {why}", "certificate")
         return None
     return context
 
@@ -248,17 +254,18 @@ def _tokens(given: Mapping[str, Any], folders: Folders, place: TomlPlace) -> lis
     if "tokens" not in given:
         return []
     path = folders.find(given["tokens"])
-    if place.attempt(_check_readable, f"tokens {path}", path) is None:
+    if place.attempt(_check_readable, f"tokens {path}", path, key="tokens") is None:
         return []
     try:
         found, wrong = read_tokens(path.read_text("utf-8"))
     except UnicodeDecodeError:
         found, wrong = [], ["it is not UTF-8 text"]
     for sentence in wrong:
-        place.wrong(f"tokens {path}: {sentence}")
+        place.wrong(f"tokens {path}: {sentence}", "tokens")
     if not found and not wrong:
         place.wrong(
-            f"tokens {path} is empty; `multidrop serve --new-token stop --for anna` makes a line for it"
+            f"tokens {path} is empty; `multidrop serve --new-token stop --for anna` makes a line for it",
+            "tokens",
         )
     return found
 
@@ -283,11 +290,13 @@ def _part(name: str, table: Mapping[str, Any], plant: Plant, place: TomlPlace) -
         return None
     before = len(place.config_errors)
     given = place.check(dict(table), keys)
+    refused = tuple(table.keys() - given.keys())  # these values are not passed on, so not missing either
     try:
         found = made(**given)
     except (ValueError, TypeError) as mistakes:
         for sentence in str(mistakes).splitlines():
-            place.wrong(sentence)
+            if not sentence.startswith(refused):
+                place.wrong(sentence)
         return None
     if len(place.config_errors) == before and hasattr(found, "check"):
         for sentence in found.check(plant):
@@ -306,7 +315,7 @@ def _check_ports(page: ListenAddress, parts: Mapping[str, Any], place: TomlPlace
         for key, address in own.items():
             other = next((other for other, used in taken.items() if _are_one_port(address, used)), None)
             if other:
-                there = place.of_file(place.path, f"[serve.{name}]")
+                there = place.within(f"[serve.{name}]", "serve", name)
                 there.wrong(f"{key}: port {address[1]} is in use by {other}; choose another port")
         taken |= {f"{key} of [serve.{name}]": address for key, address in own.items()}
 

@@ -21,7 +21,7 @@ from multidrop.importers.telegraf import read_telegraf
 from multidrop.importers.wb import json_without_comments, read_wb
 from multidrop.importers.yaml_text import parse_yaml
 from multidrop.printable import printable
-from multidrop.toml_check import parse_document, read_bounded
+from multidrop.toml_document import DocumentError, parse_document, read_bounded
 
 __all__ = ["SUFFIXES", "ImportedDevice", "all_devices", "family_text", "plant_text", "read_devices"]
 
@@ -75,6 +75,8 @@ def all_devices(path: Path) -> list[ImportedDevice]:
     except (AttributeError, TypeError, IndexError, OverflowError, RecursionError) as failure:
         kind = f"{type(failure).__name__} {printable(str(failure))[:200]}"
         raise ValueError(f"{path} does not have the structure of such a file: {kind}") from failure
+    except DocumentError as mistake:
+        raise ValueError(printable(mistake.in_file(path))) from mistake
     except ValueError as mistake:
         raise ValueError(f"{path}: {printable(str(mistake))[:1000]}") from mistake
     return devices

@@ -17,7 +17,8 @@ from multidrop.families.files.registers import MOST_BYTES, MOST_REGISTERS, Decla
 from multidrop.families.files.sections import MOST_TEXTS, texts_of
 from multidrop.importers.device import UNKNOWN_HOST, ImportedDevice, ImportedRegister
 from multidrop.printable import printable
-from multidrop.toml_check import TomlPlace, parse_document
+from multidrop.toml_check import TomlPlace
+from multidrop.toml_document import parse_document
 
 MOST_LOST = 500  # limit of lost entries listed in the family file
 UNKNOWN_PORT = f"the port, which the file does not state; tcp://{UNKNOWN_HOST}:502 if it is Modbus TCP"

@@ -13,7 +13,7 @@ from multidrop.drive.parameters import Parameter, parameters_of
 from multidrop.errors import Unsupported
 from multidrop.params.values import ParameterSet
 from multidrop.printable import is_whole, plain_whole, printable
-from multidrop.toml_check import parse_document, read_bounded
+from multidrop.toml_document import DocumentError, parse_document, read_bounded
 
 FORMAT = 1  # version of the file format; files with a higher number are refused
 MOST_BYTES = 1_000_000
@@ -46,6 +46,8 @@ def load(path: Path | str) -> ParameterSet:
     try:
         data = read_bounded(path, MOST_BYTES, "parameter file")
         facts, values = _from_csv(data) if path.suffix.lower() == ".csv" else _from_toml(data)
+    except DocumentError as mistake:
+        raise ValueError(mistake.in_file(path)) from mistake
     except ValueError as mistake:
         raise ValueError(f"{path}: {mistake}") from mistake
     if not values:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +36,8 @@ from multidrop.toml_check import (
     duration_up_to,
     grouped,
     json_schema,
-    line_numbers,
-    read_document,
 )
+from multidrop.toml_document import read_document
 
 
 class PlantError(ValueError):
@@ -73,9 +72,9 @@ def _load(path: Path | str, keys_of: Callable[[Mapping[str, Any]], Mapping[str, 
     if why := port_or_address(path):
         raise PlantError((why,))
     path = Path(path)
-    place = TomlPlace(path, lines=cache(partial(line_numbers, path)))
+    place = TomlPlace.in_file(path)
     document = place.attempt(read_document, path, "plant file")
-    given = {} if document is None else place.check(document, keys_of(document))
+    given = {} if document is None else _tables(document, keys_of(document), place)
     lines = [_line(table, at) for table, at in place.inside("line", given.get("line", []))]
     right = tuple(line for line in lines if line is not None)
     totals = path.parent / given["totals"] if "totals" in given else None
@@ -85,6 +84,17 @@ def _load(path: Path | str, keys_of: Callable[[Mapping[str, Any]], Mapping[str, 
     if place.config_errors:
         raise PlantError(grouped(place.config_errors), None if document is None else plant)
     return plant
+
+
+def _tables(document: dict[str, Any], keys: Mapping[str, Key], place: TomlPlace) -> dict[str, Any]:
+    """Return the valid tables of a document; add an error for every other one."""
+    for name, inside in _INNER.items():
+        if name in document:
+            place.wrong(f"[[{name}]] is not inside a line; write {inside}, in two brackets", name)
+    return place.check({name: one for name, one in document.items() if name not in _INNER}, keys)
+
+
+_INNER = {"drive": "[[line.drive]]", "channel": "[[line.drive.channel]]"}
 
 
 def check_channels(plant: Plant) -> None:
@@ -196,27 +206,31 @@ def _line(table: Any, place: TomlPlace) -> PlantLine | None:
     given = place.check(table, LINE_KEYS)
     name, port = given.get("name", ""), given.get("port", "")
     if name:
-        place.attempt(check_drive_name, name)
-        place.once("line", name, sentence="another line already has this name; each line needs its own")
+        place.attempt(check_drive_name, name, key="name")
+        sentence = "another line already has this name; each line needs its own"
+        place.once("line", name, sentence=sentence, key="name")
     # several lines may have the same tcp:// port, because each has its own connection
     if port and not speaks_tcp(port):
-        place.once("port", port, sentence=f"port {port} is already used by {{first}}; make them one line")
+        sentence = f"port {port} is already used by {{first}}; make them one line"
+        place.once("port", port, sentence=sentence, key="port")
     if port:
-        place.attempt(check_port, port)
+        place.attempt(check_port, port, key="port")
     settings: dict[str, Any] = {
-        "baudrate": place.attempt(Settings, given.get("baudrate", 9600), "8N1") and given.get("baudrate"),
-        "format": place.attempt(Settings, 9600, given.get("format", "8N1")) and given.get("format"),
+        "baudrate": place.attempt(Settings, given.get("baudrate", 9600), "8N1", key="baudrate")
+        and given.get("baudrate"),
+        "format": place.attempt(Settings, 9600, given.get("format", "8N1"), key="format")
+        and given.get("format"),
     }
     silence, switching, settle = (
         duration_of(given, key, place) for key in ("silence", "switching", "settle")
     )
-    place.attempt(check_settle, settle or 0.0)
-    echo = place.attempt(Echo, given.get("echo", "auto"))
-    rs485 = place.attempt(RS485, given.get("rs485", "off")) or RS485.OFF
-    place.attempt(rs485.check_port, port)
-    ids = place.attempt(TransactionIds, given.get("transaction", "match"))
+    place.attempt(check_settle, settle or 0.0, key="settle")
+    echo = place.attempt(Echo, given.get("echo", "auto"), key="echo")
+    rs485 = place.attempt(RS485, given.get("rs485", "off"), key="rs485") or RS485.OFF
+    place.attempt(rs485.check_port, port, key="rs485")
+    ids = place.attempt(TransactionIds, given.get("transaction", "match"), key="transaction")
     if "transaction" in given and not speaks_tcp(port):
-        place.wrong(f"transaction is only for tcp:// ports, and {port} is not one; remove it")
+        place.wrong(f"transaction is only for tcp:// ports, and {port} is not one; remove it", "transaction")
     is_right = len(place.config_errors) == before
     inherited = {**settings, "silence": silence, "port": port}
     drives = [_drive(drive, inherited, at) for drive, at in place.inside("drive", given.get("drive", []))]
@@ -242,14 +256,13 @@ def _drive(table: Any, line: Mapping[str, Any], place: TomlPlace) -> PolledDrive
     model = _model(table, place)
     given = place.check(table, DRIVE_KEYS | _option_keys(model))
     if "name" in given:
-        place.attempt(check_drive_name, given["name"])
-        place.once(
-            "drive", given["name"], sentence="another drive already has this name; each drive needs its own"
-        )
+        place.attempt(check_drive_name, given["name"], key="name")
+        sentence = "another drive already has this name; each drive needs its own"
+        place.once("drive", given["name"], sentence=sentence, key="name")
     if "address" in given:
         sentence = f"address {given['address']} is already used by {{first}}; give each drive its own"
         wire = line["port"] if speaks_tcp(line["port"]) else place.steps[0]
-        place.once("address", wire, given["address"], sentence=sentence)
+        place.once("address", wire, given["address"], sentence=sentence, key="address")
     is_right = len(place.config_errors) == before
     every = duration_of(given, "every", place)
     if model is None:
@@ -307,10 +320,10 @@ def _model(table: Any, place: TomlPlace) -> type[Drive] | None:
         once = ("family", text)
         if once not in place.seen:  # report the family file's mistakes only once
             for mistake in wrong.mistakes:
-                place.wrong(mistake)
+                place.wrong(mistake, "model")
         place.seen.setdefault(once, "")
     except ValueError as mistake:
-        place.wrong(mistake)
+        place.wrong(mistake, "model")
     return None
 
 
@@ -331,7 +344,7 @@ def _try_each(
     least: dict[str, Any] = {"address": model.addresses[0]}
     if "framing" in arguments:
         framing = {"framing": arguments["framing"]}
-        if place.attempt(partial(model, **least, **framing)):
+        if place.attempt(partial(model, **least, **framing), key="framing"):
             least |= framing  # the allowed formats depend on the framing
     for key, value in arguments.items():
         if key != "framing":
@@ -374,7 +387,9 @@ def _polled(
     if given.get("register") == "*":
         place.once(place.steps[:-1], "*", sentence='"*" is there twice; keep it once')
         return tuple(Polled(register, own) for register in model.readings())
-    register = place.attempt(model.register, given["register"]) if "register" in given else None
+    register = (
+        place.attempt(model.register, given["register"], key="register") if "register" in given else None
+    )
     if register is None:
         return None
     place.once(place.steps[:-1], register.name, sentence=f"{register} is polled twice; keep it once")

@@ -310,7 +310,7 @@ def allowed(plant: Plant, table: Mapping[str, Any], place: TomlPlace) -> dict[st
         for entry in table.get(key, ()):
             names.update(place.attempt(_listed, plant, key, entry) or ())
     for model, lists in table.get("family", {}).items():
-        inside = place.within(f"family {model}")
+        inside = place.within(f"family {model}", "family", model)
         drives = [polled.drive for polled in plant.drives if polled.drive.model == model]
         if not drives:
             models = {polled.drive.model for polled in plant.drives}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,8 @@ from multidrop.printable import is_number
 from multidrop.recording.phases import PHASE_DRIVE
 from multidrop.runs.model import EXAMPLE, AbortLimits, ReadingCondition, RunPlan, RunStep
 from multidrop.runs.rules import check_frequency, check_start, check_stop, check_write, contradictions
-from multidrop.toml_check import DURATION, Key, TomlPlace, duration_of, grouped, line_numbers, read_document
+from multidrop.toml_check import DURATION, Key, TomlPlace, duration_of, grouped
+from multidrop.toml_document import read_document
 
 STOP = "stop"  # the phase in which the drives are stopped, at the end of each run
 MOST_STEPS = 100_000  # limit of the number of steps in a test, including repetitions
@@ -55,7 +55,7 @@ def load_test(path: Path | str) -> RunPlan:
     Raises ValueError with a sentence for each mistake, and PlantError for mistakes in the plant file.
     """
     path = Path(path)
-    place = TomlPlace(path, lines=cache(partial(line_numbers, path)))
+    place = TomlPlace.in_file(path)
     document = place.attempt(read_document, path, "test file")
     given = {} if document is None else place.check(document, _TEST)
     if "plant" not in given:
@@ -63,7 +63,7 @@ def load_test(path: Path | str) -> RunPlan:
     plant = load_plant(path.parent / given["plant"])
     if any(polled.drive.name == PHASE_DRIVE for polled in plant.drives):
         place.wrong(f'the plant has a drive "{PHASE_DRIVE}", a name that the phases use; rename it', "plant")
-    limits = _limits(given.get("abort", {}), replace(place.within("abort"), steps=(("abort", 1),)), plant)
+    limits = _limits(given.get("abort", {}), place.within("abort", "abort"), plant)
     steps: list[RunStep] = []
     for table, at in place.inside("phase", given.get("phase", [])):
         steps += _phase(table, at, plant)

@@ -8,7 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from multidrop.toml_check import Key, TomlPlace, duration_of, read_document
+from multidrop.toml_check import Key, TomlPlace, duration_of
+from multidrop.toml_document import read_document
 
 MOST_BURST = 4096
 RATE, DURATION, WHOLE = (int, float), str, int  # types of the values in a fault file
@@ -116,17 +117,18 @@ def load_faults(path: Path | str, drives: Collection[str] | None = None) -> Faul
     in the file.
     """
     path = Path(path)
-    place = TomlPlace(path)
+    place = TomlPlace.in_file(path)
     document = place.attempt(read_document, path, "faults' file") or {}
     tables = document.pop("drive", {})
     if not isinstance(tables, dict):
         place.wrong("drive is not a table; write [drive.NAME] before a drive's faults")
         tables = {}
     if drives is not None:
-        place.unknown(tables, dict.fromkeys(drives))
+        place.within("[drive]", "drive").unknown(tables, dict.fromkeys(drives))
     line = _given(Faults, document, place)
     by_drive = {
-        name: _given(DriveFaults, one, place.within(f'drive "{name}"')) for name, one in tables.items()
+        name: _given(DriveFaults, one, place.within(f'drive "{name}"', "drive", name))
+        for name, one in tables.items()
     }
     if place.config_errors:
         raise ValueError("\n".join(place.config_errors))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import random
+import re
 import tempfile
 import time
 from enum import IntFlag
@@ -43,7 +44,8 @@ def mistakes(folder: Path, text: str) -> list[str]:
     with pytest.raises(FamilyError) as wrong:
         family(folder, text)
     assert str(wrong.value) == "\n".join(wrong.value.mistakes)
-    return [mistake.removeprefix(f"{folder}{os.sep}") for mistake in wrong.value.mistakes]
+    start = re.compile(re.escape(f"{folder}{os.sep}") + r"([\w.]+)(:\d+)?: ")
+    return [start.sub(r"\1: ", mistake, count=1) for mistake in wrong.value.mistakes]
 
 
 def facts(register: Register[Any]) -> dict[str, Any]:
@@ -183,42 +185,42 @@ gain = { at = 0x0033, while_running = "no" }
 """
 TWENTY_CSV = "name;at;step;access\nan;1E10;0,1;reading\nbn;0x12;0.1;readings\n"
 TOLD = [
-    "twenty.toml: [family]: unknown key 'manuel'; did you mean manual?",
-    "twenty.toml: [family]: silence = 'soon' is not a duration from 100 us to 24 h, such as \"50 ms\", "
+    "twenty.toml:3: [family]: unknown key 'manuel'; did you mean manual?",
+    "twenty.toml:8: [family]: silence = 'soon' is not a duration from 100 us to 24 h, such as \"50 ms\", "
     '"2 s" or "1 min"',
-    "twenty.toml: [family]: addresses = [1, 300]: must be the first and the last address, from 1 to 247 "
+    "twenty.toml:6: [family]: addresses = [1, 300]: must be the first and the last address, from 1 to 247 "
     "(0 to 255 on Modbus TCP); write addresses = [1, 247]",
-    "twenty.toml: [family]: baudrates = [9600, 'fast']: 'fast' is not a baud rate; "
+    "twenty.toml:4: [family]: baudrates = [9600, 'fast']: 'fast' is not a baud rate; "
     "write baudrates = [9600, 19200]",
-    "twenty.toml: [family]: together: holding = 200 is not 1 to 125 registers in one read",
-    'twenty.toml: [family]: formats has "7E1", and an RTU frame needs 8 data bits; write "8E1"',
-    "twenty.toml: [default]: unknown key 'tabel'; did you mean table?",
-    "twenty.toml: [reading] speed 1: 'speed 1' cannot be a register's name: it is not letters of a to z, "
+    "twenty.toml:7: [family]: together: holding = 200 is not 1 to 125 registers in one read",
+    'twenty.toml:5: [family]: formats has "7E1", and an RTU frame needs 8 data bits; write "8E1"',
+    "twenty.toml:12: [default]: unknown key 'tabel'; did you mean table?",
+    "twenty.toml:15: [reading] speed 1: 'speed 1' cannot be a register's name: it is not letters of a to z, "
     "digits and _, after a letter; write speed_1",
-    "twenty.toml: [reading] speed: unknown key 'stepp'; did you mean step?",
-    'twenty.toml: [reading] voltage: at: "40001" begins with 4, which is table holding, but table is '
+    "twenty.toml:16: [reading] speed: unknown key 'stepp'; did you mean step?",
+    'twenty.toml:17: [reading] voltage: at: "40001" begins with 4, which is table holding, but table is '
     '"input"; remove table, or write a number of that table',
-    "twenty.toml: [reading] level: at: 40002 may be the number 40002, or register 2 of table holding; write "
-    '"9C42H" for that number, or "40002" in quotes in the TOML file (in a CSV file without counts_from) '
-    "for that of the table",
-    'twenty.toml: [reading] power: at: "8192" may be decimal or hex; write 8192, or "8192H"',
-    "twenty.toml: [reading] mode: values: on and off are both 0; each has its own",
-    "twenty.toml: [reading] flags: bits: b = 99 is not a bit's number, 0 to 63",
-    "twenty.toml: [reading] both: values and unit are both given; a register has only one of unit, values "
+    "twenty.toml:18: [reading] level: at: 40002 may be the number 40002, or register 2 of table holding; "
+    'write "9C42H" for that number, or "40002" in quotes in the TOML file (in a CSV file without '
+    "counts_from) for that of the table",
+    'twenty.toml:19: [reading] power: at: "8192" may be decimal or hex; write 8192, or "8192H"',
+    "twenty.toml:20: [reading] mode: values: on and off are both 0; each has its own",
+    "twenty.toml:21: [reading] flags: bits: b = 99 is not a bit's number, 0 to 63",
+    "twenty.toml:22: [reading] both: values and unit are both given; a register has only one of unit, values "
     "and bits",
-    "twenty.toml: [setting] limit: span = [50, 0] is in the wrong order: give the smallest first; "
+    "twenty.toml:25: [setting] limit: span = [50, 0] is in the wrong order: give the smallest first; "
     "write span = [0, 50]",
-    "twenty.toml: [setting] speed: speed is declared twice, first in [reading] speed; "
+    "twenty.toml:27: [setting] speed: speed is declared twice, first in [reading] speed; "
     "every register has its own name",
-    "twenty.toml: [setting] gain: while_running = 'no' is neither true nor false; "
+    "twenty.toml:28: [setting] gain: while_running = 'no' is neither true nor false; "
     "write while_running = false",
     "twenty.csv: line 2, column step: '0,1' has a decimal comma; write 0.1",
     "twenty.csv: line 2, an: at: 1E10 is a power of ten, into which a spreadsheet has converted a hex "
     "number; write 1E10H",
     "twenty.csv: line 3, column access: 'readings' is not known; write reading, setting, command",
-    "twenty.toml: [family]: 'counts_from' is missing, and 16 is a number; add counts_from = 0 where the "
+    "twenty.toml:1: [family]: 'counts_from' is missing, and 16 is a number; add counts_from = 0 where the "
     "manual's numbers are sent as they are, or 1 where its register 1 is sent as 0",
-    "twenty.toml: [setting] target: its bound limitt is neither an option nor a number that can be read",
+    "twenty.toml:26: [setting] target: its bound limitt is neither an option nor a number that can be read",
 ]
 
 
@@ -270,7 +272,7 @@ def test_mistakes_in_identify_and_verb_sections_are_reported(
         load_family(tmp_path / "t.toml")
     except FamilyError as wrong:
         told = wrong.mistakes
-    assert [mistake.partition("t.toml: ")[2] for mistake in told] == mistakes
+    assert [mistake.partition("t.toml:")[2].partition(": ")[2] for mistake in told] == mistakes
 
 
 WRONG_KEYS = [  # a wrong key of a register
@@ -322,7 +324,7 @@ WRONG_TEXTS = [  # a wrong text after HEAD
 ]
 WRONG_FILES = [  # a whole wrong file
     ("", "t.toml: has no [family]; add it, with the title and the manual"),
-    ("[family", "t.toml: is not TOML: "),
+    ("[family", "t.toml: is not TOML: a header lacks a bracket"),
     (
         '[[line]]\nname = "L"\n',
         "is a plant file, as its [[line]] says; name a drive of it, as PLANT.toml DRIVE",

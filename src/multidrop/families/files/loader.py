@@ -33,7 +33,8 @@ from multidrop.families.files.sections import (
     texts_of,
 )
 from multidrop.printable import did_you_mean
-from multidrop.toml_check import TomlPlace, parse_document
+from multidrop.toml_check import TomlPlace
+from multidrop.toml_document import parse_document
 
 SECTIONS = (
     "family",
@@ -66,7 +67,7 @@ def load_family(path: Path | str) -> type[Drive]:
     Raises FamilyError that lists all mistakes in the file and in the CSV files that it names.
     """
     path = Path(path)
-    place = TomlPlace(path)
+    place = TomlPlace.in_file(path)
     whole = path.resolve()
     known = _loaded.get(whole)
     if known is not None and all(_same(file, data) for file, data in known.files.items()):
@@ -122,15 +123,15 @@ def _family(
 ) -> type[Drive] | None:
     """Return the class that the document declares; None if it has a mistake."""
     if "line" in document:
-        place.wrong("is a plant file, as its [[line]] says; name a drive of it, as PLANT.toml DRIVE")
+        place.wrong("is a plant file, as its [[line]] says; name a drive of it, as PLANT.toml DRIVE", "line")
         return None
     _check_sections(document, place)
-    of_family = place.within("[family]")
+    of_family = place.within("[family]", "family")
     of_document = document.get("family", {})
     given = of_family.check(of_document, FAMILY_KEYS)
     counting = Counting(_counts_from(given, of_family))
     facts = facts_of(given, counting, of_family)
-    defaults = defaults_of(document.get("default", {}), place.within("[default]"))
+    defaults = defaults_of(document.get("default", {}), place.within("[default]", "default"))
     declared = Declared(counting, defaults, given.get("write", "single"))
     for access in Access:
         declared.section(access, document.get(access.value, {}), place)
@@ -198,9 +199,13 @@ def _check_inherited(
     others = {name: one for name, one in declared.registers.items() if name not in taken}
     _report(_inherited_errors(others, base.registers, base.title), declared, place)
     if "parameters" in document and base.parameter_space is not None:
-        place.within("[parameters]").wrong(f"{base.title} has its own rule; leave this section out")
+        place.within("[parameters]", "parameters").wrong(
+            f"{base.title} has its own rule; leave this section out"
+        )
     if "identify" in document and base.identify is not Drive.identify:
-        place.within("[[identify]]").wrong(f"{base.title} has its own identity check; leave this section out")
+        place.within("[[identify]]", "identify").wrong(
+            f"{base.title} has its own identity check; leave this section out"
+        )
 
 
 def _inherited_errors(
@@ -232,7 +237,7 @@ def bases(key: str) -> Mapping[str, type[Drive]]:
 def _check_sections(document: Mapping[str, Any], place: TomlPlace) -> None:
     sections = dict.fromkeys(SECTIONS)
     if "verb" in document:
-        place.wrong("[verb] is not supported; name a profile, or write the drive as a Python class")
+        place.wrong("[verb] is not supported; name a profile, or write the drive as a Python class", "verb")
         document = {name: table for name, table in document.items() if name != "verb"}
     if unknown := {name: None for name in document if name not in SECTIONS}:
         place.unknown(unknown, sections)
@@ -298,7 +303,7 @@ def _report(mistakes: Any, declared: Declared, place: TomlPlace) -> None:
         if name in declared.places:
             declared.places[name].wrong(sentence)
         else:
-            place.within("[family]").wrong(mistake)
+            place.within("[family]", "family").wrong(mistake)
 
 
 def _class_name(path: Path) -> str:

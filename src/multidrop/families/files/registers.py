@@ -351,7 +351,7 @@ class Declared:
             )
             return
         for name, given in table.items():
-            at = place.within(f"[{access.value}] {name[:60]}")
+            at = place.within(f"[{access.value}] {name[:60]}", access.value, name)
             if not isinstance(given, dict):
                 at.wrong(f'{shown(given)} is not a register; write {{ at = 0x0010, unit = "Hz" }}')
                 self._reserve(name, at)

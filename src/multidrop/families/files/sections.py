@@ -285,7 +285,7 @@ def options_of(table: Any, registers: Collection[str], place: TomlPlace) -> dict
         return {}
     options = {}
     for name, given in table.items():
-        at = place.within(f"[option] {name[:60]}")
+        at = place.within(f"[option] {name[:60]}", "option", name)
         why = unusable(name)
         if why or name in NOT_OPTIONS:
             reason = why or "reserved name; every drive has it for something else"
@@ -334,7 +334,7 @@ def texts_of(
         return {}
     found: dict[str, Text] = {}
     for name, given in section.items():
-        at = place.within(f"[text] {name[:60]}")
+        at = place.within(f"[text] {name[:60]}", "text", name)
         why = unusable(name)
         if why:
             at.wrong(f"{shown(name)} cannot be a text's name: {why}")
@@ -401,9 +401,12 @@ def parameter_space_of(
     section: Any, counting: Counting, registers: Collection[str], place: TomlPlace
 ) -> ParameterSpace | None:
     """Return the address rule declared in the [parameters] section; None if it has a mistake."""
-    at = place.within("[parameters]")
+    at = place.within("[parameters]", "parameters")
     good = at.check(section, PARAMETER_KEYS)
-    groups = [_group(table, counting, within) for table, within in at.inside("group", good.get("groups", []))]
+    groups = [
+        _group(table, counting, within)
+        for table, within in at.inside("group", good.get("groups", []), "groups")
+    ]
     kept = [group for group in groups if group is not None]
     if sum(len(group.indices) for group in kept) > MOST_PARAMETERS:
         at.wrong(f"groups have more than {MOST_PARAMETERS} codes")

@@ -55,9 +55,10 @@ def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
 
 def _lists(table: Any, plant: Plant) -> dict[str, frozenset[str]]:
     """Return the entries of [fleet.may]: registers and verbs that may be commanded through the fleet."""
-    place = TomlPlace(plant.path, ("[fleet]",))
+    root = TomlPlace.in_file(plant.path)
+    place = root.within("[fleet]", "fleet")
     may = place.check(table, FLEET_KEYS).get("may", {})
-    inner = place.of_file(plant.path, "[fleet.may]")
+    inner = root.within("[fleet.may]", "fleet", "may")
     found = allowed(plant, inner.check(may, MAY_KEYS), inner)
     if place.config_errors:
         raise PlantError(tuple(place.config_errors))

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from multidrop import Plant
 from multidrop.gateway.live.alarms import SEPARATOR
 from multidrop.gateway.live.hub import Hub
-from multidrop.toml_check import DURATION, Key, TomlPlace, parse_duration
+from multidrop.toml_check import DURATION, Key, TomlPlace, duration_of
 
 LIMIT_KEYS = {
     "drive": Key(str, 'drive = "pump-1"', needed=True),
@@ -99,13 +99,15 @@ def read_limits(tables: Any, plant: Plant, place: TomlPlace) -> tuple[Limit, ...
     }
     found = []
     for table, inside in place.inside("limit", tables):
+        before = len(place.config_errors)
         given = inside.check(table, LIMIT_KEYS)
-        if {"drive", "register"} <= given.keys():
-            found.append(inside.attempt(_limit, given, units if plant.lines else None))
+        lasting_s = duration_of(given, "for", inside) or 0.0
+        if len(place.config_errors) == before:
+            found.append(inside.attempt(_limit, given, lasting_s, units if plant.lines else None))
     return tuple(limit for limit in found if limit is not None)
 
 
-def _limit(given: Mapping[str, Any], units: Mapping[tuple[str, str], str] | None) -> Limit:
+def _limit(given: Mapping[str, Any], lasting_s: float, units: Mapping[tuple[str, str], str] | None) -> Limit:
     """Return a limit. `units` has the unit of each polled register, or is None if the plant has no lines.
 
     Raises ValueError for an invalid limit.
@@ -119,6 +121,5 @@ def _limit(given: Mapping[str, Any], units: Mapping[tuple[str, str], str] | None
     bound, hysteresis = float(given[sides[0]]), float(given.get("hysteresis", 0.0))
     if not isfinite(bound) or not 0 <= hysteresis < float("inf"):
         raise ValueError(f"{sides[0]} and hysteresis must be finite, and hysteresis not below 0")
-    lasting_s = parse_duration(given["for"]) if "for" in given else 0.0
     unit = units[drive, register] if units is not None else ""
     return Limit(drive, register, unit, sides[0] == "above", bound, lasting_s, hysteresis)

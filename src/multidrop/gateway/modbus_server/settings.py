@@ -125,15 +125,16 @@ def listen_mistakes(listen: str, example: str, clients: Sequence[str]) -> Iterat
 
     `example` is a valid setting, which the sentence may quote.
     """
+    key = example.partition(" ")[0]
     try:
         host, _ = parse_address(listen, example)
     except ValueError as mistake:
-        yield str(mistake)
+        yield f"{key}: {mistake}"
         return
     if not is_loopback(host) and not clients:
         yield (
-            f'"{listen}" is open to other machines, and Modbus has no tokens: list the allowed clients, such '
-            'as clients = ["10.0.0.5", "10.0.1.0/24"]'
+            f'{key}: "{listen}" is open to other machines, and Modbus has no tokens: list the allowed '
+            'clients, such as clients = ["10.0.0.5", "10.0.1.0/24"]'
         )
 
 
