@@ -77,6 +77,12 @@ def pytest_configure(config: pytest.Config) -> None:
             import_module(test.stem)
 
 
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Mark nightly tests as long too, so that `not long` leaves them out."""
+    if item.get_closest_marker("nightly"):
+        item.add_marker("long")
+
+
 @pytest.hookimpl(trylast=True)  # runs after deselected tests were removed
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Distribute the slow tests, so that every worker starts with its share of them."""

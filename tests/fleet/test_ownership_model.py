@@ -463,7 +463,7 @@ def test_no_interleaving_has_two_masters() -> None:
     assert states > 100_000
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_no_interleaving_has_two_masters_with_a_longer_lease() -> None:
     states, wrong = LeaseModel(WHOLE).search()
     assert wrong is None

@@ -15,7 +15,7 @@ from time import monotonic, sleep
 from typing import Any
 
 import pytest
-from examples import usually
+from examples import first_in_ci
 from gateways import simulated_plant
 from interruptions import every, interrupted_before
 from kills import BoundProcess
@@ -66,7 +66,7 @@ def falls_silent(drive: Counting) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("step", usually(151, 53))
+@pytest.mark.parametrize("step", first_in_ci(151, 53))
 def test_gateway_interrupted_at_any_bytecode_ends(drive: Counting, tmp_path: Path, step: int) -> None:
     """Raise KeyboardInterrupt before every `step`th bytecode of the main thread, from start to end."""
     plant = Plant.load(tmp_path / "plant.toml")

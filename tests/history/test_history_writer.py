@@ -22,7 +22,7 @@ from typing import Any
 
 import histories
 import pytest
-from examples import usually
+from examples import first_in_ci
 from gateways import serving, simulated_plant
 from histories import DAY, METADATA, NOON, RUN, SECOND, STEP, batch, random_rows, record, rows_in
 from interruptions import full_at, read_only_directory
@@ -369,7 +369,7 @@ def total_of_tens(history: History, runs: int) -> int:
 
 @pytest.mark.long
 @pytest.mark.slow
-@pytest.mark.parametrize("kills", usually(3, 200))
+@pytest.mark.parametrize("kills", first_in_ci(3, 200))
 def test_kills_of_recorder_and_compaction_lose_no_row(tmp_path: Path, kills: int) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")
     dice = random.Random(kills)

@@ -54,6 +54,7 @@ NOT_RUN = {
     "env/bin/multidrop demo": "takes eight seconds: tools/bare runs it in a bare root",
     ".venv/bin/ruff": "is a step of .ci/run",
     ".ci/run": "runs the tests themselves",
+    ".ci/nightly": "takes an hour or more",
     "tools/wheels": "compiles for six machines: many minutes",
     "sudo apt-get": "installs",
     "sudo tools/kernel/build": "builds a Debian: .ci/run does it",

@@ -15,7 +15,7 @@ from time import monotonic
 from typing import Any
 
 import pytest
-from examples import usually
+from examples import first_in_ci, usually
 from interruptions import full_at
 from killable_client import DRIVE
 from kills import BoundProcess
@@ -407,7 +407,7 @@ def lives(tmp_path: Path) -> Iterator[tuple[Lives, object]]:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("most", usually(10, 50))
+@pytest.mark.parametrize("most", first_in_ci(10, 50))
 def test_the_writes_of_a_killed_apply_are_completed_by_the_next_apply(
     lives: tuple[Lives, object], tmp_path: Path, most: int
 ) -> None:

@@ -83,12 +83,18 @@ def ended(poller: Poller, hall: Received) -> None:
         bus.attach(Toy, 1).read(CURRENT)
 
 
-STEPS = usually(STRIDE, 1)
+NIGHTLY = pytest.mark.nightly
+STEPS = [*usually(STRIDE, 7), pytest.param(1, marks=NIGHTLY)]
 
 
 @pytest.mark.parametrize(
-    ("end", "step"), [("close", STRIDE), *usually(("__exit__", STRIDE), ("__exit__", 1))]
-)  # `__exit__` calls `close`
+    ("end", "step"),
+    [
+        ("close", STRIDE),
+        *usually(("__exit__", STRIDE), ("__exit__", 7)),  # calls `close`
+        pytest.param("__exit__", 1, marks=NIGHTLY),
+    ],
+)
 def test_an_interrupted_close_of_a_poller_can_be_completed(hall: Received, step: int, end: str) -> None:
     places: set[str] = set()
 
@@ -109,9 +115,10 @@ def test_an_interrupted_close_of_a_poller_can_be_completed(hall: Received, step:
     ("end", "step", "failure"),
     [
         ("close", STRIDE, Interruption),
-        *usually(("__exit__", STRIDE, Interruption), ("__exit__", 1, Interruption)),
+        *usually(("__exit__", STRIDE, Interruption), ("__exit__", 7, Interruption)),
         *usually(("__exit__", 2 * STRIDE, ZeroDivisionError), ("__exit__", 7, ZeroDivisionError)),
-        pytest.param("__exit__", 1, ZeroDivisionError, marks=pytest.mark.long),
+        pytest.param("__exit__", 1, Interruption, marks=NIGHTLY),
+        pytest.param("__exit__", 1, ZeroDivisionError, marks=NIGHTLY),
     ],
 )
 def test_an_interrupted_end_with_stop_on_exit_stops_the_motors_and_a_second_close_ends_all_requests(

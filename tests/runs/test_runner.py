@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 
 import pytest
 from commands import MULTIDROP
+from examples import first_in_ci
 from kills import BoundProcess
 from lines import until
 from simulated_bus import is_write
@@ -383,7 +384,7 @@ FAST = CHE | {"baudrate": 38400}
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", first_in_ci(*range(10)))
 def test_no_motor_keeps_running_after_ctrl_c_at_a_random_moment(seed: int, tmp_path: Path) -> None:
     """Each seed interrupts 10 processes in turn, at random moments."""
     path = write_test(tmp_path, SHORT, fan=FAST)
@@ -410,7 +411,7 @@ def test_no_motor_keeps_running_after_ctrl_c_at_a_random_moment(seed: int, tmp_p
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", first_in_ci(*range(20)))
 def test_no_motor_keeps_running_after_a_port_was_lost(seed: int, tmp_path: Path) -> None:
     path = write_test(tmp_path, '[abort]\nsilence = "500 ms"\n' + SHORT.replace("300 ms", "2 s"), fan=FAST)
     plan = load_test(path)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 import spooled
-from examples import usually
+from examples import first_in_ci, usually
 from interruptions import full_at, read_only_directory
 from kills import BoundProcess
 from lines import until
@@ -104,7 +104,7 @@ def test_a_new_folder_starts_a_new_log(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("step", usually(83, 1))
+@pytest.mark.parametrize("step", first_in_ci(83, 1))
 def test_a_newest_file_cut_at_any_byte_loses_no_earlier_message(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, step: int
 ) -> None:

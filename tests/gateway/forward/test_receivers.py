@@ -22,7 +22,7 @@ from typing import Any
 import forwarded
 import pytest
 from brokers import Listener, mosquitto
-from examples import usually
+from examples import first_in_ci
 from forwarded import DRAIN, Key, forwarding, keys_in, rows_at_noon, store, web_server
 from kills import BoundProcess
 from lines import until
@@ -98,7 +98,7 @@ def wanted(exchanges: range) -> Counter[Key]:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("kills", usually(3, 20))
+@pytest.mark.parametrize("kills", first_in_ci(3, 20))
 def test_after_kills_at_any_moment_no_row_is_lost_or_doubled(tmp_path: Path, kind: str, kills: int) -> None:
     """Each run has its own range of exchange numbers. Each row that was on the disk must arrive once."""
     dice = random.Random(kills)

@@ -488,7 +488,7 @@ def test_thousands_of_requests_are_answered_under_their_own_ids(gateway: Gateway
     all_clients(gateway, 8_000)
 
 
-@pytest.mark.long
+@pytest.mark.nightly
 def test_a_million_requests_are_answered_under_their_own_ids(gateway: Gateway) -> None:
     all_clients(gateway, 1_000_000)
 

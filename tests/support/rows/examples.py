@@ -20,6 +20,11 @@ def usually(tried: object, *others: object) -> list[Any]:
     return [tried, *(_long(other) for other in others)]
 
 
+def first_in_ci(tried: object, *others: object) -> list[Any]:
+    """Return the arguments as pytest parameters; all but the first are marked `nightly`."""
+    return [tried, *(pytest.param(other, marks=pytest.mark.nightly) for other in others)]
+
+
 def in_turn(each: Iterable[object], cases: Sequence[object]) -> list[Any]:
     """Return all pairs of `each` and `cases`; for each entry of `each`, all but one are marked `long`."""
     return [
