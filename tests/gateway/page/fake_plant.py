@@ -206,7 +206,10 @@ def lines() -> dict[str, Any]:
 
 
 def fleet(began: float) -> dict[str, Any]:
-    """Return the answer to `GET /api/fleet`: twelve lines and three gateways, one of which has just died."""
+    """Return the answer to `GET /api/fleet`: twelve lines and three gateways, one of which has just died.
+
+    Some times are more than a day ago, so that the page shows their dates too.
+    """
     at = int(began * 1000)
     spool = {"bytes": 81_234_567, "lost": 0, "behind": 2, "lag_s": 1.4, "trouble": None}
     says = {"state": "working", "margin_s": 2.14, "troubles": {}, "trouble": "", "spool": spool}
@@ -220,12 +223,13 @@ def fleet(began: float) -> dict[str, Any]:
     lines = {
         f"hall-{n}": {
             "port": f"socket://10.0.0.{n}:4001", "revision": n, "session": 5,
-            "master": f"gw-{n % 3 + 1}" if n > 1 else None, "since_ms": at - 60_000 * n if n > 1 else None,
+            "master": f"gw-{n % 3 + 1}" if n > 1 else None,
+            "since_ms": at - 10_000_000 * n if n > 1 else None,
         }
         for n in sorted(range(1, 13), key=str)  # in the gateway's order
     }  # fmt: skip
     moves = [
-        {"line": f"hall-{n}", "revision": n, "at_ms": at - 60_000 * n, "from": before, "to": "gw-1"}
+        {"line": f"hall-{n}", "revision": n, "at_ms": at - 10_000_000 * n, "from": before, "to": "gw-1"}
         for n, before in ((3, "gw-2"), (6, ""), (9, None))
     ]
     return {"at_ms": at, "age_s": 0.2, "trouble": None, "gateways": gateways, "lines": lines, "moves": moves}

@@ -49,7 +49,7 @@ def test_fleet_tables_fit_a_small_screen(opened: Opener) -> None:
     tables = page.locator("#fleet .scroll")
     wide = "tables => tables.map(table => table.scrollWidth - table.clientWidth)"
     lag = "getComputedStyle(document.querySelectorAll('#fleet-gateways td')[6], '::before').content"
-    for width in (768, 390):
+    for width in (768, 390, 360):
         page.set_viewport_size({"width": width, "height": 844})
         until_met(page, lambda: tables.count() == 3)
         until_met(page, lambda: max(tables.evaluate_all(wide)) <= 0)

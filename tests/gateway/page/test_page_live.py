@@ -42,7 +42,7 @@ def test_a_killed_gateway_is_reported(opened: Opener, gateway: FakeGateway) -> N
     assert re.fullmatch(r"\d+ s old", link(page))
     notice = page.locator("#notice").inner_text()
     assert "cannot be reached" in notice
-    assert re.search(r"The values shown are from \d\d:\d\d:\d\d UTC\.", notice)
+    assert re.search(r"The values shown are from (\d+ \w+, )?\d\d:\d\d:\d\d UTC\.", notice)
     until_met(page, lambda: page.locator(FRESH).count() == 0)
     shown = cell(page, "pump-1", "frequency").inner_text().replace("\n", "")
     assert re.search(r"^\d+\.\d+Hz\d+(\.\d)? s old$", shown)

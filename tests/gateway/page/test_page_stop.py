@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from typing import Any
 
 import fake_gateway
@@ -12,6 +11,7 @@ from fake_gateway import FakeGateway
 from watching import (
     AT_ITS_PLACE,
     LIVE,
+    PATIENCE_S,
     SIZES,
     VIEWS,
     Opener,
@@ -326,7 +326,7 @@ def test_stop_is_sent_although_other_tabs_hold_all_connections(
     browser: Any, gateway: FakeGateway, few_drives: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nine tabs occupy all six connections of the browser, because no new frame is made."""
-    monkeypatch.setattr(fake_gateway, "HOLD_S", 120)
+    monkeypatch.setattr(fake_gateway, "HOLD_S", 2 * PATIENCE_S)  # a waiting stop would come too late
     context = browser.new_context()
     pages = [context.new_page() for _ in range(9)]
     for page in pages:
@@ -339,10 +339,8 @@ def test_stop_is_sent_although_other_tabs_hold_all_connections(
     page.bring_to_front()
     page.keyboard.press("Shift+S")
     page.keyboard.press("Tab")
-    began = time.monotonic()
     page.keyboard.press("Enter")
     told(page, f"All {few_drives} drives are stopped")
-    assert time.monotonic() - began < 20.0
     context.close()
 
 
