@@ -28,8 +28,8 @@ from multidrop.cli import main
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-# Commands print titles in the language of the user, and tests expect English.
-os.environ["LC_ALL"] = "C.UTF-8"
+# Commands print titles in the user's language, and fit the user's terminal. Tests expect these values.
+os.environ |= {"LC_ALL": "C.UTF-8", "COLUMNS": "80", "LINES": "24"}
 
 gc.disable()  # garbage collections would take a fifth of the time in which tests are collected
 

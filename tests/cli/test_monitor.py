@@ -468,9 +468,7 @@ class Screened(NamedTuple):
 
 
 @pytest.fixture
-def screened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Screened:
-    monkeypatch.setenv("COLUMNS", "80")
-    monkeypatch.setenv("LINES", "24")
+def screened(tmp_path: Path) -> Screened:
     poller = Poller()
     plant = a_plant(tmp_path)
     for polled in plant.lines[0].drives:
