@@ -504,13 +504,13 @@ def test_a_stop_precedes_waiting_requests_and_cancels_earlier_ones_of_its_drive(
         threads = [threading.Thread(target=carry_out, args=[each]) for each in wanted]
         for thread in threads:
             thread.start()
-            time.sleep(0.05)  # so that the waiting requests arrive in this order
+            wait_until_it_sleeps(thread)  # so that the waiting requests arrive in this order
         latch.rise("a stop was called")
         late = [written(2, 52, permit=latch.permit()), written(2, 99, insists=True)]
         for exchange in late:
             threads.append(threading.Thread(target=carry_out, args=[exchange]))
             threads[-1].start()
-            time.sleep(0.05)
+            wait_until_it_sleeps(threads[-1])
         go_on.set()
         for thread in threads:
             thread.join(120)
@@ -572,7 +572,7 @@ def test_closing_a_port_reports_whether_each_pending_request_was_sent(drive: Dri
     threads[0].start()
     assert came.wait(120)
     threads[1].start()
-    time.sleep(0.05)  # the second request now waits behind the first
+    wait_until_it_sleeps(threads[1])  # the second request now waits behind the first
     port.stop()
     for thread in threads:
         thread.join(120)
