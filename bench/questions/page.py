@@ -33,7 +33,7 @@ LINES = (11, 10, 10)  # numbers of drives on each line
 SLOW = 8000  # bytes per second
 LOOK_MS = 10
 AGES = """async ([seconds, every]) => {
-  const { store } = await import('/page/store.js');
+  const { store } = await import('/page/data/store.js');
   const end = performance.now() + seconds * 1000, shown = [], came = [];
   let n = store.frame.n;
   while (performance.now() < end) {

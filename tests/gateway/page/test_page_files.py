@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 from fake_gateway import PAGE
 
 from multidrop.gateway.live.alarms import KINDS
 
-FILES = sorted(path for path in PAGE.iterdir() if path.is_file())
-OURS = [path for path in FILES if path.suffix in (".js", ".css", ".html")]
+FILES = {path.relative_to(PAGE).as_posix(): path for path in sorted(PAGE.rglob("*")) if path.is_file()}
+OURS = [
+    path
+    for name, path in FILES.items()
+    if path.suffix in (".js", ".css", ".html") and not name.startswith("vendor/")
+]
 SCRIPTS = [path for path in OURS if path.suffix == ".js"]
 MARKUP = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|createContextualFragment|DOMParser|srcdoc"
 CODE = r"\beval\(|new Function|javascript:|setAttribute\(\s*[\"']style|cssText"
@@ -22,7 +25,7 @@ def test_page_scripts_use_no_function_that_makes_markup_or_code() -> None:
 
 
 def test_the_page_has_no_inline_style_script_or_handler() -> None:
-    html = Path(str(PAGE / "index.html")).read_text("utf-8")
+    html = (PAGE / "index.html").read_text("utf-8")
     assert re.findall(r"\sstyle\s*=|<style|\son\w+\s*=|<script(?![^>]*\ssrc=)|https?://|data:", html) == []
 
 
@@ -35,9 +38,11 @@ def test_page_files_are_short_and_start_with_a_comment() -> None:
 
 
 def test_page_refers_to_all_its_files_and_to_no_others() -> None:
-    text = "".join(path.read_text("utf-8") for path in OURS)
-    named = set(re.findall(r'(?:from "\./|"page/)([\w./-]+)"', text))
-    there = {path.relative_to(str(PAGE)).as_posix() for path in Path(str(PAGE)).rglob("*") if path.is_file()}
+    named = set(re.findall(r'"page/([\w./-]+)"', (PAGE / "index.html").read_text("utf-8")))
+    for script in SCRIPTS:
+        imports = re.findall(r'from "(\.[\w./-]+)"', script.read_text("utf-8"))
+        named |= {(script.parent / path).resolve().relative_to(PAGE.resolve()).as_posix() for path in imports}
+    there = FILES.keys()
     served = {"prometheus/alerts.yml", "prometheus/dashboard.json"}  # for users of Prometheus and Grafana
     assert there - named == {"index.html", "texts.toml", "vendor/uPlot-LICENSE", *served}
     assert named - there == set()
@@ -45,8 +50,15 @@ def test_page_refers_to_all_its_files_and_to_no_others() -> None:
 
 def test_each_kind_of_alarm_has_a_shape_a_colour_a_word_and_a_bar() -> None:
     index, strip, lanes, table, bars, words = (
-        Path(str(PAGE / name)).read_text("utf-8")
-        for name in ("index.html", "top.css", "plots.css", "views.css", "lane.js", "values.js")
+        (PAGE / name).read_text("utf-8")
+        for name in (
+            "index.html",
+            "style/top.css",
+            "style/plots.css",
+            "style/views.css",
+            "views/trends/lane.js",
+            "ui/values.js",
+        )
     )
     for kind in KINDS:
         assert f'id="glyph-{kind}"' in index
@@ -58,8 +70,8 @@ def test_each_kind_of_alarm_has_a_shape_a_colour_a_word_and_a_bar() -> None:
 
 
 def test_vendored_plot_library_has_its_licence() -> None:
-    licence = Path(str(PAGE / "vendor" / "uPlot-LICENSE")).read_text("utf-8")
-    script = Path(str(PAGE / "vendor" / "uPlot.iife.min.js")).read_text("utf-8")
+    licence = (PAGE / "vendor" / "uPlot-LICENSE").read_text("utf-8")
+    script = (PAGE / "vendor" / "uPlot.iife.min.js").read_text("utf-8")
     assert "The MIT License" in licence
     assert "Leon Sorokin" in licence
     assert "(v1.6.32)" in script[:80]

@@ -76,7 +76,7 @@ def test_delay_of_a_viewer_with_8_kb_a_second_does_not_grow(page: Any, tmp_path:
         network.send("Network.enable")
         limits = {"latency": 0, "downloadThroughput": 8000, "uploadThroughput": 8000}
         network.send("Network.emulateNetworkConditions", {"offline": False, **limits})
-        look = """import('/page/store.js').then(m => [m.store.frame.n, Date.now() - m.store.time])"""
+        look = """import('/page/data/store.js').then(m => [m.store.frame.n, Date.now() - m.store.time])"""
         seen = []
         for _ in range(60):
             seen.append(page.evaluate(look))

@@ -107,7 +107,7 @@ def test_old_value_is_never_shown_as_new(opened: Opener, gateway: FakeGateway) -
     assert cell(page, "pump-2", "frequency").locator(".bar").is_hidden()
 
 
-SET_BACK = """([name, register, known]) => import('/page/store.js').then(s => {
+SET_BACK = """([name, register, known]) => import('/page/data/store.js').then(s => {
   const frame = structuredClone(s.store.frame), [value] = frame.drives[name].values[register];
   frame.time = new Date(Date.parse(frame.time) - 3600e3).toISOString();
   if (!known) frame.drives[name].values[register] = [null, 0, 'not asked yet'];
@@ -209,7 +209,7 @@ def test_times_have_24_hours_in_utc_or_local_time_as_chosen(opened: Opener) -> N
     assert (local - utc) % 1440 in (330, 331)
     afternoon = 1764075600  # 2025-11-25 13:00 UTC, 18:30 in Kolkata
     asked = f"[c.ticks([{afternoon}], 3600), c.moment({afternoon}000), c.isUtc()]"
-    tick = f"import('/page/clock.js').then(c => {asked})"
+    tick = f"import('/page/ui/clock.js').then(c => {asked})"
     assert page.evaluate(tick)[0] == ["18:30"]
     clock.click()
     ticks, moment, is_utc = page.evaluate(tick)
@@ -261,7 +261,7 @@ def test_page_reloads_itself_if_a_network_change_aborts_its_scripts(opened: Open
 
     def prepare(page: Any) -> None:
         page.add_init_script(FORBIDDEN)
-        page.route("**/page/api.js", break_two_off)
+        page.route("**/page/data/api.js", break_two_off)
 
     page = opened(live=False, prepare=prepare)
     page.locator("#link").get_by_text("live", exact=True).wait_for()
@@ -271,7 +271,7 @@ def test_page_reloads_itself_if_a_network_change_aborts_its_scripts(opened: Open
 
 
 def test_page_without_scripts_says_that_stop_all_does_not_work(opened: Opener) -> None:
-    page = opened(live=False, prepare=aborting("**/page/api.js"))
+    page = opened(live=False, prepare=aborting("**/page/data/api.js"))
     page.locator("#notice").get_by_text("Stop all does not work").wait_for()
     assert page.locator("#link.stale").inner_text() == "connecting"
     assert page.locator("#stopall").is_disabled()
@@ -280,7 +280,7 @@ def test_page_without_scripts_says_that_stop_all_does_not_work(opened: Opener) -
 def test_no_line_is_drawn_over_missed_time(opened: Opener) -> None:
     """The page missed an hour, as on a laptop that slept."""
     page = opened()
-    seen = page.evaluate("""() => import('/page/store.js').then(({ store, takeFrame }) => {
+    seen = page.evaluate("""() => import('/page/data/store.js').then(({ store, takeFrame }) => {
         const ring = store.drives.get('pump-1').pasts.get('output_frequency');
         const later = s => new Date(Date.parse(store.frame.time) + s * 1e3).toISOString();
         const taken = [];
@@ -294,7 +294,7 @@ def test_no_line_is_drawn_over_missed_time(opened: Opener) -> None:
     assert seen == [[False], [True, False], [False]]
 
 
-TAKEN_ANEW = """change => import('/page/store.js').then(({ store, takePlant }) => {
+TAKEN_ANEW = """change => import('/page/data/store.js').then(({ store, takePlant }) => {
   window.original ??= store.plant;
   const plant = structuredClone(window.original);
   const drive = plant.lines[0].drives.find(one => one.name === 'pump-1');
@@ -304,7 +304,7 @@ TAKEN_ANEW = """change => import('/page/store.js').then(({ store, takePlant }) =
   const { good, pasts } = store.drives.get('pump-1');
   return ['output_frequency', 'output_current'].map(name => good.has(name) && pasts.has(name));
 })"""
-KEPT = """import('/page/store.js').then(({ store }) => {
+KEPT = """import('/page/data/store.js').then(({ store }) => {
   const { good, pasts } = store.drives.get('pump-1');
   return ['output_frequency', 'output_current'].map(name => good.has(name) && pasts.has(name));
 })"""

@@ -30,7 +30,12 @@ LANGUAGES = {"ru", "zh"}
 CATALOGUE = (PAGE / "texts.toml").read_text("utf-8")
 TEXTS: dict[str, dict[str, str]] = tomllib.loads(CATALOGUE)
 OWN_PART, GATEWAY_PART = map(tomllib.loads, re.split(r"^# ====.*$", CATALOGUE, flags=re.MULTILINE))
-SCRIPTS = {path.name: path.read_text("utf-8") for path in sorted(PAGE.glob("*.js"))}
+# by path relative to the page
+SCRIPTS = {
+    name: file.body.decode()
+    for name, file in read_files(PAGE).items()
+    if name.endswith(".js") and not name.startswith("vendor/")
+}
 NAMES = {"UTC", "CSV", "Parquet", "Enter", "Esc", "Shift S", "multidrop", "English", "Русский", "中文"}
 OTHERS = {"danger stop", "Etc/UTC", "px system-ui, sans-serif", "11px system-ui, DejaVu Sans, sans-serif"}
 
@@ -193,7 +198,7 @@ def test_literal_outside_the_catalogue_is_found(script: str) -> None:
 
 def test_each_text_of_the_html_and_no_text_of_the_css_is_shown_from_the_catalogue() -> None:
     assert HtmlTexts().texts - TEXTS.keys() - NAMES == set()
-    styles = "".join(path.read_text("utf-8") for path in PAGE.glob("*.css"))
+    styles = "".join(path.read_text("utf-8") for path in PAGE.glob("style/*.css"))
     assert [text for text in re.findall(r"content:([^;]*);", styles) if re.search(r'"[^"]*\w', text)] == []
 
 

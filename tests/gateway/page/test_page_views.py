@@ -483,7 +483,7 @@ def test_trends_are_exported_as_they_are_shown(opened: Opener) -> None:
 
 
 DOTS = """async values => {
-    const { makePlot, line } = await import('/page/plots.js');
+    const { makePlot, line } = await import('/page/ui/plots.js');
     const place = document.body.appendChild(document.createElement('div'));
     const plot = makePlot(place, [values.map((_, i) => 1700000000 + i), values], {
         series: [line(0, 'speed')], height: 150 });
@@ -522,7 +522,7 @@ def test_rarely_polled_register_has_no_gaps_between_its_values(opened: Opener) -
     answer = {"step_ms": 300, "series": {"pump-1.output_frequency": told}}
     page.route("**/api/history?*", lambda route: route.fulfill(json=answer))
     drawn = page.evaluate(
-        """() => import('/page/history.js').then(m => m.read(['pump-1.output_frequency'], 0, 4801, 17))
+        """() => import('/page/data/history.js').then(m => m.read(['pump-1.output_frequency'], 0, 4801, 17))
            .then(told => Object.values(told.series)[0])"""
     )
     gap = list(range(2100, 4501, 300))
@@ -534,7 +534,7 @@ def test_axis_numbers_have_a_decimal_point_and_no_digit_groups(opened: Opener) -
     """In some countries "1,000" means one thousand, in others one."""
     page = opened(locale="de-DE")
     told = page.evaluate("""async () => {
-        const { makePlot, line } = await import('/page/plots.js');
+        const { makePlot, line } = await import('/page/ui/plots.js');
         const place = document.body.appendChild(document.createElement('div'));
         const plots = [[12000, 16000], [0.3, 0.9]].map(values =>
             makePlot(place, [[1700000000, 1700000001], values], { series: [line(0, 'speed')], height: 150 }));

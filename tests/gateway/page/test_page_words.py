@@ -19,7 +19,7 @@ MINUTE_MS = 60_000
 # Draw a plot of one minute, with a tick at the minute's end. Return True if anything is drawn at the right
 # edge of the canvas.
 EDGE = """async () => {
-  const { makePlot, line } = await import("/page/plots.js");
+  const { makePlot, line } = await import("/page/ui/plots.js");
   const place = document.querySelector("#lines");
   place.hidden = false;
   const times = [1764115200, 1764115260];
@@ -31,7 +31,7 @@ EDGE = """async () => {
 }"""
 
 TELL_NUMBERS = """async numbers => {
-  const { text } = await import("/page/values.js");
+  const { text } = await import("/page/ui/values.js");
   return numbers.map(([value, digits]) => text(value, { kind: "number", digits }));
 }"""
 
@@ -109,7 +109,7 @@ def test_durations_freeze_when_the_gateway_is_lost(opened: Opener, gateway: Fake
     told = []
     for _ in range(2):
         page.evaluate("(now => { Date.now = () => now() + 5100 })(Date.now)")  # redrawn after 5 s
-        page.evaluate("import('/page/faults.js').then(m => m.show())")
+        page.evaluate("import('/page/views/faults.js').then(m => m.show())")
         told.append(lasted.inner_text())
     assert told[0] == told[1]
 

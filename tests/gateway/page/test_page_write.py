@@ -203,7 +203,7 @@ def test_keys_pressed_before_a_dialog_is_drawn_do_not_confirm_it(
 
 def test_command_names_the_newest_frame_at_its_confirmation(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
-    newest = "import('/page/store.js').then(m => m.store.frame.n)"
+    newest = "import('/page/data/store.js').then(m => m.store.frame.n)"
     page.get_by_role("button", name="start").click()
     asked = page.evaluate(newest)
     until_met(page, lambda: page.evaluate(newest) > asked + 5)
@@ -217,7 +217,7 @@ def test_stop_while_the_dialog_is_open_prevents_a_start(opened: Opener, gateway:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="start").click()
     gateway.stops = {"pump-1": 1}
-    until(page, "import('/page/store.js').then(m => m.stops('pump-1') === 1)")
+    until(page, "import('/page/data/store.js').then(m => m.stops('pump-1') === 1)")
     page.get_by_role("button", name="start pump-1").click()
     page.locator("#outcomes li").wait_for()
     said = page.locator("#outcomes").inner_text()
@@ -233,7 +233,7 @@ def test_reload_while_the_dialog_is_open_prevents_a_start(opened: Opener, gatewa
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="start", exact=True).click()
     gateway.changes = gateway.plant_changes = {"revision": 2}
-    until(page, "import('/page/store.js').then(m => m.store.plant.revision === 2)")
+    until(page, "import('/page/data/store.js').then(m => m.store.plant.revision === 2)")
     page.get_by_role("button", name="start pump-1").click()
     page.locator("#outcomes li").wait_for()
     said = page.locator("#outcomes").inner_text()
@@ -248,7 +248,7 @@ def test_stop_verb_is_sent_after_a_stop_or_reload(opened: Opener, gateway: FakeG
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="emergency stop").click()
     gateway.stops = {"pump-1": 1}
-    until(page, "import('/page/store.js').then(m => m.stops('pump-1') === 1)")
+    until(page, "import('/page/data/store.js').then(m => m.stops('pump-1') === 1)")
     page.get_by_role("button", name="emergency stop pump-1").click()
     until_met(page, lambda: gateway.posts)
     body = {"drive": "pump-1", "verb": "emergency_stop", "options": {}}

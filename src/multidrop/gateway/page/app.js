@@ -1,25 +1,25 @@
 // The page's views, keyboard shortcuts and redraw timer: it draws texts and plots five times a second,
 // sparklines once a second.
 
-import { get } from "./api.js";
-import { askToken } from "./ask.js";
-import * as audit from "./audit.js";
-import * as clock from "./clock.js";
-import { find } from "./dom.js";
-import * as drive from "./drive.js";
-import * as faults from "./faults.js";
-import * as fleet from "./fleet.js";
-import * as lines from "./lines.js";
-import { run } from "./link.js";
-import * as markers from "./markers.js";
-import * as plots from "./panel_plots.js";
-import * as settings from "./settings.js";
+import { get } from "./data/api.js";
+import { run } from "./data/link.js";
+import { onPlant, store, takePlant } from "./data/store.js";
+import * as settings from "./head/settings.js";
+import { drawTop, showPlant } from "./head/top.js";
 import { stopKey, stopOne } from "./stop.js";
-import { onPlant, store, takePlant } from "./store.js";
-import * as table from "./table.js";
 import { plantPath, t } from "./texts.js";
-import { drawTop, showPlant } from "./top.js";
-import * as trends from "./trends.js";
+import * as clock from "./ui/clock.js";
+import { askToken } from "./ui/dialog.js";
+import { find } from "./ui/dom.js";
+import * as drive from "./views/drives/drive.js";
+import * as plots from "./views/drives/plots.js";
+import * as table from "./views/drives/table.js";
+import * as faults from "./views/faults.js";
+import * as fleet from "./views/fleet.js";
+import * as lines from "./views/lines.js";
+import * as log from "./views/log.js";
+import * as markers from "./views/trends/markers.js";
+import * as trends from "./views/trends/trends.js";
 
 const VIEWS = ["drives", "trends", "faults", "lines", "log", "fleet"];
 const BEAT_MS = 100;
@@ -46,7 +46,7 @@ function route() {
   if (view === "trends") trends.show(new URLSearchParams(options ?? ""));
   if (view === "faults") faults.show();
   if (view === "lines") lines.show();
-  if (view === "log") audit.show();
+  if (view === "log") log.show();
   if (view === "fleet") fleet.show();
 }
 
@@ -99,7 +99,7 @@ function redraw() {
     safely(() => plots.begin(store.drives.get(chosen).spec));
   if (view === "trends") safely(trends.draw);
   if (view === "lines") lines.show();
-  safely(audit.redraw);
+  safely(log.redraw);
   safely(table.fit);
   safely(drawTop);
 }
@@ -161,7 +161,7 @@ table.begin();
 drive.begin();
 trends.begin();
 faults.begin();
-audit.begin();
+log.begin();
 fleet.begin();
 onPlant(showPlant);
 onPlant(() => {

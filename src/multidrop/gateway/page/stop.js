@@ -1,8 +1,8 @@
 // Stops of all drives and of one. This file needs only the dialog, no other part of the page.
 
-import { STOP, confirm, send, tell } from "./ask.js";
-import { fill, find, glyph, make, named } from "./dom.js";
 import { pieces, said, t } from "./texts.js";
+import { STOP, confirm, send, tell } from "./ui/dialog.js";
+import { fill, find, glyph, make, named } from "./ui/dom.js";
 
 const HOW = t(
   "A stop is sent before all polling and repeated until the drive confirms it. " +

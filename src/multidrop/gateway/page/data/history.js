@@ -1,0 +1,79 @@
+// The recorded history: series of a time range, and links to download them.
+
+import { said, t } from "../texts.js";
+import { unit } from "../ui/values.js";
+import { Refused, get, query } from "./api.js";
+import { holdsFor, store } from "./store.js";
+
+export const label = (drive, register) => `${drive}.${register}`;
+
+const COLUMNS = ["time", "least", "mean", "most", "missed"];
+
+// Return {series: {label: {time, least, mean, most}}, step_ms}. A null is a gap: a value was missed, or the
+// register was not polled for longer than a value stays current. Throws Refused if no history is kept.
+export async function read(labels, from, to, points) {
+  if (!store.plant.history)
+    throw new Refused(0, t("No history is kept: the plant file has no [serve.history]."));
+  const told = await get(
+    `api/history?${query([
+      ...labels.map(name => ["series", name]),
+      ["from", Math.floor(from)],
+      ["to", Math.ceil(to)],
+      ["points", points],
+    ])}`,
+  );
+  for (const [name, series] of Object.entries(told.series)) {
+    const dot = name.lastIndexOf("."),
+      longest = holdsFor(name.slice(0, dot), name.slice(dot + 1)) + told.step_ms;
+    told.series[name] = { ...series, ...withoutPauses(series, longest) };
+  }
+  return told;
+}
+
+// A register may be polled less often than the plot has points: empty points between two values are no gap.
+function withoutPauses(series, longest) {
+  const kept = [];
+  let pause = [],
+    before = -Infinity;
+  const keepLong = at => {
+    if (at - before > longest) kept.push(...pause);
+    pause = [];
+  };
+  for (const [i, at] of series.time.entries()) {
+    if (series.mean[i] === null && !series.missed[i]) pause.push(i);
+    else {
+      keepLong(at);
+      kept.push(i);
+      before = at;
+    }
+  }
+  keepLong(series.time.at(-1));
+  return Object.fromEntries(COLUMNS.map(column => [column, kept.map(i => series[column][i])]));
+}
+
+// Return the unit in which a series was recorded; the name may have meant another drive then.
+export const unitOf = (told, spec) => told.unit ?? unit(spec);
+
+// Return true if a series has the present unit of its register.
+export const isPresent = (told, spec) => unitOf(told, spec) === unit(spec);
+
+// Return a sentence for each series that has a part in another unit, which is not drawn. If there is no such
+// part and no value at all, return a sentence that says so.
+export function notes(series) {
+  const found = Object.entries(series),
+    mixed = found.filter(([, told]) => told.left_out?.length);
+  if (found.length && !mixed.length && found.every(([, { mean }]) => mean.every(value => value === null)))
+    return [t("The history has no values in this time range.")];
+  return mixed.map(([name, told]) => {
+    const others = told.left_out.map(other => said(other) || t("no unit")).join(", ");
+    return t("{series} was also recorded in {units}; that is not drawn.", { series: name, units: others });
+  });
+}
+
+export const exportLink = (labels, from, to, format) =>
+  `api/export?${query([
+    ...labels.map(name => ["series", name]),
+    ["from", Math.floor(from)],
+    ["to", Math.ceil(to)],
+    ["format", format],
+  ])}`;
