@@ -311,7 +311,7 @@ def test_export_file_name_has_drive_and_time_range(asked: str, name: str) -> Non
 TYPES = {
     "/": "text/html; charset=utf-8",
     "/page/app.js": "text/javascript; charset=utf-8",
-    "/page/style/style.css": "text/css; charset=utf-8",
+    "/page/style/base.css": "text/css; charset=utf-8",
     "/page/icon.svg": "image/svg+xml",
     "/page/vendor/uPlot-LICENSE": "text/plain; charset=utf-8",
 }

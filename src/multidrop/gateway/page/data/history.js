@@ -1,9 +1,9 @@
-// The recorded history: series of a time range, and links to download them.
+// The recorded history: series and alarms of a time range, and links to download series.
 
 import { said, t } from "../texts.js";
 import { unit } from "../ui/values.js";
 import { Refused, get, query } from "./api.js";
-import { holdsFor, store } from "./store.js";
+import { alarms, holdsFor, store, withMs } from "./store.js";
 
 export const label = (drive, register) => `${drive}.${register}`;
 
@@ -77,3 +77,15 @@ export const exportLink = (labels, from, to, format) =>
     ["to", Math.ceil(to)],
     ["format", format],
   ])}`;
+
+// Return the alarms between two times, newest first, from the gateway's memory or else from the frame. Also
+// return the time from which the gateway knows all alarms, or null if that is unknown.
+export async function readAlarms(from, to) {
+  try {
+    const told = await get(`api/alarms?${query({ from: Math.floor(from), to: Math.ceil(to) })}`);
+    told.alarms.forEach(withMs);
+    return [told.alarms, Date.parse(told.since)];
+  } catch {
+    return [alarms().filter(alarm => (alarm.ended ?? Infinity) > from && alarm.time < to), null];
+  }
+}

@@ -43,7 +43,7 @@ const DAY = { day: "numeric", month: "short" };
 
 export const time = ms => formatted(ms, "time", TIME);
 export const minute = ms => formatted(ms, "minute", { hour: "2-digit", minute: "2-digit" });
-export const day = ms => formatted(ms, "day", DAY);
+const day = ms => formatted(ms, "day", DAY);
 export const milli = ms =>
   `${time(ms)}.${String(((Math.floor(ms) % 1000) + 1000) % 1000).padStart(3, "0")}`;
 

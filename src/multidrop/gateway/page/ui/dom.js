@@ -61,7 +61,7 @@ export const fill = (element, ...children) =>
 
 export const find = (selector, at = document) => at.querySelector(selector);
 
-// Return the value of a colour of style.css for a canvas, in the present theme.
+// Return the value of a colour of base.css for a canvas, in the present theme.
 export function colour(name) {
   const probe = make("i", { class: "hidden" });
   document.body.append(probe);

@@ -89,6 +89,12 @@ export const line = (index, label, dash = []) => ({
   points: { show: false, filter: alone, size: 4, fill: (u, k) => u.series[k].stroke(u, k) },
 });
 
+// Return the colour of this index for the area of a band.
+export const translucent = (index, alpha) =>
+  colour(COLOURS[index % COLOURS.length])
+    .replace("rgb(", "rgba(")
+    .replace(")", `, ${alpha})`);
+
 // Return a short piece of the line of this index for the legend.
 export function swatch(index) {
   const mark = make("canvas", { class: "swatch", width: 28, height: 6, "aria-hidden": "true" }),

@@ -2,7 +2,7 @@
 
 import { said, t } from "../texts.js";
 import * as clock from "./clock.js";
-import { make, setClass } from "./dom.js";
+import { make, put, setClass } from "./dom.js";
 
 export const STATES = {
   runs: t("running"),
@@ -81,11 +81,11 @@ export function makeValue() {
 export function showValue(parts, reading, register, isDated = true, isNamed = isDated) {
   const isThere = reading !== null && reading.value !== null;
   const isOld = isThere && reading.isOld;
-  set(parts.number, isThere ? text(reading.value, register) : UNKNOWN);
+  put(parts.number, isThere ? text(reading.value, register) : UNKNOWN);
   // a number without a unit needs its name
   const isBare = !unit(register) && register?.kind === "number" && isNamed;
-  set(parts.unit, isThere ? (isBare ? registerName(register) : unitName(register)) : "");
-  set(parts.age, isOld && isDated ? t("{age} old", { age: clock.lasting(reading.age) }) : "");
+  put(parts.unit, isThere ? (isBare ? registerName(register) : unitName(register)) : "");
+  put(parts.age, isOld && isDated ? t("{age} old", { age: clock.lasting(reading.age) }) : "");
   setClass(parts.whole, "old", isOld);
   const why = reason(reading);
   if (parts.whole.title !== why) parts.whole.title = why;
@@ -101,10 +101,6 @@ function reason(reading) {
   return t("of {time}; since then: {status}", { time: at, status: said(reading.status) });
 }
 
-function set(element, value) {
-  if (element.textContent !== value) element.textContent = value;
-}
-
 // Return a number with its noun: "1 drive", "31 drives".
 export const drives = n => t(n === 1 ? "{n} drive" : "{n} drives", { n });
 
@@ -115,6 +111,23 @@ export function share(part) {
   if (percent === 0) return "0 %";
   if (percent < 0.1) return "< 0.1 %";
   return percent < 10 ? `${percent.toFixed(1)} %` : `${Math.round(percent)} %`;
+}
+
+// Make the elements of a line's bar once: the used share of its time, and a mark at the planned share.
+export function makeUse() {
+  const parts = { used: make("i"), planned: make("u") };
+  parts.whole = make("span", { class: "use", role: "img" }, parts.used, parts.planned);
+  return parts;
+}
+
+// Show two shares, or null for unknown ones, in the elements that `makeUse` returned. Return them as a text.
+export function showUse({ used: part, planned: mark, whole }, used, planned) {
+  part.style.width = `${Math.min(1, used ?? 0) * 100}%`;
+  mark.style.left = `${Math.min(1, planned ?? 0) * 100}%`;
+  mark.hidden = planned === null;
+  const words = t("{used} used, {planned} planned", { used: share(used), planned: share(planned) });
+  if (whole.getAttribute("aria-label") !== words) whole.setAttribute("aria-label", words);
+  return words;
 }
 
 export const milliseconds = ms =>

@@ -1,8 +1,8 @@
 // Active and ended alarms: faults, motors that stopped by themselves, lost ports and silent drives.
 
-import { get, query } from "../data/api.js";
+import { readAlarms } from "../data/history.js";
 import { now } from "../data/link.js";
-import { alarms, isLive, store, withMs } from "../data/store.js";
+import { isLive, store } from "../data/store.js";
 import { pieces, said, t } from "../texts.js";
 import * as clock from "../ui/clock.js";
 import { confirmForm, send, tell } from "../ui/dialog.js";
@@ -15,18 +15,6 @@ const MOST_NOTE = 500; // characters of a note
 
 let shown = "",
   shownAt = 0;
-
-// Return the alarms between two times, newest first, from the gateway's memory or else from the frame. Also
-// return the time from which the gateway knows all alarms, or null if that is unknown.
-export async function read(from, to) {
-  try {
-    const told = await get(`api/alarms?${query({ from: Math.floor(from), to: Math.ceil(to) })}`);
-    told.alarms.forEach(withMs);
-    return [told.alarms, Date.parse(told.since)];
-  } catch {
-    return [alarms().filter(alarm => (alarm.ended ?? Infinity) > from && alarm.time < to), null];
-  }
-}
 
 export function begin() {
   fill(
@@ -47,7 +35,7 @@ export function begin() {
 
 // Redraw the list if it has changed.
 export async function show() {
-  const [found] = await read(now() - SPAN_MS, now()),
+  const [found] = await readAlarms(now() - SPAN_MS, now()),
     sign = JSON.stringify([found, clock.zoneName()]),
     list = find("#fault-list");
   if (sign === shown && (now() - shownAt < 5000 || list.contains(document.activeElement))) return;

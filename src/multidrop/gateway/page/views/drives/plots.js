@@ -6,7 +6,17 @@ import { holdsFor, isLive, store } from "../../data/store.js";
 import { t } from "../../texts.js";
 import * as clock from "../../ui/clock.js";
 import { colour, fill, find, make, put } from "../../ui/dom.js";
-import { COLOURS, heldAt, isThere, join, line, makePlot, summary, wide } from "../../ui/plots.js";
+import {
+  COLOURS,
+  heldAt,
+  isThere,
+  join,
+  line,
+  makePlot,
+  summary,
+  translucent,
+  wide,
+} from "../../ui/plots.js";
 import { registerName, text, title, unitName } from "../../ui/values.js";
 
 const RANGES = [
@@ -136,21 +146,16 @@ function one(place, names, index, isLast, choices) {
     hasTimes: isLast,
     range: wide(specs[0].unit === "Hz" ? 0.5 : 1),
     sync: SYNC,
-    bands: [{ series: [series.length - 1, series.length], fill: translucent(index) }],
+    bands: [{ series: [series.length - 1, series.length], fill: translucent(index, 0.2) }],
     window: () => [(until() - range * 1000) / 1000, until() / 1000],
     hooks: { setCursor: [u => put(out, under(u, specs))] },
   });
   return { plot, specs, box };
 }
 
-const translucent = index =>
-  colour(COLOURS[index % COLOURS.length])
-    .replace("rgb(", "rgba(")
-    .replace(")", ", 0.2)");
-
 function swatch(index) {
   const mark = make("i", { class: index === null ? "swatch dashed" : "swatch", "aria-hidden": "true" });
-  if (index !== null) mark.style.background = colour(COLOURS[index]);
+  if (index !== null) mark.style.background = `var(--${COLOURS[index]})`;
   return mark;
 }
 

@@ -4,7 +4,7 @@ import { driveAge, isLive, key, noteOf, reading, state, store } from "../../data
 import { said, t } from "../../texts.js";
 import * as clock from "../../ui/clock.js";
 import { fill, glyph, make, named, put, setClass } from "../../ui/dom.js";
-import { STATES, UNKNOWN, makeValue, share, showValue } from "../../ui/values.js";
+import { STATES, UNKNOWN, makeUse, makeValue, share, showUse, showValue } from "../../ui/values.js";
 
 export const COLUMNS = 8;
 const MANY = 0.01; // share of misses from which a warning is shown
@@ -17,13 +17,11 @@ export function makeHead(line, unfold) {
     line,
     fold: unfold && make("button", { type: "button", class: "fold", onclick: unfold }, name),
     count: make("span"),
-    used: make("i"),
-    planned: make("u"),
+    bar: makeUse(),
     share: make("span"),
     rate: make("span", { class: "wide" }),
     missed: make("span"),
   };
-  parts.bar = make("span", { class: "use", role: "img" }, parts.used, parts.planned);
   parts.row = make(
     "tr",
     { class: "head" },
@@ -36,7 +34,7 @@ export function makeHead(line, unfold) {
         parts.fold ?? name,
         parts.fold && parts.count,
         make("span", { class: "wide port" }, [line.port, line.speed].filter(Boolean).join(" · ")),
-        make("span", { class: "wire" }, `${t("wire")} `, parts.bar, parts.share),
+        make("span", { class: "wire" }, `${t("wire")} `, parts.bar.whole, parts.share),
         parts.rate,
         parts.missed,
       ),
@@ -160,12 +158,7 @@ function drawState(r, is, drive, age, at) {
 export function drawHead(h) {
   const line = store.frame?.lines[h.line.name];
   const { used = null, rate = null, planned = null, misses = null, lost = null } = line ?? {};
-  h.used.style.width = `${Math.min(1, used ?? 0) * 100}%`;
-  h.planned.style.left = `${Math.min(1, planned ?? 0) * 100}%`;
-  h.planned.hidden = planned === null;
-  const words = t("{used} used, {planned} planned", { used: share(used), planned: share(planned) });
-  put(h.share, ` ${words}`);
-  if (h.bar.getAttribute("aria-label") !== words) h.bar.setAttribute("aria-label", words);
+  put(h.share, ` ${showUse(h.bar, used, planned)}`);
   put(h.rate, rate === null ? "" : t("{n} exchanges/s", { n: rate.toFixed(1) }));
   put(
     h.missed,

@@ -1,10 +1,10 @@
 // Alarms as bars over the time axis of the trends.
 
+import { readAlarms } from "../../data/history.js";
 import { now } from "../../data/link.js";
 import { store } from "../../data/store.js";
 import { said, t } from "../../texts.js";
 import { fill, glyph, make, named } from "../../ui/dom.js";
-import { read } from "../faults.js";
 
 const LANES = [
   [t("faults"), ["fault", "stopped", "limit"]],
@@ -19,7 +19,7 @@ export async function draw(place, from, to, drives) {
     fill(place);
     return;
   }
-  const [all, since] = await read(from, to),
+  const [all, since] = await readAlarms(from, to),
     lines = drives.map(name => store.drives.get(name)?.line.name),
     alarms = all.filter(({ drive, line }) => (drive ? drives.includes(drive) : lines.includes(line)));
   if (mine !== serial) return;

@@ -4,8 +4,8 @@ import { label } from "../../data/history.js";
 import { holdsFor, store } from "../../data/store.js";
 import { said } from "../../texts.js";
 import * as clock from "../../ui/clock.js";
-import { colour, fill, make, named } from "../../ui/dom.js";
-import { COLOURS, dashes, heldAt, join, line, makePlot, summary, swatch, wide } from "../../ui/plots.js";
+import { fill, make, named } from "../../ui/dom.js";
+import { dashes, heldAt, join, line, makePlot, summary, swatch, translucent, wide } from "../../ui/plots.js";
 import { number, registerName } from "../../ui/values.js";
 import * as markers from "./markers.js";
 import * as picker from "./picker.js";
@@ -34,12 +34,7 @@ export function makeTrend(place, { register, unit, drives }, told, { view, set, 
       k = series.length + 1;
     const bare = { stroke: "transparent", points: { show: false } };
     series.push(bare, bare, line(index, drive, dashes(index)));
-    bands.push({
-      series: [k, k + 1],
-      fill: colour(COLOURS[index % COLOURS.length])
-        .replace("rgb(", "rgba(")
-        .replace(")", ", 0.22)"),
-    });
+    bands.push({ series: [k, k + 1], fill: translucent(index, 0.22) });
     tables.push([time, most, least, mean]);
     summaries.push(summary(drive, mean, said(unit), spec.digits));
   }
