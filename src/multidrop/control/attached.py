@@ -11,16 +11,18 @@ import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
-from multidrop.control.call import MOST_EXPIRY_S, check_expiry
+from multidrop.control.call import MOST_EXPIRY_S, Call, check_expiry
 from multidrop.control.exit_hook import LastAct, exit_hook
 from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome, Stopped
 from multidrop.control.performer import Performer
 from multidrop.control.stops import Stopper
-from multidrop.core import Latch, Message
+from multidrop.core import Message
 from multidrop.drive.family import Drive, check_own, check_own_text
 from multidrop.drive.register import Register
+from multidrop.drive.script import Script
 from multidrop.drive.text import Text
+from multidrop.drive.verbs import CalledStop
 from multidrop.transport.aside_log import log_aside
 from multidrop.transport.exchange import Exchanges
 
@@ -48,11 +50,12 @@ def made(drive: D | type[D], address: int | None, line: dict[str, Any], details:
 
 
 class BusLink:
-    """The link through which drives of a bus read and write when their own methods are called."""
+    """The link through which drives of a bus read, write, move and stop when their methods are called."""
 
-    def __init__(self, exchanges: Exchanges, performer: Performer) -> None:
+    def __init__(self, exchanges: Exchanges, performer: Performer, stopper: Stopper) -> None:
         self._exchanges = exchanges
         self._performer = performer
+        self._stopper = stopper
 
     def values(self, drive: Drive, registers: tuple[Any, ...]) -> dict[str, Any]:
         try:
@@ -87,6 +90,20 @@ class BusLink:
             raise TypeError(f"data = {data!r}: it must be bytes, such as b'\\x00\\x01'")
         return self._performer.raw(drive, Message(drive.address, function, start, count, data))
 
+    def perform(self, drive: Drive, script: Script[Any]) -> Any:
+        return self._performer.perform(script, self._performer.call(drive))
+
+    def begin_call(self, drive: Drive, verb: str, seen: int) -> Call:
+        return self._performer.call(drive, verb, seen)
+
+    def carry_out_move(self, drive: Drive, script: Script[Any], call: Call) -> Any:
+        return self._performer.move(script, call)
+
+    def begin_stop(
+        self, drive: Drive, verb: str, make: Callable[[], Script[Any]], seconds: float | None
+    ) -> CalledStop:
+        return self._stopper.stop(drive, verb, make, seconds)
+
 
 class Attached:
     """The drives of a bus; any thread may add and remove them."""
@@ -99,9 +116,7 @@ class Attached:
         self._bus = bus
         self._exchanges = exchanges
         self._latches = latches
-        self._performer = performer
-        self._stopper = stopper
-        self._link = BusLink(exchanges, performer)
+        self._link = BusLink(exchanges, performer, stopper)
 
     def forked(self) -> None:
         """Release the drives in a forked child, so that they can be attached to a bus of the child."""
@@ -122,18 +137,10 @@ class Attached:
                     "another drive object"
                 )
             self._exchanges.add(drive)
-            self._give_verbs(drive, self._latches.add(drive))
+            drive.bus = self._bus
+            drive.stops_called = self._latches.add(drive).c
+            drive.link = self._link
             self.drives = [*self.drives, drive]  # replaced, never mutated: readers iterate without a lock
-
-    def _give_verbs(self, drive: Drive, latch: Latch) -> None:
-        bus, performer, stopper = self._bus, self._performer, self._stopper
-        drive.bus = bus
-        drive.link = self._link
-        drive.perform = lambda script: performer.perform(script, performer.call(drive))
-        drive.stops_called = latch.c
-        drive.begin_call = lambda verb, seen: performer.call(drive, verb, seen)
-        drive.carry_out_move = performer.move
-        drive.begin_stop = lambda verb, script, seconds: stopper.stop(drive, verb, script, seconds)
 
     def remove(self, drive: Drive) -> None:
         """Remove a drive from the bus. Raises NotAttached if it is not there."""

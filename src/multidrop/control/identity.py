@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 from multidrop.core import PAUSE_NS, Peer
 from multidrop.drive.family import Drive
@@ -119,7 +120,8 @@ class IdentityCheck:
     def __init__(self, exchanges: Exchanges, echo: EchoCheck) -> None:
         self._exchanges = exchanges
         self._echo = echo
-        self._all_findings: dict[Drive, _Findings] = {}
+        # weak: a drive that was detached during its check must not stay in memory
+        self._all_findings: WeakKeyDictionary[Drive, _Findings] = WeakKeyDictionary()
 
     def _findings(self, drive: Drive) -> _Findings:
         """Return the results of this drive's checks since its port was opened."""

@@ -18,14 +18,14 @@ from multidrop.drive.declaration_check import (
     text_errors,
 )
 from multidrop.drive.line_settings import Settings, check_agreed_silence, framing_on
-from multidrop.drive.link import NO_LINK, Link, RegisterAccess, not_attached
+from multidrop.drive.link import NO_LINK, Link, RegisterAccess
 from multidrop.drive.options import Option, checked_options, confirmation, doubt
 from multidrop.drive.parameters import Parameter, ParameterSpace
 from multidrop.drive.register import Access, Kept, Register, Table
 from multidrop.drive.script import Script, read, until, write
 from multidrop.drive.state import Condition, Direction, KnownSetpoint, State
 from multidrop.drive.text import Text
-from multidrop.drive.verbs import MOVING, CalledStop, UnattachedStop, verb, verb_errors
+from multidrop.drive.verbs import MOVING, CalledStop, verb, verb_errors
 from multidrop.errors import Advice, NotVerified, Unconfirmed, Unsupported, WriteForbidden
 from multidrop.printable import did_you_mean
 
@@ -230,16 +230,8 @@ class Drive(RegisterAccess):
         self.option = checked_options(self._kind(), self.options, options)
         self.ram = frozenset(self._in_ram(name) for name in ram)
         self._known_setpoint = KnownSetpoint()
-        self.perform: Callable[[Script[Any]], Any] = self._perform_nowhere
         self.link: Link = NO_LINK
         self.stops_called: Sequence[int] = (0,)  # the first item is the number of stops called so far
-        # A function that takes a verb's name and the number of stops so far, and returns a call that a later
-        # stop cancels.
-        self.begin_call: Callable[[str, int], Any] = lambda verb, seen: None
-        self.carry_out_move: Callable[[Script[Any], Any], Any] = self._move_nowhere
-        self.begin_stop: Callable[[str, Callable[[], Script[Any]], float | None], CalledStop] = (
-            lambda verb, make, seconds: UnattachedStop(self, make)
-        )
 
     @classmethod
     def _one_of(cls, what: str, value: Any, allowed: Any) -> Any:
@@ -377,11 +369,23 @@ class Drive(RegisterAccess):
         """Forget the setpoint until its write ends; return a function to restore it if nothing was sent."""
         return self._known_setpoint.begin_write()
 
-    def _move_nowhere(self, script: Script[Any], call: Any) -> Any:
-        return self.perform(script)
+    # ---- scripts, carried out by the bus ----
 
-    def _perform_nowhere(self, script: Script[Any]) -> Any:
-        raise not_attached(self)
+    def perform(self, script: Script[Any]) -> Any:
+        """Carry out a script on the bus; return its result."""
+        return self.link.perform(self, script)
+
+    def begin_call(self, verb: str, seen: int) -> Any:
+        """Return a call of a verb; a stop cancels it if more than `seen` stops were called by then."""
+        return self.link.begin_call(self, verb, seen)
+
+    def carry_out_move(self, script: Script[Any], call: Any) -> Any:
+        """Carry out the script of a verb that may move the motor; `call` is from `begin_call`."""
+        return self.link.carry_out_move(self, script, call)
+
+    def begin_stop(self, verb: str, make: Callable[[], Script[Any]], seconds: float | None) -> CalledStop:
+        """Call a stop without carrying it out; `make` returns the stop's script."""
+        return self.link.begin_stop(self, verb, make, seconds)
 
     # ---- for verbs ----
 
@@ -531,7 +535,7 @@ class Drive(RegisterAccess):
 # Names that a register cannot have.
 TAKEN_NAMES = frozenset(
     {*dir(Drive), *("address", "framing", "settings", "agreed_silence", "response_delay", "name")}
-    | {"option", "ram", "perform", "link"}
+    | {"option", "ram", "link"}
 )
 
 

@@ -1,4 +1,4 @@
-"""RegisterAccess: a drive's methods that read and write. Link: the bus's methods that these call."""
+"""RegisterAccess: a drive's methods that read and write. Link: the bus's methods that a drive calls."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, NoReturn, Protocol, TypeVar, cast, overload
 
 from multidrop.drive.register import Register
+from multidrop.drive.script import Script
 from multidrop.drive.text import Text
+from multidrop.drive.verbs import CalledStop, UnattachedStop
 from multidrop.errors import NotAttached
 
 T = TypeVar("T", bound=float)
@@ -17,7 +19,11 @@ class TextWanted(Exception):
 
 
 class Link(Protocol):
-    """The bus's implementation of a drive's reads and writes; see the methods of the same names in Drive."""
+    """The bus's implementation of a drive's methods; see the methods of the same names in Drive.
+
+    Each method takes the drive. If a drive kept functions that hold the drive itself, it would be in a
+    reference cycle, and a removed drive would stay in memory until a garbage collection.
+    """
 
     @property
     def values(self) -> Any:
@@ -32,10 +38,16 @@ class Link(Protocol):
         self, drive: Any, function: int, start: int, count: int, expiry: float = ..., attempts: int = ...
     ) -> bytes: ...
     def send_raw(self, drive: Any, function: int, start: int, data: bytes, count: int) -> bytes: ...
+    def perform(self, drive: Any, script: Script[Any]) -> Any: ...
+    def begin_call(self, drive: Any, verb: str, seen: int) -> Any: ...
+    def carry_out_move(self, drive: Any, script: Script[Any], call: Any) -> Any: ...
+    def begin_stop(
+        self, drive: Any, verb: str, make: Callable[[], Script[Any]], seconds: float | None
+    ) -> CalledStop: ...
 
 
 class NoLink:
-    """The link of a drive that was never attached: every call raises NotAttached."""
+    """The link of a drive that was never attached: nothing is sent, and each call raises NotAttached."""
 
     def values(self, drive: Any, registers: Sequence[Any]) -> NoReturn:
         raise not_attached(drive)
@@ -53,6 +65,20 @@ class NoLink:
 
     def send_raw(self, drive: Any, function: int, start: int, data: bytes, count: int) -> NoReturn:
         raise not_attached(drive)
+
+    def perform(self, drive: Any, script: Script[Any]) -> NoReturn:
+        raise not_attached(drive)
+
+    def begin_call(self, drive: Any, verb: str, seen: int) -> None:
+        return None
+
+    def carry_out_move(self, drive: Any, script: Script[Any], call: Any) -> Any:
+        return drive.perform(script)
+
+    def begin_stop(
+        self, drive: Any, verb: str, make: Callable[[], Script[Any]], seconds: float | None
+    ) -> CalledStop:
+        return UnattachedStop(drive, make)
 
 
 def not_attached(drive: Any) -> NotAttached:
