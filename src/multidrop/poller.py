@@ -112,7 +112,7 @@ class Poller(RowSource):
         with self._changing:
             self._check_polling()  # an interruption may have closed the poller already
             self._lines.fill(plant.lines)
-            self._added.adopt(self.plant)
+            self._added.adopt(self.plant, self.polled_since)
 
     def _want_realtime(self, plant: Plant) -> None:
         try:
@@ -296,7 +296,7 @@ class Poller(RowSource):
             self._path, self._totals = plant.path, plant.totals
             self._want_realtime(plant)
             failures = adoption.carry_out(start=self._thread.is_alive())
-            self._added.adopt(self.plant)
+            self._added.adopt(self.plant, self.polled_since)
             return failures
 
     def add_line(self, line: PlantLine) -> None:
@@ -326,7 +326,7 @@ class Poller(RowSource):
             if failures:
                 self._lines.let_go([added], GONE)
                 raise failures[line.name]
-            self._added.adopt(self.plant)
+            self._added.adopt(self.plant, self.polled_since)
             if self._thread.is_alive():
                 added.start()
 
@@ -343,7 +343,7 @@ class Poller(RowSource):
         with self._changing:
             if not self._closing and leaving in self._lines:
                 self._lines.let_go([leaving], GONE)
-                self._added.adopt(self.plant)
+                self._added.adopt(self.plant, self.polled_since)
 
     def _check_polling(self) -> None:
         if self._closing:
@@ -388,7 +388,7 @@ class Poller(RowSource):
             if polled.drive.name in names:
                 raise ValueError(f"another drive is called {polled.drive.name}; give each its own name")
             self._lines.find(line).add(polled)
-            self._added.adopt(self.plant)
+            self._added.adopt(self.plant, self.polled_since)
 
     @undisturbed
     def remove(self, line: str, drive: str) -> None:
@@ -402,7 +402,7 @@ class Poller(RowSource):
             for attached in polled.bus.drives:
                 if attached.name == drive:
                     polled.remove(attached)
-                    return self._added.adopt(self.plant)
+                    return self._added.adopt(self.plant, self.polled_since)
         raise ValueError(f"there is no drive {drive!r} on line {line!r}")
 
     @undisturbed
@@ -422,7 +422,8 @@ class Poller(RowSource):
             line, known = self._lines.find_drive(drive)
             line.set_rate(known, known.register(register) if isinstance(register, str) else register, every)
             if self._added:
-                self._added.adopt(self.plant)  # the rate determines how long values of channels stay current
+                # the rate determines how long values of channels stay current
+                self._added.adopt(self.plant, self.polled_since)
 
     def __getitem__(self, name: str) -> Drive:
         """Return the polled drive of this name. Raises KeyError if there is none."""

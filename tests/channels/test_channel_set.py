@@ -170,6 +170,22 @@ def test_reload_continues_totals_without_an_outage() -> None:
     assert second.outages == []
 
 
+def test_total_continues_with_an_outage_if_another_drive_has_the_name() -> None:
+    ratio = Channel("ratio", "power / 2", "kW")
+    energy, change = (
+        Channel("energy", "integral(ratio)", "kW*s"),
+        Channel("change", "derivative(ratio)", "kW/s"),
+    )
+    first, second = (channels(ratio, energy, change, power="kW") for _ in range(2))
+    first.compute([row(0, 0.0, 2.0), row(0, 0.5, 2.0)])
+    second.take_over(first, {"pump"})
+    energies = [one for one in second.compute([row(0, 1.0, 100.0), row(0, 1.5, 100.0)]) if one.slot == 2]
+    assert [one.value for one in energies] == [0.5, 25.5]
+    changes = [one for one in second.compute([row(0, 2.0, 100.0)]) if one.slot == 3]
+    assert [one.value for one in changes] == [0.0]
+    assert list(map(str, second.outages)) == ["pump.energy: 0.5 s without values are not counted"]
+
+
 def test_changed_expression_and_damaged_totals_start_at_0() -> None:
     before = channels(ENERGY, power="kW")
     before.compute([row(0, at, 3600.0) for at in (0.0, 1.0)])

@@ -131,6 +131,28 @@ def test_an_adopted_plant_continues_totals_and_drops_removed_channels(port: str)
     assert of(rows[-5:], "double") == []
 
 
+def test_no_channel_combines_values_of_two_drives_of_one_name() -> None:
+    change = Channel("change", "derivative(output_current)", "A/s")
+    values = [proof(Toy(address), CURRENT) for address in (1, 2)]
+    assert values[0] != values[1]
+    with Simulator([Wire([EncodedDrive(Toy(1)), EncodedDrive(Toy(2))], unpaced=True)]) as simulator:
+        path, rows = simulator.wires[0].path, list[Row]()
+        with Poller(plant(line(path, pump(change, CHARGE, DOUBLE)))) as poller:
+            until(lambda: rows.extend(rows_of(poller)) or len(of(rows, "change")) > 5)
+            time.sleep(0.05)  # so that rows of the first drive still wait when the second one is adopted
+            second = PolledDrive(
+                Toy(2, name="pump-1"), [CURRENT], every=0.005, channels=(change, CHARGE, DOUBLE)
+            )
+            poller.adopt(plant(line(path, second)))
+            since_ns = poller.polled_since["pump-1"]
+            until(lambda: rows.extend(rows_of(poller)) or rows[-1].monotonic_ns > since_ns + 10**8)
+    assert {row.value for row in of(rows, "change") if row.value is not None} == {0.0}
+    assert [row.status for row in of(rows, "outage")][-1].startswith("pump-1.charge: ")
+    doubles = [row for row in of(rows, "double") if row.value is not None]
+    assert {row.value for row in doubles if row.monotonic_ns >= since_ns} == {2 * values[1]}
+    assert {row.value for row in doubles if row.monotonic_ns < since_ns} == {2 * values[0]}
+
+
 def test_values_stay_valid_for_longer_at_a_slower_rate(port: str) -> None:
     with Poller(plant(line(port, pump(CHARGE)))) as poller:
         poller.set_rate("pump-1", "output_current", 60)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from math import isfinite
 from typing import Any, NamedTuple
 
@@ -240,8 +240,12 @@ class ChannelSet:
 
     # ---- totals ----
 
-    def take_over(self, before: ChannelSet) -> None:
-        """Continue the totals of channels that `before` also has, with the same expression and units."""
+    def take_over(self, before: ChannelSet, replaced: Collection[str] = ()) -> None:
+        """Continue the totals of channels that `before` also has, with the same expression and units.
+
+        `replaced` has the names that other drives have taken over. For functions with a memory, an outage
+        lies between the last value of the old drive and the first value of the new drive.
+        """
         known = {(one.name, one.channel, *one.program.units): one for one in before._computed}
         for one in self._computed:
             if same := known.get((one.name, one.channel, *one.program.units)):
@@ -252,6 +256,11 @@ class ChannelSet:
                     self._left_off[one.slot] = before._left_off[same.slot]
                 if same.slot in before._newest_ns:
                     self._newest_ns[one.slot] = before._newest_ns[same.slot]
+        changed = {slot for (drive, _), slot in self.inputs.items() if drive in replaced}
+        for one in self._computed:
+            if not one.program.slots.isdisjoint(changed):
+                changed.add(one.slot)  # later channels may use this channel
+                one.program.interrupt(changed)
 
     def totals(self) -> dict[str, Any]:
         """Return the integrals and counts of all kept channels, for `restore`."""

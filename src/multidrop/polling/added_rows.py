@@ -9,14 +9,16 @@ import logging
 import os
 import threading
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from multidrop.channels import OLD, ChannelSet
+from multidrop.channels import OLD, ChannelSet, SlotRow
 from multidrop.core import Columns
 from multidrop.core.columns import COLUMNS
+from multidrop.drive.family import Drive
 from multidrop.plant.model import Plant, series_of
 from multidrop.polling.batch import Batch, bitmap_of, slot_rows, status_code
 from multidrop.polling.jobs import RowNames
@@ -77,21 +79,32 @@ class AddedRows:
         self._codes: dict[int, tuple[int, int]] = {}  # by slot: the codes of the drive and the register
         # by the codes of a drive and a register: the slot, if channels use that register
         self._slots: dict[tuple[int, int], int] = {}
+        self._drives: dict[str, Drive] = {}  # the newest drive of each name
+        # if a drive has taken over another drive's name: the monotonic time since which its rows count
+        self._since_ns: dict[str, int] = {}  # by drive name
+        self._slot_since_ns: dict[int, int] = {}  # by slot
         self._events: list[AddedRow] = []
         self._totals: TotalsFile | None = None
         self._kept: dict[str, Any] = {}  # totals, including those of channels that are not computed now
         self._save_ns = 0
         self._is_saved = True  # True if the totals have not changed since the last write
 
-    def adopt(self, plant: Plant) -> None:
+    def adopt(self, plant: Plant, polled_since: Mapping[str, int] = MappingProxyType({})) -> None:
         """Compute the channels of this plant from now on. A channel that was computed before continues its
         total.
+
+        `polled_since` has the monotonic time in ns since which each drive of the plant is polled, by drive
+        name. If another drive has taken over a name, earlier rows of that name are not used.
         """
         channels = ChannelSet(series_of(plant))
         for mistake in channels.mistakes:  # for example, a channel names a drive that was removed
             log_aside(_log, logging.WARNING, "a channel is not computed: %s", mistake)
         place = totals_path(plant) if channels else None
+        drives = {polled.drive.name: polled.drive for polled in plant.drives}
         with self._lock:
+            replaced = {name for name, drive in drives.items() if self._drives.get(name, drive) is not drive}
+            self._since_ns |= {name: polled_since.get(name, 0) for name in replaced}
+            self._drives |= drives
             before, self._channels = self._channels, channels
             self._kept |= before.totals()
             if place and (self._totals is None or self._totals.path != place):
@@ -102,7 +115,7 @@ class AddedRows:
             if self._totals:
                 for name in channels.totals().keys() - self._kept.keys() - before.totals().keys():
                     self._note_start(f"{name} starts at 0", logging.INFO)
-            channels.take_over(before)
+            channels.take_over(before, replaced)
             self._is_saved = False
             names = self._names
             self._codes = {
@@ -110,6 +123,11 @@ class AddedRows:
                 for (drive, name), slot in channels.slots.items()
             }
             self._slots = {self._codes[slot]: slot for slot in channels.inputs.values()}
+            self._slot_since_ns = {
+                slot: self._since_ns[drive]
+                for (drive, _), slot in channels.inputs.items()
+                if drive in self._since_ns
+            }
 
     def _note_start(self, text: str, level: int) -> None:
         """Log that a total does not continue the earlier one, and add an event."""
@@ -161,7 +179,7 @@ class AddedRows:
                 INPUT_OLD if row.status == OLD else row.status,
                 row.value,
             )
-            for row in self._channels.compute(slot_rows(batch.columns(), self._slots))
+            for row in self._channels.compute(self._rows_of_present_drives(batch))
         ]
         outages, self._channels.outages = self._channels.outages, []
         for outage in outages:
@@ -173,6 +191,12 @@ class AddedRows:
             self._save_ns = clock.now_ns() + SAVE_NS
             self._write_totals(self._totals)
         return added
+
+    def _rows_of_present_drives(self, batch: Batch) -> Iterator[SlotRow]:
+        """Yield the rows from which channels are computed, without rows of replaced drives."""
+        rows = slot_rows(batch.columns(), self._slots)
+        since_ns = self._slot_since_ns
+        return (row for row in rows if row.monotonic_ns >= since_ns.get(row.slot, 0)) if since_ns else rows
 
     def _write_totals(self, file: TotalsFile) -> None:
         if totals := self._kept | self._channels.totals():
