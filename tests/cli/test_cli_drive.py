@@ -19,6 +19,7 @@ from lines import Faulty, patient
 from toy import Status, Toy
 
 import multidrop.cli
+from multidrop.cli.support.values import nearest_value
 from multidrop.cli.support.writing import confirm
 from multidrop.control import eeprom_ledger as ledger
 from multidrop.errors import WriteForbidden
@@ -188,6 +189,14 @@ def test_a_clamped_value_is_reported_with_status_1(run: Run, port: str) -> None:
         "",
         "toy@2: acceleration_time = 30.0 s: taken as 20.0 s\n",
     )
+
+
+def test_a_rounding_error_of_a_calculation_is_not_reported(capsys: pytest.CaptureFixture[str]) -> None:
+    setpoint = InvtCHE.registers["setpoint"]
+    assert nearest_value(setpoint, 22 / 1000 * 100) == 2.2
+    assert capsys.readouterr().err == ""
+    assert nearest_value(setpoint, 12.0049999 / 50 * 100) == 24.01
+    assert "24.0099998 becomes 24.01 %" in capsys.readouterr().err
 
 
 def test_a_value_between_two_steps_is_rounded_with_a_warning(

@@ -244,6 +244,22 @@ def test_an_outage_is_only_logged_if_no_status_code_is_free(
     assert "122 s without values" in caplog.text
 
 
+def test_outages_that_end_with_one_row_have_different_times() -> None:
+    """InfluxDB keeps one row for each series and time."""
+    names = RowNames()
+    added = AddedRows(names)
+    added.adopt(plant(line("/dev/ttyUSB0", pump(CHARGE, replace(CHARGE, name="more")))))
+    codes = names.drives.number("pump-1"), names.registers.number("output_current")
+    rows = [AddedRow(ns, ns, 0, *codes, 0, 1.0) for ns in (10**9, 123_456_000_000)]
+    batch = added.added_to(Batch(JoinedColumns(None, rows), names.drives, names.registers))
+    assert batch is not None
+    outages = [(row.status, row.time_ns) for row in batch if row.register == "outage"]
+    assert outages == [
+        ("pump-1.charge: 122 s without values are not counted", 123_456_000_000),
+        ("pump-1.more: 122 s without values are not counted", 123_456_000_001),
+    ]
+
+
 def test_totals_of_a_simulation_are_saved_in_a_separate_file(
     port: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

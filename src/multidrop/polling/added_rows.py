@@ -182,10 +182,12 @@ class AddedRows:
             for row in self._channels.compute(self._rows_of_present_drives(batch))
         ]
         outages, self._channels.outages = self._channels.outages, []
-        for outage in outages:
+        for number, outage in enumerate(outages):
             log_aside(_log, logging.WARNING, "%s", outage)
+            # each event has another time: InfluxDB keeps one row of a series and time
+            end_ns = outage.end_ns + number
             with suppress(ValueError):  # too many different texts: the outage is only logged
-                added.append(self._event(outage.end_ns, clock.now_ns(), OUTAGE, str(outage)))
+                added.append(self._event(end_ns, clock.now_ns(), OUTAGE, str(outage)))
         self._is_saved &= not added
         if self._totals and clock.now_ns() >= self._save_ns:
             self._save_ns = clock.now_ns() + SAVE_NS

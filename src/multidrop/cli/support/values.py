@@ -88,12 +88,14 @@ def nearest_value(register: Register[T], value: T) -> T:
     Raises ValueError if `value` is outside the register's range.
     """
     nearest = register.decode(register.encode(value))
-    if nearest != value and not (register.is_float and register.parse(_number(register, nearest)) == value):
+    # 15 digits, because a value in % that was computed from Hz has a rounding error in its last digit
+    given = float(f"{value:.15g}") if isinstance(value, float) else value
+    if nearest != given and not (register.is_float and register.parse(_number(register, nearest)) == value):
         why = f"has steps of {register.step:g} {register.unit}".rstrip()
         if register.is_float:
             why = f"holds {_PRECISIONS[register.number_format]}-precision numbers"
         shown = register.format(nearest)
-        warn(f"{register.name} {why}: {value!r} becomes {shown}")
+        warn(f"{register.name} {why}: {given!r} becomes {shown}")
     return nearest
 
 
