@@ -268,6 +268,16 @@ def test_opc_ua_stop_stops_the_motors(gateway: Served, client: Any, drive: str, 
 
 
 @pytest.mark.slow
+def test_stop_of_another_object_is_sent_but_not_confirmed(gateway: Served, client: Any) -> None:
+    start(gateway, "pump-1", "pump-2")
+    with pytest.raises(ua.UaStatusCodeError, match="BadMethodInvalid"):
+        client.get_node("ns=2;s=pump-2").call_method(client.get_node("ns=2;s=pump-1.Stop").nodeid)
+    until(lambda: stands(gateway, "pump-1"))
+    assert not stands(gateway, "pump-2")
+    assert "stop" in stop(client, "")
+
+
+@pytest.mark.slow
 def test_stops_of_one_request_do_not_wait_for_each_other(gateway: Served, client: Any) -> None:
     start(gateway, "pump-1")
     gateway.sims["pump-2"].deaf_until = float("inf")

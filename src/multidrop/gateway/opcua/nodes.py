@@ -287,6 +287,11 @@ async def _notify(variable: _Variable, attribute: AttributeValue) -> None:
             _log.debug("a subscriber of %s.%s failed", drive, name, exc_info=True)
 
 
+def object_of(drive: str | None) -> ua.NodeId:
+    """Return the id of a drive's object; with None, that of the plant's object."""
+    return PLANT if drive is None else _id(drive)
+
+
 def _id(*names: str) -> ua.NodeId:
     """Return the id of a drive's object, or of a node in it."""
     return ua.NodeId(".".join(names), INDEX)

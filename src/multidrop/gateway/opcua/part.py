@@ -216,16 +216,22 @@ class OpcUa:
         if not self._wrong.is_shut(address, now) and self._wrong.note_wrong(address, visitor.secret, now):
             _log.warning("wrong token by opcua from %s", address)
 
-    async def _call(self, method: Any, visitor: Visitor) -> Any:
-        """Carry out a method, which is always a stop. Answer within STOP_WAIT_S, even if it takes longer."""
+    async def _call(self, call: Any, visitor: Visitor) -> Any:
+        """Carry out a method, which is always a stop. Answer within STOP_WAIT_S, even if it takes longer.
+
+        If the method belongs to another object than the one in the request, it is carried out, but the answer
+        is BadMethodInvalid: otherwise the client could believe that the object's drive was stopped.
+        """
         from asyncua import ua
+
+        from multidrop.gateway.opcua.nodes import object_of
 
         assert self._opened is not None
         assert self._loop is not None
         stops = self._opened[2].stops
-        if method not in stops:
+        if call.MethodId not in stops:
             return ua.CallMethodResult(ua.StatusCode(ua.StatusCodes.BadMethodInvalid))
-        drive, caller = stops[method], self._caller(visitor)
+        drive, caller = stops[call.MethodId], self._caller(visitor)
         if caller is None or caller.role < Right.STOP:
             return ua.CallMethodResult(ua.StatusCode(ua.StatusCodes.BadUserAccessDenied))
         if self._stopping[drive] >= MOST_STOPS:
@@ -235,6 +241,8 @@ class OpcUa:
         )
         self._stopping[drive] += 1
         stopping.add_done_callback(lambda _: self._stopping.subtract([drive]))
+        if call.ObjectId != object_of(drive):
+            return _answer(ua.StatusCodes.BadMethodInvalid, "this method belongs to another object")
         await asyncio.wait([stopping], timeout=STOP_WAIT_S)
         if not stopping.done():
             return _answer(ua.StatusCodes.GoodCompletesAsynchronously, "the stop is in progress")

@@ -80,7 +80,7 @@ class Visitor(User):
 
 
 MayRead = Callable[[Visitor], bool]  # returns whether the user may read
-Stop = Callable[[ua.NodeId, Visitor], Awaitable[ua.CallMethodResult]]  # carries out a method
+Stop = Callable[[ua.CallMethodRequest, Visitor], Awaitable[ua.CallMethodResult]]  # carries out a method
 
 
 class _Admission(UserManager, SimpleRoleRuleset):
@@ -190,7 +190,7 @@ class _ClientSession(InternalSession):
 
     async def call(self, params: Any) -> Any:
         _check_count(params)
-        return await asyncio.gather(*(self._server.stop_method(one.MethodId, self.user) for one in params))
+        return await asyncio.gather(*(self._server.stop_method(one, self.user) for one in params))
 
 
 def _check_count(operations: Any) -> None:
