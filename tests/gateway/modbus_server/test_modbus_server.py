@@ -317,6 +317,23 @@ def test_each_result_of_a_write_has_its_exception_code(gateway: Gateway, failure
     assert code(gateway, 1, 6, CHE_SETPOINT, 5000) == expected
 
 
+def test_write_that_waited_while_the_gateway_stood_still_is_refused(gateway: Gateway) -> None:
+    standstill, now_ns = gateway.server._standstill, [10**12]
+    with gateway.client() as client:
+        standstill._clock = lambda: now_ns[0]
+        standstill.note()
+        now_ns[0] += 5 * 10**9
+        assert client.ask(1, 6, CHE_SETPOINT, 5000).code is None
+        now_ns[0] += 5 * 10**9 + 1
+        assert client.ask(1, 6, CHE_SETPOINT, 5000).code == 6
+        assert client.ask(1, 6, CHE_CONTROL, 5).code is None  # a stop is never refused
+        now_ns[0] += 10**9 - 1
+        assert client.ask(1, 6, CHE_SETPOINT, 5000).code == 6
+        now_ns[0] += 1
+        assert client.ask(1, 6, CHE_SETPOINT, 5000).code is None
+    assert len(gateway.commands.written) == 2
+
+
 def test_read_only_gateway_refuses_writes_as_illegal_function() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0")) as gateway:
         for function, words in (

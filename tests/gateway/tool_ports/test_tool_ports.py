@@ -298,7 +298,7 @@ def test_by_default_each_write_is_refused_and_recorded(tmp_path: Path) -> None:
             assert code(tool, body) == 1
         assert rig.commands.written == rig.commands.stopped == []
         start = checksums.rtu("01 06 1000 0001").hex(" ").upper()
-        assert rig.commands.refused[0] == ("mill", f"request {start}", "refused with exception 01H")
+        assert rig.commands.refused[0] == ("mill", f"request {start}", "answered with exception 01H")
         assert len(rig.commands.refused) < 6  # at most one record per second
 
 

@@ -12,8 +12,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from multidrop.control import CommandOutcome, CommandResult
+from multidrop import WriteForbidden
+from multidrop.control import CommandOutcome, CommandResult, result_of_failure
 from multidrop.drive import Drive
+from multidrop.gateway.commands import Admit
 from multidrop.gateway.http.rights import Caller
 from multidrop.gateway.live.hub import KeptRow, Newest
 from multidrop.gateway.modbus_server.server import ModbusServer
@@ -74,7 +76,13 @@ class FakeCommands:
         self.stopped.append((drives, caller))
         return dict.fromkeys(drives or (), await self._end(*(drives or ())))
 
-    async def write(self, drive: str, register: str, value: float, caller: Caller) -> CommandResult:
+    async def write(
+        self, drive: str, register: str, value: float, caller: Caller, admit: Admit
+    ) -> CommandResult:
+        try:
+            admit(f"{drive}.{register}")
+        except WriteForbidden as refusal:
+            return result_of_failure(refusal)
         self.written.append((drive, register, value, caller))
         return await self._end(drive)
 

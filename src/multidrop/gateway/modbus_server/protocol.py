@@ -30,6 +30,7 @@ from multidrop.drive import Carrier
 from multidrop.gateway.commands import BUSY
 from multidrop.gateway.http.rights import NOT_ALLOWED, NOT_LISTED
 from multidrop.gateway.modbus_server.line_share import PassingBusy
+from multidrop.gateway.standstill import STOOD_STILL
 
 MOST_DATA = 253  # limit, in bytes, of a function code and its data (application protocol V1.1b3, 4.1)
 _HEADER = struct.Struct(">HHHB")
@@ -134,6 +135,7 @@ _RULES: Mapping[str, ModbusCode] = {
     NOT_ALLOWED: ModbusCode.ILLEGAL_FUNCTION,
     NOT_LISTED: ModbusCode.ILLEGAL_ADDRESS,
     BUSY: ModbusCode.BUSY,
+    STOOD_STILL: ModbusCode.BUSY,
 }
 
 

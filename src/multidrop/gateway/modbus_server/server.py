@@ -33,6 +33,7 @@ from multidrop.gateway.modbus_server.unit_ids import MAIN, Unit, Units
 from multidrop.gateway.modbus_server.words import Lack
 from multidrop.gateway.modbus_server.writes import ClientWrites
 from multidrop.gateway.parts import Ask, PartContext
+from multidrop.gateway.standstill import Standstill
 
 Settings = ModbusSettings
 
@@ -66,7 +67,8 @@ class ModbusServer:
         self._ask = ask
         self._units = Units(plant, settings)
         role = Right[settings.may.upper()]
-        self._writes = ClientWrites(commands, role, "modbus", settings.common_addresses)
+        self._standstill = Standstill()
+        self._writes = ClientWrites(commands, role, "modbus", settings.common_addresses, self._standstill)
         self._shares: dict[str, LineShare] = {}
         self._sockets: dict[str, Any] = {}  # listening sockets by line
         self._listening: list[ModbusPort] = []
@@ -92,6 +94,7 @@ class ModbusServer:
             self._listening.append(port)
         while True:
             await asyncio.sleep(SWEEP_S)
+            self._standstill.note()
             for port in self._listening:
                 port.sweep()
 

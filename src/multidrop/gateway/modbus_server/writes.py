@@ -15,6 +15,7 @@ from multidrop.gateway.http.rights import Caller, Right
 from multidrop.gateway.modbus_server.common_block import STOP
 from multidrop.gateway.modbus_server.protocol import WRITES, Declined, MbapRequest, ModbusCode, code_of
 from multidrop.gateway.modbus_server.unit_ids import StopWrite, Unit
+from multidrop.gateway.standstill import Standstill
 from multidrop.supervisor import supervisor
 
 STOP_WAIT_S = 0.4  # how long a stop's answer waits for the motor: less than the usual timeout of clients
@@ -35,7 +36,8 @@ class WritingClient(Protocol):
 class ClientWrites:
     """Carries out the writes of clients that share a role and an interface, such as "modbus".
 
-    `common` has the addresses of the common block, or is None without such a block. If a write that `begin`
+    `common` has the addresses of the common block, or is None without such a block. Writes received after a
+    `standstill` are refused. If a write that `begin`
     accepted is refused later, `note_refused` is called with request, drive, reason and client.
     """
 
@@ -45,12 +47,14 @@ class ClientWrites:
         role: Right,
         way: str,
         common: range | None,
+        standstill: Standstill,
         note_refused: Callable[[MbapRequest, str, str, Any], object] = lambda *refusal: None,
     ) -> None:
         self._commands = commands
         self._role = role
         self._way = way
         self._note_refused = note_refused
+        self._admit = standstill.admit
         self._common = common or range(0)
         self._common_stop = common.start + STOP if common else None
         self._stops: dict[str, set[asyncio.Task[int]]] = {}  # stops in progress, by drive
@@ -106,9 +110,10 @@ class ClientWrites:
     ) -> int:
         """Write a register; return 0 or an exception code."""
         value = raw if register.values is not None else register.decode(raw)
-        result = await self._commands.write(unit.drive.name, register.name, value, self.caller(client))
+        name, caller = unit.drive.name, self.caller(client)
+        result = await self._commands.write(name, register.name, value, caller, self._admit)
         if isinstance(result.error, ValueError):  # includes WriteForbidden
-            self._note_refused(request, unit.drive.name, result.text, client)
+            self._note_refused(request, name, result.text, client)
         return 0 if result.ok else code_of(result.error)
 
     def _begin_stop(self, unit: Unit, client: WritingClient) -> asyncio.Task[int]:

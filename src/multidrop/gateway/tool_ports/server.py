@@ -35,6 +35,7 @@ from multidrop.gateway.modbus_server.protocol import (
 from multidrop.gateway.modbus_server.unit_ids import Unit
 from multidrop.gateway.modbus_server.writes import ClientWrites
 from multidrop.gateway.parts import Ask, PartContext
+from multidrop.gateway.standstill import Standstill
 from multidrop.gateway.tool_ports.ends import Connection, End, Terminal
 from multidrop.gateway.tool_ports.requests import EXCEPTION, RequestCutter, rtu_reply, rtu_text
 from multidrop.gateway.tool_ports.settings import RTU_EXAMPLE, ToolSettings
@@ -192,7 +193,13 @@ class ToolLine:
     """The drives of a line by address, as its tools see them."""
 
     def __init__(
-        self, line: PlantLine, hub: Hub, commands: Commands, settings: ToolSettings, ask: Ask
+        self,
+        line: PlantLine,
+        hub: Hub,
+        commands: Commands,
+        settings: ToolSettings,
+        ask: Ask,
+        standstill: Standstill,
     ) -> None:
         self.share = LineShare(LEAST_SHARE)
         self._name = line.name
@@ -202,7 +209,7 @@ class ToolLine:
         self._ask = ask
         self._timeout = settings.timeout
         role = Right[settings.may.upper()]
-        self._writes = ClientWrites(commands, role, WAY, None, self._record)
+        self._writes = ClientWrites(commands, role, WAY, None, standstill, self._record)
         self._recorded = -inf  # time of the newest record of a refused write
 
     def serve(self, request: MbapRequest, tool: Tool) -> Awaitable[bytes | None] | None:
@@ -216,7 +223,7 @@ class ToolLine:
             return self._written(unit, request, tool) if is_write else self._read(unit, request, tool)
         except Declined as declined:
             if is_write and declined.code != ModbusCode.ACKNOWLEDGE:
-                self._record(request, unit.drive.name, f"refused with exception {declined.code:02X}H", tool)
+                self._record(request, unit.drive.name, f"answered with exception {declined.code:02X}H", tool)
             return _at_once(_exception(request, declined.code))
 
     def _written(self, unit: Unit, request: MbapRequest, tool: Tool) -> Awaitable[bytes | None]:
@@ -321,7 +328,15 @@ class ToolPorts:
         self.ports: dict[str, int] = {}  # TCP ports by line
         self._plant = plant
         self._folder = folder
-        self._make = partial(ToolLine, hub=hub, commands=commands, settings=settings, ask=ask)
+        self._standstill = Standstill()
+        self._make = partial(
+            ToolLine,
+            hub=hub,
+            commands=commands,
+            settings=settings,
+            ask=ask,
+            standstill=self._standstill,
+        )
         self._terminals: dict[str, Terminal] = {}
         self._listeners: dict[str, socket.socket] = {}
         self._at_terminals: list[Tool] = []
@@ -348,6 +363,7 @@ class ToolPorts:
             self._accept_on(line)
         while True:
             await asyncio.sleep(SWEEP_S)
+            self._standstill.note()
             for tools in self._tools.values():
                 self._sweep(tools, loop.time())
 
