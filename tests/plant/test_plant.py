@@ -464,6 +464,11 @@ def test_arguments_that_the_family_refuses_are_each_reported(mistakes: Mistakes)
     ]
 
 
+def test_a_path_that_is_too_long_is_reported_as_a_mistake() -> None:
+    with pytest.raises(PlantError, match="the plant file cannot be read: File name too long"):
+        load_plant("x" * 5000)
+
+
 def test_an_unreadable_plant_file_is_reported_as_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(
         PlantError, match=r"none.toml: the plant file cannot be read: No such file or directory"
