@@ -17,7 +17,7 @@ from types import FrameType, SimpleNamespace
 from typing import Any
 
 import pytest
-from examples import in_turn, usually
+from examples import first_in_ci, in_turn, usually
 from interruptions import calling_at, failing_at, interrupted_at
 from motors import MAKE
 from own_drives import Fan
@@ -99,7 +99,7 @@ def check_failing(
 
 @pytest.mark.parametrize("failure", [KeyboardInterrupt, MemoryError])
 @pytest.mark.parametrize("all_of_them", usually(False, True))
-@pytest.mark.parametrize("step", [1999, pytest.param(67, marks=[pytest.mark.slow, pytest.mark.long])])
+@pytest.mark.parametrize("step", [*usually(1999, 331), pytest.param(67, marks=pytest.mark.nightly)])
 def test_a_stop_that_fails_at_any_opcode_is_sent_and_leaves_nothing_behind(
     failure: type[BaseException], all_of_them: bool, step: int
 ) -> None:
@@ -431,7 +431,7 @@ def check_stops(monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # raised when the script ends
 @pytest.mark.usefixtures("_unbounded")
-@pytest.mark.parametrize("step", [37, pytest.param(11, marks=pytest.mark.long)])
+@pytest.mark.parametrize("step", first_in_ci(37, 11))
 @pytest.mark.parametrize(("family", "failure"), in_turn(FAMILIES, [*FAILURES]))
 def test_a_motor_is_stopped_although_its_stop_fails_at_any_line(
     monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step: int

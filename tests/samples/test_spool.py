@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 import spooled
-from examples import first_in_ci, usually
+from examples import first_in_ci
 from interruptions import full_at, read_only_directory
 from kills import BoundProcess
 from lines import until
@@ -189,7 +189,7 @@ def test_files_are_synced_before_they_are_renamed(folder: Path, monkeypatch: pyt
 
 @pytest.mark.long
 @pytest.mark.slow
-@pytest.mark.parametrize(("kills", "longest_s"), usually((2, 0.1), (12, 0.6)))
+@pytest.mark.parametrize(("kills", "longest_s"), first_in_ci((3, 0.2), (12, 0.6)))
 def test_kills_at_any_moment_lose_no_reported_row(folder: Path, kills: int, longest_s: float) -> None:
     """Each run starts at another number. All reported rows are stored once, in order, without gaps."""
     dice = random.Random(kills)

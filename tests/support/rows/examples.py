@@ -17,18 +17,18 @@ def examples(number: int) -> int:
 
 def usually(tried: object, *others: object) -> list[Any]:
     """Return the arguments as pytest parameters; all but the first are marked `long`."""
-    return [tried, *(_long(other) for other in others)]
+    return [tried, *(_marked(other, pytest.mark.long) for other in others)]
 
 
 def first_in_ci(tried: object, *others: object) -> list[Any]:
     """Return the arguments as pytest parameters; all but the first are marked `nightly`."""
-    return [tried, *(pytest.param(other, marks=pytest.mark.nightly) for other in others)]
+    return [tried, *(_marked(other, pytest.mark.nightly) for other in others)]
 
 
 def in_turn(each: Iterable[object], cases: Sequence[object]) -> list[Any]:
     """Return all pairs of `each` and `cases`; for each entry of `each`, all but one are marked `long`."""
     return [
-        (one, case) if number % len(cases) == nth else _long((one, case))
+        (one, case) if number % len(cases) == nth else _marked((one, case), pytest.mark.long)
         for number, one in enumerate(each)
         for nth, case in enumerate(cases)
     ]
@@ -57,6 +57,6 @@ def _case_id(case: object) -> str:
     return "-".join(getattr(part, "__name__", str(part)) for part in parts)
 
 
-def _long(other: object) -> Any:
+def _marked(other: object, mark: pytest.MarkDecorator) -> Any:
     values = other if isinstance(other, tuple) else (other,)
-    return pytest.param(*values, marks=pytest.mark.long)
+    return pytest.param(*values, marks=mark)
