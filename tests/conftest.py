@@ -51,8 +51,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 @pytest.hookimpl(optionalhook=True)  # of xdist
 def pytest_xdist_auto_num_workers() -> int:
-    """Return the number of workers: one per processor and one more, because some tests wait; at most 12."""
-    return min(len(os.sched_getaffinity(0)) + 1, 12)
+    """Return the number of workers: two per processor, because many tests wait; at most 12."""
+    return min(2 * len(os.sched_getaffinity(0)), 12)
 
 
 @pytest.hookimpl(optionalhook=True)  # of xdist

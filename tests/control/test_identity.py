@@ -10,7 +10,7 @@ from unittest.mock import patch
 import pytest
 from examples import usually
 from lines import line, plant, polled, until
-from motors import MAKE, ReceivedRequests
+from motors import MAKE, ReceivedRequests, at_highest_rate
 from simulated_bus import SimulatedBus, is_write, one
 from stop_frames import STOPS, first, writes
 from tables import table
@@ -35,16 +35,17 @@ GOODRIVE = 0x010A  # device code of another INVT series; a CHE has 0101H
 @contextmanager
 def known(model: str) -> Iterator[tuple[Bus, Any, ReceivedRequests]]:
     """Yield a bus with one drive whose identity is confirmed, the drive, and the requests it receives."""
-    sim = simulated(MAKE[model](1))
+    with at_highest_rate(model):
+        sim, drive = simulated(MAKE[model](1)), MAKE[model](1)
     assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.1
     received = ReceivedRequests(sim)
     with (
-        patch.object(peers, "LEAST_TIMEOUT", 0.3),  # s, for a busy machine
+        patch.object(peers, "LEAST_TIMEOUT", 1.0),  # s, for a busy machine
         Simulator([Wire([sim], unpaced=True)]) as simulator,
         Bus(simulator.wires[0].path) as bus,
     ):
-        drive = bus.attach(MAKE[model](1))
+        bus.attach(drive)
         bus.check_identity(drive)
         yield bus, drive, received
 

@@ -36,7 +36,6 @@ from lines import plant, polled
 from motors import quick
 from responder import Responder, ResponderLine
 from responder_drives import KINDS, ResponderDrive
-from tables import table
 
 from multidrop.bus import Bus
 from multidrop.control.ramp import start_staggered
@@ -384,7 +383,7 @@ def test_a_stop_during_a_start_wins_at_each_of_its_first_exchanges(kind: str) ->
         machine.teardown()
 
 
-@table("kind", KINDS)
+@pytest.mark.parametrize("kind", usually(*KINDS))
 def test_a_start_that_no_stop_ends_turns_the_motor(kind: str) -> None:
     """Without this test, the tests above could pass although no start is ever sent."""
     machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})()

@@ -12,7 +12,7 @@ import pytest
 from examples import in_turn, usually
 from lines import PATIENCE, LateWire, plant, polled, until
 from lines import line as declared_line
-from motors import MAKE, ReceivedRequests
+from motors import MAKE, ReceivedRequests, at_highest_rate
 from tables import table
 
 from multidrop.bus import Bus
@@ -40,7 +40,8 @@ class Delayed(LateWire):
 
 @contextmanager
 def line(model: str) -> Iterator[tuple[Bus, Any, ReceivedRequests, Delayed]]:
-    drive = MAKE[model](1)
+    with at_highest_rate(model):
+        drive = MAKE[model](1)
     sim = simulated(drive)
     assert isinstance(sim, MotorDrive)
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.2

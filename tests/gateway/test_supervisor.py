@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from brokers import end_paho_soon
 from examples import usually
 from gateways import Served, running, served, simulated_plant
 from lines import PATIENCE, until
@@ -60,10 +61,10 @@ def test_no_other_module_of_the_gateway_starts_a_task_or_a_thread() -> None:
 
 @pytest.fixture
 def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
-    require_module("paho.mqtt.client")
     require_module("nats")
     monkeypatch.setattr(historian, "LOOK_S", 0.02)
-    with served(tmp_path, PARTS) as gateway:
+    with pytest.MonkeyPatch.context() as paho, served(tmp_path, PARTS) as gateway:
+        end_paho_soon(paho)
         gateway.await_state("pump-1", "stands")
         until(lambda: gateway.get("/health").json["newest_row"])
         yield gateway

@@ -112,7 +112,7 @@ def test_a_failure_on_one_line_does_not_affect_other_lines(
     failure: BaseException,
 ) -> None:
     for name in ("RETRY_NS", "LONGEST_RETRY_NS"):  # pauses that allow a batch of misses before each retry
-        monkeypatch.setattr(polled_line, name, 400_000_000)
+        monkeypatch.setattr(polled_line, name, 200_000_000)
     two.until(("ill", "ok"), ("well", "ok"))
     with monkeypatch.context() as broken:
         broken.setattr(kind, method, of_line("ill", getattr(kind, method), failure))

@@ -15,6 +15,7 @@ from examples import usually
 from lines import line, plant, polled, rows_of, until
 from tables import table
 
+from multidrop import poller as poller_module
 from multidrop.core import Framing, Message, build_reply, parse_request
 from multidrop.drive import Drive
 from multidrop.drive.register import HOLDING, reading
@@ -136,12 +137,15 @@ def test_a_stop_reopens_a_lost_port_after_the_poller_has_failed(
 
 
 @contextmanager
-def server(is_last: Callable[[int, int], bool], idle_s: float | None = None) -> Iterator[str]:
+def server(
+    is_last: Callable[[int, int], bool], idle_s: float | None = None, closes: list[bytes] | None = None
+) -> Iterator[str]:
     """Serve Modbus TCP to one client at a time. Close the connection after the nth request if `is_last(nth,
     address)` is True, and if no request comes for `idle_s` s.
 
     The number n starts at 1 for each connection. Each register's value is its address. At a request for the
-    address `DEADLY`, the server closes the connection without a reply.
+    address `DEADLY`, the server closes the connection without a reply. For each idle connection that it
+    closes, the server adds to `closes` the request that came just before, or else b"".
     """
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
@@ -161,7 +165,12 @@ def server(is_last: Callable[[int, int], bool], idle_s: float | None = None) -> 
                     connection, _ = listener.accept()
                     connection.settimeout(idle_s)
                     with connection, suppress(OSError):
-                        serve(connection)
+                        try:
+                            serve(connection)
+                        except TimeoutError:
+                            connection.shutdown(socket.SHUT_RDWR)
+                            if closes is not None:
+                                closes.append(connection.recv(64))
 
         thread = threading.Thread(target=accept, daemon=True)
         thread.start()
@@ -184,10 +193,13 @@ class Scattered(Drive):
 
 @table("every", [None, 0.1])
 @table("most", [1, 2, 3])
-def test_every_register_is_read_although_connections_end_early(every: float | None, most: int) -> None:
+def test_every_register_is_read_although_connections_end_early(
+    every: float | None, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """An interrupted request is the first one on the next connection, unless it was also the first on the old
     one.
     """
+    monkeypatch.setattr(poller_module, "LOOK_NS", 5_000_000)  # notice each lost port soon
     seen = Counter[tuple[str, float | None]]()
     with server(lambda nth, address: nth == most) as port:
         drive = polled(Scattered(1, name="pump"), list(Scattered.registers.values()), every)
@@ -201,16 +213,22 @@ def test_every_register_is_read_although_connections_end_early(every: float | No
     assert {name for name, _ in seen} == {"near", "far"}
 
 
+@pytest.mark.usefixtures("_patient")
 def test_a_connection_that_its_peer_closes_between_slow_polls_costs_no_value() -> None:
-    """Reported as home-assistant/core#101982 and zivillian/esp32-modbus-gateway#2."""
-    with server(lambda nth, address: False, idle_s=0.05) as port:
-        drive = polled(Scattered(1, name="pump"), [Scattered.registers["near"]], 0.3)
+    """Reported as home-assistant/core#101982 and zivillian/esp32-modbus-gateway#2.
+
+    On a busy machine the server may close late, after the next request. Only that request may fail.
+    """
+    closes: list[bytes] = []
+    with server(lambda nth, address: False, idle_s=0.02, closes=closes) as port:
+        drive = polled(Scattered(1, name="pump"), [Scattered.registers["near"]], 0.1)
         with Poller(plant(line(port, drive))) as poller:
             rows: list[Row] = []
 
             def look() -> bool:
                 rows.extend(rows_of(poller))
-                return len(rows) >= 4
+                return closes.count(b"") >= 3 and [row.status for row in rows].count("ok") >= 4
 
             until(look)
-    assert {row.status for row in rows} == {"ok"}
+    late_closes = len(closes) - closes.count(b"")
+    assert sum(row.status != "ok" for row in rows) <= late_closes

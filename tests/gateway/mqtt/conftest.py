@@ -7,11 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from brokers import FAN, PLAIN_FAN, Broker, Host, Listener, Running, inside, mosquitto
+from brokers import FAN, PLAIN_FAN, Broker, Host, Listener, Running, end_paho_soon, inside, mosquitto
 from peers import require_module
 
 from multidrop.gateway.mqtt.part import build
 from multidrop.gateway.mqtt.settings import MqttSettings
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _paho() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        end_paho_soon(patch)
+        yield
 
 
 @pytest.fixture

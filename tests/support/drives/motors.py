@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from unittest.mock import patch
 
 from own_drives import Fan
 
@@ -37,10 +39,19 @@ DELIXI_WRITES = (2, 4, 5, 6)
 
 
 def quick(kind: str) -> type[Drive]:
-    """Return the family with all line silences set to 0, because responders need none."""
+    """Return the family at its highest baud rate, and without silences, because responders need none."""
     family = FAMILIES[kind]
-    without = {"silence": 0.0, "silence_characters": 0.0, "response_delay_characters": 0.0}
-    return type(family.__name__, (family,), without)
+    changes = {"silence": 0.0, "silence_characters": 0.0, "response_delay_characters": 0.0}
+    rates = tuple(sorted(family.baudrates, reverse=True))  # the first is the default
+    return type(family.__name__, (family,), {**changes, "baudrates": rates})
+
+
+@contextmanager
+def at_highest_rate(model: str) -> Iterator[None]:
+    """Use the family's highest baud rate by default, because exchanges wait for the time of their bits."""
+    rates = sorted(MODELS[model].baudrates, reverse=True)
+    with patch.object(MODELS[model], "baudrates", tuple(rates)):
+        yield
 
 
 class ReceivedRequests:

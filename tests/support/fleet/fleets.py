@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from multidrop import YD1000, Bus
+from motors import quick
+
+from multidrop import Bus
 from multidrop.control import commands, read_audit, written_before
 from multidrop.fleet.commands.desk import CommandDesk, StopDesk
 from multidrop.fleet.commands.held_lines import HeldLines
@@ -304,10 +306,11 @@ def _patiently(patience_s: float) -> AbstractContextManager[Any]:
 def desks(
     folder: Path, may: Mapping[str, Any] = MAY, patience_s: float = PATIENCE_S, name: str = "pump"
 ) -> Iterator[Desks]:
-    sim = simulated(YD1000(address=1, name=name))
+    family = quick("yd1000")
+    sim = simulated(family(address=1, name=name))
     audit = folder / "audit.jsonl"
     with Simulator([Wire([sim], unpaced=True)]) as line, Bus(line.wires[0].path, audit=audit) as bus:
-        bus.attach(YD1000(address=1, name=name))
+        bus.attach(family(address=1, name=name))
         made = Desks(bus, sim, folder, may)
         try:
             with _patiently(patience_s):

@@ -18,6 +18,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
+import pytest
 from peers import require_module, require_program
 
 from multidrop import Drive, InvtCHE, Plant, PlantLine, Polled, PolledDrive
@@ -29,6 +30,13 @@ from multidrop.gateway.parts import PartContext
 
 PATIENCE_S = 30.0  # longest wait for an event that is immediate on an idle machine
 TRIALS = 5
+
+
+def end_paho_soon(patch: pytest.MonkeyPatch) -> None:
+    """Let paho's thread end within 20 ms while it pauses between connections; its own limit is 1 s."""
+    require_module("paho.mqtt.client")
+    short = SimpleNamespace(**{**vars(time), "sleep": lambda seconds: time.sleep(min(seconds, 0.02))})
+    patch.setattr("paho.mqtt.client.time", short)
 
 
 def free_port() -> int:
@@ -69,7 +77,7 @@ class Broker:
             if self.process.poll() is not None:
                 raise EndedAtOnce("the broker ended at once")
             assert time.monotonic() < ends, "the broker does not listen"
-            time.sleep(0.02)
+            time.sleep(0.005)
 
     def signal(self, number: int) -> None:
         os.kill(self.process.pid, number)
@@ -137,7 +145,7 @@ class Listener:
         self._probe, self._hears = topic.replace("#", "probe"), threading.Event()
         self._thread = threading.Thread(target=self._read)
         self._thread.start()
-        while not self._hears.wait(0.05):  # until the broker has confirmed the subscription
+        while not self._hears.wait(0.01):  # until the broker has confirmed the subscription
             publish(broker, self._probe, b"probe")
 
     def _read(self) -> None:
