@@ -245,7 +245,8 @@ VIEWS = ("#/drives", "#/drives/pump-1", "#/trends", "#/faults", "#/lines", "#/lo
 NARROW = {"width": 360, "height": 780}
 STOP_ALL = {"en": "Stop all", **TEXTS["Stop all"]}
 LIVE = {"en": "live", **TEXTS["live"]}
-# Return two lists: visible texts and attributes, without the plant's names; elements that are too wide.
+# Return two lists: visible texts and attributes, without the plant's names; elements that are too wide, and
+# words of drives' names and of outcomes that are broken into two lines.
 READ = """() => {
   const attributes = ["title", "aria-label", "placeholder", "data-head"];
   const visible = element => element.checkVisibility({ visibilityProperty: true });
@@ -257,10 +258,22 @@ READ = """() => {
   for (const name of attributes)
     for (const element of document.querySelectorAll(`[${name}]`))
       if (visible(element)) texts.push(element.getAttribute(name));
-  const wide = [...document.querySelectorAll("html, body, main, dialog, button, .card")].filter(
+  const wide = [...document.querySelectorAll("html, body, main, nav, dialog, button, .card")].filter(
     element => visible(element) && element.scrollWidth > element.clientWidth + 1,
   );
-  return [texts, wide.map(element => `${element.tagName} ${element.className} ${element.textContent}`)];
+  const broken = [];
+  for (const element of document.querySelectorAll("td.name a, .audit .words")) {
+    const nodes = document.createTreeWalker(element, NodeFilter.SHOW_TEXT);
+    while (nodes.nextNode())
+      for (const { 0: word, index } of nodes.currentNode.data.matchAll(/[\\p{L}\\d]+/gu)) {
+        const range = new Range();
+        range.setStart(nodes.currentNode, index);
+        range.setEnd(nodes.currentNode, index + word.length);
+        if (visible(element) && range.getClientRects().length > 1) broken.push(`broken word: ${word}`);
+      }
+  }
+  const said = wide.map(element => `too wide: ${element.tagName} ${element.textContent}`);
+  return [texts, [...said, ...broken]];
 }"""
 
 

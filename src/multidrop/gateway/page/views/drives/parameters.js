@@ -42,11 +42,11 @@ function shown(drive, found) {
     { type: "button", onclick: () => ask(drive, { read: 1 }) },
     found.state === "read" ? t("Read again") : t("Read all parameters"),
   );
-  if (found.state === "failed") return [note(said(found.error)), button];
-  if (found.state !== "read") return [button];
+  if (found.state === "failed") return [note(said(found.error)), acts(button)];
+  if (found.state !== "read") return [acts(button)];
   return [
     note(t("{n} parameters, read at {time}.", { n: found.parameters.length, time: found.saved })),
-    make("div", { class: "acts" }, button, ...FORMATS.map(format => file(drive, format))),
+    acts(button, ...FORMATS.map(format => file(drive, format))),
     make(
       "table",
       { class: "plain" },
@@ -55,6 +55,8 @@ function shown(drive, found) {
     ),
   ];
 }
+
+const acts = (...buttons) => make("div", { class: "acts" }, buttons);
 
 const note = text => make("p", { class: "note" }, text);
 

@@ -62,8 +62,12 @@ export function build(drive) {
         name,
       ),
     ),
-    make("a", { id: "panel-csv", download: true }, "CSV"),
-    make("a", { href: `#/trends?drive=${encodeURIComponent(drive.name)}` }, t("Trends")),
+    make(
+      "span",
+      { class: "links" },
+      make("a", { id: "panel-csv", download: true }, "CSV"),
+      make("a", { href: `#/trends?drive=${encodeURIComponent(drive.name)}` }, t("Trends")),
+    ),
   );
   return make(
     "section",
