@@ -90,6 +90,8 @@ MISTAKES = {
     "": "column 1: a number, a name or ( is missing before the end",
     "current +": "column 10: a number, a name or ( is missing before the end",
     "current $ 2": "column 9: '$' is neither a number, a name nor an operator",
+    "current = 2": "column 9: '=' is neither a number, a name nor an operator; write ==",
+    "status && 1": "column 8: '&' is neither a number, a name nor an operator; write and",
     "current 2": "column 9: an operator is missing before '2'",
     "(current": "column 9: ')' is missing before the end",
     "1 < current < 3": "column 13: comparisons cannot be chained; write (a < b) and (b < c)",

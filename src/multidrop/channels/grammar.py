@@ -79,6 +79,10 @@ _TOKEN = re.compile(
 )
 
 
+# operators of other languages, and what to write in place of them
+_INSTEAD = {sign: f"; write {word}" for sign, word in (("=", "=="), ("&", "and"), ("|", "or"), ("!", "not"))}
+
+
 class _Token(NamedTuple):
     kind: str
     text: str
@@ -91,7 +95,9 @@ def _tokens(text: str) -> Iterator[_Token]:
         found = _TOKEN.match(text, at)
         if found is None:
             place = at + len(text[at:]) - len(text[at:].lstrip())
-            raise ExpressionError(place + 1, f"{text[place]!r} is neither a number, a name nor an operator")
+            hint = _INSTEAD.get(text[place], "")
+            sentence = f"{text[place]!r} is neither a number, a name nor an operator{hint}"
+            raise ExpressionError(place + 1, sentence)
         kind = found.lastgroup or ""
         yield _Token(kind, found[kind], found.start(kind) + 1)
         if kind == "end":
