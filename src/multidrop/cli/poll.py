@@ -95,6 +95,8 @@ def run(arguments: argparse.Namespace) -> int:
     plant = plant_of(arguments.plant, arguments)
     plant = replace(plant, realtime=arguments.realtime or plant.realtime)
     plant, triggering = triggering_of(plant, arguments)
+    if "key" in arguments.trigger and (arguments.json or not is_possible()):
+        raise ValueError("--trigger key needs a terminal for the key t; without one, give a condition")
     return conclude(plant, follow(plant, arguments, triggering or rotation), arguments)
 
 
