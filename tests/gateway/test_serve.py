@@ -211,8 +211,8 @@ def test_serve_check_reports_mistakes(run: Run, tmp_path: Path) -> None:
     status, out, errors = run("serve", "--check", plant.path)
     assert (status, out) == (2, "")
     assert errors.splitlines() == [
-        f'multidrop: {plant.path}: [serve]: listen = 80 is not right; write listen = "127.0.0.1:8750"',
-        f'multidrop: {plant.path}: [serve.may]: stop = 1 is not right; write stop = "token"',
+        f'multidrop: {plant.path}:18: [serve]: listen = 80 is not right; write listen = "127.0.0.1:8750"',
+        f'multidrop: {plant.path}:20: [serve.may]: stop = 1 is not right; write stop = "token"',
     ]
     plant.path.write_text(plant.path.read_text().replace("address = 2", "address = 1"))
     _, _, also = run("serve", "--check", plant.path)
