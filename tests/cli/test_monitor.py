@@ -15,6 +15,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from io import BytesIO, StringIO, TextIOWrapper
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
@@ -422,7 +423,7 @@ def test_a_key_whose_bytes_arrive_separately_is_one_key(
     with open(end, closefd=True) as stdin:  # noqa: PTH123
         monkeypatch.setattr(sys, "stdin", stdin)
         with terminal_keys() as wait_for_key:
-            monkeypatch.setattr(select, "select", wait)
+            monkeypatch.setattr("multidrop.cli.monitor.select", SimpleNamespace(select=wait))
             assert [wait_for_key(PATIENCE) for _ in pressed] == pressed
     os.close(terminal)
 

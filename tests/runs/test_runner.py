@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import pytest
@@ -445,7 +446,7 @@ def test_a_simulation_speed_does_not_shorten_the_waits_of_other_threads(
 ) -> None:
     """Another thread may ramp a real motor."""
     waits: list[float] = []
-    monkeypatch.setattr(time, "sleep", waits.append)
+    monkeypatch.setattr(clock, "time", SimpleNamespace(**vars(time) | {"sleep": waits.append}))
     with clock.at_speed(10.0):
         clock.sleep(5.0)
         other = threading.Thread(target=clock.sleep, args=[5.0])

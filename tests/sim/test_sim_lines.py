@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import select
 import signal
 import socket
 import struct
@@ -14,6 +13,7 @@ import time
 from contextlib import ExitStack
 from multiprocessing.connection import Connection
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import checksums
@@ -290,7 +290,7 @@ def test_ended_simulator_thread_logs_its_failure(
     def fail(*details: object) -> None:
         raise Ill("of select")
 
-    monkeypatch.setattr(select, "select", fail)
+    monkeypatch.setattr("multidrop.sim.simulator.select", SimpleNamespace(select=fail))
     simulator.__enter__()
     until(lambda: isinstance(simulator.failure, Ill))
     with pytest.raises(Ill, match="of select"):
