@@ -107,7 +107,7 @@ def test_a_third_signal_within_a_second_ends_the_wait_with_a_message(
 ) -> None:
     now = 1000.0
     monkeypatch.setattr("multidrop.control.exit_hook.time.monotonic", lambda: now)
-    hook, act = ExitHook(), Act()
+    hook, act, others = ExitHook(), Act(), exit_threads()
     made = hook.add(act.begin, act.work)
     for _ in range(5):  # signals that are 0.7 s apart never end the wait
         signal.raise_signal(signal.SIGINT)
@@ -121,7 +121,7 @@ def test_a_third_signal_within_a_second_ends_the_wait_with_a_message(
     assert capfd.readouterr().err == f"multidrop: {CUT_SHORT}\n"
     hook.finish(made)  # no longer waits for the act
     act.go_on.set()
-    until(lambda: not threading_names() & {"multidrop exit"})
+    until(lambda: exit_threads() <= others)
     assert len(caught) == 1
 
 
@@ -133,7 +133,7 @@ def test_a_third_signal_ends_the_wait_even_if_stderr_is_closed(
     def write(fd: int, data: bytes) -> int:
         raise OSError(errno.EIO, "Input/output error")
 
-    hook, act = ExitHook(), Act()
+    hook, act, others = ExitHook(), Act(), exit_threads()
     made = hook.add(act.begin, act.work)
     monkeypatch.setattr("multidrop.control.exit_hook.os.write", write)
     for _ in range(3):
@@ -141,7 +141,7 @@ def test_a_third_signal_ends_the_wait_even_if_stderr_is_closed(
     assert caught == [signal.SIGINT]
     hook.finish(made)
     act.go_on.set()
-    until(lambda: not threading_names() & {"multidrop exit"})
+    until(lambda: exit_threads() <= others)
 
 
 def test_repeated_hang_up_signals_do_not_end_the_wait(caught: list[int]) -> None:
@@ -175,8 +175,9 @@ def test_sighup_is_not_handled_if_the_program_handles_or_ignores_it(caught: list
         signal.signal(signal.SIGHUP, before)
 
 
-def threading_names() -> set[str]:
-    return {thread.name for thread in threading.enumerate()}
+def exit_threads() -> set[threading.Thread]:
+    """Return the threads of all hooks that are running their actions."""
+    return {thread for thread in threading.enumerate() if thread.name == "multidrop exit"}
 
 
 def test_a_failing_action_at_exit_does_not_delay_others(

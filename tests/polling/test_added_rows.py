@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from lines import line, plant, rows_of, until
+from lines import line, patient, plant, rows_of, until
 from peers import preloaded
 from recordings import recorded
 from toy import Toy
@@ -103,6 +103,7 @@ def test_an_invalid_comment_is_refused(port: str, text: str) -> None:
         poller.mark(text)
 
 
+@patient
 def test_totals_continue_exactly_after_a_restart(port: str, tmp_path: Path) -> None:
     made = replace(plant(line(port, pump(CHARGE))), totals=tmp_path / "totals.json")
     rows = polled_rows(made)
@@ -192,6 +193,7 @@ def test_a_channel_is_not_computed_if_its_register_is_not_polled(
     assert 'drive "pump-2", channel "other"' in caplog.text
 
 
+@patient
 def test_damaged_totals_start_at_0(port: str, tmp_path: Path) -> None:
     for content in ("", "[", "[]", '{"pump-1.charge": {"totals": [[1e999]]}}'):
         (tmp_path / "totals.json").write_text(content)

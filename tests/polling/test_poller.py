@@ -280,6 +280,7 @@ def test_calls_of_one_line_do_not_cause_checks_of_the_others(monkeypatch: pytest
     assert len(looks) <= len(lines) * (seconds * 1e9 / poller_module.LOOK_NS + 2)
 
 
+@pytest.mark.usefixtures("_patient")
 def test_commands_are_carried_out_while_the_line_is_polled(port: str, pump: SimulatedDrive) -> None:
     with Polling(line(port, polled(drive(), READINGS), name="hall-1")) as polling:
         bus = polling.poller.bus("hall-1")

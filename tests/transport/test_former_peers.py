@@ -83,7 +83,7 @@ def test_a_late_reply_on_a_reopened_port_is_not_read_as_another_register(
         pump = bus.attach(family, 1)
         assert bus.peer(pump).owes
         assert pump.read(family.output_current) == 1.11
-        assert bus.peer(pump).late == 1
+        assert bus.peer(pump).late >= 1  # more if an earlier reply was late too, as on a busy computer
 
 
 def test_a_late_reply_on_a_reopened_port_is_not_polled_as_another_register(wire: HoldingWire) -> None:

@@ -161,3 +161,4 @@ def test_records_waiting_for_a_hanging_handler_are_bounded(monkeypatch: pytest.M
     finally:
         handler.released.set()
         logger.removeHandler(handler)
+        flush(PATIENCE)  # no record may appear during a later test

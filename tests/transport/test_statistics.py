@@ -262,6 +262,7 @@ def test_a_poller_counts_its_rows_by_status(toy: SimulatedDrive) -> None:
     assert poller.statistics()["line"].exchanges == 0
 
 
+@pytest.mark.usefixtures("_patient")
 def test_renamed_and_replaced_drives_are_counted_since_the_reset(toy: SimulatedDrive) -> None:
     """Otherwise one drive would have earlier counts, and another drive negative ones."""
     others = [simulated(Toy(address, name=f"toy-{address}")) for address in (2, 3)]

@@ -109,6 +109,7 @@ def port() -> Iterator[str]:
         yield line.wires[0].path
 
 
+@pytest.mark.usefixtures("_patient")
 def test_a_drive_uses_the_ports_framing_while_it_is_attached(port: str) -> None:
     drive = InnovertIBD(1)
     with Bus(port) as bus:
@@ -368,6 +369,7 @@ def test_a_read_raises_if_the_peer_closes_before_any_reply() -> None:
         assert len(asked) == 1
 
 
+@pytest.mark.usefixtures("_patient")
 def test_a_write_is_not_repeated_on_a_reopened_port() -> None:
     with closing_peer(1) as (port, asked), Bus(port) as bus:
         drive = bus.attach(TwoBlocks(1))

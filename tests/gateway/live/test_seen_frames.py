@@ -8,7 +8,8 @@ import socket
 import subprocess
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from http.client import HTTPResponse
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -132,14 +133,10 @@ def held_up(gateway: Served, path: str, body: object) -> Iterator[socket.socket]
 def answer(client: socket.socket, last: bytes = b"}") -> str:
     """Send the last byte of a request, and return the gateway's answer."""
     client.sendall(last)
-    with client.makefile("rb") as received:
-        assert received.readline().startswith(b"HTTP/1.1 200 ")
-        length = next(
-            int(line.partition(b":")[2]) for line in received if line.startswith(b"content-length:")
-        )
-        while received.readline().strip():
-            pass
-        told = json.loads(received.read(length))
+    with closing(HTTPResponse(client)) as response:  # in chunks if the stop takes longer than usual
+        response.begin()
+        assert response.status == 200
+        told = json.loads(response.read())
     return str(told.get("text") or told["pump-1"]["text"])
 
 

@@ -141,7 +141,8 @@ class RecordingMastership:
         self.lines: RecordingLines | None = None
 
     def extend(self, until_ns: int) -> None:
-        assert until_ns > self.clock(), "armed at a time that is past"
+        if until_ns <= self.clock():  # this process was suspended after the caller read the clock
+            raise ValueError("armed at a time that is past")
         assert until_ns >= self.until, "went backwards"
         self.until = until_ns
         if self.events[-1:] != ["extend"]:
