@@ -202,6 +202,7 @@ async def test_a_stop_without_effect_ends_with_the_outcome_unknown(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("_patient")
 async def test_a_motor_is_stopped_if_no_thread_can_be_started(threads: Threads, tmp_path: Path) -> None:
     with desks(tmp_path) as desk:
         stopped = await desk.stop(drives=["pump"])

@@ -143,6 +143,7 @@ def test_a_stop_after_an_idle_time_is_sent_without_reading_first(model: str) -> 
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("_turns_awaited")
 @pytest.mark.parametrize("model", MAKE)
 def test_a_stop_of_a_silent_drive_is_sent_without_reading_first(model: str) -> None:
     with known(model) as (bus, drive, received):
@@ -229,6 +230,7 @@ def test_a_setpoint_that_was_written_through_another_bus_is_not_known(model: str
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("_turns_awaited")
 @pytest.mark.parametrize("model", ["innovert-ibd", "delixi-native"])
 def test_a_setpoint_is_kept_if_one_reply_was_lost(model: str) -> None:
     with known(model) as (bus, drive, received):
