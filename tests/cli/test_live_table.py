@@ -128,7 +128,8 @@ WIDE_NAME = "\u4e3b\u6cf5-1"  # its first two characters take two columns each
 def size(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Return the terminal's columns and lines, in a list that a test may change."""
     found = [80, 24]
-    monkeypatch.setattr("multidrop.cli.poll.shutil.get_terminal_size", lambda: os.terminal_size(found))
+    terminal = SimpleNamespace(get_terminal_size=lambda: os.terminal_size(found))
+    monkeypatch.setattr("multidrop.cli.poll.shutil", terminal)  # pytest uses shutil's own function
     return found
 
 

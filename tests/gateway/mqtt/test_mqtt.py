@@ -48,6 +48,14 @@ def now_ms() -> int:
     return time.time_ns() // 1_000_000
 
 
+def now_on_both_clocks() -> tuple[int, int]:
+    """Return the UTC in ms and CLOCK_BOOTTIME in ns, read within 10 ms."""
+    while True:
+        boot_ns, utc_ms = boottime_ns(), now_ms()
+        if boottime_ns() - boot_ns < 10_000_000:
+            return utc_ms, boot_ns
+
+
 def test_newest_values_are_published_as_retained_messages(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
@@ -371,9 +379,9 @@ def test_command_older_than_a_reload_is_refused(broker: Broker, listener: Listen
     """After a reload, the name may mean another drive."""
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
-    sent_ms = now_ms()
     for after_ms, text in ((1900, "not sent: it may have been sent before the plant"), (2500, "done")):
-        known.commands.plant_ns = boottime_ns() - after_ms * 1_000_000
+        sent_ms, sent_ns = now_on_both_clocks()
+        known.commands.plant_ns = sent_ns - after_ms * 1_000_000
         publish(broker, "multidrop/pump-1/set/setpoint", write_of(25, sent_ms))
         assert told(listener)["text"].startswith(text)
 
@@ -385,8 +393,8 @@ def test_command_older_than_a_stop_is_refused(
     """A broker may deliver a delayed command after the stop. The sender's clock may be up to 2 s fast."""
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
-    sent_ms = now_ms()
-    known.commands.stopped_at["pump-1"] = boottime_ns() - after_ms * 1_000_000
+    sent_ms, sent_ns = now_on_both_clocks()
+    known.commands.stopped_at["pump-1"] = sent_ns - after_ms * 1_000_000
     for topic, payload in (
         ("act", {"verb": "start", "drive": "pump-1", "time": sent_ms}),
         ("set/setpoint", {"value": 25, "time": sent_ms}),
