@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from ipaddress import ip_address
 from pathlib import Path
+from string import ascii_lowercase, digits
 from typing import Any, TypeVar
 
 from multidrop.printable import did_you_mean, is_number, masked, nearest_names, printable
@@ -229,6 +230,7 @@ DURATION: Mapping[str, Any] = {
 }
 SIZE: Mapping[str, Any] = {"pattern": r"^\s*\d+(\.\d+)?\s*(kB|MB|GB|TB)\s*$"}
 ASCENDING: Mapping[str, Any] = {"allOf": [{"$ref": "#/definitions/ascending"}]}  # see `ascending`
+DISTINCT: Mapping[str, Any] = {"allOf": [{"$ref": "#/definitions/distinct"}]}  # see `distinct`
 PORT_NUMBER = r"([0-9]{1,4}|[1-5][0-9]{4}|6[0-4][0-9]{3}|65[0-4][0-9]{2}|655[0-2][0-9]|6553[0-5])"
 _IPV6 = r"\[?[0-9A-Fa-f.]*:[0-9A-Fa-f:.]*(%[^\s\]]+)?\]?"
 _HOST_NAME = r"([A-Za-z0-9_-]+\.)*[0-9]*[A-Za-z_-][A-Za-z0-9_-]*\.?"  # its last label is not only digits
@@ -251,6 +253,32 @@ def ascending() -> dict[str, Any]:
                 "then": {"items": [{}, {"minimum": limit}]},
             }
             for limit in limits
+        ]
+    }
+
+
+def distinct() -> dict[str, Any]:
+    """Return the JSON Schema of a table whose values are different whole numbers.
+
+    A JSON Schema cannot compare the values of unknown names. It can compare two groups of names: if a number
+    is the value of a name in one group, it is not that of a name in the other. The groups are names with
+    different first or last characters. Most pairs of names are in different groups at least once.
+    """
+    letters = [f"{small}{small.upper()}" for small in ascii_lowercase]
+    characters = [*letters, "_", *digits]
+    halves = [
+        ["".join(one for at, one in enumerate(characters) if (at >> bit & 1) == side) for side in (0, 1)]
+        for bit in range(len(characters).bit_length())
+    ]
+    groups = [[form.format(half) for half in each] for form in ("^[{}]", "[{}]$") for each in halves]
+    return {
+        "allOf": [
+            {
+                "if": {"not": {"patternProperties": {one: {"not": {"const": number}}}}},
+                "then": {"patternProperties": {other: {"not": {"const": number}}}},
+            }
+            for number in range(16)
+            for one, other in groups
         ]
     }
 

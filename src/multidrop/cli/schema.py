@@ -14,35 +14,38 @@ from multidrop.cli.support.files import require_extra
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("kind", metavar="KIND", choices=["plant", "family"], help="plant or family")
     parser.add_argument(
-        "models",
-        metavar="MODEL",
+        "names",
+        metavar="NAME",
         nargs="*",
-        help="add the registers and options of your own families, as the plant file names them: "
-        "meter.toml or fan.py:Fan",
+        help="plant: your own families, as the plant file names them, such as meter.toml or fan.py:Fan; "
+        "family: the CSV files that a family file may name",
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    made = schema_of(arguments.kind, arguments.models)
+    made = schema_of(arguments.kind, arguments.names)
     print(json.dumps(made, indent=1))  # print_text would mask parts of URL patterns
     return 0
 
 
-def schema_of(kind: str, models: Sequence[str] = (), folder: Path | None = None) -> dict[str, Any]:
-    """Return the JSON Schema of a "plant" or "family" file.
+def schema_of(kind: str, names: Sequence[str] = (), folder: Path | None = None) -> dict[str, Any]:
+    """Return the JSON Schema of a "plant" or "family" file in `folder`.
 
-    `models` are a user's own families, written as a plant file in `folder` would name them.
+    `names` are a user's own families, written as a plant file would name them, or the CSV files that a family
+    file may name. Raises ValueError if one of these cannot be used.
     """
     if kind == "family":
+        from multidrop.families.files.registers import beside
         from multidrop.families.files.schema import family_schema
 
-        if models:
-            raise ValueError(f"schema family takes no model; leave out {' '.join(models)}")
-        return family_schema()
+        for name in names:
+            if not beside((folder or Path()) / "family.toml", name).is_file():
+                raise ValueError(f"{name}: there is no such file")
+        return family_schema(names)
     for library in ("starlette", "uvicorn"):  # libraries that the gateway's settings import
         require_extra(library, "serve", "schema plant")
     from multidrop.families.registry import find_model
     from multidrop.gateway.settings import serve_schema
     from multidrop.plant.schema import plant_schema
 
-    return plant_schema(serve_schema(), {model: find_model(model, folder) for model in models})
+    return plant_schema(serve_schema(), {model: find_model(model, folder) for model in names})

@@ -32,7 +32,7 @@ from multidrop.drive.titles import LANGUAGES
 from multidrop.families.files import notation
 from multidrop.families.files.notation import TABLES, Counting
 from multidrop.printable import did_you_mean, is_number, is_whole
-from multidrop.toml_check import ASCENDING, TomlPlace
+from multidrop.toml_check import ASCENDING, DISTINCT, TomlPlace
 
 LONGEST_NAME = 60
 MOST_VALUES = 500
@@ -264,6 +264,7 @@ _SCHEMAS: Mapping[Callable[[Any], Any], Mapping[str, Any]] = {  # JSON Schemas, 
         "additionalProperties": _COUNT,
         "minProperties": 1,
         "maxProperties": MOST_VALUES,
+        **DISTINCT,
     },
     _titles: {
         **{"type": "object", "minProperties": 1, "additionalProperties": False},

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import keyword
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from multidrop.core import NumberFormat
@@ -33,22 +33,27 @@ from multidrop.families.files.sections import (
     TEXT_KEYS,
 )
 from multidrop.families.profiles import PROFILES, Profile, Role
-from multidrop.toml_check import DRAFT, ascending, json_schema
+from multidrop.toml_check import DRAFT, ascending, distinct, json_schema
 
 _NEVER_WRITTEN = ("harmless", "broadcast")  # keys that a reading cannot have
 _WRITTEN = [access.value for access in Access if access is not Access.READING]  # sections
 _FORBIDDEN: dict[str, Any] = {"not": {}}
 
 
-def family_schema() -> dict[str, Any]:
-    """Return the JSON Schema of a family file."""
+def family_schema(tables: Sequence[str] = ()) -> dict[str, Any]:
+    """Return the JSON Schema of a family file.
+
+    With `tables`, the names of CSV files, the key `registers` may name only these.
+    """
     proof = json_schema(PROOF_KEYS, anyOf=[{"required": [key]} for key in ("is", "above", "below")])
     proofs = {"type": "array", "minItems": 1, "maxItems": MOST_PROOFS, "items": proof}
     of_words = [_without_addresses(_numbered("01"))]
     sections = {
-        "family": _facts(),
+        "family": _facts(tables),
         "default": _table({key: REGISTER_KEYS[key].schema for key in DEFAULT_KEYS}),
-        **{name: _named(_register(access), TAKEN_NAMES, MOST_REGISTERS) for name, access in ACCESSES.items()},
+        **{
+            name: _named(_of_access(access), TAKEN_NAMES, MOST_REGISTERS) for name, access in ACCESSES.items()
+        },
         "text": _named(json_schema(TEXT_KEYS, allOf=of_words), TAKEN_NAMES, MOST_TEXTS),
         "option": _named(json_schema(OPTION_KEYS), NOT_OPTIONS),
         "parameters": json_schema(PARAMETER_KEYS),
@@ -58,7 +63,13 @@ def family_schema() -> dict[str, Any]:
     return {
         "$schema": DRAFT,
         "title": "multidrop family file",
-        "definitions": {"ascending": ascending(), **{one.name: _of_format(one) for one in WORDS}},
+        "definitions": {
+            "ascending": ascending(),
+            "distinct": distinct(),
+            "register": _register(),
+            **{one.name: _of_format(one) for one in WORDS},
+            **{f"roles of {name}": _of_roles(profile.roles) for name, profile in PROFILES.items()},
+        },
         **_table({name: sections[name] for name in SECTIONS}),
         "required": ["family"],
         "anyOf": [*declaring, _says("registers")],
@@ -181,8 +192,7 @@ def _with_profile(name: str, roles: Mapping[str, Role]) -> dict[str, Any]:
             "properties": {
                 section: {
                     "propertyNames": {"not": {"enum": sorted(reserved - roles.keys() | others)}},
-                    "properties": {role: _of_role(role, roles[role]) for role in roles},
-                    "additionalProperties": {"properties": {"harmless": {"maxItems": 0}}},
+                    "allOf": [{"$ref": f"#/definitions/roles of {name}"}],
                 }
                 for section, access in ACCESSES.items()
                 for others in [{role for role in roles if access not in roles[role].access}]
@@ -193,6 +203,14 @@ def _with_profile(name: str, roles: Mapping[str, Role]) -> dict[str, Any]:
                 if roles[role].needed
             ],
         },
+    }
+
+
+def _of_roles(roles: Mapping[str, Role]) -> dict[str, Any]:
+    """Return the schema of a section of registers in a file with a profile, which has these roles."""
+    return {
+        "properties": {role: _of_role(role, roles[role]) for role in roles},
+        "additionalProperties": {"properties": {"harmless": {"maxItems": 0}}},
     }
 
 
@@ -300,7 +318,7 @@ def _named(entry: dict[str, Any], reserved: Iterable[str], most: int = 1000) -> 
     return {"type": "object", "propertyNames": names, "additionalProperties": entry, "maxProperties": most}
 
 
-def _facts() -> dict[str, Any]:
+def _facts(tables: Sequence[str]) -> dict[str, Any]:
     """Return the schema of [family]."""
     eight_bits = {"type": "array", "items": {"type": "string", "pattern": "^8"}}
     speaks_ascii = {
@@ -316,25 +334,36 @@ def _facts() -> dict[str, Any]:
             {"if": speaks_ascii, "then": {"properties": both}, "else": {"properties": rtu_only}},
         ],
     )
-    facts["properties"]["registers"]["maxItems"] = MOST_CSV_FILES
+    facts["properties"]["registers"] |= {"maxItems": MOST_CSV_FILES}
+    if tables:
+        facts["properties"]["registers"] |= {"items": {"enum": [*tables]}}
     for key in ("profile", "extends"):
         facts["properties"][key]["enum"] = [*bases(key)]
     return facts
 
 
-def _register(access: Access) -> dict[str, Any]:
+def _register() -> dict[str, Any]:
+    """Return the schema of a register in any section."""
     keys = {key: one.schema for key, one in REGISTER_KEYS.items()}
     keys["bits"]["additionalProperties"] = {"type": "integer", "minimum": 0, "maximum": MOST_BITS - 1}
-    parts = [*(_addresses_of(table) for table in DIGIT_OF_TABLE), *_by_format()]
-    if access is Access.READING:
-        keys |= {key: one | {"maxItems": 0} for key, one in keys.items() if key in _NEVER_WRITTEN}
-        keys["moves"] |= {"const": False}
-    else:
-        parts.append({"properties": {"part": _FORBIDDEN, "number_format": {"not": {"enum": ["I8", "i8"]}}}})
-        of_written = _without_addresses(_numbered("13"))
-        of_written["properties"]["table"] = {"enum": ["holding", "HOLDING", "coil", "COIL"]}
-        parts.append({"if": _IS_WRITTEN, "then": of_written})
     has_unit = {"required": ["unit"], "properties": {"unit": {"minLength": 1}}}
     meanings = [{"required": ["values"]}, {"required": ["bits"]}, has_unit]
     pairs = [{"allOf": [one, other]} for at, one in enumerate(meanings) for other in meanings[:at]]
+    parts = [*(_addresses_of(table) for table in DIGIT_OF_TABLE), *_by_format()]
     return {**_table(keys), "required": ["at"], "not": {"anyOf": pairs}, "allOf": parts}
+
+
+def _of_access(access: Access) -> dict[str, Any]:
+    """Return the schema of a register in the section of this access."""
+    if access is Access.READING:
+        never_written = {key: {"maxItems": 0} for key in _NEVER_WRITTEN}
+        only: dict[str, Any] = {"properties": {**never_written, "moves": {"const": False}}}
+    else:
+        of_written = _without_addresses(_numbered("13"))
+        of_written["properties"]["table"] = {"enum": ["holding", "HOLDING", "coil", "COIL"]}
+        only = {
+            "properties": {"part": _FORBIDDEN, "number_format": {"not": {"enum": ["I8", "i8"]}}},
+            "if": _IS_WRITTEN,
+            "then": of_written,
+        }
+    return {"allOf": [{"$ref": "#/definitions/register"}, only]}
