@@ -258,7 +258,7 @@ def ascending() -> dict[str, Any]:
 
 
 def distinct() -> dict[str, Any]:
-    """Return the JSON Schema of a table whose values are different whole numbers.
+    """Return the JSON Schema "distinct", of a table whose values are different whole numbers, and its parts.
 
     A JSON Schema cannot compare the values of unknown names. It can compare two groups of names: if a number
     is the value of a name in one group, it is not that of a name in the other. The groups are names with
@@ -271,16 +271,20 @@ def distinct() -> dict[str, Any]:
         for bit in range(len(characters).bit_length())
     ]
     groups = [[form.format(half) for half in each] for form in ("^[{}]", "[{}]$") for each in halves]
-    return {
-        "allOf": [
-            {
-                "if": {"not": {"patternProperties": {one: {"not": {"const": number}}}}},
-                "then": {"patternProperties": {other: {"not": {"const": number}}}},
-            }
-            for number in range(16)
-            for one, other in groups
-        ]
+    numbers = range(16)  # the bits of a word, and most values
+    parts: dict[str, Any] = {
+        f"not-{number}": {"not": {"const": number, "description": f"another name has the number {number}"}}
+        for number in numbers
     }
+    rules = [
+        {
+            "if": {"not": {"patternProperties": {one: {"$ref": f"#/definitions/not-{number}"}}}},
+            "then": {"patternProperties": {other: {"$ref": f"#/definitions/not-{number}"}}},
+        }
+        for number in numbers
+        for one, other in groups
+    ]
+    return {"distinct": {"allOf": rules}, **parts}
 
 
 def parse_address(text: str, example: str) -> tuple[str, int]:

@@ -90,6 +90,9 @@ _POWER = re.compile(r"([^\W\d]+)([23²³])")
 _EXPONENTS = {"2": 2, "3": 3, "²": 2, "³": 3}
 
 
+KNOWN_UNITS = tuple(_KNOWN)  # their texts
+
+
 @lru_cache(maxsize=1024)
 def unit_of(text: str) -> ValueUnit:
     """Return the unit of a text such as "kWh", "m3/h" or "kg*m/s2"."""

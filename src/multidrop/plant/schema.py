@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from multidrop.channels.units import KNOWN_UNITS, SECOND, unit_of
 from multidrop.core import Framing
 from multidrop.drive import Kept
 from multidrop.drive.family import Drive
@@ -28,29 +29,41 @@ def plant_schema(serve: Mapping[str, Any], own: _Families) -> dict[str, Any]:
     """
     families = {**MODELS, **{name: shipped_family(name) for name in SHIPPED}, **own}
     follows = {"required": ["serve"], "properties": {"serve": {"required": ["fleet"]}}}
+    models = dict.fromkeys(family.model for family in families.values())
     plant = json_schema(
-        PLANT_KEYS, required=[], anyOf=[{"required": ["line"]}, follows], allOf=[*_allowed(families)]
+        PLANT_KEYS,
+        required=[],
+        anyOf=[{"required": ["line"]}, follows],
+        allOf=[_allowed(model, table) for model in models for table in ("serve", "fleet")],
+        definitions={
+            **{f"lists-{model}": _lists_of(model, families) for model in models},
+            **_units_of_integrals(families),
+        },
     )
     plant["properties"]["line"]["items"] = _line_schema(families)
     plant["properties"]["serve"] |= serve
     return {"$schema": DRAFT, "title": "multidrop plant file", **plant}
 
 
-def _allowed(families: _Families) -> Iterator[dict[str, Any]]:
-    """Yield the parts of the schema for the tables `may.family` of [serve] and [fleet]."""
-    for model in dict.fromkeys(family.model for family in families.values()):
-        names = [name for name, family in families.items() if family.model == model]
-        family = families[names[0]]
-        writable = [register.name for register in family.registers.values() if register.writable]
-        verbs = [verb for verb in LISTED_VERBS if getattr(family, verb) is not getattr(Drive, verb)]
-        lists = {"write": {"items": {"enum": writable}}, "verbs": {"items": {"enum": verbs}}}
-        lines = {"contains": _inside(["drive"], {"contains": _facts(model=names)})}
-        in_family = {"properties": {model: {"properties": lists}}}
-        for table in ("serve", "fleet"):
-            yield {
-                "if": _inside([table, "may", "family", model], {}),
-                "then": {"allOf": [_inside([table, "may", "family"], in_family), _inside(["line"], lines)]},
-            }
+def _allowed(model: str, table: str) -> dict[str, Any]:
+    """Return the part of the schema for the table `may.family` of [serve] or [fleet]."""
+    of_model = [table, "may", "family", model]
+    return {"if": _inside(of_model, {}), "then": {"$ref": f"#/definitions/lists-{model}"}}
+
+
+def _lists_of(model: str, families: _Families) -> dict[str, Any]:
+    """Return the schema of a plant file whose tables `may.family` name this model."""
+    names = [name for name, family in families.items() if family.model == model]
+    family = families[names[0]]
+    writable = [register.name for register in family.registers.values() if register.writable]
+    verbs = [verb for verb in LISTED_VERBS if getattr(family, verb) is not getattr(Drive, verb)]
+    may: dict[str, Any] = {
+        "properties": {"write": {"items": {"enum": writable}}, "verbs": {"items": {"enum": verbs}}}
+    }
+    for key in (model, "family", "may"):
+        may = {"properties": {key: may}}
+    lines = {"contains": _inside(["drive"], {"contains": _facts(model=names)})}
+    return {"properties": {"serve": may, "fleet": may, "line": lines}, "required": ["line"]}
 
 
 def _inside(keys: Sequence[str], condition: dict[str, Any]) -> dict[str, Any]:
@@ -157,7 +170,11 @@ def _drive_schema(families: _Families) -> dict[str, Any]:
     drive = json_schema(
         DRIVE_KEYS,
         additionalProperties={"type": "number"},  # options of families in files
-        allOf=[_of_family(name, family) for name, family in families.items()],
+        allOf=[
+            *(_of_family(name, family) for name, family in families.items()),
+            *(_used(name) for name in sorted(readable)),
+            *_integrals(families),
+        ],
     )
     drive["properties"]["model"] |= {
         "anyOf": [
@@ -186,6 +203,60 @@ def _twice(name: str) -> dict[str, Any]:
     """Return the condition that a list polls a register twice, by its name and in a table."""
     in_table = {"type": "object", "properties": {"register": {"const": name}}, "required": ["register"]}
     return {"allOf": [{"contains": {"const": name}}, {"contains": in_table}]}
+
+
+# ---- computed channels ----
+
+
+def _used(name: str) -> dict[str, Any]:
+    """Return the part of the schema for a register that a channel of its drive uses: it must be polled."""
+    word = rf"^[^\"']*(?<![\w.-]){name}(?![\w.-]|\s*\()"
+    uses = {"description": f"{name} is not in poll", "pattern": word}
+    names = {"enum": ["*", name]}
+    in_table = {"type": "object", "properties": {"register": names}, "required": ["register"]}
+    return {
+        "if": {
+            "properties": {
+                "poll": {"not": {"contains": {"anyOf": [names, in_table]}}},
+                "channel": {"not": {"contains": {"properties": {"name": {"const": name}}}}},
+            },
+            "required": ["poll"],
+        },
+        "then": {"properties": {"channel": {"items": {"properties": {"value": {"not": uses}}}}}},
+    }
+
+
+def _integrals(families: _Families) -> Iterator[dict[str, Any]]:
+    """Yield the parts of the schema for channels with the integral of one register: its possible units."""
+    models: dict[tuple[str, str], list[str]] = {}
+    for model, family in families.items():
+        for register in family.readings():
+            if not register.values:
+                models.setdefault((register.name, register.value_unit), []).append(model)
+    names: dict[tuple[str, tuple[str, ...]], list[str]] = {}
+    for (name, unit), using in models.items():
+        names.setdefault((unit, tuple(using)), []).append(name)
+    units = _units(families)
+    for (unit, users), registers in names.items():
+        value = {"pattern": rf"^\s*integral\(\s*({'|'.join(registers)})\s*\)\s*$"}
+        integral = {"unit": {"$ref": f"#/definitions/integral-{units.index(unit)}"}}
+        channel = {"if": {"properties": {"value": value}}, "then": {"properties": integral}}
+        yield {"if": _facts(model=[*users]), "then": {"properties": {"channel": {"items": channel}}}}
+
+
+def _units_of_integrals(families: _Families) -> dict[str, Any]:
+    """Return the schema of an integral's unit for each unit of a register."""
+    found = {}
+    for number, unit in enumerate(_units(families)):
+        integral = unit_of(unit).times(SECOND)
+        wrong = [one for one in KNOWN_UNITS if one and not unit_of(one).is_like(integral)]
+        right = f"an integral of {unit} has a unit such as {integral}"
+        found[f"integral-{number}"] = {"not": {"description": right, "enum": wrong}}
+    return found
+
+
+def _units(families: _Families) -> list[str]:
+    return sorted({one.value_unit for family in families.values() for one in family.readings()})
 
 
 def _of_family(name: str, family: type[Drive]) -> dict[str, Any]:

@@ -65,10 +65,10 @@ def family_schema(tables: Sequence[str] = ()) -> dict[str, Any]:
         "title": "multidrop family file",
         "definitions": {
             "ascending": ascending(),
-            "distinct": distinct(),
+            **distinct(),
             "register": _register(),
             **{one.name: _of_format(one) for one in WORDS},
-            **{f"roles of {name}": _of_roles(profile.roles) for name, profile in PROFILES.items()},
+            **{f"roles-{name}": _of_roles(profile.roles) for name, profile in PROFILES.items()},
         },
         **_table({name: sections[name] for name in SECTIONS}),
         "required": ["family"],
@@ -192,7 +192,7 @@ def _with_profile(name: str, roles: Mapping[str, Role]) -> dict[str, Any]:
             "properties": {
                 section: {
                     "propertyNames": {"not": {"enum": sorted(reserved - roles.keys() | others)}},
-                    "allOf": [{"$ref": f"#/definitions/roles of {name}"}],
+                    "allOf": [{"$ref": f"#/definitions/roles-{name}"}],
                 }
                 for section, access in ACCESSES.items()
                 for others in [{role for role in roles if access not in roles[role].access}]
