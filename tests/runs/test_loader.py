@@ -85,7 +85,10 @@ MISTAKES = {  # by text of a test file: the number of the wrong line, and a part
     STEP + "dwel = 3": (5, "unknown key 'dwel'; did you mean dwell?"),
     STEP + 'start = ["fen"]': (5, "has no drive 'fen'; did you mean fan?"),
     STEP + "start = [1]": (5, "start: 1 is not a text"),
-    STEP + 'start = ["fan"]\ndirection = "left"': (6, "'left' is not a valid Direction"),
+    STEP + 'start = ["fan"]\ndirection = "left"': (
+        6,
+        'direction = \'left\' is neither "forward" nor "reverse"',
+    ),
     STEP + 'dwell = "1 s"\ndirection = "forward"': (6, 'direction needs start; add start = ["pump-1"]'),
     STEP + "frequency = { fan = 51 }": (5, "51"),
     STEP + 'frequency = { fan = "x" }': (5, "'x' is not a number in Hz"),
@@ -102,10 +105,10 @@ MISTAKES = {  # by text of a test file: the number of the wrong line, and a part
     STEP + "frequency = { eeprom = 20 }": (5, "may be kept in EEPROM, which steps would wear out"),
     STEP + "write = { eeprom = { frequency = 20 } }": (5, 'declare ram = ["frequency"]'),
     STEP.replace('"a"', '"stop"') + 'dwell = "1 s"': (3, 'name "stop" is that of the stops at the end'),
-    STEP + 'dwell = "1 s"\n' + STEP + 'dwell = "1 s"': (6, "another phase already has this name"),
+    STEP + 'dwell = "1 s"\n' + STEP + 'dwell = "1 s"': (7, "another phase already has this name"),
     STEP.replace("\n[[", "\nrepeat = 0\n[[") + 'dwell = "1 s"': (4, "repeat = 0 is not right"),
     STEP.replace("\n[[", "\nrepeat = 99999\n[[") + 'dwell = "1 s"\n[[phase.step]]\ndwell = "1 s"': (
-        0,
+        2,
         "the phases have",
     ),
 }
@@ -131,6 +134,13 @@ def test_a_condition_compares_a_computed_channel(tmp_path: Path) -> None:
     (step,) = load_test(path).steps
     assert step.until
     assert (step.until.register, step.until.number) == ("double", 3.0)
+
+
+def test_a_missing_plant_file_is_reported_with_the_line_that_names_it(tmp_path: Path) -> None:
+    path = write_test(tmp_path, STEP + 'dwell = "1 s"', fan=CHE)
+    (tmp_path / "plant.toml").unlink()
+    with pytest.raises(ValueError, match=r'test\.toml:1: plant = "plant\.toml": there is no such file$'):
+        load_test(path)
 
 
 def test_a_plant_with_the_drive_test_is_refused(tmp_path: Path) -> None:

@@ -60,6 +60,9 @@ def load_test(path: Path | str) -> RunPlan:
     given = {} if document is None else place.check(document, _TEST)
     if "plant" not in given:
         raise ValueError("\n".join(place.config_errors))
+    if not (path.parent / given["plant"]).exists():
+        place.wrong(f'plant = "{given["plant"]}": there is no such file', "plant")
+        raise ValueError("\n".join(place.config_errors))
     plant = load_plant(path.parent / given["plant"])
     if any(polled.drive.name == PHASE_DRIVE for polled in plant.drives):
         place.wrong(f'the plant has a drive "{PHASE_DRIVE}", a name that the phases use; rename it', "plant")
@@ -68,7 +71,9 @@ def load_test(path: Path | str) -> RunPlan:
     for table, at in place.inside("phase", given.get("phase", [])):
         steps += _phase(table, at, plant)
     if len(steps) > MOST_STEPS:
-        place.wrong(f"the phases have {len(steps)} steps, repetitions included; at most {MOST_STEPS} fit")
+        place.wrong(
+            f"the phases have {len(steps)} steps, repetitions included; at most {MOST_STEPS} fit", "phase"
+        )
     if place.config_errors:
         raise ValueError("\n".join(grouped(place.config_errors)))
     return RunPlan(plant, tuple(steps), limits, path)
@@ -98,7 +103,8 @@ def _phase(table: Any, place: TomlPlace, plant: Plant) -> list[RunStep]:
     if name == STOP:
         place.wrong(f'name "{STOP}" is that of the stops at the end; give the phase another name', "name")
     if name:
-        place.once("phase", name, sentence="another phase already has this name; each needs its own")
+        sentence = "another phase already has this name; each needs its own"
+        place.once("phase", name, sentence=sentence, key="name")
     if not 1 <= repeat <= MOST_STEPS:
         place.wrong(f"repeat = {repeat} is not right; write a number from 1 to {MOST_STEPS}", "repeat")
         repeat = 1
@@ -124,7 +130,7 @@ def _steps(table: Any, place: TomlPlace, plant: Plant) -> Iterator[RunStep]:
         names = [name for name in given.get(key, []) if _is_text(name, place, key)]
         given[key] = tuple(name for name in names if _find(plant, name, place, key))
     direction = (
-        place.attempt(Direction, given["direction"], key="direction") if "direction" in given else None
+        place.attempt(_direction, given["direction"], key="direction") if "direction" in given else None
     )
     step = RunStep(
         "",
@@ -150,6 +156,13 @@ def _steps(table: Any, place: TomlPlace, plant: Plant) -> Iterator[RunStep]:
         for name, hz in frequency.items():
             place.attempt(check_frequency, _find(plant, name, place, "frequency"), hz, key="frequency")
         yield replace(step, frequency=frequency)
+
+
+def _direction(name: str) -> Direction:
+    try:
+        return Direction(name)
+    except ValueError:
+        raise ValueError(f'direction = {name!r} is neither "forward" nor "reverse"') from None
 
 
 def _find(plant: Plant, name: str, place: TomlPlace, key: str) -> Drive | None:

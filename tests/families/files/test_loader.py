@@ -254,6 +254,10 @@ DEVICE = HEAD + "[reading]\ndevice = { at = 3 }\nspeed = { at = 4, unit = 'Hz', 
             '[[identify]]\nregister = "device"\nis = ["x"]',
             ["identify number 1: is = ['x'] is not right; write is = [0x010A]"],
         ),
+        (
+            '[[identify]]\nregister = "device"\nist = [1]',
+            ["identify number 1: unknown key 'ist'; did you mean is?"],
+        ),
         ("[[identify]]\nis = [1]", ["identify number 1: 'register' is missing; add register = \"device\""]),
         ("identify = 5", ["identify number 1: 5 is not a table with register, is, above, below"]),
         (

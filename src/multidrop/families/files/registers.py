@@ -348,7 +348,8 @@ class Declared:
         """Declare the registers in a [reading], [setting] or [command] section."""
         if not isinstance(table, dict):
             place.wrong(
-                f"[{access.value}] is not a table; write [{access.value}] and NAME = {{ at = 0x0010 }}"
+                f"[{access.value}] is not a table; write [{access.value}] and NAME = {{ at = 0x0010 }}",
+                access.value,
             )
             return
         for name, given in table.items():

@@ -281,7 +281,7 @@ NOT_OPTIONS = frozenset(
 def options_of(table: Any, registers: Collection[str], place: TomlPlace) -> dict[str, Option]:
     """Return the options declared in the [option] section; report mistakes at `place`."""
     if not isinstance(table, dict):
-        place.wrong("[option] is not a table; write [option] and NAME = { unit, span, meaning }")
+        place.wrong("[option] is not a table; write [option] and NAME = { unit, span, meaning }", "option")
         return {}
     options = {}
     for name, given in table.items():
@@ -327,7 +327,7 @@ def texts_of(
 ) -> dict[str, Text]:
     """Return the texts declared in the [text] section, by name; report mistakes at `place`."""
     if not isinstance(section, dict):
-        place.wrong("[text] is not a table; write [text] and NAME = { at = 0xFC00, length = 8 }")
+        place.wrong("[text] is not a table; write [text] and NAME = { at = 0xFC00, length = 8 }", "text")
         return {}
     if len(section) > MOST_TEXTS:
         place.wrong(f"[text] has {len(section)} texts, and {MOST_TEXTS} are the most")
@@ -482,6 +482,7 @@ def proofs_of(section: Any, registers: Mapping[str, Register[Any]], place: TomlP
 
 
 def _proof(table: Any, registers: Mapping[str, Register[Any]], place: TomlPlace) -> Proof | None:
+    before = len(place.config_errors)
     good = place.check(table, PROOF_KEYS)
     name, values = good.get("register"), good.get("is", [])
     if name is None:
@@ -493,7 +494,8 @@ def _proof(table: Any, registers: Mapping[str, Register[Any]], place: TomlPlace)
         place.wrong(f"is = {values!r} is not right; write {PROOF_KEYS['is'].example}")
         return None
     if not good.keys() & {"is", "above", "below"}:
-        place.wrong("says no value; add is = [0x010A], or above and below")
+        if len(place.config_errors) == before:  # else the key is there, but misspelt or wrong
+            place.wrong("says no value; add is = [0x010A], or above and below")
         return None
     return Proof(name, tuple(values), good.get("above", -inf), good.get("below", inf))
 
