@@ -29,14 +29,18 @@ def plant_schema(serve: Mapping[str, Any], own: _Families) -> dict[str, Any]:
     """
     families = {**MODELS, **{name: shipped_family(name) for name in SHIPPED}, **own}
     follows = {"required": ["serve"], "properties": {"serve": {"required": ["fleet"]}}}
-    models = dict.fromkeys(family.model for family in families.values())
+    models = [*dict.fromkeys(family.model for family in families.values())]
     plant = json_schema(
         PLANT_KEYS,
         required=[],
         anyOf=[{"required": ["line"]}, follows],
-        allOf=[_allowed(model, table) for model in models for table in ("serve", "fleet")],
-        definitions={
-            **{f"lists-{model}": _lists_of(model, families) for model in models},
+        allOf=[
+            _allowed(model, table, number)
+            for number, model in enumerate(models)
+            for table in ("serve", "fleet")
+        ],
+        definitions={  # numbered, because a model's name or a unit may have any characters
+            **{f"lists-{number}": _lists_of(model, families) for number, model in enumerate(models)},
             **_units_of_integrals(families),
         },
     )
@@ -45,10 +49,10 @@ def plant_schema(serve: Mapping[str, Any], own: _Families) -> dict[str, Any]:
     return {"$schema": DRAFT, "title": "multidrop plant file", **plant}
 
 
-def _allowed(model: str, table: str) -> dict[str, Any]:
-    """Return the part of the schema for the table `may.family` of [serve] or [fleet]."""
+def _allowed(model: str, table: str, number: int) -> dict[str, Any]:
+    """Return the part of the schema for this model in the table `may.family` of [serve] or [fleet]."""
     of_model = [table, "may", "family", model]
-    return {"if": _inside(of_model, {}), "then": {"$ref": f"#/definitions/lists-{model}"}}
+    return {"if": _inside(of_model, {}), "then": {"$ref": f"#/definitions/lists-{number}"}}
 
 
 def _lists_of(model: str, families: _Families) -> dict[str, Any]:

@@ -34,7 +34,7 @@ from multidrop.families.files.sections import (
 )
 from multidrop.printable import did_you_mean
 from multidrop.toml_check import TomlPlace
-from multidrop.toml_document import parse_document
+from multidrop.toml_document import parse_document, read_bounded
 
 SECTIONS = (
     "family",
@@ -98,13 +98,9 @@ def _bytes(path: Path, what: str) -> bytes:
         if not path.is_file():
             other = "is not a file, but a directory or a device; name a file" if path.exists() else ""
             raise ValueError(other or "there is no such file")
-        with path.open("rb") as file:
-            data = file.read(MOST_BYTES + 1)
     except OSError as failure:
         raise ValueError(f"the {what} cannot be read: {failure.strerror}") from failure
-    if len(data) > MOST_BYTES:
-        raise ValueError(f"the {what} has more than {MOST_BYTES} bytes")
-    return data
+    return read_bounded(path, MOST_BYTES, what)
 
 
 def _at_most(place: TomlPlace) -> tuple[str, ...]:

@@ -375,7 +375,7 @@ class Declared:
             details["ram_address"] = good["ram_address"]
         if "title" in good:
             details["titles"] = good["title"]
-        register = place.attempt(_made, access, address[0], what, {**details, "table": table})
+        register = place.attempt(partial(_DECLARE[access], address[0], what, table=table, **details))
         if register is not None:
             register.__set_name__(type(self), name)
             self.registers[name] = register
@@ -461,10 +461,6 @@ class Declared:
         if table == "holding" and good.get("write", self.defaults.get("write", self.write)) == "multiple":
             space = HOLDING_MULTIPLE
         return details, space
-
-
-def _made(access: Access, address: int, what: Any, details: dict[str, Any]) -> Register[Any]:
-    return _DECLARE[access](address, what, **details)
 
 
 def defaults_of(table: Any, place: TomlPlace) -> dict[str, Any]:
