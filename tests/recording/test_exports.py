@@ -7,7 +7,9 @@ import random
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from typing import Any
 import pyarrow as pa
 import pytest
 from batches import SECOND, UTC_0
+from lines import until
 from peers import require_installed
 from recordings import ABOUT, record, row
 
@@ -200,6 +203,36 @@ def test_interrupt_during_a_write_of_hdf5_leaves_no_file(
     with pytest.raises(KeyboardInterrupt):
         convert(source, tmp_path / "run.h5")
     assert [path.name for path in tmp_path.iterdir()] == ["run.arrows"]
+
+
+def swallowing(work: Callable[..., Any], interrupts: int) -> Callable[..., Any]:
+    """Return a function that presses Ctrl-C, catches everything as asammdf does, and then does the work."""
+
+    def interrupted(*words: Any, **details: Any) -> Any:
+        for _ in range(interrupts):
+            with suppress(BaseException):
+                signal.raise_signal(signal.SIGINT)
+                time.sleep(0.02)  # the handler runs in the main thread
+        return work(*words, **details)
+
+    return interrupted
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("interrupts", [1, 2])
+@pytest.mark.parametrize("step", ["attach", "append", "extend", "save"])
+def test_interrupt_in_a_step_of_mdf4_leaves_no_file(
+    step: str, interrupts: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second Ctrl-C interrupts the wait for the library, which then still removes its file."""
+    from multidrop.recording.mdf4 import MDF
+
+    source = record(tmp_path / "run.arrows", rows(400), METADATA)
+    monkeypatch.setattr("multidrop.recording.series.PIECE_ROWS", 100)
+    monkeypatch.setattr(MDF, step, swallowing(getattr(MDF, step), interrupts))
+    with pytest.raises(KeyboardInterrupt):
+        convert(source, tmp_path / "run.mf4")
+    until(lambda: [path.name for path in tmp_path.iterdir()] == ["run.arrows"])
 
 
 @pytest.mark.slow

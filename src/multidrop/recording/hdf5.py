@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from functools import partial
 from io import FileIO
 from pathlib import Path
 from typing import Any
@@ -58,15 +59,19 @@ class Hdf5Writer(SeriesWriter):
     def __init__(self, path: Path, metadata: Metadata) -> None:
         super().__init__(path, metadata)
         described = dump_metadata(metadata)
+        self._file: Any = None
+        self._groups: dict[tuple[str, str], Any] = {}
+        self._events: list[Event] = []
         with writing(path):
             try:
                 self._raw = GuardedFile(path, "x+b")
             except FileExistsError:
                 raise already_there(path) from None
-            self._file = self._in_thread(h5py.File, self._raw, "w")
-        self._in_thread(self._file.__setitem__, "metadata", described)
-        self._groups: dict[tuple[str, str], Any] = {}
-        self._events: list[Event] = []
+            self._open(partial(self._begin, described))
+
+    def _begin(self, described: str) -> None:
+        self._file = h5py.File(self._raw, "w")
+        self._file["metadata"] = described
 
     def _append(self, rows: ExportedRows, drive: Mapping[str, Any]) -> None:
         group = self._groups.get(rows[:2])
@@ -111,7 +116,8 @@ class Hdf5Writer(SeriesWriter):
                 events[name] = np.array(column, dtype=h5py.string_dtype())
 
     def _release(self) -> None:
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
         self._raw.close()
         self._raw.raise_failure()
 

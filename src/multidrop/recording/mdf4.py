@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,15 +32,19 @@ class Mdf4Writer(SeriesWriter):
     def __init__(self, path: Path, metadata: Metadata) -> None:
         super().__init__(path, metadata)
         described = dump_metadata(metadata)
+        self._mdf: Any = None
+        self._groups: dict[tuple[str, str], int] = {}
         with writing(path):
             new_file(path).close()
-            self._mdf = MDF(version="4.10", temporary_folder=str(path.absolute().parent))
+            self._open(partial(self._begin, metadata, described))
+
+    def _begin(self, metadata: Metadata, described: str) -> None:
+        self._mdf = MDF(version="4.10", temporary_folder=str(self.path.absolute().parent))
         self._mdf.attach(described.encode(), file_name="metadata.json", mime="application/json")
         header = self._mdf.header
         header.comment = printable(f"multidrop {metadata.get('multidrop', '')}: {metadata.get('plant', '')}")
         header.tz_offset = header.daylight_save_time = 0
         header.time_flags = FLAG_HD_TIME_OFFSET_VALID  # the start time is in UTC
-        self._groups: dict[tuple[str, str], int] = {}
 
     def _append(self, rows: ExportedRows, drive: Mapping[str, Any]) -> None:
         missed = np.isnan(rows.value)
@@ -95,7 +100,8 @@ class Mdf4Writer(SeriesWriter):
             self._mdf.save(file)
 
     def _release(self) -> None:
-        self._mdf.close()
+        if self._mdf is not None:
+            self._mdf.close()
 
 
 def _names(texts: Mapping[int, str]) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -150,7 +150,8 @@ class SeriesWriter(RecordingWriter):
     The writer keeps at most PIECE_ROWS rows in memory, besides the library's own buffers.
 
     The library runs in a thread of its own. In the main thread, Ctrl-C could raise KeyboardInterrupt within
-    the library, which would catch it and continue. Then the file would lack some rows.
+    the library, which would catch it and continue. Then the file would lack some rows. An interruption ends
+    the wait for the thread; the thread then removes the file.
     """
 
     def __init__(self, path: Path, metadata: Metadata) -> None:
@@ -185,18 +186,30 @@ class SeriesWriter(RecordingWriter):
             with writing(self.path):
                 self._in_thread(self._write_piece)
 
-    def _in_thread(self, work: Callable[..., Any], *arguments: Any) -> Any:
-        return self._thread.submit(work, *arguments).result()
+    def _in_thread(self, *works: Callable[[], Any]) -> Any:
+        """Carry out these works in the library's thread; return the result of the last one.
+
+        The thread carries out all works, even if one fails or the wait for them is interrupted. Raises the
+        first failure.
+        """
+        futures = [self._thread.submit(work) for work in works]
+        wait(futures)
+        return [future.result() for future in futures][-1]
+
+    def _open(self, work: Callable[[], Any]) -> Any:
+        """Open the new file with this work; remove the file if the work fails or is interrupted."""
+        try:
+            return self._in_thread(work)
+        except BaseException:
+            self.discard()
+            raise
 
     def close(self) -> None:
         if self._is_closed:
             return
         self._is_closed = True
         with writing(self.path):
-            try:
-                self._in_thread(self._complete)
-            finally:
-                self._end()
+            self._in_thread(self._complete, self._release)
 
     def _complete(self) -> None:
         if self._waiting:
@@ -205,18 +218,11 @@ class SeriesWriter(RecordingWriter):
             self._add_event(self._trigger)
         self._finish()
 
-    def _end(self) -> None:
-        try:
-            self._in_thread(self._release)
-        finally:
-            self._thread.shutdown(wait=False)
-
     def discard(self) -> None:
-        if not self._is_closed:
-            self._is_closed = True
-            with suppress(OSError):
-                self._end()
-        super().discard()
+        release = () if self._is_closed else (self._release,)
+        self._is_closed = True
+        with suppress(OSError):
+            self._in_thread(*release, super().discard)
 
     def __exit__(self, *error: object) -> None:
         if error[0] is None:
@@ -255,4 +261,4 @@ class SeriesWriter(RecordingWriter):
 
     @abstractmethod
     def _release(self) -> None:
-        """Close the library's files."""
+        """Close the library's files, if they are open."""
