@@ -31,8 +31,9 @@ from typing import NamedTuple
 
 sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterdir()))
 
+from free_ports import free_ports
 from gateway_users import GatewayUsers, Place, gateway_users, place_of, serve_tables
-from simulated_pumps import POLLED, SimulatedPumps, free_ports, simulated_pumps, write_plant
+from simulated_pumps import POLLED, SimulatedPumps, simulated_pumps, write_plant
 
 from bench.players.hostile_clients import KINDS
 from bench.support import tables

@@ -28,8 +28,9 @@ from tempfile import TemporaryDirectory
 
 sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterdir()))
 
+from free_ports import free_ports
 from kills import BoundProcess
-from simulated_pumps import free_ports, simulated_pumps, write_plant
+from simulated_pumps import simulated_pumps, write_plant
 
 from bench.questions.gateway_costs import Worker
 from bench.support import tables

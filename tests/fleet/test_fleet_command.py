@@ -18,9 +18,10 @@ from typing import Any
 import pytest
 from commands import MULTIDROP, Run
 from examples import usually
+from free_ports import free_ports
 from kills import BoundProcess
 from lines import PATIENCE, until
-from nats_clusters import Cluster, cluster, free_ports, old_server_program
+from nats_clusters import Cluster, cluster, old_server_program
 from tables import table
 from terminals import on_terminal
 

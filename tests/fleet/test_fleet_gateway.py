@@ -15,11 +15,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from free_ports import free_ports
 from gateways import served, written
 from hypothesis import given
 from hypothesis import strategies as st
 from lines import until
-from nats_clusters import Cluster, cluster, free_ports
+from nats_clusters import Cluster, cluster
 from peers import require_module, require_program
 from serial_hall import SerialHall
 from tables import table

@@ -13,7 +13,8 @@ from typing import Any
 import nats_clusters
 import pytest
 from commands import Run
-from nats_clusters import Cluster, cluster, free_ports
+from free_ports import free_ports
+from nats_clusters import Cluster, cluster
 from peers import require_module
 from spooled import NOON, STEP, exchanges_in, numbered
 from terminals import closing_terminal

@@ -14,7 +14,7 @@ from tables import table
 
 from multidrop.core import Framing, Message, build_request, parse_reply
 from multidrop.drive import Drive
-from multidrop.drive.register import Carrier, setting
+from multidrop.drive.register import HOLDING, Carrier, setting
 from multidrop.families.delixi_modbus import DelixiModbus
 from multidrop.families.delixi_native import PARAMETER, DelixiNative
 from multidrop.families.erman_er_g_220 import ErmanERG220
@@ -391,6 +391,13 @@ def test_ibd_does_not_reply_to_invalid_requests(ibd: Bench, function: int, start
     data = b"\0\1" if function == 0x10 else b""
     assert ibd.sim.answer(Message(1, function, start, count, data), 0.0) is None
     assert len(ibd.ask(3, 100, 3)) == 3
+
+
+def test_ibd_answers_a_read_of_4_registers_but_not_of_5(ibd: Bench) -> None:
+    """The other reasons for silence are excluded: all five registers are readable."""
+    ibd.sim.memory.make_readable(HOLDING, range(100, 105))
+    assert len(ibd.ask(3, 100, 4)) == 4
+    assert ibd.sim.answer(Message(1, 3, 100, 5), 0.0) is None
 
 
 def test_ibd_carries_out_a_broadcast_without_a_reply(ibd: Bench) -> None:

@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 from fleets import MemoryBucket
-from nats_clusters import Cluster, cluster, connected_path, free_ports, old_server_program, server_program
+from free_ports import free_ports
+from nats_clusters import Cluster, cluster, connected_path, old_server_program, server_program
 from tables import table
 
 from multidrop import Plant

@@ -10,11 +10,12 @@ from typing import Any
 
 import pytest
 from brokers import mosquitto
+from free_ports import free_ports
 from gateway_users import gateway_users, place_of, serve_tables
 from gateways import get, serving
 from lines import PATIENCE, until
 from peers import require_module
-from simulated_pumps import free_ports, simulated_pumps, write_plant
+from simulated_pumps import simulated_pumps, write_plant
 
 LINES = (8, 8, 8, 7)  # number of drives on each line
 LEAST = {"frames": 100, "scrapes": 5, "queries": 5, "messages": 200, "reads": 100, "reads of others": 100}

@@ -11,11 +11,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from contextlib import AbstractContextManager, contextmanager, redirect_stderr, redirect_stdout, suppress
 from functools import partial
 from io import StringIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 from unittest.mock import patch
 
 from kills import kill_all
@@ -295,6 +295,18 @@ DEEDS: dict[str, Callable[[FleetDrill], object]] = {
     "ownership leader stands still": partial(FleetDrill.stop_leader, group=names.OWNERS, others=names.LEASES),
     "all nodes killed": FleetDrill.kill_all_nodes,
 }
+
+
+D = TypeVar("D", bound=FleetDrill)
+
+
+@contextmanager
+def judged_at_end(drills: AbstractContextManager[D]) -> Iterator[D]:
+    """Yield a fleet; at the end, wait for its last elections and check that no line had two masters."""
+    with drills as drill:
+        yield drill
+        drill.settle()
+        assert drill.hall.overlaps() == 0
 
 
 @contextmanager

@@ -82,6 +82,7 @@ def cpu_s_of(pid: int) -> float:
 
 
 def until(condition: Callable[[], bool], what: str) -> None:
+    """Wait until the condition holds; fail with the text `what` after PATIENCE_S."""
     ends = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < ends, what

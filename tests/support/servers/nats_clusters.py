@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import time
 import urllib.request
@@ -17,6 +16,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any, TypeVar
 
+from free_ports import free_ports
 from namespaces import Namespace
 from peers import require_program
 
@@ -27,16 +27,6 @@ PATIENCE_S = 60.0
 ATTEMPTS = 4
 OLDEST = (2, 12)
 MAX_FILE = "64G"  # limit of reserved space; only stored data uses disk
-
-
-def free_ports(number: int) -> list[int]:
-    sockets = [socket.socket() for _ in range(number)]
-    for one in sockets:
-        one.bind(("127.0.0.1", 0))
-    ports = [int(one.getsockname()[1]) for one in sockets]
-    for one in sockets:
-        one.close()
-    return ports
 
 
 def server_program() -> str:

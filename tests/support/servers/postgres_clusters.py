@@ -16,7 +16,7 @@ from typing import Any
 
 import psycopg
 import pytest
-from nats_clusters import free_ports
+from free_ports import free_ports
 from peers import require_program
 
 PATIENCE_S = 30.0

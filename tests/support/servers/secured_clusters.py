@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet_drills import CommandEnd, fleet_status, run_here
+from fleet_scale import until
 from kills import kill_all
 from nats_clusters import Cluster, Node, server_program, started_cluster
 from peers import require_program
@@ -152,13 +153,6 @@ def secured_cluster(
 def multidrop(servers: SecuredCluster, user: str, *words: str) -> CommandEnd:
     """Run a `multidrop` command as this user."""
     return run_here(servers.environment(user), *words)
-
-
-def until(condition: Callable[[], bool], what: str) -> None:
-    ends = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < ends, what
-        time.sleep(0.1)
 
 
 class SecuredFleet:

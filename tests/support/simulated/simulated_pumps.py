@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import json
 import math
-import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -26,6 +25,7 @@ from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 sys.path.extend(map(str, Path(__file__).parents[1].iterdir()))
 
+from free_ports import free_ports
 from kills import BoundProcess
 
 from multidrop import Plant
@@ -79,13 +79,6 @@ POLLED = (
 FIRST_READING, UNPOLLED = 0x2100, 0x0900  # addresses: first polled reading, an unpolled register
 RAMP_S = 0.2  # deceleration time in s; short, because `stop` returns only when the motor is at rest
 WAVE_S = 0.1  # s between changes of load and speed
-
-
-def free_ports(count: int) -> list[int]:
-    """Return the numbers of `count` free TCP ports."""
-    with ExitStack() as stack:
-        found = [stack.enter_context(closing(socket.create_server(("127.0.0.1", 0)))) for _ in range(count)]
-        return [one.getsockname()[1] for one in found]
 
 
 def write_plant(folder: Path, drives: Sequence[int], serve: str = "", every: str = "100 ms") -> Path:
