@@ -281,3 +281,48 @@ def test_the_time_of_a_row_is_a_datetime() -> None:
     row = Row(1_700_000_000_123_456_789, 1, None, "pump", "speed", None, "no reply")
     assert row.time == datetime(2023, 11, 14, 22, 13, 20, 123456, tzinfo=UTC)
     assert row.time_ns == 1_700_000_000_123_456_789
+
+
+# ---- real polled rows, taken by Arrow libraries ----
+
+
+def polled_batches() -> list[Batch]:
+    """Poll a drive that answers and one that does not; return batches with values and misses of both."""
+    with Simulator([Wire([EncodedDrive(Toy(1))], unpaced=True)]) as simulator:
+        drives = [polled(Toy(at, name=f"pump-{at}"), [Toy.output_current, Toy.fault]) for at in (1, 2)]
+        found: list[Batch] = []
+        seen: set[tuple[str, bool]] = set()
+        with Poller(plant(line(simulator.wires[0].path, *drives))) as poller:
+            for batch in poller:
+                found.append(batch)
+                seen |= {(row.drive, row.value is None) for row in batch}
+                if seen >= {("pump-1", False), ("pump-2", True)}:
+                    return found
+    raise AssertionError("the poller has ended")
+
+
+@pytest.mark.slow
+def test_arrow_libraries_read_polled_rows_and_misses_of_a_poller() -> None:
+    polars = pytest.importorskip("polars", reason="needs polars")
+    batches = polled_batches()
+    rows = [row for batch in batches for row in batch]
+    assert {row.status for row in rows if row.value is None} >= {"no reply"}
+    found = [pa.record_batch(batch) for batch in batches]
+    for one in found:
+        one.validate(full=True)
+    assert [row for one in found for row in rows_of(one)] == rows
+    frame = polars.concat([polars.DataFrame(batch) for batch in batches])
+    assert [Row(*row) for row in frame.with_columns(frame["time"].to_physical()).iter_rows()] == rows
+    assert frame["value"].null_count() == sum(row.value is None for row in rows)
+
+
+@pytest.mark.slow
+def test_arrow_libraries_share_the_memory_of_polled_numbers() -> None:
+    """No library copies the column `value`, or `monotonic_ns`. Names are built for Arrow, from codes."""
+    polars = pytest.importorskip("polars", reason="needs polars")
+    for batch in polled_batches():
+        columns, frame = batch.columns(), polars.DataFrame(batch)
+        for name in ("value", "monotonic_ns"):
+            address = pa.py_buffer(getattr(columns, name)).address
+            assert pa.record_batch(batch).column(name).buffers()[1].address == address
+            assert frame[name].to_arrow().buffers()[1].address == address
