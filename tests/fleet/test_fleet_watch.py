@@ -247,8 +247,9 @@ async def test_after_a_failed_read_the_last_view_is_shown_with_its_age(
     assert shown[0]["age_s"] < shown[1]["age_s"] < shown[2]["age_s"]
 
 
-async def test_watch_ends_when_the_task_of_its_connection_ends() -> None:
+async def test_watch_ends_when_the_task_of_its_connection_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise `fleet watch` would show the last view forever."""
+    monkeypatch.setattr(views, "EVERY_S", 0.01)
     supervisor().keep("path", asyncio.sleep(0)).cancel()
     watch: Any = FleetWatch(FailingView())  # type: ignore[arg-type]
     with pytest.raises(Ended, match="path has ended: it was cancelled"):

@@ -48,6 +48,7 @@ def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     for module, name in ((parts, "BUILD_S"), (reload, "QUICK_S")):
         monkeypatch.setattr(module, name, SHORT_S)
     monkeypatch.setattr(historian, "CLOSING_S", SHORT_S)
+    monkeypatch.setattr(gateway_module, "GRACE_S", SHORT_S)
 
 
 class Fifos:

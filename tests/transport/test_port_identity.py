@@ -412,6 +412,7 @@ def test_the_error_for_a_silent_drive_behind_a_stalled_adapter_names_the_stall(
     monkeypatch.setattr(Line, "is_stalled", True)
     with Bus(terminal) as bus:
         toy = bus.attach(Toy, 1)
+        bus.peer(toy).c.most_timeout_ns = bus.peer(toy).c.least_timeout_ns = 20_000_000
         with pytest.raises(NoReply, match=f"but the port is {STALLED}"):
             toy.read(toy.output_current)
 
