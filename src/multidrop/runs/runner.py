@@ -37,6 +37,7 @@ from multidrop.transport import clock
 from multidrop.transport.port_identity import is_simulated
 
 LOOK_S = 0.01  # pause between two comparisons of new rows with the limits, in s
+STILL_S = 5.0  # a run ends if it does not compare rows with its limits for longer than this, in s
 LATE_S = 0.5  # s; if a step starts later than this, all later steps are delayed too, so that none is shorter
 UNKNOWN = "the stops of its line failed; the log has the error"
 SHORTEST_S = 1e-4  # shortest period of a polled register, in s
@@ -224,6 +225,7 @@ class _Session:
         self._watch = LimitWatch(self._plan, round(silence_of(self._plan) * 1e9), clock.now_ns())
         # how long, in ns, the computer had slept before the run
         self._slept_ns = clock.boottime_ns() - clock.now_ns()
+        self._looked_ns = clock.boottime_ns()  # when rows were last compared with the limits
         self._is_stopping = False
 
     def carry_out(self) -> RunResult:
@@ -285,6 +287,7 @@ class _Session:
         for number, planned in enumerate(self._run.timeline):
             step = planned.step
             self._run.number = number
+            self._check_standstill()  # a suspension just before this line must not delay a start
             self._mark(step.name)
             works = [
                 pool.submit(copy_context().run, _command, self._poller[name], step) for name in step.drives
@@ -322,6 +325,7 @@ class _Session:
 
         If the computer slept, that time counts as silence, because a run must not continue after a sleep.
         """
+        self._check_standstill()
         self.take()
         self._raise_failure()
         if slow := next((thread for thread in self._row_threads if thread.has_lost), None):
@@ -337,6 +341,13 @@ class _Session:
                 raise _Aborted(str(failure)) from failure
             if failure is not None:
                 raise failure
+
+    def _check_standstill(self) -> None:
+        """Raise _Aborted if the run stood still, for example because its process was suspended."""
+        before_ns, self._looked_ns = self._looked_ns, clock.boottime_ns()
+        still_s = (self._looked_ns - before_ns) / 1e9
+        if still_s > STILL_S:
+            raise _Aborted(f"the run stood still for {still_s:.1f} s")
 
     def take(self) -> bool:
         """Pass one batch of new rows on; return False if there is none.
