@@ -67,15 +67,15 @@ def hub(tmp_path: Path, clock: HubClock) -> Hub:
     return Hub(written(tmp_path), clock)
 
 
-def rows(*found: tuple[int, int, int | Status], drive: str = "pump-1") -> Batch:
+def rows(*found: tuple[int, int, int | Status], drive: str = "pump-1", utc_0: int = UTC_0) -> Batch:
     """Return rows of a drive, each given as its time in periods, a register, and a raw count or a status."""
     columns = Columns(len(found))
     for at, register, said in found:
         layout = RowLayout(DRIVES.index(drive), [Field(0, NumberFormat.U16, register, 1.0, 1.0)])
         if isinstance(said, Status):
-            assert add_miss(columns, layout, said, at * PERIOD, UTC_0)
+            assert add_miss(columns, layout, said, at * PERIOD, utc_0)
         else:
-            assert add_rows(columns, layout, completion(at * PERIOD, words=(said,)), UTC_0)
+            assert add_rows(columns, layout, completion(at * PERIOD, words=(said,)), utc_0)
     return Batch(columns, Names(DRIVES), Names(REGISTERS))
 
 
@@ -95,6 +95,15 @@ def test_registers_are_unknown_before_their_first_request(hub: Hub) -> None:
     assert hub.last_answer("pump-1") is None
     assert hub.newest("pump-9", "status") is None
     assert hub.state("pump-9") == "unknown"
+
+
+def test_time_of_the_newest_row_follows_a_clock_that_is_set_back(hub: Hub) -> None:
+    hub.take(rows((10, FREQUENCY, 25)))
+    assert hub.time == UTC_0 + 10 * PERIOD
+    hub.take(rows((11, FREQUENCY, 25), utc_0=UTC_0 - 3600 * SECOND))
+    assert hub.time == UTC_0 - 3600 * SECOND + 11 * PERIOD
+    hub.take(rows((9, CURRENT, 25)))  # a row of a slower exchange
+    assert hub.time == UTC_0 - 3600 * SECOND + 11 * PERIOD
 
 
 def test_a_miss_does_not_replace_the_last_good_row(hub: Hub) -> None:

@@ -166,6 +166,7 @@ class Hub:
         _, self._slept_ns = clock()
         self._woke_ns = 0  # monotonic time at which a sleep was noticed
         self.time = 0  # time of the newest row, UTC in ns
+        self._time_ns = 0  # the same, monotonic: the clock of UTC may be set back
         self.taken = 0  # number of batches received
         self.unopened: dict[str, str] = {}  # by line: why its port could not be opened
         self.stalled: dict[str, str] = {}  # by line: why its open port accepts no bytes
@@ -230,8 +231,8 @@ class Hub:
             if status == 0:
                 cell.good = row
             cell.newest = row
-            if time > self.time:
-                self.time = time
+            if monotonic_ns > self._time_ns:
+                self.time, self._time_ns = time, monotonic_ns
         self.taken += 1
 
     def _cell(self, drive: str, register: str) -> RegisterRows | None:
