@@ -24,9 +24,10 @@ from multidrop.core import Message
 from multidrop.drive import Direction, Drive, Script, read
 from multidrop.drive.register import Kept, command, setting
 from multidrop.drive.verbs import verb
-from multidrop.errors import NoReply, Unconfirmed, WriteForbidden
+from multidrop.errors import Expired, NoReply, Unconfirmed, WriteForbidden
 from multidrop.families import YD1000, DelixiModbus, InnovertIBD, InvtCHE
 from multidrop.sim import simulated
+from multidrop.transport import clock
 
 # ---- ramps ----
 
@@ -172,6 +173,22 @@ def test_drives_waiting_for_a_staggered_start_are_read_regularly(
     start_staggered(drives, gap)
     assert all(sim.motor.energised for sim in sims)
     assert 4 * gap <= line.seconds - begun < 4 * gap + 10
+
+
+def test_no_drive_is_started_after_a_suspension_between_staggered_starts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    line, drives, sims = che_drives(monkeypatch, 2)
+
+    def sleep(seconds: float) -> None:
+        line.sleep(seconds)
+        if sims[0].motor.energised:
+            line.slept = 60.0
+
+    monkeypatch.setattr(clock, "sleep", sleep)
+    with pytest.raises(Expired, match="control = FORWARD was not sent"):
+        start_staggered(drives, 4.0)
+    assert not any(sim.motor.energised for sim in sims)
 
 
 def test_a_staggered_start_does_not_stop_drives_it_never_reached(monkeypatch: pytest.MonkeyPatch) -> None:

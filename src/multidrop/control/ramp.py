@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from contextvars import copy_context
 from math import inf
+from typing import Any
 
 from multidrop.control.rules import conditions, raw_count, wears
 from multidrop.core import PAUSE_NS
@@ -19,6 +20,8 @@ from multidrop.transport import clock
 
 # s between reads of waiting drives: a drive silent for PAUSE_NS may have lost its power (identity.py)
 HEARD_S = PAUSE_NS / 2e9
+# A start whose turn comes later than planned expires. Delays up to these limits are not counted, in s.
+WAIT_SLACK_S, READ_S = 2.0, 5.0  # of each wait, and of the reads of each waiting drive
 
 
 def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | None = None) -> None:
@@ -28,7 +31,8 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
     identity is not confirmed and nothing was sent to it, it gets no stop, because the stop of its declared
     family may start a drive of another family. A drive whose stop is called on any thread during this call
     is not started. Drives that wait for their turn are read regularly: if a drive was silent, a setpoint that
-    cannot be read back is assumed lost.
+    cannot be read back is assumed lost. Raises Expired if a drive's turn comes late, because the computer
+    slept or the process was suspended.
     """
     if not 0 <= gap < inf:
         raise ValueError(f"gap = {gap:g} s: it must be 0 or more")
@@ -39,8 +43,8 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
     for number, (drive, call) in enumerate(zip(drives, calls, strict=True)):
         try:
             if number:
-                unheard_s = _await_turn(drives[number:], gap, unheard_s)
-            call = call and call.restarted()
+                call = call and call.restarted()
+                unheard_s = _await_turn(drives[number:], gap, unheard_s, call)
             drive.carry_out_move(drive.start.script(direction), call)
         except BaseException:
             is_safe_to_stop = call is None or call.sent or drive.bus.knows_identity(drive)
@@ -48,16 +52,26 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
             raise
 
 
-def _await_turn(waiting: Sequence[Drive], gap: float, unheard_s: float) -> float:
-    """Wait for `gap` s, and read the waiting drives every HEARD_S; return the time since the last read."""
+def _await_turn(waiting: Sequence[Drive], gap: float, unheard_s: float, call: Any) -> float:
+    """Wait for `gap` s, and read the waiting drives every HEARD_S; return the time since the last read.
+
+    A suspension of the process in the meantime makes `call` late.
+    """
+
+    def planned(seconds: float) -> AbstractContextManager[None]:
+        step: AbstractContextManager[None] = call.step(seconds) if call else nullcontext()
+        return step
+
     while gap > 0:
         rest = min(gap, HEARD_S - unheard_s)
-        waiting[0].perform(wait(rest))
+        with planned(rest + WAIT_SLACK_S):
+            waiting[0].perform(wait(rest))
         gap, unheard_s = gap - rest, unheard_s + rest
         if unheard_s >= HEARD_S:
             unheard_s = 0.0
             for drive in waiting:
-                with suppress(Exception):  # the later start of the drive will report the failure
+                # the later start of the drive will report the failure
+                with suppress(Exception), planned(READ_S):
                     drive.identify()
     return unheard_s
 
