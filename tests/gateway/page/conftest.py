@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 import socket
+from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from importlib.resources import files
 from typing import Any
 
@@ -59,66 +60,89 @@ def gateway(port: int) -> Iterator[FakeGateway]:
     gateway.kill()
 
 
+class Tab:
+    """A page of the browser that many tests use, one after the other: a new page costs a process."""
+
+    def __init__(self, context: Any) -> None:
+        self.page = context.new_page()
+        self.problems: list[str] = []
+        note_problems(self.page, self.problems)
+        self.page.on("requestfailed", lambda request: print("failed:", request.url, request.failure))
+        note_requests(self.page)
+
+    def leave(self) -> None:
+        """Leave the gateway's page, and reset all that a test may have changed."""
+        self.page.unroute_all(behavior="ignoreErrors")
+        with suppress(Exception):  # the test may have forbidden storage
+            self.page.evaluate("localStorage.clear()")
+        self.page.context.clear_cookies()
+        self.page.mouse.move(0, 0)
+        self.page.goto("about:blank")
+
+
 @pytest.fixture(scope="module")
-def context_with(browser: Any) -> Iterator[Callable[..., Any]]:
-    """Yield a function that takes options and returns a browser context, one per test file and options."""
-    made: dict[str, Any] = {}
+def tab_with(browser: Any) -> Iterator[Callable[..., AbstractContextManager[Tab]]]:
+    """Yield a function that takes a context's options and returns an unused tab of such a context."""
+    contexts: dict[str, Any] = {}
+    unused: defaultdict[str, list[Tab]] = defaultdict(list)
 
-    def context_with(**options: Any) -> Any:
+    @contextmanager
+    def tab_with(is_reusable: bool, **options: Any) -> Iterator[Tab]:
         key = json.dumps(options, sort_keys=True)
-        if key not in made:
-            made[key] = browser.new_context(**options)
-            made[key].set_default_timeout(PATIENCE_S * 1000)
-        return made[key]
+        if key not in contexts:
+            contexts[key] = browser.new_context(**options)
+            contexts[key].set_default_timeout(PATIENCE_S * 1000)
+        tab = unused[key].pop() if is_reusable and unused[key] else Tab(contexts[key])
+        tab.problems.clear()
+        yield tab
+        tab.leave()
+        if is_reusable:
+            unused[key].append(tab)
+        else:
+            tab.page.close()
 
-    yield context_with
-    for context in made.values():
+    yield tab_with
+    for context in contexts.values():
         context.close()
 
 
 @pytest.fixture
-def few_drives(monkeypatch: pytest.MonkeyPatch) -> int:
-    """Reduce the plant to a few drives of every state, to save drawing time; return their number."""
-    monkeypatch.setattr(fake_plant, "NAMES", fake_plant.FEW_NAMES)
-    return len(" ".join(fake_plant.FEW_NAMES).split())
+def many_drives(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give the plant 31 drives, as many as a line may have."""
+    monkeypatch.setattr(fake_plant, "NAMES", fake_plant.MANY_NAMES)
 
 
 @pytest.fixture
-def opened(context_with: Callable[..., Any], gateway: FakeGateway) -> Iterator[Opener]:
+def opened(tab_with: Callable[..., AbstractContextManager[Tab]], gateway: FakeGateway) -> Iterator[Opener]:
     """Return a function that opens a view; the test fails if the page had an error or violated its CSP.
 
     `prepare` is called with the page before it is loaded.
     """
-    pages, problems = [], []
+    with ExitStack() as tabs:
+        problems: list[list[str]] = []
 
-    def open_page(
-        view: str = "#/drives",
-        size: str = "desk",
-        live: bool = True,
-        prepare: Callable[[Any], object] = lambda page: None,
-        **options: Any,
-    ) -> Any:
-        width, height = SIZES[size]
-        viewport = {"width": width, "height": height}
-        page = context_with(viewport=viewport, **{"locale": "en-US", **options}).new_page()
-        pages.append(page)
-        page.on("pageerror", lambda error: problems.append(str(error)))
-        page.on("console", lambda said: problems.append(said.text) if is_problem(said) else None)
-        page.on("requestfailed", lambda request: print("failed:", request.url, request.failure))
-        note_requests(page)
-        prepare(page)
-        page.goto(gateway.url + view)
-        if live:
-            until(page, LIVE)
-        return page
+        def open_page(
+            view: str = "#/drives",
+            size: str = "desk",
+            live: bool = True,
+            prepare: Callable[[Any], object] | None = None,
+            **options: Any,
+        ) -> Any:
+            width, height = SIZES[size]
+            viewport = {"width": width, "height": height}
+            chosen = {"viewport": viewport, "locale": "en-US", **options}
+            tab = tabs.enter_context(tab_with(prepare is None, **chosen))
+            problems.append(tab.problems)
+            tab.page.set_viewport_size(viewport)
+            if prepare is not None:
+                prepare(tab.page)
+            tab.page.goto(gateway.url + view)
+            if live:
+                until(tab.page, LIVE)
+            return tab.page
 
-    yield open_page
-    for page in pages:
-        with suppress(Exception):  # the test may have forbidden storage
-            page.evaluate("localStorage.clear()")
-        page.context.clear_cookies()
-        page.close()
-    assert problems == []
+        yield open_page
+    assert [each for each in problems if each] == []
 
 
 @pytest.fixture
@@ -126,12 +150,17 @@ def page(browser: Any) -> Iterator[Any]:
     """A page without a gateway; the test fails if the page had an error or violated its CSP."""
     context = browser.new_context(viewport={"width": 1440, "height": 900}, locale="en-US")
     context.set_default_timeout(PATIENCE_S * 1000)
-    page, problems = context.new_page(), []
-    page.on("pageerror", lambda error: problems.append(str(error)))
-    page.on("console", lambda said: problems.append(said.text) if is_problem(said) else None)
+    page, problems = context.new_page(), list[str]()
+    note_problems(page, problems)
     yield page
     context.close()
     assert problems == []
+
+
+def note_problems(page: Any, problems: list[str]) -> None:
+    """Append the page's errors, and its violations of the CSP, to a list."""
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on("console", lambda said: problems.append(said.text) if is_problem(said) else None)
 
 
 def is_problem(said: Any) -> bool:

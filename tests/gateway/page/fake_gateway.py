@@ -255,7 +255,8 @@ def lines(handler: Any, gateway: FakeGateway, _: object) -> None:
             "minutes": noisy if n == 1 else quiet,
             "drives": {
                 d["name"]: {
-                    "p50": 3 + i % 4, "p99": 6 + i % 5, "asked": 5120, "missed": 3 * ((n, i) == (1, 5)),
+                    "p50": 3 + i % 4, "p99": 6 + i % 5, "asked": 5120,
+                    "missed": 3 * (d["name"] == "labeller"),
                 }
                 for i, d in enumerate(line["drives"])
             },

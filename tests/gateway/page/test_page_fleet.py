@@ -133,12 +133,12 @@ def test_stop_all_in_the_fleet_view_names_and_stops_this_plant(opened: Opener, g
     stopall = page.locator("#stopall")
     assert stopall.inner_text() == "Stop this plant"
     stopall.click()
-    assert page.locator("#ask-title").inner_text() == "Stop all 31 drives of bottling plant?"
+    assert page.locator("#ask-title").inner_text() == "Stop all 10 drives of bottling plant?"
     asked = page.locator("#ask").inner_text()
     assert "drives of this plant only" in asked
     assert "multidrop fleet stop --all" in asked
-    page.get_by_role("button", name="Stop all 31 drives of bottling plant").click()
-    page.get_by_role("heading", name="All 31 drives are stopped").wait_for()
+    page.get_by_role("button", name="Stop all 10 drives of bottling plant").click()
+    page.get_by_role("heading", name="All 10 drives are stopped").wait_for()
     assert gateway.posts == [("/api/stop", {"drives": None})]
     page.keyboard.press("Escape")
     page.evaluate("location.hash = '#/drives'")
@@ -152,9 +152,9 @@ def test_stop_all_stops_the_fleet_with_a_commanders_key(opened: Opener, gateway:
     assert page.locator("#stopall").inner_text() == "Stop the fleet"
     page.locator("#stopall").click()
     assert page.locator("#ask-title").inner_text() == "Stop the whole fleet?"
-    assert "all 31 drives of bottling plant" in page.locator("#ask").inner_text()
+    assert "all 10 drives of bottling plant" in page.locator("#ask").inner_text()
     page.get_by_role("button", name="Stop the whole fleet").click()
-    page.get_by_role("heading", name="All 32 drives are stopped").wait_for()
+    page.get_by_role("heading", name="All 11 drives are stopped").wait_for()
     assert sorted(gateway.posts) == [("/api/fleet/stop", {}), ("/api/stop", {"drives": None})]
 
 
@@ -167,9 +167,9 @@ def test_a_failed_stop_of_the_fleet_is_reported_in_addition_to_the_own_drives(
     page = opened("#/fleet")
     page.locator("#stopall").click()
     page.get_by_role("button", name="Stop the whole fleet").click()
-    page.get_by_role("heading", name="1 of 32 drives are not confirmed as stopped").wait_for()
+    page.get_by_role("heading", name="1 of 11 drives are not confirmed as stopped").wait_for()
     assert page.locator("#ask .outcome li").all_inner_texts() == ["the fleet: the stop was NOT sent"]
     page.route("**/api/fleet/stop", lambda route: route.abort())
     page.get_by_role("button", name="Send the stop again").click()
     page.get_by_role("heading", name="It is unknown whether the stop was sent").wait_for()
-    assert "All 31 drives are stopped." in page.locator("#ask").inner_text()
+    assert "All 10 drives are stopped." in page.locator("#ask").inner_text()

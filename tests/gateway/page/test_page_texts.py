@@ -292,7 +292,7 @@ def english_in(texts: list[str]) -> set[str]:
 @pytest.mark.long
 @pytest.mark.parametrize("language", ["ru", "zh"])
 def test_each_view_fits_a_narrow_screen_and_has_no_english_text(
-    opened: Opener, axe: str, few_drives: int, language: str
+    opened: Opener, axe: str, language: str
 ) -> None:
     page = opened(live=False, locale=language)
     page.set_viewport_size(NARROW)
@@ -304,7 +304,8 @@ def test_each_view_fits_a_narrow_screen_and_has_no_english_text(
         until_settled(page)
         texts, wide = page.evaluate(READ)
         assert len(texts) > 10, view
-        found[view] = [*english_in(texts), *wide, *violations(page)]
+        # Colours are the same in all languages.
+        found[view] = [*english_in(texts), *wide, *violations(page, "color-contrast")]
 
     for view in VIEWS:
         page.evaluate("view => { location.hash = view }", view)
@@ -315,7 +316,7 @@ def test_each_view_fits_a_narrow_screen_and_has_no_english_text(
     page.locator("#stopall").click()
     read("question about a stop")
     page.locator("#ask .danger").click()
-    stopped = TEXTS["All {n} drives are stopped"][language].replace("{n}", str(few_drives))
+    stopped = TEXTS["All {n} drives are stopped"][language].replace("{n}", "10")
     page.get_by_role("heading", name=stopped).wait_for()
     read("outcome of a stop")
     assert {view: problems for view, problems in found.items() if problems} == {}
@@ -368,7 +369,7 @@ def test_page_without_its_texts_is_in_english_and_stops_drives(opened: Opener, g
     page.locator("#link").get_by_text("live", exact=True).wait_for()
     assert page.locator("html").get_attribute("lang") == "en"
     page.get_by_role("button", name="Stop all", exact=True).click()
-    page.get_by_role("button", name="Stop all 31 drives").click()
+    page.get_by_role("button", name="Stop all 10 drives").click()
     until_met(page, lambda: gateway.posts == [("/api/stop", {"drives": None})])
 
 

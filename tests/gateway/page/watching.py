@@ -1,4 +1,4 @@
-"""Functions that wait for a state of a page. They poll it, because its CSP forbids evaluated code."""
+"""Functions that wait for a state of a page."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def missing(what: str) -> NoReturn:
 
 
 PATIENCE_S = 60.0  # time limit for events that are immediate on an idle machine
-LOOK_MS = 60  # polling interval; each check costs 2 ms of processor time
+LOOK_MS = 60  # polling interval
 LIVE = "document.querySelector('#link').textContent.trim() === 'live'"
 STALE = "document.body.classList.contains('stale')"
 VIEWS = ("#/drives", "#/drives/pump-3", "#/trends", "#/faults", "#/lines", "#/log")
@@ -37,8 +37,27 @@ AT_ITS_PLACE = """() => {
 
 AXE_TAGS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
 # Report violations only: other results would list all elements of the page.
-RUN_AXE = """tags => axe.run(document, { runOnly: tags, resultTypes: ["violations"] })
-  .then(found => found.violations)"""
+RUN_AXE = """([tags, without]) => axe.run(document, {
+  runOnly: tags,
+  rules: Object.fromEntries(without.map(rule => [rule, { enabled: false }])),
+  resultTypes: ["violations"],
+}).then(found => found.violations)"""
+
+
+# Poll inside the page, which costs less than messages. The CSP forbids `page.wait_for_function`.
+POLLED = """new Promise((done, fail) => {
+  let left = %(looks)d;
+  const look = async () => {
+    try {
+      if (await (%(expression)s)) done(true);
+      else if (--left) setTimeout(look, %(look_ms)d);
+      else done(false);
+    } catch (error) {
+      fail(error);
+    }
+  };
+  look();
+})"""
 
 
 def until(page: Any, expression: str) -> None:
@@ -49,7 +68,7 @@ def until(page: Any, expression: str) -> None:
 
     def met() -> object:
         try:
-            return page.evaluate(expression)
+            return page.evaluate(POLLED % {"expression": expression, "looks": 50, "look_ms": LOOK_MS})
         except Exception as failure:
             if "Execution context was destroyed" not in str(failure):
                 raise
@@ -67,6 +86,12 @@ def until_met(page: Any, met: Callable[[], object], what: str = "") -> None:
     while not met():
         assert time.monotonic() < end, f"not within {PATIENCE_S:g} s: {what}; {told(page)}"
         page.wait_for_timeout(LOOK_MS)
+
+
+def await_new_value(page: Any, shown: Callable[[], float]) -> None:
+    """Wait until a value made after this call is shown. The values of `clocked` are times modulo 1000 s."""
+    called_s = time.time()
+    until_met(page, lambda: (shown() - called_s) % 1000 < 500)
 
 
 def until_still(page: Any) -> None:
@@ -131,7 +156,10 @@ def link(page: Any) -> str:
     return str(page.locator("#link").inner_text().strip())
 
 
-def violations(page: Any) -> list[str]:
-    """Return the violations that axe-core finds in the present view; the page must have loaded axe-core."""
-    found = page.evaluate(RUN_AXE, AXE_TAGS)
+def violations(page: Any, *without: str) -> list[str]:
+    """Return the violations that axe-core finds in the present view, without these rules.
+
+    The page must have loaded axe-core.
+    """
+    found = page.evaluate(RUN_AXE, [AXE_TAGS, without])
     return [f"{v['id']}: {node['target']} {node['failureSummary']}" for v in found for node in v["nodes"]]
