@@ -12,7 +12,8 @@
 
 /* ---- errors ---- */
 
-/* Windows errors as the errno of POSIX, which the core and Python use. */static const struct {
+/* Windows errors as the errno of POSIX, which the core and Python use. */
+static const struct {
     DWORD error;
     int number;
 } known[] = {

@@ -13,7 +13,17 @@ from collections import Counter
 from typing import Any
 
 import plug
-from common import KINDS, Command, Meter, attempt, kernel_settings, right, run, until_answered
+from common import (
+    KINDS,
+    Command,
+    Meter,
+    attempt,
+    insist,
+    kernel_settings,
+    right,
+    run,
+    until_answered,
+)
 
 import multidrop
 from multidrop import Bus
@@ -75,7 +85,7 @@ def rts_in_stall(kind: str) -> dict[str, Any]:
 
     with Bus(adapter.path, baudrate=9600, format="8N1", rs485="rts-up") as bus:
         meter = bus.attach(Meter, address=2)
-        meter.read(meter.a)
+        insist(meter.read, meter.a)
         adapter.do("stall", True)
         results = [str(attempt(meter.read, meter.a)) for _ in range(3)]
         held = record()
