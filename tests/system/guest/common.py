@@ -75,15 +75,17 @@ def until_answered(call: Callable[..., object], *arguments: Any) -> Any:
     return result
 
 
-def insist(call: Callable[..., object], *arguments: Any) -> None:
-    """Repeat a call until it succeeds: on a busy computer a write may expire before it is sent.
+def insist(call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """Repeat a call until it succeeds, and return its result.
 
-    Raises the call's last error if none of its attempts succeeds.
+    On a busy computer a write may expire before it is sent, and a reply may come too late. Raises the call's
+    last error if none of its attempts succeeds.
     """
     for _ in range(ATTEMPTS - 1):
-        if not isinstance(attempt(call, *arguments), str):
-            return
-    call(*arguments)
+        result = attempt(call, *arguments, **options)
+        if not isinstance(result, str):
+            return result
+    return call(*arguments, **options)
 
 
 def kernel_settings(path: str) -> tuple[int, str]:

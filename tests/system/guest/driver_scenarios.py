@@ -169,7 +169,7 @@ def rs485_mode() -> dict[str, Any] | None:
     before = len(plug.do("registers"))
     try:
         _, text = run("doctor", "/dev/ttyS1", "--json")
-        read = attempt(_values, "/dev/ttyS1", 9600, "8N1", rs485="kernel")
+        read = attempt(insist, _values, "/dev/ttyS1", 9600, "8N1", rs485="kernel")
         registers = plug.do("registers")[before:]
     finally:
         subprocess.run(["rmmod", "rs485_uart"], check=True)
