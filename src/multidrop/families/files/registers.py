@@ -508,9 +508,6 @@ def declare_rows(data: bytes, declared: Declared, place: TomlPlace) -> None:
 
 
 def _decoded(data: bytes, place: TomlPlace) -> str | None:
-    if len(data) > MOST_BYTES:
-        place.wrong(f"has more than {MOST_BYTES} bytes")
-        return None
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as failure:
