@@ -210,8 +210,9 @@ def test_no_reply_reaches_a_tool_after_the_timeout(tmp_path: Path) -> None:
         until(lambda: rig.line.asked)
         assert receive(tool, 1, 0.4) == b""
         rig.line.seconds = 0.0
-        os.write(tool, checksums.rtu("01 03 00 02 00 01"))
-        until(lambda: len(rig.line.asked) == 2)
+        while len(rig.line.asked) < 2:  # on a busy computer, a request may be answered "busy"
+            os.write(tool, checksums.rtu("01 03 00 02 00 01"))
+            time.sleep(0.05)
         time.sleep(0.2)  # longer than the port's timeout
         assert receive(tool, 1, QUIET) == b""
 
