@@ -119,7 +119,7 @@ def line_numbers(path: Path) -> Lines:
     return _LineScan(text).lines
 
 
-class _Open(NamedTuple):
+class _Unclosed(NamedTuple):
     """A list or an inline table that is not closed yet."""
 
     is_list: bool
@@ -146,7 +146,7 @@ class _LineScan:
         self.lines: dict[tuple[Steps, str], int] = {}
         self._counts: Counter[tuple[Steps, str]] = Counter()  # of [[ARRAY]] headers
         self._table: Steps = ()  # the table of the latest header
-        self._open: list[_Open] = []
+        self._open: list[_Unclosed] = []
         self._parts: list[str] = []  # parts of the latest key or header
         self._brackets = 0  # of the header that is being read
         self._is_value = False  # inside the value of a key, not in a key
@@ -225,9 +225,9 @@ class _LineScan:
         place = self._place()
         if is_list:
             *outer, (name, _) = place
-            self._open.append(_Open(True, tuple(outer), name, 1))
+            self._open.append(_Unclosed(True, tuple(outer), name, 1))
         else:
-            self._open.append(_Open(False, place))
+            self._open.append(_Unclosed(False, place))
             self._is_value = False
 
     def _next_element(self) -> None:

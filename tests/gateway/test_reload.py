@@ -105,15 +105,15 @@ def test_a_file_with_mistakes_changes_nothing(tmp_path: Path) -> None:
         assert told["done"] is False
         assert told["text"] == "the previous plant stays in use: the file has mistakes"
         lines = told["mistakes"]
-        assert [mistake.partition(": ")[0] for mistake in lines] == [f"{path}:{line}" for line in (4, 5, 11)]
+        assert [mistake.partition(": ")[0] for mistake in lines] == [f"{path}:{line}" for line in (4, 7, 13)]
         path.write_text(path.read_text() + '[serve]\nlisten = 80\n[serve.may]\nwrite = ["pump-9.setpoint"]\n')
         (of_serve,) = [one for one in reload(gateway)["mistakes"] if one not in lines]
-        assert of_serve == f'{path}: [serve]: listen = 80 is not right; write listen = "127.0.0.1:8750"'
+        assert of_serve == f'{path}:18: [serve]: listen = 80 is not right; write listen = "127.0.0.1:8750"'
         path.write_text(good + '[serve]\nlisten = 80\n[serve.may]\nwrite = ["pump-9.setpoint"]\n')
         mistakes = reload(gateway)["mistakes"]
         assert mistakes == [
-            f'{path}: [serve]: listen = 80 is not right; write listen = "127.0.0.1:8750"',
-            f"{path}: [serve.may]: write: there is no drive 'pump-9'; did you mean pump-2 or pump-1?",
+            f'{path}:18: [serve]: listen = 80 is not right; write listen = "127.0.0.1:8750"',
+            f"{path}:20: [serve.may]: write: there is no drive 'pump-9'; did you mean pump-2 or pump-1?",
         ]
         health = gateway.get("/health")
         assert (health.status, health.json["status"]) == (200, "degraded")

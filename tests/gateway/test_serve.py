@@ -102,7 +102,7 @@ def test_sighup_reloads_and_notifies_systemd(tmp_path: Path) -> None:
                 assert process.returncode == 0
     messages = [json.loads(line)["message"] for line in errors.splitlines()]
     assert messages.count("reload, asked for by a signal") == 2
-    mistake = f"the previous plant stays in use: {path}: unknown key 'lin'; did you mean line?"
+    mistake = f"the previous plant stays in use: {path}:1: unknown key 'lin'; did you mean line?"
     assert mistake in messages
     assert "the plant file is in effect" in messages
 
