@@ -205,6 +205,7 @@ def test_only_the_newest_of_several_requests_is_answered(rig: Rig, tool: int) ->
 
 def test_no_reply_reaches_a_tool_after_the_timeout(tmp_path: Path) -> None:
     with serving(tmp_path, timeout=0.05) as rig, opened(str(rig.link)) as tool:
+        rig.ports.lines["hall"].share.share = 100.0  # no pauses
         rig.line.seconds = 0.2
         os.write(tool, checksums.rtu("01 03 00 01 00 01"))
         until(lambda: rig.line.asked)
