@@ -187,6 +187,19 @@ def test_existing_file_is_kept_and_an_incomplete_one_is_removed(
     assert [path.name for path in tmp_path.iterdir()] == ["run.arrows"]
 
 
+def test_drives_with_similar_names_have_separate_groups_in_hdf5(tmp_path: Path) -> None:
+    import h5py
+
+    names = ["hall/fan", "hall\N{DIVISION SLASH}fan"]
+    found = [row(at, name, "output_current", at) for at in (1.0, 2.0) for name in names]
+    source = record(tmp_path / "run.arrows", found, METADATA)
+    convert(source, tmp_path / "run.h5")
+    with h5py.File(tmp_path / "run.h5") as file:
+        groups = [file[f"drives/{key}/output_current"] for key in (names[1], f"{names[1]}_")]
+        assert [group.attrs["drive"] for group in groups] == names
+        assert [group["value"][:].tolist() for group in groups] == [[1.0, 2.0]] * 2
+
+
 def test_interrupt_during_a_write_of_hdf5_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

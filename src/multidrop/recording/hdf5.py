@@ -61,6 +61,7 @@ class Hdf5Writer(SeriesWriter):
         described = dump_metadata(metadata)
         self._file: Any = None
         self._groups: dict[tuple[str, str], Any] = {}
+        self._drives: dict[str, str] = {}  # by name of a drive's group: the drive
         self._events: list[Event] = []
         with writing(path):
             try:
@@ -96,7 +97,10 @@ class Hdf5Writer(SeriesWriter):
 
     def _new_group(self, rows: ExportedRows, drive: Mapping[str, Any]) -> Any:
         about = drive.get("registers", {}).get(rows.register, {})
-        group = self._file.create_group(f"drives/{_key(rows.drive)}/{_key(rows.register)}")
+        key = _key(rows.drive)
+        while self._drives.setdefault(key, rows.drive) != rows.drive:  # another drive has this group
+            key += "_"
+        group = self._file.create_group(f"drives/{key}/{_key(rows.register)}")
         group.attrs["drive"], group.attrs["register"] = rows.drive, rows.register
         group.attrs["unit"] = unit_of_register(about)
         if about.get("values"):
