@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import sys
+import threading
 from io import BytesIO, StringIO, TextIOWrapper
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,6 +23,7 @@ from multidrop.cli import run
 from multidrop.cli.poll import LiveTable
 from multidrop.cli.support.polling import Triggering
 from multidrop.cli.support.triggers import trigger_picture
+from multidrop.control import exit_hook
 from multidrop.plant.loader import load_plant
 from multidrop.polling.batch import Row
 from multidrop.recording import open_writer
@@ -198,7 +200,11 @@ def test_a_sentence_printed_at_a_signal_stays_above_the_next_table_of_a_run(
     monkeypatch.setattr(terminal, "isatty", lambda: True)
     monkeypatch.setattr(sys, "stdout", terminal)
     monkeypatch.setattr("multidrop.cli.poll.EVERY", 0.0)
-    before = signal.signal(signal.SIGTERM, lambda number, frame: print("stopping pump"))
+    monkeypatch.setattr(exit_hook, "_print_error", print)
+    monkeypatch.setattr(exit_hook, "_hook", hook := exit_hook.ExitHook())
+    before = signal.signal(signal.SIGTERM, lambda number, frame: None)
+    stopped = threading.Event()
+    act = hook.add(lambda: None, stopped.wait, lambda: ["pump"])
     test: Any = SimpleNamespace(plan=SimpleNamespace(plant=load_plant(path)), phase="")
     try:
         with run._screen(test, argparse.Namespace(json=False)) as (show,):
@@ -207,7 +213,11 @@ def test_a_sentence_printed_at_a_signal_stays_above_the_next_table_of_a_run(
             for _ in range(2):
                 show(NO_ROWS)
     finally:
+        stopped.set()
+        hook.await_effect()
+        hook.finish(act)
         signal.signal(signal.SIGTERM, before)
     table = "DRIVE  SAMPLES  MISSES  NEWEST VALUES\npump         0       0\n"
     again = f"stopping all drives\n{table}"
-    assert terminal.getvalue() == f"checking the drives\n{table}stopping pump\n{again}\x1b[3F\x1b[J{again}"
+    sentence = exit_hook.STOPPING.format("SIGTERM", "pump")
+    assert terminal.getvalue() == f"checking the drives\n{table}{sentence}\n{again}\x1b[3F\x1b[J{again}"

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import signal
-import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -29,6 +27,7 @@ from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.values import aligned, counted
 from multidrop.cli.support.writing import confirm
 from multidrop.cli.verbs import stop_sentence
+from multidrop.control.exit_hook import signal_has_come
 from multidrop.drive.known_state import can_show_fault
 from multidrop.polling.batch import Rows
 from multidrop.recording import FORMATS
@@ -121,40 +120,17 @@ def _screen(test: TestRun, arguments: argparse.Namespace) -> Iterator[list[Calla
         return
     is_ending = False
     table = LiveTable(test.plan.plant, sys.stdout, lambda: STOPPING if is_ending else _progress(test))
-    with table.showing_warnings(), _signals() as came:
+    with table.showing_warnings():
 
         def show(rows: Rows) -> None:
             nonlocal is_ending
             table.add(rows)
-            if came():  # after a signal, another sentence is printed below the table
+            if not is_ending and signal_has_come():  # then another sentence is printed below the table
                 is_ending = True
                 table.keep_drawing(time.monotonic())
             table.draw_if_due(time.monotonic())
 
         yield [show]
-
-
-@contextmanager
-def _signals() -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns True if the process has received a signal since the function's last call.
-
-    The function may be called in any thread.
-    """
-    received, sent = socket.socketpair()
-    with received, sent:
-        received.setblocking(False)
-        sent.setblocking(False)
-        before = signal.set_wakeup_fd(sent.fileno(), warn_on_full_buffer=False)
-
-        def came() -> bool:
-            with suppress(BlockingIOError):
-                return bool(received.recv(4096))
-            return False
-
-        try:
-            yield came
-        finally:
-            signal.set_wakeup_fd(before)
 
 
 def _progress(test: TestRun) -> str:

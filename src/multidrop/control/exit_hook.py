@@ -249,6 +249,11 @@ class ExitHook:
             self._has_passed = True
         _send(held, ident)
 
+    @property
+    def delays_signal(self) -> bool:
+        """True while the effect of a signal is delayed until the last acts are over."""
+        return self._held is not None
+
     def await_effect(self) -> None:
         """Wait until a delayed signal has its effect, such as KeyboardInterrupt.
 
@@ -309,6 +314,11 @@ def await_signal() -> None:
     """If a signal has started the stops, wait until the signal has its effect (main thread only)."""
     if _hook is not None:
         _hook.await_effect()
+
+
+def signal_has_come() -> bool:
+    """Return True while drives are stopped because of a signal. Any thread may call this."""
+    return _hook is not None and _hook.delays_signal
 
 
 _hook: ExitHook | None = None
