@@ -109,7 +109,7 @@ def test_a_silent_drive_is_identified_once_before_the_next_write(
 
 
 @pytest.mark.parametrize("model", MAKE)
-@pytest.mark.usefixtures("_turns_awaited")
+@pytest.mark.usefixtures("_patient")
 @pytest.mark.parametrize("pause", ["idle", "asleep", "read since"])
 def test_a_drive_is_identified_once_after_ten_seconds_without_a_reply(
     model: str, pause: str, monkeypatch: pytest.MonkeyPatch
