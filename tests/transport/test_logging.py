@@ -154,11 +154,12 @@ def test_records_waiting_for_a_hanging_handler_are_bounded(monkeypatch: pytest.M
     handler, logger = Hanging(), logging.getLogger("multidrop.line")
     logger.addHandler(handler)
     try:
+        aside_log.log_aside(logger, logging.WARNING, "the first record")
+        assert handler.has_begun.wait(PATIENCE)
         for number in range(2 * aside_log.MOST_WAITING):
             aside_log.log_aside(logger, logging.WARNING, "%d", number)
-        assert handler.has_begun.wait(PATIENCE)
-        assert aside._work.qsize() <= aside_log.MOST_WAITING
+        assert aside._work.qsize() == aside_log.MOST_WAITING
     finally:
         handler.released.set()
         logger.removeHandler(handler)
-        flush(PATIENCE)  # no record may appear during a later test
+        assert aside.flush(PATIENCE)  # also with a full queue; no record may appear during a later test

@@ -32,9 +32,9 @@ class AsideThread:
         # call is done, and the timeout of that call in s.
         self._late: tuple[SimpleQueue[None], float] | None = None
 
-    def put(self, work: Callable[[], object]) -> None:
-        """Queue this work, and return immediately. Work is done in the order of the calls."""
-        if self._work.qsize() < MOST_WAITING:
+    def put(self, work: Callable[[], object], most: int = MOST_WAITING) -> None:
+        """Queue this work unless `most` pieces are queued; return immediately. Work is done in order."""
+        if self._work.qsize() < most:
             self._work.put(work)
         if self._begun.acquire(blocking=False):
             try:
@@ -49,7 +49,7 @@ class AsideThread:
         if not self._begun.locked():
             return self._work.empty()
         done: SimpleQueue[None] = SimpleQueue()
-        self.put(partial(done.put, None))
+        self.put(partial(done.put, None), 2 * MOST_WAITING)  # even if the queue is full of other work
         try:
             done.get(timeout=seconds)
         except Empty:
