@@ -60,7 +60,7 @@ NOT_RUN = {
     "MULTIDROP_KERNEL=": "runs the tests themselves",
     "tools/musl": "builds a Python: many minutes",
     "tools/wine": "needs Wine, and downloads a Python for Windows",
-    ".venv/bin/python -m bench": "needs rivals and a quiet machine; .ci/run runs a benchmark",
+    ".venv/bin/python -m bench": "needs rivals and a quiet machine; .ci/nightly runs a benchmark",
     ".venv/bin/python -m sphinx": "has its own test below",
     ".venv/bin/python docs/pictures/make.py": "takes a minute; a test below compares the constant parts",
     "mbpoll": "is another program: tests/gateway/modbus_server/test_masters.py runs it",
