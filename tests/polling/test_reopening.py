@@ -232,3 +232,18 @@ def test_a_connection_that_its_peer_closes_between_slow_polls_costs_no_value() -
             until(look)
     late_closes = len(closes) - closes.count(b"")
     assert sum(row.status != "ok" for row in rows) <= late_closes
+
+
+def test_values_of_a_server_that_closes_each_connection_at_once_are_misses() -> None:
+    """Many devices do this while they already have as many connections as they can serve."""
+    with server(lambda nth, address: False, idle_s=0.0) as port:
+        drive = polled(Scattered(1, name="pump"), [Scattered.registers["near"]], 0.1)
+        with Poller(plant(line(port, drive))) as poller:
+            rows: list[Row] = []
+
+            def look() -> bool:
+                rows.extend(row for row in rows_of(poller) if row.status != "ok")
+                return len(rows) >= 10
+
+            until(look)
+    assert {row.status for row in rows} <= {"port lost", "reply cut short"}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -32,10 +32,14 @@ _log = logging.getLogger("multidrop.polling")
 
 
 class Reopening:
-    """Attempts to reopen a lost port, one at a time, in a thread: a slow port must not delay other lines."""
+    """Attempts to reopen a lost port, one at a time, in a thread: a slow port must not delay other lines.
 
-    def __init__(self, bus: Bus) -> None:
+    After a successful attempt, `reopened` is called in that thread.
+    """
+
+    def __init__(self, bus: Bus, reopened: Callable[[], object]) -> None:
         self._bus = bus
+        self._reopened = reopened
         self._thread: threading.Thread | None = None
 
     @property
@@ -59,6 +63,7 @@ class Reopening:
     def _attempt(self) -> None:
         try:
             self._bus.line.regain()
+            self._reopened()
         except LineError:
             pass  # the line has logged the failure
         except BaseException as failure:
@@ -140,8 +145,10 @@ class PolledLine:
         self._observed: list[tuple[int, int, bool]] = []  # the last observation of each drive in `_polled`
         self._is_started = False
         self._learnt_ns = 0
-        self._reopening = Reopening(bus)
-        self._lost_ns = self._reopen_ns = 0
+        # Some servers close a connection that stays idle: send the next request at once.
+        self._reopening = Reopening(bus, lambda: row_queue.call(number))
+        self._lost_ns = 0  # when the port was lost; 0 while it is open
+        self._reopen_ns = 0  # when the next attempt to reopen it is due
         self._standby_ns = 0
         self.failure = ""  # the last failure of polling; "" after SOUND_NS without another failure
         self._failures = 0  # number of failures in a row
@@ -394,6 +401,7 @@ class PolledLine:
             if port.lost:
                 self._lose(port, now_ns)
                 return
+            self._lost_ns = 0
             self.bus.line.note_news()
             if not self.bus.line.may_send:
                 self._queue.pause(port)
@@ -468,7 +476,8 @@ class PolledLine:
         port.stop()
         self._queue.give_back()
         self.bus.line.drop()
-        self._lost_ns = self._reopen_ns = now_ns
+        if not self._lost_ns:  # else the reopened port was lost before a request was queued
+            self._lost_ns = self._reopen_ns = now_ns
 
     def _regain(self, now_ns: int) -> None:
         """Reopen the port in a thread; until that succeeds, add a miss row for each value that is due.
