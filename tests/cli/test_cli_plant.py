@@ -69,7 +69,7 @@ def one_line(directory: Path, port: str, name: str = "one.toml") -> Path:
 # ---- reading and writing ----
 
 
-def test_read_takes_a_plant_file_and_a_drive_name(run: Run, port: str, tmp_path: Path) -> None:
+def test_read_accepts_a_plant_file_and_a_drive_name(run: Run, port: str, tmp_path: Path) -> None:
     plant = one_line(tmp_path, port)
     shown = "output_current    3.25  A\noutput_frequency  49.9  Hz\n"
     assert run("read", plant, "pump-1", *READINGS) == (0, shown, "")
@@ -130,7 +130,7 @@ def test_options_for_plant_files_are_refused_without_a_plant_file(run: Run) -> N
         assert run(*words, "--port=a=b") == (2, "", sentence)
 
 
-def test_a_plant_files_mistakes_are_reported_as_by_plan(run: Run, plant: Path) -> None:
+def test_read_reports_mistakes_in_a_plant_file_like_the_command_plan(run: Run, plant: Path) -> None:
     plant.write_text(
         plant.read_text().replace('"pump-1"', '"fan-1"').replace("address = 4", "address = 4000")
     )
@@ -140,7 +140,7 @@ def test_a_plant_files_mistakes_are_reported_as_by_plan(run: Run, plant: Path) -
     assert run("read", plant.with_name("none.toml"), "fan-1")[0] == 2
 
 
-def test_write_takes_a_plant_file_and_a_drive_name(
+def test_write_accepts_a_plant_file_and_a_drive_name(
     run: Run, plant: Path, at: str, toy: SimulatedDrive
 ) -> None:
     words = ("write", plant, "pump-1", at, "frequency")
@@ -157,7 +157,7 @@ def test_write_takes_a_plant_file_and_a_drive_name(
 # ---- commands to motors ----
 
 
-def test_verbs_take_a_plant_file_and_a_drive_name(
+def test_verbs_accept_a_plant_file_and_a_drive_name(
     run: Run, plant: Path, at: str, toy: SimulatedDrive
 ) -> None:
     drive = (plant, "pump-1", at)
@@ -272,7 +272,7 @@ def test_monitor_replaces_ports_by_the_port_option(
 
 
 @pytest.mark.slow
-def test_scan_takes_a_plant_file_and_a_line(run: Run, plant: Path, port: str, at: str) -> None:
+def test_scan_accepts_a_plant_file_and_a_line(run: Run, plant: Path, port: str, at: str) -> None:
     few = ("--model", TOY, "--addresses", "1", "--baudrates", "9600", "--formats", "8N1", "--json")
     status, out, _ = run("scan", plant, "hall-1", at, *few)
     assert status == 0
@@ -301,7 +301,7 @@ def test_doctor_measures_with_the_drives_of_a_plant(run: Run, plant: Path, port:
     assert "--model is not for plant files" in run("doctor", plant, "pump-1", "--model", TOY)[2]
 
 
-def test_sniff_takes_a_plant_file_and_a_line(run: Run, plant: Path, at: str) -> None:
+def test_sniff_accepts_a_plant_file_and_a_line(run: Run, plant: Path, at: str) -> None:
     status, out, err = run("sniff", plant, "hall-1", at, "--seconds", "0.2")
     assert (status, out) == (0, "0 exchanges, 0 unknown bytes\n")
     assert err.startswith("listening on /dev/pts/")

@@ -149,7 +149,7 @@ def test_low_latency_is_not_advised_for_drivers_that_ignore_it(driver: str) -> N
     assert low_latency_finding(False, "ftdi_sio").advice
 
 
-def test_a_long_latency_timer_gets_advice(sysfs: Path) -> None:
+def test_doctor_gives_advice_if_the_latency_timer_is_long(sysfs: Path) -> None:
     finding = latency_finding(find_adapter("/dev/ttyUSB0", sysfs))
     assert finding.what == "16 ms: every reply may wait that long in the adapter"
     assert f"echo 1 | sudo tee {sysfs}/bus/usb-serial/devices/ttyUSB0/latency_timer" in finding.advice
@@ -234,7 +234,7 @@ def test_each_finding_is_a_sentence_with_advice_only_if_needed(
     assert bool(finding.advice) == advised
 
 
-def test_a_slow_round_trip_gets_advice() -> None:
+def test_doctor_gives_advice_if_the_round_trip_is_slow() -> None:
     drive = InvtCHE(1)
     usual = round_trip_finding(drive, [0.005] * ROUNDS, ROUNDS)
     assert usual.what.endswith("answers in 5.0 ms (median; 5.0 to 5.0 ms)")
@@ -246,7 +246,7 @@ def test_a_slow_round_trip_gets_advice() -> None:
     assert "did not answer 4 requests" in round_trip_finding(drive, [], 4).what
 
 
-def test_lost_requests_are_a_failure_with_advice() -> None:
+def test_doctor_reports_lost_requests_as_a_failure_with_advice() -> None:
     lost = round_trip_finding(InvtCHE(1), [0.005] * 10, 17)
     assert lost.what.endswith("7 of 17 requests got no valid reply")
     assert lost.advice.startswith("check termination, bias, cable and signal ground")

@@ -84,7 +84,10 @@ def test_a_class_missing_in_a_model_file_is_reported(fan: Path) -> None:
 def test_a_model_file_that_is_a_link_to_another_type_is_reported(tmp_path: Path) -> None:
     (tmp_path / "fan.txt").write_text(FAN)
     (tmp_path / "fan.py").symlink_to("fan.txt")
-    assert refused("fan.py:Fan", tmp_path) == f"{tmp_path}/fan.txt cannot be loaded as Python"
+    assert (
+        refused("fan.py:Fan", tmp_path)
+        == f"{tmp_path}/fan.txt cannot be loaded as Python: its name must end in .py"
+    )
 
 
 @table(

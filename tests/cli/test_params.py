@@ -98,7 +98,7 @@ def test_commissioning_needs_a_terminal_for_confirmation(
     words = ("params", "apply", "pump.toml", *drive, "--yes", "--commissioning", "--audit", "audit.jsonl")
     status, _, err = run(*words)
     assert status == 1
-    assert "--commissioning is for a person at a terminal" in err
+    assert "--commissioning needs a terminal, at which a person" in err
     ours, theirs = pty.openpty()
     try:
         done = subprocess.run(

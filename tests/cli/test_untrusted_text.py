@@ -343,7 +343,7 @@ def test_numbers_in_ascii_digits_are_parsed() -> None:
 
 
 @table("text", [text for text in ODD if text.strip() == text])
-def test_other_digits_are_refused_in_requests_and_files(text: str) -> None:
+def test_digits_other_than_ascii_are_refused_in_requests_and_files(text: str) -> None:
     row = ["2026-11-21T09:30:00.000000000Z", "1", "", "pump", "speed", text, "ok"]
     attempts: list[tuple[Any, Any]] = [
         (InvtCHE(1).setpoint.parse, text),
@@ -375,7 +375,7 @@ def test_other_digits_are_refused_in_requests_and_files(text: str) -> None:
         ["doctor", "/dev/none", "--address", "{}"],
     ],
 )
-def test_a_command_whose_arguments_have_other_digits_returns_2(
+def test_a_command_with_digits_other_than_ascii_returns_2(
     words: list[str], text: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([word.format(text) for word in words]) == 2

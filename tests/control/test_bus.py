@@ -215,20 +215,20 @@ MISTAKES: dict[type[Exception], list[tuple[Callable[[Bus, Any], Any], str]]] = {
         (lambda bus, rig: bus.attach(Toy), "attach(Toy, address=...): the address is missing"),
         (
             lambda bus, rig: rig.read(5),
-            "5 is not a register of pump: use its attribute, or drive.register(NAME)",
+            "5 is not a Register of pump: use an attribute of the drive, or drive.register(NAME)",
         ),
         (
             lambda bus, rig: rig.read([rig.target]),
-            "is not a register of pump: use its attribute, or drive.register(NAME)",
+            "is not a Register of pump: use an attribute of the drive, or drive.register(NAME)",
         ),
         (lambda bus, rig: rig.read(), "read of pump takes registers or their names; read_all() reads all"),
         (lambda bus, rig: bus.watchdog([rig]), "is not a drive: use the one that attach returns"),
         (lambda bus, rig: bus.check_identity([rig]), "is not a drive: use the one that attach returns"),
         (lambda bus, rig: rig.send_raw(16, 0, 5), r"data = 5: it must be bytes, such as b'\x00\x01'"),
-        (lambda bus, rig: rig.register(5), "a register has a name, such as 'speed', not 5"),
+        (lambda bus, rig: rig.register(5), "5 is not a register's name, such as 'speed'"),
         (
             lambda bus, rig: bus.attach("innovert-ibd", 2),
-            "attach takes a family such as InnovertIBD, or a drive of one, not 'innovert-ibd'",
+            "attach needs a family such as YD1000, or a drive such as YD1000(1), not 'innovert-ibd'",
         ),
         (
             lambda bus, rig: bus.attach(Toy(3, name="pump"), name="fan"),
@@ -244,7 +244,7 @@ MISTAKES: dict[type[Exception], list[tuple[Callable[[Bus, Any], Any], str]]] = {
         ),
         (
             lambda bus, rig: bus.attach(dict, 2),
-            "attach takes a family such as InnovertIBD, or a drive of one, not <class 'dict'>",
+            "attach needs a family such as YD1000, or a drive such as YD1000(1), not <class 'dict'>",
         ),
         (
             lambda bus, rig: Bus(cast(Any, None)),

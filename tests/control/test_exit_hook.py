@@ -580,7 +580,7 @@ def test_a_poller_restores_the_handlers_that_its_bus_replaced(caught: list[int],
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_a_signal_stops_drives_although_the_program_installed_a_handler_between_pollers(
+def test_sigterm_stops_drives_before_a_handler_runs_that_was_installed_between_pollers(
     caught: list[int],
 ) -> None:
     """The program's own SIGTERM handler, installed between two pollers, runs once the motor has stopped."""

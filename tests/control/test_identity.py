@@ -122,7 +122,7 @@ def test_a_drive_is_identified_once_after_ten_seconds_without_a_reply(
         monkeypatch.setattr(
             type(drive).identify, "_script", lambda drive: looks.append("look") or look(drive)
         )
-        if pause == "read since":  # a plain read does not show which drive answers
+        if pause == "read since":  # the drive answers a read after the pause, but a read proves no identity
             bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
             drive.read(next(register for register in drive.registers.values() if register.readable))
         else:

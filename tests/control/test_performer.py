@@ -124,7 +124,7 @@ def test_a_ramp_cancelled_by_a_stop_names_the_write_that_was_not_sent(
     assert len(line.written) == before
 
 
-def test_a_reset_cancelled_by_a_stop_still_takes_its_command_back(
+def test_a_reset_that_a_stop_cancels_still_clears_its_coil(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Otherwise the reset coil would stay on, and reset the next fault by itself."""

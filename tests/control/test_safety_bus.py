@@ -382,7 +382,9 @@ def test_a_start_is_refused_if_another_client_changed_the_setpoint(monkeypatch: 
     assert not sim.motor.energised
 
 
-def test_a_clamped_setpoint_is_reported_with_the_value_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_setpoint_that_the_drive_limits_is_reported_with_the_limited_value(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, drive, sim = one(monkeypatch, ErmanERG220(1))
     accept = type(sim).accept
     monkeypatch.setattr(
@@ -469,7 +471,7 @@ def test_the_watchdog_is_read_if_readable(monkeypatch: pytest.MonkeyPatch) -> No
     assert line.written == []
 
 
-def test_harmless_counts_only_stop_or_take_a_command_back() -> None:
+def test_numbers_declared_harmless_only_stop_the_motor_or_cancel_a_command() -> None:
     """A harmless raw count may be written repeatedly, so it may only stop a motor or withdraw a command."""
     for family in MODELS.values():
         for register in family.registers.values():

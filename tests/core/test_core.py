@@ -201,7 +201,7 @@ def test_queued_exchanges_are_carried_out_in_order(drive: Drive) -> None:
     assert queued[0].peer.counters().values == 1
 
 
-def test_a_full_queue_takes_no_further_exchanges(drive: Drive) -> None:
+def test_a_full_queue_accepts_no_further_exchanges(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS, room=4)) as port:
         later = [now_ns() + 60_000_000_000] * 6
         queued = [read(start) for start in range(6)]

@@ -268,7 +268,7 @@ def test_a_function_wrapped_by_only_here_does_nothing_in_a_child_process() -> No
     assert in_child(act) == ["here"]
 
 
-def test_pending_rows_are_taken_only_in_the_parent() -> None:
+def test_pending_rows_can_be_read_only_in_the_parent_process() -> None:
     row_queue, block = RowQueue(), RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, 1)])
     row_queue.add_miss(block, Status.NO_REPLY, 0)
     assert in_child(row_queue.take) is None

@@ -44,7 +44,7 @@ def is_barred(line: LineDriver, drive: Peer, request: Message) -> bool:
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_read_that_a_late_reply_could_answer_waits_for_the_reply_to_a_proof(
+def test_a_read_is_not_sent_while_a_late_reply_could_pass_for_its_reply(
     line: LineDriver, drive: Peer
 ) -> None:
     assert is_barred(line, drive, OTHER)

@@ -215,7 +215,7 @@ def test_silence_starts_after_the_requests_last_bit(line: LineDriver) -> None:
 # ---- sending ----
 
 
-def test_a_request_is_sent_in_parts_if_the_port_takes_a_few_bytes_at_a_time(line: LineDriver) -> None:
+def test_a_request_is_sent_in_parts_if_the_port_accepts_only_a_few_bytes_at_once(line: LineDriver) -> None:
     line.begin(exchange(READ))
     line.now += SILENCE
     assert [line.want, line.want] == ["read", "write"]
@@ -231,7 +231,7 @@ def test_a_request_is_sent_in_parts_if_the_port_takes_a_few_bytes_at_a_time(line
     assert line.completion.sent_ns == sent
 
 
-def test_a_port_that_takes_no_bytes_is_lost(line: LineDriver) -> None:
+def test_a_port_that_accepts_no_bytes_is_lost(line: LineDriver) -> None:
     line.begin(exchange(READ))
     line.now += SILENCE
     assert [line.want, line.want] == ["read", "write"]
@@ -661,7 +661,9 @@ def test_with_a_configured_echo_the_echo_of_a_delixi_query_is_not_a_value(line: 
     assert (line.completion.reply.data, line.completion.skipped) == (value, 21)
 
 
-def test_a_lone_copy_is_rejected_while_it_is_unknown_whether_the_adapter_echoes(line: LineDriver) -> None:
+def test_a_copy_of_the_request_is_no_reply_while_it_is_unknown_whether_the_adapter_echoes(
+    line: LineDriver,
+) -> None:
     found = exchanged(line, confirmation(), WRITE)
     assert (found.result, found.raw) == (Failure.MAYBE_ECHO, confirmation())
     found = exchanged(line, confirmation() + confirmation(), WRITE)  # two copies: the adapter echoes

@@ -32,7 +32,7 @@ def refused(fd: int, baudrate: int, format: str) -> set[str]:
 
 
 @pytest.mark.parametrize("baudrate", [50, 1200, 9600, 38400, 115200, 12345, 250_000, 3_000_000])
-def test_a_port_takes_any_baud_rate(pty: int, baudrate: int) -> None:
+def test_a_port_can_be_set_to_any_baud_rate(pty: int, baudrate: int) -> None:
     assert refused(pty, baudrate, "8N1") == set()
     assert get_settings(pty) == (baudrate, "8N1")
 

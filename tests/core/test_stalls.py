@@ -232,7 +232,7 @@ def test_the_port_counts_as_lost_if_a_command_is_held_until_its_timeout(port: Po
     assert (port.lost, port.lost_error, port.called_off) == (True, errno.ETIMEDOUT, True)
 
 
-def test_a_command_that_the_adapter_took_does_not_lose_the_port(free_port: Port) -> None:
+def test_a_command_that_the_adapter_has_accepted_does_not_lose_the_port(free_port: Port) -> None:
     assert free_port.carry_out(exchange(START, baudrate=9600)).result == Failure.NO_REPLY
     assert (free_port.is_stalled, free_port.lost, free_port.called_off) == (False, False, False)
 
@@ -263,7 +263,9 @@ def patient(message: Message) -> Exchange:
     return exchange(message, timeout=PATIENCE)
 
 
-def test_a_count_that_stays_above_0_although_replies_come_is_ignored(ends: Ends, port: Port) -> None:
+def test_a_drivers_count_of_unsent_bytes_is_ignored_if_it_stays_above_0_despite_replies(
+    ends: Ends, port: Port
+) -> None:
     requests = [READ, OTHER, READ, START, SILENT, OTHER]
     with Device(ends[1], len(requests), miscounted=0) as device:
         for request in requests[:4]:
@@ -275,7 +277,7 @@ def test_a_count_that_stays_above_0_although_replies_come_is_ignored(ends: Ends,
     assert device.heard == [frame(request) for request in requests]
 
 
-def test_a_silent_drive_does_not_hold_up_the_other_drives_of_a_port_with_a_wrong_count(
+def test_a_silent_drive_does_not_delay_others_although_the_driver_miscounts_unsent_bytes(
     ends: Ends, port: Port
 ) -> None:
     requests = [READ, OTHER, SILENT, READ, SILENT]
@@ -298,7 +300,9 @@ def test_after_a_long_stall_a_drive_that_answered_is_read_first(
     assert lib.md_line_hold_ns(line._line, was_wrong) == seconds * 10**9
 
 
-def test_a_count_that_becomes_wrong_later_is_ignored_after_three_replies(ends: Ends, port: Port) -> None:
+def test_a_count_of_unsent_bytes_that_becomes_wrong_is_ignored_after_three_replies(
+    ends: Ends, port: Port
+) -> None:
     with Device(ends[1], 6, miscounted=2):
         for _ in range(3):
             assert port.carry_out(patient(READ)).result > 0
@@ -310,7 +314,9 @@ def test_a_count_that_becomes_wrong_later_is_ignored_after_three_replies(ends: E
     assert port.miscounts
 
 
-def test_a_count_that_falls_shortly_after_each_reply_is_not_ignored(ends: Ends, port: Port) -> None:
+def test_a_count_of_unsent_bytes_that_falls_shortly_after_each_reply_is_not_ignored(
+    ends: Ends, port: Port
+) -> None:
     with Device(ends[1], 5, lag=TIMEOUT_S / 2):
         for _ in range(5):
             assert port.carry_out(patient(READ)).result > 0
@@ -318,7 +324,9 @@ def test_a_count_that_falls_shortly_after_each_reply_is_not_ignored(ends: Ends, 
     assert (port.miscounts, port.is_stalled) == (False, True)
 
 
-def test_a_stop_does_not_wait_for_a_count_that_may_be_late(ends: Ends, port: Port) -> None:
+def test_a_stop_does_not_wait_although_the_count_of_unsent_bytes_may_be_out_of_date(
+    ends: Ends, port: Port
+) -> None:
     """The port ignores a wrong count after three requests that waited for it. The stop does not wait."""
     stop = exchange(START, timeout=PATIENCE, insists=True)
     with Device(ends[1], 4, miscounted=0):

@@ -286,7 +286,7 @@ def test_a_part_of_a_word_can_be_an_enumeration() -> None:
 @settings(max_examples=examples(300))
 @given(numbers().filter(lambda case: case[0] not in DIGITS), st.data())
 @example((NumberFormat.U64, "CDAB", 1, 0, 2**64 - 2), None)
-def test_invalid_count_has_no_value(
+def test_a_number_declared_invalid_has_no_value(
     case: tuple[NumberFormat, str, float, float, float], data: st.DataObject | None
 ) -> None:
     number_format, order, step, offset, raw = case
@@ -331,7 +331,7 @@ def test_invalid_count_has_no_value(
         (NumberFormat.I16, (0, 3), -8, "00 08"),
     ],
 )
-def test_an_invalid_raw_count_gives_no_value(
+def test_a_number_declared_invalid_gives_no_value_in_every_format(
     number_format: NumberFormat, part: Any, invalid: Any, wire: str
 ) -> None:
     data = bytes.fromhex(wire)

@@ -154,13 +154,13 @@ WRITTEN: dict[str, dict[str, Any]] = {
 
 
 @table("mistake", WRITTEN)
-def test_a_declared_raw_count_that_no_write_can_send_is_reported(mistake: str) -> None:
+def test_a_declared_number_that_no_write_can_send_is_reported(mistake: str) -> None:
     details = dict(WRITTEN[mistake])
     (sentence,) = mistakes_in(level=setting(5, details.pop("what", ""), **details))
     assert sentence.startswith(f"level: {mistake}")
 
 
-def test_declared_raw_counts_that_a_write_can_send_are_accepted() -> None:
+def test_declared_numbers_that_a_write_can_send_are_accepted() -> None:
     assert declare(
         level=setting(5, harmless=(-1, 0), number_format=NumberFormat.I16, default=-3),
         control=command(6, BITS, harmless=(0, 0x8000), never_together=(9,), broadcast=(0,)),

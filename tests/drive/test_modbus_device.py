@@ -165,7 +165,7 @@ def test_a_refused_address_raises_drive_exception(meter: tuple[SimulatedBus, Mod
         meter[1].read_holding(5000)
 
 
-def test_many_registers_take_several_requests(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+def test_many_registers_need_several_requests(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
     line, device = meter
     line.answers = lambda request: rtu(f"07 03 {2 * request.count:02X}" + " 00" * (2 * request.count))
     assert device.read_holding(0, 300) == [0] * 300

@@ -124,7 +124,7 @@ def test_missing_verb_names_the_declaration_that_is_needed(monkeypatch: pytest.M
     assert line.frames == []
 
 
-def test_harmless_counts_need_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_writing_a_number_declared_harmless_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
     class Stoppable(Pump):
         """A drive whose stop is declared harmless."""
 

@@ -70,7 +70,7 @@ def test_a_register_is_named_like_its_class_attribute() -> None:
     assert list(Example.registers)[:2] == ["current", "unknown"]
 
 
-def test_a_raw_count_without_a_member_decodes_to_its_number() -> None:
+def test_a_number_without_a_name_in_the_enumeration_decodes_to_itself() -> None:
     assert Example.run.decode(2) is Run.GO
     assert Example.run.decode(9) == 9
     assert Example.bits.decode(9) == Bits.RUN | Bits.FAULT
@@ -102,12 +102,12 @@ def test_encoding_an_invalid_value_raises_an_error_that_names_the_register(
 
 
 @given(st.integers(0, 40000))
-def test_every_raw_count_survives_decoding_and_encoding(raw: int) -> None:
+def test_every_register_number_survives_decoding_and_encoding(raw: int) -> None:
     assert Example.frequency.encode(Example.frequency.decode(raw)) == raw
 
 
 @given(st.floats(0, 400))
-def test_encoding_rounds_to_the_nearest_raw_count(value: float) -> None:
+def test_encoding_rounds_to_the_nearest_number_that_a_register_can_hold(value: float) -> None:
     assert abs(Example.frequency.decode(Example.frequency.encode(value)) - value) <= 0.00501
 
 
@@ -129,7 +129,7 @@ def test_format_returns_values_with_their_unit(register: Register[Any], value: o
     assert register.format(value) == text
 
 
-def test_a_typed_text_is_parsed_to_a_value() -> None:
+def test_text_typed_by_a_user_is_parsed_to_a_value() -> None:
     assert Example.frequency.parse("25.5") == 25.5
     assert Example.run.parse("go") is Run.GO
     assert Example.word.parse("run|fault") == Bits.RUN | Bits.FAULT
@@ -323,7 +323,7 @@ class Meter(Drive):
     maker = text(40, 3, order="BA")
 
 
-def test_a_text_is_read_as_the_document_prints_it() -> None:
+def test_a_text_register_is_read_as_the_document_prints_it() -> None:
     assert Meter.serial.decode(b"EM3-0042\0\0\0\0 rubbish") == "EM3-0042"
     assert Meter.maker.decode(b"BAB ") == "AB B"
     assert Meter.maker.decode(bytes.fromhex("42 41 00 42 00 00")) == "ABB"
@@ -331,7 +331,7 @@ def test_a_text_is_read_as_the_document_prints_it() -> None:
 
 
 @given(st.binary(max_size=24))
-def test_decoded_texts_have_no_control_characters(data: bytes) -> None:
+def test_strings_read_from_text_registers_have_no_control_characters(data: bytes) -> None:
     found = Meter.serial.decode(data)
     assert found.isprintable()
     assert Meter.serial.decode(b"\x1b[2J\x07") == "?[2J?"
@@ -340,7 +340,7 @@ def test_decoded_texts_have_no_control_characters(data: bytes) -> None:
 @settings(max_examples=examples(20))
 @given(st.text(st.characters(min_codepoint=33, max_codepoint=126), max_size=6))
 @pytest.mark.parametrize("declared", [Meter.serial, Meter.maker], ids=str)
-def test_a_text_of_a_simulated_drive_is_read_over_the_line(declared: Text, value: str) -> None:
+def test_a_text_register_of_a_simulated_drive_is_read_over_the_line(declared: Text, value: str) -> None:
     with pytest.MonkeyPatch.context() as monkeypatch:
         sim = SimulatedDrive(Meter(1))
         line = SimulatedBus(monkeypatch, sim)
@@ -364,7 +364,7 @@ class Known(Meter):
 
 
 @pytest.mark.parametrize("maker", ["ABB", "ABC"])
-def test_identify_can_read_a_text(monkeypatch: pytest.MonkeyPatch, maker: str) -> None:
+def test_identify_can_read_a_text_register(monkeypatch: pytest.MonkeyPatch, maker: str) -> None:
     sim = SimulatedDrive(Known(1))
     sim["maker"] = maker
     line = SimulatedBus(monkeypatch, sim)
@@ -377,7 +377,7 @@ def test_identify_can_read_a_text(monkeypatch: pytest.MonkeyPatch, maker: str) -
     assert (line.written != []) == (maker == "ABB")
 
 
-def test_scan_reads_texts_to_identify_families() -> None:
+def test_scan_reads_text_registers_to_identify_families() -> None:
     sim = SimulatedDrive(Known(1))
     sim["maker"] = "ABB"
 
@@ -389,7 +389,9 @@ def test_scan_reads_texts_to_identify_families() -> None:
     assert _read(Known(1), Known.maker, ask) == "ABB"
 
 
-def test_polling_a_text_or_reading_another_family_s_text_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_polling_a_text_register_or_reading_one_of_another_family_raises(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     class Other(Drive):
         """Another family, with a text at the same address."""
 
@@ -410,10 +412,10 @@ def test_polling_a_text_or_reading_another_family_s_text_raises(monkeypatch: pyt
 @table(
     ("details", "sentence"),
     [
-        ((1, 0), "a text of 0 registers"),
-        ((1, 126), "a text of 126 registers: it must have 1 to 125"),
-        ((0xFFFF, 2), "its registers are not within 0 to FFFFH"),
-        ((-1, 2), "its registers are not within 0 to FFFFH"),
+        ((1, 0), "a text has 0 registers"),
+        ((1, 126), "a text has 126 registers; it must have 1 to 125"),
+        ((0xFFFF, 2), "its registers must be within 0 to FFFFH"),
+        ((-1, 2), "its registers must be within 0 to FFFFH"),
     ],
 )
 def test_text_longer_than_a_request_is_refused(details: tuple[int, int], sentence: str) -> None:
@@ -421,10 +423,12 @@ def test_text_longer_than_a_request_is_refused(details: tuple[int, int], sentenc
         text(*details)
 
 
-def test_invalid_texts_are_refused() -> None:
-    with pytest.raises(ValueError, match="order = 'CDAB' of a text is not 'AB', 'BA' or 'B'"):
+def test_invalid_declarations_of_text_registers_are_refused() -> None:
+    with pytest.raises(ValueError, match="a text has order = 'CDAB'; it must be 'AB', 'BA' or 'B'"):
         text(1, 2, order="CDAB")
-    with pytest.raises(ValueError, match="a text is in holding or input registers, and 'coil' is neither"):
+    with pytest.raises(
+        ValueError, match="a text has the table 'coil'; it must be in holding or input registers"
+    ):
         text(1, 2, table=COIL)
     with pytest.raises(DeclarationError, match="bus: reserved name"):
         type("Wrong", (Drive,), {"bus": text(1, 2)})
@@ -432,7 +436,7 @@ def test_invalid_texts_are_refused() -> None:
         type("Wrong", (Drive,), {"second": Meter.serial})
 
 
-def test_command_line_prints_texts_and_missing_values(run: RunCommand, tmp_path: Path) -> None:
+def test_command_line_prints_text_registers_and_missing_values(run: RunCommand, tmp_path: Path) -> None:
     path = tmp_path / "meter.py"
     path.write_text(METER)
     model = f"{path}:Meter"

@@ -229,12 +229,12 @@ def test_folder_without_templates_is_reported(tmp_path: Path, folder: str, sente
 # ---- texts of one character a register ----
 
 
-def test_a_text_of_one_character_a_register_is_its_low_bytes() -> None:
+def test_a_text_with_one_character_per_register_uses_the_low_bytes() -> None:
     version = text(250, 5, order="B")
     assert version.decode(bytes.fromhex("0034 002E 0031 0000 0041")) == "4.1"
     assert version.decode(bytes.fromhex("FF34 FF2E FF31 FF38 FF20")) == "4.18"
     assert version.encode("4.1") == bytes.fromhex("0034 002E 0031 0000 0000")
     with pytest.raises(ValueError, match="holds 5 characters, not 6"):
         version.encode("4.18.1")
-    with pytest.raises(ValueError, match="order = 'A' of a text is not 'AB', 'BA' or 'B'"):
+    with pytest.raises(ValueError, match="a text has order = 'A'; it must be 'AB', 'BA' or 'B'"):
         Text(1, 1, order="A")

@@ -44,7 +44,7 @@ TABLE = """
 """
 
 
-def test_registers_equal_the_typed_table_of_part_2() -> None:
+def test_registers_equal_the_table_typed_from_part_2() -> None:
     shared = "\n".join(f"03/06 {line}" for line in DELIXI_MONITORS.strip().splitlines())
     assert rows(DelixiModbus) == typed(TABLE + shared)
 
@@ -61,7 +61,7 @@ def test_line_settings_and_limits_are_those_of_the_document() -> None:
         DelixiModbus(1, framing="ascii", format="8N2")
 
 
-def test_run_words_have_a_direction_and_never_the_toggle() -> None:
+def test_run_words_have_a_direction_bit_and_never_the_bit_that_toggles_the_direction() -> None:
     assert {each.value for each in DelixiModbusControl} == {0x00, 0x01, 0x12, 0x22, 0x13, 0x23}
 
 
@@ -100,7 +100,7 @@ def test_each_verb_sends_the_documented_frame(framing: Framing) -> None:
     assert wire.sent == [FIFTY[framing], forward, forward, REVERSE[framing], STOP[framing]]
 
 
-def test_jog_sends_the_word_of_its_direction() -> None:
+def test_jog_sends_the_control_word_of_its_direction() -> None:
     jogs = [
         frame(DelixiModbus(1), DelixiModbus.control, word)
         for word in (DelixiModbusControl.JOG_FORWARD, DelixiModbusControl.JOG_REVERSE)

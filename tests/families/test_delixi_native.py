@@ -54,7 +54,7 @@ TABLE = """
 """
 
 
-def test_registers_equal_the_typed_tables_of_part_3() -> None:
+def test_registers_equal_the_tables_typed_from_part_3() -> None:
     own = DELIXI_MONITORS.replace("DelixiModbusFormat", "DelixiNativeFormat")
     shared = "\n".join(f"07/06 {line}" for line in own.strip().splitlines())
     assert rows(DelixiNative) == typed(TABLE + shared)
@@ -261,7 +261,7 @@ def test_table_of_a_parameter_decides_whether_it_is_stored() -> None:
         "pi_setpoint": Kept.RAM,
         "stored_frequency": Kept.EEPROM,
     }
-    with pytest.raises(ValueError, match="a 'parameter' is kept in EEPROM, not in RAM"):
+    with pytest.raises(ValueError, match="its table 'parameter' is kept in EEPROM, not in RAM"):
         setting(parameter(0, 17), "s", table=PARAMETER, kept=Kept.RAM)
 
 

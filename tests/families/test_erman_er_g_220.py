@@ -68,7 +68,7 @@ TABLE = """
 """
 
 
-def test_registers_equal_the_typed_table_of_section_10() -> None:
+def test_registers_equal_the_table_typed_from_section_10() -> None:
     assert rows(ErmanERG220) == typed(TABLE)
 
 
@@ -244,7 +244,7 @@ def test_start_without_effect_is_unconfirmed_and_names_the_setting() -> None:
     assert wire.sent.count(START_ON) == 1
 
 
-def test_emergency_stop_writes_its_coil_on_and_start_off() -> None:
+def test_emergency_stop_sets_its_coil_and_clears_the_start_coil() -> None:
     wire = Wire(ErmanERG220(1), STOPPED)
     wire.drive.emergency_stop()
     assert wire.sent == [EMERGENCY_ON, START_OFF]

@@ -69,7 +69,7 @@ TABLE = """
 """
 
 
-def test_registers_equal_the_typed_table_of_appendix_2() -> None:
+def test_registers_equal_the_table_typed_from_appendix_2() -> None:
     assert rows(InnovertIBD) == typed(TABLE)
 
 
@@ -157,7 +157,7 @@ def test_forward_bit_option_selects_the_direction_word(forward_bit: int, forward
 JOG = checksums.rtu("01 06 20 00 00 03").hex(" ").upper()  # table 3, bits 1 and 0
 
 
-def test_jog_sends_the_word_of_table_3() -> None:
+def test_jog_sends_the_control_word_of_table_3() -> None:
     wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0)}, turns={JOG: {"output_current": 0.4}})
     wire.drive.jog()
     assert wire.sent == [JOG]
@@ -221,7 +221,7 @@ def test_identify_requires_its_own_address_or_the_confirmed_option() -> None:
         Wire(InnovertIBD(1, confirmed=1), {**says, **other}).drive.identify()
 
 
-def test_start_without_current_and_speed_is_unconfirmed() -> None:
+def test_start_is_unconfirmed_if_current_and_speed_stay_0() -> None:
     wire = Wire(InnovertIBD(1), STANDING | {"terminals": Terminals(0)})
     wire.drive.set_frequency(50)
     with pytest.raises(Unconfirmed, match="it is not seen to run; stop it, or it may start later"):

@@ -77,7 +77,7 @@ TABLE = """
 """
 
 
-def test_registers_equal_the_typed_table_of_the_che100() -> None:
+def test_registers_equal_the_table_typed_from_the_che100_manual() -> None:
     assert rows(InvtCHE) == typed(TABLE)
     assert all(register.outside for register in InvtCHE.registers.values())
     signed = {name for name, each in InvtCHE.registers.items() if each.number_format is NumberFormat.I16}
@@ -117,7 +117,7 @@ def test_line_settings_and_limits_are_those_of_the_manual() -> None:
     assert "PC.05" in InvtCHE.watchdog
 
 
-def test_start_sends_the_word_of_its_direction() -> None:
+def test_start_sends_the_control_word_of_its_direction() -> None:
     wire = Wire(InvtCHE(1), STANDBY, turns=TURNS)
     wire.drive.start(Direction.FORWARD)
     wire.drive.start()

@@ -53,7 +53,7 @@ class Asked:
         self.answers.append(json.loads(data))
 
 
-async def test_a_gateway_that_waits_for_its_namesake_answers_no_requests(tmp_path: Path) -> None:
+async def test_a_gateway_that_waits_for_another_one_of_its_name_answers_no_requests(tmp_path: Path) -> None:
     """Its namesake gets the request too. A second answer would mislead `fleet status` and `drain`."""
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     lease = gateway.member.lease

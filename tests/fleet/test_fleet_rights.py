@@ -84,7 +84,7 @@ LISTENED = (
 class Attempt(NamedTuple):
     user: str
     deed: str  # "publish" or "subscribe"
-    subject: str  # {name} stands for that user's inbox
+    subject: str  # {hub} in it, for example, stands for the inbox of the user "hub"
 
 
 def attempts() -> Iterator[Attempt]:

@@ -292,7 +292,7 @@ def test_values_read_before_a_reload_are_not_shown_after_it(
         assert values() == []
 
 
-def test_a_reload_gives_no_right_to_look_before_the_restart(tmp_path: Path) -> None:
+def test_a_reload_grants_no_rights_while_a_new_listen_address_waits_for_a_restart(tmp_path: Path) -> None:
     """Until the restart the gateway listens on the old address, which other clients can reach."""
     serve = '[serve]\nlisten = "127.0.0.1:0"\ntokens = "tokens"\n[serve.may]\nlook = "token"\n'
     with served(tmp_path, serve) as gateway:

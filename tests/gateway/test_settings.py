@@ -27,7 +27,7 @@ def mistakes(folder: Path, serve: str) -> list[str]:
     return [start.sub("", mistake, count=1) for mistake in wrong.value.mistakes]
 
 
-def test_without_a_serve_table_only_this_machine_may_look(tmp_path: Path) -> None:
+def test_without_the_table_serve_only_this_machine_may_read_values(tmp_path: Path) -> None:
     settings = read_settings(written(tmp_path), {})
     assert (settings.host, settings.port) == ("127.0.0.1", 8750)
     assert settings.may.without_token(is_loopback=True) is Right.LOOK
@@ -104,8 +104,8 @@ verbs = ["pump-1.fly"]
         "[serve.may]: write: 'setpoint' is not right; write write = [\"pump-1.frequency_setpoint\"]",
         "[serve.may]: write: pump-1.setpint: INVT CHE has no register 'setpint'; did you mean setpoint or "
         "pid_setpoint?",
-        "[serve.may]: verbs: pump-1 has no verb 'fly' for this list; choose from start, jog, reset_fault, "
-        "set_frequency, coast",
+        "[serve.may]: verbs: 'fly' of pump-1 is not a verb that can be listed here; choose from start, jog, "
+        "reset_fault, set_frequency, coast",
         f"[serve]: audit {tmp_path}/no/such/folder/audit.jsonl cannot be written: No such file or directory",
     ]
     assert sorted(found) == sorted(expected)
@@ -189,10 +189,10 @@ def test_an_entry_equal_to_a_drive_name_with_a_star_allows_only_that_drive(tmp_p
     ("may", "sentence"),
     [
         ('verbs = ["fan-?.start"]', "there is no drive 'fan-?'; did you mean fan-1"),
-        ('verbs = ["pump-1.*"]', "pump-1 has no verb '*' for this list; choose from start, "),
+        ('verbs = ["pump-1.*"]', "'*' of pump-1 is not a verb that can be listed here; choose from start, "),
         (
             'verbs = ["*.stop"]',
-            "*.stop matches no register or verb: fan-1 has no verb 'stop' for this list",
+            "*.stop matches no register or verb: 'stop' of fan-1 is not a verb that can be listed here",
         ),
         ('verbs = ["Pump-*.start"]', "Pump-*.start matches no register or verb: there is no drive 'Pump-*'"),
         ('write = ["*.output_current"]', "fan-1.output_current is never written: it can only be read"),
@@ -201,7 +201,10 @@ def test_an_entry_equal_to_a_drive_name_with_a_star_allows_only_that_drive(tmp_p
             'family.yd1000 = { verbs = ["start"] }',
             "family yd1000: no drive has this model; the plant has invt-che",
         ),
-        ('family.invt-che = { verbs = ["pump-1.start"] }', "has no verb 'pump-1.start' for this list"),
+        (
+            'family.invt-che = { verbs = ["pump-1.start"] }',
+            "'pump-1.start' of pump-1 is not a verb that can be listed here",
+        ),
         ('family.invt-che = { look = ["token"] }', "family invt-che: unknown key 'look'"),
         ('family.invt-che = ["start"]', "family invt-che: ['start'] is not a table with write, verbs"),
     ],

@@ -316,7 +316,9 @@ MENTIONED = sorted(
 
 
 @table("mentioned", MENTIONED)
-def test_mentioned_commands_parse(mentioned: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_in_the_docs_are_accepted_by_the_argument_parser(
+    mentioned: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     words = [PLACEHOLDERS.get(word, word) for word in shlex.split(mentioned)]
     if words[0].startswith("--"):
         return

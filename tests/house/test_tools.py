@@ -121,7 +121,7 @@ def test_the_core_survives_its_corpus(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", READERS)
-def test_a_reader_survives_its_corpus(tmp_path: Path, name: str) -> None:
+def test_each_reader_survives_the_inputs_of_its_fuzz_corpus(tmp_path: Path, name: str) -> None:
     for data in corpora.load(name).values():
         read(name, data, tmp_path)
 

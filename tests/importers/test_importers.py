@@ -463,7 +463,7 @@ def test_import_writes_a_family_and_a_plant(run: Run, tmp_path: Path) -> None:
     assert run("import", source, "--out", family)[0] == 2
 
 
-def test_device_with_only_texts_gets_no_plant_file(run: Run, tmp_path: Path) -> None:
+def test_device_with_only_text_registers_gets_no_plant_file(run: Run, tmp_path: Path) -> None:
     source, family, plant = (tmp_path / name for name in ("c.csv", "label.toml", "plant.toml"))
     source.write_text("name,address,type\nlabel,1!400001.8,STRING\n")
     status, _, err = run("import", source, "--out", family, "--plant", plant)

@@ -162,7 +162,7 @@ def test_exception_code_raises_drive_exception(server: Server) -> None:
 @pytest.mark.parametrize(
     "name", [name for name in COMMANDS if name != "libmodbus tcp"]
 )  # this server answers requests to any unit id
-def test_another_address_times_out(name: str, tmp_path: Path) -> None:
+def test_a_read_from_an_address_without_a_device_times_out(name: str, tmp_path: Path) -> None:
     advice = r"name the port socket://127\.0\.0\.1:\d+" if "tcp" in name else "does not answer"
     with running(name, tmp_path) as server, Bus(server.port) as bus:
         device = server.attach(bus, address=ADDRESS + 1)

@@ -169,7 +169,7 @@ def test_take_returns_at_most_the_given_number_of_turns() -> None:
     assert len(take(made, 0, 1000, most=7)) == 7
 
 
-def test_at_least_one_job_is_taken_however_long_it_lasts() -> None:
+def test_the_schedule_returns_at_least_one_job_even_if_it_is_long() -> None:
     made = schedule(long := job(duration_ms=500))
     assert take(made, 0, 1) == [(long, 0)]
 
@@ -208,7 +208,7 @@ def test_a_rest_ends_exactly_on_time() -> None:
         assert [each for each, _, _ in made.take(at, at, at + 1, 9)] == [dead]
 
 
-def test_all_silent_drives_together_take_at_most_their_share() -> None:
+def test_requests_to_silent_drives_use_at_most_their_share_of_the_line() -> None:
     jobs = [job(drive, duration_ms=40) for drive in range(10)]
     made = schedule(*jobs, job(99))
     cost_ms, asked = 300, 0
@@ -354,7 +354,7 @@ def test_observing_the_same_failures_again_does_not_end_a_rest() -> None:
     assert poll not in [each for each, _ in take(made, 100, 300)]
 
 
-def test_a_drive_does_not_rest_after_one_failure() -> None:
+def test_polling_of_a_drive_does_not_pause_after_one_failure() -> None:
     made = schedule(poll := job(1))
     fail(made, 1, 1, now_ms=0)
     assert made.unasked == []
@@ -629,7 +629,7 @@ def test_only_slots_within_the_horizon_are_planned() -> None:
     assert take(made, 0, 100) == [(soon, 10)]
 
 
-def test_the_round_continues_after_the_place_of_a_removed_job() -> None:
+def test_after_a_job_is_removed_the_round_continues_with_the_next_job() -> None:
     first, second, third = job(1), job(2), job(3)
     made = schedule(first, second, third)
     assert take(made, 0, 1, 1) == [(first, 0)]

@@ -685,7 +685,7 @@ def test_a_star_polls_all_readings_and_respects_their_own_rates(load: Load) -> N
     }
 
 
-def test_polling_a_text_is_reported_as_such(mistakes: Mistakes, tmp_path: Path) -> None:
+def test_polling_a_text_register_is_reported_as_a_mistake(mistakes: Mistakes, tmp_path: Path) -> None:
     (tmp_path / "meter.toml").write_text(
         '[family]\ntitle = "Meter"\nmanual = "M"\ncounts_from = 0\n'
         "[reading]\npower = { at = 1 }\n[text]\nmark = { at = 9, length = 4 }\n"
@@ -807,7 +807,7 @@ WRONG_CHANNELS = (
 
 
 @pytest.mark.parametrize(("right", "wrong", "line", "sentence"), WRONG_CHANNELS)
-def test_mistake_in_a_channel_is_reported_with_its_place(
+def test_a_mistake_in_a_channel_is_reported_with_its_file_and_line(
     tmp_path: Path, right: str, wrong: str, line: int, sentence: str
 ) -> None:
     assert right in FILE

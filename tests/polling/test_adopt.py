@@ -455,7 +455,7 @@ def test_adopting_more_names_than_a_batch_has_codes_raises() -> None:
         for number in range(65534):
             made.poller._lines.names.drives.number(f"gone-{number}")
         assert made.poller.adopt(plant(hall(*pumps()))) == {}
-        with pytest.raises(ValueError, match="65537 names of drives since polling started are too many"):
+        with pytest.raises(ValueError, match="at most 65536 names of drives while it runs"):
             made.poller.adopt(plant(hall(toy("pump-1", 1), toy("one-more", 3))))
         check_rates(made, pump_2=0.1)
 

@@ -256,7 +256,7 @@ def test_a_plant_can_be_built_without_a_file() -> None:
     assert [poll.register for poll in made.lines[0].drives[0].polls] == list(fan.readings())
 
 
-def test_a_poller_takes_a_plant_file(tmp_path: Path) -> None:
+def test_a_poller_can_be_created_from_a_plant_file(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     with Simulator([Wire([EncodedDrive(Toy(1))], unpaced=True)]) as simulator:
         path.write_text(

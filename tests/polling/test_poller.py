@@ -645,7 +645,7 @@ def test_an_unopenable_port_raises_and_leaves_no_descriptor_or_thread(port: str)
     assert (descriptors(), threads()) == before
 
 
-def test_rows_can_be_taken_after_the_poller_is_closed(port: str) -> None:
+def test_rows_can_be_read_after_the_poller_is_closed(port: str) -> None:
     with Poller(plant(line(port, polled(drive(), ONE)))) as poller:
         until(lambda: poller.summary()["samples"])
     poller.close()  # a second call is allowed
@@ -692,6 +692,6 @@ print(re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1
 @pytest.mark.uncounted
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the kernel tells the memory")
-def test_a_recording_poller_of_31_drives_takes_at_most_30_mb() -> None:
+def test_a_recording_poller_of_31_drives_uses_at_most_30_mb() -> None:
     ran = subprocess.run([sys.executable, "-c", POLLER], capture_output=True, text=True, check=True)
     assert 5.0 < int(ran.stdout) / 1024 <= MOST_MB

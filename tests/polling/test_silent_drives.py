@@ -210,7 +210,7 @@ def test_memory_is_bounded_if_a_response_delay_keeps_changing() -> None:
 
 
 @pytest.mark.slow
-def test_blocks_are_kept_unless_others_are_faster(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drives_blocks_change_only_if_other_blocks_are_faster(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measured delays always vary a little. That alone must not change the blocks."""
     drive = Wide(1, name="pump-1")
     sim = SimulatedDrive(Wide(1), response_delay=SOON)

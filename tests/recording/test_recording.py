@@ -201,7 +201,7 @@ def test_a_null_in_a_required_column_is_reported_as_damage(tmp_path: Path, suffi
     else:
         with pa.ipc.new_stream(path, table.schema) as stream:
             stream.write_table(table)
-    with pytest.raises(ValueError, match=f"is damaged after row 0: a row has no {name}"):
+    with pytest.raises(ValueError, match=f"is damaged after row 0: a row has no value in the column {name}"):
         list(open_recording(path))
 
 
@@ -216,7 +216,7 @@ def test_a_long_parquet_file_has_its_rows_in_groups(tmp_path: Path, monkeypatch:
     assert [row for rows in open_recording(tmp_path / "a.parquet") for row in rows] == [*batch] * times
 
 
-def test_names_are_dictionaries_in_parquet(tmp_path: Path) -> None:
+def test_names_are_dictionary_encoded_in_parquet(tmp_path: Path) -> None:
     group = pa.parquet.read_metadata(record(tmp_path / "a.parquet")).row_group(0)
     encodings = {group.column(at).path_in_schema: group.column(at).encodings for at in range(7)}
     assert all("RLE_DICTIONARY" in encodings[name] for name in ("drive", "register", "status"))
@@ -258,7 +258,7 @@ MISS = st.builds(Row, INT64, INT64, st.none(), NAME, NAME, st.none(), NAME)
 @pytest.mark.parametrize("target", FORMATS)
 @settings(max_examples=examples(20), deadline=None)
 @given(batches=st.lists(st.lists(st.one_of(SAMPLE, NO_NUMBER, MISS), max_size=9), max_size=5))
-def test_converting_keeps_any_rows(
+def test_converting_a_recording_keeps_all_rows(
     tmp_path_factory: pytest.TempPathFactory, suffix: str, target: str, batches: list[list[Row]]
 ) -> None:
     """Values may be NaN, which does not equal itself, so the test compares texts."""
@@ -281,7 +281,7 @@ def as_text(name: str) -> str:
 
 @settings(max_examples=examples(60), deadline=None)
 @given(some=st.lists(st.one_of(SAMPLE, MISS), min_size=1, max_size=20))
-def test_any_csv_means_the_same_to_another_reader(
+def test_any_csv_recording_has_the_same_rows_in_pythons_csv_module(
     tmp_path_factory: pytest.TempPathFactory, some: list[Row]
 ) -> None:
     path = tmp_path_factory.mktemp("any") / "a.csv"
@@ -465,7 +465,7 @@ def test_recordings_of_earlier_versions_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_pandas_and_duckdb_take_arrows_through_pyarrow(tmp_path: Path) -> None:
+def test_pandas_and_duckdb_read_arrow_recordings_through_pyarrow(tmp_path: Path) -> None:
     pandas = pytest.importorskip("pandas", reason="needs pandas")
     duckdb = pytest.importorskip("duckdb", reason="needs duckdb")
     table = pa.ipc.open_stream(record(tmp_path / "a.arrows").read_bytes()).read_all()

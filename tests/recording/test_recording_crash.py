@@ -315,7 +315,9 @@ def test_recording_continues_when_there_is_room_again(tmp_path: Path, suffix: st
 
 @table("suffix", FORMATS)
 def test_a_read_only_directory_raises_a_one_sentence_error(tmp_path: Path, suffix: str) -> None:
-    open_writer(tmp_path / f"a{suffix}", METADATA).close()  # imports modules while privileged
+    open_writer(
+        tmp_path / f"a{suffix}", METADATA
+    ).close()  # as root, import the modules that the writer needs
     with read_only_directory() as directory:
         path = directory / f"a{suffix}"
         with pytest.raises(RecordingError) as failure:

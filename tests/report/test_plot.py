@@ -634,7 +634,7 @@ def test_series_that_do_not_fit_into_the_picture_are_named(run: Run, tmp_path: P
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_series_that_do_not_fit_into_the_picture_are_named_only_once(tmp_path: Path) -> None:
+def test_a_register_of_two_panels_without_room_is_named_only_once(tmp_path: Path) -> None:
     """A register whose values are numbers on one drive and states on another has two panels."""
     rows = [row(0, "pump", f"r{number}", 1) for number in range(MOST_PANELS)]
     rows += [row(0, drive, "status", 1) for drive in ("pump", "che")]

@@ -225,7 +225,7 @@ def test_rows_that_a_hanging_disk_loses_abort_the_run_and_are_counted(
     disk.released.set()
 
 
-def test_an_exception_of_a_function_that_takes_rows_ends_the_run(tmp_path: Path) -> None:
+def test_an_exception_in_a_callback_for_rows_ends_the_run(tmp_path: Path) -> None:
     def fail(rows: Rows) -> None:
         raise ZeroDivisionError
 

@@ -350,7 +350,7 @@ def test_frame_of_unknown_function_ends_with_silence() -> None:
 
 
 @table(("framing", "text"), [(Framing.ASCII, RUN), (Framing.DELIXI, NATIVE)])
-def test_text_frames_are_split_at_their_line_ends(framing: Framing, text: bytes) -> None:
+def test_an_ascii_or_delixi_frame_is_complete_at_its_line_end(framing: Framing, text: bytes) -> None:
     receiver = Receiver(framing, CHARACTER, 1.0)
     assert receiver.feed(text[:7], 0.0) == []
     (frame,) = receiver.feed(text[7:], 0.5)

@@ -144,7 +144,7 @@ def test_rts_never_changes_before_the_last_bit_has_left(
 @pytest.mark.slow
 @pytest.mark.long
 @USB
-def test_rts_falls_after_a_request_that_the_adapter_does_not_take(guest: Guest, kind: str) -> None:
+def test_rts_is_lowered_although_the_adapter_accepts_no_bytes(guest: Guest, kind: str) -> None:
     """The transceiver must not occupy the line. Closing the port then discards the request."""
     found = guest.run("rts_in_stall", kind=kind)
     assert any("stalled: its adapter takes no bytes" in result for result in found["results"])

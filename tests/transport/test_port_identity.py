@@ -86,7 +86,7 @@ def sysfs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sysfs:
         ("devices/pnp0/00:05", "", "", None),  # ttyS0
     ],
 )
-def test_adapter_of_returns_place_and_serial_number(
+def test_adapter_of_returns_the_usb_socket_and_the_serial_number(
     tmp_path: Path, device: str, serial: str, port_number: str, adapter: USBAdapter | None
 ) -> None:
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -395,7 +395,7 @@ def test_ctrl_c_does_not_leave_a_called_off_command_in_the_driver(
     found.close()
 
 
-def test_a_driver_that_counts_its_bytes_wrong_is_logged_once(
+def test_a_driver_that_miscounts_its_unsent_bytes_is_logged_once(
     terminal: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(Port, "miscounts", True)

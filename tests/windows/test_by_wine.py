@@ -307,7 +307,7 @@ def test_ctrl_c_during_a_start_reports_sent_frames_and_the_stop_command(
 
 
 @pytest.mark.parametrize("name", ["COM5", "com5", r"\\.\COM5", "COM10", "com10", r"\\.\COM10"])
-def test_port_opens_by_all_its_names(wine: Wine, pump: MotorDrive, name: str) -> None:
+def test_a_port_can_be_opened_by_each_of_its_names(wine: Wine, pump: MotorDrive, name: str) -> None:
     wine.link("com10", wine.terminal_of("com5"))
     ran = wine.run("-m", "multidrop", "state", name, "invt-che", 1)
     assert ran.returncode == 0, ran.stderr

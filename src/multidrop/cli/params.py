@@ -185,7 +185,9 @@ def _apply(arguments: argparse.Namespace) -> int:
     if not arguments.words or not _is_file(arguments.words):
         raise mistaken(arguments, "give a parameter file, and then the drive")
     if arguments.commissioning and not sys.stdin.isatty():
-        raise WriteForbidden("nothing was sent: --commissioning is for a person at a terminal")
+        raise WriteForbidden(
+            "nothing was sent: --commissioning needs a terminal, at which a person confirms the writes"
+        )
     given = params.load(arguments.words[0])
     target, words = _drive_of(arguments, arguments.words[1:])
     _check_no_more(arguments, words)

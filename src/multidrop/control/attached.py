@@ -39,7 +39,7 @@ def made(drive: D | type[D], address: int | None, line: dict[str, Any], details:
     """
     family = drive if isinstance(drive, type) else type(drive)
     if not issubclass(family, Drive):
-        raise TypeError(f"attach takes a family such as InnovertIBD, or a drive of one, not {drive!r}")
+        raise TypeError(f"attach needs a family such as YD1000, or a drive such as YD1000(1), not {drive!r}")
     if isinstance(drive, type):
         if address is None:
             raise TypeError(f"attach({drive.__name__}, address=...): the address is missing")

@@ -112,7 +112,9 @@ class RS485(StrEnum):
     def check_port(self, port: str) -> None:
         """Raise ValueError if the port cannot switch a transceiver."""
         if self is not RS485.OFF and "://" in port:
-            raise ValueError(f"rs485 applies to serial devices only, and {port} is not one; remove it")
+            raise ValueError(
+                f"rs485 applies to serial devices only; the port {port} is not one, so remove rs485"
+            )
 
 
 class TransactionIds(StrEnum):

@@ -161,7 +161,7 @@ class Drive(RegisterAccess):
         """Return the register of this name. Raises ValueError with the nearest names if there is none."""
         if not isinstance(name, str):
             first = next(iter(cls.registers), "speed")
-            raise TypeError(f"a register has a name, such as {first!r}, not {name!r}")
+            raise TypeError(f"{name!r} is not a register's name, such as {first!r}")
         try:
             return cls.registers[name]
         except KeyError:
@@ -555,8 +555,8 @@ def check_own(drive: Drive, register: Register[Any]) -> None:
     """
     check_drive(drive)
     if not isinstance(register, Register):
-        hint = "use its attribute, or drive.register(NAME)"
-        raise TypeError(f"{register!r} is not a register of {drive.name}: {hint}")
+        hint = "use an attribute of the drive, or drive.register(NAME)"
+        raise TypeError(f"{register!r} is not a Register of {drive.name}: {hint}")
     is_parameter = isinstance(register, Parameter) and isinstance(drive, register.family)
     if not is_parameter and drive.registers.get(register.name) is not register:
         raise ValueError(
@@ -574,6 +574,8 @@ def check_own_text(drive: Drive, text: Text) -> None:
     """Raise ValueError for another family's text, TypeError if `text` is not a text."""
     check_drive(drive)
     if not isinstance(text, Text):
-        raise TypeError(f"{text!r} is not a text of {drive.name}: use its attribute, or drive.texts[NAME]")
+        raise TypeError(
+            f"{text!r} is not a Text: use an attribute of {drive.name}, or {drive.name}.texts[NAME]"
+        )
     if drive.texts.get(text.name) is not text:
         raise ValueError(f"this {text.name} is not a text of {drive.name}, which is a {drive._kind()}")

@@ -143,8 +143,8 @@ class Register(Generic[T]):
         table_kept = getattr(self.table, "kept", Kept.UNKNOWN)
         if self.access is not Access.READING and table_kept is not Kept.UNKNOWN:
             if self.kept not in (Kept.UNKNOWN, table_kept):
-                table = f"{self.table.name!r} is kept in {table_kept.value}"
-                raise ValueError(f"register {self.address:04X}H: a {table}, not in {self.kept.value}")
+                table = f"its table {self.table.name!r} is kept in {table_kept.value}"
+                raise ValueError(f"register {self.address:04X}H: {table}, not in {self.kept.value}")
             object.__setattr__(self, "kept", table_kept)
 
     def __set_name__(self, owner: type, name: str) -> None:

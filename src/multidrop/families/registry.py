@@ -178,7 +178,7 @@ def _module(path: Path) -> ModuleType:
             return sys.modules[name]
         spec = importlib.util.spec_from_file_location(name, path)
         if spec is None or spec.loader is None:
-            raise _NotPython(f"{path} cannot be loaded as Python")
+            raise _NotPython(f"{path} cannot be loaded as Python: its name must end in .py")
         _log.info("%s is run as Python: a user's model is a program", path)
         module = importlib.util.module_from_spec(spec)
         vars(module)["__builtins__"] = {**vars(builtins), "__import__": _import_beside(path.parent)}
@@ -217,7 +217,10 @@ def _imported(name: str, path: Path) -> ModuleType | None:
 
 
 def _place(mistake: BaseException, path: Path) -> str:
-    """Return the file and, if known, the line of an error, which may be in a file of the same directory."""
+    """Return the path and, if known, the line at which an error was raised.
+
+    The path is that of `path`, or of a file that it imports from its directory.
+    """
     if isinstance(mistake, SyntaxError):
         return str(path)  # the message already has file and line
     frames = [

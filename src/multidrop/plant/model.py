@@ -365,7 +365,9 @@ def _entry(key: str, drive: Drive, name: object) -> str:
     verbs = [verb for verb in verbs_of(drive) if verb in LISTED_VERBS]
     if name not in verbs:
         known = ", ".join(verbs) or "none"
-        raise ValueError(f"{key}: {drive.name} has no verb {name!r} for this list; choose from {known}")
+        raise ValueError(
+            f"{key}: {name!r} of {drive.name} is not a verb that can be listed here; choose from {known}"
+        )
     return entry
 
 

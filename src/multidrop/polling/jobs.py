@@ -33,8 +33,8 @@ class RowNames:
         for names, of in ((of_drives, "drives"), (of_registers, "registers")):
             if len(names) > MOST_NAMES:
                 raise ValueError(
-                    f"{len(names)} names of {of} since polling started are too many for one poller: at most "
-                    f"{MOST_NAMES}; start another one"
+                    f"a poller uses at most {MOST_NAMES} names of {of} while it runs, and this one would use "
+                    f"{len(names)}; start another poller"
                 )
 
     def layout(self, drive: Drive, block: Block) -> RowLayout:

@@ -136,7 +136,7 @@ class BatchDecoder:
         """Replace a dictionary, or extend it if the message is a delta."""
         number, table = header.number(0, "<q"), header.table(1)
         if table is None or number not in self._ids:
-            raise ValueError("a dictionary belongs to no column")
+            raise ValueError("it has a dictionary that no column uses")
         count, (_, ends, text) = _parts(table, body, 3)
         _check_text(ends, text)
         if count and len(ends) < 4 * (count + 1):
@@ -172,7 +172,7 @@ def _check_filled(column: FileColumn, bits: bytes, rows: int) -> None:
     """Raise ValueError if a row lacks a value in this column, which must not have nulls."""
     filled = (1 << rows) - 1
     if int.from_bytes(bits, "little") & filled != filled:
-        raise ValueError(f"a row has no {column.name.decode()}")
+        raise ValueError(f"a row has no value in the column {column.name.decode()}")
 
 
 def _check_text(offsets: bytes, text: bytes) -> None:

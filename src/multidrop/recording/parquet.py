@@ -157,7 +157,7 @@ class ParquetReader(RecordingReader):
         batch = self._with_texts(batch, rows)
         for field in self._arrow.schema(schema()):
             if not field.nullable and batch[field.name].null_count:
-                raise self._damaged(rows, f"a row has no {field.name}")
+                raise self._damaged(rows, f"a row has no value in the column {field.name}")
         return batch
 
     def _with_texts(self, batch: Any, rows: int) -> Any:

@@ -69,7 +69,7 @@ def unpacked_size(data: bytes | memoryview) -> int:
 def _size(metadata: memoryview, body: memoryview) -> int:
     message = _Table(metadata, _U32.unpack_from(metadata)[0])
     if message.number(0, _U16) != LATEST:
-        raise ValueError("another version of the format")
+        raise ValueError("its Arrow metadata version is not 5")
     kind = message.number(1, _I8)
     rows = message.table(2)
     if kind == _DICTIONARY and rows:

@@ -81,7 +81,9 @@ def _score(drive: Drive, ask: Ask) -> int:
         except BusError:
             return score  # the failure is ignored, because not every firmware has this register
         if held != drive.address:
-            raise WriteForbidden(f"{drive.name} holds {held:g} as its address")
+            raise WriteForbidden(
+                f"{drive.name} answers at address {drive.address}, but its address register holds {held:g}"
+            )
         score += 1
     return score
 

@@ -93,7 +93,8 @@ def sweeps(
     ]
     if not found:
         raise ValueError(
-            "no family has one of these addresses together with one of these baud rates and formats"
+            "no family allows one of these addresses together with one of these baud rates and formats; "
+            "choose more of them"
         )
     found.sort(key=lambda weighted: -weighted[0] / weighted[1].needed)
     brisk = [sweep for _, sweep in found]
@@ -149,7 +150,10 @@ def _settings(families: Sequence[type[Drive]]) -> dict[Setting, dict[type[Drive]
 def _sweeps(
     setting: Setting, weights: dict[type[Drive], float], addresses: Sequence[int]
 ) -> Iterator[tuple[float, Sweep]]:
-    """Yield pairs (likelihood, sweep): the fewest sweeps that reach every family at this setting."""
+    """Yield a few sweeps, with their likelihoods, that together find drives of every family at this setting.
+
+    Each sweep reads the register that drives of the most remaining families answer.
+    """
     left = dict(weights)
     while left:
         register = _best(left)

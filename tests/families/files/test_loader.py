@@ -198,8 +198,8 @@ TOLD = [
     "twenty.toml:15: [reading] speed 1: 'speed 1' cannot be a register's name: it is not letters of a to z, "
     "digits and _, after a letter; write speed_1",
     "twenty.toml:16: [reading] speed: unknown key 'stepp'; did you mean step?",
-    'twenty.toml:17: [reading] voltage: at: "40001" begins with 4, which is table holding, but table is '
-    '"input"; remove table, or write a number of that table',
+    'twenty.toml:17: [reading] voltage: at: "40001" begins with 4, which stands for table holding, but '
+    'table = "input"; leave out table, or write a number of table input',
     "twenty.toml:18: [reading] level: at: 40002 may be the number 40002, or register 2 of table holding; "
     'write "9C42H" for that number, or "40002" in quotes in the TOML file (in a CSV file without '
     "counts_from) for that of the table",
@@ -266,7 +266,7 @@ DEVICE = HEAD + "[reading]\ndevice = { at = 3 }\nspeed = { at = 4, unit = 'Hz', 
         ),
     ],
 )
-def test_mistakes_in_identify_and_verb_sections_are_reported(
+def test_mistakes_in_the_sections_identify_and_verb_are_reported(
     tmp_path: Path, section: str, mistakes: list[str]
 ) -> None:
     first, rest = ("", DEVICE + section) if section.startswith("[") else (section + "\n", DEVICE)
@@ -281,7 +281,7 @@ def test_mistakes_in_identify_and_verb_sections_are_reported(
 
 WRONG_KEYS = [  # a wrong key of a register
     ("harmless = [0]", "[reading] a: a reading is never written"),
-    ("step = inf", "step = inf is no finite number; write step = 0.1"),
+    ("step = inf", "step = inf is not a finite number; write step = 0.1"),
     ("step = 0", "step = 0 makes every value 0; write step = 0.1"),
     ("number_format = 'F31'", "number_format = 'F31' is not known"),
     ("values = {}", "values is empty; leave it out"),
@@ -347,7 +347,7 @@ WRONG_FILES = [  # a whole wrong file
         *WRONG_FILES,
     ],
 )
-def test_mistake_is_reported_with_its_place(tmp_path: Path, text: str, told: str) -> None:
+def test_a_mistake_is_reported_with_its_file_and_line(tmp_path: Path, text: str, told: str) -> None:
     found = mistakes(tmp_path, text)
     assert any(told in mistake for mistake in found), found
 
@@ -438,7 +438,7 @@ def test_every_key_is_documented_in_the_reference() -> None:
     assert [section for section in SECTIONS if f"[{section}]" not in page] == []
 
 
-def test_registers_of_text_can_be_declared_and_read(tmp_path: Path) -> None:
+def test_text_registers_can_be_declared_and_read(tmp_path: Path) -> None:
     entries = 'serial = { at = 0xFC00, length = 8, order = "BA" }\nkind = { at = "30011", length = 2 }\n'
     loaded: Any = family(tmp_path, HEAD + "[text]\n" + entries)
     assert (loaded.serial.address, loaded.serial.length, loaded.serial.order) == (0xFC00, 8, "BA")
@@ -450,9 +450,9 @@ def test_registers_of_text_can_be_declared_and_read(tmp_path: Path) -> None:
     ("entry", "told"),
     [
         ("a = { at = 1 }", "[text] a: 'length' is missing; add length = 8"),
-        ("a = { at = 1, length = 126 }", "a text of 126 registers: it must have 1 to 125"),
-        ("a = { at = 1, length = 2, order = 'CDAB' }", "order = 'CDAB' of a text"),
-        ("a = { at = '00001', length = 2 }", "in holding or input registers, and 'coil' is neither"),
+        ("a = { at = 1, length = 126 }", "a text has 126 registers; it must have 1 to 125"),
+        ("a = { at = 1, length = 2, order = 'CDAB' }", "a text has order = 'CDAB'"),
+        ("a = { at = '00001', length = 2 }", "a text has the table 'coil'; it must be in"),
         ("a = { at = 1, length = 2 }\n[reading]\na = { at = 1 }", "a register has this name too"),
         (
             "name = { at = 1, length = 2 }",
@@ -460,7 +460,9 @@ def test_registers_of_text_can_be_declared_and_read(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_mistakes_in_texts_are_reported(tmp_path: Path, entry: str, told: str) -> None:
+def test_mistakes_in_declarations_of_text_registers_are_reported(
+    tmp_path: Path, entry: str, told: str
+) -> None:
     found = mistakes(tmp_path, HEAD + "[text]\n" + entry + "\n")
     assert any(told in mistake for mistake in found), found
 

@@ -94,7 +94,7 @@ def test_with_counts_from_0_every_address_can_be_written(table: str) -> None:
 
 def test_address_digit_that_contradicts_its_table_is_refused() -> None:
     with pytest.raises(
-        ValueError, match='"30001" begins with 3, which is table input, but table is "holding"'
+        ValueError, match='"30001" begins with 3, which stands for table input, but table = "holding"; '
     ):
         Counting(0).address("30001", "holding", "holding")
 

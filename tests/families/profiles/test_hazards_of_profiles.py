@@ -219,7 +219,7 @@ def test_direction_is_sent_or_refused(line: Line, model: str) -> None:
     assert line.drive.state().condition is Condition.RUNNING
 
 
-def test_write_of_a_start_word_is_refused(line: Line) -> None:
+def test_a_plain_write_of_a_start_word_is_refused(line: Line) -> None:
     control = line.drive.control
     requests = {count: Message(1, 6, control.address, data=count.to_bytes(2)) for count in range(0x900)}
     starts = [count for count, request in requests.items() if line.is_start(request)]
@@ -230,7 +230,7 @@ def test_write_of_a_start_word_is_refused(line: Line) -> None:
     assert line.writes == []
 
 
-def test_harmless_counts_never_start_the_motor(line: Line) -> None:
+def test_writing_a_number_declared_harmless_never_starts_the_motor(line: Line) -> None:
     line.drive.set_frequency(20)
     control = line.drive.control
     for before in control.harmless:

@@ -29,7 +29,7 @@ def test_every_profile_is_documented(profile: type[Drive]) -> None:
 
 
 @every_profile
-def test_no_harmless_count_is_a_start_or_reset_word(profile: Any) -> None:
+def test_no_number_declared_harmless_is_a_start_or_reset_word(profile: Any) -> None:
     harmless = profile.roles["control"].harmless
     assert profile.stop_word in harmless
     assert profile.coast_word is None or profile.coast_word in harmless

@@ -90,7 +90,7 @@ STARTS: dict[str, tuple[list[int], tuple[str, ...]]] = {
 
 
 @table("model", STARTS)
-def test_start_sends_the_words_of_the_manual(model: str) -> None:
+def test_start_sends_the_control_words_printed_in_the_manual(model: str) -> None:
     status, words = STARTS[model]
     found = wire(model, status)
     found.drive.start()
@@ -125,7 +125,7 @@ STOPS = {
 
 
 @table("model", STOPS)
-def test_stop_and_coast_send_the_words_of_the_manual(model: str) -> None:
+def test_stop_and_coast_send_the_control_words_printed_in_the_manual(model: str) -> None:
     status, stop, coast = STOPS[model]
     found = wire(model, status, output_frequency=[12.0, 0.0])
     found.drive.stop()
@@ -159,7 +159,7 @@ RESETS: Mapping[str, tuple[list[int], dict[str, Any], tuple[str, ...]]] = {
 
 
 @table("model", RESETS)
-def test_reset_sends_the_words_of_the_manual(model: str) -> None:
+def test_reset_sends_the_control_words_printed_in_the_manual(model: str) -> None:
     status, says, words = RESETS[model]
     found = wire(model, status, **says)
     found.drive.reset_fault()
@@ -178,14 +178,14 @@ REVERSES = {
 
 
 @table("model", REVERSES)
-def test_reverse_start_sends_the_word_of_the_manual(model: str) -> None:
+def test_reverse_start_sends_the_control_word_printed_in_the_manual(model: str) -> None:
     status, word = REVERSES[model]
     found = wire(model, status)
     found.drive.start(Direction.REVERSE)
     assert sent(found)[-1] == word
 
 
-def test_jog_sends_the_word_of_its_direction() -> None:
+def test_jog_sends_the_control_word_of_its_direction() -> None:
     found = wire("delta-vfd-el", [DELTA_STOP, DELTA_RUNS])
     found.drive.jog()
     assert sent(found) == [DELTA + "00 13"]
@@ -385,7 +385,7 @@ class Clone(Goodrive):
     control = numbered(EXCHANGED)
 
 
-def test_renumbered_words_are_sent() -> None:
+def test_renumbered_control_words_are_sent() -> None:
     drive: Any = Clone(1, confirmed=1)
     drive.commanded = 40.0
     found = Wire(drive, {**FREE, "status": drive.status.values(GD_STANDBY)})
@@ -403,7 +403,7 @@ def test_renumbered_stop_is_the_only_stop_of_a_turning_motor_without_jogs() -> N
     assert sent(found) == [DELTA + "00 06"]
 
 
-def test_verbs_without_a_word_in_the_family_are_unsupported() -> None:
+def test_verbs_without_a_control_word_in_the_family_are_unsupported() -> None:
     control = numbered({"forward": 1, "stop": 0, "reset_fault": 9})
     drive: Any = type("Short", (Goodrive,), {"control": control})(1, confirmed=1)
     drive.commanded = 40.0
@@ -424,7 +424,7 @@ def test_verbs_without_a_word_in_the_family_are_unsupported() -> None:
         ({**EXCHANGED, "stop": 0x10000}, "control: STOP = 65536 is not within 0 to 65535"),
     ],
 )
-def test_invalid_word_numbers_are_reported(words: Mapping[str, int], mistake: str) -> None:
+def test_invalid_numbers_of_control_words_are_reported(words: Mapping[str, int], mistake: str) -> None:
     with pytest.raises(DeclarationError) as wrong:
         type("Wrong", (Goodrive,), {"control": numbered(words)})
     assert any(each.startswith(mistake) for each in wrong.value.mistakes)
@@ -454,7 +454,7 @@ output_frequency = { at = 0x3000, unit = "Hz", step = 0.01 }
 """
 
 
-def test_family_file_with_renumbered_words_runs_and_stops_its_simulation(tmp_path: Path) -> None:
+def test_family_file_with_renumbered_control_words_runs_and_stops_its_simulation(tmp_path: Path) -> None:
     (tmp_path / "clone.toml").write_text(CLONE_FILE)
     family = load_family(tmp_path / "clone.toml")
     sim: SimulatedDrive = simulated(family(1))

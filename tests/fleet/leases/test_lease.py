@@ -312,7 +312,7 @@ async def test_no_session_number_is_reused_whatever_the_records_say() -> None:
     assert after.session == newest + 1 > 4
 
 
-async def test_a_gateway_with_a_taken_name_waits_until_the_lease_expires() -> None:
+async def test_a_gateway_whose_name_is_in_use_waits_until_that_lease_expires() -> None:
     trial, first = await begun()
     second = trial.lease()
     for _ in range(10):
@@ -353,7 +353,7 @@ async def test_of_two_simultaneous_session_starts_at_most_one_is_valid() -> None
     assert [first.is_valid, second.is_valid] == begun
 
 
-async def test_a_starting_session_takes_no_path_of_a_living_one() -> None:
+async def test_a_starting_session_replaces_no_record_of_a_living_session() -> None:
     """The first session renews path 0 right before the second session would take it. It renews path 2 too."""
     trial = Trial()
     gate = trial.buckets[0] = GatedBucket("lease_0")
@@ -714,7 +714,7 @@ async def test_a_session_without_one_path_is_weak_until_the_next_session_starts(
     assert (lease.is_weak, observer.weak()) == (False, [])
 
 
-async def test_a_path_that_was_down_at_the_start_is_taken_later() -> None:
+async def test_a_session_adds_a_path_that_was_down_at_its_start() -> None:
     trial = Trial()
     trial.buckets[2].is_down = True
     lease = trial.lease()
@@ -725,7 +725,7 @@ async def test_a_path_that_was_down_at_the_start_is_taken_later() -> None:
     assert lease.held[2] is not None
 
 
-async def test_a_path_with_a_rival_session_of_the_same_number_is_taken_later() -> None:
+async def test_a_session_later_adds_a_path_that_a_rival_session_of_the_same_number_held() -> None:
     """Another process of this gateway, which died when its session had only one path, left the record."""
     trial = Trial()
     trial.buckets[2].is_down = True

@@ -517,7 +517,7 @@ async def test_a_line_that_cannot_be_opened_is_logged_once_per_reason(
     ]
 
 
-async def test_trouble_with_a_line_is_forgotten_when_another_gateway_takes_it(
+async def test_the_problem_of_a_line_is_forgotten_when_another_gateway_polls_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     trial = BrokenTrial(monkeypatch)

@@ -441,7 +441,7 @@ def test_a_second_hub_of_a_database_waits_until_the_first_ends(empty: Postgres) 
 
 
 @pytest.mark.slow
-def test_rows_after_a_moved_position_are_refused(empty: Postgres) -> None:
+def test_writing_fails_if_another_hub_has_changed_the_stored_position(empty: Postgres) -> None:
     """Behind a connection pooler, several hubs may share one lock."""
     sink = PostgresSink(empty.where)
     sink.begin("then")

@@ -81,7 +81,7 @@ def asked(ways: Sequence[SlowWay]) -> list[list[float]]:
     return [way.asked for way in ways]
 
 
-def test_a_prompt_answer_takes_one_request() -> None:
+def test_a_prompt_answer_needs_only_one_request() -> None:
     ways = [SlowWay("a", 0.01), SlowWay("b", 0.01), SlowWay("c", 0.01)]
     assert answer(*ways) == ("a", 0.01)
     assert asked(ways) == [[0.0], [], []]

@@ -62,7 +62,7 @@ def test_newest_message_is_sent_before_the_backlog() -> None:
     assert sent == [9, 4, 5, 12, 6, 7, 8, 10, 11]
 
 
-def test_random_outages_send_each_message_once() -> None:
+def test_each_message_is_sent_once_despite_random_outages() -> None:
     dice = random.Random(43)
     for _ in range(200):
         position, sent, newest = SpoolPosition(), list[int](), 0
@@ -207,7 +207,7 @@ def test_a_spool_that_is_older_than_its_position_is_reported(tmp_path: Path) -> 
 # ---- receivers ----
 
 
-def test_a_message_is_skipped_if_the_receiver_refuses_it_but_takes_others(clocked: Clocked) -> None:
+def test_a_message_is_skipped_if_the_receiver_refuses_it_but_accepts_others(clocked: Clocked) -> None:
     clocked.receiver.failure = Refused("HTTP Error 400: field type conflict")
     store(clocked.spool, 0, 5)
     assert clocked.send_all() > 0

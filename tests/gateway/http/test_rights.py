@@ -262,7 +262,7 @@ def test_wrong_methods_and_bodies_are_refused(open_gateway: Served) -> None:
     assert post("/api/act", {"drive": "pump-1", "verb": "start", "options": []}, **writer).status == 400
 
 
-def test_lone_surrogates_in_texts_are_answered_like_other_texts(open_gateway: Served) -> None:
+def test_strings_with_lone_surrogates_are_answered_like_other_strings(open_gateway: Served) -> None:
     post, writer = open_gateway.post, {"authorization": open_gateway.bearer(Right.WRITE)}
     odd = "\ud800"
     assert post("/api/token", {"token": odd}).status == 401

@@ -343,7 +343,7 @@ def test_alarms_are_logged_acknowledged_and_kept_over_a_restart(
     assert any(
         text.startswith(f"alarm of pump-1, {words}, acknowledged by stopper") for text in caplog.messages
     )
-    with served(tmp_path) as gateway:  # after a restart the drive has no fault
+    with served(tmp_path) as gateway:  # this simulates a new pump-1, without a fault
         until(lambda: [one for one in faults(gateway) if one["ended"]])
         [again] = faults(gateway)
         kept = ("id", "time", "text", "by", "note", "acknowledged")

@@ -446,7 +446,7 @@ def test_only_scaled_values_have_a_unit(model: str) -> None:
             assert (register["at_least"], register["at_most"]) == (known.at_least, known.at_most)
 
 
-def test_the_common_block_has_no_number_for_a_raw_count() -> None:
+def test_the_common_block_leaves_out_values_of_unknown_scale() -> None:
     delixi, che = DelixiModbus(1, name="fan"), InvtCHE(2, name="pump", maximum_frequency=50)
     names = ("output_frequency", "output_current")
     drives = [polled(drive, [drive.registers[name] for name in names]) for drive in (delixi, che)]
@@ -456,7 +456,7 @@ def test_the_common_block_has_no_number_for_a_raw_count() -> None:
     assert [number(pump, at) for at in COMMON] == [2500, 2500, NO_NUMBER]
 
 
-def test_metric_of_raw_counts_is_named_raw() -> None:
+def test_the_metric_of_values_of_unknown_scale_is_named_raw() -> None:
     drive = DelixiModbus(1, name="fan")
     hub = FullHub(plant(line("/dev/null", polled(drive, [drive.output_frequency, drive.output_current]))))
     found = {
@@ -484,7 +484,7 @@ def test_metrics_are_in_base_units() -> None:
     assert base_unit(InvtCHE(1).status).name == "code"
 
 
-def test_home_assistant_shows_an_unscaled_number_as_a_raw_count() -> None:
+def test_home_assistant_shows_a_number_of_unknown_scale_as_a_raw_count() -> None:
     topics = dict.fromkeys(("set", "stop", "state", "gateway", "available"), "topic")
     details = {"prefix": "", "version": "1", "every_s": 1.0, "writable": ["pressure"], "takes_commands": True}
     found = json.loads(discovery(Fan(1), [Fan.pressure], topics, **details))  # type: ignore[arg-type]

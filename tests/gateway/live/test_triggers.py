@@ -44,7 +44,7 @@ def moments(found: Triggers) -> dict[str, float]:
     return {name: (one.time_ns - UTC_0) / SECOND for name, one in found.last.items()}
 
 
-def test_trigger_comes_once_when_its_condition_becomes_true(tmp_path: Path) -> None:
+def test_a_trigger_occurs_once_when_its_condition_becomes_true(tmp_path: Path) -> None:
     """A condition that is true from the start is no trigger, and neither is a miss."""
     found = triggers(tmp_path, {"trip": "pump-1.output_current > 30"})
     seen = []

@@ -260,7 +260,7 @@ def test_a_master_reads_all_words_as_the_drives_store_them(rig: Rig, master: Mas
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_cached_words_equal_the_words_of_the_line(rig: Rig, master: Master) -> None:
+def test_register_words_from_the_cache_equal_those_read_from_the_line(rig: Rig, master: Master) -> None:
     """Reads of whole polled registers are answered from polled rows, with the words on the line."""
     frequency = rig.drives[2].drive.register("output_frequency").address  # polled
 

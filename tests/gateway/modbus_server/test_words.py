@@ -109,7 +109,7 @@ def test_words_are_known_for_all_integer_values(
 
 
 @pytest.mark.slow
-def test_every_raw_count_of_16_bits_has_its_word() -> None:
+def test_the_bytes_of_every_16_bit_number_are_known() -> None:
     """By default, only every 19th raw count is tested."""
     for step in (0.1, 0.01, -0.25):
         register = declared(step=step)
@@ -131,7 +131,7 @@ def test_words_are_known_for_floats_other_than_zero(number: float, order: str) -
 
 
 @table("value", [math.inf, -math.inf, math.nan, 1e300, 0.3, -1, 65536, 2**70])
-def test_words_are_unknown_for_a_value_without_a_raw_count(value: float) -> None:
+def test_no_words_are_computed_for_a_value_that_the_register_cannot_hold(value: float) -> None:
     assert exact_data(declared(), value) is None
 
 

@@ -639,7 +639,7 @@ class Awkward(Drive):
     mode = setting(6, values=IntEnum("Mode", {"SLOW": 1, "FAST": 7}), moves=False)
 
 
-def test_registers_named_like_components_get_their_own_keys() -> None:
+def test_registers_whose_names_home_assistant_components_have_get_other_keys() -> None:
     found = configured(Awkward(1, name="a"), [*Awkward.registers], ["level", "mode"], page="http://hall:8750")
     check_components(found)
     assert found["dev"] == {
@@ -681,7 +681,7 @@ def test_binary_sensors_follow_the_state_of_the_drive(state: str, problem: str, 
     assert rendered(parts["state"], {"state": state}) in parts["state"]["options"]
 
 
-def test_raw_count_without_a_name_is_unknown_in_home_assistant() -> None:
+def test_a_number_without_a_name_is_shown_as_unknown_in_home_assistant() -> None:
     """Home Assistant ignores a state that is not in its options, and keeps showing the previous one."""
     part = configured(InvtCHE(1, name="a"), ["status"], [])["cmps"]["status"]
     values = [rendered(part, {"values": {"status": value}}) for value in ("FORWARD", "77", None)]
@@ -752,7 +752,7 @@ def test_file_name_that_cannot_be_an_edge_node_is_reported(tmp_path: Path) -> No
     assert sentence == "the plant file's name 'a+b' cannot be an edge node; add node = \"hall-1\""
 
 
-def test_all_words_of_topics_are_reserved_names(tmp_path: Path) -> None:
+def test_all_fixed_levels_of_topics_are_reserved_names(tmp_path: Path) -> None:
     topics = JsonTopics(MqttSettings(commands=True), inside(tmp_path), now_ms)
     topics.outbox = PutMessages()
     topics.connected()

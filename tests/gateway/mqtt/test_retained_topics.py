@@ -246,7 +246,7 @@ def topics_of(kind: str) -> list[str]:
     return [node["topic"] for node in FLOW if node["type"] == kind]
 
 
-def test_each_topic_of_the_flow_is_published_or_taken(tmp_path: Path) -> None:
+def test_each_topic_of_the_flow_is_published_or_subscribed(tmp_path: Path) -> None:
     matches = require_module("paho.mqtt.client").topic_matches_sub
     topics = JsonTopics(MqttSettings(commands=True), inside(tmp_path), lambda: 7)
     topics.outbox = noted = Noted()

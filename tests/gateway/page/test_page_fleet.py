@@ -121,7 +121,7 @@ def test_fleet_view_is_hidden_without_a_fleet(opened: Opener, gateway: FakeGatew
     assert page.evaluate("location.hash") == "#/log"
 
 
-def test_fleet_view_opens_by_its_key(opened: Opener) -> None:
+def test_the_view_fleet_is_opened_by_a_key(opened: Opener) -> None:
     page = opened()
     page.keyboard.press("6")
     await_note(page, "Updated once a second")

@@ -140,7 +140,7 @@ def resize(page: Any, width: int, height: int) -> None:
     page.set_viewport_size({"width": width, "height": height})
 
 
-def test_a_raw_count_stays_within_its_column(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_unit_raw_count_stays_within_its_column(opened: Opener, gateway: FakeGateway) -> None:
     line = fake_plant.plant({})["lines"][0]
     raw = [
         r | {"unit": "raw count", "digits": 3} if r["unit"] == "A" else r
@@ -197,7 +197,7 @@ def test_problems_are_marked_by_shape_and_word_besides_colour(opened: Opener) ->
     until_met(page, lambda: page.locator("#panel h2").inner_text() == "booster-1")
 
 
-def test_a_drive_shows_all_registers_with_unit_and_place(opened: Opener) -> None:
+def test_the_page_of_a_drive_lists_all_registers_with_unit_and_manual_section(opened: Opener) -> None:
     page = opened("#/drives/filler-2")
     rows = page.locator(".registers tbody tr")
     assert rows.count() == 12

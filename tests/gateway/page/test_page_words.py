@@ -184,7 +184,7 @@ def test_time_label_at_the_end_of_a_plot_is_not_cut_off(opened: Opener) -> None:
     assert opened().evaluate(EDGE) is False
 
 
-def test_old_register_shows_its_age(opened: Opener) -> None:
+def test_the_age_of_an_old_value_is_shown(opened: Opener) -> None:
     page = opened()
     row = page.locator("#panel tr", has_text="acceleration time")
     until_met(page, lambda: bool(re.fullmatch(r"\d+ min", row.locator(".age").inner_text())))

@@ -89,7 +89,10 @@ def until_met(page: Any, met: Callable[[], object], what: str = "") -> None:
 
 
 def await_new_value(page: Any, shown: Callable[[], float]) -> None:
-    """Wait until a value made after this call is shown. The values of `clocked` are times modulo 1000 s."""
+    """Wait until the page shows a value that the gateway made after this call.
+
+    The shown register belongs to the drive `FakeGateway.clocked`: its value is the time in s, modulo 1000.
+    """
     called_s = time.time()
     until_met(page, lambda: (shown() - called_s) % 1000 < 500)
 

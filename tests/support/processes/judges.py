@@ -182,11 +182,11 @@ class Pymodbus:
         self._client = make(self._pdu.DecodePDU(False))
 
     def hear(self, said: SampleFrame) -> Verdict:
-        """Return how the server decodes the request."""
+        """Return the request as pymodbus's server decodes it, or the reason for its rejection."""
         return self._open(self._server, said, address=0)
 
     def ask(self, said: SampleFrame) -> Verdict:
-        """Return how the client decodes the reply."""
+        """Return the reply as pymodbus's client decodes it, or the reason for its rejection."""
         found = self._open(self._client, said, said.request.address)
         if isinstance(found, Message) and found.function in READS and not found.exception:
             return replace(found, start=said.request.start, count=said.request.count)

@@ -150,13 +150,13 @@ def _locked(how: int) -> Iterator[None]:
 
 @contextmanager
 def steady_network() -> Iterator[None]:
-    """Hold a shared lock that prevents network changes by other processes."""
+    """Within the block, hold a shared lock that keeps other processes from changing the network."""
     with _locked(fcntl.LOCK_SH):
         yield
 
 
 @contextmanager
 def changing_network() -> Iterator[None]:
-    """Hold the exclusive lock for changing the network."""
+    """Within the block, hold the lock that lets only this process change the network."""
     with _locked(fcntl.LOCK_EX):
         yield

@@ -111,8 +111,8 @@ def _numbered(text: str, table: str | None) -> tuple[int, str]:
     named, number = _TABLE_OF_DIGIT[text[0]], int(text[1:])
     if table is not None and table != named:
         raise ValueError(
-            f'"{text}" begins with {text[0]}, which is table {named}, but table is "{table}"; '
-            "remove table, or write a number of that table"
+            f'"{text}" begins with {text[0]}, which stands for table {named}, but table = "{table}"; '
+            f"leave out table, or write a number of table {table}"
         )
     if not 1 <= number <= LAST_ADDRESS + 1:
         raise ValueError(f'"{text}" is outside "{text[0]}{1:0{len(text) - 1}}" to "{text[0]}65536"')

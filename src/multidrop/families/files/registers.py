@@ -143,7 +143,7 @@ def _number(value: Any) -> float:
     if not is_number(value):
         raise ValueError("is not a number")
     if not math.isfinite(value):
-        raise ValueError("is no finite number")
+        raise ValueError("is not a finite number")
     return value
 
 
@@ -381,7 +381,7 @@ class Declared:
             self.registers[name] = register
 
     def _reserve(self, name: str, place: TomlPlace) -> bool:
-        """Record the place of a name; return False if the name is invalid or taken."""
+        """Remember where the file declares a name; return False if the name is invalid or already used."""
         if why := unusable(name):
             place.wrong(f"{shown(name)} cannot be a register's name: {why}")
             return False

@@ -256,7 +256,7 @@ def _by_table(given: Mapping[str, Any], counting: Counting, place: TomlPlace) ->
 
 def _gap(table: str, value: Any, counting: Counting) -> range | None:
     if not isinstance(value, list) or len(value) != 2:
-        raise ValueError(f"gaps: {table} = {shown(value)} is not its first and last address")
+        raise ValueError(f"gaps: {table} = {shown(value)} is not a list of a first and a last address")
     try:
         first, last = (counting.address(end, table, table)[0] for end in value)
     except ValueError as mistake:

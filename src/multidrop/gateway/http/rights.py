@@ -62,12 +62,13 @@ class Caller(NamedTuple):
         if given is None:
             return self._replace(command=self.command or secrets.token_hex(8))
         if not isinstance(given, str) or not COMMAND_ID.fullmatch(given):
-            raise ValueError("id is not a text of 1 to 64 ASCII letters, digits or signs without spaces")
+            raise ValueError("id must be a string of 1 to 64 ASCII characters without spaces")
         return self._replace(command=given)
 
     def stopping(self, given: object = None) -> Caller:
-        """Return the same as `commanding`, but replace an invalid id by a new id, so that no stop is
-        refused.
+        """Return the same as `commanding`, but replace an invalid id by a new id.
+
+        So no stop is refused because of its id.
         """
         try:
             return self.commanding(given)

@@ -120,7 +120,7 @@ def read_command(data: bytes) -> tuple[int, list[Given]]:
     Raises ValueError for an invalid payload.
     """
     if len(data) > MOST_PAYLOAD:
-        raise ValueError(f"a payload of {len(data)} bytes")
+        raise ValueError(f"the payload has {len(data)} bytes; the limit is {MOST_PAYLOAD}")
     time_ms, given = 0, []
     for field, value in _fields(data):
         if field == _TIMESTAMP and isinstance(value, int):
@@ -150,7 +150,7 @@ def _found_value(field: int, found: int | bytes, before: float | str | None) -> 
     if field in (_FLOAT, _DOUBLE) and isinstance(found, bytes):
         form = {4: "<f", 8: "<d"}.get(len(found))
         if form is None:
-            raise ValueError("a float of the wrong size")
+            raise ValueError(f"a float has {len(found)} bytes; it must have 4 or 8")
         return float(struct.unpack(form, found)[0])
     return before
 
@@ -159,7 +159,7 @@ def _text(found: bytes) -> str:
     try:
         return found.decode()
     except UnicodeDecodeError:
-        raise ValueError("a text that is not UTF-8") from None
+        raise ValueError("a string in the payload is not UTF-8") from None
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
@@ -177,9 +177,9 @@ def _fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
         elif wire in (_EIGHT, _FOUR):
             length = 8 if wire == _EIGHT else 4
         else:
-            raise ValueError(f"a field of wire type {wire}")
+            raise ValueError(f"a field has wire type {wire}; it must be 0, 1, 2 or 5")
         if length > len(data) - at:
-            raise ValueError("a field that is longer than the payload")
+            raise ValueError("a field extends beyond the end of the payload")
         yield key >> 3, data[at : at + length]
         at += length
 
@@ -190,4 +190,4 @@ def _read_varint(data: bytes, at: int) -> tuple[int, int]:
         value |= (byte & 0x7F) << 7 * shift
         if byte < 0x80:
             return value & 0xFFFF_FFFF_FFFF_FFFF, at + shift + 1
-    raise ValueError("a number without an end")
+    raise ValueError("a varint has no last byte: the payload is incomplete, or the varint is too long")

@@ -162,7 +162,9 @@ class SparkplugNode:
                     self._put(drive, "DDATA", self._data)
                 await confirm()
                 if self._past:
-                    raise ConnectionError("a birth or a death came in between")
+                    raise ConnectionError(
+                        "a birth or death certificate was sent while stored values were being sent"
+                    )
             finally:
                 self._past = {}
 
