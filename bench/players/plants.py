@@ -63,7 +63,7 @@ def write_plant(directory: Path, lines: int) -> Path:
 
 
 def proofs(plant: Plant) -> dict[tuple[str, str], float]:
-    """Return each register's value, by names of drive and register, except for the drives with motors."""
+    """Return the constant value of each register, by drive and register name; leave out motors."""
     return {
         (drive.drive.name, poll.register.name): proof(drive.drive, poll.register)
         for line in plant.lines

@@ -111,7 +111,10 @@ class Victim:
         ]
 
     def judge(self, counters: Counters, what: str, *, excuse: bool = False) -> None:
-        """Count the results of this episode's stops. Set `excuse` if the client reported an aborted stop."""
+        """Count the results of this episode's stops.
+
+        Set `excuse` if the client reported an aborted stop: then a motor that still turns is not a failure.
+        """
         counters.rounds += 1
         for line in self.lines:
             for address, drive in line.drives.items():

@@ -48,7 +48,7 @@ class Holding:
 
     @property
     def details(self) -> Iterator[str]:
-        """Yield the keys of DETAILS that the entry needs; 16 or 32 bits with a step need none."""
+        """Yield the keys of DETAILS that apply to the entry; none applies to a plain 16-bit number."""
         if self.entry is None:
             return
         details, number = self.entry.details, str(self.entry.details.get("number_format", "U16"))
@@ -70,7 +70,10 @@ class Holding:
 
 
 def holdings(device: ImportedDevice) -> list[Holding]:
-    """Return a Holding for each entry of a device, declared as the other program uses the entry."""
+    """Return for each entry of an imported device whether a family can declare it.
+
+    A declaration must let the register be read and written as the program uses it from which it was imported.
+    """
     found = [_held(entry) for entry in device.registers]
     found += [Holding(entry, is_held=True, is_text=True) for entry in device.texts]
     found += [_commanded(entry) for entry in device.commands]

@@ -148,7 +148,7 @@ class TomlPlace:
         return word if (self.steps, word) in self.lines() else ""
 
     def _line(self, key: str) -> int:
-        """Return the line of a key or its table, or else of the innermost table around it; 0 if unknown."""
+        """Return the line number of a key, or else of the innermost table around it; 0 if unknown."""
         lines, steps = self.lines(), self.steps
         while True:
             for name in (key, ""):

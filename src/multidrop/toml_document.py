@@ -19,7 +19,10 @@ Lines = Mapping[tuple[Steps, str], int]
 
 
 class DocumentError(ValueError):
-    """A file that is not TOML. The text does not name the file; `line` is the wrong line, 0 if unknown."""
+    """Raised for a file that is not TOML.
+
+    Its text does not name the file. `line` is the number of the line with the mistake; 0 if unknown.
+    """
 
     def __init__(self, sentence: str, line: int = 0) -> None:
         super().__init__(sentence)

@@ -14,7 +14,7 @@ class _Cause(NamedTuple):
     """A frequent mistake: patterns of tomllib's message and of the whole wrong line, and a sentence.
 
     The sentence may use the groups of the line's pattern. `rest` is the line from the wrong column on, and
-    `first` says in which line above the same key or header is.
+    `first` names the earlier line that has the same key or header.
     """
 
     message: str
@@ -133,7 +133,7 @@ def _shown(text: str) -> str:
 
 
 def _first(above: Sequence[str], wrong: str) -> str:
-    """Return in which line above the same key or header is, as the end of a clause; "" if it is unknown."""
+    """Return words that name the earlier line with the same key or header; "" if it is unknown."""
     is_header = wrong.lstrip().startswith("[")
     name = re.split("[]=]", wrong.strip(" \t["))[0].strip()
     same = re.compile((r"\s*\[+\s*" if is_header else r"\s*") + re.escape(name) + r"\s*[]=]")

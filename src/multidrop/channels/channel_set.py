@@ -157,7 +157,7 @@ class ChannelSet:
         return found
 
     def _computed_from(self, group: list[SlotRow]) -> Iterator[SlotRow]:
-        """Yield the channels' rows that follow from the rows of one request."""
+        """Compute channels from the rows of one request; yield the channels' rows."""
         fresh: set[int] = set()
         uncertainty_ns = max(row.uncertainty_ns for row in group)
         for row in group:
@@ -187,10 +187,10 @@ class ChannelSet:
             yield row
 
     def _expire(self, computed: _Computed, now_ns: int) -> None:
-        """Note an outage for each input whose newest value is too old at `now_ns` (monotonic).
+        """Note an outage for each input of a channel whose newest value is too old at `now_ns` (monotonic).
 
-        Functions with a memory that need this input do not count the time of the outage. If the input's
-        newest row is not a miss, its value becomes unknown, with the status OLD.
+        Functions with a memory, such as integrals, leave out the time of an outage. The value of an input in
+        an outage is unknown. Its status is OLD, unless its newest row is a miss with another status.
         """
         gone = set()
         for slot in computed.program.slots:

@@ -126,7 +126,7 @@ def _is(compare: Callable[[Any, Any], bool]) -> Callable[[float, float], float]:
 
 
 class Function(NamedTuple):
-    """A pure function: how many operands it takes, its unit, and its value."""
+    """A pure function: its number of operands, and functions for its unit and its value."""
 
     arities: range
     typed: Callable[[Units], Typed]
@@ -201,7 +201,7 @@ class StatefulFunction:
         self._last = 0.0
 
     def take(self, value: float, now_ns: int) -> None:
-        """Take the value of the request sent at `now_ns`, monotonic."""
+        """Process a value whose request was sent at `now_ns` (monotonic)."""
         if self._last_ns is None:
             self._first(value)
         # ignore an older row, because rows of several lines may be out of order

@@ -78,9 +78,9 @@ class _Operand(NamedTuple):
 
 
 class _Memorised(NamedTuple):
-    """An instruction: call a function with a memory.
+    """An instruction: call a function with a memory, such as an integral.
 
-    `slots` has the series that the function's operand needs.
+    `slots` are the slots of the series in the function's operand.
     """
 
     memory: StatefulFunction

@@ -74,7 +74,7 @@ def page(
 ) -> list[TextLine]:
     """Draw every register of one drive.
 
-    `others` has values of registers that are not polled. A SideReader has read them.
+    `others` has the values that a SideReader has read from registers that are not polled.
     """
     width, height = size
     drive = shown.polled.drive

@@ -113,7 +113,7 @@ def _name(port: str) -> str:
 
 
 def _settings(arguments: argparse.Namespace, line: PlantLine | None) -> Settings:
-    """Return the settings in the arguments. Replace a missing setting by that of most drives of the line."""
+    """Return the settings in the arguments. A missing one is that of most drives of the line."""
     usual = usual_settings(line)
     baudrate = usual.baudrate if arguments.baudrate is None else arguments.baudrate
     return Settings(baudrate, arguments.format or usual.format)
@@ -289,7 +289,7 @@ class TrafficPrinter:
 def replay(
     capture: Capture, plant: Plant | None, *, as_json: bool, out: CaptureWriter | None = None
 ) -> Counter[str]:
-    """Print the traffic in a capture; return its counts, such as that of exchanges, for `summary`."""
+    """Print the traffic in a capture; return the numbers of exchanges, frames and so on, for `summary`."""
     printers: list[TrafficPrinter] = []
     for _ in capture:
         printers += [

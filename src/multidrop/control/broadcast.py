@@ -78,7 +78,7 @@ class Broadcaster:
         return {drive.name: self._state(drive) for drive in drives}
 
     def _checked_call(self, drives: Sequence[Drive], what: str) -> Call:
-        """Run the checks of a single write for each drive; return a new call of the first drive."""
+        """Check that each drive may be written; return a new call of the first drive, for the broadcast."""
         check_author()
         calls = [self._performer.call(drive) for drive in drives]
         for call in calls:

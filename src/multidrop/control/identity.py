@@ -312,7 +312,7 @@ class IdentityCheck:
         return None
 
     def _lookalike(self, drive: Drive, register: Register[Any], count: float) -> Drive | None:
-        """Return a drive object of the built-in family that recognises this drive SURE times; else None.
+        """Return this drive as an object of the built-in family that recognises it SURE times; else None.
 
         Families in which the same raw count at this register is also a stop are skipped.
         """

@@ -18,7 +18,10 @@ POLL_S = 0.005  # s between checks for the end of stops
 
 
 class Latches:
-    """The latches of a bus's drives, one per drive, and the bus's unfinished stops."""
+    """The unfinished stops of a bus, and a latch for each of its drives.
+
+    A latch counts the stops of its drive, so that each stop cancels the calls that were made before it.
+    """
 
     def __init__(self, exchanges: Exchanges) -> None:
         self._exchanges = exchanges

@@ -53,9 +53,10 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
 
 
 def _await_turn(waiting: Sequence[Drive], gap: float, unheard_s: float, call: Any) -> float:
-    """Wait for `gap` s, and read the waiting drives every HEARD_S; return the time since the last read.
+    """Wait for `gap` s, and read the drives that wait for their start every HEARD_S.
 
-    A suspension of the process in the meantime makes `call` late.
+    `unheard_s` is the time since their last read; return this time after the wait. If the process is
+    suspended during the wait, that time counts towards the expiry of `call`: the next start may expire.
     """
 
     def planned(seconds: float) -> AbstractContextManager[None]:

@@ -171,7 +171,10 @@ class StopAttempt:
         self._resume = lambda: script.send(None)
 
     def _share_line(self, begun: float, now: float) -> None:
-        """After a step without a good reply, delay the next step, unless the stop would be over by then."""
+        """After a step without a good reply, delay the next step, so that other requests can use the line.
+
+        Do not delay it beyond the time limit of the stop.
+        """
         self._unanswered += 1
         limit = LEAST_S if self._seconds is None else self._seconds
         due = now + SHARE * (now - begun)

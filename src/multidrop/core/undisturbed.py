@@ -29,7 +29,7 @@ class _Act:
         self._outcome = SimpleQueue[tuple[Any, BaseException | None]]()
 
     def run(self) -> None:
-        """Carry out the call, unless another thread has taken it."""
+        """Carry out the call, unless another thread has started it."""
         try:
             act = self._untaken.get_nowait()
         except Empty:

@@ -221,10 +221,13 @@ class InnovertIBD(Drive):
 
     @verb
     def identify(self) -> Script[None]:
-        """Check that PrH.00 and PrH.02 hold the drive's baud rate and address; their addresses are inferred.
+        """Raise WriteForbidden unless PrH.00 holds the line's baud rate, and PrH.02 the drive's address.
 
-        A drive with other values in these parameters may still be an IBD: its owner then declares confirmed =
-        1 in the plant file. A sibling with a valid run state that takes commands from the line passes too.
+        The manual does not state the register addresses of the two parameters: 02BCH and 02BEH are inferred.
+        So an IBD may fail this check. Its owner then declares `confirmed = 1` in the plant file.
+
+        If a family file extends this family and declares `run_state`, a second check is enough: `run_state`
+        has a valid value, and the drive takes its commands and its setpoint from the line.
         """
         if self.identity_is_weak or (yield from self._shows_its_line()):
             return
@@ -241,7 +244,7 @@ class InnovertIBD(Drive):
         return bool(self.option.get("confirmed")) and not self.declared_in
 
     def _shows_its_state(self) -> Script[bool]:
-        """Return True if a sibling shows a valid run state and takes commands from the line."""
+        """Return True if `run_state` is valid, and the drive takes commands and setpoint from the line."""
         try:
             state = yield from read(self.register("run_state"))
             source = yield from read(self.frequency_source)

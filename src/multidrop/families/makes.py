@@ -77,7 +77,7 @@ def _one_to_four(word: float) -> bool:
 
 
 def _bit_1(word: float) -> bool:
-    """Return True if bit 1 is set: bits 1 and 0 are 10 for run, 11 for jog."""
+    """Return True if the control word runs or jogs the motor: its bits 1 and 0 are 10 (run) or 11 (jog)."""
     return bool(int(word) & 0x02)
 
 

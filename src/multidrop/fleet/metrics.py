@@ -22,7 +22,7 @@ from multidrop.toml_check import parse_address
 
 
 class _Figure(NamedTuple):
-    """A metric, and the place of its value in a gateway's state."""
+    """A metric, and where its value is in a gateway's state."""
 
     name: str
     kind: str  # "gauge" or "counter"

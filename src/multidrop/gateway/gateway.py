@@ -299,7 +299,7 @@ class Gateway:
                 self.hub.unopened.pop(line.name, None)  # the port works now: forget why it did not open
 
     def _restore_alarms(self) -> bool:
-        """Take over earlier runs' alarms. Return False while they are being read, for at most RESTORE_S."""
+        """Continue the alarms of earlier runs; return False while they are read, at most for RESTORE_S."""
         if not self.plant.lines:  # the lines come from a fleet, and are not read yet
             return False
         past = self.alarm_file.past if self.alarm_file is not None else []

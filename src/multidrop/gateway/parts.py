@@ -250,7 +250,7 @@ class LiveParts:
 
 
 async def _close_when_built(built: Mapping[str, Building]) -> None:
-    """Close the parts that are built, and return; each of the others is closed once it is built."""
+    """Close the parts that are built; let each part that is still being built be closed afterwards."""
 
     async def close(name: str, part: asyncio.Future[Part]) -> None:
         await asyncio.wait([part])

@@ -84,7 +84,10 @@ class HistoryWriter:
         return []
 
     def take(self, batch: Batch) -> None:
-        """Copy a batch's rows for the writing thread, in microseconds. Disk errors are never raised here."""
+        """Queue a copy of a batch's rows for the writing thread; drop the rows if the queue is full.
+
+        This takes microseconds, and never raises an error of the disk.
+        """
         with self._changing:
             if self._over.is_set() or self._waiting_rows + len(batch) > MOST_WAITING:
                 self._dropped += len(batch)
@@ -99,7 +102,7 @@ class HistoryWriter:
             self._waiting = []
 
     def state(self) -> HistoryState:
-        """Return the rows written and lost so far, and the present problem."""
+        """Return the numbers of rows written and dropped so far, and the present problem."""
         return HistoryState(self._segments.rows, self._dropped, self._hang() or self._trouble)
 
     def _hang(self) -> str:

@@ -67,7 +67,10 @@ def put_number(details: dict[str, Any], number: str, order: str = "") -> None:
 
 
 def scaled(details: dict[str, Any], step: Any, offset: Any = 0) -> None:
-    """Set step and offset in `details`; omit a step of 1 or 0, and an offset of 0. Raises ValueError."""
+    """Put `step` and `offset` into `details`, except values without effect: step 0 or 1, offset 0.
+
+    Raises ValueError if one of them is not a number.
+    """
     step, offset = number(step, 1, "scale"), number(offset, 0, "offset")
     if step not in (0, 1):
         details["step"] = step
@@ -76,8 +79,9 @@ def scaled(details: dict[str, Any], step: Any, offset: Any = 0) -> None:
 
 
 def number(given: Any, default: float, key: str = "number") -> float:
-    """Return a number, which may be given as text; `default` if `given` is empty. Raises ValueError for other
-    values.
+    """Return a number, which may be given as text; `default` if `given` is None or empty.
+
+    Raises ValueError for any other value.
     """
     if given in (None, ""):
         return default

@@ -119,7 +119,7 @@ class BackOff:
         return round(sum(health.cost_ns for health in self.health.values() if health.rest_ns) / SILENT_SHARE)
 
     def _wake_next(self, drive: int, now_ns: int) -> None:
-        """Retry now the silent drive that would be due next, because this drive answers again."""
+        """Retry the silent drive that is due next immediately, because this drive answers again."""
         resting = [health for number, health in self.health.items() if health.rest_ns and number != drive]
         if resting:
             first = min(resting, key=lambda health: health.asleep_until_ns)

@@ -224,7 +224,7 @@ def _side_by_side(drive: Drive, wanted: list[tuple[range, Register[Any]]]) -> _N
 
 @dataclass(frozen=True)
 class _Way:
-    """A division of registers into requests. No division into as many requests has fewer characters."""
+    """The division of registers into a given number of requests that has the fewest characters."""
 
     characters: int  # total characters of the requests and their replies
     spans: tuple[tuple[int, int], ...]  # (begin, end) of each request: it reads registers[begin:end]
@@ -236,9 +236,10 @@ class _Way:
 
 @lru_cache(maxsize=256)
 def _ways(framing: Framing, neighbours: _Neighbours) -> tuple[_Way, ...]:
-    """Return divisions, sorted by number of requests, that include the quickest for every response delay.
+    """Return all divisions that are the quickest for some response delay, sorted by number of requests.
 
-    The algorithm is dynamic programming over the first register of the last request.
+    With a long delay, few requests are quicker; with a short delay, few characters. The algorithm is dynamic
+    programming over the first register of the last request.
     """
     fronts: list[list[_Way]] = [[_Way(0, ())]]  # index n: divisions of the first n registers
     for end in range(1, len(neighbours.registers) + 1):
@@ -255,7 +256,7 @@ def _ways(framing: Framing, neighbours: _Neighbours) -> tuple[_Way, ...]:
 
 
 def _worthwhile(ways: dict[int, _Way]) -> list[_Way]:
-    """Drop each division that has more requests than another one but not fewer characters."""
+    """Drop each division with more requests than another division, but without fewer characters."""
     kept: list[_Way] = []
     for requests in sorted(ways):
         if not kept or ways[requests].characters < kept[-1].characters:

@@ -57,10 +57,10 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
 
 @lru_cache(maxsize=256)
 def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
-    """Return groups of registers. The replies to reads of any two groups differ in shape; see `_shape`.
+    """Return groups of registers whose reads have replies of different shape (see `_shape`), as proofs.
 
-    If there are many groups, only the first MOST_PROOFS and the last one are returned. Groups of readings
-    come first, because readings are polled anyway, and shorter requests come before longer ones.
+    Groups of readings come first, because readings are polled anyway; shorter requests come before longer
+    ones. If there are many groups, only the first MOST_PROOFS and the last one are returned.
     """
     readable: list[Register[Any]] = [register for register in family.registers.values() if register.readable]
     readings = [register for register in readable if register.access is Access.READING]

@@ -19,7 +19,7 @@ from typing import Generic, NamedTuple, TypeVar
 from multidrop.planning.back_off import BackOff, Health
 
 TURN_SHARE = 0.05  # minimum share of the line for jobs without a period
-CREDIT_NS = 50_000_000  # most line time by which these jobs can be ahead of their share
+CREDIT_NS = 50_000_000  # limit of the line time that these jobs can use in advance of their share
 NEVER_NS = 1 << 63
 
 
@@ -77,7 +77,7 @@ class Schedule(Generic[J]):
         self._held: list[J] = []  # jobs without a period whose turn came before their drive was ready
         self._round: list[J] = []  # jobs without a period
         self._next = 0  # index of the next job in the round
-        self._owed_ns = -CREDIT_NS  # line time that the round lacks of its share; negative: it is ahead
+        self._owed_ns = -CREDIT_NS  # line time owed to jobs without a period; negative: used in advance
         self._is_late = False  # True after a skipped slot, until the line has no due job
         self._kind: Hashable = None  # kind of the job that was taken last
         self._number = 0
@@ -189,10 +189,11 @@ class Schedule(Generic[J]):
         self._await(job)
 
     def _due(self, at_ns: int) -> J | None:
-        """Return the started job whose slot ends first.
+        """Choose the next of the jobs whose slots have started; return None if no job can be sent now.
 
-        But if all started jobs can be carried out before that slot ends, prefer a job of the last job's kind.
-        If slots were skipped, return the job that has waited longest. Return None if no job can be sent.
+        If slots were skipped, choose the job that was sent longest ago. Otherwise choose the job whose slot
+        ends first. If there is time for all of these jobs before this slot ends, prefer a job of the same
+        kind as the last one.
         """
         if self.back_off.may_sleep(at_ns):
             for job in [job for job in self._begun if self.back_off.is_asleep(job.drive, at_ns)]:
@@ -264,7 +265,7 @@ class Schedule(Generic[J]):
         return max(job.duration_ns, health.cost_ns) if health.rest_ns else job.duration_ns
 
     def _put_off(self) -> None:
-        """While a new drive's first request is pending, treat its started slots as not started."""
+        """Delay the started slots of new drives whose first request has no result yet."""
         for job in [job for job in self._begun if self._health[job.drive].is_pending]:
             self._begun.remove(job)
             self._await(job)

@@ -72,10 +72,11 @@ def suggest(exchanges: Sequence[Planned], prediction: Prediction, switching: flo
 def _every(
     exchanges: Sequence[Planned], tight: Sequence[Rate], least: float, switching: float
 ) -> tuple[tuple[float, float], ...]:
-    """Return pairs (wanted period, longer period) in s; with the longer periods, all rates are reached.
+    """Lengthen the periods of the rates `tight`, which are not reached, until all rates are reached.
 
-    The wanted periods of `tight` are multiplied by one factor, at least `least`. The search always ends: the
-    other exchanges reach their rates already, and longer periods leave them more time.
+    Return pairs in s: the wanted period, and the longer period. All wanted periods are multiplied by the
+    same factor, at least `least`. The search always ends: the other exchanges reach their rates already, and
+    longer periods leave them more time.
     """
     hasty = {(rate.drive, rate.every) for rate in tight}
     wanted = sorted({rate.every for rate in tight if rate.every})

@@ -127,7 +127,10 @@ class _BatchCodes:
         self.certain = self.valid = columns.valid
 
     def codes(self, begin: int, end: int) -> Codes | None:
-        """Return the rows' codes; None if there are too many names."""
+        """Return codes for the drives, registers and statuses of the rows `begin` to `end`, and their names.
+
+        Return None if the rows have more names than there are codes.
+        """
         columns, rows = self._columns, slice(begin, end)
         statuses = self._statuses.narrow(columns.status[rows])
         if statuses is None:
@@ -155,7 +158,10 @@ class _RowCodes:
         self.certain, self.valid = (_bits(children[number]) for number in (2, 5))
 
     def codes(self, begin: int, end: int) -> Codes | None:
-        """Return the rows' codes; None if there are too many names."""
+        """Return codes for the drives, registers and statuses of the rows `begin` to `end`, and their names.
+
+        Return None if the rows have more names than there are codes.
+        """
         found: Codes = {}
         for number, texts in self._texts.items():
             known, part = self._known[number], texts[begin:end]

@@ -129,7 +129,7 @@ class SegmentWriter(RecordingWriter):
 
 
 def _cut_truncated(path: Path) -> None:
-    """Remove an incomplete batch of a killed writer, because other libraries cannot read such a file."""
+    """Cut off the incomplete batch that a killed writer has left, because other libraries cannot read it."""
     with suppress(OSError, ValueError):  # a file that is not a recording is kept
         truncated = ArrowsReader(path).truncated
         if 0 < truncated <= MOST_CUT:

@@ -70,7 +70,7 @@ def delays(recording: Recording) -> list[DelaySeries]:
 
 
 def _spans_loss(series: Series) -> Array:
-    """Return an array with True for each value that may belong to an earlier, lost request."""
+    """Return an array: True for each value whose request overlaps a miss, so that it may be a late reply."""
     asked = [number for number, status in enumerate(series.statuses) if not status.startswith(UNASKED)]
     lost = np.unique(series.time[series.missed & np.isin(series.status, asked)])
     next_lost = np.append(lost, np.iinfo(np.int64).max)[np.searchsorted(lost, series.time)]

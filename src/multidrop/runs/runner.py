@@ -244,23 +244,22 @@ class _Session:
         return RunResult("; ".join([*([abort] if abort else []), *missing]), self._stopped())
 
     def _end_rows(self) -> list[str]:
-        """Pass on the last rows and close the recording; return a sentence for the recording, and for each
-        taker, that lacks rows.
+        """Pass on the last rows and close the recording.
+
+        Return a sentence for each consumer that did not get all rows: the recording, or a callback.
         """
         while self.take():  # pass on the rows that arrived while the poller was being closed
             pass
         return [sentence for thread in self._row_threads if (sentence := thread.end())]
 
     def _raise_failure(self) -> None:
-        """Raise the error of the recording or of a taker, if there is one."""
+        """Raise the error of the recording or of a callback, if there is one."""
         for thread in self._row_threads:
             if thread.failure is not None:
                 raise thread.failure
 
     def _stopped(self) -> dict[str, Stopped]:
-        """Return the result of each drive's stop. It covers all drives of the plant, even if the stops of a
-        line raised an error.
-        """
+        """Return the result of each drive's stop, even of drives on a line whose stops raised an error."""
         found = {name: one for bus in self._poller.buses.values() for name, one in bus.stopped.items()}
         names = [polled.drive.name for polled in self._plan.plant.drives]
         return {name: found.get(name, Stopped(name, Seen.SENT, 0.0, UNKNOWN)) for name in names}
@@ -321,7 +320,7 @@ class _Session:
 
     def _look(self, works: list[Future[Any]]) -> None:
         """Take one batch of rows. Raises _Aborted if a limit is reached, if a command has failed, or if
-        rows were lost. Raises the error of the recording or of a taker.
+        rows were lost. Raises the error of the recording or of a callback.
 
         If the computer slept, that time counts as silence, because a run must not continue after a sleep.
         """

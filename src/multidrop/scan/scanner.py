@@ -145,7 +145,10 @@ class _Scan:
         return completion
 
     def _sweep_peer(self, sweep: Sweep) -> Peer:
-        """Return a peer whose timeout covers only the start of a reply; a probe reads whole replies later."""
+        """Return a peer with a timeout that is too short for a whole reply, but not for its first characters.
+
+        These suffice to find an address that answers. The scan then repeats the request with more time.
+        """
         settings = sweep.settings
         length = reply_length(sweep.framing, sweep.request.to(sweep.addresses[0]))
         window = sweep.patience + (BEGUN - length) * settings.character

@@ -1,8 +1,9 @@
 """MotorDrive: a simulated drive with a motor behind its registers.
 
-Settings with common names configure the motor, and monitors with common names show its state. Two tables
-cover a family's special registers by name: `obeys` has functions that carry out writes, and `shows` has
-functions that return the raw count to read.
+Registers with usual names need no code: a setting such as `acceleration_time` configures the motor, and a
+reading such as `output_current` shows its state. A subclass handles the other registers of its family in two
+tables, by register name. A function in `obeys` is called after a write to its register. A function in `shows`
+returns the number that a read of its register returns.
 """
 
 from __future__ import annotations

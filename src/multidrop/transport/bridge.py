@@ -143,7 +143,7 @@ class Bridge:
                 self._hand_over(received[at : at + MOST_CHUNK])
 
     def _hand_over(self, chunk: bytes) -> None:
-        """Pass these bytes to the core. Until the core has taken them, further bytes stay in the port."""
+        """Pass these bytes to the core. Until the core has read them, further bytes stay in the port."""
         while chunk and not self._closing.is_set():
             with suppress(TimeoutError):
                 chunk = chunk[self._ours.send(chunk) :]

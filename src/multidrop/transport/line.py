@@ -96,7 +96,7 @@ class LineLog:
             log_aside(_log, logging.WARNING, "%s: not opened%s: %s", self._port, again, why)
 
     def holds_bytes(self) -> None:
-        """Log that the port is being closed although the adapter has not taken all bytes."""
+        """Log that the port is being closed although the driver still holds bytes."""
         said = "%s: waiting %g s for its adapter, which takes no bytes; then they are discarded"
         log_aside(_log, logging.WARNING, said, self._port, CLOSING_S)
 
@@ -276,7 +276,7 @@ class Line:
 
     @property
     def is_stalled(self) -> bool:
-        """True if at the last timeout the adapter had not taken the request, and no reply has come since."""
+        """True if the driver still held the request at the last timeout, and no reply has come since."""
         core = self.queue
         return core is not None and core.is_stalled
 

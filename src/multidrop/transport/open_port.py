@@ -335,7 +335,7 @@ class OpenPort:
         return core
 
     def _holds_bytes_now(self) -> bool:
-        """Return True if the adapter has not taken all bytes from the driver; False on Windows."""
+        """Return True if the driver still holds bytes that the adapter has not accepted; False on Windows."""
         port = self._serial
         if sys.platform != "win32" and isinstance(port, serial.Serial) and port.is_open and not self.bridge:
             with suppress(*PORT_FAILURES):
@@ -343,7 +343,7 @@ class OpenPort:
         return False
 
     def holds_bytes(self) -> bool:
-        """Return True if the adapter has not taken the driver's bytes although a healthy one would have."""
+        """Return True if the driver still holds bytes that a healthy adapter would have accepted by now."""
         if not self._holds_bytes_now():
             return False
         clock.sleep(_UNNOTICED_S)
@@ -352,8 +352,8 @@ class OpenPort:
     def close(self) -> None:
         """Close the port, even if opening it failed halfway.
 
-        The adapter has CLOSING_S seconds to take the driver's bytes; then the rest is discarded. With
-        `must_discard`, all are discarded now.
+        The adapter has CLOSING_S seconds to accept the driver's bytes; then the rest is discarded. With
+        `must_discard`, all bytes are discarded now.
         """
         if self.bridge:
             self.bridge.close()

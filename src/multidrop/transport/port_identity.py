@@ -195,7 +195,10 @@ def ledger_of(identity: str, directory: Path) -> Path:
 
 
 class SimulatedPort:
-    """The mark of a simulated port. Creating or closing the mark deletes the port's EEPROM ledger."""
+    """Marks a port as simulated until `close`; `is_simulated` finds this mark from any process of the user.
+
+    The EEPROM ledger of the port is deleted when the mark is set and when it is removed.
+    """
 
     def __init__(self, identity: str, directory: Path) -> None:
         self._ledger = ledger_of(identity, directory)

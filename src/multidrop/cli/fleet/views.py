@@ -208,7 +208,7 @@ def _fitting(lines: list[str], room: int) -> list[str]:
 
 
 def _urgency(name: str, master: str | None, silent: set[str]) -> tuple[int, list[str | int]]:
-    """Return a sort key: lines without a master come first, then lines whose master does not answer."""
+    """Return a key that sorts lines without a master first, then lines whose master does not answer."""
     return 0 if master is None else 1 if master in silent else 2, natural(name)
 
 

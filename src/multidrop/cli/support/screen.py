@@ -81,9 +81,9 @@ class Screen:
         return f"\x1b[{codes}m{text}\x1b[m{blank}" if codes else text + blank
 
     def encodable(self, text: str) -> str:
-        """Return the text with a ? for each column of a character that the terminal's encoding lacks.
+        """Replace each character that the terminal's encoding lacks by `?`, or a wide character by `??`.
 
-        An escape would be longer than the character, and would move all columns after it.
+        So each character keeps its width. An escape such as `\\u2026` would shift all columns after it.
         """
         try:
             text.encode(self._encoding)

@@ -207,7 +207,7 @@ def _with_profile(name: str, roles: Mapping[str, Role]) -> dict[str, Any]:
 
 
 def _of_roles(roles: Mapping[str, Role]) -> dict[str, Any]:
-    """Return the schema of a section of registers in a file with a profile, which has these roles."""
+    """Return the schema of a section such as [reading], in a family file whose profile has these roles."""
     return {
         "properties": {role: _of_role(role, roles[role]) for role in roles},
         "additionalProperties": {"properties": {"harmless": {"maxItems": 0}}},

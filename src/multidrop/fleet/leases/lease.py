@@ -307,9 +307,9 @@ class Lease:
 
 
 def _least_session(record: Record) -> int:
-    """Return the highest session number that was used so far, as far as this record shows.
+    """Return a number that is not below any session number used so far: the next session needs a higher one.
 
-    If the record is invalid, return its revision, which is never below that number.
+    That is the session in the record, or for an invalid record its revision.
     """
     return int(record.value["session"]) if record.value else record.revision
 

@@ -170,7 +170,7 @@ class Member:
         self._is_dirty = True
 
     def _wake(self) -> None:
-        """Take the next step immediately instead of waiting."""
+        """End the wait for the next step, so that it is taken immediately."""
         self._is_dirty = True
         self._woken.set()
 

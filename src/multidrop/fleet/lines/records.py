@@ -166,7 +166,7 @@ class ShareFollower(Follower):
         self._is_mine = is_mine
         self._has = has
         self._share: frozenset[str] = frozenset()
-        self._asked: frozenset[str] | None = frozenset()  # lines whose record may change; None: recompute
+        self._asked: frozenset[str] | None = frozenset()  # lines to read at each look; None: find them first
         self._doubted: dict[str, float] = {}  # by line with an unanswered write: when that write was sent
         self._is_urgent = asyncio.Event()
 
@@ -182,7 +182,7 @@ class ShareFollower(Follower):
         self._is_urgent.set()
 
     def recompute(self) -> None:
-        """Recompute at the next read which lines' records may change."""
+        """Before the next read, find again which lines must be read."""
         self._asked = None
 
     async def look(self) -> list[Record]:

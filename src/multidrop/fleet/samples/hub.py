@@ -131,7 +131,10 @@ class HubState(NamedTuple):
 
 
 class SampleHub:
-    """Reads a stream into a sink. It commits every `every` seconds, and after a million rows."""
+    """Copies the rows of a fleet's sample stream into a sink, such as a database.
+
+    It stores them in commits: every `every` seconds, or as soon as a million rows are pending.
+    """
 
     def __init__(self, path: ServerPath, sink: SampleSink, *, every: float = 10.0) -> None:
         self._path, self._sink, self._every = path, sink, every

@@ -102,7 +102,7 @@ def no_quorum(path: ServerPath, failure: Exception) -> FleetError:
 
 
 async def _kept_on(path: ServerPath) -> int:
-    """Return on how many servers the least replicated bucket is stored; 0 if a bucket is missing."""
+    """Return the smallest number of servers that store a bucket; 0 if a bucket is missing."""
     infos = [await _retried(path, partial(_info, path, f"KV_{bucket}")) for bucket in names.BUCKETS]
     return min(1 + len(cluster_of(info, path).followers) if info else 0 for info in infos)
 

@@ -71,7 +71,7 @@ class Forwarding:
         self._note_units(self._adopted_ns)
 
     def _without_former_drives(self, batch: Batch) -> Batch:
-        """Return the batch without rows of the former plant, if the new plant changes their drives.
+        """Return the batch without rows of drives that the new plant changes, if the old plant polled them.
 
         Such rows were requested before the new plant was adopted, so their units are unknown.
         """

@@ -240,7 +240,10 @@ class Frames:
         self._wake()
 
     def _since(self, n: int) -> Encoded | None:
-        """Return the newest frame relative to frame `n`; None if frame `n` is the newest."""
+        """Return the changes from frame `n` to the newest frame; None if frame `n` is the newest.
+
+        Return the whole newest frame if frame `n` is forgotten, or is from before a reload.
+        """
         if not self._remembered or self._remembered[-1]["n"] == n:
             return None
         newest = self._remembered[-1]

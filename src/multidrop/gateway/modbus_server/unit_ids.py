@@ -198,9 +198,7 @@ def _ranges(numbers: Iterable[int]) -> str:
 
 
 def _overlap(unit: Unit, settings: UnitSettings) -> Iterator[str]:
-    """Yield a sentence if the common block or the channel block overlaps registers of the family, or the
-    other block.
-    """
+    """Yield a sentence for each overlap of the common block, the channel block and the registers."""
     channels = range(settings.channels, settings.channels + unit.channels.length)
     if channels.stop > 0x10000 or set(channels) & (unit.holding_addresses() | set(settings.common_addresses)):
         yield (

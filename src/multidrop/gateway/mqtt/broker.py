@@ -218,11 +218,11 @@ class Broker:
             self.publish_all()
 
     def publish_all(self) -> None:
-        """Let the speaker send all its messages, as on a new connection."""
+        """Publish all current messages, as on a new connection."""
         self._let(self._speaker.connected)
 
     def _let(self, say: Callable[[], None]) -> None:
-        """Let the speaker publish. If that fails, publish "offline", but keep receiving commands.
+        """Call `say`, which publishes messages. If it fails, publish "offline", but keep receiving commands.
 
         Without "offline", retained values at the broker would look current.
         """

@@ -34,9 +34,9 @@ export const now = () => Math.max(Date.now() + correction(), store.time + perfor
 
 const pause = ms => new Promise(done => setTimeout(done, ms));
 
-// Call this before a command is sent: it cancels the pending request, and requests the next frame after the
-// command. A browser has six connections for all its pages together, so the other pages also cancel their
-// requests, and repeat them a little later.
+// A browser allows six connections to a gateway, and each open page occupies one of them with its pending
+// request for a frame. So with six open pages, a command would wait. Before a page sends a command, all pages
+// therefore cancel their requests for frames. The other pages wait AGAIN_MS before they request frames again.
 const pages = new BroadcastChannel("command");
 let restMs = 0; // pause before the next request
 addEventListener("command", () => {
