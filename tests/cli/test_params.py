@@ -246,7 +246,7 @@ def test_the_question_names_missing_setpoints_and_fault_registers(run: Run, tmp_
 @pytest.mark.slow
 def test_a_simulated_run_needs_no_drive_and_is_recorded(tmp_path: Path) -> None:
     out = tmp_path / "run.arrows"
-    done = multidrop("run", write_test(tmp_path), "--simulate", "--speed", 20, "--out", out)
+    done = multidrop("run", write_test(tmp_path), "--simulate", "--speed", 4, "--out", out)
     assert (done.returncode, done.stderr) == (0, "")
     stopped, next_command = done.stdout.splitlines()
     assert stopped.startswith("fan: stopped after ")

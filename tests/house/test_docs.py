@@ -57,6 +57,7 @@ NOT_RUN = {
     "tools/wheels": "compiles for six machines: many minutes",
     "sudo apt-get": "installs",
     "sudo tools/kernel/build": "builds a Debian: .ci/run does it",
+    "python tools/kernel/rig.py": "needs that Debian: tests/system runs its scenarios",
     "MULTIDROP_KERNEL=": "runs the tests themselves",
     "tools/musl": "builds a Python: many minutes",
     "tools/wine": "needs Wine, and downloads a Python for Windows",
