@@ -168,7 +168,7 @@ def test_a_pseudo_terminal_works_without_transceiver_switching() -> None:
 def test_an_unknown_rs485_option_or_a_network_port_raises() -> None:
     with pytest.raises(ValueError, match='rs485 \'on\' is none of "off", "kernel", "rts-up" and "rts-down"'):
         Bus("/dev/null", rs485="on")
-    with pytest.raises(ValueError, match="serial devices only, and tcp://h is not one; remove it"):
+    with pytest.raises(ValueError, match="serial devices only; the port tcp://h is not one, so remove rs485"):
         Bus("tcp://h", rs485="kernel")
 
 
@@ -198,7 +198,7 @@ def test_rs485_is_read_from_a_plant_file(tmp_path: Path) -> None:
     [
         ("/dev/ttyS0", '"rts"', 'rs485 \'rts\' is none of "off", "kernel", "rts-up" and "rts-down"'),
         ("/dev/ttyS0", "true", 'rs485 = "kernel"'),
-        ("socket://10.0.0.7:4001", '"kernel"', "socket://10.0.0.7:4001 is not one; remove it"),
+        ("socket://10.0.0.7:4001", '"kernel"', "socket://10.0.0.7:4001 is not one, so remove rs485"),
     ],
 )
 def test_an_invalid_line_option_is_reported_as_one_mistake(
