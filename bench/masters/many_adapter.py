@@ -136,7 +136,7 @@ def mixed() -> Mixed:
 
 
 def poll_mixed(port: str, seconds: float) -> dict[str, Any]:
-    """Poll the line of `mixed` for `seconds`; return the line's part of the poller's summary."""
+    """Poll the drives of `mixed()` at `port` for `seconds`; return the poller's summary of their line."""
     with _polling_drives({port: mixed().drives}, None) as poller:
         for _ in poller.batches(seconds):
             pass

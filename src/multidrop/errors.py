@@ -13,7 +13,7 @@ _NONE: Mapping[str, Any] = MappingProxyType({})
 
 
 class BusError(Exception):
-    """Any failure between the call and the drive."""
+    """Base class of the errors of a drive, of its port, and of the line between them."""
 
 
 class LineError(BusError, OSError):

@@ -100,7 +100,7 @@ class ModbusConnection(neutral.ModbusConnection):  # type: ignore[misc]
 
     @property
     def connected(self) -> bool:
-        """True while the port works."""
+        """True while the connection is open and its port is not lost."""
         return self._client is not None and not self._client.line.is_lost
 
     def for_unit(self, unit_id: int) -> ModbusUnit:
@@ -210,7 +210,7 @@ class ModbusUnit:
 
     @property
     def connected(self) -> bool:
-        """True while the port works."""
+        """True while the connection is open and its port is not lost."""
         return self.connection.connected
 
     def set_message_spacing(self, seconds: float) -> None:

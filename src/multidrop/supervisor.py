@@ -80,7 +80,7 @@ class Supervisor:
     def _note_end(self, name: str, task: asyncio.Task[Any]) -> None:
         failure = None if task.cancelled() else task.exception()
         if self._kept.get(name) is not task:
-            return  # the task was released
+            return  # `let_go` or `release` removed the task, so its end is expected
         del self._kept[name]
         self.note_dead(name, "it was cancelled" if task.cancelled() else reason_of(failure), failure)
 

@@ -90,7 +90,7 @@ def grouped(errors: Sequence[str]) -> tuple[str, ...]:
     return tuple(found.values())
 
 
-SHOWN_ALIKE = 3  # limit up to which errors with the same sentence are shown separately
+SHOWN_ALIKE = 3  # up to this many errors with the same sentence are listed separately
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ class TomlPlace:
                 if name not in meant:
                     self.wrong(f"{name} = {_shown(value)} is not right; write {key.example}", name)
             elif isinstance(value, str) and not value.isprintable():
-                self.wrong(f"{name} = {value!r} has characters that do not print; leave them out", name)
+                self.wrong(f"{name} = {value!r} has unprintable characters; remove them", name)
             else:
                 good[name] = value
         return good

@@ -143,7 +143,7 @@ def test_names_and_ports_that_cannot_be_printed_are_refused(tmp_path: Path, trap
     with pytest.raises(PlantError) as found:
         load_plant(path)
     assert len(found.value.mistakes) == 3
-    assert all("has characters that do not print" in sentence for sentence in found.value.mistakes)
+    assert all("has unprintable characters" in sentence for sentence in found.value.mistakes)
     assert is_harmless(str(found.value))
 
 

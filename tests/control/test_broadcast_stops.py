@@ -89,7 +89,9 @@ def test_stop_all_broadcasts_if_all_drives_are_of_one_family(
     assert (sent.start, sent.data) == (line.frames[-2][0].start, line.frames[-2][0].data)
 
 
-def test_stop_all_sends_no_broadcast_if_the_family_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_all_sends_no_broadcast_if_the_family_defines_no_broadcast(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, drives, sims = line_of(monkeypatch, "erman-er-g-220", "erman-er-g-220")
     for drive in drives:
         drive.set_frequency(20)

@@ -331,7 +331,7 @@ def test_a_stop_counts_as_repeated_from_its_call_to_its_end() -> None:
     run_controlled(live())
 
 
-def test_drives_are_divided_into_new_and_repeated_stops() -> None:
+def test_drives_whose_stop_is_already_repeated_are_separated_from_other_drives() -> None:
     async def live() -> None:
         stops = RepeatedStops(stop_noted, on_threads)
         drives: list[Any] = [NotedStops(), NotedStops(), NotedStops()]

@@ -303,7 +303,7 @@ def test_after_a_clock_is_set_back_by_a_quarter_second_one_write_is_allowed(tmp_
     assert "was written 0 s ago" in ledger.enter(CELL, 999.75, 60.0)
 
 
-def test_the_ledger_counts_all_writes_of_a_stop_or_none(tmp_path: Path) -> None:
+def test_the_ledger_counts_all_writes_of_a_stop_or_none_of_them(tmp_path: Path) -> None:
     """One transaction is used, because each transaction may wait for the disk or for another process."""
     ledger = Ledger(tmp_path / "wear")
     wrong = replace(CELL, register="no text: \udcff")

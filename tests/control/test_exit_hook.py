@@ -74,7 +74,9 @@ def test_a_second_signal_is_delayed_until_all_stops_have_ended(caught: list[int]
 
 
 @BOTH
-def test_a_signal_while_one_bus_closes_starts_the_stops_of_others(caught: list[int], number: int) -> None:
+def test_a_signal_while_one_bus_closes_starts_the_stops_of_other_buses(
+    caught: list[int], number: int
+) -> None:
     hook, acts = ExitHook(), [Act(), Act()]
     made = [hook.add(act.begin, act.work) for act in acts]
     timer = threading.Thread(target=lambda: (acts[0].works.wait(PATIENCE), signal.raise_signal(number)))
@@ -180,7 +182,7 @@ def exit_threads() -> set[threading.Thread]:
     return {thread for thread in threading.enumerate() if thread.name == "multidrop exit"}
 
 
-def test_a_failing_action_at_exit_does_not_delay_others(
+def test_a_failing_action_at_exit_does_not_delay_other_actions(
     caught: list[int], caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail() -> None:

@@ -519,7 +519,7 @@ def test_the_error_of_a_withheld_stop_names_the_command_for_the_other_family(
     assert line.written != []
 
 
-OUT_OF_DATE = [  # registers of `identify`, each with a raw count that the right drive may temporarily hold
+OUT_OF_DATE = [  # registers that `identify` reads, with a raw count that even the right drive may hold
     ("delixi-modbus", "baudrate_setting", 4),
     ("delixi-modbus", "address_setting", 7),
     ("delixi-modbus", "fault", 99),

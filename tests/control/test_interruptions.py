@@ -73,7 +73,7 @@ def test_an_interruption_reports_what_may_have_been_sent(verb: str) -> None:
     assert nth > 8
 
 
-def test_an_interrupted_exchange_does_not_delay_the_next_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_exchange_does_not_delay_the_next_exchange(monkeypatch: pytest.MonkeyPatch) -> None:
     waits: list[float] = []
     with Simulator([Wire([simulated(InvtCHE(1, baudrate=BAUDRATE))], unpaced=True)]) as simulator:
         for nth in count(1):

@@ -154,7 +154,7 @@ def test_a_block_makes_one_row_for_each_field() -> None:
 
 
 @table(("raw", "divisor"), [(3, 10), (7, 100), (5000, 100), (65535, 1000), (1, 3)])
-def test_scaling_gives_the_nearest_number(raw: int, divisor: int) -> None:
+def test_scaled_value_is_the_float_nearest_to_the_exact_result(raw: int, divisor: int) -> None:
     """Three steps of 0.1 give 0.3, not 0.30000000000000004."""
     columns = Columns(1)
     assert add_rows(columns, RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, divisor)]), reply(raw), 0)

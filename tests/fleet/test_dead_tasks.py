@@ -265,7 +265,7 @@ async def test_a_failed_start_of_compaction_is_retried(
     assert "no process is left" in caplog.text
 
 
-def test_failing_metrics_are_answered_with_a_server_error(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_error_while_metrics_are_computed_gives_status_500(caplog: pytest.LogCaptureFixture) -> None:
     def families() -> Any:
         raise Ill("a mistake")
 

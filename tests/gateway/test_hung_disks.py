@@ -291,7 +291,7 @@ def test_a_ledger_and_an_audit_log_that_hang_are_reported(
 # ---- the page's files ----
 
 
-def test_requests_for_hung_page_files_fail_and_delay_no_others(
+def test_requests_for_hung_page_files_fail_and_delay_no_other_requests(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on, read = threading.Event(), Path.read_bytes

@@ -342,7 +342,9 @@ def test_apprise_sends_title_and_text(webhook: SimpleNamespace) -> None:
 
 
 @pytest.mark.slow
-def test_gateway_sends_faults_and_exceeded_limits(tmp_path: Path, webhook: SimpleNamespace) -> None:
+def test_gateway_sends_messages_about_faults_and_exceeded_limits(
+    tmp_path: Path, webhook: SimpleNamespace
+) -> None:
     (tmp_path / "targets").write_text(webhook.url)
     limit = '[[serve.limit]]\ndrive = "pump-1"\nregister = "output_frequency"\nabove = 100.0\n'
     below = limit.replace("above = 100.0", "below = 1.0")

@@ -490,7 +490,7 @@ async def test_unfinished_exports_of_a_killed_process_are_removed(tmp_path: Path
 
 
 @pytest.mark.slow
-async def test_the_historian_records_and_answers(tmp_path: Path) -> None:
+async def test_the_historian_records_rows_and_answers_queries(tmp_path: Path) -> None:
     part = build(HistorySettings(folder="kept"), inside(tmp_path))
     running = asyncio.create_task(part.run())
     taken = batch(Names(["pump-1"]), 0, range(100), NOON, SECOND)

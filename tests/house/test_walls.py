@@ -155,7 +155,7 @@ def test_only_core_imports_the_compiled_module() -> None:
 
 
 @pytest.mark.long
-def test_only_listed_files_use_the_system() -> None:
+def test_only_listed_files_import_operating_system_modules() -> None:
     outside = {str(path.relative_to(PACKAGE)): run_time_imports(path) & OUTSIDE for path in FILES}
     allowed = {name for name in outside if name.split("/")[0] in TOUCHING_THE_SYSTEM}
     allowed |= FILES_TOUCHING_THE_SYSTEM

@@ -248,7 +248,7 @@ def test_second_write_within_a_minute_is_refused_without_commissioning(
     assert {one.cell.register: one.writes for one in wear} == {"acceleration_time": 2, "deceleration_time": 1}
 
 
-def test_refused_write_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_write_does_not_prevent_the_other_writes(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, sim = attached(monkeypatch, DelixiNative(1), ["P01.00", "P01.01"])
     accept = type(sim).accept
 

@@ -64,7 +64,7 @@ def test_parameters_are_read_in_few_blocks(monkeypatch: pytest.MonkeyPatch) -> N
     assert counts(line) == [16, 16]
 
 
-def test_refused_block_does_not_prevent_reading_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_block_does_not_prevent_reading_the_other_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive = blocky(monkeypatch, {"P00.05"})
     assert set(params.read(drive).values) == {*CODES} - {"P00.05"}
     assert counts(line) == [16, 8, 4, 4, 2, 1, 1, 2, 8, 16]

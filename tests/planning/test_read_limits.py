@@ -252,7 +252,7 @@ def test_a_group_shares_a_request_even_if_separate_requests_are_quicker(baudrate
     assert all(Grouped.energy_high in block.registers for block in found)
 
 
-def test_a_single_register_of_a_group_is_read_without_the_others() -> None:
+def test_a_single_register_of_a_group_is_read_without_the_rest_of_the_group() -> None:
     assert spans(Grouped(1), "energy_low") == [(60, 1)]
     rates = [(Grouped.energy_high, 1.0), (Grouped.energy_low, None)]
     assert [(one.block.start, one.block.count) for one in planned(Grouped(1), rates)] == [(0, 1), (60, 1)]

@@ -392,7 +392,7 @@ def test_pass_slots_includes_started_slots_and_slots_that_start_now() -> None:
     assert made.pass_slots(100 * MS) == [(begun, 0), (one, 100 * MS), (two, 100 * MS)]
 
 
-def test_removing_a_job_keeps_the_order_of_the_others() -> None:
+def test_removing_a_job_keeps_the_order_of_the_other_jobs() -> None:
     jobs = [job(drive) for drive in range(4)]
     made = schedule(*jobs, timed := job(9, 1000), other := job(8, 1000))
     assert [each for each, _ in take(made, 0, 20)] == [timed, other, *jobs[:2]]

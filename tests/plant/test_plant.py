@@ -529,7 +529,7 @@ def test_a_file_that_makes_tomllib_fail_is_reported_as_a_sentence(
 def test_control_characters_in_names_are_escaped_in_errors(mistakes: Mistakes) -> None:
     name, address = mistakes(HEAD + TOY.replace('"D"', r'"D\n\u001B[2J"').replace("= 1", "= 99"))
     assert name.startswith(r'line "L", drive "D\n\x1b[2J": name = ')
-    assert name.endswith("has characters that do not print; leave them out")
+    assert name.endswith("has unprintable characters; remove them")
     assert address.startswith(r'line "L", drive "D\n\x1b[2J": address 99')
 
 

@@ -256,7 +256,7 @@ def test_a_line_is_added_polled_and_removed() -> None:
         }
 
 
-def test_all_lines_can_be_replaced_by_others() -> None:
+def test_all_lines_can_be_replaced_by_other_lines() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         assert made.poller.adopt(plant()) == {}

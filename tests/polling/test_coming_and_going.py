@@ -93,7 +93,7 @@ def test_polling_continues_after_all_drives_left_and_one_was_added(port: str) ->
 
 
 @pytest.mark.slow
-def test_removing_a_silent_drive_does_not_disturb_the_others(port: str) -> None:
+def test_removing_a_silent_drive_does_not_disturb_other_drives(port: str) -> None:
     with Poller(plant(line(port, pump(1), pump(3, "dead")))) as poller:
         seen = Seen(poller)
         until(lambda: "not asked: drive is silent" in (seen.of("dead") and ()) or len(seen.statuses) > 1)
@@ -119,7 +119,7 @@ def test_invalid_additions_and_removals_are_errors(port: str) -> None:
 
 
 @pytest.mark.slow
-def test_an_unpolled_drive_does_not_disturb_others(port: str) -> None:
+def test_an_unpolled_drive_does_not_disturb_other_drives(port: str) -> None:
     with Poller(plant(line(port, pump(1), polled(Toy(3, name="pump-3"), [])))) as poller:
         seen = Seen(poller)
         until(lambda: len(seen.of("pump-1")) > 50)

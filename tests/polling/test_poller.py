@@ -263,7 +263,7 @@ def test_sixteen_lines_are_polled_concurrently() -> None:
 
 
 @pytest.mark.long
-def test_calls_of_one_line_do_not_cause_checks_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_calls_of_one_line_do_not_cause_checks_of_other_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lines with a rate are checked once per interval, however often the core calls for other lines."""
     looks: list[int] = []
     is_steady = PolledLine.is_steady
@@ -448,7 +448,7 @@ def test_polling_continues_after_a_stop_reopened_the_port(port: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_lost_line_does_not_disturb_the_others(port: str, tmp_path: Path) -> None:
+def test_a_lost_line_does_not_disturb_other_lines(port: str, tmp_path: Path) -> None:
     link = tmp_path / "hall-2"
     lines = [
         line(port, polled(drive(), ONE), name="hall-1"),

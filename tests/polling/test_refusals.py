@@ -398,7 +398,7 @@ def test_an_invalid_value_is_a_miss_with_its_reason() -> None:
     assert statistics.samples == sum(row.status == "ok" for row in rows)
 
 
-def test_registers_written_by_function_16_are_read_together_with_others() -> None:
+def test_registers_written_by_function_16_are_read_together_with_other_registers() -> None:
     class Controller(Drive):
         """A drive with a register that only function 16 writes."""
 

@@ -98,7 +98,7 @@ def test_silent_drives_hardly_slow_the_others_and_return_soon(dead: int, back_s:
 @pytest.mark.long
 @pytest.mark.story
 @pytest.mark.parametrize(("count", "dead", "every"), [(16, 5, None), (16, 1, 0.5), (31, 10, None)])
-def test_drives_dead_from_the_start_hardly_slow_the_others(
+def test_drives_dead_from_the_start_hardly_slow_the_polling_of_other_drives(
     count: int, dead: int, every: float | None
 ) -> None:
     """Every third drive is dead, so that most answering drives are polled after a dead one."""

@@ -89,7 +89,7 @@ def test_batches_from_a_reader_can_be_passed_to_arrow(tmp_path: Path, suffix: st
 
 @pytest.mark.slow
 @every_format
-def test_a_recording_never_replaces_another(tmp_path: Path, suffix: str) -> None:
+def test_a_recording_never_replaces_another_recording(tmp_path: Path, suffix: str) -> None:
     path = record(tmp_path / f"a{suffix}")
     sentence = rf"a{suffix} exists already: name another file, or remove it first$"
     with pytest.raises(ValueError, match=sentence):

@@ -123,7 +123,7 @@ def test_coil_writes_set_values_and_reject_invalid_data(sim: SimulatedDrive) -> 
     assert exception_of(ask(sim, 5, 5, data=b"\x12\x34")) == 3
 
 
-def test_refused_write_of_several_registers_changes_none(sim: SimulatedDrive) -> None:
+def test_refused_write_of_several_registers_changes_no_register(sim: SimulatedDrive) -> None:
     assert exception_of(ask(sim, 0x10, 0x12, 3, bytes(range(1, 7)))) == 2
     assert sim["total"] == 0
     assert not sim.counters.writes

@@ -274,7 +274,7 @@ def test_che_parameter_writes_wear_the_eeprom_but_alias_writes_do_not(che: Bench
     assert che.sim.counters.eeprom_writes == {"acceleration_time": 3}
 
 
-def test_che_refuses_a_write_while_it_stores_the_previous_one(che: Bench) -> None:
+def test_che_refuses_a_write_while_it_stores_the_previous_value(che: Bench) -> None:
     assert isinstance(che.sim, SimulatedCHE)
     che.sim.storing = 0.5
     assert che.write(11, 50) == 0

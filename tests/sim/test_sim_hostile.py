@@ -88,7 +88,7 @@ def test_delay_fault_delays_the_reply_by_up_to_late() -> None:
     assert 0 <= min(delays) < 0.1 < 0.4 < max(delays) <= 0.5
 
 
-def test_merge_fault_holds_a_reply_until_the_next_one() -> None:
+def test_merge_fault_holds_a_reply_until_the_next_reply() -> None:
     line = LineClient(SimulatedDrive(Toy(1)), SimulatedDrive(Toy(2)), merge=1, late=4.0)
     line.wire.receive(READ, 0.0)
     assert timeline(line.wire, 0.3) == []

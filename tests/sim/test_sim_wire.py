@@ -279,7 +279,7 @@ def test_frame_received_in_pieces_without_a_gap_is_one_frame() -> None:
     assert frame.end == pytest.approx(10.013)
 
 
-def test_bytes_received_too_fast_get_the_times_of_the_baud_rate() -> None:
+def test_end_of_a_frame_that_arrives_too_fast_is_computed_from_the_baud_rate() -> None:
     receiver = receiver_rtu()
     receiver.feed(WRITE[:5], 10.0)
     (frame,) = receiver.feed(WRITE[5:], 10.001)

@@ -102,7 +102,7 @@ def test_repeated_reads_of_the_same_registers_are_planned_once(bus: Bus, counted
     assert counted.since() == (1, 2)
     assert [one.read_many(WANTED) for _ in range(5)] == 5 * [first]
     assert counted.since() == (0, 0)
-    one.read(Toy.acceleration_time)  # the same block as in WANTED
+    one.read(Toy.acceleration_time)  # a new plan, but its block was prepared by the read of WANTED
     assert counted.since() == (1, 0)
     other.read_many(WANTED)
     assert counted.since() == (1, 2)
@@ -281,7 +281,7 @@ def test_the_core_decodes_floats() -> None:
     assert set(decoder().names) == {one.name for one in REGISTERS} - {"pulses", "drift", "flow", "fine"}
 
 
-def test_drives_of_a_model_share_a_decoder_and_other_blocks_do_not() -> None:
+def test_drives_of_a_model_share_the_decoder_of_equal_blocks_only() -> None:
     assert decoder_of(Block.of(Mixed(2), REGISTERS)) is decoder()
     assert decoder_of(Block.of(Mixed(2), REGISTERS[1:])) is not decoder()
 

@@ -397,7 +397,7 @@ def terminal_keys() -> Iterator[Callable[[float], str]]:
 
 
 def next_key(pressed: bytes) -> tuple[str, bytes]:
-    """Split the first key off a terminal's bytes; return its name or letter, and the rest."""
+    """Return the name or letter of the first key in a terminal's bytes, and the bytes after this key."""
     if sequence := _SEQUENCE.match(pressed):
         return KEYS.get(sequence[0], UNKNOWN), pressed[sequence.end() :]
     if pressed[:1] == b"\x1b":

@@ -94,7 +94,7 @@ def _write_modbus_map(plant: Plant, settings: ServeSettings, path: Path) -> int:
     from multidrop.gateway.modbus_server.unit_ids import MAIN, Units
 
     if path.suffix not in (".csv", ".json"):
-        raise ValueError(f"{path}: the name of an address map ends in .csv or .json")
+        raise ValueError(f"{path}: the name of an address map must end in .csv or .json")
     modbus: Any = settings.parts.get("modbus")
     if modbus is None:
         raise ValueError(f"{plant.path} has no Modbus server: add [serve.modbus]")

@@ -21,7 +21,7 @@ YEARS = 10
 BUDGET = CYCLES // YEARS  # limit of writes of one register in a year
 NO_HOME = Path("/nonexistent")  # used for a user without a home folder
 LATEST = 6e10  # s; the file is damaged if a time in it is further than this from 1970
-YEARLY = "times in a year"  # identifies the refusal for a used-up yearly budget
+YEARLY = "times in a year"  # only the error for a used-up yearly budget contains these words
 LEAST_INTERVAL = 60.0  # s between two writes of a register that is kept in EEPROM
 
 

@@ -97,7 +97,7 @@ class LastAct:
         return self.is_cut_short or self._over.is_set()
 
     def begin(self) -> None:
-        """Start the work without waiting."""
+        """Start the work, and return without waiting for its end."""
         self._on_begin()
         self._calls.put(None)
 
@@ -325,7 +325,7 @@ _hook: ExitHook | None = None
 
 
 def exit_hook() -> ExitHook:
-    """Return the hook of this process."""
+    """Return the only ExitHook of this process, which the first call creates."""
     global _hook
     if _hook is None:
         _hook = ExitHook()

@@ -531,7 +531,7 @@ def _limit(seconds: float | None) -> float | None:
 
 
 def stop_together(stops: Sequence[StopAttempt], do: Do, end: Callable[[StopAttempt], object]) -> None:
-    """Carry out the stops in turn, one step at a time; call `end` at least once when a stop is over."""
+    """Carry out the steps of all stops as they become due; call `end(stop)` once or more when it is over."""
     waiting = [stop for stop in stops if not stop.is_over]
     while waiting:
         stop = min(waiting, key=_due)  # the stop that is due first

@@ -130,7 +130,7 @@ class RowLayout:
 
     @property
     def refusals(self) -> int:
-        """Number of consecutive exceptions."""
+        """How many times in a row the drive has answered this read with an exception."""
         return int(self.c.refusals)
 
     @refusals.setter
@@ -139,7 +139,7 @@ class RowLayout:
 
     @property
     def refusal(self) -> int:
-        """The code of the newest exception."""
+        """The code of the newest exception reply; `refusals` counts these replies."""
         return int(self.c.refusal)
 
     @property
@@ -229,7 +229,7 @@ class Names:
         self._spelling = self._spell()
 
     def number(self, name: str) -> int:
-        """Return the name's number; a new name gets the next one."""
+        """Return the name's number; a new name gets the next number."""
         found = self._numbers.setdefault(name, len(self._names))
         if found == len(self._names):
             self._names.append(name)

@@ -64,7 +64,7 @@ class RowQueue:
 
     @property
     def dropped(self) -> int:
-        """The number of dropped rows."""
+        """The number of rows that were dropped because the queue was full."""
         return int(lib.md_row_queue_dropped(self.c))
 
     def call(self, number: int) -> None:
@@ -154,7 +154,7 @@ class _Engine:
         register_at_fork(self)
 
     def forked(self) -> None:
-        """Forget the thread in a forked child: the next port starts another one."""
+        """Forget the thread in a forked child, where the next opened port starts a new thread."""
         self._starting = threading.Lock()  # several threads may open a first port at the same time
         self._c: Any = None
         self._changing = threading.Lock()
@@ -330,7 +330,7 @@ class Port:
             lib.md_port_tap(self.c, tap.c)
 
     def set_echo(self, echo: Echo) -> None:
-        """Set whether the adapter echoes."""
+        """Set whether the adapter returns a copy (echo) of each request."""
         lib.md_port_set_echo(self.c, _ECHOES[echo])
 
     def switch(self, rs485: RS485, is_usb: bool = False) -> None:
@@ -382,7 +382,7 @@ class Port:
             lib.md_port_report(self.c, row_queue.c, number)
 
     def repeat(self, exchanges: Sequence[Exchange]) -> int:
-        """Carry out these exchanges in turn whenever no queued exchange is due, until the next call.
+        """Carry out these exchanges in turn, whenever no queued exchange is due, until the next call.
 
         Return the index of the exchange that the replaced round would have sent next; 0 on a closed port.
         """

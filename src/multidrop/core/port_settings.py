@@ -12,7 +12,7 @@ REFUSALS = {
     lib.MD_REFUSED_PARITY: "parity",
     lib.MD_REFUSED_STOPBITS: "stop bits",
 }
-NO_DIVISOR = int(lib.MD_REFUSED_DIVISOR)  # a failure only on UARTs with a whole-number divisor
+NO_DIVISOR = int(lib.MD_REFUSED_DIVISOR)  # no whole divisor of the UART's clock gives the baud rate
 
 
 class CharacterFormat(NamedTuple):

@@ -97,13 +97,13 @@ class UnattachedStop:
         self._make = make
 
     def carry_out(self) -> None:
-        """Do nothing."""
+        """Do nothing, because without a bus no stop can be sent."""
 
     def interrupted(self, interruption: BaseException) -> None:
-        """Do nothing."""
+        """Do nothing, because no stop was in progress."""
 
     def result(self) -> CommandResult:
-        """Raise NotAttached."""
+        """Raise NotAttached, because the drive has no bus."""
         return cast(CommandResult, self._drive.perform(self._make()))
 
 

@@ -136,7 +136,7 @@ class FleetGateway:
         await end_tasks(*waits)
 
     async def _look(self) -> None:
-        """Check repeatedly for ended threads.
+        """Check repeatedly whether a watched thread or polling has ended.
 
         If polling has failed, report that to the supervisor, and return.
         """

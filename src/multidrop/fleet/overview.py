@@ -143,7 +143,7 @@ class FleetWatch:
             self._looked, self.trouble = begun, None
 
     async def run(self) -> None:
-        """Read once a second, forever."""
+        """Read the fleet's state once a second, until cancelled."""
         while True:
             await self.look()
             await asyncio.sleep(EVERY_S)

@@ -39,7 +39,7 @@ from multidrop.gateway.http.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTE
 from multidrop.plant import drive_meant
 from multidrop.supervisor import supervisor
 
-MOST_AGE_S = 5.0  # writes and verbs that a network delayed longer are refused; stops are not
+MOST_AGE_S = 5.0  # writes and verbs that arrive later than this are refused; late stops are sent
 LOOK_S = 0.02  # during a reload: interval between checks for replaced drives, which must be stopped again
 MOST_WRITES = 8  # limit of concurrent writes on one line; stops are not counted
 MOST_STOPS = 8  # limit of concurrent stops of a drive from one interface
@@ -171,7 +171,7 @@ class Commands:
         return await stop_meant(self._lines, drives, partial(self._stop, caller=caller))
 
     async def _stop(self, plant: Plant, wanted: Iterable[str], caller: Caller) -> dict[str, CommandResult]:
-        """Stop these drives of a plant."""
+        """Stop the plant's drives with the names in `wanted`."""
         wanted = dict.fromkeys(wanted)
         lines: list[LineStop] = []
         for line in plant.lines:

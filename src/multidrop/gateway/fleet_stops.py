@@ -66,7 +66,7 @@ class FleetStops(Commands):
     async def write(
         self, drive: str, register: str, value: float, caller: Caller, admit: Admit = lambda what: inf
     ) -> CommandResult:
-        """Refuse the write."""
+        """Refuse the write, because a fleet's page can only stop drives."""
         if caller.role < Right.WRITE:
             return denied(caller, Right.WRITE, f"a write of {drive}.{register}")
         return _refused(ONLY_STOPS.format("write"))

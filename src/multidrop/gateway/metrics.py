@@ -37,7 +37,7 @@ class BaseUnit(NamedTuple):
     factor: float = 1.0
 
 
-UNITS = {  # by unit of a register
+UNITS = {  # a metric's unit, by the unit of its register
     "Hz": BaseUnit("hertz"),
     "kHz": BaseUnit("hertz", 1e3),
     "A": BaseUnit("amperes"),

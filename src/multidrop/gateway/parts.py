@@ -65,7 +65,7 @@ class PartContext(NamedTuple):
 
 
 class Part(Protocol):
-    """The methods of a part.
+    """The methods of a part, which is one interface of the gateway, such as MQTT.
 
     Four more methods are optional: `adopt(plant)` is called after a reload, and `note_alarm(alarm,
     change)` when an alarm starts, changes or ends. `health()` returns a problem or "", and `figures()`
@@ -77,10 +77,10 @@ class Part(Protocol):
         """Process a batch. Called in the loop; must return within 1 ms."""
 
     async def run(self) -> None:
-        """Run until cancelled."""
+        """Do the part's work until this task is cancelled."""
 
     async def close(self) -> None:
-        """Shut down; called after the last batch."""
+        """Close the part. Called after the last batch."""
 
 
 class PartHost(Protocol):
@@ -239,7 +239,7 @@ class LiveParts:
             raise
 
     async def _drop(self, names: Sequence[str], seconds: float) -> None:
-        """Close parts concurrently."""
+        """Remove the parts with these names, and close them concurrently."""
         for name in names:
             del self._settings[name]
             self.dead.pop(name, None)

@@ -169,7 +169,7 @@ class History:
 
         `end` None means now. Each bucket keeps its extreme values in `most` and `least`. Buckets of 2 s and
         more are rounded up to whole tens of seconds, minutes, hours or days of UTC. So the first bucket
-        may start before `begin`, and the last one may end after `end`.
+        may start before `begin`, and the last bucket may end after `end`.
 
         In a part of the range, a name may have belonged to another register, with another unit or other
         names of its numbers. Only values of the newest quantity are included: see `unit` and `left_out`.

@@ -134,7 +134,7 @@ def _substitutions(document: Any) -> dict[str, str]:
 
 
 def _substituted(value: Any, known: Mapping[str, str], depth: int) -> Any:
-    """Return the value, with each ${name} replaced whose name the document itself defines."""
+    """Return the value with $name and ${name} replaced by their text in `known`, if they are in it."""
     if isinstance(value, str) and "$" in value and not isinstance(value, YamlTag):
         return re.sub(r"\$(?:\{(\w+)\}|(\w+))", lambda name: known.get(name[1] or name[2], name[0]), value)
     if depth < 5 and known:

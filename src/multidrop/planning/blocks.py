@@ -265,7 +265,7 @@ def _worthwhile(ways: dict[int, _Way]) -> list[_Way]:
 
 
 def _even(drive: Drive, few: _Way, many: _Way) -> float:
-    """Return the response delay in s at which both divisions take equally long."""
+    """Return the response delay in s at which both ways to divide the reads take equally long."""
     saved = (few.characters - many.characters) * drive.settings.character
     return saved / (many.requests - few.requests) - silence(drive)
 

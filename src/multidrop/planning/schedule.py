@@ -193,7 +193,7 @@ class Schedule(Generic[J]):
 
         If slots were skipped, choose the job that was sent longest ago. Otherwise choose the job whose slot
         ends first. If there is time for all of these jobs before this slot ends, prefer a job of the same
-        kind as the last one.
+        kind as the job that was chosen before.
         """
         if self.back_off.may_sleep(at_ns):
             for job in [job for job in self._begun if self.back_off.is_asleep(job.drive, at_ns)]:

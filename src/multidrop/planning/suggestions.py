@@ -31,7 +31,7 @@ SLOWER = 1.05  # factor from one attempted period to the next
 
 @dataclass(frozen=True)
 class Suggestions:
-    """Three changes, each of which lets the line reach its rates. A change that cannot do so is None."""
+    """Three changes, each of which lets the line reach its rates. A change is None if it is not enough."""
 
     every: tuple[tuple[float, float], ...]  # pairs: wanted period, reachable period (s)
     # lowest sufficient baud rate, and the drives that now use a lower one

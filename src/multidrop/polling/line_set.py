@@ -205,7 +205,7 @@ class LineSet:
             line.bus.line.end()
 
     def let_go(self, lines: Iterable[PolledLine], why: str) -> None:
-        """End these lines and remove them."""
+        """Stop polling these lines, and remove them from the set."""
         going = set(lines)
         self.end(going, why)
         self._lines = tuple(line for line in self._lines if line not in going)

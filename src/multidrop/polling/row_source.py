@@ -84,7 +84,7 @@ class BatchCaller:
             self._thread.join()
 
     def raise_failure(self) -> None:
-        """Raise the function's failure, once."""
+        """If the function has raised an exception, raise it again, but only at the first call."""
         failure, self._failure = self._failure, None
         if failure is not None:
             raise failure

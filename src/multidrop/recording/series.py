@@ -187,9 +187,9 @@ class SeriesWriter(RecordingWriter):
                 self._in_thread(self._write_piece)
 
     def _in_thread(self, *works: Callable[[], Any]) -> Any:
-        """Carry out these works in the library's thread; return the result of the last one.
+        """Call these functions in the library's thread; return the result of the last function.
 
-        The thread carries out all works, even if one fails or the wait for them is interrupted. Raises the
+        The thread calls all functions, even if one fails or the wait for them is interrupted. Raises the
         first failure.
         """
         futures = [self._thread.submit(work) for work in works]

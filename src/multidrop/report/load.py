@@ -259,7 +259,7 @@ def load(path: str | Path) -> Recording:
 
 
 def _steps(phases: Series, end: int) -> list[TimeSpan]:
-    """Return the steps of a test run. A step ends at the start of the next one, or at the recording's end."""
+    """Return the steps of a test run. Each ends at the next step, or at the recording's end."""
     begins = phases.time.tolist()
     names = map(phases.name_of, phases.value.tolist())
     return [TimeSpan(*span) for span in zip(begins, [*begins[1:], end], names, strict=True)]

@@ -10,7 +10,7 @@ from multidrop.recording.series import Array
 from multidrop.report.load import Recording, Series, TimeSpan
 
 BAND = 0.02  # a value is settled if it differs from the settled value by at most this fraction of its change
-LAST = 0.2  # the last fraction of a step, whose mean is the settled value
+LAST = 0.2  # the settled value is the mean over this last fraction of a step
 KILOWATTS = {"kW": 1.0, "W": 1e-3}  # units whose integral is an energy, each in kW
 
 

@@ -234,7 +234,7 @@ class SampleTables:
             self._connection = None
 
     def open(self) -> psycopg.Connection[Any]:
-        """Connect again, and return the connection."""
+        """Close the old connection, connect to the database, and return the new connection."""
         self.close()
         login = {"application_name": self._program, **self._login}
         where = make_conninfo(self._database, connect_timeout=ANSWER_S, **SILENT_SERVER, **login)

@@ -254,7 +254,7 @@ class Spool:
         return self._thread.is_alive()
 
     def state(self) -> SpoolState:
-        """Return counts and the present problem."""
+        """Return the counts of the spool's messages and rows, and its present problem."""
         with self._changing:
             oldest = next(iter(self._folder.messages), 0)
             counts = self._written, self._lost, self._in_memory(), oldest, self._folder.newest
@@ -353,7 +353,7 @@ class Spool:
         return max(0.0, self._first_s + ENOUGH_S - time.monotonic())
 
     def _pause(self) -> bool:
-        """Wait before the disk is retried. If the spool is closing, count the rest as lost; return True."""
+        """Wait before a retry. If the spool is closing, count the rows in memory as lost; return True."""
         with self._changing:
             if not self._over:
                 self._changing.wait_for(lambda: self._over, AGAIN_S)

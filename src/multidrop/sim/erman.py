@@ -21,7 +21,7 @@ class SimulatedERMAN(MotorDrive):
     The manual leaves three points open. It does not say whether a coil is a level or a pulse. Here clearing
     START also stops the motor, and neither clearing a stop coil nor a reset starts it. It does not say when
     the motor is overloaded: here above 1.2 times its rated current. It does not say whether the drive obeys
-    the line if b.001 is not 2: here it does.
+    commands from the line if b.001 is not 2: here it obeys them.
     """
 
     functions = (0x01, 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F, 0x10)

@@ -296,7 +296,7 @@ class SimulatedInvt(ProfileDrive):
 
 
 class SimulatedInovance(SimulatedInvt):
-    """Inovance and its copies: the status register shows no fault."""
+    """A drive with Inovance's status register, which has no value for a fault: it shows STOPPED."""
 
     def _state(self) -> int:
         if not self.motor.energised:

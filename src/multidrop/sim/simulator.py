@@ -120,7 +120,7 @@ class Simulator:
         return self._interrupter.fileno()
 
     def run(self) -> None:
-        """Run the wires until interrupted. Blocks.
+        """Simulate all wires in the calling thread until interrupted.
 
         If a simulated drive raises an exception, its request gets no reply. The first exception of each wire
         is logged.

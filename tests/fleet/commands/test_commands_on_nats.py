@@ -279,7 +279,7 @@ def drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CommandDrill]:
         yield found
 
 
-def test_the_fleet_command_line_writes_and_stops(drill: CommandDrill) -> None:
+def test_the_fleet_command_line_can_write_a_setpoint_and_stop_a_drive(drill: CommandDrill) -> None:
     before = drill.setpoints("drive-0")
     for _ in range(ATTEMPTS):
         done = drill.run("write", "drive-0", "frequency", "49.99", "--yes", "--json", "--by", "anna")

@@ -207,7 +207,7 @@ def test_a_restarted_master_rejects_earlier_tokens(desk: Desks, tmp_path: Path) 
 
 
 @patient
-def test_only_the_master_answers_commands_and_stops(desk: Desks) -> None:
+def test_only_the_master_answers_a_command_or_a_stop(desk: Desks) -> None:
     """A gateway that is not the master stays silent, because the sender uses the first answer."""
     desk.is_master = False
     assert desk.ask(register=SETPOINT, value=20.0) is None

@@ -207,7 +207,7 @@ def test_a_spool_that_is_older_than_its_position_is_reported(tmp_path: Path) -> 
 # ---- receivers ----
 
 
-def test_a_message_is_skipped_if_the_receiver_refuses_it_but_accepts_others(clocked: Clocked) -> None:
+def test_a_message_is_skipped_if_the_receiver_refuses_it_but_accepts_other_messages(clocked: Clocked) -> None:
     clocked.receiver.failure = Refused("HTTP Error 400: field type conflict")
     store(clocked.spool, 0, 5)
     assert clocked.send_all() > 0

@@ -154,7 +154,7 @@ plants = st.fixed_dictionaries(
 
 
 @given(plants, plants)
-def test_changes_turn_the_old_frame_into_the_new_one(before: dict[str, Any], now: dict[str, Any]) -> None:
+def test_changes_turn_the_old_frame_into_the_new_frame(before: dict[str, Any], now: dict[str, Any]) -> None:
     said = changes(before, now)
     assert merged(before, said) == now
     assert changes(before, merged(before, said)) == said
@@ -192,7 +192,7 @@ async def view(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
 
 @pytest.mark.slow
 @given(st.lists(st.tuples(plants, st.integers(0, 9)), min_size=2, max_size=12), st.integers(0, 2**32))
-def test_viewer_that_skips_frames_ends_with_the_newest_one(
+def test_viewer_that_skips_frames_ends_with_the_newest_frame(
     pictures: list[tuple[dict[str, Any], int]], begin: int
 ) -> None:
     """The plant description changes in the middle of the run."""
@@ -211,7 +211,7 @@ async def test_a_waiting_viewer_gets_no_frame_at_its_timeout_or_at_closing(
     waiting = [asyncio.create_task(frames.after(first.n)) for _ in range(3)]
     await asyncio.sleep(0)
     assert [one.done() for one in waiting] == [False, False, True]
-    with pytest.raises(OverflowError, match="2 viewers are waiting already"):
+    with pytest.raises(OverflowError, match="too many viewers; the limit is 2"):
         await waiting.pop()
     frames.close()
     assert await asyncio.gather(*waiting) == [None, None]
@@ -230,7 +230,7 @@ async def test_too_many_viewers_get_an_error(frames: Frames, monkeypatch: pytest
     scope = {"type": "http", "query_string": f"after={first.n}".encode(), "headers": []}
     await FrameRoute(frames)(scope, None, send)  # type: ignore[arg-type]
     assert [one.get("status") for one in sent] == [503, None]
-    assert json.loads(sent[1]["body"]) == {"error": "0 viewers are waiting already"}
+    assert json.loads(sent[1]["body"]) == {"error": "too many viewers; the limit is 0"}
 
 
 def test_frame_is_made_after_the_check_for_alarms_of_the_same_rows(

@@ -142,7 +142,9 @@ def test_a_status_alone_shows_a_fault(hub: Hub) -> None:
     assert hub.seen("pump-1").fault == "overcurrent while accelerating (OC1)"
 
 
-def test_drive_is_silent_after_many_lost_replies_but_not_after_one(hub: Hub, clock: HubClock) -> None:
+def test_drive_is_silent_after_many_lost_replies_but_not_after_one_lost_reply(
+    hub: Hub, clock: HubClock
+) -> None:
     hub.take(all_of(10, FORWARD, 25))
     for at in range(11, 20):
         hub.take(rows(*((at, register, Status.NO_REPLY) for register in range(4))))

@@ -268,7 +268,7 @@ def test_http_and_the_command_give_the_same_address_map(
     assert json.loads(path.read_text()) == [{**row, "tcp_port": 0} for row in rows]
     assert main(["serve", plant, "--modbus-map", str(path)]) == 2
     assert main(["serve", plant, "--modbus-map", "map.xls"]) == 2
-    assert "map.xls: the name of an address map ends in .csv or .json" in capsys.readouterr().err
+    assert "map.xls: the name of an address map must end in .csv or .json" in capsys.readouterr().err
 
 
 def test_the_map_states_an_invalid_count_of_32_bits_and_the_bits_of_a_byte(tmp_path: Path) -> None:

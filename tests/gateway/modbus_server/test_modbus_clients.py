@@ -115,7 +115,7 @@ async def test_internal_failure_is_answered_with_an_exception_code(caplog: pytes
     assert "a mistake of ours" in caplog.text
 
 
-async def test_a_flooding_client_does_not_delay_others() -> None:
+async def test_a_flooding_client_does_not_delay_other_clients() -> None:
     port = port_of()
     flood, flooded = connected(port)
     other, answered = connected(port)
@@ -229,7 +229,7 @@ async def test_parsing_of_received_writes_pauses_after_each_time_slice() -> None
     assert transport.is_reading
 
 
-def test_requests_of_a_client_that_reads_no_answers_are_read_within_limits(
+def test_a_client_that_reads_no_answers_can_send_only_a_limited_number_of_requests(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(modbus_clients, "MOST_UNTAKEN", 4096)
@@ -286,7 +286,7 @@ async def test_idle_client_is_disconnected_unless_it_waits_for_an_answer() -> No
     never.cancel()
 
 
-async def test_a_client_beyond_the_limit_replaces_the_longest_idle_one() -> None:
+async def test_a_client_beyond_the_limit_replaces_the_client_that_is_idle_longest() -> None:
     port = port_of()
     found = []
     for _ in range(modbus_clients.MOST_CLIENTS):
@@ -629,7 +629,7 @@ async def test_requests_of_a_disconnected_client_are_dropped_but_the_current_one
     assert line.begun[1] - line.begun[0] >= 0.1
 
 
-async def test_failed_request_raises_for_its_client_and_the_next_one_runs() -> None:
+async def test_a_failed_request_raises_for_its_client_and_the_next_request_is_sent() -> None:
     async def fails(left: float) -> list[int]:
         raise TimeoutError("no reply")
 

@@ -428,7 +428,9 @@ def test_retained_command_is_refused(broker: RunningBroker, listener: Listener, 
 
 @pytest.mark.slow
 @nats_of(old_server_program)
-def test_rejected_topics_do_not_delay_others(broker: RunningBroker, listener: Listener, start: Start) -> None:
+def test_rejected_topics_do_not_delay_other_topics(
+    broker: RunningBroker, listener: Listener, start: Start
+) -> None:
     """Sparkplug's topics have a dot; nats-server before 2.10 closes connections because of it."""
     known, running = start(sparkplug="works", node="line")
     listener.wait_for(has("multidrop/pump-1"))
@@ -446,7 +448,9 @@ def test_rejected_topics_do_not_delay_others(broker: RunningBroker, listener: Li
 
 @pytest.mark.slow
 @on_nats
-def test_sparkplug_births_data_deaths_and_commands(broker: RunningBroker, host: Host, start: Start) -> None:
+def test_sparkplug_host_receives_births_data_and_deaths_and_sends_commands(
+    broker: RunningBroker, host: Host, start: Start
+) -> None:
     known, running = start(sparkplug="works", node="line", commands=True)
     assert host.values(host.wait_for("NBIRTH")) == {"bdSeq": 0, "Node Control/Rebirth": False}
     born = host.values(host.wait_for("DBIRTH", "pump-1"))

@@ -37,7 +37,7 @@ def test_page_files_are_short_and_start_with_a_comment() -> None:
         assert path.suffix == ".html" or re.match(r"// [A-Z]|/\* [A-Z]", lines[0]), path.name
 
 
-def test_page_refers_to_all_its_files_and_to_no_others() -> None:
+def test_page_refers_to_all_its_files_and_to_no_other_files() -> None:
     named = set(re.findall(r'"page/([\w./-]+)"', (PAGE / "index.html").read_text("utf-8")))
     for script in SCRIPTS:
         imports = re.findall(r'from "(\.[\w./-]+)"', script.read_text("utf-8"))

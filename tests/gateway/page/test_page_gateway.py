@@ -143,7 +143,7 @@ def test_reload_is_not_offered_without_a_file_or_right(opened: Opener, gateway: 
         assert page.get_by_role("button", name=READ_AGAIN).count() == 0
 
 
-def test_real_gateway_refuses_a_broken_file_and_reloads_a_good_one(page: Any, tmp_path: Path) -> None:
+def test_real_gateway_refuses_a_broken_file_and_reloads_a_valid_file(page: Any, tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         path = gateway.gateway.plant.path
         good = path.read_text()

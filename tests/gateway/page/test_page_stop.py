@@ -387,7 +387,7 @@ def test_no_later_dialog_replaces_the_question_of_a_stop(
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
-KEYS = {  # by key, its place on the keyboard, and whether Shift is held: the question that is asked
+KEYS = {  # (key, its place on the keyboard, is Shift held): question that the page then asks
     ("S", "KeyS", True): "Stop all 10 drives?",
     ("s", "KeyS", False): "Stop pump-1?",
     ("s", "KeyS", True): "Stop all 10 drives?",  # with caps lock on

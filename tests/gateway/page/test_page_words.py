@@ -277,7 +277,9 @@ def test_an_alarm_is_acknowledged_with_a_note(opened: Opener, alarmed: FakeGatew
     assert "there is no such alarm" in page.locator("#ask").inner_text()
 
 
-def test_many_misses_show_a_warning_and_one_does_not(opened: Opener, gateway: FakeGateway) -> None:
+def test_many_misses_show_a_warning_and_a_single_miss_shows_none(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     gateway.drive_changes = {"pump-1": {"missed": 0.0003}, "pump-2": {"missed": 0.05}}
     gateway.changes = {"lines": {name: line | {"misses": 1} for name, line in lines().items()}}
     page = opened()

@@ -147,7 +147,7 @@ def test_a_tool_reads_the_drives_and_cannot_write(name: str, tmp_path: Path) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", usually(*TOOLS))
-def test_a_tool_with_rights_writes_and_stops_but_never_starts(name: str, tmp_path: Path) -> None:
+def test_a_tool_with_rights_can_write_and_stop_but_cannot_start_a_drive(name: str, tmp_path: Path) -> None:
     with connected(name, tmp_path, SERVE.replace("[serve.tool]", '[serve.tool]\nmay = "write"')) as (
         gateway,
         tool,

@@ -131,7 +131,7 @@ class GatedBucket(MemoryBucket):
 
 
 class RecordingMastership:
-    """A fake mastership that records its deadline, and raises the same errors as the engine."""
+    """Replaces the engine's mastership: records the deadline and the calls, and raises the same errors."""
 
     def __init__(self, clock: Callable[[], int]) -> None:
         self.clock = clock

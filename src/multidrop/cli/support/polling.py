@@ -297,7 +297,7 @@ class SideReader:
         return self._found
 
     def rest(self) -> None:
-        """Stop reading."""
+        """Read no more registers until the next call of `read`."""
         self._drive = None
 
     def _read_all(self, chosen: LiveDrive, found: dict[str, SideRead]) -> None:

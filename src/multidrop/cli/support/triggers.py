@@ -1,4 +1,4 @@
-"""The triggers of `poll` and `monitor`: their arguments, and a picture of the last one for the terminal."""
+"""The triggers of `poll` and `monitor`: their arguments, and a drawing of the newest trigger's signals."""
 
 from __future__ import annotations
 

@@ -133,7 +133,7 @@ def _text(value: Any) -> str:
     if not isinstance(value, str):
         raise ValueError("is not a text")
     if not value.isprintable():
-        raise ValueError("has characters that do not print; leave them out")
+        raise ValueError("has unprintable characters; remove them")
     if len(value) > LONGEST_TEXT:
         raise ValueError(f"has more than {LONGEST_TEXT} characters")
     return value

@@ -278,7 +278,7 @@ class FleetCommands:
         return self._find(drive)
 
     async def _read_plant(self, otherwise: str) -> None:
-        """Read changes of the plant.
+        """Read the changed records of the plant from the servers.
 
         If that fails, use an older copy, because masters check each command anyway.
         """

@@ -76,7 +76,7 @@ class CommandRequest(NamedTuple):
 
 
 class StopRequest(NamedTuple):
-    """A stop of these drives of a line, or of all its drives if None. Each stop has its own `id`."""
+    """A stop of some drives of a line; of all its drives if `drives` is None. Each stop has its own `id`."""
 
     id: str
     by: str

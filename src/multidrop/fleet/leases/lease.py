@@ -42,7 +42,7 @@ class MayPoll(Protocol):
         """
 
     def end(self) -> object:
-        """Stop sending, and cancel the timer."""
+        """Forbid the engine to send, and cancel the kernel's timer."""
 
 
 class Held(NamedTuple):

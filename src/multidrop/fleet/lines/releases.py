@@ -56,7 +56,7 @@ class Releases:
         return {line for line in lines if names.owner_buckets(line)[0] in ready}
 
     async def watch(self) -> None:
-        """Check the servers forever."""
+        """Call `look` repeatedly, until cancelled."""
         while True:
             await self.look()
             await asyncio.sleep(LOOK_S)

@@ -105,7 +105,7 @@ class SampleSink(Protocol):
         """Store the whole commit; if that fails, leave the sink unchanged."""
 
     def close(self) -> None:
-        """Release open resources."""
+        """Close the sink's open files and connections."""
 
 
 async def _on_thread(act: Callable[..., T], *arguments: Any) -> T:

@@ -75,7 +75,7 @@ def digest_of(data: bytes) -> str:
 def end_if_cancelled() -> None:
     """Raise CancelledError if this task was cancelled, but `asyncio.wait_for` has swallowed the exception.
 
-    Python 3.11 does so if the cancellation coincides with an answer.
+    In Python 3.11, it swallows the exception if an answer arrives at the moment of the cancellation.
     """
     task = asyncio.current_task()
     if task and task.cancelling():

@@ -32,7 +32,7 @@ class DirectMessage(NamedTuple):
 
 
 class Request(NamedTuple):
-    """A message that expects an answer."""
+    """A message whose sender waits for an answer."""
 
     subject: str
     data: bytes

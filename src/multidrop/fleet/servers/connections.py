@@ -28,7 +28,8 @@ from multidrop.fleet.servers.batch_client import BatchClient, DirectGet, DirectM
 from multidrop.fleet.servers.direct_gets import Spare, first_answer
 from multidrop.printable import masked
 
-OLDEST = (2, 12)  # minimum version; 2.9.10 accepts several writes to one revision (nats-server issue 4320)
+# Minimum version of NATS. In 2.9.10, several clients may replace the same revision (nats-server issue 4320).
+OLDEST = (2, 12)
 CONNECT_S = 1.0
 ANSWER_S = 1.0  # time limit of an answer; leases are renewed twice a second
 PONG_S = 0.7  # time limit of a ping; if a server is slower, the path moves to another server

@@ -26,7 +26,8 @@ from multidrop.whole_file import whole_file
 RETRY_S, MOST_RETRY_S = 1.0, 30.0  # pause after the first failed attempt, and the longest pause
 SLOW_S = 40.0  # a receiver that takes longer than this (in s) for one message is reported
 REMOVED_S = 0.01  # pause if the full spool has just removed the message that was to be sent
-MOST_GAPS = 64  # limit of ranges of unsent messages; with more, messages are sent in numerical order
+# A gap is a range of messages that were skipped to send a newer one first. At this limit, none are skipped.
+MOST_GAPS = 64
 SET_BACK = (
     "it has message {} of the spool {}, which ends at message {}: the folder was copied or set back; "
     "move it away to start a new spool"
@@ -80,7 +81,7 @@ class RowReceiver(Protocol):
         """Send a message, and store the position after it. Raises Refused or another OSError."""
 
     def close(self) -> None:
-        """Release open resources."""
+        """Close the receiver's open files and connections."""
 
 
 class RepeatingReceiver:
@@ -232,7 +233,7 @@ class RowForwarder:
         return 0.0
 
     def _ask(self) -> None:
-        """Get the receiver's position.
+        """Ask the receiver which messages it has.
 
         Raises SinkError if that position is beyond the spool's newest message.
         """

@@ -12,7 +12,7 @@ from multidrop.gateway.settings import Folders
 from multidrop.printable import masked
 from multidrop.recording import parse_size
 
-SECRETS = ("p", "u", "token", "password", "api_key", "apikey", "key")  # keys of a URL's query
+SECRETS = ("p", "u", "token", "password", "api_key", "apikey", "key")  # query parameters with secrets
 MOST_SECRET = 4096  # limit, in bytes, of the size of a file with a secret
 
 

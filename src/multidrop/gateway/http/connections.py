@@ -60,7 +60,7 @@ class Rank(IntEnum):
 
 
 class _Open:
-    """One connection."""
+    """The state of one open connection."""
 
     __slots__ = ("ends", "fresh_until", "is_busy", "is_greedy", "is_stop", "peer", "stalled_since")
 

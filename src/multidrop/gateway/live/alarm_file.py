@@ -20,7 +20,7 @@ CLOSE_S = 2.0
 
 
 class AlarmFile:
-    """A file of alarms as JSON lines; if an alarm has several lines, the last one counts.
+    """A file of alarms as JSON lines; if an alarm has several lines, the last line counts.
 
     All disk access is in `run`, which needs a thread of its own. No method raises.
     """

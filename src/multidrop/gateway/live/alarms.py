@@ -146,7 +146,7 @@ class Alarms:
             self._begin(time, line, "", PORT, lost)
 
     def look_at_limits(self, time: int, drive: str, exceeded: Callable[[str], str]) -> None:
-        """Note a drive's exceeded limits.
+        """Start, update or end the alarm about a drive's exceeded limits.
 
         `exceeded` is called with the text of the active alarm ("" without one), and returns the alarm's
         new text ("" if no limit is exceeded).

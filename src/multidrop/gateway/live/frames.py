@@ -1,6 +1,6 @@
 """Frames: the state of the plant for all viewers, made at most five times a second.
 
-A viewer requests a frame only after it has received the last one, so no queue builds up for a slow viewer.
+A viewer requests a frame only after it has the frame before, so no queue builds up for a slow viewer.
 The request has the number of the viewer's newest frame, and the answer has the changes since that frame. If
 the gateway no longer remembers that frame, the answer is the whole newest frame.
 """
@@ -23,7 +23,7 @@ from multidrop.gateway.live.hub import Hub, KeptRow
 from multidrop.gateway.live.recent_statistics import RecentStatistics
 
 LEAST_S = 0.2  # least mean time between two frames
-EARLY_S = 0.02  # after a late frame, the next one may come this much earlier than LEAST_S
+EARLY_S = 0.02  # after a late frame, the next frame may come this much earlier than LEAST_S
 WAIT_S = 20.0  # longest wait for a frame
 MOST_VIEWERS = 200  # limit of concurrently waiting viewers
 WHOLE = -1  # frame number in the request of a viewer that has no frame yet
@@ -163,7 +163,7 @@ def changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
 
 
 class Frames:
-    """The newest frames and the viewers waiting for the next one.
+    """The newest frames, and the viewers that wait for the next frame.
 
     `clock` returns monotonic seconds. Frame numbers start at `begin`, which is random so that a frame of an
     earlier process is never mistaken for a frame of this process.
@@ -187,7 +187,7 @@ class Frames:
 
     @property
     def viewers(self) -> int:
-        """The number of waiting viewers."""
+        """The number of viewers that wait for the next frame."""
         return len(self._waiting)
 
     def note_news(self) -> None:
@@ -219,7 +219,7 @@ class Frames:
         if (news := self._since(n)) is not None:
             return news
         if len(self._waiting) >= MOST_VIEWERS:
-            raise OverflowError(f"{MOST_VIEWERS} viewers are waiting already")
+            raise OverflowError(f"too many viewers; the limit is {MOST_VIEWERS}")
         if self._is_closed:
             return None
         loop = asyncio.get_running_loop()

@@ -31,7 +31,7 @@ class RecentStatistics:
         self.adopt(plant)
 
     def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
-        """Use another plant."""
+        """Continue with another plant, and forget the figures of lines that it lacks."""
         planned = plant.metadata()["planned"] if planned is None else planned
         self._planned = {name: float(line["utilisation"]) for name, line in planned.items()}
         self._hours = {name: minutes for name, minutes in self._hours.items() if name in self._planned}

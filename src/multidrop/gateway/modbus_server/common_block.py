@@ -20,7 +20,7 @@ STATE, FAULT, FREQUENCY, CURRENT, SETPOINT, AGE, STOP = 0, 1, 2, 4, 6, 8, 10  # 
 STATES = {"unknown": 0, "stands": 1, "runs": 2, "fault": 3, "silent": 4}
 NO_FAULT, FAULT_WITHOUT_NUMBER, FAULT_UNKNOWN = 0, 0xFFFE, 0xFFFF
 NO_NUMBER = -(1 << 31)  # 8000 0000H: the value is unknown, or out of range
-NEVER, LONGEST_AGE = 0xFFFF_FFFF, 0xFFFF_FFFE  # in place of an age in ms: no value so far; this age or more
+NEVER, LONGEST_AGE = 0xFFFF_FFFF, 0xFFFF_FFFE  # ages in ms: no value was read yet; limit of ages
 
 _PER_UNIT = 100
 

@@ -93,7 +93,7 @@ class Mqtt:
             one.adopt(plant)
 
     async def run(self, sleep: Callable[[float], Awaitable[object]] = asyncio.sleep) -> None:
-        """Publish periodically until cancelled."""
+        """Publish new values to all brokers periodically, until cancelled."""
         for broker in self._brokers:
             broker.open()
         forwarding = [supervisor().start("mqtt rows", one.run()) for one in self._forwarded]

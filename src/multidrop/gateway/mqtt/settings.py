@@ -17,7 +17,7 @@ from multidrop.plant import check_drive_name
 from multidrop.toml_check import DURATION, SIZE, parse_duration
 
 LEVEL = re.compile(r"[^+#/\x00]+")  # one level of a topic
-OTHERS = ("homeassistant", "spBv1.0")  # first levels reserved for discovery and Sparkplug
+OTHERS = ("homeassistant", "spBv1.0")  # first topic levels that discovery and Sparkplug use
 LEAST_EVERY_S, MOST_EVERY_S = 0.1, 3600.0
 BROKER = r"^[Mm][Qq][Tt][Tt][Ss]?://(\[[0-9A-Fa-f:.]+\]|[^@:/?#\[\]]+)(:[0-9]{1,5})?/*$"
 PREFIX = rf"^(?!\$)(?!({'|'.join(OTHERS)})(/|$)){LEVEL.pattern}(/{LEVEL.pattern})*$"
@@ -82,7 +82,7 @@ class MqttSettings:
 
     @property
     def libraries(self) -> tuple[str, ...]:
-        """The libraries that the part imports."""
+        """The names of the libraries that MQTT needs with these settings."""
         return ("paho", "pyarrow") if self.rows else ("paho",)
 
     def check(self, plant: Plant) -> list[str]:

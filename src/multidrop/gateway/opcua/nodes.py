@@ -148,7 +148,7 @@ class _Value(ua.DataValue):
 
 
 class _Variable:
-    """A variable and its newest state.
+    """A variable of the OPC UA server, and its newest state.
 
     The value for clients is made on request, because few variables have subscribers.
     """

@@ -188,7 +188,7 @@ class OpcUa:
     def _quick_process(self) -> Iterator[None]:
         """Make threads take turns quickly while a server runs. After the last server, undo `lasting` too.
 
-        There may be two servers: during a reload, the next one may start before this one has ended.
+        There may be two servers: during a reload, the next server may start before this server has ended.
         """
         _unended.add(self)
         sys.setswitchinterval(SWITCH_S)

@@ -328,7 +328,7 @@ class PlantServer(Server):
             await self.get_node(node).write_value(MOST_OPERATIONS, ua.VariantType.UInt32)
 
     async def start(self) -> None:
-        """Accept clients."""
+        """Start the server, and accept clients from then on."""
         await self._setup_server_nodes()
         await self.iserver.start()
         self.bserver = _Network(self.iserver, self._listener, self.limits)

@@ -371,7 +371,7 @@ class ToolPorts:
         """Ignore the batch: tools read from the drives."""
 
     def adopt(self, plant: Plant) -> None:
-        """Use another plant; connections stay open."""
+        """Continue with another plant; tools stay connected."""
         self._plant = plant
         before, self.lines = self.lines, {}
         for tools in before.values():
