@@ -247,7 +247,9 @@ def test_the_question_names_missing_setpoints_and_fault_registers(run: Run, tmp_
 def test_a_simulated_run_needs_no_drive_and_is_recorded(tmp_path: Path) -> None:
     out = tmp_path / "run.arrows"
     done = multidrop("run", write_test(tmp_path), "--simulate", "--speed", 4, "--out", out)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.returncode == 0
+    # On a busy machine, a reply of the simulated drive may be too late; the stop is then repeated.
+    assert [said for said in done.stderr.splitlines() if not said.startswith("the stop is repeated")] == []
     stopped, next_command = done.stdout.splitlines()
     assert stopped.startswith("fan: stopped after ")
     assert next_command == f"recorded in {out}; next: multidrop report {out}"
