@@ -84,6 +84,8 @@ def mistake(data: str | bytes) -> tuple[int, str]:
         ),
         ("a\u00a0= 1", 1, "the line has an invisible character; write the line again"),
         ('a = "\x01"', 1, "a text has an invisible character; remove it"),
+        # mistakes without a sentence of their own have that of tomllib
+        ("a = 1\nb = 2026-02-30", 2, "Invalid date or datetime"),
         # headers
         ("[[line]\na = 1", 1, "a header lacks a bracket; write [serve] or [[line]]"),
         ("[serve\na = 1", 1, "a header lacks a bracket; write [serve] or [[line]]"),
@@ -93,6 +95,12 @@ def mistake(data: str | bytes) -> tuple[int, str]:
             3,
             "[serve] is there twice, first in line 1; write its keys below one header, or write each header "
             "as [[serve]]",
+        ),
+        (
+            '["x (at 5"]\na = 1\n["x (at 5"]',
+            3,
+            '["x (at 5"] is there twice, first in line 1; write its keys below one header, or write each '
+            'header as [["x (at 5"]]',
         ),
         (
             "[line]\na = 1\n[[line]]\n",
