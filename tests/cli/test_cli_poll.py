@@ -479,7 +479,7 @@ def test_poll_records_triggers(run: Run, plant: Path, tmp_path: Path) -> None:
             ["--trigger", "key", "--out", "a.txt"],
             "a.txt: a recording's name must end in .arrows, .csv, .parquet",
         ),
-        (["--trigger", "key", "--out", "a.arrows"], "--trigger key needs a terminal"),
+        (["--trigger", "key", "--out", "a.arrows"], "--trigger key needs a terminal and excludes --json"),
         (["--pre", "1 s"], "--pre and --post belong to a trigger"),
     ],
 )

@@ -96,7 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
     plant = replace(plant, realtime=arguments.realtime or plant.realtime)
     plant, triggering = triggering_of(plant, arguments)
     if "key" in arguments.trigger and (arguments.json or not is_possible()):
-        raise ValueError("--trigger key needs a terminal for the key t; without one, give a condition")
+        raise ValueError("--trigger key needs a terminal and excludes --json; give a condition instead")
     return conclude(plant, follow(plant, arguments, triggering or rotation), arguments)
 
 
