@@ -96,6 +96,7 @@ def test_the_help_imports_no_command_and_no_large_library() -> None:
             ["read", "/dev/ttyX"],
             "the following arguments are required: MODEL, ADDRESS; see `multidrop read --help`",
         ),
+        (["schema"], "the following arguments are required: KIND; see `multidrop schema --help`"),
         (
             ["read", "/dev/ttyX", TOY, "one"],
             "argument ADDRESS: 'one' is not a number such as 1; see `multidrop read --help`",

@@ -17,6 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "names",
         metavar="NAME",
         nargs="*",
+        default=[],  # else argparse's error for a missing KIND would call NAME required too
         help="plant: your own families, as the plant file names them, such as meter.toml or fan.py:Fan; "
         "family: the CSV files that a family file may name",
     )
