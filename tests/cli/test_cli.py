@@ -1,8 +1,7 @@
-"""The command line as a whole: help, exit statuses and error sentences. Also `models`."""
+"""The command line as a whole: help, exit statuses and error sentences."""
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -20,8 +19,7 @@ from tables import table
 from multidrop.cli import COMMANDS, main
 from multidrop.cli.fleet import ACTIONS as FLEET
 from multidrop.drive import Advice, WriteForbidden, carry_out
-from multidrop.families import MODELS, ErmanERG220, InnovertIBD, InvtCHE
-from multidrop.families.registry import SHIPPED, find_model
+from multidrop.families import ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.recording import open_writer
 
 
@@ -228,36 +226,6 @@ def test_a_missing_ledger_file_is_reported_with_the_default_path(
     assert run("wear", "--ledger", tmp_path / "none") == (2, "", f"multidrop: {sentence}\n")
 
 
-def test_a_sheet_shows_addresses_that_do_not_wear_eeprom(run: Run, tmp_path: Path) -> None:
-    (tmp_path / "mine.py").write_text(
-        "from multidrop.families.invt_che import InvtCHE, parameter\n\n\n"
-        'class Mine(InvtCHE):\n    """With a parameter."""\n\n'
-        '    ramp = parameter(11, "s", step=0.1, span=(0, 3600))\n'
-    )
-    status, out, _ = run("models", f"{tmp_path / 'mine.py'}:Mine")
-    assert status == 0
-    assert "        kept: EEPROM; written at 800BH, in RAM" in out
-
-
-def test_a_sheet_shows_which_writes_may_move_the_motor(run: Run, tmp_path: Path) -> None:
-    (tmp_path / "moved.py").write_text(
-        "from multidrop import Drive, command, setting\n\n\n"
-        'class Moved(Drive):\n    """Moved."""\n\n'
-        "    speed = command(1, moves=False)\n    jog_bit = setting(2, moves=True)\n    unsaid = command(3)\n"
-    )
-    family = f"{tmp_path / 'moved.py'}:Moved"
-    _, out, _ = run("models", family)
-    _, _, registers = out.partition("holding registers")
-    remarks = [line.strip() for line in registers.splitlines() if line.startswith(" " * 8)]
-    assert remarks == [
-        "a write never starts, stops or resets",
-        "kept: not stated; a write may move the motor",
-    ]
-    _, out, _ = run("models", family, "--json")
-    told = {register["name"]: register["moves"] for register in json.loads(out)["registers"]}
-    assert told == {"speed": False, "jog_bit": True, "unsaid": None}
-
-
 @table(
     ("words", "sentence"),
     [
@@ -365,174 +333,6 @@ def test_a_port_that_cannot_be_opened_is_reported_in_one_sentence_with_status_1(
     run: Run, port: str, sentence: str
 ) -> None:
     assert run("read", port, TOY, 1) == (1, "", f"multidrop: {sentence}\n")
-
-
-# ---- models ----
-
-
-def test_models_lists_the_families(run: Run) -> None:
-    status, out, _ = run("models")
-    assert status == 0
-    lines = [line for line in out.splitlines()[1:-2] if line[0] != " "]  # indented lines continue a title
-    assert [line.split()[0] for line in lines] == [*MODELS, *SHIPPED]
-    assert max(map(len, out.splitlines())) <= 80
-    titles = " ".join(out.split())
-    assert [family.title for family in MODELS.values() if family.title not in titles] == []
-    _, out, _ = run("models", "--json")
-    assert [family["model"] for family in json.loads(out)] == [*MODELS, *SHIPPED]
-
-
-def test_a_familys_sheet_has_every_fact(run: Run) -> None:
-    _, out, _ = run("models", TOY)
-    for line in (
-        "addresses       1-31",
-        "baud rates      9600, 19200 (the first is the default)",
-        "rtu formats     8N1, 8E1, 8O1, 8N2",
-        "rtu silence     3.5 characters, above 19200 bit/s 1.75 ms, before and after a",
-        "ascii silence   none",
-        "verbs           start, stop, set-frequency, state",
-        "  02H  illegal address",
-        "  rated_frequency  rated frequency of the motor (10 to 400 Hz)",
-        "holding registers (read 03H, at most 10; write 06H)",
-        "  0003H  mystery            reading  scale not stated",
-        "        the manual gives no scale",
-        "  000AH  acceleration_time  setting  0.1 s             0.1 to 600",
-        "        kept: EEPROM; only while stopped",
-        "        kept: not stated; never written: it is the maker's",
-        "        0 NONE, 1 OVERCURRENT",
-        "- the scale of `mystery`.",
-    ):
-        assert any(shown.startswith(line) for shown in out.splitlines()), f"{line!r} is not in\n{out}"
-
-
-def test_a_familys_json_has_every_register(run: Run) -> None:
-    _, out, _ = run("models", TOY, "--json")
-    sheet = json.loads(out)
-    by_name = {register["name"]: register for register in sheet["registers"]}
-    assert len(by_name) == sheet["register_count"] == 9
-    assert by_name["acceleration_time"]["span"] == [0.1, 600]
-    assert by_name["fault"]["values"] == {"NONE": 0, "OVERCURRENT": 1}
-    assert by_name["mystery"]["step"] is None
-
-
-@table(
-    ("name", "facts"),
-    [
-        (
-            "erman-er-g-220",
-            [
-                "b.010 address (1 from the factory), set while the motor stands",
-                "remote b.001 must be 2 and b.002 5 (RS-485)",
-                "broadcast the manual calls address 0 one, and does not say that nobody answers: none",
-                "coils (read 01H, at most 12; write 05H)",
-                "only verbs write it, except ON",
-                "(0 to 4294967295)",
-            ],
-        ),
-        (
-            "invt-che",
-            [
-                "PC.00 address (1 from the factory), PC.01 baud rate",
-                "PC.02 format (0 to 5: 8N1, 8E1, 8O1, 8N2, 8E2, 8O2",
-                "remote P0.01 must be 2",
-                "only verbs write it, except STOP, COAST, STOP_JOG",
-            ],
-        ),
-        (
-            "innovert-ibd",
-            [
-                "rtu silence 10 ms before and after",
-                "ascii silence none",
-                "PrH.02 address",
-                "remote set Prb.01",
-            ],
-        ),
-        ("delixi-modbus", ["P04.30 address", "P00.00 must be 2 (RS-485), and P00.01 1", "0 ASCII_7N2"]),
-        (
-            "delixi-native",
-            [
-                "delixi formats 8N1",
-                "delixi silence none",
-                "until measured, less than 80 ms by its manual; timeout 150 ms",
-                "P00.00 must be 2",
-                "0 N81, 1 E81",
-            ],
-        ),
-        (
-            "yd1000",
-            [
-                "24 characters (27.5 ms at 9600 bit/s) until measured; timeout 500 ms",
-                "F802 address",
-                "at least minimum_frequency; at most maximum_frequency",
-                "except COMMAND_VALID|FREQUENCY_VALID, COMMAND_VALID,",
-                "never together: RESET and RUN, RESET and JOG",
-                "what it is from the factory is not stated",
-            ],
-        ),
-    ],
-)
-def test_a_sheet_has_drive_settings_and_limits_of_values(run: Run, name: str, facts: list[str]) -> None:
-    """Settings and limits are printed in the words of the manual (ERMAN, section 3; YD1000, 4.3 and 6.1)."""
-    _, out, _ = run("models", name)
-    shown = " ".join(out.split())
-    assert [fact for fact in facts if fact not in shown] == []
-    assert "3.5 characters" not in shown or name in ("erman-er-g-220", "invt-che", "delixi-modbus")
-
-
-def test_a_familys_json_has_the_limits_of_values(run: Run) -> None:
-    _, out, _ = run("models", "yd1000", "--json")
-    sheet = json.loads(out)
-    by_name = {register["name"]: register for register in sheet["registers"]}
-    upper = by_name["upper_limit_frequency"]  # values from 0.5 Hz to the highest frequency FH
-    assert (upper["span"][0], upper["at_most"]) == (0.5, "maximum_frequency")
-    speeds = [by_name[f"preset_speed_{number}"] for number in range(1, 8)]  # between both limits
-    limits = {("minimum_frequency", "upper_limit_frequency")}
-    assert {(speed["at_least"], speed["at_most"]) for speed in speeds} == limits
-    assert by_name["control"]["harmless"] == [0xC000, 0x8000, 0xC800]
-    assert by_name["control"]["never_together"] == [0x2400, 0x2100]
-    assert by_name["acceleration_time"]["harmless"] is None
-    assert sheet["response_delay_s"] == pytest.approx(24 * 11 / 9600)
-    assert sheet["needed_silence_s"]["rtu"] == pytest.approx(24 * 11 / 9600)
-    assert "F802" in sheet["line_parameters"]
-    assert "reset_fault" in sheet["remote"]
-    _, out, _ = run("models", "delixi-native", "--json")
-    sheet = json.loads(out)
-    assert (sheet["needed_silence_s"], sheet["answering_time_s"]) == ({"delixi": 0}, 0.08)
-    _, out, _ = run("models", "erman-er-g-220", "--json")
-    assert "address 0" in json.loads(out)["no_broadcasts"]
-
-
-@table("name", [*MODELS, *SHIPPED])
-def test_every_sheet_is_at_most_80_columns_wide(run: Run, name: str) -> None:
-    _, out, _ = run("models", name)
-    too_wide = [line for line in out.splitlines() if len(line) > 80]
-    assert not too_wide
-    assert all(register in out for register in find_model(name).registers)
-
-
-NOTES = """
-Where the document errs or is silent, the safest interpretation applies:
-
-- The example of function 04 has the checksum of function 03's example. Its
-  reply has a byte count of 10H for 5 registers: the library requires the byte
-  count that fits the request.
-- The example of function 06"""
-
-
-def test_a_sheet_keeps_indented_lines_of_notes(run: Run, tmp_path: Path) -> None:
-    notes = "Two words:\n    0 off\n    1 on\n* one\n* two"
-    docstring = f'"""Mine.\n\n{notes}"""'.replace("\n", "\n    ")
-    (tmp_path / "mine.py").write_text(
-        "from multidrop import Drive, reading\n\n\n"
-        f"class Mine(Drive):\n    {docstring}\n\n    speed = reading(1)\n"
-    )
-    assert run("models", f"{tmp_path / 'mine.py'}:Mine")[1].endswith(f"Mine.\n\n{notes}\n")
-
-
-def test_a_sheet_wraps_its_notes_as_paragraphs(run: Run) -> None:
-    _, out, _ = run("models", "erman-er-g-220")
-    assert NOTES in out
-    assert "refuse others.\n\nNo ranges, defaults" in out
 
 
 # ---- signals ----
