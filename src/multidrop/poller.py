@@ -112,7 +112,7 @@ class Poller(RowSource):
         with self._changing:
             self._check_polling()  # an interruption may have closed the poller already
             self._lines.fill(plant.lines)
-            self._added.adopt(self.plant, self.polled_since)
+            self._adopt_channels()
 
     def _want_realtime(self, plant: Plant) -> None:
         try:
@@ -263,6 +263,10 @@ class Poller(RowSource):
         """For each drive name, the `monotonic_ns` since which rows belong to `plant`'s drive of that name."""
         return {name: since_ns for line in self._lines for name, since_ns in line.since_ns.items()}
 
+    def _adopt_channels(self) -> None:
+        """Compute the channels of the drives that are polled now."""
+        self._added.adopt(self.plant, self.polled_since)
+
     def adopt(self, plant: Plant | Path | str) -> dict[str, LineError]:
         """Poll another plant from now on; return the error of each line whose port cannot be opened, by name.
 
@@ -296,7 +300,7 @@ class Poller(RowSource):
             self._path, self._totals = plant.path, plant.totals
             self._want_realtime(plant)
             failures = adoption.carry_out(start=self._thread.is_alive())
-            self._added.adopt(self.plant, self.polled_since)
+            self._adopt_channels()
             return failures
 
     def add_line(self, line: PlantLine) -> None:
@@ -326,7 +330,7 @@ class Poller(RowSource):
             if failures:
                 self._lines.let_go([added], GONE)
                 raise failures[line.name]
-            self._added.adopt(self.plant, self.polled_since)
+            self._adopt_channels()
             if self._thread.is_alive():
                 added.start()
 
@@ -343,7 +347,7 @@ class Poller(RowSource):
         with self._changing:
             if not self._closing and leaving in self._lines:
                 self._lines.let_go([leaving], GONE)
-                self._added.adopt(self.plant, self.polled_since)
+                self._adopt_channels()
 
     def _check_polling(self) -> None:
         if self._closing:
@@ -388,7 +392,7 @@ class Poller(RowSource):
             if polled.drive.name in names:
                 raise ValueError(f"another drive is called {polled.drive.name}; give each its own name")
             self._lines.find(line).add(polled)
-            self._added.adopt(self.plant, self.polled_since)
+            self._adopt_channels()
 
     @undisturbed
     def remove(self, line: str, drive: str) -> None:
@@ -402,7 +406,7 @@ class Poller(RowSource):
             for attached in polled.bus.drives:
                 if attached.name == drive:
                     polled.remove(attached)
-                    return self._added.adopt(self.plant, self.polled_since)
+                    return self._adopt_channels()
         raise ValueError(f"there is no drive {drive!r} on line {line!r}")
 
     @undisturbed
@@ -422,8 +426,7 @@ class Poller(RowSource):
             line, known = self._lines.find_drive(drive)
             line.set_rate(known, known.register(register) if isinstance(register, str) else register, every)
             if self._added:
-                # the rate determines how long values of channels stay current
-                self._added.adopt(self.plant, self.polled_since)
+                self._adopt_channels()  # the rate determines how long values of channels stay current
 
     def __getitem__(self, name: str) -> Drive:
         """Return the polled drive of this name. Raises KeyError if there is none."""
