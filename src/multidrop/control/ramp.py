@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from contextvars import copy_context
 from math import inf
-from typing import Any
 
+from multidrop.control.call import Call
 from multidrop.control.rules import conditions, raw_count, wears
 from multidrop.core import PAUSE_NS
 from multidrop.drive.family import Drive
@@ -52,7 +52,7 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
             raise
 
 
-def _await_turn(waiting: Sequence[Drive], gap: float, unheard_s: float, call: Any) -> float:
+def _await_turn(waiting: Sequence[Drive], gap: float, unheard_s: float, call: Call | None) -> float:
     """Wait for `gap` s, and read the drives that wait for their start every HEARD_S.
 
     `unheard_s` is the time since their last read; return this time after the wait. If the process is
@@ -60,8 +60,7 @@ def _await_turn(waiting: Sequence[Drive], gap: float, unheard_s: float, call: An
     """
 
     def planned(seconds: float) -> AbstractContextManager[None]:
-        step: AbstractContextManager[None] = call.step(seconds) if call else nullcontext()
-        return step
+        return call.step(seconds) if call else nullcontext()
 
     while gap > 0:
         rest = min(gap, HEARD_S - unheard_s)
