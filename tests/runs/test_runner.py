@@ -255,40 +255,28 @@ def test_no_step_is_shortened_by_a_delay_of_the_run(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.slow
-def test_a_run_ends_if_the_computer_has_slept_for_longer_than_silence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("silence", "seconds", "why"),
+    [
+        ("3 s", 4, "no value of fan came for 4"),
+        ("1 min", 6, "the run stood still for 6"),  # silence does not end this run: new rows come at once
+    ],
+)
+def test_no_step_is_carried_out_after_the_computer_has_slept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, silence: str, seconds: int, why: str
 ) -> None:
-    text = '[abort]\nsilence = "3 s"\n' + STEPS.replace('"2 s"', '"30 s"')
+    text = f'[abort]\nsilence = "{silence}"\n' + STEPS.replace('"2 s"', '"30 s"')
     with simulated_test(write_test(tmp_path, text)) as (plan, sims):
         awake = clock.boottime_ns
 
         def sleep(rows: object) -> None:
             if test.phase == "steps 1":
-                monkeypatch.setattr(clock, "boottime_ns", lambda: awake() + 4 * 10**9)
+                monkeypatch.setattr(clock, "boottime_ns", lambda: awake() + seconds * 10**9)
 
         test = TestRun(plan)
         result = test.run(None, sleep)
-        assert result.abort.startswith("no value of fan came for 4")
-        assert turning(sims) == []
-
-
-@pytest.mark.slow
-def test_no_step_is_carried_out_after_the_run_stood_still(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The rows are fresh again when the run continues, so silence does not end it."""
-    text = f'[abort]\nsilence = "1 min"\n{STEPS}'
-    with simulated_test(write_test(tmp_path, text)) as (plan, sims):
-        running = clock.boottime_ns
-
-        def stand_still(rows: object) -> None:
-            if test.phase == "steps 1":
-                monkeypatch.setattr(clock, "boottime_ns", lambda: running() + 6 * 10**9)
-
-        test = TestRun(plan)
-        result = test.run(None, stand_still)
-        assert result.abort.startswith("the run stood still for 6")
-        assert test.phase == "stop"
+        assert result.abort.startswith(why)
+        assert test.number == 1
         assert turning(sims) == []
 
 

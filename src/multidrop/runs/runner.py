@@ -1,6 +1,6 @@
 """TestRun: carry out the steps of a test while its plant is polled, and abort at a limit.
 
-Each drive's commands run on a separate thread. So do the recording and each taker, a function that the caller
+Each drive's commands run on a separate thread. So do the recording and each taker, a callback that the caller
 passes to `run`. The calling thread compares the rows with the limits, and starts each step at its planned
 time.
 """
