@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from weakref import ref
 
 import pytest
 from lines import line, patient, plant, rows_of, until
@@ -236,7 +237,7 @@ def test_an_outage_is_only_logged_if_no_status_code_is_free(
     monkeypatch.setattr("multidrop.polling.batch.MOST_STATUSES", 0)
     names = RowNames()
     added = AddedRows(names)
-    added.adopt(plant(line("/dev/ttyUSB0", pump(CHARGE))))
+    added.adopt(plant(line("/dev/ttyUSB0", pump(CHARGE))), {})
     codes = names.drives.number("pump-1"), names.registers.number("output_current")
     # No other test has an outage of 343 s: a status text of this process keeps its code.
     rows = [AddedRow(ns, ns, 0, *codes, 0, 1.0) for ns in (10**9, 344_000_000_000)]
@@ -248,11 +249,22 @@ def test_an_outage_is_only_logged_if_no_status_code_is_free(
     assert "343 s without values" in caplog.text
 
 
+def test_a_removed_drive_is_freed_at_once() -> None:
+    """The memory of a poller does not grow if its drives change for years."""
+    added = AddedRows(RowNames())
+    removed = pump(CHARGE)
+    known = ref(removed.drive)
+    added.adopt(plant(line("/dev/ttyUSB0", removed)), {})
+    added.adopt(plant(), {})
+    del removed
+    assert known() is None
+
+
 def test_outages_that_end_with_one_row_have_different_times() -> None:
     """InfluxDB keeps one row for each series and time."""
     names = RowNames()
     added = AddedRows(names)
-    added.adopt(plant(line("/dev/ttyUSB0", pump(CHARGE, replace(CHARGE, name="more")))))
+    added.adopt(plant(line("/dev/ttyUSB0", pump(CHARGE, replace(CHARGE, name="more")))), {})
     codes = names.drives.number("pump-1"), names.registers.number("output_current")
     rows = [AddedRow(ns, ns, 0, *codes, 0, 1.0) for ns in (10**9, 123_456_000_000)]
     batch = added.added_to(Batch(JoinedColumns(None, rows), names.drives, names.registers))

@@ -12,8 +12,8 @@ from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
+from weakref import ref
 
 from multidrop.channels import OLD, ChannelSet, SlotRow
 from multidrop.core import Columns
@@ -79,7 +79,8 @@ class AddedRows:
         self._codes: dict[int, tuple[int, int]] = {}  # by slot: the codes of the drive and the register
         # by the codes of a drive and a register: the slot, if channels use that register
         self._slots: dict[tuple[int, int], int] = {}
-        self._drives: dict[str, Drive] = {}  # the newest drive of each name
+        # the newest drive of each name; weak: a drive that was removed must not stay in memory
+        self._drives: dict[str, ref[Drive]] = {}
         # if a drive has taken over another drive's name: the monotonic time since which its rows count
         self._since_ns: dict[str, int] = {}  # by drive name
         self._slot_since_ns: dict[int, int] = {}  # by slot
@@ -89,7 +90,7 @@ class AddedRows:
         self._save_ns = 0
         self._is_saved = True  # True if the totals have not changed since the last write
 
-    def adopt(self, plant: Plant, polled_since: Mapping[str, int] = MappingProxyType({})) -> None:
+    def adopt(self, plant: Plant, polled_since: Mapping[str, int]) -> None:
         """Compute the channels of this plant from now on. A channel that was computed before continues its
         total.
 
@@ -100,10 +101,10 @@ class AddedRows:
         for mistake in channels.mistakes:  # for example, a channel names a drive that was removed
             log_aside(_log, logging.WARNING, "a channel is not computed: %s", mistake)
         place = totals_path(plant) if channels else None
-        drives = {polled.drive.name: polled.drive for polled in plant.drives}
+        drives = {polled.drive.name: ref(polled.drive) for polled in plant.drives}
         with self._lock:
-            replaced = {name for name, drive in drives.items() if self._drives.get(name, drive) is not drive}
-            self._since_ns |= {name: polled_since.get(name, 0) for name in replaced}
+            replaced = {name for name, drive in drives.items() if self._drives.get(name, drive) != drive}
+            self._since_ns |= {name: polled_since[name] for name in replaced}
             self._drives |= drives
             before, self._channels = self._channels, channels
             self._kept |= before.totals()
