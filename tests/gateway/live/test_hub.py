@@ -153,8 +153,8 @@ def test_drive_is_silent_after_many_lost_replies_but_not_after_one_lost_reply(
     hub.take(rows(*((21, register, Status.NO_REPLY) for register in range(4))))
     hub.take(rows(*((22, register, Status.NOT_ASKED) for register in range(4))))
     clock.now_ns = 22 * PERIOD
-    assert hub.seen("pump-1") == Shown("silent", "not asked: drive is silent")
-    assert hub.seen("pump-1").why_silent == "not asked: drive is silent"
+    assert hub.seen("pump-1") == Shown("silent", "no reply")
+    assert hub.seen("pump-1").why_silent == "no reply"
     assert hub.seen("pump-1").fault is None
     assert hub.last_answer("pump-1")[:2] == (UTC_0 + 10 * PERIOD, 10 * PERIOD)
     hub.take(all_of(23, STANDBY))

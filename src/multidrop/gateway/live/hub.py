@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from multidrop import Batch, Condition, Plant, Polled, PolledDrive, Register
 from multidrop.channels import ChannelSet
+from multidrop.core import STATUSES, UNASKED, Status
 from multidrop.drive import FAULT_RECORDS, StateReader
 from multidrop.plant import current_for, series_of
 
@@ -39,6 +40,8 @@ FAULT_REGISTER = "fault"
 # a fault is over if the motor still turns this long (in ns) after the fault record changed
 RAN_NS = 3_000_000_000
 _ANSWERED = ("exception ", "no valid value")  # prefixes of a miss's status if the drive replied
+# polling skips most requests of a drive that does not reply
+_SKIPPED, _NO_REPLY = STATUSES[Status.NOT_ASKED], STATUSES[Status.NO_REPLY]
 
 
 class RegisterRows:
@@ -381,8 +384,8 @@ class Hub:
         reasons = [self._statuses[status] for _, _, _, status in sorted(misses, key=lambda row: -row[1])]
         if any(reason.startswith(_ANSWERED) for reason in reasons):
             return Shown(UNKNOWN, INCOMPLETE)
-        asked = next((reason for reason in reasons if not reason.startswith("not ")), reasons[0])
-        return Shown(SILENT, asked)
+        why = next((reason for reason in reasons if not reason.startswith(UNASKED)), reasons[0])
+        return Shown(SILENT, _NO_REPLY if why == _SKIPPED else why)
 
 
 def _lack(watched: _Watched) -> str:
