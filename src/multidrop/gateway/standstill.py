@@ -1,7 +1,6 @@
-"""Standstill: refuse writes that may have waited while the gateway stood still, such as during a sleep of the
-computer.
+"""Standstill: refuse Modbus writes that may have waited while the gateway did not run.
 
-Requests over Modbus have no time of their own.
+The computer may have slept, for example. A Modbus request contains no time, so its age is unknown.
 """
 
 from __future__ import annotations
@@ -12,12 +11,12 @@ from multidrop import WriteForbidden
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.commands import MOST_AGE_S
 
-SETTLE_S = 1.0  # after a standstill: how long writes are refused, until all waiting requests are received
+SETTLE_S = 1.0  # how long writes are refused after a standstill, until the waiting requests are read
 STOOD_STILL = "the gateway stood still"  # value of WriteForbidden.rule
 
 
 class Standstill:
-    """The last time at which the gateway is known to have run, and the end of its last standstill.
+    """Detects that the gateway did not run for more than MOST_AGE_S; then refuses writes for SETTLE_S.
 
     `clock` returns CLOCK_BOOTTIME in ns.
     """

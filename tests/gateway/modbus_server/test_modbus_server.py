@@ -332,6 +332,9 @@ def test_write_that_waited_while_the_gateway_stood_still_is_refused(gateway: Gat
         now_ns[0] += 1
         assert client.ask(1, 6, CHE_SETPOINT, 5000).code is None
     assert len(gateway.commands.written) == 2
+    ((drive, what, why),) = gateway.commands.refused  # at most one record per second
+    assert (drive, what) == ("mill", "request 01 06 20 00 13 88")
+    assert "the gateway stood still" in why
 
 
 def test_read_only_gateway_refuses_writes_as_illegal_function() -> None:

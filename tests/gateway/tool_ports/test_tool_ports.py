@@ -48,21 +48,10 @@ TIMEOUT = 10.0  # in s; long, so that every answer is in time even on a busy mac
 QUIET = 0.1  # in s; if no byte comes for this long, there is no reply
 
 
-class AuditedCommands(FakeCommands):
-    """Fake commands that also record refused writes."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.refused: list[tuple[str, str, str]] = []  # drive, request, reason
-
-    def note_refused(self, line: str, drive: str, what: str, why: str, caller: Any) -> None:
-        self.refused.append((drive, what, why))
-
-
 class Rig(NamedTuple):
     ports: ToolPorts
     hub: FakeHub
-    commands: AuditedCommands
+    commands: FakeCommands
     line: FakeLine
     link: Path
 
@@ -75,7 +64,7 @@ def serving(folder: Path, *, ask: Any = None, **settings: Any) -> Iterator[Rig]:
         ("hall", InnovertIBD(3, name="pump")),
         ("hall", DelixiNative(4, name="belt")),
     )
-    hub, commands, line = FakeHub(), AuditedCommands(), FakeLine()
+    hub, commands, line = FakeHub(), FakeCommands(), FakeLine()
     known = ToolSettings(
         **{"pty": {"hall": "port"}, "rtu": {"hall": "127.0.0.1:0"}, "timeout": TIMEOUT, **settings}
     )
@@ -299,8 +288,8 @@ def test_by_default_each_write_is_refused_and_recorded(tmp_path: Path) -> None:
         ):
             assert code(tool, body) == 1
         assert rig.commands.written == rig.commands.stopped == []
-        start = checksums.rtu("01 06 1000 0001").hex(" ").upper()
-        assert rig.commands.refused[0] == ("mill", f"request {start}", "answered with exception 01H")
+        why = "answered with exception 01H"
+        assert rig.commands.refused[0] == ("mill", "request 01 06 10 00 00 01", why)
         assert len(rig.commands.refused) < 6  # at most one record per second
 
 

@@ -64,6 +64,7 @@ class FakeCommands:
         self.told: CommandResult | Callable[[], Awaitable[CommandResult]] = DONE
         self.written: list[tuple[str, str, float, Caller]] = []
         self.stopped: list[tuple[Sequence[str] | None, Caller]] = []
+        self.refused: list[tuple[str, str, str]] = []  # drive, request, reason
         self.ended: dict[str, int] = {}
 
     async def _end(self, *drives: str) -> CommandResult:
@@ -85,6 +86,9 @@ class FakeCommands:
             return result_of_failure(refusal)
         self.written.append((drive, register, value, caller))
         return await self._end(drive)
+
+    def note_refused(self, line: str, drive: str, what: str, why: str, caller: Caller) -> None:
+        self.refused.append((drive, what, why))
 
     def ended_ns(self, drive: str) -> int:
         return self.ended.get(drive, 0)

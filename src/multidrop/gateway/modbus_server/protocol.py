@@ -49,6 +49,11 @@ class MbapRequest(NamedTuple):
     function: int
     data: bytes  # after the function code
 
+    @property
+    def text(self) -> str:
+        """Unit id, function code and data as hexadecimal digits."""
+        return bytes([self.unit, self.function, *self.data]).hex(" ").upper()
+
     def reply(self, data: bytes) -> bytes:
         """Return the frame of a normal reply."""
         return _HEADER.pack(self.transaction, 0, 2 + len(data), self.unit) + bytes([self.function]) + data

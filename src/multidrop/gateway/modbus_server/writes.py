@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable
 from contextlib import suppress
+from math import inf
 from typing import Any, Protocol
 
 from multidrop import Register
@@ -19,6 +20,7 @@ from multidrop.gateway.standstill import Standstill
 from multidrop.supervisor import supervisor
 
 STOP_WAIT_S = 0.4  # how long a stop's answer waits for the motor: less than the usual timeout of clients
+REFUSAL_S = 1.0  # least time between two audit records of a line's refused writes
 
 _log = logging.getLogger("multidrop.gateway")
 
@@ -37,8 +39,7 @@ class ClientWrites:
     """Carries out the writes of clients that share a role and an interface, such as "modbus".
 
     `common` has the addresses of the common block, or is None without such a block. Writes received after a
-    `standstill` are refused. If a write that `begin`
-    accepted is refused later, `note_refused` is called with request, drive, reason and client.
+    `standstill` are refused.
     """
 
     def __init__(
@@ -48,16 +49,15 @@ class ClientWrites:
         way: str,
         common: range | None,
         standstill: Standstill,
-        note_refused: Callable[[MbapRequest, str, str, Any], object] = lambda *refusal: None,
     ) -> None:
         self._commands = commands
         self._role = role
         self._way = way
-        self._note_refused = note_refused
         self._admit = standstill.admit
         self._common = common or range(0)
         self._common_stop = common.start + STOP if common else None
         self._stops: dict[str, set[asyncio.Task[int]]] = {}  # stops in progress, by drive
+        self._recorded: dict[str, float] = {}  # by line: time of the newest record of a refused write
 
     def begin(
         self, unit: Unit, request: MbapRequest, client: WritingClient, stop_wait_s: float = STOP_WAIT_S
@@ -110,11 +110,21 @@ class ClientWrites:
     ) -> int:
         """Write a register; return 0 or an exception code."""
         value = raw if register.values is not None else register.decode(raw)
-        name, caller = unit.drive.name, self.caller(client)
+        name, caller = unit.drive.name, self._caller(client)
         result = await self._commands.write(name, register.name, value, caller, self._admit)
         if isinstance(result.error, ValueError):  # includes WriteForbidden
-            self._note_refused(request, name, result.text, client)
+            self.note_refused(unit.line, name, request, result.text, client)
         return 0 if result.ok else code_of(result.error)
+
+    def note_refused(
+        self, line: str, drive: str, request: MbapRequest, why: str, client: WritingClient
+    ) -> None:
+        """Record a refused write in the audit log, at most once in REFUSAL_S for each line."""
+        now = asyncio.get_running_loop().time()
+        if now - self._recorded.get(line, -inf) >= REFUSAL_S:
+            self._recorded[line] = now
+            what = f"request {request.text}"
+            self._commands.note_refused(line, drive, what, why, self._caller(client))
 
     def _begin_stop(self, unit: Unit, client: WritingClient) -> asyncio.Task[int]:
         """Start a stop immediately. Raises Declined if MOST_STOPS of this drive are in progress."""
@@ -122,7 +132,7 @@ class ClientWrites:
         under_way = self._stops.setdefault(name, set())
         if len(under_way) >= MOST_STOPS:
             raise Declined(ModbusCode.ACKNOWLEDGE)
-        task = supervisor().start("modbus stop", self._stop_one(unit, self.caller(client)))
+        task = supervisor().start("modbus stop", self._stop_one(unit, self._caller(client)))
         under_way.add(task)
         task.add_done_callback(under_way.discard)
         return task
@@ -139,6 +149,6 @@ class ClientWrites:
         code = code_of(result.error)
         return ModbusCode.NO_RESPONSE if code == ModbusCode.DEVICE_FAILURE else code
 
-    def caller(self, client: WritingClient) -> Caller:
+    def _caller(self, client: WritingClient) -> Caller:
         """Return the client as the sender of a command."""
         return Caller("anyone", self._way, client.address, self._role)

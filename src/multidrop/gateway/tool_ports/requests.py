@@ -79,8 +79,3 @@ def rtu_reply(frame: bytes) -> bytes:
     """Return an RTU frame with the content of a Modbus TCP frame."""
     body = frame[_MBAP:]
     return body + int(crc16(body, len(body))).to_bytes(2, "little")
-
-
-def rtu_text(request: MbapRequest) -> str:
-    """Return a request's RTU frame as hexadecimal digits."""
-    return rtu_reply(request.reply(request.data)).hex(" ").upper()

@@ -12,7 +12,6 @@ import socket
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from functools import partial
-from math import inf
 from pathlib import Path
 
 from multidrop import Batch, BusError, Plant, PlantLine
@@ -37,7 +36,7 @@ from multidrop.gateway.modbus_server.writes import ClientWrites
 from multidrop.gateway.parts import Ask, PartContext
 from multidrop.gateway.standstill import Standstill
 from multidrop.gateway.tool_ports.ends import Connection, End, Terminal
-from multidrop.gateway.tool_ports.requests import EXCEPTION, RequestCutter, rtu_reply, rtu_text
+from multidrop.gateway.tool_ports.requests import EXCEPTION, RequestCutter, rtu_reply
 from multidrop.gateway.tool_ports.settings import RTU_EXAMPLE, ToolSettings
 from multidrop.supervisor import supervisor
 from multidrop.toml_check import parse_address
@@ -53,7 +52,6 @@ IDLE_S = 300.0  # a TCP connection is closed after this time without a request
 SWEEP_S = 1.0  # interval of checking for idle connections
 # a stop's answer waits for the motor, and a read waits for the line, for this share of `timeout`
 WAIT_SHARE = 0.75
-REFUSAL_S = 1.0  # least time between two audit records of a line's refused writes
 
 # Codes of failures after which a tool on a real line would get no reply.
 _SILENT = (ModbusCode.NO_PATH, ModbusCode.NO_RESPONSE)
@@ -209,21 +207,21 @@ class ToolLine:
         self._ask = ask
         self._timeout = settings.timeout
         role = Right[settings.may.upper()]
-        self._writes = ClientWrites(commands, role, WAY, None, standstill, self._record)
-        self._recorded = -inf  # time of the newest record of a refused write
+        self._writes = ClientWrites(commands, role, WAY, None, standstill)
 
     def serve(self, request: MbapRequest, tool: Tool) -> Awaitable[bytes | None] | None:
         """Start a request; return an awaitable of the answer's frame, or None if it gets no answer."""
         unit, is_write = self._units.get(request.unit), request.function in WRITES
         if request.unit == 0 and is_write:
-            self._record(request, "all", "a broadcast is never passed on", tool)
+            self._writes.note_refused(self._name, "all", request, "a broadcast is never passed on", tool)
         if unit is None:
             return None
         try:
             return self._written(unit, request, tool) if is_write else self._read(unit, request, tool)
         except Declined as declined:
             if is_write and declined.code != ModbusCode.ACKNOWLEDGE:
-                self._record(request, unit.drive.name, f"answered with exception {declined.code:02X}H", tool)
+                why = f"answered with exception {declined.code:02X}H"
+                self._writes.note_refused(self._name, unit.drive.name, request, why, tool)
             return _at_once(_exception(request, declined.code))
 
     def _written(self, unit: Unit, request: MbapRequest, tool: Tool) -> Awaitable[bytes | None]:
@@ -234,14 +232,6 @@ class ToolLine:
             return None if frame[7] & EXCEPTION and frame[8] in _SILENT else frame
 
         return finish()
-
-    def _record(self, request: MbapRequest, drive: str, why: str, tool: Tool) -> None:
-        """Record a refused write in the audit log, at most once in REFUSAL_S."""
-        now = asyncio.get_running_loop().time()
-        if now - self._recorded >= REFUSAL_S:
-            self._recorded = now
-            what = f"request {rtu_text(request)}"
-            self._commands.note_refused(self._name, drive, what, why, self._writes.caller(tool))
 
     # ---- reading ----
 
