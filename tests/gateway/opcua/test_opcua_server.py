@@ -278,6 +278,17 @@ def test_stop_of_another_object_is_sent_but_not_confirmed(gateway: Served, clien
 
 
 @pytest.mark.slow
+def test_stop_of_another_object_is_not_confirmed_while_many_stops_are_in_progress(
+    gateway: Served, client: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # with this limit, the server answers as if enough stops were in progress already
+    monkeypatch.setattr("multidrop.gateway.opcua.part.MOST_STOPS", 0)
+    with pytest.raises(ua.UaStatusCodeError, match="BadMethodInvalid"):
+        client.get_node("ns=2;s=pump-2").call_method(client.get_node("ns=2;s=pump-1.Stop").nodeid)
+    assert stop(client, "pump-1") == "the stop is in progress"
+
+
+@pytest.mark.slow
 def test_stops_of_one_request_do_not_wait_for_each_other(gateway: Served, client: Any) -> None:
     start(gateway, "pump-1")
     gateway.sims["pump-2"].deaf_until = float("inf")

@@ -234,17 +234,18 @@ class OpcUa:
         drive, caller = stops[call.MethodId], self._caller(visitor)
         if caller is None or caller.role < Right.STOP:
             return ua.CallMethodResult(ua.StatusCode(ua.StatusCodes.BadUserAccessDenied))
-        if self._stopping[drive] >= MOST_STOPS:
-            return _answer(ua.StatusCodes.GoodCompletesAsynchronously, "a stop is in progress")
-        stopping = asyncio.wrap_future(
-            asyncio.run_coroutine_threadsafe(self._stop(drive, caller), self._loop)
-        )
-        self._stopping[drive] += 1
-        stopping.add_done_callback(lambda _: self._stopping.subtract([drive]))
+        stopping = None
+        if self._stopping[drive] < MOST_STOPS:
+            stopping = asyncio.wrap_future(
+                asyncio.run_coroutine_threadsafe(self._stop(drive, caller), self._loop)
+            )
+            self._stopping[drive] += 1
+            stopping.add_done_callback(lambda _: self._stopping.subtract([drive]))
         if call.ObjectId != object_of(drive):
             return _answer(ua.StatusCodes.BadMethodInvalid, "this method belongs to another object")
-        await asyncio.wait([stopping], timeout=STOP_WAIT_S)
-        if not stopping.done():
+        if stopping is not None:
+            await asyncio.wait([stopping], timeout=STOP_WAIT_S)
+        if stopping is None or not stopping.done():
             return _answer(ua.StatusCodes.GoodCompletesAsynchronously, "the stop is in progress")
         result = stopping.result()
         if result.ok:
