@@ -1,7 +1,7 @@
-"""LineShare: the share of a line's time that clients of the Modbus server may use.
+"""LineShare: the share of a line's time that reads of Modbus clients and vendors' tools may use.
 
-Reads that polled rows cannot answer are sent to the drive one at a time, before polls. They may use a fifth
-of the line's time. The time is measured, so timeouts of a silent drive count too.
+Such reads are sent to the drives one at a time, before polls. Their time is measured, so timeouts of a silent
+drive count too.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 from multidrop.supervisor import supervisor
 
-SHARE = 0.2  # share of a line's time
+SHARE = 0.2  # default share of a line's time
 BURST_S = 0.2  # limit of the unused line time, in s, that clients save up
 MOST_WAITING = 8  # limit of waiting requests per line
 EXPIRY_S = 1.0  # a request that has waited for this long is dropped
