@@ -19,6 +19,7 @@ from commands import Run, multidrop, plant_file, running
 from examples import usually
 from kills import BoundProcess
 from lines import until
+from peers import require_module
 from recordings import recorded
 from toy import Toy
 
@@ -129,6 +130,7 @@ def test_a_recording_in_segments_must_be_named_by_a_segment(run: Run, tmp_path: 
     whole, newest = tmp_path / "run.arrows", tmp_path / "run.00000002.arrows"
     sentence = f"multidrop: {whole} was recorded in segments: name one, such as {newest}\n"
     assert run("convert", whole, tmp_path / "a.csv") == (2, "", sentence)
+    require_module("matplotlib")
     assert run("report", whole) == (2, "", sentence)
 
 
