@@ -14,9 +14,10 @@ import corpora
 import pytest
 from harness import HERE, command
 from kills import BoundProcess
+from lines import PATIENCE
 from mutation.edits import mutants
 from mutation.trials import core_names
-from peers import CC, SANITIZERS, STRICT
+from peers import CC, SANITIZERS, STRICT, require_module
 from readers import READERS, read
 from tables import table
 
@@ -32,6 +33,29 @@ def test_help_is_the_header_of_the_tool(tool: str) -> None:
     assert f"tools/{tool} " in ran.stdout
     assert ran.stdout.isascii()
     assert ran.stderr == ""
+
+
+BENCHMARKS = [
+    path.stem for path in (ROOT / "bench" / "questions").glob("*.py") if "def main(" in path.read_text()
+]
+PRINT_HELP = """
+import importlib, sys
+from contextlib import suppress
+for name in sys.argv[1:]:
+    sys.argv = [name, "--help"]
+    with suppress(SystemExit):
+        importlib.import_module(f"bench.questions.{name}").main()
+"""
+
+
+@pytest.mark.long
+def test_each_benchmark_can_be_imported_and_prints_its_help() -> None:
+    for library in ("duckdb", "numpy"):
+        require_module(library)
+    command = [sys.executable, "-c", PRINT_HELP, *BENCHMARKS]
+    ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert [name for name in BENCHMARKS if f"usage: {name} " not in ran.stdout] == []
 
 
 # ---- .ci/run and .ci/nightly ----
