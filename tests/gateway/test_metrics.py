@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 import yaml
-from brokers import free_port
+from free_ports import free_port
 from gateways import Served, served, serving
 from lines import PATIENCE, until
 from peers import require_program

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from brokers import Listener, free_port, mosquitto
+from brokers import Listener, mosquitto
+from free_ports import free_port
 from gateways import Served, served
 from lines import PATIENCE, line, plant, polled, until
 from modbus_gateway import RawClient

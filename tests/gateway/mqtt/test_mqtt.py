@@ -15,8 +15,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from brokers import FAN, Broker, Listener, Published, Running, free_port, has, inside, publish, without_fan
+from brokers import FAN, Broker, Listener, Published, Running, has, inside, publish, without_fan
 from examples import in_turn
+from free_ports import free_port
 from gateways import certificate, served
 from lines import until
 from peers import require_module

@@ -19,6 +19,7 @@ from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
+from free_ports import free_port
 from peers import require_module, require_program
 
 from multidrop import Drive, InvtCHE, Plant, PlantLine, Polled, PolledDrive
@@ -37,12 +38,6 @@ def end_paho_soon(patch: pytest.MonkeyPatch) -> None:
     require_module("paho.mqtt.client")
     short = SimpleNamespace(**{**vars(time), "sleep": lambda seconds: time.sleep(min(seconds, 0.02))})
     patch.setattr("paho.mqtt.client.time", short)
-
-
-def free_port() -> int:
-    with closing(socket.socket()) as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
 
 
 class EndedAtOnce(Exception):

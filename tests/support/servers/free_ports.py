@@ -6,6 +6,11 @@ import socket
 from contextlib import ExitStack, closing
 
 
+def free_port() -> int:
+    (port,) = free_ports(1)
+    return port
+
+
 def free_ports(count: int) -> list[int]:
     """Return the numbers of `count` free TCP ports of this computer."""
     with ExitStack() as stack:
