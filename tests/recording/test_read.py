@@ -154,6 +154,7 @@ def test_polling_and_recording_need_no_nanoarrow(tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.slow
 def test_reading_without_nanoarrow_names_the_missing_library(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="needs matplotlib")  # for `report`
     record(tmp_path / "run.arrows", [row(1, "pump", "output_frequency", 50.0)])
     for words in (("report", "run.arrows"), ("convert", "run.arrows", "run.csv")):
         ran = without_nanoarrow(*words, folder=tmp_path)
