@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from itertools import count
+from itertools import count, product
 from pathlib import Path
 from typing import Any
 
@@ -187,17 +187,20 @@ def test_existing_file_is_kept_and_an_incomplete_one_is_removed(
     assert [path.name for path in tmp_path.iterdir()] == ["run.arrows"]
 
 
-def test_drives_with_similar_names_have_separate_groups_in_hdf5(tmp_path: Path) -> None:
+def test_drives_and_registers_with_similar_names_have_separate_groups_in_hdf5(tmp_path: Path) -> None:
     import h5py
 
-    names = ["hall/fan", "hall\N{DIVISION SLASH}fan"]
-    found = [row(at, name, "output_current", at) for at in (1.0, 2.0) for name in names]
+    drives = ["hall/fan", "hall\N{DIVISION SLASH}fan"]
+    registers = ["in/out", "in\N{DIVISION SLASH}out"]
+    names = list(product(drives, registers))
+    found = [row(at, *name, at) for at in (1.0, 2.0) for name in names]
     source = record(tmp_path / "run.arrows", found, METADATA)
     convert(source, tmp_path / "run.h5")
     with h5py.File(tmp_path / "run.h5") as file:
-        groups = [file[f"drives/{key}/output_current"] for key in (names[1], f"{names[1]}_")]
-        assert [group.attrs["drive"] for group in groups] == names
-        assert [group["value"][:].tolist() for group in groups] == [[1.0, 2.0]] * 2
+        keys = product((drives[1], f"{drives[1]}_"), (registers[1], f"{registers[1]}_"))
+        groups = [file[f"drives/{drive}/{register}"] for drive, register in keys]
+        assert [(group.attrs["drive"], group.attrs["register"]) for group in groups] == names
+        assert [group["value"][:].tolist() for group in groups] == [[1.0, 2.0]] * 4
 
 
 def test_interrupt_during_a_write_of_hdf5_leaves_no_file(

@@ -61,7 +61,7 @@ class Hdf5Writer(SeriesWriter):
         described = dump_metadata(metadata)
         self._file: Any = None
         self._groups: dict[tuple[str, str], Any] = {}
-        self._drives: dict[str, str] = {}  # by name of a drive's group: the drive
+        self._names: dict[str, str] = {}  # by a group's path: the name of its drive or register
         self._events: list[Event] = []
         with writing(path):
             try:
@@ -97,15 +97,19 @@ class Hdf5Writer(SeriesWriter):
 
     def _new_group(self, rows: ExportedRows, drive: Mapping[str, Any]) -> Any:
         about = drive.get("registers", {}).get(rows.register, {})
-        key = _key(rows.drive)
-        while self._drives.setdefault(key, rows.drive) != rows.drive:  # another drive has this group
-            key += "_"
-        group = self._file.create_group(f"drives/{key}/{_key(rows.register)}")
+        group = self._file.create_group(self._path(self._path("drives", rows.drive), rows.register))
         group.attrs["drive"], group.attrs["register"] = rows.drive, rows.register
         group.attrs["unit"] = unit_of_register(about)
         if about.get("values"):
             group.attrs["values"] = json.dumps(about["values"], ensure_ascii=False)
         return group
+
+    def _path(self, parent: str, name: str) -> str:
+        """Return the path of the group in `parent` that belongs to this drive or register."""
+        path = f"{parent}/{_key(name)}"
+        while self._names.setdefault(path, name) != name:  # the group belongs to another name
+            path += "_"
+        return path
 
     def _add_event(self, event: Event) -> None:
         self._events.append(event)
