@@ -6,7 +6,7 @@ import asyncio
 import json
 import time
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
@@ -62,7 +62,7 @@ class Clocks:
         return round(1000 * S + self.utc_s * S), round(NOON + self.utc_s * S)
 
 
-def reader_by(clocks: Clocks) -> RowReader:
+def reader_by(clocks: Callable[[], tuple[int, int]]) -> RowReader:
     """Return a reader that knows all registers of `numbered`."""
     reader, columns = RowReader(clocks), numbered(0, 1).columns()
     reader.known = {(drive, register) for drive in columns.drives for register in columns.registers}
@@ -134,6 +134,13 @@ def test_rows_of_a_former_master_do_not_replace_newer_rows() -> None:
     codes = reader.rows([message(16, "gw-2")])
     assert codes is not None
     assert codes.columns().statuses[0] == "ok"
+
+
+def test_rows_are_shown_after_this_computers_clock_was_set_back() -> None:
+    times = iter([(1000 * S, NOON + S), (1001 * S, NOON - 3600 * S)])
+    reader = reader_by(lambda: next(times))
+    assert reader.rows([message(0)]) is not None
+    assert reader.rows([message(8)]) is not None
 
 
 def test_forged_and_damaged_messages_are_ignored() -> None:

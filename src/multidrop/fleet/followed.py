@@ -94,6 +94,7 @@ class RowReader:
         self._drives, self._registers = NameCodes(MOST_NAMES, ""), NameCodes(MOST_NAMES, "")
         self._statuses = NameCodes(MOST_STATUSES, OTHER, "ok")
         self._newest: dict[tuple[str, str], int] = {}  # time of the newest row, by drive and register
+        self._read_ns = 0  # this computer's clock (UTC, ns) at the last call of `rows`
         # By gateway: when its newest row arrived, by this computer's clock, and the row's own time (UTC, ns).
         self.arrivals: dict[str, tuple[int, int]] = {}
 
@@ -104,6 +105,9 @@ class RowReader:
         line long after another gateway has taken the line over.
         """
         now_ns, utc_ns = self._clocks()
+        if utc_ns < self._read_ns:  # the clock was set back, and known times may be in the future now
+            self._newest.clear()
+        self._read_ns = utc_ns
         found: dict[tuple[str, str], tuple[int, int | None, float | None, str]] = {}
         for message in messages:
             for key, row in _newest_rows(message):
