@@ -302,14 +302,14 @@ async def test_while_an_incompatible_gateway_lives_no_line_is_claimed(
     async with gateways(fleet, terms=LONG) as running, other_version(fleet, monkeypatch) as other:
         await other.begin()
         member = await running.join("a")
-        await until(lambda: "before the end of other" in member.trouble, "a word about it")
+        await until(lambda: "while it runs on other" in member.trouble, "a word about it")
         await until(lambda: member.records.is_complete, "all records")
         await asyncio.sleep(0.5)
         assert member.lease.session == 0
         await other.end()
         await until(running.all_are_polled, "start")
         await other.begin()
-        await until(lambda: "before the end of other" in member.trouble, "a word about it")
+        await until(lambda: "while it runs on other" in member.trouble, "a word about it")
         bucket = Bucket(names.PLANT, member.best)
         more = [*LINES, "line-new"]
         await store(bucket, {line: {"line": {"name": line}, "files": {}} for line in more})
@@ -408,7 +408,7 @@ async def test_without_servers_all_lines_are_closed_and_no_gateway_is_killed(
 # ---- gateways with an incompatible ownership protocol: how they are detected, and when they are ignored ----
 
 
-SENTENCE = "incompatible version of multidrop in this fleet: no line is taken before the end of {}"
+SENTENCE = "incompatible version of multidrop in this fleet: no line is taken while it runs on {}"
 
 
 class Trial:

@@ -73,7 +73,7 @@ class IncompatibleGateways:
         if not self.gateways:
             return ""
         names = ", ".join(sorted(self.gateways))
-        return f"incompatible version of multidrop in this fleet: no line is taken before the end of {names}"
+        return f"incompatible version of multidrop in this fleet: no line is taken while it runs on {names}"
 
 
 GUARD_LOOK_S = 0.02
