@@ -409,7 +409,8 @@ static void put_written(struct md_message *reply, int framing, const struct md_m
         md_copy_message(reply, request);
 }
 
-/* Add the rows of the last request: values, or why there is no reply. Return 0 if the columns are full. */
+/* Add the rows of the last request: each has a value, or a status that states why there is no reply. Return 0
+ * if the columns are full. */
 static int add_rows(struct md_decoder *decoder, int result, struct md_columns *columns)
 {
     struct md_completion *completion = &decoder->completion;

@@ -465,7 +465,7 @@ void md_line_received(struct md_line *line, const uint8_t *bytes, size_t len, in
         if (md_reply_find(line, now_ns, &ending))
             finish(line, ending);
     }
-    if (at < len) /* bytes after the reply, for which rx has no room */
+    if (at < len) /* the exchange has ended, and these bytes came after the reply */
         md_tap_put(line->tap, MD_NOISE, now_ns, bytes + at, len - at);
     if (line->state != MD_IDLE && now_ns < line->give_up_ns)
         md_line_go(line, MD_BYTES_IN_TIME);

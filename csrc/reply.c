@@ -1,5 +1,5 @@
-/* Find the reply among the bytes since the request. Decide when to read the port, where the reply starts, and
- * what the reply shows about drive and adapter.
+/* Choose when to read the port after a request, find the reply among the bytes that came, and learn from it
+ * about the drive and the adapter.
  *
  * The reply may start at any byte. Late replies may precede or replace it. frame.c and body.c check the
  * reply against its request. */

@@ -165,14 +165,13 @@ def _without_tens(folder: Path, tens: list[HistoryFile]) -> set[int]:
     return found - {number for file in tens for number in range(file.first, file.last + 1)}
 
 
-def finished(tens: list[HistoryFile], seconds: int, missing: set[int]) -> list[list[HistoryFile]]:
-    """Return groups of files in `tens/` to merge: one group for each past hour or day, which lasts `seconds`
-    s.
+def finished(files: list[HistoryFile], seconds: int, missing: set[int]) -> list[list[HistoryFile]]:
+    """Return groups of files to merge: one group for each past period of `seconds`, an hour or a day.
 
-    A group is left out while a segment within it lacks tens: the merged file would hide that these tens
-    are missing.
+    A group is left out while one of its segments is in `missing`, the numbers of segments without ten-second
+    summaries: a merged file would hide that these summaries are missing.
     """
-    runs = [list(run) for _, run in groupby(tens, key=lambda file: file.begin // seconds)]
+    runs = [list(run) for _, run in groupby(files, key=lambda file: file.begin // seconds)]
     return [
         run
         for run in runs[:-1]

@@ -30,7 +30,7 @@ SLOW = 3.0  # silence before a repeat, as a multiple of the usual time of an ans
 MOST_SILENCE_S = 1.0  # limit of the silence before a repeat, because requests time out then
 FORGET = 0.97  # factor by which the usual time of an answer decays with each answer
 MOST_SPARE = 300.0  # limit of the budget: twice the repeats needed until servers notice a dead route (3 s)
-EARNED = 0.5  # by so many repeats, each timely answer increases the budget
+EARNED = 0.5  # repeats that each timely answer adds to the budget
 
 
 class Way(Protocol):
