@@ -8,7 +8,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from itertools import count, product
 from pathlib import Path
@@ -249,6 +250,33 @@ def test_interrupt_in_a_step_of_mdf4_leaves_no_file(
     with pytest.raises(KeyboardInterrupt):
         convert(source, tmp_path / "run.mf4")
     until(lambda: [path.name for path in tmp_path.iterdir()] == ["run.arrows"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", [".mf4", ".h5"])
+def test_interrupt_between_two_steps_of_an_export_leaves_no_file(
+    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C comes when a step is handed to the library's thread: in turn at each step of the export."""
+    source, submit = record(tmp_path / "run.arrows", rows(400), METADATA), ThreadPoolExecutor.submit
+    monkeypatch.setattr("multidrop.recording.series.PIECE_ROWS", 100)
+    for last in count():
+        calls = count()
+
+        def interrupted_submit(*words: Any, calls: Iterator[int] = calls, last: int = last) -> Any:
+            future = submit(*words)
+            if next(calls) == last:
+                raise KeyboardInterrupt
+            return future
+
+        monkeypatch.setattr(ThreadPoolExecutor, "submit", interrupted_submit)
+        try:
+            convert(source, tmp_path / f"run{suffix}")
+        except KeyboardInterrupt:
+            until(lambda: [path.name for path in tmp_path.iterdir()] == ["run.arrows"])
+        else:
+            break
+    assert last > 4
 
 
 @pytest.mark.slow

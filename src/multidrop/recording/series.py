@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -158,6 +158,7 @@ class SeriesWriter(RecordingWriter):
         super().__init__(path)
         self.drives = checked_drives(metadata.get("drives"))
         self._thread = ThreadPoolExecutor(1, "multidrop export")
+        self._thread.submit(int)  # starts the thread: if Ctrl-C interrupts the start, there is no file yet
         self._codes: dict[str, dict[str, int]] = {"drive": {}, "register": {}, "status": {}}
         self._waiting: list[list[Array]] = []
         self._waiting_rows = 0
@@ -186,30 +187,29 @@ class SeriesWriter(RecordingWriter):
             with writing(self.path):
                 self._in_thread(self._write_piece)
 
-    def _in_thread(self, *works: Callable[[], Any]) -> Any:
-        """Call these functions in the library's thread; return the result of the last function.
+    def _in_thread(self, work: Callable[[], Any]) -> None:
+        """Do this work in the library's thread, which completes the work even if the wait is interrupted."""
+        self._thread.submit(work).result()
 
-        The thread calls all functions, even if one fails or the wait for them is interrupted. Raises the
-        first failure.
-        """
-        futures = [self._thread.submit(work) for work in works]
-        wait(futures)
-        return [future.result() for future in futures][-1]
-
-    def _open(self, work: Callable[[], Any]) -> Any:
+    def _open(self, work: Callable[[], Any]) -> None:
         """Open the new file with this work; remove the file if the work fails or is interrupted."""
         try:
-            return self._in_thread(work)
+            self._in_thread(work)
         except BaseException:
             self.discard()
             raise
 
     def close(self) -> None:
-        if self._is_closed:
-            return
+        if not self._is_closed:
+            with writing(self.path):
+                self._in_thread(self._close)
+
+    def _close(self) -> None:
         self._is_closed = True
-        with writing(self.path):
-            self._in_thread(self._complete, self._release)
+        try:
+            self._complete()
+        finally:
+            self._release()
 
     def _complete(self) -> None:
         if self._waiting:
@@ -219,10 +219,16 @@ class SeriesWriter(RecordingWriter):
         self._finish()
 
     def discard(self) -> None:
-        release = () if self._is_closed else (self._release,)
-        self._is_closed = True
         with suppress(OSError):
-            self._in_thread(*release, super().discard)
+            self._in_thread(self._remove)
+
+    def _remove(self) -> None:
+        try:
+            if not self._is_closed:
+                self._is_closed = True
+                self._release()
+        finally:
+            super().discard()
 
     def __exit__(self, *error: object) -> None:
         if error[0] is None:
