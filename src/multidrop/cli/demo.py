@@ -106,7 +106,8 @@ def _next(commands: Sequence[NextCommand]) -> Iterator[str]:
     yield from ("", "Next:", *aligned(rows, "<<"))
     if lacking := [one for one in commands if one.lacks]:
         install = install_command(*dict.fromkeys(one.extra for one in lacking))
-        yield f"first: {Path(program).with_name('pip')}{install.removeprefix('pip')}"
+        pip = Path(program).with_name("pip")
+        yield f"To install what these commands need: {pip}{install.removeprefix('pip')}"
 
 
 def _check_web(arguments: argparse.Namespace) -> None:
