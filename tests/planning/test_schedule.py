@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from itertools import pairwise
 
@@ -206,6 +207,15 @@ def test_a_rest_ends_exactly_on_time() -> None:
         at += rest_ms * MS
         assert made.take(at - 1, at - 1, at, 9) == []
         assert [each for each, _, _ in made.take(at, at, at + 1, 9)] == [dead]
+
+
+def test_only_the_first_rest_is_short_if_a_request_without_reply_costs_much() -> None:
+    made = schedule(lossy := job(1))
+    for failures, at_ms, rest_ms in ((2, 0, 500), (3, 500, 20_000)):
+        made.back_off.observe(1, failures, at_ms * MS, late_until_ns=0, cost_ns=300 * MS)
+        end = (at_ms + rest_ms) * MS
+        assert made.take(end - 1, end - 1, end, 9) == []
+        assert [each for each, _, _ in made.take(end, end, end + 1, 9)] == [lossy]
 
 
 def test_requests_to_silent_drives_use_at_most_their_share_of_the_line() -> None:
@@ -714,10 +724,10 @@ def test_silent_new_drives_get_a_second_request_immediately_if_they_are_few() ->
 
 def test_when_a_silent_drive_answers_again_exactly_one_other_is_tried() -> None:
     made = schedule(*(jobs := [job(drive) for drive in range(4)]))
-    for drive in (0, 1, 2):
-        made.back_off.observe(drive, 2, 0, late_until_ns=0, cost_ns=300 * MS)
+    for failures, drive in itertools.product((2, 3), (0, 1, 2)):
+        made.back_off.observe(drive, failures, 0, late_until_ns=0, cost_ns=300 * MS)
     assert {asked for asked, _ in take(made, 1000, 50)} == {jobs[3]}
     made.back_off.observe(2, 0, 1100 * MS, late_until_ns=0, cost_ns=300 * MS)
     assert {asked for asked, _ in take(made, 1100, 400)} == {jobs[0], jobs[2], jobs[3]}
-    made.back_off.observe(0, 3, 1500 * MS, late_until_ns=0, cost_ns=300 * MS)
+    made.back_off.observe(0, 4, 1500 * MS, late_until_ns=0, cost_ns=300 * MS)
     assert {asked for asked, _ in take(made, 1500, 1000)} == {jobs[2], jobs[3]}

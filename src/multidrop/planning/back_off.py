@@ -2,10 +2,11 @@
 
 A silent drive rests (gets no request) for longer each time. After each rest it gets its shortest request, in
 spare time or in the line time of jobs without a period. All silent drives together take only a small share of
-the line. When a silent drive replies, its rests end. The next silent drive is then tried immediately, because
-both may have been without power. A new drive, which has never answered, gets one request and no other until
-the outcome is known; without a reply it rests immediately. Once all new drives have had their first request,
-the silent ones get a second request if they are few.
+the line. Only the first rest of a drive that has answered before is short in any case, because the drive may
+have missed two requests by chance. When a silent drive replies, its rests end. The next silent drive is then
+tried immediately, because both may have been without power. A new drive, which has never answered, gets one
+request and no other until the outcome is known; without a reply it rests immediately. Once all new drives
+have had their first request, the silent ones get a second request if they are few.
 """
 
 from __future__ import annotations
@@ -107,12 +108,13 @@ class BackOff:
 
     def _rest(self, drive: int, now_ns: int) -> None:
         health = self.health[drive]
+        rest_ns = 0
         if health.failures >= (1 if health.is_new else SILENT_AFTER):
+            is_first = not health.rest_ns and not health.is_new
             health.rest_ns = min(max(2 * health.rest_ns, FIRST_REST_NS), LONGEST_REST_NS)
-        rest_ns = max(health.rest_ns, self._fair_rest_ns()) if health.rest_ns else 0
-        health.asleep_until_ns = max(health.late_until_ns, now_ns + rest_ns)
-        if rest_ns:
+            rest_ns = health.rest_ns if is_first else max(health.rest_ns, self._fair_rest_ns())
             self.begin_rest(drive, now_ns)
+        health.asleep_until_ns = max(health.late_until_ns, now_ns + rest_ns)
 
     def _fair_rest_ns(self) -> int:
         """Return the pause, in ns, that keeps requests to all silent drives within SILENT_SHARE."""
