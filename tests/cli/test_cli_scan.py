@@ -24,7 +24,7 @@ from multidrop.cli.scan import sentence
 from multidrop.core import RS485, Framing
 from multidrop.drive.line_settings import Settings
 from multidrop.families import ErmanERG220
-from multidrop.families.delixi_modbus import DelixiModbus
+from multidrop.families.delixi import DelixiModbus
 from multidrop.families.innovert_ibd import InnovertIBD
 from multidrop.families.invt_che import InvtCHE
 from multidrop.families.registry import find_model

@@ -27,7 +27,7 @@ from multidrop.cli import sniff
 from multidrop.cli.sniff import Listener, TrafficPrinter
 from multidrop.core import Framing, Message, Splitter, Stream, build_reply, build_request
 from multidrop.drive.line_settings import Settings
-from multidrop.families.delixi_native import DelixiNative
+from multidrop.families.delixi import DelixiNative
 from multidrop.families.innovert_ibd import InnovertIBD
 from multidrop.families.invt_che import InvtCHE
 from multidrop.sim import EncodedDrive, Simulator, Wire

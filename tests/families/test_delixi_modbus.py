@@ -16,8 +16,13 @@ from multidrop.drive import (
     WriteForbidden,
 )
 from multidrop.drive.register import HOLDING, Kept
-from multidrop.families.delixi_modbus import DelixiModbus, DelixiModbusControl
-from multidrop.families.delixi_parameters import DelixiBaudrate, DelixiFault, DelixiRunSource
+from multidrop.families.delixi import (
+    DelixiBaudrate,
+    DelixiFault,
+    DelixiModbus,
+    DelixiModbusControl,
+    DelixiRunSource,
+)
 
 FORWARD = {Framing.RTU: "01 06 20 00 00 12 02 07", Framing.ASCII: ":010620000012C7"}  # printed
 FIFTY = {Framing.RTU: "01 06 00 02 13 88 25 5C", Framing.ASCII: ":0106000213885C"}  # printed

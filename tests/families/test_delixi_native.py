@@ -21,8 +21,16 @@ from multidrop.drive import (
 )
 from multidrop.drive.register import Carrier, Kept, setting
 from multidrop.errors import NoReply
-from multidrop.families.delixi_native import PARAMETER, PARAMETER_RAM, DelixiNative, DelixiNativeStatus
-from multidrop.families.delixi_parameters import DelixiBaudrate, DelixiFault, DelixiRunSource, parameter
+from multidrop.families.delixi import (
+    PARAMETER,
+    PARAMETER_RAM,
+    DelixiBaudrate,
+    DelixiFault,
+    DelixiNative,
+    DelixiNativeStatus,
+    DelixiRunSource,
+    parameter,
+)
 
 FORWARD = ":010200020000000005"  # printed
 FIFTY = ":0104000100001388A1"  # printed

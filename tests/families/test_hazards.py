@@ -22,7 +22,7 @@ from multidrop.drive import Condition, Direction, Drive
 from multidrop.drive.register import HOLDING, Kept
 from multidrop.errors import BadReply, DriveException, NoReply, Unconfirmed, Unsupported, WriteForbidden
 from multidrop.families import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
-from multidrop.families.delixi_native import DelixiNativeStatus
+from multidrop.families.delixi import DelixiNativeStatus
 from multidrop.families.erman_er_g_220 import ErmanFault, ErmanStatus, Modes
 from multidrop.families.innovert_ibd import FrequencySource
 from multidrop.families.invt_che import parameter

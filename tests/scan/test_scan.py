@@ -18,8 +18,7 @@ from multidrop.drive.register import Kept, command, setting
 from multidrop.drive.verbs import verb
 from multidrop.errors import LineError
 from multidrop.families import MODELS
-from multidrop.families.delixi_modbus import DelixiModbus
-from multidrop.families.delixi_native import DelixiNative
+from multidrop.families.delixi import DelixiModbus, DelixiNative
 from multidrop.families.erman_er_g_220 import ErmanERG220
 from multidrop.families.innovert_ibd import InnovertIBD
 from multidrop.families.invt_che import InvtCHE

@@ -15,8 +15,7 @@ from tables import table
 from multidrop.core import Framing, Message, build_request, parse_reply
 from multidrop.drive import Drive
 from multidrop.drive.register import HOLDING, Carrier, setting
-from multidrop.families.delixi_modbus import DelixiModbus
-from multidrop.families.delixi_native import PARAMETER, DelixiNative
+from multidrop.families.delixi import PARAMETER, DelixiModbus, DelixiNative
 from multidrop.families.erman_er_g_220 import ErmanERG220
 from multidrop.families.innovert_ibd import InnovertIBD
 from multidrop.families.invt_che import InvtCHE, parameter

@@ -28,7 +28,7 @@ from toy import Toy
 from multidrop import YD1000, Bus, NoReply
 from multidrop.core import Framing, Message, build_request, parse_reply, reply_length, set_settings
 from multidrop.drive import Drive
-from multidrop.families.delixi_native import DelixiNative
+from multidrop.families.delixi import DelixiNative
 from multidrop.families.erman_er_g_220 import ErmanERG220
 from multidrop.families.innovert_ibd import InnovertIBD
 from multidrop.families.invt_che import InvtCHE, parameter

@@ -11,8 +11,7 @@ from tables import table
 
 from multidrop.core import Framing
 from multidrop.drive import Drive
-from multidrop.families.delixi_modbus import DelixiModbus
-from multidrop.families.delixi_native import DelixiNative
+from multidrop.families.delixi import DelixiModbus, DelixiNative
 from multidrop.families.erman_er_g_220 import ErmanERG220
 from multidrop.families.innovert_ibd import InnovertIBD
 from multidrop.families.invt_che import InvtCHE

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from multidrop.families.profiles.cia402 import CiA402Control, CiA402Status
-from multidrop.families.profiles.danfoss_fc import DanfossControl, DanfossStatus
 from multidrop.families.profiles.delta import (
     FORWARD,
     REVERSE,
@@ -15,10 +13,21 @@ from multidrop.families.profiles.delta import (
     DeltaReset,
     DeltaStatus,
 )
+from multidrop.families.profiles.iec_61800_7 import (
+    CiA402Control,
+    CiA402Status,
+    ProfidriveControl,
+    ProfidriveStatus,
+)
 from multidrop.families.profiles.invt import InovanceStatus, InvtControl, InvtStatus
-from multidrop.families.profiles.optidrive import OptidriveControl, OptidriveStatus
-from multidrop.families.profiles.profidrive import ProfidriveControl, ProfidriveStatus
-from multidrop.families.profiles.yaskawa import YaskawaControl, YaskawaStatus
+from multidrop.families.profiles.run_bits import (
+    DanfossControl,
+    DanfossStatus,
+    OptidriveControl,
+    OptidriveStatus,
+    YaskawaControl,
+    YaskawaStatus,
+)
 from multidrop.sim.memory import MemoryCell
 from multidrop.sim.motor import Phase
 from multidrop.sim.motor_drive import COMMANDS, ProfileDrive

@@ -112,21 +112,16 @@ class Delta(Profile):
         shown = (yield from self._status()) >> 3 & 3
         return shown in (FORWARD, REVERSE) and (yield from super()._turns_in(direction))
 
-    def _reverse(self, direction: Direction | None, status: int) -> bool:
-        if direction is None:
-            return self._turns(status) and self._direction(status) is Direction.REVERSE
-        return direction is Direction.REVERSE
-
     def _start_word(self, direction: Direction | None, status: int) -> int:
-        return DeltaControl.REVERSE if self._reverse(direction, status) else DeltaControl.FORWARD
+        return DeltaControl.REVERSE if self._reverses(direction, status) else DeltaControl.FORWARD
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
         """Turn slowly from rest until stopped; without a direction, forward."""
         status = yield from self._status()
         yield from self._may_jog(status)
-        reverse = self._reverse(direction, status)
-        word = DeltaControl.JOG_REVERSE if reverse else DeltaControl.JOG_FORWARD
+        reverses = self._reverses(direction, status)
+        word = DeltaControl.JOG_REVERSE if reverses else DeltaControl.JOG_FORWARD
         yield from write(self.control, self._word(word))
         yield from self._started(direction)
 

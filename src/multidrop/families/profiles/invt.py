@@ -97,11 +97,8 @@ class Invt(Profile):
             raise self._unsupported(f"{word.name.lower().replace('_', ' ')} command")
         return cast(Any, self.control.values)[word.name]
 
-    def _reverse(self, direction: Direction | None, status: int) -> bool:
-        return (direction or self._direction(status)) is Direction.REVERSE
-
     def _start_word(self, direction: Direction | None, status: int) -> int:
-        return InvtControl.REVERSE if self._reverse(direction, status) else InvtControl.FORWARD
+        return InvtControl.REVERSE if self._reverses(direction, status) else InvtControl.FORWARD
 
     def _may_start(self, status: int) -> Script[None]:
         yield from super()._may_start(status)
@@ -114,8 +111,8 @@ class Invt(Profile):
         """Turn slowly from rest until stopped; without a direction, forward."""
         status = yield from self._status()
         yield from self._may_jog(status)
-        reverse = self._reverse(direction, status)
-        word = self._word(InvtControl.JOG_REVERSE if reverse else InvtControl.JOG_FORWARD)
+        reverses = self._reverses(direction, status)
+        word = self._word(InvtControl.JOG_REVERSE if reverses else InvtControl.JOG_FORWARD)
         self._jogged = True
         yield from write(self.control, word)
         yield from self._started(direction)

@@ -290,6 +290,12 @@ class Profile(Drive):
         """Return the direction that the status shows; None if it does not show one."""
         return None
 
+    def _reverses(self, direction: Direction | None, status: int) -> bool:
+        """Return True if a start or jog in this direction goes in reverse; None keeps a turning motor's."""
+        if direction is None:
+            return self._turns(status) and self._direction(status) is Direction.REVERSE
+        return direction is Direction.REVERSE
+
     def _start_word(self, direction: Direction | None, status: int) -> int:
         raise NotImplementedError
 

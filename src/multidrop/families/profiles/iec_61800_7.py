@@ -1,8 +1,9 @@
-"""The PROFIdrive profile, used by ABB (as "ABB Drives") and Siemens' SINAMICS."""
+"""Two profiles of IEC 61800-7: CiA 402 (Schneider's Altivar, Lenze's i500) and PROFIdrive (ABB, SINAMICS)."""
 
 from __future__ import annotations
 
 from enum import IntFlag
+from functools import partial
 from typing import ClassVar
 
 from multidrop.drive import NotVerified, WriteForbidden
@@ -11,7 +12,113 @@ from multidrop.drive.script import Script, insist, until, wait, write
 from multidrop.drive.state import Condition, Direction
 from multidrop.families.profiles.profile import COMMON, Profile, Role
 
-READY_TIME = 1.0  # s within which the drive must become ready to switch on
+
+class CiA402Control(IntFlag):
+    """The control word, 6040H. Bits 0 to 3 and 7 are those of the standard; each make defines the others."""
+
+    SWITCH_ON = 1 << 0
+    ENABLE_VOLTAGE = 1 << 1
+    NO_QUICK_STOP = 1 << 2
+    ENABLE_OPERATION = 1 << 3
+    RESET = 1 << 7  # acts on a change from 0 to 1
+
+
+class CiA402Status(IntFlag):
+    """The status word, 6041H. Bits 0 to 7, 9 and 10 are those of the standard."""
+
+    READY_TO_SWITCH_ON = 1 << 0
+    SWITCHED_ON = 1 << 1
+    OPERATION_ENABLED = 1 << 2
+    FAULT = 1 << 3
+    VOLTAGE_ENABLED = 1 << 4
+    NO_QUICK_STOP = 1 << 5
+    SWITCH_ON_DISABLED = 1 << 6
+    WARNING = 1 << 7
+    BIT_8 = 1 << 8
+    REMOTE = 1 << 9
+    AT_REFERENCE = 1 << 10
+    BIT_11 = 1 << 11
+    BIT_12 = 1 << 12
+    BIT_13 = 1 << 13
+    BIT_14 = 1 << 14
+    BIT_15 = 1 << 15
+
+
+SHUTDOWN, SWITCH_ON, ENABLE = 0x0006, 0x0007, 0x000F  # control words before and for the start
+MASK, SHORT_MASK = 0x6F, 0x4F  # masks of the state bits: with and without the quick stop bit
+NOT_READY, SWITCH_ON_DISABLED, FAULT_REACTION, FAULT = 0x00, 0x40, 0x0F, 0x08  # states, with SHORT_MASK
+READY, SWITCHED_ON, ENABLED, QUICK_STOP = 0x21, 0x23, 0x27, 0x07  # states, with MASK
+_UP = ((SHUTDOWN, READY, "ready to be switched on"), (SWITCH_ON, SWITCHED_ON, "switched on"))
+
+
+class CiA402(Profile):
+    """CiA 402: the words 6, 7, 15 start the motor, 7 stops it along the ramp, 0 lets it coast; bit 7 resets.
+
+    - The stop is "disable operation", 0007H. With factory settings it ramps down. It never starts the motor:
+      it only switches on a drive that is ready to be switched on. "Shutdown", 0006H, coasts or ramps,
+      depending on a setting.
+    - The reset is 0087H: bit 7 and the stop word. Because bit 3 is 0, the reset does not enable operation.
+    - The standard has no direction for frequency drives. A family may declare a bit of its own,
+      `bits = { reverse = 11 }`; without it a direction is refused.
+    - For a start, the remote bit 9 of the status must be set: it means that the drive obeys the line.
+    """
+
+    stop_word: ClassVar[int] = SWITCH_ON
+    coast_word: ClassVar[int] = 0x0000
+    reset_word: ClassVar[int] = 0x0087
+    roles = {
+        **COMMON,
+        "control": Role(
+            (Access.COMMAND,),
+            values=CiA402Control,
+            harmless=(coast_word, SHUTDOWN, stop_word),
+            never_together=(CiA402Control.RESET | CiA402Control.ENABLE_OPERATION,),
+            extra=("reverse",),
+        ),
+        "status": Role((Access.READING,), values=CiA402Status),
+    }
+
+    def _impossible(self, status: int) -> str:
+        if status & SHORT_MASK in (NOT_READY, SWITCH_ON_DISABLED, FAULT_REACTION, FAULT):
+            return ""
+        known = status & MASK in (READY, SWITCHED_ON, ENABLED, QUICK_STOP)
+        return "" if known else "it is none of the states of CiA 402"
+
+    def _is_tripped(self, status: int) -> bool:
+        return bool(status & CiA402Status.FAULT)
+
+    def _turns(self, status: int) -> bool:
+        return bool(status & CiA402Status.OPERATION_ENABLED)
+
+    def _condition(self, status: int) -> Condition:
+        return Condition.DECELERATING if status & MASK == QUICK_STOP else super()._condition(status)
+
+    def _not_ready(self, status: int) -> str:
+        return "" if status & CiA402Status.REMOTE else "does not take its commands from the line"
+
+    def _start_word(self, direction: Direction | None, status: int) -> int:
+        reverse = {member.name: int(member) for member in self.control.values or ()}.get("REVERSE", 0)
+        if direction is not None and not reverse:
+            raise WriteForbidden(
+                f"{self.name}: the standard has no direction, and its family declares no bit for it; "
+                "start without a direction"
+            )
+        if direction is None and reverse and self._turns(status):
+            raise WriteForbidden(f"{self.name} turns, and cannot report which way: give the direction")
+        return ENABLE | reverse if direction is Direction.REVERSE else ENABLE
+
+    def _prepare(self, status: int) -> Script[None]:
+        for word, state, words in _UP:
+            yield from insist(self.control, self._word(word))
+            if not (yield from until(partial(self._is_in, state), limit=READY_TIME)):
+                why = f"after {READY_TIME:g} s it is not {words}"
+                raise NotVerified(self.name, "the start", f"{why}; {self.remote}")
+
+    def _is_in(self, state: int) -> Script[bool]:
+        return (yield from self._status()) & MASK == state
+
+
+READY_TIME = 1.0  # s allowed for each step before the start word
 BETWEEN = 0.1  # s; least pause between "ready to switch on" and the next word (ACS550-02/U2 manual, p. 246)
 
 
@@ -50,8 +157,7 @@ class ProfidriveStatus(IntFlag):
     BIT_15 = 1 << 15
 
 
-STOP, COAST, RESET, START = 0x047E, 0x047C, 0x04FE, 0x047F
-SWITCH_OFF, SWITCH_ON = 0x0476, 0x0477  # neither word turns the motor, because operation is not enabled
+OFF, ON, START = 0x0476, 0x0477, 0x047F  # OFF and ON do not turn the motor: they do not enable operation
 
 
 class Profidrive(Profile):
@@ -69,15 +175,15 @@ class Profidrive(Profile):
     - Each make has its own jog, so none is sent.
     """
 
-    stop_word: ClassVar[int] = STOP
-    coast_word: ClassVar[int | None] = COAST
-    reset_word: ClassVar[int] = RESET
+    stop_word: ClassVar[int] = 0x047E
+    coast_word: ClassVar[int] = 0x047C
+    reset_word: ClassVar[int] = 0x04FE
     roles = {
         **COMMON,
         "control": Role(
             (Access.COMMAND,),
             values=ProfidriveControl,
-            harmless=(STOP, COAST, SWITCH_OFF),
+            harmless=(stop_word, coast_word, OFF),
             never_together=(ProfidriveControl.RESET | ProfidriveControl.ON,),
         ),
         "status": Role((Access.READING,), values=ProfidriveStatus),
@@ -114,13 +220,13 @@ class Profidrive(Profile):
         return START
 
     def _prepare(self, status: int) -> Script[None]:
-        yield from insist(self.control, self._word(SWITCH_OFF))
+        yield from insist(self.control, self._word(OFF))
         if not (yield from until(self._is_ready, limit=READY_TIME)):
             raise WriteForbidden(f"{self.name} {self._hindrance((yield from self._status()))}; {self.remote}")
         yield from wait(BETWEEN)
-        yield from write(self.control, self._word(SWITCH_ON))
+        yield from write(self.control, self._word(ON))
         if not (yield from until(self._is_on, limit=READY_TIME)):
-            yield from insist(self.control, self._word(STOP))
+            yield from insist(self.control, self._word(self.stop_word))
             why = f"after {READY_TIME:g} s it is not ready to operate"
             raise NotVerified(self.name, "the start", f"{why}; {self.remote}")
 
