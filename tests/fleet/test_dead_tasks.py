@@ -28,19 +28,16 @@ from multidrop.cli.fleet.tables import count_sentence, failing_lines
 from multidrop.core import Mastership
 from multidrop.fleet import gateway as fleet_gateway
 from multidrop.fleet import metrics
+from multidrop.fleet.commands.desk import CommandSubjects
 from multidrop.fleet.commands.fleet_commands import FleetCommands
-from multidrop.fleet.commands.log import CommandLog
-from multidrop.fleet.commands.messages import CommandOutcome
-from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects
-from multidrop.fleet.gateway import FleetGateway
-from multidrop.fleet.lines import fleet_lines
-from multidrop.fleet.lines.fleet_lines import FleetLines
+from multidrop.fleet.commands.messages import CommandLog, CommandOutcome
+from multidrop.fleet.gateway import CommandedLines, FleetGateway, FleetLines
 from multidrop.fleet.samples import forwarder as forwarder_module
 from multidrop.fleet.samples import parquet_sink
 from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.servers import names
 from multidrop.samples import spool as spool_module
-from multidrop.samples.polled_units import PolledUnits
+from multidrop.samples.message import PolledUnits
 from multidrop.samples.spool import Spool
 from multidrop.sim import Simulator, Wire, simulated
 from multidrop.supervisor import Ended, end_tasks, supervisor
@@ -51,8 +48,7 @@ STARTERS = {
 }
 WAITED_FOR = {  # modules that start tasks or threads, and wait for them themselves
     *("connections", "direct_gets", "fleet_commands", "followed", "forwarder", "gateway", "hub", "leaders"),
-    *("line_keeper", "member", "observer", "owner_records", "page_part", "servers", "shares"),
-    "fleet_lines",  # callers in other modules wait for this thread
+    *("line_keeper", "member", "observer", "page_part", "shares"),
     "spool",  # the gateway checks this thread
 }
 MEMBER = (
@@ -306,7 +302,7 @@ def taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Taken]:
     with Simulator([Wire([simulated(Toy(1))])]) as simulator:
         path = simulator.wires[0].path
         described = line(path, polled(Toy(1, name="pump"), [Toy.registers["output_current"]]), name=LINE)
-        monkeypatch.setattr(fleet_lines, "line_of", lambda record, folder: described)
+        monkeypatch.setattr(fleet_gateway, "line_of", lambda record, folder: described)
         made = Taken(path, tmp_path)
         yield made
         made.close()

@@ -19,7 +19,7 @@ from nats.aio.client import Client
 from secured_clusters import SecuredCluster, secured_cluster
 
 from multidrop.fleet.errors import Denials, MayNotSend, NoRight
-from multidrop.fleet.servers.credentials import connect_options, inbox_of, public_key
+from multidrop.fleet.servers.connections import connect_options, inbox_of, public_key
 from multidrop.fleet.servers.rights import OTHERS, rights_of
 
 GATEWAYS = ("gw-a", "gw-b")
@@ -203,7 +203,7 @@ def test_secret_files_are_readable_only_by_their_owner(as_written: SecuredCluste
 
 
 def test_adding_a_gateway_keeps_all_existing_keys(tmp_path: Path) -> None:
-    from multidrop.fleet.servers.files import write_files
+    from multidrop.fleet.servers.rights import write_files
 
     urls = ["nats://a:4222", "nats://b:4222"]
 

@@ -23,12 +23,11 @@ from multidrop.fleet.leases.member import Member
 from multidrop.fleet.leases.rules import SECOND, USUAL
 from multidrop.fleet.samples import samples_stream
 from multidrop.fleet.servers import names, setup
-from multidrop.fleet.servers.buckets import Bucket, LeaseBucket, Record, ServerError
+from multidrop.fleet.servers.buckets import LARGE, SMALL, Bucket, LeaseBucket, Record, ServerError, parsed
 from multidrop.fleet.servers.connections import ServerPath, paths_of
 from multidrop.fleet.servers.leaders import Cluster as Leaders
 from multidrop.fleet.servers.leaders import known_cluster, led_clusters
 from multidrop.fleet.servers.plant_store import store
-from multidrop.fleet.servers.record_shapes import LARGE, SMALL, parsed
 from multidrop.fleet.servers.setup import check_buckets, open_all
 
 LEASE = {

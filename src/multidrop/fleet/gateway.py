@@ -5,35 +5,39 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
+from math import inf
 from pathlib import Path
 from typing import Any
 
 from nats.aio.msg import Msg
 
-from multidrop import PollingFailed
+from multidrop import Plant, Poller, PollingFailed
 from multidrop.core import Mastership
-from multidrop.fleet.commands.held_lines import HeldLines
-from multidrop.fleet.commands.log import CommandLog
-from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects
+from multidrop.fleet.commands.desk import CommandSubjects
+from multidrop.fleet.commands.messages import CommandLog
+from multidrop.fleet.commands.offers import HeldLines
 from multidrop.fleet.errors import FleetError, NoRight
 from multidrop.fleet.leases.lease import LifeLock
 from multidrop.fleet.leases.member import Member
 from multidrop.fleet.leases.rules import SECOND, USUAL
-from multidrop.fleet.lines.fleet_lines import FleetLines
-from multidrop.fleet.lines.line_keeper import SILENT_S
-from multidrop.fleet.lines.moves import MOST_REPORTED
+from multidrop.fleet.lines.line_keeper import SILENT_S, PortLoss
+from multidrop.fleet.lines.records import MOST_REPORTED
 from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.samples.samples_stream import samples_path
 from multidrop.fleet.servers import names
+from multidrop.fleet.servers.buckets import Record, misshapen, with_short_texts
 from multidrop.fleet.servers.connections import ServerPath, paths_of
-from multidrop.fleet.servers.record_shapes import misshapen, with_short_texts
+from multidrop.fleet.servers.plant_store import line_of
 from multidrop.fleet.servers.setup import check_buckets, open_all
 from multidrop.samples import PolledUnits, Spool
 from multidrop.supervisor import Ended, end_tasks, supervisor
 
 SPOOL_BYTES = 10_000_000_000
+LINES_AT_ONCE = 32  # limit of lines that are opened or closed at the same time
 STATE = {"state": str, "lines": int, "margin_s": float, "trouble": str, "troubles": dict, "spool": dict}
 SPOOL = {"bytes": int, "lost": int, "behind": int | None, "lag_s": float | None, "trouble": str | None}
 FORWARD_S = 10.0  # time limit at shutdown for forwarding samples; the rest is forwarded after the next start
@@ -136,10 +140,7 @@ class FleetGateway:
         await end_tasks(*waits)
 
     async def _look(self) -> None:
-        """Check repeatedly whether a watched thread or polling has ended.
-
-        If polling has failed, report that to the supervisor, and return.
-        """
+        """Check the watched threads and the poller repeatedly; report failed polling, and return."""
         while True:
             supervisor().look()
             if failure := self.lines.poller.failure:
@@ -236,3 +237,110 @@ async def ask_gateway(path: ServerPath, gateway: str, wanted: str) -> dict[str, 
     if mistake := misshapen(found, STATE) or misshapen(found["spool"], SPOOL):
         raise FleetError(f"the answer of {gateway} is not a gateway's state: {mistake}")
     return found
+
+
+# ---- the gateway's lines ----
+
+
+class FleetLines:
+    """The lines that a gateway polls, in one Poller that sends only while the lease is valid.
+
+    Lines are added and removed in threads, because both wait for ports.
+    """
+
+    def __init__(self, mastership: Mastership, folder: Path, units: PolledUnits) -> None:
+        self.poller = Poller(
+            Plant((), folder, totals=folder / "totals.json"),
+            mastership=mastership,
+            audit=folder / "audit.jsonl",
+        )
+        self._folder = folder / "lines"
+        self._units = units
+        self._free = asyncio.Semaphore(LINES_AT_ONCE)
+
+    async def take(self, line: str, description: Any) -> None:
+        """Open the line and poll it. If that raises, the line is not polled and its port is closed.
+
+        Raises LineError if its port does not exist, and ValueError for a mistake in its description. A user's
+        own class may raise other errors.
+        """
+        await self._in_thread(self._take, Record(line, 0, description))
+
+    async def _in_thread(self, act: Callable[..., object], *details: object) -> None:
+        """Call `act` in a daemon thread. SystemExit, which would end the loop, becomes RuntimeError."""
+        async with self._free:
+            await supervisor().thread("line", inf, partial(act, *details))
+
+    def _take(self, record: Record) -> None:
+        line = line_of(record, self._folder)
+        polled = {drive.name for bus in self.poller.buses.values() for drive in bus.drives}
+        # a line without polled drives would be refused by `add_line`
+        if not any(one.drive.name in polled for one in line.drives):
+            self._units.note(line, time.monotonic_ns())  # must precede the line's first row
+        before = self.poller.buses.get(line.name)
+        try:
+            self.poller.add_line(line)
+        except BaseException:  # a half-open line must be closed: another gateway may soon be its master
+            if self.poller.buses.get(line.name) is not before:
+                self.poller.remove_line(line.name)
+            raise
+
+    async def let_go(self, line: str) -> None:
+        await self._in_thread(self._let_go, line)
+
+    def _let_go(self, line: str) -> None:
+        try:
+            self.poller.remove_line(line)
+        except PollingFailed:  # polling of all lines has ended; closing the port is enough
+            self.poller.bus(line).close()
+
+    def port_loss(self, line: str) -> PortLoss | None:
+        bus = self.poller.bus(line)
+        if not bus.line.is_lost:
+            return None
+        replied_ns = max((bus.peer(drive).answered_ns for drive in bus.drives), default=0)
+        silent_ns = time.monotonic_ns() - replied_ns if replied_ns else None
+        return PortLoss(bus.why_lost, silent_ns)
+
+    async def close(self) -> None:
+        """Stop polling and deliver the last rows. Raises PollingFailed if polling had failed."""
+        await self._in_thread(self.poller.close)
+
+
+class CommandedLines:
+    """Polls lines, and accepts commands for a line while it is polled.
+
+    `may_wait` returns True until the lines must be closed because the lease is about to expire.
+    """
+
+    def __init__(
+        self, lines: FleetLines, subjects: CommandSubjects, may_wait: Callable[[], bool] = lambda: False
+    ) -> None:
+        self._lines = lines
+        self._subjects = subjects
+        self._may_wait = may_wait
+
+    async def take(self, line: str, description: Any) -> None:
+        """Poll a line and accept commands for it. If that raises, the line is closed again."""
+        await self._lines.take(line, description)
+        try:
+            self._subjects.open(line, description)
+        except BaseException:
+            await self.let_go(line)
+            raise
+
+    def port_loss(self, line: str) -> PortLoss | None:
+        return self._lines.port_loss(line)
+
+    async def let_go(self, line: str) -> None:
+        """Accept no more commands for the line, stop polling it, and close it.
+
+        Closing waits for stops in progress, so that their senders get answers. It also waits a short time for
+        commands in progress, because their results would otherwise stay unknown.
+        """
+        self._subjects.leave(line)
+        try:
+            await self._subjects.desk.await_commands(line, self._may_wait)
+            await self._lines.let_go(line)
+        finally:
+            self._subjects.shut(line)

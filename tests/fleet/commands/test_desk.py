@@ -28,9 +28,9 @@ from multidrop.control import Seen, audit_log, read_audit
 from multidrop.control.commands import RepeatedStops, Results, begin_stops, stop_drive, stop_line
 from multidrop.fleet.commands import desk as desk_module
 from multidrop.fleet.commands.desk import MOST_WRITES
-from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.messages import (
     CommandAnswer,
+    CommandLog,
     CommandOutcome,
     CommandRequest,
     Offered,
@@ -569,10 +569,10 @@ def test_an_offer_does_not_change_the_known_setpoint() -> None:
 HANGING_LOG = """
 import asyncio, sys, threading
 from pathlib import Path
-from multidrop.fleet.commands import log as logs
+from multidrop.fleet.commands.messages import CommandLog
 
 async def main():
-    log = logs.CommandLog(Path(sys.argv[1]))
+    log = CommandLog(Path(sys.argv[1]))
     log._add = lambda record, now_ns: threading.Event().wait()
     asyncio.create_task(log.note({}))
     await asyncio.sleep(0.05)
@@ -584,8 +584,8 @@ HANGING_LINE = """
 import asyncio, sys, threading
 from pathlib import Path
 from multidrop.core import Mastership
-from multidrop.fleet.lines.fleet_lines import FleetLines
-from multidrop.samples.polled_units import PolledUnits
+from multidrop.fleet.gateway import FleetLines
+from multidrop.samples.message import PolledUnits
 
 async def main():
     lines = FleetLines(Mastership(), Path(sys.argv[1]).parent, PolledUnits())

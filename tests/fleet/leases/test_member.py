@@ -23,7 +23,7 @@ from multidrop.fleet.leases.lease import Held, Lease, boottime_ns
 from multidrop.fleet.leases.member import IncompatibleGateways, Member, MemberState
 from multidrop.fleet.leases.observer import Observer
 from multidrop.fleet.leases.rules import RULES, SECOND, USUAL, Terms
-from multidrop.fleet.lines import line_keeper, releases, unopened_lines
+from multidrop.fleet.lines import line_keeper, shares
 from multidrop.fleet.lines.line_keeper import PortLoss
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Bucket, LeaseBucket
@@ -202,9 +202,9 @@ async def test_lines_that_a_gateway_cannot_open_move_to_others_and_return_later(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The gateway is cut off from its lines but not from the servers, so its lease stays valid."""
-    monkeypatch.setattr(unopened_lines, "LOST_NS", SECOND // 2)
+    monkeypatch.setattr(shares, "LOST_NS", SECOND // 2)
     for wait in ("FIRST_WAIT_NS", "LAST_WAIT_NS"):  # longer than a failed trial, which takes up to 2 s
-        monkeypatch.setattr(unopened_lines, wait, 3 * SECOND)
+        monkeypatch.setattr(shares, wait, 3 * SECOND)
     monkeypatch.setattr(line_keeper, "TAKE_AGAIN_S", 0.1)
     async with gateways(fleet, "a", "b", "c", terms=LONG) as running:
         await until(running.are_shared, "shares")
@@ -250,7 +250,7 @@ def test_while_a_server_is_silent_only_a_drained_gateway_releases_lines(
     async def main() -> None:
         async with gateways(fleet, "a", "b", terms=LONG) as running:
             await until(running.are_shared, "start")
-            monkeypatch.setattr(releases, "known_cluster", maimed)
+            monkeypatch.setattr(member_module, "known_cluster", maimed)
             joined, drained = await running.join("c"), running.members["b"]
             await until(lambda: "c" in drained.wanted.values(), "its share")
             await asyncio.sleep(1.0)

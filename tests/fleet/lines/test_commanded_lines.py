@@ -21,8 +21,9 @@ from tables import table
 from multidrop.core import UNASKED, Mastership
 from multidrop.families import InnovertIBD
 from multidrop.fleet.commands import desk as command_desk
+from multidrop.fleet.commands.desk import CommandSubjects
 from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome
-from multidrop.fleet.commands.subjects import CommandedLines, CommandSubjects
+from multidrop.fleet.gateway import CommandedLines
 from multidrop.fleet.servers import names
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant, PlantLine

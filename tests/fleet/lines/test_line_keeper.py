@@ -13,7 +13,7 @@ from fleets import GatedBucket, Hall, HandClock, MemoryBucket, RecordingLines, R
 
 from multidrop.fleet.leases.lease import Lease
 from multidrop.fleet.leases.rules import SECOND, USUAL
-from multidrop.fleet.lines import line_keeper, owner_records
+from multidrop.fleet.lines import line_keeper
 from multidrop.fleet.lines.line_keeper import LineKeeper, PortLoss
 from multidrop.fleet.lines.ownership import owner_of, owner_value
 from multidrop.fleet.lines.records import ShareRecords
@@ -282,7 +282,7 @@ async def test_a_bucket_without_a_leader_does_not_delay_a_claim(place: int) -> N
 
 
 async def test_a_slow_bucket_does_not_delay_a_claim(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
+    monkeypatch.setattr(line_keeper, "SPARE_S", 0.0)
     trial = DeadTrial()
     await trial.claim_without_the_first()
     assert owners(trial) == [NOBODY, ME, ME]
@@ -294,7 +294,7 @@ async def test_a_slow_bucket_does_not_delay_a_claim(monkeypatch: pytest.MonkeyPa
 
 async def test_a_refused_claim_does_not_wait_for_a_late_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     """The claim is repeated immediately, with newer records. A server that is cut off may answer late."""
-    monkeypatch.setattr(owner_records, "SPARE_S", 100.0)
+    monkeypatch.setattr(line_keeper, "SPARE_S", 100.0)
     trial = DeadTrial()
     await trial.read_and_begin()
     trial.buckets[1].store("hall", owner_value(("", 0), 2, 0))
@@ -334,7 +334,7 @@ async def test_a_bucket_that_lost_its_home_server_does_not_delay_claims(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A new line is first written in this bucket, so the gateway cannot use another bucket instead."""
-    monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
+    monkeypatch.setattr(line_keeper, "SPARE_S", 0.0)
     trial = Trial()
     await trial.read_and_begin()
     await trial.let_the_first_lag()
@@ -358,7 +358,7 @@ async def test_a_claim_ends_when_another_gateway_was_faster() -> None:
 
 async def test_a_late_answer_does_not_reclaim_a_line_being_released(monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise the line would be opened between the writes of its release."""
-    monkeypatch.setattr(owner_records, "SPARE_S", 0.0)
+    monkeypatch.setattr(line_keeper, "SPARE_S", 0.0)
     trial = DeadTrial()
     await trial.claim_without_the_first()
     trial.keeper.releasing = {"hall"}

@@ -14,11 +14,10 @@ from fleets import Hall, HandClock, RecordingMastership
 from nats_clusters import Cluster as Servers
 from tables import table
 
-from multidrop.fleet.leases.member import SETTLE_S, Member
+from multidrop.fleet.leases import member
+from multidrop.fleet.leases.member import SETTLE_S, SILENT_S, Member, Releases
 from multidrop.fleet.leases.rules import RULES, SECOND
-from multidrop.fleet.lines import releases
 from multidrop.fleet.lines.ownership import NEEDED, Claim, Step, claim_of, decide, owner_by, owner_value
-from multidrop.fleet.lines.releases import WAIT_S, Releases
 from multidrop.fleet.lines.shares import QUIET_NS, assign
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Record
@@ -323,7 +322,7 @@ class Releasing:
         self.now_s = 0.0
         nowhere: Any = None
         self.releases = Releases(lambda: nowhere, self.note, lambda: self.now_s)
-        monkeypatch.setattr(releases, "known_cluster", self.known_cluster)
+        monkeypatch.setattr(member, "known_cluster", self.known_cluster)
 
     def note(self) -> None:
         self.changes += 1
@@ -382,10 +381,10 @@ def test_releases_ignore_a_long_silent_server(monkeypatch: pytest.MonkeyPatch) -
     trial.maimed = {"own_0", "own_1"}
     trial.releases.due(FIRST_LINES)
     trial.look()
-    trial.now_s = WAIT_S - 1
+    trial.now_s = SILENT_S - 1
     trial.look()
     assert trial.releases.due(FIRST_LINES) == set()
-    trial.now_s = WAIT_S
+    trial.now_s = SILENT_S
     trial.look()
     assert trial.releases.due(FIRST_LINES) == FIRST_LINES
     trial.maimed.clear()  # the server answered once and is silent again, so the wait restarts

@@ -13,11 +13,9 @@ from tables import table
 from multidrop.fleet.errors import Unsure
 from multidrop.fleet.leases.rules import SECOND, USUAL
 from multidrop.fleet.lines import records as line_records
-from multidrop.fleet.lines.moves import Move, Moves, move_of
 from multidrop.fleet.lines.ownership import NEEDED, owner_of, owner_value
-from multidrop.fleet.lines.records import ShareFollower, ShareRecords
-from multidrop.fleet.lines.shares import assign, hand_over
-from multidrop.fleet.lines.unopened_lines import (
+from multidrop.fleet.lines.records import Move, Moves, ShareFollower, ShareRecords, move_of
+from multidrop.fleet.lines.shares import (
     FIRST_WAIT_NS,
     LAST_WAIT_NS,
     LOST_NS,
@@ -26,6 +24,8 @@ from multidrop.fleet.lines.unopened_lines import (
     REPLY_NS,
     TRIAL_NS,
     UnopenedLines,
+    assign,
+    hand_over,
 )
 from multidrop.fleet.servers import buckets, names
 from multidrop.fleet.servers.buckets import Bucket, Record

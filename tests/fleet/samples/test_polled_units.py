@@ -21,16 +21,14 @@ from spooled import NOON, STEP, empty_stream, numbered
 import multidrop
 from multidrop import History
 from multidrop.core import Mastership
-from multidrop.fleet.lines.fleet_lines import FleetLines
+from multidrop.fleet.gateway import FleetLines
 from multidrop.fleet.samples.hub import Commit
 from multidrop.fleet.samples.parquet_sink import ParquetSink
 from multidrop.fleet.samples.samples_stream import StreamMessage, read_after
 from multidrop.fleet.servers.buckets import Record
 from multidrop.fleet.servers.plant_store import line_of
 from multidrop.history import compact, quantities
-from multidrop.samples import polled_units
-from multidrop.samples.message import RowBuffer, unpack
-from multidrop.samples.polled_units import PolledUnits
+from multidrop.samples.message import RAW, PolledUnits, RowBuffer, unpack
 
 FAMILY = """
 [family]
@@ -123,7 +121,7 @@ def test_merged_files_keep_the_units_although_other_rows_have_none(tmp_path: Pat
 def test_units_are_named_as_in_a_history() -> None:
     plant = {"drives": {"a": {"model": "meter.toml", "registers": {"b": {"values": {"ON": 1}}}}}}
     assert quantities.units_of(plant) == {("a", "b"): "names of meter.toml"}
-    assert polled_units.RAW == quantities.RAW
+    assert RAW == quantities.RAW
 
 
 @pytest.fixture(params=["as they came", "merged"])

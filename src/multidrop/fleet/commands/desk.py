@@ -1,4 +1,4 @@
-"""The two desks of a gateway: CommandDesk carries out each command once, StopDesk carries out stops.
+"""The command desks of a gateway: CommandDesk, StopDesk, and CommandSubjects, which connects them to NATS.
 
 Both act only on lines whose master is this gateway. The command desk checks a command and sends the
 sender an offer with a token. If the sender returns the token within a second, measured by this computer's
@@ -7,38 +7,48 @@ and again when it has ended.
 
 A stop needs no offer and no entry in `[fleet.may]`: sending a stop twice is harmless, but a late stop may do
 harm. The stop is sent first and recorded afterwards.
+
+A gateway subscribes to a line's subjects only while it polls the line. For a line without a master, the
+server therefore reports to a sender that there is no receiver. Each message arrives once on each path; the
+desks recognise copies by the id that the sender chose. No stream stores these messages.
 """
 
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
+import secrets
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from hashlib import sha256
 from typing import Any
 
+from nats.aio.msg import Msg
+
 from multidrop import Unsupported
 from multidrop.control import CommandResult, written_by
 from multidrop.control.commands import LineStop, RepeatedStops, begin_command, stop_line
-from multidrop.fleet.commands.held_lines import HeldLine, HeldLines
-from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.messages import (
     CommandAnswer,
+    CommandLog,
     CommandOutcome,
     CommandRequest,
     Offered,
     StopRequest,
+    encode,
     read_command,
     read_json,
     read_stop,
     spelt,
     worst,
 )
-from multidrop.fleet.commands.offers import Offer, Offers, Prepared, prepare
+from multidrop.fleet.commands.offers import HeldLine, HeldLines, Offer, Offers, Prepared, prepare
 from multidrop.fleet.leases.lease import boottime_ns
+from multidrop.fleet.servers import names
+from multidrop.fleet.servers.connections import ServerPath
 from multidrop.plant import drive_meant
 from multidrop.supervisor import supervisor
 
@@ -252,10 +262,10 @@ class StopDesk:
         return answer if answer.ok or is_ours else None
 
     def _so_far(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
-        names = held.drives if request.drives is None else request.drives
+        asked = held.drives if request.drives is None else request.drives
         known = held.bus.stops_under_way()
         drives = {
-            name: CommandAnswer(CommandOutcome.UNDER_WAY, known[name]) for name in names if name in known
+            name: CommandAnswer(CommandOutcome.UNDER_WAY, known[name]) for name in asked if name in known
         }
         text = "; ".join(answer.text for answer in drives.values())
         text = text or f"line {held.name}: a stop is under way"
@@ -277,18 +287,18 @@ class StopDesk:
         """Stop the drives in parallel. If a drive's stop is already being repeated, send one more command."""
         self._offers.void(held.name, request.drives, CALLED)
         drives = held.drives
-        names = list(drives) if request.drives is None else list(dict.fromkeys(request.drives))
-        asked = [drives[name] for name in names if name in drives]
-        whole = partial(stop_line, lambda: held.bus, [*drives]) if len(asked) == len(drives) else None
+        asked = list(drives) if request.drives is None else list(dict.fromkeys(request.drives))
+        stopped = [drives[name] for name in asked if name in drives]
+        whole = partial(stop_line, lambda: held.bus, [*drives]) if len(stopped) == len(drives) else None
         with written_by(request.by, WAY):
-            waited = self._repeated.begin([LineStop(asked, whole)])
-        printed = [spelt(name) for name in names]
+            waited = self._repeated.begin([LineStop(stopped, whole)])
+        printed = [spelt(name) for name in asked]
         _log.warning("stop of %s, asked for by %s", ", ".join(printed), request.by)
         record = {"id": request.id, "line": held.name, "what": "stop", "drives": printed, "by": request.by}
         self._note({"step": "begun", **record, "gateway": self.gateway})
         there = f"line {held.name} has no such drive; it has {', '.join(drives) or 'none'}"
         missing = CommandAnswer(CommandOutcome.REFUSED, f"no stop was sent: {there}")
-        found = {name: missing for name in names if name not in drives}
+        found = {name: missing for name in asked if name not in drives}
         for results in await asyncio.gather(*waited):
             found |= {name: CommandAnswer.of(name, result) for name, result in results.items()}
         text = "; ".join(answer.text for answer in found.values()) or f"line {held.name} has no drives"
@@ -305,3 +315,75 @@ class StopDesk:
             await self._log.note(record)
         except Exception as failure:
             _log.warning("a stop is not in the log of commands: %s", failure)
+
+
+# ---- NATS ----
+
+Heard = Callable[[bytes], Awaitable[Offered | CommandAnswer | None]]
+
+
+class CommandSubjects:
+    """The subscriptions for commands and stops, in one run of a gateway."""
+
+    def __init__(self, gateway: str, paths: Sequence[ServerPath], lines: HeldLines, log: CommandLog) -> None:
+        self._paths = paths
+        self._lines = lines
+        self.desk = CommandDesk(gateway, names.do_subject(gateway, secrets.token_hex(8)), lines, log)
+        self._stops = StopDesk(gateway, lines, self.desk.offers, log)
+
+    async def begin(self) -> None:
+        """Subscribe to the subject on which senders return this process's tokens."""
+        await self._subscribe(self.desk.subject, self.desk.do)
+
+    def open(self, line: str, description: Any) -> None:
+        """Accept commands and stops for a line from now on."""
+        self._lines.open(line, description)
+        self._change(self._subscribe(names.command_subject(line), partial(self._offer, line)))
+        self._change(self._subscribe(names.stop_subject(line), partial(self._stops.stop, line)))
+
+    def leave(self, line: str) -> None:
+        """Accept only stops for a line from now on."""
+        self._lines.leave(line)
+        self._change(self._unsubscribe(names.command_subject(line)))
+
+    def shut(self, line: str) -> None:
+        """Accept neither commands nor stops for a line from now on."""
+        self._lines.shut(line)
+        self._change(self._unsubscribe(names.command_subject(line), names.stop_subject(line)))
+
+    async def _offer(self, line: str, data: bytes) -> Offered | CommandAnswer | None:
+        return self.desk.offer(line, data)
+
+    async def _subscribe(self, subject: str, heard: Heard) -> None:
+        async def take(message: Msg) -> None:
+            # in a task, so that messages do not wait for each other
+            supervisor().start("answer", _answer(message, heard))
+
+        await asyncio.gather(*(path.subscribe(subject, take) for path in self._paths))
+
+    async def _unsubscribe(self, *subjects: str) -> None:
+        await asyncio.gather(*(path.unsubscribe(one) for path in self._paths for one in subjects))
+
+    def _change(self, work: Coroutine[Any, Any, None]) -> None:
+        """Change subscriptions in a task. A failure ends the gateway, because it could miss stops."""
+
+        async def change() -> None:
+            try:
+                await work
+            except Exception as failure:
+                supervisor().note_dead("commands", f"{type(failure).__name__}: {failure}", failure)
+
+        supervisor().start("subjects", change())
+
+
+async def _answer(message: Msg, heard: Heard) -> None:
+    try:
+        answer = await heard(message.data)
+    except Exception:
+        _log.exception("a message to %s", message.subject)
+        return
+    if answer is None or not names.is_inbox(message.reply):
+        return
+    data = json.dumps(answer.as_json()).encode() if isinstance(answer, CommandAnswer) else encode(answer)
+    with suppress(Exception):  # the sender may have disconnected
+        await message.respond(data)

@@ -10,10 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.messages import (
     UNNAMED,
     CommandAnswer,
+    CommandLog,
     CommandOutcome,
     CommandRequest,
     Offered,
