@@ -34,7 +34,7 @@ from multidrop.control.ramp import start_staggered
 from multidrop.control.records import WriteRecords
 from multidrop.control.stops import LEAST_S, StopAttempt, stop_together
 from multidrop.core import Completion, Exchange
-from multidrop.drive import Drive, Script, verb
+from multidrop.drive import Drive, Script, carry_out, insist, read, until, verb, wait, write
 from multidrop.errors import CancelledByStop, Unconfirmed, WriteForbidden
 from multidrop.families import InvtCHE
 from multidrop.sim import MotorDrive, simulated
@@ -373,19 +373,21 @@ FAILURES: dict[str, Callable[[], BaseException]] = {
 
 HOME = Path(multidrop.__file__).parent
 
-SCRIPTS = tuple(str(HOME / name) for name in ("families", "drive/script.py"))
+SCRIPTS = str(HOME / "families")
+
+STEPS = {one.__code__ for one in (carry_out, insist, read, until, wait, write)}
 
 ATTEMPT = (str(HOME / "control/stops.py"), str(HOME / "drive/family.py"))
 
 
 @cache
 def has_lines_that_count(file: str) -> bool:
-    return file.startswith((*SCRIPTS, *ATTEMPT))
+    return file.startswith((SCRIPTS, *ATTEMPT))
 
 
 def counts(frame: FrameType) -> bool:
     code = frame.f_code
-    return has_lines_that_count(code.co_filename) or code is stop_together.__code__
+    return has_lines_that_count(code.co_filename) or code in STEPS or code is stop_together.__code__
 
 
 @pytest.fixture

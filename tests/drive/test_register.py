@@ -22,12 +22,20 @@ from multidrop.core import Message, NumberFormat
 from multidrop.drive import Drive, StateReader, WriteForbidden, chosen_language
 from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.line_settings import Settings
-from multidrop.drive.register import COIL, INPUT, Kept, Register, command, reading, setting
-from multidrop.drive.script import Script, read
+from multidrop.drive.register import (
+    COIL,
+    INPUT,
+    LANGUAGES,
+    Kept,
+    Register,
+    catalogue,
+    command,
+    reading,
+    setting,
+)
 from multidrop.drive.state import State
 from multidrop.drive.text import Text, text
-from multidrop.drive.titles import LANGUAGES, catalogue
-from multidrop.drive.verbs import verb
+from multidrop.drive.verbs import Script, read, verb
 from multidrop.families import MODELS
 from multidrop.families.registry import SHIPPED, shipped_family
 from multidrop.scan.identify import _read

@@ -16,7 +16,7 @@ from multidrop.control.stops import StopAttempt, stop_together
 from multidrop.core import Latch, Message
 from multidrop.drive import Drive
 from multidrop.drive.register import HOLDING
-from multidrop.drive.script import Insist, Script
+from multidrop.drive.verbs import Insist, Script
 from multidrop.planning.blocks import planned
 from multidrop.planning.prediction import predict
 from multidrop.planning.schedule import Job, Schedule

@@ -17,7 +17,7 @@ from toy import Toy
 
 import multidrop
 from multidrop import steps
-from multidrop.drive.script import Read, Wait
+from multidrop.drive.verbs import Read, Wait
 from multidrop.polling.batch import Row
 from multidrop.recording import FORMATS, open_writer
 

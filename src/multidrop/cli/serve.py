@@ -22,8 +22,8 @@ from multidrop.cli.support.log_thread import LogThread, add_log_argument, loggin
 from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.signals import on_end_signals, on_reload_signal, run_loop
 from multidrop.cli.support.values import counted
+from multidrop.drive.family import verbs_of
 from multidrop.drive.known_state import can_show_fault
-from multidrop.drive.named_verbs import verbs_of
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 

@@ -36,8 +36,8 @@ from multidrop.control.audit_log import AuditLog
 from multidrop.control.outcome import Seen, Stopped
 from multidrop.control.stops import LEAST_S
 from multidrop.drive.family import Drive
-from multidrop.drive.script import Script, Write
 from multidrop.drive.state import Direction, State
+from multidrop.drive.verbs import Script, Write
 from multidrop.errors import LineError, Unsupported
 from multidrop.plant.model import Plant, PlantLine
 

@@ -20,9 +20,8 @@ from multidrop.control.stops import Stopper
 from multidrop.core import Message
 from multidrop.drive.family import Drive, check_own, check_own_text
 from multidrop.drive.register import Register
-from multidrop.drive.script import Script
 from multidrop.drive.text import Text
-from multidrop.drive.verbs import CalledStop
+from multidrop.drive.verbs import CalledStop, Script
 from multidrop.transport.aside_log import log_aside
 from multidrop.transport.exchange import Exchanges
 

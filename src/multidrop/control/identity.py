@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 from multidrop.core import PAUSE_NS, Peer
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
-from multidrop.drive.script import Read, Script, Step, Wait, carry_out
+from multidrop.drive.verbs import Read, Script, Step, Wait, carry_out
 from multidrop.errors import (
     ANOTHER_FAMILY,
     BadReply,

@@ -17,7 +17,7 @@ from multidrop.core import Message
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.request import check_no_read
-from multidrop.drive.script import Insist, Read, Script, Step, Wait, Write, carry_out
+from multidrop.drive.verbs import Insist, Read, Script, Step, Wait, Write, carry_out
 from multidrop.errors import (
     BadReply,
     CancelledByStop,

@@ -13,8 +13,8 @@ from multidrop.control.rules import conditions, raw_count, wears
 from multidrop.core import PAUSE_NS
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Kept, Register
-from multidrop.drive.script import Script, Write, read, wait
 from multidrop.drive.state import Direction
+from multidrop.drive.verbs import Script, Write, read, wait
 from multidrop.errors import WriteForbidden
 from multidrop.transport import clock
 

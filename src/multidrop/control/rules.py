@@ -9,9 +9,8 @@ from typing import Any, TypeVar
 
 from multidrop.drive.family import Drive, check_own
 from multidrop.drive.register import Access, Carrier, Kept, Register
-from multidrop.drive.script import Script, read
 from multidrop.drive.state import Condition
-from multidrop.drive.verbs import VERBS
+from multidrop.drive.verbs import VERBS, Script, read
 from multidrop.errors import Advice, Unsupported, WriteForbidden
 
 T = TypeVar("T", bound=float)

@@ -19,8 +19,7 @@ from multidrop.control.outcome import Outcome, Seen, Stopped, result_of_stop
 from multidrop.control.writer import Writer
 from multidrop.core import Message
 from multidrop.drive.family import Drive
-from multidrop.drive.script import Pulse, Read, Script, Step, Wait, Write
-from multidrop.drive.verbs import CommandResult
+from multidrop.drive.verbs import CommandResult, Pulse, Read, Script, Step, Wait, Write
 from multidrop.errors import (
     BadReply,
     BusError,

@@ -17,7 +17,7 @@ from multidrop.core import Completion, Failure, Message, build_request
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Kept, Register
 from multidrop.drive.request import write_request
-from multidrop.drive.script import Step, Wait, Write, carry_out
+from multidrop.drive.verbs import Step, Wait, Write, carry_out
 from multidrop.errors import (
     BadReply,
     BusError,

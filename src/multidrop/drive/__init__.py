@@ -3,11 +3,10 @@
 from multidrop.core import Framing
 from multidrop.drive.declaration_check import DeclarationError as DeclarationError
 from multidrop.drive.family import Drive
+from multidrop.drive.family import verbs_of as verbs_of
 from multidrop.drive.known_state import FAULT_RECORDS as FAULT_RECORDS
 from multidrop.drive.known_state import StateReader as StateReader
 from multidrop.drive.known_state import can_show_fault as can_show_fault
-from multidrop.drive.named_verbs import verb_arguments as verb_arguments
-from multidrop.drive.named_verbs import verbs_of as verbs_of
 from multidrop.drive.options import Option
 from multidrop.drive.register import COIL as COIL
 from multidrop.drive.register import DISCRETE as DISCRETE
@@ -18,15 +17,15 @@ from multidrop.drive.register import Access as Access
 from multidrop.drive.register import Carrier as Carrier
 from multidrop.drive.register import Kept as Kept
 from multidrop.drive.register import Table as Table
+from multidrop.drive.register import chosen_language as chosen_language
 from multidrop.drive.request import DEVICE_ID as DEVICE_ID
 from multidrop.drive.request import MEI_DEVICE_ID as MEI_DEVICE_ID
 from multidrop.drive.request import SERVER_ID as SERVER_ID
 from multidrop.drive.request import STATUS as STATUS
-from multidrop.drive.script import Read, Script, Wait, carry_out, insist, read, until, wait, write
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.text import Text as Text
-from multidrop.drive.titles import chosen_language as chosen_language
-from multidrop.drive.verbs import verb
+from multidrop.drive.verbs import Read, Script, Wait, carry_out, insist, read, until, verb, wait, write
+from multidrop.drive.verbs import verb_arguments as verb_arguments
 from multidrop.errors import (
     ANOTHER_FAMILY,
     Advice,

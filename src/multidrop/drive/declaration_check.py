@@ -13,10 +13,9 @@ from multidrop.core import MOST_INVALID, Framing, NumberFormat
 from multidrop.drive.line_settings import LONGEST_SILENCE, Settings
 from multidrop.drive.number_format import FLOATS, ORDERS, WORDS, width
 from multidrop.drive.options import Option
-from multidrop.drive.register import Access, Carrier, Kept, Register, Table
+from multidrop.drive.register import LANGUAGES, Access, Carrier, Kept, Register, Table
 from multidrop.drive.request import LONGEST_INTERVAL, STANDARD_LIMITS, may_be_crossed, read_limit
 from multidrop.drive.text import Text
-from multidrop.drive.titles import LANGUAGES
 from multidrop.printable import is_whole
 
 LAST_ADDRESS = 0xFFFF

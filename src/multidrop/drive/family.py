@@ -22,10 +22,19 @@ from multidrop.drive.link import NO_LINK, Link, RegisterAccess
 from multidrop.drive.options import Option, checked_options, confirmation, doubt
 from multidrop.drive.parameters import Parameter, ParameterSpace
 from multidrop.drive.register import Access, Kept, Register, Table
-from multidrop.drive.script import Script, read, until, write
 from multidrop.drive.state import Condition, Direction, KnownSetpoint, State
 from multidrop.drive.text import Text
-from multidrop.drive.verbs import MOVING, CalledStop, verb, verb_errors
+from multidrop.drive.verbs import (
+    MOVING,
+    VERB_OPTIONS,
+    CalledStop,
+    Script,
+    read,
+    until,
+    verb,
+    verb_errors,
+    write,
+)
 from multidrop.errors import Advice, NotVerified, Unconfirmed, Unsupported, WriteForbidden
 from multidrop.printable import did_you_mean
 
@@ -537,6 +546,11 @@ TAKEN_NAMES = frozenset(
     {*dir(Drive), *("address", "framing", "settings", "agreed_silence", "response_delay", "name")}
     | {"option", "ram", "link"}
 )
+
+
+def verbs_of(drive: Drive) -> list[str]:
+    """Return the names of the verbs that command this drive."""
+    return [name for name in VERB_OPTIONS if getattr(type(drive), name) is not getattr(Drive, name)]
 
 
 # ---- checks that a register belongs to the drive's family, because families use addresses differently ----

@@ -8,8 +8,8 @@ from typing import Any, cast
 
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
-from multidrop.drive.script import Read
 from multidrop.drive.state import Condition, State
+from multidrop.drive.verbs import Read
 from multidrop.errors import BusError
 
 MOST_STEPS = 20

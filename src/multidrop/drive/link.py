@@ -6,9 +6,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, NoReturn, Protocol, TypeVar, cast, overload
 
 from multidrop.drive.register import Register
-from multidrop.drive.script import Script
 from multidrop.drive.text import Text
-from multidrop.drive.verbs import CalledStop, UnattachedStop
+from multidrop.drive.verbs import CalledStop, Script, UnattachedStop
 from multidrop.errors import NotAttached
 
 T = TypeVar("T", bound=float)

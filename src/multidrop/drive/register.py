@@ -1,4 +1,4 @@
-"""Registers: the manual's facts about one quantity, and its values in replies and requests.
+"""Registers: the manual's facts about one quantity, its titles, and its values in replies and requests.
 
 `Register[float]` has a unit and a step, `Register[E]` the names of an enumeration. Declare them with
 `reading`, `setting` and `command`.
@@ -7,13 +7,16 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
-from collections.abc import Callable, Mapping
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
 from enum import Enum, Flag, IntEnum, IntFlag
 from fractions import Fraction
-from functools import cached_property
+from functools import cache, cached_property
+from importlib.resources import files
 from typing import Any, Generic, Protocol, Self, TypedDict, TypeVar, Unpack, cast, overload
 
 from multidrop.core import Extra, Field, NumberFormat
@@ -27,7 +30,6 @@ from multidrop.drive.number_format import (
     bits_of,
     shortest,
 )
-from multidrop.drive.titles import catalogue
 from multidrop.printable import plain_number, plain_whole
 
 
@@ -518,3 +520,26 @@ def _extra(register: Register[Any], at: int) -> Extra | None:
         invalid=coding.invalid_patterns,
         scale_invalid=power.coding.invalid_patterns if power else (),
     )
+
+
+LANGUAGES = ("ru", "zh")  # languages of the catalogue, besides English
+ENGLISH = "en"
+_CODE = re.compile(r"[A-Za-z]{2}(?![A-Za-z])")  # the language in a tag such as ru-RU, or ru_RU.UTF-8
+
+
+@cache
+def catalogue(language: str) -> Mapping[str, str]:
+    """Return the titles in a language, by the register's name; none for English or an unknown language."""
+    if language not in LANGUAGES:
+        return {}
+    file = files("multidrop.drive") / "catalogue" / f"{language}.toml"
+    return tomllib.loads(file.read_text("utf-8"))
+
+
+def chosen_language(tags: Iterable[str]) -> str:
+    """Return the first language of these tags in which titles are known; English if there is none.
+
+    A tag is such as `ru`, `zh-CN` or `ru_RU.UTF-8`.
+    """
+    codes = (match[0].lower() for tag in tags if (match := _CODE.match(tag.strip())))
+    return next((code for code in codes if code in (*LANGUAGES, ENGLISH)), ENGLISH)

@@ -1,11 +1,13 @@
-"""Verbs: methods of a drive that are scripts, and are carried out on its bus."""
+"""Verbs: methods of a drive that are scripts, and the steps that scripts yield to the drive's bus."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass
 from enum import StrEnum
 from inspect import Signature, signature
 from numbers import Real
+from sys import float_info
 from typing import (
     TYPE_CHECKING,
     Any,
@@ -19,12 +21,121 @@ from typing import (
     overload,
 )
 
-from multidrop.drive.script import Script
+from multidrop.drive.register import Register
 from multidrop.drive.state import Direction
-from multidrop.errors import BusError
+from multidrop.drive.text import Text
+from multidrop.errors import BadReply, BusError, DriveException, NoReply, Unconfirmed
+from multidrop.printable import is_number
 
 if TYPE_CHECKING:
     from multidrop.drive.family import Drive
+
+MOST_UNANSWERED = 3  # number of checks in a row without a valid reply after which `until` raises the error
+
+T = TypeVar("T", bound=float)
+R = TypeVar("R")
+P = ParamSpec("P")
+
+
+@dataclass(frozen=True)
+class Read:
+    register: Register[Any] | Text
+
+
+@dataclass(frozen=True)
+class Write:
+    register: Register[Any]
+    value: Any
+
+
+@dataclass(frozen=True)
+class Insist(Write):
+    """A write that is harmless at any time, even if repeated, such as a stop."""
+
+
+@dataclass(frozen=True)
+class Pulse(Insist):
+    """A harmless write that is sent only once in a call, such as a stop that trips the drive."""
+
+
+@dataclass(frozen=True)
+class Wait:
+    seconds: float
+
+
+Step = Read | Write | Wait
+Script = Generator[Step, Any, R]
+
+
+@overload
+def read(register: Register[T]) -> Script[T]: ...
+@overload
+def read(register: Text) -> Script[str]: ...
+def read(register: Register[Any] | Text) -> Script[Any]:
+    """Read a register's value, or a text: `value = yield from read(register)`."""
+    return (yield Read(register))
+
+
+def write(register: Register[T], value: T) -> Script[T]:
+    """Write a value once; return the value read back, or `value` if the register cannot be read."""
+    return cast(T, (yield Write(register, value)))
+
+
+def wait(seconds: float) -> Script[None]:
+    yield Wait(seconds)
+
+
+def carry_out(script: Script[R], do: Callable[[Step], Any]) -> R:
+    """Run a script, calling `do` for each step, and return the script's result.
+
+    A BusError or ValueError that `do` raises is raised in the script.
+    """
+    try:
+        step = next(script)
+        while True:
+            try:
+                result = do(step)
+            except (BusError, ValueError) as failure:
+                step = script.throw(failure)
+            else:
+                step = script.send(result)
+    except StopIteration as end:
+        return cast(R, end.value)
+
+
+def insist(register: Register[T], value: T, attempts: int = 3) -> Script[None]:
+    """Write a harmless value, such as a stop; repeat the write if the reply is lost or is an exception."""
+    for attempt in range(1, attempts + 1):
+        try:
+            yield Insist(register, value)
+        except (Unconfirmed, DriveException):
+            if attempt == attempts:
+                raise
+        else:
+            return
+
+
+def until(look: Callable[[], Script[bool]], *, limit: float, every: float = 0.1) -> Script[bool]:
+    """Repeat a check every `every` seconds until it is true; return False after `limit` seconds.
+
+    A starting motor causes noise, so a check without a valid reply counts as false. The third such check in
+    a row raises its NoReply or BadReply.
+    """
+    waited = 0.0
+    unanswered = 0
+    while True:
+        try:
+            if (yield from look()):
+                return True
+            unanswered = 0
+        except (NoReply, BadReply):
+            unanswered += 1
+            if unanswered == MOST_UNANSWERED:
+                raise
+        if waited >= limit:
+            return False
+        yield from wait(every)
+        waited += every
 
 
 class CommandOutcome(StrEnum):
@@ -55,9 +166,6 @@ class CommandResult(NamedTuple):
         """True if the command was carried out; for a stop, if the motor was seen at rest."""
         return self.outcome is CommandOutcome.DONE
 
-
-R = TypeVar("R")
-P = ParamSpec("P")
 
 # Verbs that are sent only to an identified drive, and not after a stop was called.
 MOVING = ("start", "jog", "reset_fault", "set_frequency", "release_control")
@@ -257,3 +365,46 @@ def verb_errors(family: Any) -> list[str]:
         and name not in family.texts
         and not isinstance(getattr(family, name), Verb)
     ]
+
+
+def _direction(value: object) -> Direction:
+    try:
+        return Direction(value)
+    except ValueError:
+        raise ValueError(f"direction = {value!r} is neither forward nor reverse") from None
+
+
+def _hertz(value: object) -> float:
+    if not is_number(value) or not abs(value) <= float_info.max:
+        raise ValueError(f"hz = {value!r} is not a number")
+    return float(value)
+
+
+# By verb that commands a drive: its options, and the functions that convert their JSON values.
+VERB_OPTIONS: Mapping[str, Mapping[str, Callable[[object], Any]]] = {
+    "start": {"direction": _direction},
+    "jog": {"direction": _direction},
+    "reset_fault": {},
+    "set_frequency": {"hz": _hertz},
+    "coast": {},  # not part of "stop", because coasting lets a hoist drop its load
+    "emergency_stop": {},
+    "stop": {},
+}
+LISTED_VERBS = tuple(
+    name for name in VERB_OPTIONS if name != "stop"
+)  # verbs that a plant's list `may` can allow
+
+
+def verb_arguments(verb: str, options: Mapping[str, object]) -> dict[str, Any]:
+    """Convert options with JSON values into the keyword arguments of a verb.
+
+    `{"direction": "reverse"}` becomes Direction.REVERSE; `hz` is in Hz. An option that is None is omitted.
+    Raises ValueError for an unknown, missing or invalid option, KeyError for an unknown verb.
+    """
+    takes = VERB_OPTIONS[verb]
+    for name in options:
+        if name not in takes:
+            raise ValueError(f"{verb} has no option {name!r}; it has {', '.join(takes) or 'none'}")
+    if "hz" in takes and options.get("hz") is None:
+        raise ValueError(f"{verb} needs a frequency: hz = 20.0")
+    return {name: takes[name](value) for name, value in options.items() if value is not None}

@@ -21,9 +21,8 @@ from multidrop.drive.register import (
     reading,
     setting,
 )
-from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.verbs import verb
+from multidrop.drive.verbs import Script, insist, read, verb, write
 
 STOP_TIME = 60.0  # s; the parameter number of the deceleration time is not known
 

@@ -20,9 +20,8 @@ from multidrop.drive.register import (
     reading,
     setting,
 )
-from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.verbs import verb
+from multidrop.drive.verbs import Script, insist, read, verb, write
 
 STOP_MARGIN = 5.0  # s; a stop may take this much longer than the deceleration time
 UNKNOWN_RAMP = 30.0  # s; allowed time of a stop if the deceleration time cannot be read

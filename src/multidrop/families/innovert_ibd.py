@@ -8,9 +8,8 @@ from multidrop.drive import Advice, BusError, Drive, DriveException, Framing, Wr
 from multidrop.drive.options import Option
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace
 from multidrop.drive.register import HOLDING, command, reading, setting
-from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.verbs import verb
+from multidrop.drive.verbs import Script, insist, read, verb, write
 
 STOP_MARGIN = 5.0  # s; a stop may take this much longer than the deceleration time
 

@@ -28,9 +28,8 @@ from multidrop.drive.register import (
     reading,
     setting,
 )
-from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.verbs import verb
+from multidrop.drive.verbs import Script, insist, read, verb, write
 
 CHE100 = "CHE100 manual v1.4, p. 117"
 CHE100_NEXT = "CHE100 manual v1.4, p. 118"

@@ -15,7 +15,7 @@ from typing import Any
 from multidrop.drive.family import Drive
 from multidrop.drive.number_format import NumberFormat
 from multidrop.drive.register import HOLDING, Register, reading
-from multidrop.drive.script import Script, read
+from multidrop.drive.verbs import Script, read
 from multidrop.families.innovert_ibd import IBDBaudrate
 
 

@@ -12,9 +12,8 @@ from multidrop.drive import BusError, Drive, DriveException, NotVerified, Unconf
 from multidrop.drive.options import Option
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace
 from multidrop.drive.register import HOLDING, Details, Kept, Register, command, reading, setting
-from multidrop.drive.script import Pulse, Script, insist, read, until, wait, write
 from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.verbs import verb
+from multidrop.drive.verbs import Pulse, Script, insist, read, until, verb, wait, write
 
 STOP_MARGIN = 5.0  # s; a stop may take this much longer than the deceleration time
 SELECTION_TIME = 1.0  # s within which 1202H shows a newly selected preset speed

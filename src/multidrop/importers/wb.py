@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from multidrop.drive.titles import LANGUAGES
+from multidrop.drive.register import LANGUAGES
 from multidrop.families.files.registers import LONGEST_TITLE
 from multidrop.importers.device import (
     UNKNOWN_LINE,

@@ -15,10 +15,10 @@ from unicodedata import normalize
 import multidrop
 from multidrop.channels import Channel, DriveSeries
 from multidrop.core import RS485, Echo, TransactionIds
-from multidrop.drive.family import Drive
+from multidrop.drive.family import Drive, verbs_of
 from multidrop.drive.line_settings import check_port
-from multidrop.drive.named_verbs import LISTED_VERBS, verbs_of
 from multidrop.drive.register import Register
+from multidrop.drive.verbs import LISTED_VERBS
 from multidrop.planning.blocks import Planned, planned
 from multidrop.planning.prediction import predict, prediction_metadata
 from multidrop.printable import did_you_mean

@@ -10,8 +10,8 @@ from multidrop.core import Framing
 from multidrop.drive import Kept
 from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import SERIAL_ADDRESSES
-from multidrop.drive.named_verbs import LISTED_VERBS
 from multidrop.drive.options import Option
+from multidrop.drive.verbs import LISTED_VERBS
 from multidrop.families import MODELS
 from multidrop.families.registry import SHIPPED, installed_models, shipped_family
 from multidrop.plant.loader import CHANNEL_KEYS, DRIVE_KEYS, LINE_KEYS, PLANT_KEYS, POLL_KEYS

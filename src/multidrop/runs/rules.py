@@ -9,8 +9,8 @@ from multidrop.control.ramp import check_worn
 from multidrop.control.rules import check_plain, conditions, raw_count, refused, wears
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Kept
-from multidrop.drive.script import Write
 from multidrop.drive.state import Direction
+from multidrop.drive.verbs import Write
 from multidrop.errors import Unsupported
 from multidrop.plant.model import Plant
 from multidrop.runs.model import RunStep

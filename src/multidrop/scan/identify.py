@@ -13,8 +13,8 @@ from multidrop.core import STATUSES, Completion, Failure, FrameFault, Framing, M
 from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import Settings
 from multidrop.drive.register import Register
-from multidrop.drive.script import Read, Script, Step, carry_out
 from multidrop.drive.text import Text
+from multidrop.drive.verbs import Read, Script, Step, carry_out
 from multidrop.errors import BusError, NoValue, WriteForbidden
 from multidrop.planning.blocks import blocks, text_blocks
 from multidrop.scan.results import GUESS, Found

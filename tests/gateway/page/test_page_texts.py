@@ -18,8 +18,8 @@ from watching import Opener, aborting, until, until_met, until_settled, violatio
 from multidrop.control import CommandOutcome
 from multidrop.control.outcome import Effect, Seen
 from multidrop.core.result import Status
-from multidrop.drive.named_verbs import LISTED_VERBS
 from multidrop.drive.register import Access
+from multidrop.drive.verbs import LISTED_VERBS
 from multidrop.fleet.leases.member import MemberState
 from multidrop.gateway.http.page_files import PAGE, read_files
 from multidrop.gateway.http.rights import Right

@@ -12,8 +12,7 @@ from unicodedata import combining, east_asian_width
 
 from multidrop.cli.support.output import warn
 from multidrop.core import NumberFormat
-from multidrop.drive.register import Register, unnamed_bits
-from multidrop.drive.titles import chosen_language
+from multidrop.drive.register import Register, chosen_language, unnamed_bits
 
 Row = Sequence[str]
 T = TypeVar("T", bound=float)

@@ -20,6 +20,7 @@ from multidrop.drive.declaration_check import MOST_COUNTS
 from multidrop.drive.family import TAKEN_NAMES
 from multidrop.drive.register import (
     HOLDING_MULTIPLE,
+    LANGUAGES,
     Access,
     Carrier,
     Kept,
@@ -28,7 +29,6 @@ from multidrop.drive.register import (
     reading,
     setting,
 )
-from multidrop.drive.titles import LANGUAGES
 from multidrop.families.files import notation
 from multidrop.families.files.notation import TABLES, Counting
 from multidrop.printable import did_you_mean, is_number, is_whole

@@ -18,9 +18,8 @@ from multidrop.drive.options import Option
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace
 from multidrop.drive.register import Register, Table
 from multidrop.drive.request import LONGEST_INTERVAL, STANDARD_LIMITS
-from multidrop.drive.script import Script, read
 from multidrop.drive.text import Text, text
-from multidrop.drive.verbs import Verb, verb
+from multidrop.drive.verbs import Script, Verb, read, verb
 from multidrop.errors import WriteForbidden
 from multidrop.families.files.notation import TABLES, Counting
 from multidrop.families.files.registers import ADDRESS, BESIDE, WRITES, converted, shown, unusable

@@ -6,9 +6,8 @@ from enum import IntEnum, IntFlag
 from typing import ClassVar
 
 from multidrop.drive.register import Access
-from multidrop.drive.script import Script, read, write
 from multidrop.drive.state import Condition, Direction
-from multidrop.drive.verbs import verb
+from multidrop.drive.verbs import Script, read, verb, write
 from multidrop.families.profiles.profile import COMMON, READING, Profile, Role
 
 STOPPED, STOPPING, STANDBY, RUNNING = range(4)  # values of bits 1 and 0 of the status

@@ -8,8 +8,8 @@ from typing import ClassVar
 
 from multidrop.drive import NotVerified, WriteForbidden
 from multidrop.drive.register import Access
-from multidrop.drive.script import Script, insist, until, wait, write
 from multidrop.drive.state import Condition, Direction
+from multidrop.drive.verbs import Script, insist, until, wait, write
 from multidrop.families.profiles.profile import COMMON, Profile, Role
 
 

@@ -9,9 +9,8 @@ from typing import Any, ClassVar, cast
 
 from multidrop.drive import BusError, DriveException, WriteForbidden
 from multidrop.drive.register import Access
-from multidrop.drive.script import Script, insist, read, write
 from multidrop.drive.state import Condition, Direction
-from multidrop.drive.verbs import verb
+from multidrop.drive.verbs import Script, insist, read, verb, write
 from multidrop.families.profiles.profile import COMMON, READING, Profile, Role
 
 

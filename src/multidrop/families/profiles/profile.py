@@ -21,9 +21,8 @@ from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.number_format import NumberFormat
 from multidrop.drive.options import Option
 from multidrop.drive.register import Access, Carrier, Register
-from multidrop.drive.script import Script, insist, read, until, write
 from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.verbs import verb
+from multidrop.drive.verbs import Script, insist, read, until, verb, write
 
 _CODED = "what the profile itself says; leave it out"
 

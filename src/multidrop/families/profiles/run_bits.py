@@ -7,8 +7,8 @@ from typing import ClassVar
 
 from multidrop.drive import WriteForbidden
 from multidrop.drive.register import Access
-from multidrop.drive.script import Script
 from multidrop.drive.state import Direction
+from multidrop.drive.verbs import Script
 from multidrop.families.profiles.profile import COMMON, Profile, Role
 
 
