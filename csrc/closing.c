@@ -1,8 +1,10 @@
 /* Close a serial port in bounded time.
  *
- * On Linux close(2) waits up to 30 s for the adapter to take the driver's bytes (closing_wait, which only
+ * On Linux closing waits up to 30 s for the adapter to take the driver's bytes (closing_wait, which only
  * root may change). A signal to the closing thread ends the wait, and the driver then discards the bytes. A
- * timer sends this signal to the closing thread only. The program does not otherwise use the signal. */
+ * timer sends this signal to the closing thread only. The program does not otherwise use the signal.
+ *
+ * dup2(2) closes the port too. It needs no free descriptor, and pyserial may later close its own. */
 #define _GNU_SOURCE
 #include "internal.h"
 
@@ -18,7 +20,7 @@
 #define sigev_notify_thread_id _sigev_un._tid
 #endif
 
-static const int64_t AGAIN_NS = 20000000; /* repeat the signal: the first may come before close(2) */
+static const int64_t AGAIN_NS = 20000000; /* repeat the signal: the first may come before the wait */
 
 static void interrupt(int number)
 {
@@ -47,7 +49,7 @@ static int take_signal(void)
     return -1;
 }
 
-int md_port_close(int fd, int64_t most_ns)
+int md_port_close(int fd, int other, int64_t most_ns)
 {
     struct sigevent event = {.sigev_notify = SIGEV_THREAD_ID, .sigev_signo = take_signal()};
     struct itimerspec times = {timespec_of(AGAIN_NS), timespec_of(later(most_ns, 1))};
@@ -56,7 +58,7 @@ int md_port_close(int fd, int64_t most_ns)
     int is_timed = event.sigev_signo > 0 && timer_create(CLOCK_MONOTONIC, &event, &timer) == 0;
     if (is_timed)
         timer_settime(timer, 0, &times, NULL);
-    int failure = close(fd) ? -errno : 0;
+    int failure = dup2(other, fd) < 0 ? -errno : 0;
     if (is_timed)
         timer_delete(timer);
     return failure;
@@ -64,10 +66,10 @@ int md_port_close(int fd, int64_t most_ns)
 
 #else
 
-int md_port_close(int fd, int64_t most_ns)
+int md_port_close(int fd, int other, int64_t most_ns)
 {
     (void)most_ns;
-    return close(fd) ? -errno : 0;
+    return dup2(other, fd) < 0 ? -errno : 0;
 }
 
 #endif

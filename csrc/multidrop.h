@@ -104,8 +104,9 @@ uint32_t md_port_baud_base(int fd);
 
 /* ---- closing.c: return 0 or -errno ---- */
 
-/* Close the descriptor. The driver has `most_ns` to send its remaining bytes; then it discards them. */
-int md_port_close(int fd, int64_t most_ns);
+/* Close the port behind `fd`, which then refers to the file of `other`. The driver has `most_ns` to send its
+ * remaining bytes; then it discards them. */
+int md_port_close(int fd, int other, int64_t most_ns);
 
 /* ---- clock.c: return a time ---- */
 

@@ -20,6 +20,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from line_driver import LineDriver
@@ -36,7 +37,7 @@ from multidrop.core import (
     Port,
     build_reply,
     build_request,
-    close_descriptor,
+    close_behind,
 )
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="other systems do not count a pair's bytes")
@@ -335,12 +336,12 @@ def test_a_stop_does_not_wait_although_the_count_of_unsent_bytes_may_be_out_of_d
     assert not port.miscounts
 
 
-def test_close_descriptor_does_not_wait_for_a_stalled_far_end() -> None:
-    """A TCP connection that lingers for 60 s waits in close(2) as a serial port does."""
+def test_close_behind_does_not_wait_for_a_stalled_far_end() -> None:
+    """A TCP connection that lingers for 60 s waits while it is closed, as a serial port does."""
     handled: list[int] = []
     before = signal.signal(signal.SIGRTMAX, lambda number, frame: handled.append(number))
     try:
-        with socket.create_server(("127.0.0.1", 0)) as listener:
+        with socket.create_server(("127.0.0.1", 0)) as listener, Path(os.devnull).open() as other:
             sender = socket.create_connection(listener.getsockname())
             accepted, _ = listener.accept()
             sender.setblocking(False)
@@ -350,9 +351,11 @@ def test_close_descriptor_does_not_wait_for_a_stalled_far_end() -> None:
             sender.setblocking(True)
             sender.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 60))
             begun = time.monotonic()
-            close_descriptor(sender.detach(), 0.01)
+            close_behind(sender.fileno(), other.fileno(), 0.01)
             assert time.monotonic() - begun < 30
             accepted.close()
+            assert os.path.sameopenfile(sender.fileno(), other.fileno())
+            os.close(sender.detach())
         assert handled == []
         assert signal.getsignal(signal.SIGRTMAX) not in (signal.SIG_DFL, before)
     finally:

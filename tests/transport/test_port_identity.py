@@ -5,10 +5,11 @@ from __future__ import annotations
 import errno
 import os
 import pty
+import resource
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,7 +21,7 @@ from toy import Toy
 
 from multidrop import Poller
 from multidrop.bus import Bus
-from multidrop.core import NO_DIVISOR, RS485, Failure, Port, TransactionIds, port_settings
+from multidrop.core import NO_DIVISOR, RS485, Failure, Port, TransactionIds, close_behind, port_settings
 from multidrop.errors import LineError, NoReply, PortLost
 from multidrop.families import InnovertIBD
 from multidrop.sim import EncodedDrive, Simulator, Wire, simulated
@@ -307,11 +308,11 @@ def test_closing_a_stalled_port_takes_bounded_time_and_discards_a_command(
 ) -> None:
     closed: list[float] = []
 
-    def close(fd: int, seconds: float) -> None:
+    def close(fd: int, other: int, seconds: float) -> None:
         closed.append(seconds)
-        os.close(fd)
+        os.dup2(other, fd)
 
-    monkeypatch.setattr(open_port, "close_descriptor", close)
+    monkeypatch.setattr(open_port, "close_behind", close)
     monkeypatch.setattr(clock, "sleep", lambda seconds: None)
     found = Line(terminal).open()
     monkeypatch.setattr(Serial, "out_waiting", 8)
@@ -321,18 +322,42 @@ def test_closing_a_stalled_port_takes_bounded_time_and_discards_a_command(
     assert ("waiting 0.75 s for its adapter" in caplog.text) != must_discard
 
 
-def test_a_stalled_port_is_closed_although_no_descriptor_is_left(
+@contextmanager
+def all_descriptors_in_use() -> Iterator[None]:
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    held: list[int] = []
+    try:
+        highest = max(int(fd.name) for fd in Path("/proc/self/fd").iterdir())
+        resource.setrlimit(resource.RLIMIT_NOFILE, (highest + 1, before[1]))
+        with suppress(OSError):
+            while True:
+                held.append(os.open(os.devnull, os.O_RDONLY))
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+        for fd in held:
+            os.close(fd)
+
+
+def test_closing_a_stalled_port_takes_bounded_time_although_all_descriptors_are_in_use(
     terminal: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(fd: int) -> int:
-        raise OSError(errno.EMFILE, "Too many open files")
+    """If pyserial closed the port itself, it would wait for the adapter for up to 30 s."""
+    closed: list[float] = []
 
+    def close(fd: int, other: int, seconds: float) -> None:
+        closed.append(seconds)
+        close_behind(fd, other, seconds)
+        assert not os.isatty(fd)
+
+    monkeypatch.setattr(open_port, "close_behind", close)
+    monkeypatch.setattr(clock, "sleep", lambda seconds: None)
     found = Line(terminal).open()
     port = found._opened._serial
-    monkeypatch.setattr(clock, "sleep", lambda seconds: None)
     monkeypatch.setattr(Serial, "out_waiting", 8)
-    monkeypatch.setattr(os, "dup", fail)
-    found.close()
+    with all_descriptors_in_use():
+        found.close()
+    assert closed == [CLOSING_S]
     assert port is not None
     assert not port.is_open
 

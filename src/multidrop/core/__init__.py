@@ -63,7 +63,7 @@ from multidrop.core.port import why_not_realtime as why_not_realtime
 from multidrop.core.port_settings import NO_DIVISOR as NO_DIVISOR
 from multidrop.core.port_settings import REFUSALS as REFUSALS
 from multidrop.core.port_settings import CharacterFormat as CharacterFormat
-from multidrop.core.port_settings import close_descriptor as close_descriptor
+from multidrop.core.port_settings import close_behind as close_behind
 from multidrop.core.port_settings import get_settings as get_settings
 from multidrop.core.port_settings import is_pseudo_terminal as is_pseudo_terminal
 from multidrop.core.port_settings import must_take as must_take

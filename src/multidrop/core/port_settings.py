@@ -53,9 +53,12 @@ def possible_rates(fd: int, baudrate: int) -> tuple[int, int, int]:
     return base // divisor, base // -(-base // baudrate), base // (base // baudrate)
 
 
-def close_descriptor(fd: int, seconds: float) -> None:
-    """Close a port's descriptor. Its driver may still send for this time; then unsent bytes are discarded."""
-    lib.md_port_close(fd, round(seconds * 1e9))
+def close_behind(fd: int, other: int, seconds: float) -> None:
+    """Close the port behind descriptor `fd`, which then refers to the file of descriptor `other`.
+
+    The port's driver may still send for `seconds` s; then it discards its unsent bytes.
+    """
+    lib.md_port_close(fd, other, round(seconds * 1e9))
 
 
 def get_settings(fd: int) -> tuple[int, str]:

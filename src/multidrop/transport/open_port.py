@@ -24,7 +24,7 @@ from multidrop.core import (
     Port,
     TransactionIds,
     Transactions,
-    close_descriptor,
+    close_behind,
     is_pseudo_terminal,
     must_take,
     possible_rates,
@@ -360,13 +360,12 @@ class OpenPort:
             self.bridge = None
         if self._serial:
             connection = connection_of(self._serial)
-            last = None
-            with suppress(*PORT_FAILURES):  # os.dup fails if the process has no descriptor left
-                last = os.dup(self._serial.fileno()) if self._holds_bytes_now() else None
+            if self._holds_bytes_now():  # pyserial would wait for them for up to 30 s
+                port = cast(serial.Serial, self._serial)
+                other = cast(int, port.pipe_abort_read_r)
+                close_behind(port.fileno(), other, 0.0 if self.must_discard else CLOSING_S)
             with suppress(*PORT_FAILURES):
                 self._serial.close()
-            if last is not None:
-                close_descriptor(last, 0.0 if self.must_discard else CLOSING_S)
             self.must_discard = False
             if connection:  # pyserial leaves a connection open that the far end has closed
                 connection.close()
