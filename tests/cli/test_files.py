@@ -22,8 +22,8 @@ from lines import until
 from peers import require_module
 
 from multidrop import Plant
-from multidrop.cli import hub, main
-from multidrop.cli.fleet import gateway as serve
+from multidrop.cli import main
+from multidrop.cli.fleet import services
 from multidrop.cli.support import log_thread, polling
 from multidrop.cli.support.files import write_new
 from multidrop.cli.support.log_thread import LogThread
@@ -131,31 +131,30 @@ def test_a_fleets_gateway_never_waits_for_its_log(monkeypatch: pytest.MonkeyPatc
         logging.getLogger("multidrop.fleet").warning("a stop of pump-1")
         return 7
 
-    monkeypatch.setattr(serve, "_serve", work)
+    monkeypatch.setattr(services, "_serve", work)
     monkeypatch.setattr(log_thread, "ENDING_S", 0.05)
     unread, log = os.pipe()
     with os.fdopen(unread) as reader, os.fdopen(log, "w") as stream:
         fill(log)
         monkeypatch.setattr(sys, "stderr", stream)
-        assert serve.run(argparse.Namespace(command="serve", log="text")) == 7
+        assert services.run(argparse.Namespace(command="serve", log="text")) == 7
         assert reader.readline().strip().endswith(" warning a stop of pump-1")
 
 
-@pytest.mark.parametrize("command", [serve, hub])
+@pytest.mark.parametrize("command", ["serve", "hub"])
 def test_logs_of_a_fleet_have_time_and_level_in_text_and_json(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path, command: Any
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path, command: str
 ) -> None:
     require_module("nats")
     from multidrop.fleet.samples.hub import HubState
 
     async def work(*_: object) -> Any:
         logging.getLogger("multidrop.fleet").warning("line %s is lost\x1b", "hall-1")
-        return HubState(0, 0, 0, 0, 0, 0, None) if command is hub else 0
+        return HubState(0, 0, 0, 0, 0, 0, None) if command == "hub" else 0
 
-    name = "_read_until_signal" if command is hub else "_serve"
-    monkeypatch.setattr(command, name, work)
+    monkeypatch.setattr(services, "_read" if command == "hub" else "_serve", work)
     for form in ("text", "json"):
-        words = ["hub", "--parquet", str(tmp_path)] if command is hub else ["fleet", "serve", "gw-1"]
+        words = ["hub", "--parquet", str(tmp_path)] if command == "hub" else ["fleet", "serve", "gw-1"]
         assert main([*words, "--log", form]) == 0
     text, told = capfd.readouterr().err.splitlines()
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT[0-9:.]+\+00:00 warning line hall-1 is lost\\x1b", text)

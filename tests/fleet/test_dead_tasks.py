@@ -24,7 +24,7 @@ from toy import Toy
 
 import multidrop.fleet
 from multidrop import Poller, PollingFailed
-from multidrop.cli.fleet.tables import count_sentence, failing_lines
+from multidrop.cli.fleet.views import count_sentence, failing_lines
 from multidrop.core import Mastership
 from multidrop.fleet import gateway as fleet_gateway
 from multidrop.fleet import metrics

@@ -25,7 +25,7 @@ from nats_clusters import Cluster, cluster, old_server_program
 from tables import table
 from terminals import on_terminal
 
-from multidrop.cli.fleet import demo_processes
+from multidrop.cli.fleet import demo
 from multidrop.cli.fleet.demo import Stage, plant_file
 from multidrop.control import eeprom_ledger
 from multidrop.plant.loader import load_plant
@@ -311,13 +311,13 @@ def test_a_servers_version_is_parsed_or_zero(tmp_path: Path, said: str, version:
     program = tmp_path / "nats-server"
     program.write_text(f"#!/bin/sh\necho '{said}'\n")
     program.chmod(0o755)
-    assert demo_processes.version_of(str(program)) == version
+    assert demo.version_of(str(program)) == version
 
 
 def test_without_a_nats_server_the_error_says_where_to_get_one(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(demo_processes, "_programs", lambda: iter(["/nowhere/nats-server"]))
+    monkeypatch.setattr(demo, "_programs", lambda: iter(["/nowhere/nats-server"]))
     status, out, err = run("fleet", "demo")
     assert (status, out) == (2, "")
     assert err == (

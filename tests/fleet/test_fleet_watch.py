@@ -22,8 +22,7 @@ from tables import table
 from terminals import on_terminal
 
 from multidrop.cli.fleet import views
-from multidrop.cli.fleet.tables import moment, move_table, size
-from multidrop.cli.fleet.views import picture
+from multidrop.cli.fleet.views import moment, move_table, picture, size
 from multidrop.fleet.overview import FleetWatch
 from multidrop.supervisor import Ended, supervisor
 
@@ -155,7 +154,7 @@ def test_the_exit_status_is_1_if_a_line_has_no_living_master(
     async def seen(paths: object) -> dict[str, Any]:
         return told() | {"lines": {"line-1": line(master)}}
 
-    monkeypatch.setattr(views, "_seen", seen)
+    monkeypatch.setattr(views, "_fleet_state", seen)
     assert asyncio.run(views._print_status(Namespace(json=False), [])) == status
 
 
@@ -173,7 +172,7 @@ def test_a_missing_gateway_and_a_lost_port_are_shown(
         (gone, "gw-9 on pc-9 is missing: last seen 2025-11-24 16:00:00"),
         (lost, f"gw-1: line line-1: {why}"),
     ):
-        monkeypatch.setattr(views, "_seen", AsyncMock(return_value=found))
+        monkeypatch.setattr(views, "_fleet_state", AsyncMock(return_value=found))
         assert asyncio.run(views._print_status(Namespace(json=False), [])) == 1
         assert sentence in capsys.readouterr().out.splitlines()
     assert "1 with a lost port" in drawn(lost)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from multidrop.cli.fleet.connection import add_server_arguments, nats_urls, require_fleet, run_with_paths
-from multidrop.cli.fleet.tables import size
+from multidrop.cli.fleet.views import size
 from multidrop.cli.support.files import require_extra
 from multidrop.cli.support.output import print_text, warn
 
