@@ -88,7 +88,7 @@ FONT = "ui-monospace,'DejaVu Sans Mono',Menlo,Consolas,monospace"
 
 
 def _svg(screen: str) -> str:
-    """Return an SVG of a terminal's screen, given as text with the escapes of `cli/support/screen.py`."""
+    """Return an SVG of a terminal's screen, given as text with the escapes of `cli/support/terminal.py`."""
     width, height = WIDTH * CHARACTER + 2 * MARGIN, HEIGHT * LINE + BAR + MARGIN
     parts = [
         f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 {width:.0f} {height}' "

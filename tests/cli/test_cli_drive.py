@@ -19,8 +19,8 @@ from lines import Faulty, patient
 from toy import Status, Toy
 
 import multidrop.cli
+from multidrop.cli.support.output import confirm
 from multidrop.cli.support.values import nearest_value
-from multidrop.cli.support.writing import confirm
 from multidrop.control import eeprom_ledger as ledger
 from multidrop.errors import WriteForbidden
 from multidrop.families.innovert_ibd import InnovertIBD

@@ -265,7 +265,7 @@ def test_monitor_replaces_ports_by_the_port_option(
         shown.extend(line.port for line in watched.lines)
         return {"samples": 1}
 
-    monkeypatch.setattr(monitor, "is_possible", lambda: True)
+    monkeypatch.setattr(monitor, "keys_are_readable", lambda: True)
     monkeypatch.setattr(monitor, "watch", watch)
     assert run("monitor", plant, "--port=roof=/dev/other")[0] == 0
     assert shown == ["/dev/none-1", "/dev/other"]

@@ -19,7 +19,7 @@ from toy import Toy
 
 import multidrop.cli.scan
 import multidrop.scan.identify
-from multidrop.cli import main, ports
+from multidrop.cli import main
 from multidrop.cli.scan import sentence
 from multidrop.core import RS485, Framing
 from multidrop.drive.line_settings import Settings
@@ -347,8 +347,8 @@ def devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             (tty / "type").write_text(kind)
         (tmp_path / "dev").mkdir(exist_ok=True)
         (tmp_path / "dev" / name).touch(mode=0o660)
-    found = list(ports._linux_ports(tmp_path / "sys", tmp_path / "dev"))
-    monkeypatch.setattr(ports, "_linux_ports", lambda: found)
+    found = list(multidrop.cli.scan._linux_ports(tmp_path / "sys", tmp_path / "dev"))
+    monkeypatch.setattr(multidrop.cli.scan, "_linux_ports", lambda: found)
     monkeypatch.setattr("sys.platform", "linux")
     return tmp_path / "dev"
 
@@ -365,8 +365,8 @@ def test_ports_lists_existing_ports_with_adapter_and_driver(
 def test_without_any_port_the_advice_is_to_plug_one_in(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(ports, "_linux_ports", lambda: iter(()))
-    monkeypatch.setattr(ports, "_other_ports", lambda: iter(()))
+    monkeypatch.setattr(multidrop.cli.scan, "_linux_ports", lambda: iter(()))
+    monkeypatch.setattr(multidrop.cli.scan, "_other_ports", lambda: iter(()))
     assert main(["ports"]) == 1
     assert capsys.readouterr().out.startswith("no serial port found; plug the adapter in")
 
@@ -378,12 +378,12 @@ def test_advice_names_the_group_that_owns_the_port(tmp_path: Path, monkeypatch: 
 
     port = tmp_path / "ttyUSB0"
     port.touch(mode=0o600)
-    assert "a udev rule" in ports._permission_advice(port)
+    assert "a udev rule" in multidrop.cli.scan._permission_advice(port)
     group = next(one for one in grp.getgrall() if one.gr_gid)
     os.chown(port, -1, group.gr_gid) if os.getuid() == 0 else pytest.skip("only root may give a file away")
     port.chmod(0o660)
     user = pwd.getpwuid(os.getuid()).pw_name
-    assert ports._permission_advice(port).startswith(f"sudo usermod -aG {group.gr_name} {user}")
+    assert multidrop.cli.scan._permission_advice(port).startswith(f"sudo usermod -aG {group.gr_name} {user}")
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="permissions of POSIX")
@@ -393,7 +393,7 @@ def test_advice_for_a_port_is_given_in_a_container_whose_user_has_no_name(
     port = tmp_path / "ttyUSB0"
     port.touch(mode=0o660)
     monkeypatch.setattr(os, "getuid", lambda: 4_123_456)
-    assert f"in group {port.stat().st_gid}" in ports._permission_advice(port)
+    assert f"in group {port.stat().st_gid}" in multidrop.cli.scan._permission_advice(port)
 
 
 # ---- commands on tcp:// ports: simulate serves such a line, scan finds its drives, and poll reads them ----

@@ -21,8 +21,7 @@ from terminals import on_terminal
 
 from multidrop.cli import run
 from multidrop.cli.poll import LiveTable
-from multidrop.cli.support.polling import Triggering
-from multidrop.cli.support.triggers import trigger_picture
+from multidrop.cli.support.polling import Triggering, trigger_picture
 from multidrop.control import exit_hook
 from multidrop.plant.loader import load_plant
 from multidrop.polling.batch import Row
@@ -113,7 +112,7 @@ def test_picture_of_a_trigger_has_its_signals_and_its_moment(
     of_all = trigger_picture(tmp_path / "a.csv", how._replace(signals={}), 55, "_#")
     assert [line[:3] for line in of_all] == ["tri", "a.i", "a.u", "   "]
     assert trigger_picture(tmp_path / "none.csv", how, 55, "_#") == []
-    monkeypatch.setattr("multidrop.cli.support.triggers.MOST_ROWS", len(rows) - 1)
+    monkeypatch.setattr("multidrop.cli.support.polling.MOST_ROWS", len(rows) - 1)
     (line,) = trigger_picture(tmp_path / "a.csv", how, 55, "_#")
     assert line == "trigger 00:00:02.000000 UTC: a.i > 3, in a.csv, which is too large for a picture"
 

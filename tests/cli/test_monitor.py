@@ -24,23 +24,26 @@ from lines import PATIENCE
 from tables import table
 from terminals import Terminal, on_terminal
 
-from multidrop.cli.monitor import (
+from multidrop.cli.monitor import PAGE, Monitor, pause_s
+from multidrop.cli.monitor_screen import LEAST_HEIGHT, LEAST_WIDTH, Position, SideRead, overview, page
+from multidrop.cli.support.polling import LivePlant, PollingSession, Triggering
+from multidrop.cli.support.signals import Interruption
+from multidrop.cli.support.terminal import (
+    BLOCKS,
     DOWN,
     ENTER,
     KEYS,
-    PAGE,
     PAGE_DOWN,
     PAGE_UP,
+    PLAIN_BLOCKS,
     UNKNOWN,
     UP,
-    Monitor,
+    Screen,
+    TextLine,
     next_key,
+    sparkline,
     terminal_keys,
 )
-from multidrop.cli.monitor_screen import LEAST_HEIGHT, LEAST_WIDTH, Position, overview, page
-from multidrop.cli.support.polling import LivePlant, PollingSession, SideRead, Triggering, pause_s
-from multidrop.cli.support.screen import BLOCKS, PLAIN_BLOCKS, Screen, TextLine, sparkline
-from multidrop.cli.support.signals import Interruption
 from multidrop.cli.support.values import columns_of
 from multidrop.control.outcome import Seen, Stopped
 from multidrop.core import Counters, Status
@@ -423,7 +426,7 @@ def test_a_key_whose_bytes_arrive_separately_is_one_key(
     with open(end, closefd=True) as stdin:  # noqa: PTH123
         monkeypatch.setattr(sys, "stdin", stdin)
         with terminal_keys() as wait_for_key:
-            monkeypatch.setattr("multidrop.cli.monitor.select", SimpleNamespace(select=wait))
+            monkeypatch.setattr("multidrop.cli.support.terminal.select", SimpleNamespace(select=wait))
             assert [wait_for_key(PATIENCE) for _ in pressed] == pressed
     os.close(terminal)
 

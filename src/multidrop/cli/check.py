@@ -1,6 +1,7 @@
-"""`multidrop check`: prints a family file's contents, unknown facts, and requests that are never sent.
+"""`multidrop check` and `import`: check a family file, or make one from another program's register table.
 
-It also checks a plant file, except its table `[serve]`, which `multidrop serve --check` checks.
+`check` prints a family file's contents, unknown facts, and requests that are never sent. It also checks a
+plant file, except its table `[serve]`, which `multidrop serve --check` checks.
 """
 
 from __future__ import annotations
@@ -9,10 +10,11 @@ import argparse
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from multidrop.cli.models import INDENT, facts, sheet
-from multidrop.cli.support.arguments import add_json_argument
+from multidrop.cli.support.arguments import add_json_argument, whole
+from multidrop.cli.support.files import refuse_overwriting, write_new
 from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.values import counted, wrapped
 from multidrop.control.eeprom_ledger import BUDGET, LEAST_INTERVAL
@@ -27,10 +29,17 @@ from multidrop.families.files.notation import TABLES
 from multidrop.families.registry import find_model
 from multidrop.plant.loader import PlantError, load_plant, port_or_address
 from multidrop.plant.model import Plant
+from multidrop.printable import printable
 from multidrop.toml_document import read_document
+
+if TYPE_CHECKING:
+    from multidrop.importers import ImportedDevice
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    if parser.get_default("command") == "import":
+        _add_import(parser)
+        return
     parser.add_argument(
         "file",
         metavar="FILE.toml",
@@ -41,6 +50,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    return _run_import(arguments) if arguments.command == "import" else _run_check(arguments)
+
+
+# ---- check ----
+
+
+def _run_check(arguments: argparse.Namespace) -> int:
     if why := port_or_address(arguments.file):
         raise ValueError(why)
     if _is_plant(arguments.file):
@@ -224,3 +240,70 @@ def _refused_of(drive: Drive, register: Register[Any]) -> Iterator[str]:
         yield f"more than one write in {LEAST_INTERVAL:.0f} s, or {BUDGET} a year: it is stored in EEPROM"
     elif register.writable and kept is Kept.UNKNOWN:
         yield f"more than {BUDGET} writes a year: it may be stored in EEPROM"
+
+
+# ---- import ----
+
+
+def _add_import(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "file",
+        metavar="FILE",
+        type=Path,
+        help="CSV, TSV, YAML (Home Assistant, ESPHome), TOML (Telegraf) or JSON",
+    )
+    parser.add_argument("--address", metavar="N", type=whole, help="the device, if the file has several")
+    parser.add_argument("--title", metavar="NAME", help="the device's hub, if several have that address")
+    parser.add_argument(
+        "--out",
+        metavar="FAMILY.toml",
+        type=Path,
+        help="the new family file; without it the family is printed",
+    )
+    parser.add_argument("--plant", metavar="PLANT.toml", type=Path, help="a new plant file with this device")
+
+
+def _run_import(arguments: argparse.Namespace) -> int:
+    for target in filter(None, (arguments.out, arguments.plant)):
+        refuse_overwriting(target)
+    if arguments.plant and not arguments.out:
+        raise ValueError("--plant needs --out FAMILY.toml: the plant file names the family file")
+    from multidrop.importers import family_text, plant_text, read_devices
+
+    try:
+        devices = read_devices(arguments.file)
+    except ImportError as failure:
+        raise ValueError(str(failure)) from failure
+    device = _chosen(devices, arguments.address, arguments.title)
+    text = family_text(device, arguments.file.name)
+    plant = plant_text(device, arguments.out.name) if arguments.plant else ""
+    if arguments.out:
+        write_new(arguments.out, text)
+        print_text(f"wrote {arguments.out}: fill its gaps, then run multidrop check {arguments.out}")
+    else:
+        print_text(text)
+    if plant:
+        write_new(arguments.plant, plant)
+        print_text(f"wrote {arguments.plant}: enter its port")
+    for sentence in device.lost:
+        warn(f"not imported: {sentence}")
+    return 0
+
+
+def _chosen(devices: list[ImportedDevice], address: int | None, title: str | None) -> ImportedDevice:
+    found = [
+        device for device in devices if address in (None, device.address) and title in (None, device.title)
+    ]
+    if len(found) == 1:
+        return found[0]
+    first = devices[0]
+    addresses = {device.address for device in devices}
+    example = f"--address {first.address}" if first.address is not None else ""
+    if len(addresses) == len(devices) and None not in addresses:
+        known = ", ".join(str(device.address) for device in devices)
+    else:
+        places = ("an unknown address" if one.address is None else one.address for one in devices)
+        named = (f"{place} of {one.title!r}" for place, one in zip(places, devices, strict=True))
+        known = ", ".join(printable(text[:100]) for text in named)
+        example = f"{example} --title {printable(first.title[:60])!r}".strip()
+    raise ValueError(f"the file has devices at {known}: choose one, such as {example}")

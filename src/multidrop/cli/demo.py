@@ -12,11 +12,12 @@ from shutil import which
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from multidrop.cli.monitor import is_possible, watch
+from multidrop.cli.monitor import watch
 from multidrop.cli.poll import add_polling_arguments, conclude, follow, tap_text
 from multidrop.cli.support.demo_plant import DRIVES, Operator, demo_files, simulator
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.cli.support.output import command_line, print_text
+from multidrop.cli.support.terminal import keys_are_readable
 from multidrop.cli.support.values import aligned, counted
 from multidrop.extras import install_command
 from multidrop.plant.loader import load_plant
@@ -135,4 +136,4 @@ def _can_be_watched(arguments: argparse.Namespace) -> bool:
     """Return True if the monitor can show the demo: on a terminal, and without capture or JSON output."""
     if arguments.capture or arguments.flight_recorder:
         return False
-    return not arguments.json and is_possible()
+    return not arguments.json and keys_are_readable()

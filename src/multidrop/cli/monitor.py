@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import codecs
-import os
 import re
-import select
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
 from datetime import UTC, datetime
-from errno import EIO
 from functools import partial
 from logging import WARNING
 from pathlib import Path
@@ -23,6 +18,7 @@ from multidrop.cli.monitor_screen import (
     LEAST_HEIGHT,
     LEAST_WIDTH,
     Position,
+    SideRead,
     overview,
     page,
 )
@@ -34,13 +30,27 @@ from multidrop.cli.support.polling import (
     LiveDrive,
     LivePlant,
     PollingSession,
-    SideReader,
     Triggering,
+    add_trigger_arguments,
     polling_session,
+    trigger_picture,
+    triggering_of,
 )
-from multidrop.cli.support.screen import Screen, TextLine
-from multidrop.cli.support.triggers import add_trigger_arguments, trigger_picture, triggering_of
-from multidrop.cli.support.values import counted
+from multidrop.cli.support.terminal import (
+    DOWN,
+    ENTER,
+    ESCAPE,
+    LATIN,
+    PAGE_DOWN,
+    PAGE_UP,
+    UP,
+    Screen,
+    TextLine,
+    keys_are_readable,
+    terminal_keys,
+)
+from multidrop.cli.support.values import counted, value_text
+from multidrop.errors import BusError
 from multidrop.plant.model import Plant
 from multidrop.poller import Poller
 from multidrop.polling.added_rows import TRIGGER
@@ -61,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    if not is_possible():
+    if not keys_are_readable():
         raise ValueError(
             "`multidrop monitor` needs a terminal on Linux or macOS; `multidrop poll` works without one"
         )
@@ -70,11 +80,6 @@ def run(arguments: argparse.Namespace) -> int:
     plant, triggering = triggering_of(plant_of(arguments.plant, arguments), arguments)
     summary = watch(plant, out=arguments.out, how=triggering)
     return 0 if summary["samples"] else 1
-
-
-def is_possible() -> bool:
-    """Return True if stdin and stdout are a terminal whose keys can be read."""
-    return sys.platform != "win32" and sys.stdin.isatty() and sys.stdout.isatty()
 
 
 def watch(
@@ -338,90 +343,6 @@ class Monitor:
         return f"{have} of {asked} drives stopped{so_far}", doubtful
 
 
-UP, DOWN, PAGE_UP, PAGE_DOWN, ENTER, ESCAPE = "up", "down", "page up", "page down", "enter", "escape"
-KEYS = {  # maps the bytes that a terminal sends to the key's name
-    b"\x1b[A": UP,
-    b"\x1bOA": UP,
-    b"\x1b[B": DOWN,
-    b"\x1bOB": DOWN,
-    b"\x1b[5~": PAGE_UP,
-    b"\x1b[6~": PAGE_DOWN,
-    b"\r": ENTER,
-    b"\n": ENTER,
-}
-UNKNOWN = "unknown"
-# Other escape sequences, and their starts. They are dropped whole: F4's ends in S, the key that stops motors.
-_SEQUENCE = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*[@-Z\\-~]|O[ -~])")
-_BEGUN = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*|O)?")
-SPLIT_S = 0.05  # how long to wait for the rest of an escape sequence
-MOST_BYTES = 4  # limit of a character's bytes in UTF-8
-# Letters of the Russian and Ukrainian layouts, and the Latin letters on the same keys.
-LATIN = str.maketrans("йыіфнолеЙЫІФНОЛЕ", "qssayjktQSSAYJKT")
-
-
-@contextmanager
-def terminal_keys() -> Iterator[Callable[[float], str]]:
-    """Yield a function that waits for a key, and returns the key's name or letter; "" if none is pressed.
-
-    The function's argument is the longest wait in s. The function raises OSError if the terminal is closed.
-    """
-    assert sys.platform != "win32", "is_possible excludes it"
-    import termios
-    import tty
-
-    fd = sys.stdin.fileno()
-    before = termios.tcgetattr(fd)
-    tty.setcbreak(fd)
-    pressed = b""  # bytes that were read but not returned yet
-
-    def read() -> bytes:
-        found = os.read(fd, 64)
-        if not found:
-            raise OSError(EIO, "the terminal is closed")
-        return found
-
-    def wait_for_key(seconds: float) -> str:
-        nonlocal pressed
-        if not pressed and select.select([fd], [], [], seconds)[0]:
-            pressed = read()
-        while is_begun(pressed) and select.select([fd], [], [], SPLIT_S)[0]:
-            pressed += read()
-        key, pressed = next_key(pressed)
-        return key
-
-    try:
-        yield wait_for_key
-    finally:
-        with suppress(termios.error):  # fails if the terminal is closed
-            termios.tcsetattr(fd, termios.TCSADRAIN, before)
-
-
-def next_key(pressed: bytes) -> tuple[str, bytes]:
-    """Return the name or letter of the first key in a terminal's bytes, and the bytes after this key."""
-    if sequence := _SEQUENCE.match(pressed):
-        return KEYS.get(sequence[0], UNKNOWN), pressed[sequence.end() :]
-    if pressed[:1] == b"\x1b":
-        return ESCAPE, pressed[1:]
-    letter, rest = _first_letter(pressed)
-    return KEYS.get(letter.encode(), letter), rest
-
-
-def is_begun(pressed: bytes) -> bool:
-    """Return True if these bytes start a key or letter whose other bytes may still come."""
-    with suppress(UnicodeDecodeError):
-        return bool(_BEGUN.fullmatch(pressed)) or (
-            pressed != b"" and codecs.getincrementaldecoder("utf-8")().decode(pressed) == ""
-        )
-    return False
-
-
-def _first_letter(pressed: bytes) -> tuple[str, bytes]:
-    for length in range(1, MOST_BYTES + 1):
-        with suppress(UnicodeDecodeError):
-            return pressed[:length].decode(), pressed[length:]
-    return "\ufffd", pressed[1:]
-
-
 def _check_size(screen: Screen) -> None:
     """Raise ValueError if the terminal is too small."""
     width, height = screen.size
@@ -430,3 +351,63 @@ def _check_size(screen: Screen) -> None:
             f"the terminal has {width} x {height} characters; "
             f"the monitor needs at least {LEAST_WIDTH} x {LEAST_HEIGHT}"
         )
+
+
+# ---- side reads ----
+
+LEAST_PAUSE_S = 0.1  # least pause between two reads
+# share of the line's time for side reads: on a line with spare time, and on a full line
+MOST_SHARE, LEAST_SHARE = 0.05, 0.01
+
+
+class SideReader:
+    """Reads a drive's registers that are not polled, one after another, in its own thread.
+
+    The reads take at most MOST_SHARE of the line's time, or LEAST_SHARE if the line has no spare time.
+    """
+
+    def __init__(self, poller: Poller) -> None:
+        self._poller = poller
+        self._drive: LiveDrive | None = None
+        self._found: dict[str, SideRead] = {}
+        self._thread: threading.Thread | None = None
+
+    def read(self, drive: LiveDrive) -> dict[str, SideRead]:
+        """Return the values that were read so far, by register, and continue to read this drive."""
+        if self._drive is not drive:
+            self._drive, self._found = drive, {}
+        if self._thread is None or not self._thread.is_alive():
+            self._thread = threading.Thread(target=self._read_all, args=(drive, self._found), daemon=True)
+            self._thread.start()
+        return self._found
+
+    def rest(self) -> None:
+        """Read no more registers until the next call of `read`."""
+        self._drive = None
+
+    def _read_all(self, chosen: LiveDrive, found: dict[str, SideRead]) -> None:
+        drive = chosen.polled.drive
+        polled = {poll.register.name for poll in chosen.polled.polls}
+        for name, register in drive.registers.items():
+            if not register.readable or name in polled:
+                continue
+            if self._drive is not chosen:
+                return
+            asked = time.monotonic()
+            try:
+                text = value_text(register, drive.read(register))
+            except BusError as failure:
+                text = _in_words(failure)
+            found[name] = SideRead(text, time.time_ns())
+            time.sleep(pause_s(time.monotonic() - asked, chosen.line_utilisation))
+
+
+def pause_s(read_s: float, utilisation: float) -> float:
+    """Return the pause in s after a read that took `read_s` on a line with this planned utilisation."""
+    share = min(MOST_SHARE, max(LEAST_SHARE, 1.0 - utilisation))
+    return max(LEAST_PAUSE_S, read_s * (1.0 / share - 1.0))
+
+
+def _in_words(failure: BusError) -> str:
+    """Describe a failure in a few words, such as "no reply"."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(failure).__name__).lower()

@@ -9,9 +9,10 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from typing import NamedTuple
 
-from multidrop.cli.support.polling import CURRENT, FAULT, FREQUENCY, STATE, LiveDrive, LivePlant, SideRead
-from multidrop.cli.support.screen import TextLine, cut, filled, sparkline
+from multidrop.cli.support.polling import CURRENT, FAULT, FREQUENCY, STATE, LiveDrive, LivePlant
+from multidrop.cli.support.terminal import TextLine, cut, filled, sparkline
 from multidrop.cli.support.values import columns_of, counted, padded
 from multidrop.printable import printable
 
@@ -41,6 +42,13 @@ class Position:
     failures: list[str] = field(default_factory=list)  # unacknowledged failures of stops
     failures_shown: int = 0  # number of failures that the last picture showed
     trigger: list[str] = field(default_factory=list)  # curves around the last trigger
+
+
+class SideRead(NamedTuple):
+    """One read of a register: the value as text, or why the read failed."""
+
+    text: str
+    time: int  # end of the read, UTC in ns
 
 
 def overview(

@@ -21,9 +21,8 @@ from multidrop.cli.support.arguments import (
     mistaken,
     target_of,
 )
-from multidrop.cli.support.output import print_text
+from multidrop.cli.support.output import confirm, print_text, reporting_interruption
 from multidrop.cli.support.values import aligned, counted
-from multidrop.cli.support.writing import confirm, reporting_interruption
 from multidrop.drive.parameters import parameters_of
 from multidrop.errors import Unsupported, WriteForbidden
 from multidrop.families.registry import find_model

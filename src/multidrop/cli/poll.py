@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from multidrop.capture import CaptureWriter, FlightRecorder, Tapped
-from multidrop.cli.monitor import ENTER, ESCAPE, is_possible, terminal_keys
 from multidrop.cli.support.arguments import (
     add_json_argument,
     add_plant_argument,
@@ -29,10 +28,18 @@ from multidrop.cli.support.arguments import (
 )
 from multidrop.cli.support.files import check_capture, refuse_overwriting
 from multidrop.cli.support.output import logging_to, print_text, warn
-from multidrop.cli.support.polling import LiveDrive, LivePlant, Rotation, Triggering, polling_session
-from multidrop.cli.support.screen import blocks_of
+from multidrop.cli.support.polling import (
+    LiveDrive,
+    LivePlant,
+    Rotation,
+    Triggering,
+    add_trigger_arguments,
+    polling_session,
+    trigger_picture,
+    triggering_of,
+)
 from multidrop.cli.support.signals import Interruption
-from multidrop.cli.support.triggers import add_trigger_arguments, trigger_picture, triggering_of
+from multidrop.cli.support.terminal import ENTER, ESCAPE, blocks_of, keys_are_readable, terminal_keys
 from multidrop.cli.support.values import aligned, columns_of, counted, cut_to, shortened
 from multidrop.planning.prediction import Prediction, predict
 from multidrop.plant.model import Plant, PlantLine, planned_on
@@ -95,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
     plant = plant_of(arguments.plant, arguments)
     plant = replace(plant, realtime=arguments.realtime or plant.realtime)
     plant, triggering = triggering_of(plant, arguments)
-    if "key" in arguments.trigger and (arguments.json or not is_possible()):
+    if "key" in arguments.trigger and (arguments.json or not keys_are_readable()):
         raise ValueError("--trigger key needs a terminal and excludes --json; give a condition instead")
     return conclude(plant, follow(plant, arguments, triggering or rotation), arguments)
 
@@ -362,7 +369,7 @@ class Keys:
         cls, poller: Poller, table: LiveTable, how: Rotation | Triggering | None
     ) -> Iterator[Keys | None]:
         """Yield the keys of this terminal; None if its keys cannot be read, as in the background."""
-        if not (is_possible() and _is_in_foreground()):
+        if not (keys_are_readable() and _is_in_foreground()):
             yield None
             return
         with terminal_keys() as wait_for_key:

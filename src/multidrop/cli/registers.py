@@ -1,10 +1,12 @@
-"""`multidrop read` and `write`: print values of one drive with their units, or write one register."""
+"""`multidrop read`, `write` and `wear`: one drive's registers, and the writes that wear EEPROMs."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import sys
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 from multidrop.cli.support.arguments import (
@@ -14,21 +16,25 @@ from multidrop.cli.support.arguments import (
     check_words,
     target_of,
 )
-from multidrop.cli.support.output import print_text
+from multidrop.cli.support.output import confirm, print_text, reporting_interruption
 from multidrop.cli.support.values import Row, aligned, as_json, as_row, nearest_value, user_title
-from multidrop.cli.support.writing import confirm, reporting_interruption
+from multidrop.control.eeprom_ledger import BUDGET, CYCLES, Ledger, Wear, default_path
 from multidrop.control.rules import check_plain, raw_count, refused
-from multidrop.core import Status
+from multidrop.core import Status, utc_minus_monotonic_ns
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.text import Text
 from multidrop.errors import DriveException, NoValue
+from multidrop.transport.clock import now_ns
 
 _FURTHER = ("REGISTER", "VALUE")  # arguments of `write` after the drive
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    if parser.get_default("command") == "write":
+    command = parser.get_default("command")
+    if command == "wear":
+        parser.add_argument("--ledger", metavar="FILE", help="another ledger than the user's")
+    elif command == "write":
         add_target_arguments(parser, *_FURTHER)
         parser.description = f"{parser.description} VALUE is in the register's unit, or a name."
         add_writing_arguments(parser)
@@ -39,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    return _run_write(arguments) if arguments.command == "write" else _run_read(arguments)
+    return {"read": _run_read, "write": _run_write, "wear": _run_wear}[arguments.command](arguments)
 
 
 def _run_read(arguments: argparse.Namespace) -> int:
@@ -127,3 +133,44 @@ def _run_write(arguments: argparse.Namespace) -> int:
     else:
         print_text(outcome, file=sys.stdout if outcome.ok else sys.stderr)
     return 0 if outcome.ok else 1
+
+
+# ---- wear ----
+
+
+WEAR_HEAD = ("PORT", "ADDRESS", "MODEL", "REGISTER", "WRITES", "THIS YEAR", "LEFT", "LAST")
+
+
+def _run_wear(arguments: argparse.Namespace) -> int:
+    if arguments.ledger and not Path(arguments.ledger).is_file():
+        raise ValueError(f"there is no ledger {arguments.ledger}; the default is {default_path()}")
+    ledger = Ledger(arguments.ledger)
+    found = ledger.wear((now_ns() + utc_minus_monotonic_ns()) / 1e9)
+    if arguments.json:
+        print_text(json.dumps([_wear_as_json(wear) for wear in found], indent=2))
+    elif not found:
+        print_text(f"{ledger.path}: no writes to EEPROM yet")
+    else:
+        print_text("\n".join(aligned([WEAR_HEAD, *map(_wear_row, found)], "<><<>>><")))
+        print_text(f"\n{ledger.path}: {BUDGET} writes of a register a year; an EEPROM lasts {CYCLES} writes.")
+    return 0
+
+
+def _wear_row(wear: Wear) -> tuple[str, ...]:
+    """Return the cells of a row. The model is shown without the title that follows its ": "."""
+    port, address, model, *columns, last = map(str, _wear_as_json(wear).values())
+    return port, address, model.partition(": ")[0], *columns, last[:16].replace("T", " ")
+
+
+def _wear_as_json(wear: Wear) -> dict[str, object]:
+    cell = wear.cell
+    return {
+        "port": cell.port,
+        "address": cell.address,
+        "model": cell.model,
+        "register": cell.register,
+        "writes": wear.writes,
+        "this_year": wear.this_year,
+        "left": BUDGET - wear.this_year,
+        "last": datetime.fromtimestamp(wear.last, UTC).isoformat(timespec="seconds"),
+    }

@@ -23,9 +23,8 @@ from multidrop.cli.support.arguments import (
 )
 from multidrop.cli.support.demo_plant import simulator
 from multidrop.cli.support.files import refuse_overwriting
-from multidrop.cli.support.output import print_text, warn
+from multidrop.cli.support.output import confirm, print_text, warn
 from multidrop.cli.support.values import aligned, counted
-from multidrop.cli.support.writing import confirm
 from multidrop.cli.verbs import stop_sentence
 from multidrop.control.exit_hook import signal_has_come
 from multidrop.drive.known_state import can_show_fault

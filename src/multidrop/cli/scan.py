@@ -1,15 +1,22 @@
-"""`multidrop scan`: finds the drives on a line, with addresses and settings, and writes a plant file."""
+"""`multidrop ports` and `scan`: list the serial ports, and find the drives on a line.
+
+`ports` shows each port's adapter and whether the user may open it. `scan` finds drives with their addresses
+and settings, and writes a plant file.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from multidrop.cli.doctor_findings import SYSFS, find_adapter
 from multidrop.cli.support.arguments import (
     add_json_argument,
     add_line_arguments,
@@ -21,7 +28,7 @@ from multidrop.cli.support.arguments import (
 )
 from multidrop.cli.support.files import check_writable, write_new
 from multidrop.cli.support.output import print_text
-from multidrop.cli.support.values import counted
+from multidrop.cli.support.values import counted, wrapped
 from multidrop.core import RS485
 from multidrop.drive.declaration_check import UNIT_IDS
 from multidrop.drive.family import Drive
@@ -45,12 +52,100 @@ from multidrop.scan import (
     sweeps,
 )
 from multidrop.transport.line import Line
-from multidrop.transport.port_identity import lasting_name
+from multidrop.transport.port_identity import lasting_name, of_device
 
 _CLEAR_LINE = "\r\x1b[K"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    if parser.get_default("command") == "scan":
+        _add_scan(parser)
+    add_json_argument(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    return _run_ports(arguments) if arguments.command == "ports" else _run_scan(arguments)
+
+
+# ---- ports ----
+
+
+NO_PORTS = "no serial port found; plug the adapter in" + (
+    ", then see `sudo dmesg | tail`" if sys.platform == "linux" else ""
+)
+
+
+@dataclass(frozen=True)
+class SerialPort:
+    """A serial port. If its adapter has a serial number, `name` is the device name that contains it."""
+
+    name: str
+    device: str
+    adapter: str
+    may_open: bool
+    advice: str = ""  # how the user gets the permission to open it
+
+
+def _run_ports(arguments: argparse.Namespace) -> int:
+    found = sorted(_linux_ports() if sys.platform == "linux" else _other_ports(), key=lambda port: port.name)
+    if arguments.json:
+        print_text(json.dumps([asdict(port) for port in found], indent=2))
+    else:
+        print_text("\n".join(line for port in found for line in _port_text(port)) or NO_PORTS)
+    return 0 if found else 1
+
+
+def _port_text(port: SerialPort) -> Iterator[str]:
+    yield port.name
+    now = f"{port.device}: " if port.device != port.name else ""
+    yield from wrapped(f"{now}{port.adapter}", "  ", "    ")
+    opening = "you may open it" if port.may_open else f"you may not open it: {port.advice}"
+    yield from wrapped(opening, "  ", "    ", breaks_words=False)
+
+
+def _linux_ports(sysfs: Path = SYSFS, devices: Path = Path("/dev")) -> Iterator[SerialPort]:
+    """Yield the terminal devices that have hardware. For an absent UART, the kernel reports type 0."""
+    for tty in sorted((sysfs / "class/tty").glob("*")):
+        device, uart = devices / tty.name, tty / "type"
+        if not (tty / "device").exists() or (uart.exists() and uart.read_text("ascii").strip() == "0"):
+            continue
+        adapter = find_adapter(str(device), sysfs)
+        if not adapter.driver or not device.exists():
+            continue
+        advice = "" if os.access(device, os.R_OK | os.W_OK) else _permission_advice(device)
+        yield SerialPort(of_device(str(device)), str(device), str(adapter), not advice, advice)
+
+
+def _permission_advice(device: Path) -> str:
+    """Return how this user gets the permission to open a device."""
+    import grp
+    import pwd
+
+    about = device.stat()
+    try:
+        owner, user = (pwd.getpwuid(number).pw_name for number in (about.st_uid, os.getuid()))
+        group = grp.getgrgid(about.st_gid)
+    except KeyError:  # in a container, numbers may have no names
+        return f"start this program, or its container, in group {about.st_gid}"
+    if about.st_mode & 0o060 != 0o060 or not about.st_gid:
+        return f"only {owner} may; a udev rule can give it to a group"
+    if user in group.gr_mem:
+        return f"you were added to its group {group.gr_name} after this login: log out and in again"
+    return f"sudo usermod -aG {group.gr_name} {user}, then log out and in again"
+
+
+def _other_ports() -> Iterator[SerialPort]:
+    """Yield the ports that pyserial finds on Windows or macOS, where every user may open them."""
+    from serial.tools.list_ports import comports
+
+    for port in comports():
+        yield SerialPort(port.device, port.device, port.description or "unknown adapter", may_open=True)
+
+
+# ---- scan ----
+
+
+def _add_scan(parser: argparse.ArgumentParser) -> None:
     add_line_arguments(parser)
     parser.add_argument("--model", action="append", default=[], help="only these; default: all families")
     parser.add_argument(
@@ -68,10 +163,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", metavar="PLANT.toml", type=Path, help="write a plant file of the drives found"
     )
-    add_json_argument(parser)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def _run_scan(arguments: argparse.Namespace) -> int:
     if arguments.out:
         check_writable(arguments.out)
     plant = plant_at(arguments)

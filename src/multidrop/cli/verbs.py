@@ -29,9 +29,8 @@ from multidrop.cli.support.arguments import (
     plant_of,
     target_of,
 )
-from multidrop.cli.support.output import command_line, print_text, warn
+from multidrop.cli.support.output import command_line, confirm, print_text, reporting_interruption, warn
 from multidrop.cli.support.values import as_json, nearest_value
-from multidrop.cli.support.writing import confirm, reporting_interruption
 from multidrop.control.audit_log import AuditLog
 from multidrop.control.outcome import Seen, Stopped
 from multidrop.control.stops import LEAST_S

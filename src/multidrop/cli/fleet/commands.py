@@ -24,8 +24,7 @@ from multidrop.cli.fleet.connection import (
     run_action,
     state_folder,
 )
-from multidrop.cli.support.output import print_text, warn
-from multidrop.cli.support.writing import confirm
+from multidrop.cli.support.output import confirm, print_text, warn
 from multidrop.printable import plain_number, printable
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 from multidrop.cli.fleet.connection import add_server_arguments, open_path, run_with_paths
 from multidrop.cli.support.output import print_text
-from multidrop.cli.support.screen import Screen, TextLine, cut
 from multidrop.cli.support.signals import on_end_signals
+from multidrop.cli.support.terminal import Screen, TextLine, cut
 from multidrop.cli.support.values import Row, aligned, columns_of, counted
 from multidrop.supervisor import end_tasks, supervisor
 

@@ -1,32 +1,34 @@
-"""A polled plant for commands: the polling session, the state that screens show, and side reads."""
+"""A polled plant for commands: the polling session, the state that screens show, and triggers."""
 
 from __future__ import annotations
 
-import re
-import threading
-import time
+import argparse
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from enum import Flag
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from multidrop.cli.support.arguments import argument
 from multidrop.cli.support.signals import Interruption, noting_signals
-from multidrop.cli.support.values import value_text
+from multidrop.cli.support.terminal import sparkline
+from multidrop.cli.support.values import columns_of, padded, value_text
 from multidrop.core import UNASKED, Counters
 from multidrop.drive.known_state import StateReader
 from multidrop.drive.state import Condition, Direction
-from multidrop.errors import BusError
 from multidrop.plant.model import Plant, PlantLine, PolledDrive, current_for
-from multidrop.plant.triggers import TriggerSeries
+from multidrop.plant.triggers import POST_S, PRE_S, TriggerSeries, with_triggers
 from multidrop.poller import Poller
 from multidrop.polling.batch import Row, Rows
-from multidrop.recording import open_writer
+from multidrop.recording import FORMATS, open_recording, open_writer
 from multidrop.recording.format import Metadata, RecordingWriter
 from multidrop.recording.segments import SegmentWriter
 from multidrop.recording.triggered import TriggeredWriter
+from multidrop.toml_check import parse_duration
 from multidrop.transport.statistics import LineStatistics, Statistics, line_statistics
 
 
@@ -261,68 +263,129 @@ class LivePlant:
             drive.remember()
 
 
-# ---- side reads ----
-
-LEAST_PAUSE_S = 0.1  # least pause between two reads
-# share of the line's time for side reads: on a line with spare time, and on a full line
-MOST_SHARE, LEAST_SHARE = 0.05, 0.01
+# ---- triggers ----
 
 
-class SideRead(NamedTuple):
-    """One read of a register: the value as text, or why the read failed."""
+def add_trigger_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--trigger",
+        metavar="CONDITION",
+        action="append",
+        default=[],
+        help="record only around each moment at which this becomes true, such as "
+        '"pump-1.output_current > 30"; fault: a fault of any drive; key: the key t; may be repeated',
+    )
+    for name, default, where in (("pre", PRE_S, "before"), ("post", POST_S, "after")):
+        parser.add_argument(
+            f"--{name}",
+            metavar="TIME",
+            type=argument(parse_duration),
+            help=f"with --trigger: how long to record {where} each trigger; default: {default:g} s",
+        )
 
-    text: str
-    time: int  # end of the read, UTC in ns
 
+def triggering_of(plant: Plant, arguments: argparse.Namespace) -> tuple[Plant, Triggering | None]:
+    """Return the plant with a channel for each trigger's condition, and how the triggers are recorded.
 
-class SideReader:
-    """Reads a drive's registers that are not polled, one after another, in its own thread.
-
-    The reads take at most MOST_SHARE of the line's time, or LEAST_SHARE if the line has no spare time.
+    Raises ValueError for contradicting options and for a mistake in a condition.
     """
-
-    def __init__(self, poller: Poller) -> None:
-        self._poller = poller
-        self._drive: LiveDrive | None = None
-        self._found: dict[str, SideRead] = {}
-        self._thread: threading.Thread | None = None
-
-    def read(self, drive: LiveDrive) -> dict[str, SideRead]:
-        """Return the values that were read so far, by register, and continue to read this drive."""
-        if self._drive is not drive:
-            self._drive, self._found = drive, {}
-        if self._thread is None or not self._thread.is_alive():
-            self._thread = threading.Thread(target=self._read_all, args=(drive, self._found), daemon=True)
-            self._thread.start()
-        return self._found
-
-    def rest(self) -> None:
-        """Read no more registers until the next call of `read`."""
-        self._drive = None
-
-    def _read_all(self, chosen: LiveDrive, found: dict[str, SideRead]) -> None:
-        drive = chosen.polled.drive
-        polled = {poll.register.name for poll in chosen.polled.polls}
-        for name, register in drive.registers.items():
-            if not register.readable or name in polled:
-                continue
-            if self._drive is not chosen:
-                return
-            asked = time.monotonic()
-            try:
-                text = value_text(register, drive.read(register))
-            except BusError as failure:
-                text = _in_words(failure)
-            found[name] = SideRead(text, time.time_ns())
-            time.sleep(pause_s(time.monotonic() - asked, chosen.line_utilisation))
+    if not arguments.trigger:
+        if arguments.pre is not None or arguments.post is not None:
+            raise ValueError(
+                '--pre and --post belong to a trigger: add --trigger "pump-1.output_current > 30"'
+            )
+        return plant, None
+    if not arguments.out:
+        raise ValueError("--trigger needs --out, such as --out trip.arrows")
+    if getattr(arguments, "rotate", None) is not None:
+        raise ValueError("--trigger and --rotate exclude each other: each trigger has its own file")
+    if arguments.out.suffix not in FORMATS:
+        raise ValueError(f"{arguments.out}: a recording's name must end in {', '.join(FORMATS)}")
+    try:
+        found = with_triggers(plant, [condition for condition in arguments.trigger if condition != "key"])
+    except ValueError as mistakes:
+        raise ValueError("\n".join(f"--trigger {one}" for one in str(mistakes).splitlines())) from None
+    how = Triggering(arguments.pre or PRE_S, arguments.post or POST_S, found.texts, found.signals)
+    return found.plant, how
 
 
-def pause_s(read_s: float, utilisation: float) -> float:
-    """Return the pause in s after a read that took `read_s` on a line with this planned utilisation."""
-    share = min(MOST_SHARE, max(LEAST_SHARE, 1.0 - utilisation))
-    return max(LEAST_PAUSE_S, read_s * (1.0 / share - 1.0))
+# ---- the picture of the last trigger ----
+
+MOST_SIGNALS = 4  # limit of lines in the picture
+LEAST_COLUMNS = 10  # least width of a curve
+MOST_ROWS = 100_000  # rows read from a recording for a picture; new rows must wait during the reading
 
 
-def _in_words(failure: BusError) -> str:
-    """Describe a failure in a few words, such as "no reply"."""
-    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(failure).__name__).lower()
+def trigger_picture(path: Path, how: Triggering, width: int, blocks: str) -> list[str]:
+    """Draw the signals around the moment of a trigger, as lines of text with at most `width` columns.
+
+    The signals are those that the condition names; for a trigger without a condition, they are the polled
+    registers. `path` is a complete recording. Return [] if it cannot be read, because polling must go on.
+    """
+    try:
+        recording = open_recording(path)
+        trigger = recording.metadata["trigger"]
+        rows = list(islice(chain.from_iterable(recording), MOST_ROWS + 1))
+    except (ImportError, KeyError, OSError, ValueError):
+        return []
+    is_large = len(rows) > MOST_ROWS
+    polled: dict[TriggerSeries, list[Row]] = {}
+    for row in sorted([] if is_large else rows, key=lambda row: row.time_ns):
+        polled.setdefault((row.drive, row.register), []).append(row)
+    known = recording.metadata.get("drives", {})
+    wanted = how.signals.get(trigger["condition"]) or [one for one in polled if one[0] in known]
+    signals = {series: polled[series] for series in wanted if series in polled}
+    shown = [*signals.items()][:MOST_SIGNALS]
+    names = [".".join(series) for series, _ in shown]
+    registers = [known.get(drive, {}).get("registers", {}).get(name, {}) for (drive, name), _ in shown]
+    ranges = [_range(own, about.get("unit", "")) for about, (_, own) in zip(registers, shown, strict=True)]
+    side = max(map(columns_of, names), default=0) + 2
+    columns = max(LEAST_COLUMNS, width - side - max(map(columns_of, ranges), default=0) - 2)
+    span = SpanOfTime(trigger["time_ns"], trigger["pre_s"], trigger["post_s"])
+    time = datetime.fromtimestamp(trigger["time_ns"] / 1e9, UTC)
+    note = ", which is too large for a picture" if is_large else ""
+    lines = [f"trigger {time:%H:%M:%S.%f} UTC: {trigger['condition']}, in {path.name}{note}"]
+    for name, text, (_, own) in zip(names, ranges, shown, strict=True):
+        lines.append(
+            f"{padded(name, '<', side)}{sparkline(span.history(own, columns), columns, blocks)}  {text}"
+        )
+    mark = " " * span.column(trigger["time_ns"], columns) + "^"
+    return [*lines, f"{padded('', '<', side)}{mark} {span}"] if shown else lines
+
+
+class SpanOfTime(NamedTuple):
+    """The time that a trigger's picture shows, from `pre_s` before the trigger to `post_s` after it."""
+
+    trigger_ns: int
+    pre_s: float
+    post_s: float
+
+    def __str__(self) -> str:
+        return f"from -{self.pre_s:g} s to {self.post_s:g} s"
+
+    def column(self, time_ns: int, columns: int) -> int:
+        """Return which of `columns` columns shows this time."""
+        since_ns = time_ns - self.trigger_ns + round(self.pre_s * 1e9)
+        span_ns = round((self.pre_s + self.post_s) * 1e9)
+        return max(0, min(columns - 1, since_ns * columns // max(1, span_ns)))
+
+    def history(self, rows: Iterable[Row], columns: int) -> list[float | None]:
+        """Return a value for each column: the value with the largest magnitude among its rows.
+
+        A column without rows has the value of the last row before it: None if that row is a miss.
+        """
+        found: dict[int, list[float | None]] = {}
+        for row in rows:
+            found.setdefault(self.column(row.time_ns, columns), []).append(row.value)
+        history: list[float | None] = []
+        last: float | None = None
+        for column in range(columns):
+            values = found.get(column, [last])
+            history.append(max((value for value in values if value is not None), key=abs, default=None))
+            last = values[-1]
+        return history
+
+
+def _range(rows: Iterable[Row], unit: str) -> str:
+    values = [row.value for row in rows if row.value is not None]
+    return f"{min(values):g} to {max(values):g} {unit}".rstrip() if values else "no value"

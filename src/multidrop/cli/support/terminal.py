@@ -1,11 +1,16 @@
-"""Full-screen pictures on a terminal: styled lines of text, each picture drawn over the previous one."""
+"""The terminal: full-screen pictures of styled lines of text, sparklines, and the keys that are pressed."""
 
 from __future__ import annotations
 
+import codecs
 import os
+import re
+import select
 import shutil
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from errno import EIO
 from math import ceil
 from types import TracebackType
 from typing import NamedTuple, Self, TextIO
@@ -135,3 +140,95 @@ def sparkline(
     low = min(low, 0.0)
     span, highest = high - low or 1.0, len(blocks) - 1
     return "".join(" " if mean is None else blocks[round((mean - low) / span * highest)] for mean in means)
+
+
+# ---- keys ----
+
+
+def keys_are_readable() -> bool:
+    """Return True if stdin and stdout are a terminal whose keys can be read."""
+    return sys.platform != "win32" and sys.stdin.isatty() and sys.stdout.isatty()
+
+
+UP, DOWN, PAGE_UP, PAGE_DOWN, ENTER, ESCAPE = "up", "down", "page up", "page down", "enter", "escape"
+KEYS = {  # maps the bytes that a terminal sends to the key's name
+    b"\x1b[A": UP,
+    b"\x1bOA": UP,
+    b"\x1b[B": DOWN,
+    b"\x1bOB": DOWN,
+    b"\x1b[5~": PAGE_UP,
+    b"\x1b[6~": PAGE_DOWN,
+    b"\r": ENTER,
+    b"\n": ENTER,
+}
+UNKNOWN = "unknown"
+# Other escape sequences, and their starts. They are dropped whole: F4's ends in S, the key that stops motors.
+_SEQUENCE = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*[@-Z\\-~]|O[ -~])")
+_BEGUN = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*|O)?")
+SPLIT_S = 0.05  # how long to wait for the rest of an escape sequence
+MOST_BYTES = 4  # limit of a character's bytes in UTF-8
+# Letters of the Russian and Ukrainian layouts, and the Latin letters on the same keys.
+LATIN = str.maketrans("йыіфнолеЙЫІФНОЛЕ", "qssayjktQSSAYJKT")
+
+
+@contextmanager
+def terminal_keys() -> Iterator[Callable[[float], str]]:
+    """Yield a function that waits for a key, and returns the key's name or letter; "" if none is pressed.
+
+    The function's argument is the longest wait in s. The function raises OSError if the terminal is closed.
+    """
+    assert sys.platform != "win32", "keys_are_readable excludes it"
+    import termios
+    import tty
+
+    fd = sys.stdin.fileno()
+    before = termios.tcgetattr(fd)
+    tty.setcbreak(fd)
+    pressed = b""  # bytes that were read but not returned yet
+
+    def read() -> bytes:
+        found = os.read(fd, 64)
+        if not found:
+            raise OSError(EIO, "the terminal is closed")
+        return found
+
+    def wait_for_key(seconds: float) -> str:
+        nonlocal pressed
+        if not pressed and select.select([fd], [], [], seconds)[0]:
+            pressed = read()
+        while is_begun(pressed) and select.select([fd], [], [], SPLIT_S)[0]:
+            pressed += read()
+        key, pressed = next_key(pressed)
+        return key
+
+    try:
+        yield wait_for_key
+    finally:
+        with suppress(termios.error):  # fails if the terminal is closed
+            termios.tcsetattr(fd, termios.TCSADRAIN, before)
+
+
+def next_key(pressed: bytes) -> tuple[str, bytes]:
+    """Return the name or letter of the first key in a terminal's bytes, and the bytes after this key."""
+    if sequence := _SEQUENCE.match(pressed):
+        return KEYS.get(sequence[0], UNKNOWN), pressed[sequence.end() :]
+    if pressed[:1] == b"\x1b":
+        return ESCAPE, pressed[1:]
+    letter, rest = _first_letter(pressed)
+    return KEYS.get(letter.encode(), letter), rest
+
+
+def is_begun(pressed: bytes) -> bool:
+    """Return True if these bytes start a key or letter whose other bytes may still come."""
+    with suppress(UnicodeDecodeError):
+        return bool(_BEGUN.fullmatch(pressed)) or (
+            pressed != b"" and codecs.getincrementaldecoder("utf-8")().decode(pressed) == ""
+        )
+    return False
+
+
+def _first_letter(pressed: bytes) -> tuple[str, bytes]:
+    for length in range(1, MOST_BYTES + 1):
+        with suppress(UnicodeDecodeError):
+            return pressed[:length].decode(), pressed[length:]
+    return "\ufffd", pressed[1:]
