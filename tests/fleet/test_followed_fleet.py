@@ -32,7 +32,7 @@ from multidrop.fleet.overview import MISSED_MS, FleetView, FleetWatch
 from multidrop.fleet.samples.samples_stream import StreamMessage
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.connections import ServerPath
-from multidrop.gateway.fleet_stops import FleetStops
+from multidrop.gateway.commands import FleetStops
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Caller, May, Right
 from multidrop.gateway.settings import read_plant

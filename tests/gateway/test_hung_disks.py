@@ -21,7 +21,7 @@ from lines import PATIENCE, until
 from multidrop import History
 from multidrop.gateway import gateway as gateway_module
 from multidrop.gateway import historian, parts, reload, settings
-from multidrop.gateway.http import page_files
+from multidrop.gateway.http import files
 from multidrop.gateway.http import routes as web
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live import views
@@ -297,10 +297,10 @@ def test_requests_for_hung_page_files_fail_and_delay_no_other_requests(
     go_on, read = threading.Event(), Path.read_bytes
 
     def read_bytes(path: Path) -> bytes:
-        assert page_files.PAGE not in path.parents or go_on.wait(PATIENCE)
+        assert files.PAGE not in path.parents or go_on.wait(PATIENCE)
         return read(path)
 
-    monkeypatch.setattr(page_files, "READ_S", SHORT_S)
+    monkeypatch.setattr(files, "READ_S", SHORT_S)
     with served(tmp_path, SERVE) as gateway:
         monkeypatch.setattr(Path, "read_bytes", read_bytes)
         # At most four reads of files may hang concurrently.

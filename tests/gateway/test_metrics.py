@@ -23,7 +23,7 @@ from peers import require_program
 
 from multidrop import exposition
 from multidrop.exposition import MetricFamily, expose_metrics
-from multidrop.gateway.http.page_files import PAGE
+from multidrop.gateway.http.files import PAGE
 from multidrop.gateway.http.rights import Right
 
 # ---- a Prometheus server that scrapes a gateway ----

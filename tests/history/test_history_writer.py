@@ -35,7 +35,7 @@ from multidrop.core.columns import Names
 from multidrop.families import InnovertIBD
 from multidrop.gateway import historian
 from multidrop.gateway.historian import MOST_BUCKETS, HistorySettings, as_json, build
-from multidrop.gateway.http.exports import Exports
+from multidrop.gateway.http.files import Exports
 from multidrop.history import Buckets, HistoryWriter
 from multidrop.history import writer as writer_module
 from multidrop.history.compact import main as compact

@@ -91,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _write_modbus_map(plant: Plant, settings: ServeSettings, path: Path) -> int:
     """Write the table that `GET /api/modbus-map` returns, with the ports that the plant file names."""
     from multidrop.gateway.modbus_server.address_map import address_map, to_csv, to_json
-    from multidrop.gateway.modbus_server.unit_ids import MAIN, Units
+    from multidrop.gateway.modbus_server.settings import MAIN, Units
 
     if path.suffix not in (".csv", ".json"):
         raise ValueError(f"{path}: the name of an address map must end in .csv or .json")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import secrets
+import socket
 import struct
 import time
 from collections.abc import Awaitable, Callable, Mapping
@@ -19,24 +21,20 @@ import multidrop
 from multidrop import Bus, LineError, Plant, Poller
 from multidrop.control import Ledger
 from multidrop.gateway.clock import boottime_ns, now_and_slept_ns, utc_ms
-from multidrop.gateway.commands import Commands
-from multidrop.gateway.fleet_stops import FleetStops
+from multidrop.gateway.commands import Commands, FleetStops
 from multidrop.gateway.http.connections import BACKLOG, Connections, Watched, WatchedProtocol, listen
 from multidrop.gateway.http.guard import MOST_HEAD
 from multidrop.gateway.http.rights import OwnNames, Tokens
 from multidrop.gateway.http.routes import make_app
 from multidrop.gateway.live.alarm_file import AlarmFile
-from multidrop.gateway.live.alarms import Alarm, AlarmChange, Alarms
-from multidrop.gateway.live.drive_reads import Identities, SideReads
+from multidrop.gateway.live.alarms import Alarm, AlarmChange, Alarms, Limits, current_values
+from multidrop.gateway.live.drive_reads import Identities, ParameterReads, SideReads
 from multidrop.gateway.live.frames import Frames, SeenFrames, frame_of, lost_of
 from multidrop.gateway.live.hub import SILENT, Hub
-from multidrop.gateway.live.limits import Limits, current_values
-from multidrop.gateway.live.parameter_reads import ParameterReads
 from multidrop.gateway.live.recent_statistics import RecentStatistics
 from multidrop.gateway.live.views import troubles_of
 from multidrop.gateway.parts import LiveParts, PartContext
 from multidrop.gateway.reload import ADOPTION_S, Read, Reload
-from multidrop.gateway.sd_notify import Notifier
 from multidrop.gateway.settings import AUDIT_S, ServeSettings, check_writable
 from multidrop.supervisor import Hung, in_time, supervisor
 
@@ -50,8 +48,35 @@ MOST_ASKED = 16  # limit of concurrent requests for registers that are not decla
 ASKED_S = 30.0  # time limit of one request for a register that is not declared
 END_S = 4.0  # time limit of shutdown, stops included
 GRACE_S = 1  # part of END_S for finishing HTTP requests in flight
-
 _log = logging.getLogger("multidrop.gateway")
+
+
+class Notifier:
+    """Sends messages to the service manager's socket; without a socket, all calls are ignored."""
+
+    def __init__(self, address: str | None = None) -> None:
+        self._address = os.environ.get("NOTIFY_SOCKET", "") if address is None else address
+
+    @property
+    def watchdog_s(self) -> float | None:
+        """The service manager's limit of the time between WATCHDOG=1 messages, in s; None: no limit."""
+        asked = os.environ.get("WATCHDOG_USEC", "")
+        mine = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        return int(asked) / 1e6 if asked.isdigit() and int(asked) > 0 and mine else None
+
+    def send_reloading(self) -> None:
+        """Report the start of a reload, with its time. A later READY=1 reports the end of the reload."""
+        self.send("RELOADING=1", f"MONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
+
+    def send(self, *lines: str) -> None:
+        """Send lines such as READY=1, without waiting; they are lost if the manager's queue is full."""
+        if not self._address:
+            return
+        abstract = self._address.startswith("@")
+        address = "\0" + self._address[1:] if abstract else self._address
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+            manager.setblocking(False)
+            manager.sendto("\n".join(lines).encode(), address)
 
 
 class Gateway:

@@ -36,7 +36,7 @@ PARTS: Mapping[str, str] = {
     "notify": "multidrop.gateway.notifications",
     "opcua": "multidrop.gateway.opcua.part",
     "postgres": "multidrop.gateway.forward.postgres",
-    "tool": "multidrop.gateway.tool_ports.server",
+    "tool": "multidrop.gateway.modbus_server.tool_ports",
     "trigger": "multidrop.gateway.live.triggers",
     "upload": "multidrop.gateway.forward.upload",
 }

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from multidrop import Batch, Plant, PlantError, Poller
 from multidrop.gateway.clock import utc_ms
 from multidrop.gateway.commands import drives_of
-from multidrop.gateway.live.limits import Limits
+from multidrop.gateway.live.alarms import Limits
 from multidrop.gateway.parts import PARTS
 from multidrop.gateway.settings import AUDIT_S, check_writable
 from multidrop.supervisor import Hung, supervisor

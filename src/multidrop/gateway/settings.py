@@ -17,7 +17,7 @@ from typing import Any
 
 from multidrop import Plant, PlantError
 from multidrop.gateway.http.rights import May, Right, Token, is_loopback, read_tokens
-from multidrop.gateway.live.limits import LIMIT_KEYS, Limit, read_limits
+from multidrop.gateway.live.alarms import LIMIT_KEYS, Limit, read_limits
 from multidrop.gateway.parts import PARTS, missing_library
 from multidrop.plant import MAY_KEYS, allowed
 from multidrop.supervisor import Hung, in_time

@@ -26,9 +26,9 @@ from tables import table
 from multidrop import Plant, PlantError, PlantLine, Polled, PolledDrive
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
 from multidrop.drive.register import reading
-from multidrop.gateway.forward import part as part_module
-from multidrop.gateway.forward.formats import MOST_ROWS, line_protocol, pieces, row_objects
-from multidrop.gateway.forward.part import Forwarding
+from multidrop.gateway.forward import forwarder
+from multidrop.gateway.forward.forwarder import MOST_ROWS, Forwarding, pieces, row_objects
+from multidrop.gateway.forward.influx import line_protocol
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.parts import missing_library
 from multidrop.gateway.settings import read_settings
@@ -270,7 +270,7 @@ def test_units_follow_the_present_plant_and_rows_of_unknown_units_are_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sent: list[Any] = []
-    monkeypatch.setattr(part_module, "monotonic_ns", lambda: 1000)
+    monkeypatch.setattr(forwarder, "monotonic_ns", lambda: 1000)
     made: Any = Forwarding(  # type: ignore[arg-type]
         "upload",
         "it",

@@ -31,7 +31,7 @@ from peers import require_module, require_program
 from postgres_clusters import postgres
 from spooled import NOON, STEP, rows_of
 
-from multidrop.gateway.forward.formats import line_protocol
+from multidrop.gateway.forward.influx import line_protocol
 from multidrop.gateway.http_post import post
 from multidrop.iso_time import parse_time
 from multidrop.samples import unpack

@@ -25,8 +25,8 @@ from starlette.requests import Request
 from tables import table
 
 from multidrop.gateway.commands import VERBS
-from multidrop.gateway.http import page_files
-from multidrop.gateway.http.exports import MOST_EXPORTS, Exports
+from multidrop.gateway.http import files
+from multidrop.gateway.http.files import MOST_EXPORTS, Exports
 from multidrop.gateway.http.messages import language_of
 from multidrop.gateway.http.operations import OPERATIONS, openapi
 from multidrop.gateway.http.rights import COMMAND_ID, May, Right
@@ -336,7 +336,7 @@ def test_files_outside_the_page_folder_are_not_served(gateway: Served, name: str
 
 
 def test_installation_without_a_page_answers_404(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page_files.PageFiles.__init__, "__defaults__", (tmp_path / "missing",))
+    monkeypatch.setattr(files.PageFiles.__init__, "__defaults__", (tmp_path / "missing",))
     with served(tmp_path) as gateway:
         assert "this version of multidrop has no page" in gateway.get("/").json["error"]
         assert gateway.get("/api/plant").status == 200

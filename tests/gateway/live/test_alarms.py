@@ -27,9 +27,8 @@ from multidrop.gateway.commands import in_words
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live.alarm_file import AlarmFile, alarm_in
-from multidrop.gateway.live.alarms import Alarm, Alarms
+from multidrop.gateway.live.alarms import Alarm, Alarms, Limit, Limits
 from multidrop.gateway.live.hub import RAN_NS, Hub, Shown
-from multidrop.gateway.live.limits import Limit, Limits
 from multidrop.gateway.settings import read_settings
 from multidrop.polling.batch import Batch
 

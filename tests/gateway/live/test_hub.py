@@ -20,7 +20,6 @@ from multidrop import Drive, Plant, PolledDrive, reading, setting
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
 from multidrop.families import MODELS, DelixiModbus, InvtCHE
 from multidrop.gateway.live.alarms import Alarms
-from multidrop.gateway.live.descriptions import describe_line
 from multidrop.gateway.live.frames import frame_of, lost_of
 from multidrop.gateway.live.hub import (
     INCOMPLETE,
@@ -33,9 +32,10 @@ from multidrop.gateway.live.hub import (
     published_values,
 )
 from multidrop.gateway.live.recent_statistics import RecentStatistics
+from multidrop.gateway.live.views import describe_line
 from multidrop.gateway.metrics import OTHER, base_unit, plant_families
-from multidrop.gateway.modbus_server import common_block
-from multidrop.gateway.modbus_server.common_block import NO_NUMBER, CommonBlock
+from multidrop.gateway.modbus_server import words as modbus_words
+from multidrop.gateway.modbus_server.words import NO_NUMBER, CommonBlock
 from multidrop.gateway.mqtt.home_assistant import discovery
 from multidrop.polling.batch import Batch
 
@@ -406,7 +406,7 @@ def test_age_is_right_if_a_clock_was_set_back_or_stopped_in_sleep(hub: Hub, cloc
 # ---- registers whose documents state no scale: raw counts are never reported in amperes, volts or hertz ----
 
 
-COMMON = (common_block.FREQUENCY, common_block.CURRENT, common_block.SETPOINT)
+COMMON = (modbus_words.FREQUENCY, modbus_words.CURRENT, modbus_words.SETPOINT)
 
 
 class FullHub(Hub):

@@ -26,11 +26,10 @@ from multidrop.drive import parameters
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace
 from multidrop.families import ErmanERG220, InvtCHE
 from multidrop.gateway.live import drive_reads
-from multidrop.gateway.live.descriptions import describe_line
 from multidrop.gateway.live.drive_reads import Identities
 from multidrop.gateway.live.hub import Hub
 from multidrop.gateway.live.recent_statistics import MINUTES, RecentStatistics
-from multidrop.gateway.live.views import line_views
+from multidrop.gateway.live.views import describe_line, line_views
 from multidrop.gateway.metrics import plant_families
 from multidrop.transport.statistics import LineStatistics, line_statistics
 

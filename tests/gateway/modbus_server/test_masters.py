@@ -26,8 +26,7 @@ from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.rights import May
 from multidrop.gateway.live.hub import Hub
 from multidrop.gateway.modbus_server.server import ModbusServer
-from multidrop.gateway.modbus_server.settings import ModbusSettings
-from multidrop.gateway.modbus_server.unit_ids import MAIN
+from multidrop.gateway.modbus_server.settings import MAIN, ModbusSettings
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 

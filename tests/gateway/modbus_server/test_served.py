@@ -22,11 +22,10 @@ from multidrop.drive import COIL, HOLDING, Carrier
 from multidrop.families import MODELS, InnovertIBD
 from multidrop.families.registry import find_model
 from multidrop.gateway.modbus_server import clients as modbus_clients
-from multidrop.gateway.modbus_server import common_block
 from multidrop.gateway.modbus_server import line_share as passing
+from multidrop.gateway.modbus_server import words
 from multidrop.gateway.modbus_server.protocol import ModbusCode
-from multidrop.gateway.modbus_server.settings import ModbusSettings
-from multidrop.gateway.modbus_server.unit_ids import MAIN, StopWrite, Unit, Units
+from multidrop.gateway.modbus_server.settings import MAIN, ModbusSettings, StopWrite, Unit, Units
 from multidrop.gateway.settings import read_settings
 from multidrop.plant.model import PolledDrive
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
@@ -211,15 +210,15 @@ def test_every_exception_code_has_a_row_in_the_page() -> None:
 
 def test_the_common_block_is_laid_out_as_the_page_says() -> None:
     offsets = [int(address.rstrip("H"), 16) - ModbusSettings().common for address in rows("The common block")]
-    layout = common_block
+    layout = words
     assert offsets == [
         *(layout.STATE, layout.FAULT, layout.FREQUENCY, layout.CURRENT, layout.SETPOINT),
         *(layout.AGE, layout.STOP, layout.STOP + 1),
     ]
     sizes = [int(rest.split(" | ")[0]) for rest in rows("The common block").values()]
-    assert sum(sizes) == common_block.COMMON_LENGTH
+    assert sum(sizes) == words.COMMON_LENGTH
     states = re.findall(r"(\d) (\w+)", next(iter(rows("The common block").values())).partition("state: ")[2])
-    assert {name: int(number) for number, name in states} == common_block.STATES
+    assert {name: int(number) for number, name in states} == words.STATES
 
 
 def test_the_limits_of_clients_are_as_the_page_says() -> None:

@@ -15,7 +15,7 @@ from urllib.parse import parse_qs, unquote, urlsplit
 import fake_plant
 
 from multidrop.gateway.clock import iso_time
-from multidrop.gateway.http.page_files import PAGE, read_files
+from multidrop.gateway.http.files import PAGE, read_files
 from multidrop.gateway.live.frames import changes
 
 FILES = read_files(PAGE)

@@ -21,7 +21,7 @@ from multidrop.core.result import Status
 from multidrop.drive.register import Access
 from multidrop.drive.verbs import LISTED_VERBS
 from multidrop.fleet.leases.member import MemberState
-from multidrop.gateway.http.page_files import PAGE, read_files
+from multidrop.gateway.http.files import PAGE, read_files
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live import alarms, hub
 from multidrop.history.quantities import RAW

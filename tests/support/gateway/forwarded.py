@@ -23,8 +23,7 @@ from lines import until
 from spooled import EXCHANGES, NOON, numbered
 
 from multidrop import Plant
-from multidrop.gateway.forward.forwarder import Outgoing, RepeatingReceiver
-from multidrop.gateway.forward.part import Forwarding
+from multidrop.gateway.forward.forwarder import Forwarding, Outgoing, RepeatingReceiver
 from multidrop.gateway.mqtt.broker import Login, parse_broker
 from multidrop.gateway.mqtt.rows import json_rows
 from multidrop.gateway.mqtt.settings import MqttSettings

@@ -19,8 +19,7 @@ from multidrop.gateway.commands import Admit
 from multidrop.gateway.http.rights import Caller
 from multidrop.gateway.live.hub import KeptRow, Newest
 from multidrop.gateway.modbus_server.server import ModbusServer
-from multidrop.gateway.modbus_server.settings import ModbusSettings
-from multidrop.gateway.modbus_server.unit_ids import MAIN
+from multidrop.gateway.modbus_server.settings import MAIN, ModbusSettings
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 
 PATIENCE = 30.0  # s, longest wait for an expected event

@@ -1,4 +1,4 @@
-"""RowForwarder: sends the messages of a spool to a receiver.
+"""Forwarding: store all rows on disk, and send them to a receiver, such as a database.
 
 After an outage, the newest message is sent first.
 
@@ -9,20 +9,33 @@ whose answer was lost is sent again, with the same id.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 import threading
 import time
-from collections.abc import Callable
-from math import inf
+from collections.abc import Callable, Iterator
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+import pyarrow as pa
+
+from multidrop import Batch, Plant
+from multidrop.exposition import MetricFamily
+from multidrop.gateway.clock import monotonic_ns
 from multidrop.gateway.http_post import Refused
+from multidrop.gateway.metrics import counter
+from multidrop.gateway.reload import changed_drives
+from multidrop.iso_time import format_time
 from multidrop.printable import printable
-from multidrop.samples import MessageError, SinkError, Spool, StoredMessage, unpack
+from multidrop.recording import parse_size
+from multidrop.samples import MessageError, PolledUnits, SinkError, Spool, StoredMessage, unpack
+from multidrop.supervisor import supervisor
 from multidrop.whole_file import whole_file
 
+MOST_ROWS = 2000  # limit of rows in one request or MQTT message, about 250 kB of JSON
+NOT_FINITE = "not a finite number"  # status of a row whose value JSON and InfluxDB cannot represent
 RETRY_S, MOST_RETRY_S = 1.0, 30.0  # pause after the first failed attempt, and the longest pause
 SLOW_S = 40.0  # a receiver that takes longer than this (in s) for one message is reported
 REMOVED_S = 0.01  # pause if the full spool has just removed the message that was to be sent
@@ -32,8 +45,39 @@ SET_BACK = (
     "it has message {} of the spool {}, which ends at message {}: the folder was copied or set back; "
     "move it away to start a new spool"
 )
-
 _log = logging.getLogger("multidrop.gateway.forward")
+LOOK_S = 1.0  # interval of checking that the threads are alive
+CLOSING_S = 2.0  # time limit for writing the last rows to the disk
+SENDING_S = 0.5  # time limit for the message that is being sent
+SETTLED_NS = 60_000_000_000  # rows of the former plant arrive at most this long after a reload
+
+
+def pieces(rows: Any) -> Iterator[Any]:
+    """Yield the table in pieces of at most MOST_ROWS rows."""
+    for begin in range(0, len(rows), MOST_ROWS):
+        yield rows.slice(begin, MOST_ROWS)
+
+
+def listed(rows: Any) -> Iterator[tuple[int, str, str, float | None, str, str | None]]:
+    """Yield time (UTC in ns), drive, register, value, status and unit of each row."""
+    times = rows.column("time").cast(pa.int64())
+    names = ("drive", "register", "value", "status", "unit")
+    return zip(times.to_pylist(), *(rows.column(name).to_pylist() for name in names), strict=True)
+
+
+def row_objects(rows: Any) -> list[dict[str, Any]]:
+    """Return each row as a JSON object."""
+    return [
+        {
+            "time": format_time(time_ns),
+            "drive": drive,
+            "register": register,
+            "value": value if value is not None and isfinite(value) else None,
+            "status": status if value is None or isfinite(value) else NOT_FINITE,
+            "unit": unit,
+        }
+        for time_ns, drive, register, value, status, unit in listed(rows)
+    ]
 
 
 class SpoolPosition(NamedTuple):
@@ -281,3 +325,117 @@ class RowForwarder:
 def _reason(failure: Exception) -> str:
     text = str(failure) if isinstance(failure, OSError) else type(failure).__name__
     return printable(text or type(failure).__name__)[:200]
+
+
+class Forwarding:
+    """A spool and its forwarder.
+
+    `name` is the prefix of the metrics, and `receiver` the receiver's name in logs. `make_receiver`
+    is called with the spool's folder.
+
+    Raises ValueError if the folder is not a spool, is in use, or cannot be written.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        receiver: str,
+        folder: Path,
+        most: str,
+        plant: Plant,
+        make_receiver: Callable[[Path], RowReceiver],
+    ) -> None:
+        self._name = name
+        self._plant = plant
+        self._units = PolledUnits()
+        self._note_units(0)
+        self._spool = Spool(folder, "serve", most=parse_size(most), units=self._units, keep_sent=False)
+        self._forwarder = RowForwarder(receiver, self._spool, make_receiver(folder))
+        self._changed: frozenset[str] = frozenset()  # drives that the newest plant changed
+        self._adopted_ns = 0
+        self._lost_before = 0  # number of lost rows that /health no longer reports
+        self._sending: asyncio.Future[None] | None = None
+        self._is_closed = False
+
+    def _note_units(self, since_ns: int) -> None:
+        for line in self._plant.lines:
+            self._units.note(line, since_ns)
+
+    # ---- the methods of Part ----
+
+    def take(self, batch: Batch) -> None:
+        """Copy the rows within microseconds; other threads store and send them."""
+        self._spool.append(self._without_former_drives(batch) if self._changed else batch)
+
+    def adopt(self, plant: Plant) -> None:
+        """Use the units of another plant from now on."""
+        self._adopted_ns = monotonic_ns()
+        self._changed = changed_drives(self._plant, plant)
+        self._plant = plant
+        self._note_units(self._adopted_ns)
+
+    def _without_former_drives(self, batch: Batch) -> Batch:
+        """Return the batch without rows of drives that the new plant changes, if the old plant polled them.
+
+        Such rows were requested before the new plant was adopted, so their units are unknown.
+        """
+        columns = batch.columns()
+        former = {code for code, name in enumerate(columns.drives) if name in self._changed}
+        rows = enumerate(zip(columns.drive, columns.monotonic_ns, strict=True))
+        kept = [at for at, (drive, time_ns) in rows if time_ns >= self._adopted_ns or drive not in former]
+        if columns.monotonic_ns and min(columns.monotonic_ns) >= self._adopted_ns + SETTLED_NS:
+            self._changed = frozenset()
+        return batch if len(kept) == len(columns.time) else batch.at(kept)
+
+    async def run(self) -> None:
+        """Forward until cancelled. If a thread ends before `close`, raises its exception or RuntimeError."""
+        sending = supervisor().thread(f"{self._name} rows", inf, self._forwarder.run)
+        self._sending = sending
+        while self._spool.is_alive() and not sending.done():
+            if not self._forwarder.behind and not self._forwarder.problem:
+                self._lost_before = self._spool.state().lost
+            await asyncio.sleep(LOOK_S)
+        if not self._is_closed:
+            if sending.done():
+                sending.result()
+            raise RuntimeError("the thread that stores or sends rows has ended")
+
+    def abandon(self) -> None:
+        """Close the spool of a part that does not start, so that the next reload can open it."""
+        self._spool.close()
+
+    async def close(self) -> None:
+        """Write the last rows to the disk; they are sent after the next start. Raises Hung."""
+        self._is_closed = True
+        self._forwarder.close()
+        await supervisor().within(f"{self._name} spool", CLOSING_S, self._spool.close)
+        if self._sending is not None:
+            await asyncio.wait([self._sending], timeout=SENDING_S)
+
+    def health(self) -> str:
+        """Return why rows are not stored or not sent; "" if they are stored and sent."""
+        state = self._spool.state()
+        lost = state.lost - self._lost_before
+        found = [
+            f"rows are not stored: {state.trouble}" if state.trouble else "",
+            self._forwarder.problem,
+            f"{lost} rows were lost, because the spool or the disk is full" if lost else "",
+        ]
+        return "; ".join(filter(None, found))
+
+    def figures(self) -> list[MetricFamily]:
+        """Return metrics: rows sent, lost and refused since the start, and the backlog."""
+        state, sent, name = self._spool.state(), self._forwarder, f"multidrop_{self._name}"
+        gauges = {
+            f"{name}_backlog_messages": ("Stored messages that are not sent yet.", sent.behind),
+            f"{name}_spool_bytes": ("Size of the stored messages.", state.stored),
+        }
+        return [
+            counter(f"{name}_rows_sent", "Rows that the receiver has taken.", sent.rows),
+            counter(f"{name}_rows_lost", "Rows lost because the spool or the disk was full.", state.lost),
+            counter(f"{name}_rows_refused", "Rows that the receiver does not accept.", sent.refused),
+            *(
+                MetricFamily(of, "gauge", text, [("", {}, float(value))])
+                for of, (text, value) in gauges.items()
+            ),
+        ]

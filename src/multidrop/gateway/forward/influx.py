@@ -6,12 +6,19 @@ import gzip
 import os
 import sys
 from dataclasses import dataclass, field
+from math import isfinite
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from multidrop import Plant
-from multidrop.gateway.forward.formats import line_protocol, pieces
-from multidrop.gateway.forward.forwarder import Outgoing, RepeatingReceiver
-from multidrop.gateway.forward.part import Forwarding
+from multidrop.gateway.forward.forwarder import (
+    NOT_FINITE,
+    Forwarding,
+    Outgoing,
+    RepeatingReceiver,
+    listed,
+    pieces,
+)
 from multidrop.gateway.forward.settings import (
     host_of,
     secret_in,
@@ -77,3 +84,38 @@ def build(settings: InfluxSettings, context: PartContext) -> Forwarding:
     return Forwarding(
         "influx", receiver, folder, settings.most, context.plant, lambda at: RepeatingReceiver(at, deliver)
     )
+
+
+def line_protocol(rows: Any, measurement: str) -> bytes:
+    """Return the rows in line protocol.
+
+    Drive, register and unit are tags; the value or the miss is the field. If a row is written twice,
+    InfluxDB replaces the point by the same point.
+    """
+    name, lines = _escaped(measurement, ", "), []
+    heads: dict[tuple[str, str, str | None], str] = {}  # how a line starts, by drive, register and unit
+    for time_ns, drive, register, value, status, unit in listed(rows):
+        head = heads.get((drive, register, unit))
+        if head is None:
+            tags = {"drive": drive, "register": register, "unit": unit}
+            head = heads[drive, register, unit] = name + "".join(
+                f",{key}={_escaped(text, ',= ')}" for key, text in tags.items() if text
+            )
+        if value is not None and isfinite(value):
+            lines.append(f"{head} value={value!r} {time_ns}\n")
+        else:
+            lines.append(f"{head} miss={_quoted(status if value is None else NOT_FINITE)} {time_ns}\n")
+    return "".join(lines).encode()
+
+
+def _escaped(text: str, special: str) -> str:
+    """Return a name with its special characters escaped.
+
+    A backslash at the name's end becomes a slash, because it would escape the character after the name.
+    """
+    text = "".join(f"\\{one}" if one in special else one for one in text.replace("\n", " "))
+    return f"{text[:-1]}/" if text.endswith("\\") else text
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ") + '"'

@@ -13,8 +13,7 @@ import psycopg
 from psycopg.conninfo import conninfo_to_dict
 
 from multidrop import Plant
-from multidrop.gateway.forward.forwarder import Outgoing, SpoolPosition
-from multidrop.gateway.forward.part import Forwarding
+from multidrop.gateway.forward.forwarder import Forwarding, Outgoing, SpoolPosition
 from multidrop.gateway.forward.settings import secret_in, secret_mistakes, spool_mistakes
 from multidrop.gateway.parts import PartContext
 from multidrop.samples import SinkError

@@ -6,9 +6,7 @@ import json
 from dataclasses import dataclass, field
 
 from multidrop import Plant
-from multidrop.gateway.forward.formats import pieces, row_objects
-from multidrop.gateway.forward.forwarder import Outgoing, RepeatingReceiver
-from multidrop.gateway.forward.part import Forwarding
+from multidrop.gateway.forward.forwarder import Forwarding, Outgoing, RepeatingReceiver, pieces, row_objects
 from multidrop.gateway.forward.settings import (
     host_of,
     secret_in,

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from multidrop.gateway.http import schemas
+from multidrop.gateway.http.files import TYPES
 from multidrop.gateway.http.guard import Needed
-from multidrop.gateway.http.page_files import TYPES
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.http.schemas import Schema
 

@@ -24,7 +24,7 @@ from multidrop.control import CommandOutcome, CommandResult, read_audit
 from multidrop.exposition import expose_metrics
 from multidrop.gateway.clock import iso_time, utc_ms
 from multidrop.gateway.commands import STOPPING, Admit, UnknownDrive
-from multidrop.gateway.http.exports import KINDS, Exports, attachment, parameter_file
+from multidrop.gateway.http.files import KINDS, Exports, PageFiles, attachment, parameter_file
 from multidrop.gateway.http.guard import COOKIE, HAS_WRONG_TOKEN, SHUT, WRONG, Guard
 from multidrop.gateway.http.messages import (
     Denied,
@@ -43,11 +43,9 @@ from multidrop.gateway.http.messages import (
     text_in,
 )
 from multidrop.gateway.http.operations import FRAME, NEEDED, OPERATIONS, Operation, openapi
-from multidrop.gateway.http.page_files import PageFiles
 from multidrop.gateway.http.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Caller
-from multidrop.gateway.live.descriptions import describe
 from multidrop.gateway.live.frames import WHOLE, Frames
-from multidrop.gateway.live.views import drive_view, health_of, line_views
+from multidrop.gateway.live.views import describe, drive_view, health_of, line_views
 from multidrop.gateway.metrics import families_of
 from multidrop.gateway.modbus_server.address_map import to_csv, to_json
 from multidrop.printable import is_number

@@ -430,7 +430,12 @@ def _words(register: Register[Any], value: float) -> str:
     return f"{register.name.replace('_', ' ')}: {register.format(value)}"
 
 
-# ---- values as MQTT and OPC UA publish them ----
+# ---- values as clients get them ----
+
+
+def digits_of(register: Register[Any]) -> int | None:
+    """Return the number of digits after the decimal point; None if it varies, as for a float."""
+    return None if register.is_float or register.scale_register else register.decimals
 
 
 def published_value(register: Register[Any], value: float) -> float | str:

@@ -1,1 +1,1 @@
-"""The gateway as a Modbus TCP server for SCADA systems."""
+"""The gateway as a Modbus server: over TCP for SCADA systems, and on tool ports for vendors' tools."""

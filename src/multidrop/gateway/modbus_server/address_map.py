@@ -13,10 +13,8 @@ from multidrop import Register
 from multidrop.core import NumberFormat
 from multidrop.drive import Carrier, Text
 from multidrop.gateway.http.rights import May, Right
-from multidrop.gateway.modbus_server.common_block import NUMBERS, STATE, STOP
-from multidrop.gateway.modbus_server.settings import ModbusSettings
-from multidrop.gateway.modbus_server.unit_ids import Unit, Units
-from multidrop.gateway.modbus_server.words import reading_function
+from multidrop.gateway.modbus_server.settings import ModbusSettings, Unit, Units
+from multidrop.gateway.modbus_server.words import NUMBERS, STATE, STOP, reading_function
 from multidrop.printable import spreadsheet_text
 
 NO_ANSWER = "exception 0BH"  # the answer if the gateway has no current value, and the drive gives none

@@ -27,10 +27,9 @@ from multidrop import (
 )
 from multidrop.control import NotAttached
 from multidrop.drive import Carrier
-from multidrop.gateway.commands import BUSY
+from multidrop.gateway.commands import BUSY, STOOD_STILL
 from multidrop.gateway.http.rights import NOT_ALLOWED, NOT_LISTED
 from multidrop.gateway.modbus_server.line_share import PassingBusy
-from multidrop.gateway.standstill import STOOD_STILL
 
 MOST_DATA = 253  # limit, in bytes, of a function code and its data (application protocol V1.1b3, 4.1)
 _HEADER = struct.Struct(">HHHB")

@@ -28,12 +28,10 @@ from multidrop.gateway.modbus_server.protocol import (
     read_range,
     reply_data,
 )
-from multidrop.gateway.modbus_server.settings import ModbusSettings
-from multidrop.gateway.modbus_server.unit_ids import MAIN, Unit, Units
+from multidrop.gateway.modbus_server.settings import MAIN, ModbusSettings, Unit, Units
 from multidrop.gateway.modbus_server.words import Lack
-from multidrop.gateway.modbus_server.writes import ClientWrites
+from multidrop.gateway.modbus_server.writes import ClientWrites, Standstill
 from multidrop.gateway.parts import Ask, PartContext
-from multidrop.gateway.standstill import Standstill
 
 Settings = ModbusSettings
 

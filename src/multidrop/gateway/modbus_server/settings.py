@@ -1,23 +1,37 @@
-"""The table [serve.modbus] of a plant file."""
+"""The table [serve.modbus] of a plant file, and the units: drives as Modbus clients address them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from ipaddress import ip_address, ip_network
-from typing import Any
+from typing import Any, NamedTuple
 
-from multidrop import Plant
+from multidrop import Plant, PolledDrive, Register
+from multidrop.drive import Carrier
+from multidrop.gateway.commands import drives_of
 from multidrop.gateway.http.rights import is_loopback
-from multidrop.gateway.modbus_server.common_block import COMMON_LENGTH
-from multidrop.gateway.modbus_server.unit_ids import Units
-from multidrop.printable import is_whole
+from multidrop.gateway.modbus_server.protocol import WriteRequest
+from multidrop.gateway.modbus_server.words import (
+    COMMON_LENGTH,
+    ChannelBlock,
+    CommonBlock,
+    DriveWords,
+    reading_function,
+)
+from multidrop.printable import did_you_mean, is_whole
 from multidrop.toml_check import ADDRESS, parse_address
 
 EXAMPLE = 'listen = "127.0.0.1:1502"'
 PASSING = ("off", "declared", "any")
 ROLES = ("look", "stop", "write")
 NETWORK = r"^([0-9.]+|[0-9A-Fa-f:.]*:[0-9A-Fa-f:.]*)(/[0-9.]+)?$"
+MAIN = ""  # key of the TCP port of all lines that have no port of their own
+UNITS = range(1, 248)  # 0 is a broadcast, 248 to 255 are reserved
+LAST_UNIT = 255  # reserved ids, up to this one, are accepted too, because some devices use them
+_WRITES = {Carrier.BIT: (0x05, 0x0F), Carrier.WORD: (0x06, 0x10)}
+_STOPS = ("stop", "coast", "emergency_stop")
 
 
 def _whole_numbers(least: int, most: int) -> dict[str, Any]:
@@ -154,3 +168,194 @@ def _is_network(text: object) -> bool:
         return isinstance(text, str) and bool(ip_network(text, strict=False))
     except ValueError:
         return False
+
+
+class StopWrite(NamedTuple):
+    """A register, and a raw value that stops the motor if it is written to the register."""
+
+    register: str
+    raw: float
+
+
+class Unit:
+    """A drive as Modbus clients see it, with its readable and writable addresses."""
+
+    def __init__(self, line: str, polled: PolledDrive) -> None:
+        self.line = line
+        self.drive = polled.drive
+        self.words = DriveWords(polled)
+        self.common = CommonBlock(polled)
+        self.channels = ChannelBlock(polled)
+        self.stops = frozenset(_stop_writes(polled.drive))
+        # addresses by the function code that reads them; 0: no function does
+        self._readable: dict[int, set[int]] = {code: set() for code in range(5)}
+        self._gaps: list[tuple[int, range]] = []
+        self._writable: dict[tuple[Carrier, int], Register[Any]] = {}
+        for register in self.drive.registers.values():
+            self._declare(register)
+        for text in self.drive.texts.values():
+            self._readable[reading_function(text.table)].update(
+                range(text.address, text.address + text.length)
+            )
+        for table, gap in self.drive.readable_gaps.items():
+            self._gaps.append((reading_function(table), gap))
+
+    def __repr__(self) -> str:
+        return f"<Unit {self.drive.name} on {self.line}>"
+
+    def _declare(self, register: Register[Any]) -> None:
+        table, addresses = register.table, range(register.address, register.address + register.words)
+        if register.readable:
+            self._readable[reading_function(table)].update(addresses)
+        if register.writable and table.write in _WRITES.get(table.carrier, ()):
+            self._writable[table.carrier, register.address] = register
+
+    def is_declared(self, function: int, addresses: range) -> bool:
+        """Return True if the drive's manual declares all these addresses readable."""
+        own = self._readable[function]
+        gaps = [gap for code, gap in self._gaps if code == function]
+        return all(at in own or any(at in gap for gap in gaps) for at in addresses)
+
+    def writable(self, carrier: Carrier, address: int) -> Register[Any] | None:
+        """Return the writable register that starts at this address; None if there is none."""
+        return self._writable.get((carrier, address))
+
+    def has_stop_in(self, written: WriteRequest, common_stop: int | None) -> bool:
+        """Return True if a request writes a stop to a register, or to `common_stop` in the common block."""
+        carrier, start, size, data = written
+        for at in range(size):
+            if carrier is Carrier.WORD and start + at == common_stop and data[2 * at : 2 * at + 2] != b"\0\0":
+                return True
+            register = self.writable(carrier, start + at)
+            if register is not None and at + register.words <= size:
+                raw = register.coding.raw_in(data, at)
+                if raw is not None and StopWrite(register.name, raw) in self.stops:
+                    return True
+        return False
+
+    def holding_addresses(self) -> set[int]:
+        """Return the addresses of all words that the drive's registers and texts use."""
+        written = {
+            at
+            for register in self.drive.registers.values()
+            if register.table.carrier is Carrier.WORD
+            for at in range(register.address, register.address + register.words)
+        }
+        return self._readable[3] | self._readable[4] | written
+
+
+def _stop_writes(drive: Any) -> Iterator[StopWrite]:
+    """Yield the register and raw value of the first write of each stop verb of the family.
+
+    Also yield the other raw values in `harmless` of the register's declaration, such as YD1000's 8000H.
+    Omit 0, which may mean "no command".
+    """
+    for name in _STOPS:
+        try:
+            script = getattr(drive, name).script()
+            step = next(script, None)
+            script.close()
+            register, value = getattr(step, "register", None), getattr(step, "value", None)
+            if isinstance(register, Register) and value is not None:
+                counts = {register.encode(value), *filter(None, register.harmless or ())}
+                yield from (StopWrite(register.name, raw) for raw in counts)
+        except Exception:  # the family lacks this verb, or the verb's script needs a bus
+            continue
+
+
+class Units:
+    """All units of a plant, by TCP port (MAIN, or a line's name) and unit id.
+
+    The drives of a line with its own port are reached only on that port. Raises ValueError with a
+    sentence per line for each mistake, such as two drives with one unit id, or an unknown name in the
+    settings.
+    """
+
+    def __init__(self, plant: Plant, settings: ModbusSettings) -> None:
+        self._units: dict[tuple[str, int], Unit] = {}
+        wrong = [*_unknown_names(plant, settings)]
+        for port, found in _by_port(plant, settings).items():
+            wrong += _clashes(port, found)
+            for number, units in found.items():
+                self._units[port, number] = units[0]
+                for unit in units:
+                    wrong += _overlap(unit, settings)
+        if wrong:
+            raise ValueError("\n".join(wrong))
+
+    def find(self, port: str, number: int) -> Unit | None:
+        """Return the unit of this number on a port; None if there is none."""
+        return self._units.get((port, number))
+
+    def __iter__(self) -> Iterator[tuple[str, int, Unit]]:
+        return ((port, number, unit) for (port, number), unit in self._units.items())
+
+
+def _by_port(plant: Plant, settings: ModbusSettings) -> Mapping[str, Mapping[int, list[Unit]]]:
+    found: dict[str, dict[int, list[Unit]]] = defaultdict(lambda: defaultdict(list))
+    for line in plant.lines:
+        port = line.name if line.name in settings.ports else MAIN
+        for polled in line.drives:
+            number = settings.units.get(polled.drive.name, polled.drive.address)
+            found[port][number].append(Unit(line.name, polled))
+    return found
+
+
+def _clashes(port: str, units: Mapping[int, list[Unit]]) -> Iterator[str]:
+    """Yield a sentence for each duplicate or invalid unit id, and a sentence that lists the free ids."""
+    where = "" if port == MAIN else f" on the port of line {port}"
+    wrong: list[str] = []  # names of drives
+    for number, found in sorted(units.items()):
+        names = " and ".join(f"{unit.drive.name} (line {unit.line})" for unit in found)
+        if not 1 <= number <= LAST_UNIT:
+            yield f"{names} cannot be unit {number}{where}, but 1 to {LAST_UNIT}"
+            wrong.append(found[-1].drive.name)
+        elif len(found) > 1:
+            yield f"unit {number}{where} would be {names}"
+            wrong.append(found[-1].drive.name)
+    if wrong:
+        free = [number for number in UNITS if number not in units]
+        example = f'units = {{ "{wrong[0]}" = {free[0] if free else 1} }}'
+        yield (
+            f"units gives a drive another number, such as {example}, and ports gives a line its own "
+            f"port; free numbers{where}: {_ranges(free)}"
+        )
+
+
+def _ranges(numbers: Iterable[int]) -> str:
+    """Return numbers as "3 to 20, 22"."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1][1:] = [number]
+        else:
+            runs.append([number])
+    return ", ".join(" to ".join(str(end) for end in run) for run in runs) or "none"
+
+
+def _overlap(unit: Unit, settings: ModbusSettings) -> Iterator[str]:
+    """Yield a sentence for each overlap of the common block, the channel block and the registers."""
+    channels = range(settings.channels, settings.channels + unit.channels.length)
+    if channels.stop > 0x10000 or set(channels) & (unit.holding_addresses() | set(settings.common_addresses)):
+        yield (
+            f"{unit.drive.name}: the {unit.channels.length} words of its channels do not fit at "
+            f"{settings.channels:04X}H: move them, such as channels = 0xE100"
+        )
+    own = sorted(unit.holding_addresses() & set(settings.common_addresses))
+    if own:
+        yield (
+            f"{unit.drive.name} has registers at {own[0]:04X}H, in the range of the common block: move "
+            f"the block, such as common = 0xE000"
+        )
+
+
+def _unknown_names(plant: Plant, settings: ModbusSettings) -> Iterator[str]:
+    drives = drives_of(plant)
+    lines = [line.name for line in plant.lines]
+    for key, kind, given, known in (
+        ("units", "drive", settings.units, drives),
+        ("ports", "line", settings.ports, lines),
+    ):
+        for name in given:
+            if known and name not in known:
+                yield f"{key}: there is no {kind} {name!r}; {did_you_mean(name, known)}"

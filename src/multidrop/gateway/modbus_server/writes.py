@@ -4,25 +4,56 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from math import inf
 from typing import Any, Protocol
 
-from multidrop import Register
+from multidrop import Register, WriteForbidden
 from multidrop.drive import Carrier
-from multidrop.gateway.commands import MOST_STOPS, Commands
+from multidrop.gateway.clock import boottime_ns
+from multidrop.gateway.commands import MOST_AGE_S, MOST_STOPS, STOOD_STILL, Commands
 from multidrop.gateway.http.rights import Caller, Right
-from multidrop.gateway.modbus_server.common_block import STOP
 from multidrop.gateway.modbus_server.protocol import WRITES, Declined, MbapRequest, ModbusCode, code_of
-from multidrop.gateway.modbus_server.unit_ids import StopWrite, Unit
-from multidrop.gateway.standstill import Standstill
+from multidrop.gateway.modbus_server.settings import StopWrite, Unit
+from multidrop.gateway.modbus_server.words import STOP
 from multidrop.supervisor import supervisor
 
+SETTLE_S = 1.0  # how long writes are refused after a standstill, until the waiting requests are read
 STOP_WAIT_S = 0.4  # how long a stop's answer waits for the motor: less than the usual timeout of clients
 REFUSAL_S = 1.0  # least time between two audit records of a line's refused writes
-
 _log = logging.getLogger("multidrop.gateway")
+
+
+class Standstill:
+    """Detects that the gateway did not run for more than MOST_AGE_S; then refuses writes for SETTLE_S.
+
+    The computer may have slept, for example. A Modbus request contains no time, so its age is unknown.
+    `clock` returns CLOCK_BOOTTIME in ns.
+    """
+
+    def __init__(self, clock: Callable[[], int] = boottime_ns) -> None:
+        self._clock = clock
+        self._ran_ns = clock()
+        self._until_ns = 0  # writes are refused until this time
+
+    def note(self) -> None:
+        """Note that the event loop runs. Call this at least once a second."""
+        now_ns = self._clock()
+        if now_ns - self._ran_ns > MOST_AGE_S * 1e9:
+            self._until_ns = now_ns + round(SETTLE_S * 1e9)
+        self._ran_ns = now_ns
+
+    def admit(self, what: str) -> float:
+        """Return the deadline for sending a write that is received now (CLOCK_BOOTTIME, ns).
+
+        Raises WriteForbidden after a standstill.
+        """
+        self.note()
+        if self._ran_ns < self._until_ns:
+            reason = f"it may be older than {MOST_AGE_S:g} s, because {STOOD_STILL}"
+            raise WriteForbidden(f"{what} was not sent: {reason}", rule=STOOD_STILL)
+        return self._ran_ns + MOST_AGE_S * 1e9
 
 
 class WritingClient(Protocol):

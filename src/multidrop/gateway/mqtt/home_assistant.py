@@ -14,8 +14,7 @@ from typing import Any
 
 from multidrop import Drive, Register
 from multidrop.drive import Access
-from multidrop.gateway.live.descriptions import digits_of
-from multidrop.gateway.live.hub import FAULT, RUNS, SILENT, STANDS, UNKNOWN
+from multidrop.gateway.live.hub import FAULT, RUNS, SILENT, STANDS, UNKNOWN, digits_of
 
 DISCOVERY = "homeassistant"
 CLASSES = {  # Home Assistant's device_class by unit

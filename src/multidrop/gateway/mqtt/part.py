@@ -19,7 +19,7 @@ from multidrop.gateway.parts import PartContext
 from multidrop.supervisor import supervisor
 
 if TYPE_CHECKING:
-    from multidrop.gateway.forward.part import Forwarding
+    from multidrop.gateway.forward.forwarder import Forwarding
 
 Settings = MqttSettings
 

@@ -12,9 +12,14 @@ from functools import cache
 from math import isfinite
 from typing import Any
 
-from multidrop.gateway.forward.formats import listed, pieces, row_objects
-from multidrop.gateway.forward.forwarder import Outgoing, RepeatingReceiver
-from multidrop.gateway.forward.part import Forwarding
+from multidrop.gateway.forward.forwarder import (
+    Forwarding,
+    Outgoing,
+    RepeatingReceiver,
+    listed,
+    pieces,
+    row_objects,
+)
 from multidrop.gateway.live.hub import published_value
 from multidrop.gateway.mqtt.broker import Address, Broker, Login
 from multidrop.gateway.mqtt.settings import MqttSettings

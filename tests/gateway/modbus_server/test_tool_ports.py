@@ -35,13 +35,11 @@ from multidrop.control import CommandOutcome, CommandResult
 from multidrop.errors import PortLost
 from multidrop.families import DelixiNative, InnovertIBD, InvtCHE
 from multidrop.gateway.http.rights import NOT_LISTED, Right
+from multidrop.gateway.modbus_server import tool_ports
 from multidrop.gateway.modbus_server.protocol import MbapRequest
+from multidrop.gateway.modbus_server.tool_connections import MOST_FRAME, RequestCutter, Terminal, rtu_reply
+from multidrop.gateway.modbus_server.tool_ports import MOST_SHARE, Tool, ToolPorts, ToolSettings
 from multidrop.gateway.settings import read_settings
-from multidrop.gateway.tool_ports import server
-from multidrop.gateway.tool_ports.ends import Terminal
-from multidrop.gateway.tool_ports.requests import MOST_FRAME, RequestCutter, rtu_reply
-from multidrop.gateway.tool_ports.server import MOST_SHARE, Tool, ToolPorts
-from multidrop.gateway.tool_ports.settings import ToolSettings
 
 SETPOINT, CONTROL, START, STOP = 0x2000, 0x1000, 1, 5  # CHE100 manual v1.4, p. 117
 TIMEOUT = 10.0  # in s; long, so that every answer is in time even on a busy machine
@@ -70,7 +68,7 @@ def serving(folder: Path, *, ask: Any = None, **settings: Any) -> Iterator[Rig]:
     )
     fakes: Any = plant, hub, commands
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(server, "utilisation_of", lambda plant, line: 0.0)
+        patch.setattr(tool_ports, "utilisation_of", lambda plant, line: 0.0)
         with in_thread(lambda: ToolPorts(*fakes, known, ask or line.ask, folder)) as ports:
             until(lambda: ports.lines and ports.lines["hall"].share.share == MOST_SHARE)
             yield Rig(ports, hub, commands, line, folder / "port")
@@ -378,7 +376,7 @@ def test_a_connection_that_cannot_be_accepted_yet_is_accepted_later(
         failures.append(None)
         raise OSError(errno.EMFILE, "Too many open files")
 
-    monkeypatch.setattr(server, "SWEEP_S", 0.2)
+    monkeypatch.setattr(tool_ports, "SWEEP_S", 0.2)
     with monkeypatch.context() as patch:
         patch.setattr(rig.ports._listeners["hall"], "accept", accept, raising=False)
         tool = socket.create_connection(("127.0.0.1", rig.ports.ports["hall"]))

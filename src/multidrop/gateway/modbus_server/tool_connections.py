@@ -1,4 +1,4 @@
-"""Ends: the gateway's side of a tool's connection, which is a pseudo-terminal or a TCP connection."""
+"""Connections of vendors' tools: pseudo-terminals, TCP connections, and the RTU requests in their bytes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
+from multidrop.core import FrameFault, Framing, crc16, parse_request
+from multidrop.gateway.modbus_server.protocol import MbapRequest
 from multidrop.recording import FileLock
 
 MOST_READ = 256  # bytes of one read
@@ -15,6 +17,10 @@ _DEVICES = "/dev/pts/"
 # The target of each link that a gateway makes starts with this text, so that gateways recognise their links
 # and replace no others. Links are made and read with `os`, because a Path would drop the ".".
 _OURS = "/dev/pts/./"
+LEAST_FRAME, MOST_FRAME = 4, 256  # in bytes: address, function, data, checksum
+EXCEPTION = 0x80  # bit of a function code that only replies have
+_CHECKSUM = 2
+_MBAP = 6  # bytes of a Modbus TCP frame before the unit id
 
 
 class End(Protocol):
@@ -150,3 +156,69 @@ class Connection:
 
     def close(self) -> None:
         self._peer.close()
+
+
+class RequestCutter:
+    """Collects a tool's bytes and returns whole requests."""
+
+    def __init__(self) -> None:
+        self._came = bytearray()
+        self._is_in_step = True  # False while the start of the next request is unknown
+
+    def add(self, data: bytes) -> None:
+        """Append received bytes."""
+        self._came += data
+
+    def take(self) -> MbapRequest | None:
+        """Remove the first request and return it; None if no request is complete.
+
+        Bytes before this request that belong to no request are dropped.
+        """
+        while len(self._came) >= LEAST_FRAME:
+            length = _request_length(self._came, self._is_in_step)
+            if length is None:
+                return None
+            self._is_in_step = length > 0
+            if length:
+                body = bytes(self._came[: length - _CHECKSUM])
+                del self._came[:length]
+                return MbapRequest(0, body[0], body[1], body[2:])
+            del self._came[0]
+        return None
+
+    @property
+    def has_rest(self) -> bool:
+        """True if bytes of an incomplete request wait for the rest."""
+        return bool(self._came)
+
+    def skip(self) -> bool:
+        """Drop the first byte, because the rest of the request that it starts did not come.
+
+        Return False if no byte is left.
+        """
+        del self._came[:1]
+        self._is_in_step = not self._came
+        return self.has_rest
+
+
+def _request_length(came: bytearray, is_in_step: bool) -> int | None:
+    """Return the length of the request at the start of `came`.
+
+    Return None if that request is incomplete, and 0 if no request starts there.
+    """
+    found, _ = parse_request(Framing.RTU, bytes(came[:MOST_FRAME]))
+    if found == FrameFault.INCOMPLETE:
+        return None
+    if found != FrameFault.BAD_FUNCTION:
+        return max(found, 0)
+    # The length of requests of other functions is unknown. But a tool waits after its request, so the request
+    # ends where the received bytes end.
+    if not is_in_step or came[1] >= EXCEPTION or len(came) > MOST_FRAME:
+        return 0
+    return None if crc16(bytes(came), len(came)) else len(came)
+
+
+def rtu_reply(frame: bytes) -> bytes:
+    """Return an RTU frame with the content of a Modbus TCP frame."""
+    body = frame[_MBAP:]
+    return body + int(crc16(body, len(body))).to_bytes(2, "little")

@@ -1,1 +1,0 @@
-"""Serial and TCP ports on which vendors' tools reach the drives of a line that the gateway polls."""
