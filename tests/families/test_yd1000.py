@@ -23,7 +23,7 @@ from multidrop.drive.register import HOLDING, Kept
 from multidrop.errors import Expired, NoReply
 from multidrop.families import DelixiModbus
 from multidrop.families.yd1000 import YD1000, Inputs, Outputs, YD1000Control, YD1000Status, extended
-from multidrop.sim.yd1000 import SimulatedYD1000
+from multidrop.sim.families import SimulatedYD1000
 
 FORWARD = "01 06 10 00 C4 00 DF CA"
 REVERSE = "01 06 10 00 C6 00 DE AA"

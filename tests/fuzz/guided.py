@@ -26,7 +26,7 @@ import multidrop.importers
 import multidrop.plant.model
 import multidrop.recording
 import multidrop.samples.message
-import multidrop.sim.faulty_wire
+import multidrop.sim.faults
 import multidrop.toml_check
 from multidrop.capture import decoding
 
@@ -43,7 +43,7 @@ MODULES = (  # modules that several readers use: always instrumented
     multidrop.plant.model,
     multidrop.toml_check,
     multidrop.families.registry,
-    multidrop.sim.faulty_wire,
+    multidrop.sim.faults,
     multidrop.samples.message,
     multidrop.gateway.modbus_server.protocol,
     multidrop.gateway.modbus_server.server,

@@ -104,7 +104,6 @@ TIED = (  # groups of files whose annotations refer to each other
     {"drive/family.py", "drive/link.py", "drive/verbs.py"},
     {"polling/batch.py", "polling/tables.py"},
     {"report/load.py", "report/value_plot.py"},
-    {"sim/drive.py", "sim/protocol.py"},
     {f"gateway/{name}.py" for name in ("gateway", "reload", "metrics", "live/views", "http/routes")},
 )
 MOST_LINES_OF_A_FILE = 600

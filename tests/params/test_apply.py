@@ -39,8 +39,8 @@ from multidrop.control import Ledger, read_audit
 from multidrop.families.registry import shipped_family
 from multidrop.families.yd1000 import COMMAND
 from multidrop.sim import MotorDrive, Simulator, Wire
+from multidrop.sim.drive import Reason, Refusal
 from multidrop.sim.memory import MemoryCell
-from multidrop.sim.protocol import Reason, Refusal
 
 GOODRIVE, DELIXI_E = shipped_family("invt-goodrive"), shipped_family("delixi-e")
 EXTRA: dict[type[Drive], list[str]] = {

@@ -27,7 +27,7 @@ from multidrop.poller import Poller
 from multidrop.polling import refusals
 from multidrop.polling.batch import Row
 from multidrop.sim import Faults, SimulatedDrive, Simulator, Wire, simulated
-from multidrop.sim.protocol import Reason, Refusal
+from multidrop.sim.drive import Reason, Refusal
 
 WIDE = 24
 

@@ -18,7 +18,7 @@ from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.polling.polled_line import PolledLine
 from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, proof
-from multidrop.sim.protocol import Reason, Refusal
+from multidrop.sim.drive import Reason, Refusal
 
 CURRENT, FREQUENCY, FAULT, STATUS = (
     Toy.registers[name] for name in ("output_current", "output_frequency", "fault", "status")

@@ -25,9 +25,8 @@ from multidrop.families.invt_che import InvtCHE
 from multidrop.families.yd1000 import YD1000
 from multidrop.scan import Crowd, Found, Noise, Progress, Sweep, Untried, plant_text, scan, sweeps
 from multidrop.sim import SimulatedDrive, Wire, simulated
-from multidrop.sim.che import SimulatedCHE
-from multidrop.sim.ibd import SimulatedIBD
-from multidrop.sim.protocol import Reason, Refusal
+from multidrop.sim.drive import Reason, Refusal
+from multidrop.sim.families import SimulatedCHE, SimulatedIBD
 
 FAMILIES = list(MODELS.values())
 READS = {Framing.RTU: {1, 2, 3, 4}, Framing.ASCII: {1, 2, 3, 4}, Framing.DELIXI: {3, 7}}

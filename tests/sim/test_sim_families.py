@@ -21,9 +21,7 @@ from multidrop.families.innovert_ibd import InnovertIBD
 from multidrop.families.invt_che import InvtCHE, parameter
 from multidrop.families.yd1000 import YD1000
 from multidrop.sim import EncodedDrive, MotorDrive, Wire, encoded, simulated
-from multidrop.sim.che import SimulatedCHE
-from multidrop.sim.delixi import SimulatedDelixiNative
-from multidrop.sim.yd1000 import SimulatedYD1000
+from multidrop.sim.families import SimulatedCHE, SimulatedDelixiNative, SimulatedYD1000
 
 
 class Bench:

@@ -19,9 +19,8 @@ from multidrop.drive.family import Drive
 from multidrop.errors import LineError, PortLost
 from multidrop.families import MODELS, YD1000
 from multidrop.sim import DriveFaults, Faults, FaultyWire, SimulatedDrive, Simulator, load_faults, simulated
-from multidrop.sim.faults import rates_of
-from multidrop.sim.faulty_wire import overload_code
-from multidrop.sim.motor_drive import MotorDrive
+from multidrop.sim.faults import overload_code, rates_of
+from multidrop.sim.motor import MotorDrive
 from multidrop.toml_check import parse_duration
 from multidrop.transport.line import Line
 from multidrop.transport.prepared import make_exchange

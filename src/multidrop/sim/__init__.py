@@ -9,12 +9,12 @@ from multidrop.sim.drive import proof as proof
 from multidrop.sim.families import simulated as simulated
 from multidrop.sim.faults import DriveFaults as DriveFaults
 from multidrop.sim.faults import Faults as Faults
+from multidrop.sim.faults import FaultyWire as FaultyWire
 from multidrop.sim.faults import load_faults as load_faults
-from multidrop.sim.faulty_wire import FaultyWire as FaultyWire
 from multidrop.sim.motor import Motor as Motor
+from multidrop.sim.motor import MotorDrive as MotorDrive
 from multidrop.sim.motor import Phase as Phase
 from multidrop.sim.motor import Rating as Rating
-from multidrop.sim.motor_drive import MotorDrive as MotorDrive
 from multidrop.sim.simulator import Simulator as Simulator
 from multidrop.sim.simulator import serve as serve
 from multidrop.sim.wire import Wire as Wire

@@ -1,7 +1,11 @@
-"""A simulated motor and its power stage: ramps, voltage and current, temperature, faults.
+"""A simulated motor with its power stage, and MotorDrive: a simulated drive with such a motor.
 
-The model has no registers, and gets the time as an argument. Only `run` and `jog` start the motor, and not
-during a fault.
+Only `run` and `jog` start the motor, and not during a fault. Time is an argument.
+
+Registers with usual names need no code: a setting such as `acceleration_time` configures the motor, and a
+reading such as `output_current` shows its state. A subclass of MotorDrive handles the other registers of its
+family in two tables, by register name. A function in `obeys` is called after a write to its register. A
+function in `shows` returns the number that a read of its register returns.
 """
 
 from __future__ import annotations
@@ -11,6 +15,12 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any, ClassVar
+
+from multidrop.drive.family import Drive
+from multidrop.drive.register import Register
+from multidrop.sim.drive import Reason, Refusal, SimulatedDrive
+from multidrop.sim.memory import MemoryCell
 
 MAGNETISING = 0.3  # no-load current as a fraction of the rated current
 ACCELERATING_TORQUE = 0.5  # fraction of the rated torque, added to the load while accelerating
@@ -229,3 +239,121 @@ RATED: Mapping[str, Callable[[Rating], float]] = {
     "output_torque": lambda rating: rating.torque,
     "dc_bus_voltage": lambda rating: rating.voltage * math.sqrt(2),
 }
+
+
+COMMANDS: Mapping[str, Callable[[Motor], None]] = {  # maps the name of a control word to its action
+    "FORWARD": lambda motor: motor.run(1),
+    "REVERSE": lambda motor: motor.run(-1),
+    "JOG_FORWARD": lambda motor: motor.jog(1),
+    "JOG_REVERSE": lambda motor: motor.jog(-1),
+    "STOP": lambda motor: motor.stop(),
+    "STOP_JOG": lambda motor: motor.stop(),
+    "COAST": lambda motor: motor.coast(),
+    "RESET_FAULT": lambda motor: motor.reset(),
+}
+_SETTINGS = ("acceleration_time", "deceleration_time", "maximum_frequency")
+
+
+class MotorDrive(SimulatedDrive):
+    """A simulated drive with a motor. A monitor register set by `drive[name] = value` keeps that value."""
+
+    obeys: ClassVar[Mapping[str, Callable[[Any, int], None]]] = {}
+    shows: ClassVar[
+        Mapping[str, Callable[[Any], int]]
+    ] = {}  # maps a register's name to a function that returns its raw count
+    begins: ClassVar[Mapping[int, int]] = {}  # address of holding register: raw count at power-up
+
+    def __init__(
+        self, drive: Drive, *, response_delay: float | None = None, rating: Rating | None = None
+    ) -> None:
+        super().__init__(drive, response_delay=response_delay)
+        self.motor = Motor(rating)
+        most = drive.option.get("maximum_frequency")
+        self.motor.maximum_frequency = most or self.motor.rating.frequency
+        self._held: set[Register[Any]] = set()
+        for name in _SETTINGS:
+            register = drive.registers.get(name)
+            if register is not None and register.default is None:
+                self.memory.set(register, getattr(self.motor, name))
+        for address, raw in self.begins.items():
+            cell = self.memory.writable(0x06, address)
+            if cell is not None:
+                cell.raw = raw
+        self.prepare()
+        self.set_up()
+
+    def __setitem__(self, name: str, value: float) -> None:
+        self._held.add(self.drive.register(name))
+        super().__setitem__(name, value)
+
+    def prepare(self) -> None:
+        """Set up initial state that the drive's class does not declare."""
+
+    def trip(self, code: int) -> None:
+        """Trip the motor with this fault code of the family."""
+        self.motor.trip(code)
+
+    def pass_time(self, now: float) -> None:
+        self.motor.run_to(now)
+
+    def set_up(self) -> None:
+        """Configure the motor from the drive's settings."""
+        for name in _SETTINGS:
+            value = self._known(name)
+            if value:
+                setattr(self.motor, name, value)
+        self.motor.target = self.setpoint()
+
+    def setpoint(self) -> float:
+        """Return the frequency setpoint in Hz."""
+        return self._known("frequency") or 0.0
+
+    def _known(self, name: str) -> float | None:
+        """Return the register's value; None if the class lacks the register or its scale is unknown."""
+        register = self.drive.registers.get(name)
+        if register is None or register.step is None:
+            return None
+        return float(self.memory.get(register))
+
+    def run_or_stop(self, action: int, direction: int | None) -> None:
+        """Carry out the action of a control word: 0 none, 1 stop, 2 run, 3 jog."""
+        if action == 1:
+            self.motor.stop()
+        elif action == 2:
+            self.motor.run(direction)
+        elif action == 3:
+            self.motor.jog(direction)
+        elif direction is not None:
+            self.motor.direction = direction
+
+    def carry_out_named(self, raw: int) -> None:
+        """Carry out the named control word with this raw count; see COMMANDS."""
+        COMMANDS[self.drive.register("control").decode(raw).name](self.motor)
+
+    def word(self, address: int) -> int:
+        """Return the raw count of the writable holding register at this address; 0 if there is none."""
+        cell = self.memory.writable(0x06, address)
+        return cell.raw if cell else 0
+
+    def accept(self, cell: MemoryCell, raw: int) -> int:
+        register = cell.register
+        if register is not None and register.while_running is False and self.motor.energised:
+            raise Refusal(Reason.LOCKED)
+        return super().accept(cell, raw)
+
+    def changed(self, cell: MemoryCell) -> None:
+        self.set_up()
+        if cell.name in self.obeys:
+            self.obeys[cell.name](self, cell.raw)
+
+    def refresh(self, cell: MemoryCell) -> None:
+        register = cell.register
+        if register is None or register in self._held:
+            return
+        if register.name in self.shows:
+            self.memory.set_raw(register, self.shows[register.name](self))
+        elif register.name in MONITORS and not register.writable:
+            value = MONITORS[register.name](self.motor)
+            if register.unit == "%":
+                value *= 100 / RATED[register.name](self.motor.rating)
+            self.memory.set(register, value)

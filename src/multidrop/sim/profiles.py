@@ -28,10 +28,64 @@ from multidrop.families.profiles.run_bits import (
     YaskawaControl,
     YaskawaStatus,
 )
+from multidrop.sim.drive import Reason, Refusal
 from multidrop.sim.memory import MemoryCell
-from multidrop.sim.motor import Phase
-from multidrop.sim.motor_drive import COMMANDS, ProfileDrive
-from multidrop.sim.protocol import Reason, Refusal
+from multidrop.sim.motor import COMMANDS, MotorDrive, Phase
+
+
+class ProfileDrive(MotorDrive):
+    """A simulated drive of a profile; its registers are named by their roles.
+
+    While `is_local` is set, the keypad is in control and commands from the line are ignored. After a
+    `power_cycle` only settings in EEPROM are kept.
+    """
+
+    is_local = False
+    word_before = 0  # the previous control word
+
+    def prepare(self) -> None:
+        if "signature" in self.drive.registers:
+            values: Any = self.drive.register("signature").values
+            self["signature"] = next(iter(values))
+        if "station" in self.drive.registers:
+            self["station"] = self.drive.address
+        self.powered_up()
+
+    def setpoint(self) -> float:
+        held = self._known("reference") or 0.0
+        if self.drive.register("reference").unit != "%":
+            return held
+        return held / 100 * self.motor.maximum_frequency
+
+    def changed(self, cell: MemoryCell) -> None:
+        super().changed(cell)
+        if cell.name == "control":
+            self.word_before = cell.raw
+
+    def refresh(self, cell: MemoryCell) -> None:
+        super().refresh(cell)
+        register = cell.register
+        if register and register.name == "reference_in_force" and register not in self._held:
+            self.memory.set(register, self.memory.get(self.drive.register("reference")))
+
+    def rises(self, word: int, bits: int) -> bool:
+        """Return True if this control word sets one of the bits, and the previous one set none of them."""
+        return bool(word & bits) and not self.word_before & bits
+
+    def power_cycle(self) -> None:
+        """Switch the mains off and on, which clears commands, setpoint and faults."""
+        self.motor.coast()
+        self.motor.reset()
+        for name in ("control", "reset", "reference"):
+            if name in self.drive.registers:
+                self.memory.set_raw(self.drive.register(name), 0)
+        self.word_before = 0
+        self.set_up()
+        self.powered_up()
+
+    def powered_up(self) -> None:
+        """Set the drive's state after power-up."""
+
 
 _RUN = (
     ProfidriveControl.ENABLE_OPERATION

@@ -10,7 +10,7 @@ from multidrop.drive.options import Option
 from multidrop.drive.register import HOLDING, Kept, command, reading, setting
 from multidrop.drive.verbs import verb
 from multidrop.sim import SimulatedDrive
-from multidrop.sim.protocol import Reason, Refusal
+from multidrop.sim.drive import Reason, Refusal
 
 
 class Fault(IntEnum):
