@@ -8,20 +8,16 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from multidrop.control.attached import Attached, Leaving, made
-from multidrop.control.audit_log import AuditLog
-from multidrop.control.broadcast import Broadcaster
-from multidrop.control.call import check_expiry
+from multidrop.control.call import Latches, check_expiry
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.exit_hook import give_signals_back, without_internals
-from multidrop.control.latches import Latches
 from multidrop.control.outcome import Stopped
-from multidrop.control.performer import Performer
-from multidrop.control.records import WriteRecords
+from multidrop.control.performer import Broadcaster, Performer
+from multidrop.control.records import AuditLog, WriteRecords
 from multidrop.control.stops import Stopper, StopRun
 from multidrop.control.writer import Writer
 from multidrop.core import RS485, Echo, Mastership, Peer, TransactionIds
-from multidrop.core.fork import register_at_fork
-from multidrop.core.undisturbed import undisturbed
+from multidrop.core.process import register_at_fork, undisturbed
 from multidrop.drive.family import Drive, check_drive
 from multidrop.drive.register import Register
 from multidrop.drive.state import State

@@ -18,8 +18,7 @@ from multidrop.bus import Bus
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.exit_hook import exit_hook, give_signals_back, without_internals
 from multidrop.core import REALTIME_ENDED, Mastership, Realtime, RowQueue, why_not_realtime
-from multidrop.core.fork import register_at_fork
-from multidrop.core.undisturbed import undisturbed
+from multidrop.core.process import register_at_fork, undisturbed
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.errors import LineError, PollingFailed

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from simulated_bus import SimulatedBus, one
 
-from multidrop.control.audit_log import read_audit, written_by
 from multidrop.control.ramp import start_staggered
+from multidrop.control.records import read_audit, written_by
 from multidrop.core import Completion, Exchange, Framing, Message, build_reply
 from multidrop.drive import Condition
 from multidrop.errors import BusError, DriveException, LineError, Unconfirmed

@@ -16,9 +16,9 @@ from stop_frames import all_stopped, che_drives
 from tables import table
 from toy import Status, Toy
 
-from multidrop.control.audit_log import read_audit
 from multidrop.control.call import written_before
 from multidrop.control.outcome import Seen
+from multidrop.control.records import read_audit
 from multidrop.core import Completion, Exchange, Message
 from multidrop.drive import Condition, Drive, Script, State
 from multidrop.drive.register import Kept, command, setting

@@ -17,11 +17,11 @@ from interruptions import full_at, read_only_directory
 from simulated_bus import SimulatedBus, one
 
 from multidrop.cli import main
-from multidrop.control import audit_log
+from multidrop.control import records
 from multidrop.control import records as write_records
-from multidrop.control.audit_log import AuditLog, noted_first, read_audit, written_by
 from multidrop.control.eeprom_ledger import Ledger, LedgerCell
 from multidrop.control.outcome import Effect
+from multidrop.control.records import AuditLog, noted_first, read_audit, written_by
 from multidrop.core import Message
 from multidrop.errors import Unconfirmed, WriteForbidden
 from multidrop.families import DelixiModbus, ErmanERG220, InvtCHE
@@ -233,7 +233,7 @@ def test_opening_the_audit_log_on_a_hung_disk_times_out(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     answers = threading.Event()
-    monkeypatch.setattr(audit_log, "OPENING_S", 0.05)
+    monkeypatch.setattr(records, "OPENING_S", 0.05)
     monkeypatch.setattr(Path, "open", lambda *details, **options: answers.wait(PATIENCE_S))
     with pytest.raises(OSError, match=r"audit log: not done within 0\.05 s; does the disk answer\?"):
         AuditLog(tmp_path / "audit.jsonl")

@@ -19,10 +19,10 @@ from tables import table
 
 from multidrop import DelixiNative, InnovertIBD
 from multidrop.control import records
-from multidrop.control.audit_log import read_audit, written_by
 from multidrop.control.call import written_before
 from multidrop.control.outcome import Effect, Seen, Stopped
 from multidrop.control.ramp import ramp
+from multidrop.control.records import read_audit, written_by
 from multidrop.core import Message, build_reply
 from multidrop.drive import Direction, Drive, Script, State, read, write
 from multidrop.drive.register import Kept, reading, setting

@@ -20,9 +20,9 @@ from simulated_bus import SimulatedBus, is_write, one
 from tables import table
 
 from multidrop.bus import Bus
-from multidrop.control.audit_log import AuditLog, read_audit
 from multidrop.control.eeprom_ledger import BUDGET, YEAR, Ledger, LedgerCell
 from multidrop.control.outcome import Effect
+from multidrop.control.records import AuditLog, read_audit
 from multidrop.core import Message, build_request
 from multidrop.drive import Drive
 from multidrop.errors import NoReply, Unconfirmed
@@ -162,7 +162,7 @@ def test_an_invalid_ledger_file_raises_a_one_sentence_error(tmp_path: Path) -> N
 
 WRITER = """
 import sys
-from multidrop.control.audit_log import AuditLog
+from multidrop.control.records import AuditLog
 log = AuditLog(sys.argv[1])
 for number in range(200):
     log.add(number, {"writer": sys.argv[2], "number": number, "text": "x" * 200})

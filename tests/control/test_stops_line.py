@@ -16,7 +16,7 @@ from motors import MAKE, ReceivedRequests, at_highest_rate
 from tables import table
 
 from multidrop.bus import Bus
-from multidrop.control.audit_log import read_audit
+from multidrop.control.records import read_audit
 from multidrop.core import Message
 from multidrop.drive import Condition
 from multidrop.errors import BusError, CancelledByStop, LineError, NoReply, PortLost, Unconfirmed

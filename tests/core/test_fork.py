@@ -23,7 +23,7 @@ from toy import Toy
 
 from multidrop.bus import Bus
 from multidrop.core import Field, NumberFormat, RowLayout, RowQueue, Status
-from multidrop.core.fork import only_here
+from multidrop.core.process import only_here
 from multidrop.errors import CancelledByStop, LineError, NoReply
 from multidrop.families import InvtCHE
 from multidrop.poller import Poller

@@ -25,8 +25,8 @@ from tables import table
 
 from multidrop import Drive, PlantError
 from multidrop.control import CommandOutcome, CommandResult
-from multidrop.control.audit_log import AuditLog
 from multidrop.control.commands import Results
+from multidrop.control.records import AuditLog
 from multidrop.gateway import commands, parts
 from multidrop.gateway.http import messages
 from multidrop.gateway.http.rights import Right

@@ -44,12 +44,12 @@ TOUCHING_THE_SYSTEM = {"transport", "recording", "history", "samples", "sim", "g
 FILES_TOUCHING_THE_SYSTEM = {
     "supervisor.py",
     "whole_file.py",
-    "core/fork.py",
+    "core/process.py",
     "core/port.py",
     "control/eeprom_ledger.py",
-    "control/audit_log.py",
+    "control/records.py",
     "control/exit_hook.py",
-    "control/latches.py",
+    "control/call.py",
     "params/apply.py",
     "polling/added_rows.py",
     "polling/row_source.py",
@@ -102,7 +102,6 @@ OPEN = {
 }
 TIED = (  # groups of files whose annotations refer to each other
     {"drive/family.py", "drive/link.py", "drive/verbs.py"},
-    {"polling/batch.py", "polling/tables.py"},
     {"report/load.py", "report/value_plot.py"},
     {f"gateway/{name}.py" for name in ("gateway", "reload", "metrics", "live/views", "http/routes")},
 )

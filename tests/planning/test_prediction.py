@@ -24,10 +24,9 @@ from multidrop.families.registry import SHIPPED
 from multidrop.planning import prediction
 from multidrop.planning.blocks import Planned, planned
 from multidrop.planning.bus_time import in_order
-from multidrop.planning.prediction import LATENESS
+from multidrop.planning.prediction import LATENESS, Suggestions, duration_text, reading_gain, suggest
 from multidrop.planning.prediction import predict as predict_with_host
 from multidrop.planning.schedule import TURN_SHARE
-from multidrop.planning.suggestions import Suggestions, duration_text, reading_gain, suggest
 from multidrop.sim import EncodedDrive
 from multidrop.transport.prepared import make_exchange
 

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from multidrop.planning.back_off import FIRST_REST_NS, LONGEST_REST_NS
-from multidrop.planning.schedule import TURN_SHARE, Job, Schedule
+from multidrop.planning.schedule import FIRST_REST_NS, LONGEST_REST_NS, TURN_SHARE, Job, Schedule
 
 MS = 1_000_000
 

@@ -19,7 +19,7 @@ from multidrop.families import YD1000, InvtCHE
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PolledDrive
 from multidrop.poller import Poller
-from multidrop.polling.port_queue import AHEAD_NS
+from multidrop.polling.jobs import AHEAD_NS
 from multidrop.sim import EncodedDrive, Simulator, Wire, proof, simulated
 
 ROOT = Path(__file__).parents[2]

@@ -20,11 +20,11 @@ from multidrop.drive import Drive
 from multidrop.poller import Poller
 from multidrop.polling import polled_line
 from multidrop.polling.batch import Batch, Row
-from multidrop.polling.port_queue import PortQueue
+from multidrop.polling.jobs import PortQueue
 from multidrop.sim import EncodedDrive, Simulator, Wire, proof, simulated
 from multidrop.transport import clock
 from multidrop.transport.aside_log import flush
-from multidrop.transport.bridge import Bridge
+from multidrop.transport.network_port import Bridge
 
 FAILED = "not asked: polling failed"
 CURRENT = Toy.registers["output_current"]

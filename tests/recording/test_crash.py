@@ -22,7 +22,7 @@ import pytest
 from killable_client import METADATA, NAME, Counted, audit, ledger
 from lines import until
 
-from multidrop.control.audit_log import read_audit
+from multidrop.control.records import read_audit
 from multidrop.polling.batch import Row
 from multidrop.recording import open_recording
 from multidrop.sim import SimulatedDrive, Simulator, Wire

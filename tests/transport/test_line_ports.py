@@ -27,8 +27,8 @@ from multidrop.families import MODELS
 from multidrop.poller import Poller
 from multidrop.sim import Simulator, Wire, simulated
 from multidrop.transport import clock, open_port
-from multidrop.transport.bridge import MOST_STALL_MS
 from multidrop.transport.line import Line
+from multidrop.transport.network_port import MOST_STALL_MS
 
 
 def wire(port: str = "pty") -> Wire:

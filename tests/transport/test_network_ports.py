@@ -28,10 +28,19 @@ from toy import Status, Toy
 
 from multidrop.bus import Bus
 from multidrop.errors import Unconfirmed
-from multidrop.transport import bridge as bridge_module
-from multidrop.transport.bridge import MOST_AGE, MOST_STALL_MS, Bridge, discard_late_bytes
+from multidrop.transport import network_port
 from multidrop.transport.exchange import WRITE_TIMEOUT
-from multidrop.transport.network_port import MOST_CHUNKS, MOST_RECEIVED, RFC2217Port, SocketPort, Telnet
+from multidrop.transport.network_port import (
+    MOST_AGE,
+    MOST_CHUNKS,
+    MOST_RECEIVED,
+    MOST_STALL_MS,
+    Bridge,
+    RFC2217Port,
+    SocketPort,
+    Telnet,
+    discard_late_bytes,
+)
 
 SERVER = Path(__file__).parents[1] / "support" / "servers" / "network_server.py"
 IAC, SB, SE = rfc2217.IAC, rfc2217.SB, rfc2217.SE
@@ -206,8 +215,8 @@ class AsOnWindows:
 @pytest.mark.slow
 def test_a_bridge_forwards_requests_without_socket_timestamps(monkeypatch: pytest.MonkeyPatch) -> None:
     ours, theirs = socket.socketpair()
-    monkeypatch.setattr(bridge_module, "_STAMPED", False)
-    monkeypatch.setattr(bridge_module, "_pair", lambda: (AsOnWindows(ours), theirs))
+    monkeypatch.setattr(network_port, "_STAMPED", False)
+    monkeypatch.setattr(network_port, "_pair", lambda: (AsOnWindows(ours), theirs))
     port = HeldUp()
     port.free.set()
     bridge = Bridge(port)  # type: ignore[arg-type]

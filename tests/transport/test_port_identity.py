@@ -21,7 +21,7 @@ from toy import Toy
 
 from multidrop import Poller
 from multidrop.bus import Bus
-from multidrop.core import NO_DIVISOR, RS485, Failure, Port, TransactionIds, close_behind, port_settings
+from multidrop.core import NO_DIVISOR, RS485, Failure, Port, TransactionIds, close_behind, port
 from multidrop.errors import LineError, NoReply, PortLost
 from multidrop.families import InnovertIBD
 from multidrop.sim import EncodedDrive, Simulator, Wire, simulated
@@ -469,7 +469,7 @@ def test_an_impossible_baud_rate_is_refused_and_the_error_names_the_nearest_rate
     baudrate: int, sentence: str
 ) -> None:
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(port_settings, "lib", SimpleNamespace(md_port_baud_base=lambda fd: 115200))
+        monkeypatch.setattr(port, "lib", SimpleNamespace(md_port_baud_base=lambda fd: 115200))
         found = OpenPort("/dev/ttyS1", TransactionIds.MATCH, RS485.OFF, None)
         found._serial = SimpleNamespace(fileno=lambda: 0)  # type: ignore[assignment]
         assert found.refusal(NO_DIVISOR, baudrate).endswith(sentence)

@@ -25,7 +25,7 @@ from simulated_bus import SimulatedBus, one
 from toy import PatientToy, Picky, Toy, expected_values, family
 
 from multidrop.bus import Bus
-from multidrop.control.audit_log import read_audit
+from multidrop.control.records import read_audit
 from multidrop.core import Completion, Exchange, Failure, Message, NumberFormat
 from multidrop.drive import Drive
 from multidrop.drive.line_settings import Settings

@@ -23,7 +23,7 @@ from multidrop.families import YD1000, DelixiNative, InnovertIBD
 from multidrop.plant.loader import PlantError, load_plant
 from multidrop.poller import Poller
 from multidrop.sim import Simulator, Wire, simulated
-from multidrop.transport.mixed_up import mixed_up
+from multidrop.transport.network_port import mixed_up
 from multidrop.transport.open_port import unopened
 from multidrop.transport.port_identity import of_name
 

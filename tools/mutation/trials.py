@@ -71,7 +71,6 @@ def by_test_schedule(tree: Path, path: str) -> str | None:
 TRIALS: dict[str, tuple[Trial, ...]] = {
     "csrc/body.c": (by_test_core, by_compiler, by_test_frame),
     "csrc/frame.c": (by_test_core, by_compiler, by_test_frame),
-    "src/multidrop/planning/back_off.py": (by_test_schedule,),
     "src/multidrop/planning/schedule.py": (by_test_schedule,),
 }
 

@@ -64,7 +64,7 @@ from multidrop.families.registry import find_model
 from multidrop.planning.blocks import first_block
 from multidrop.plant.model import Plant
 from multidrop.transport.line import Line
-from multidrop.transport.mixed_up import mixed_up, other_port, spoken_on
+from multidrop.transport.network_port import mixed_up, other_port, spoken_on
 from multidrop.transport.peers import LEAST_TIMEOUT
 from multidrop.transport.port_identity import lasting_name
 from multidrop.transport.prepared import make_exchange

@@ -23,7 +23,7 @@ from multidrop.drive.text import Text
 from multidrop.drive.verbs import VERBS
 from multidrop.families import MODELS
 from multidrop.families.registry import SHIPPED, find_model, installed_models, is_users_own, shipped_family
-from multidrop.planning.suggestions import ReadingGain, reading_gain
+from multidrop.planning.prediction import ReadingGain, reading_gain
 from multidrop.plant.loader import load_plant
 
 

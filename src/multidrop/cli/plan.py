@@ -15,8 +15,15 @@ from multidrop.cli.support.arguments import add_json_argument, add_plant_argumen
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.values import Row, aligned, counted, shortened, wrapped
 from multidrop.families.registry import is_users_own
-from multidrop.planning.prediction import Prediction, Rate, predict
-from multidrop.planning.suggestions import Suggestions, duration_text, reading_gain, suggest
+from multidrop.planning.prediction import (
+    Prediction,
+    Rate,
+    Suggestions,
+    duration_text,
+    predict,
+    reading_gain,
+    suggest,
+)
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine, planned_on
 

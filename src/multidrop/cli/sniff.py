@@ -38,7 +38,7 @@ from multidrop.errors import LineError
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant, PlantLine
 from multidrop.recording import FORMATS, open_writer
-from multidrop.transport.bridge import PORT_FAILURES
+from multidrop.transport.network_port import PORT_FAILURES
 from multidrop.transport.open_port import reason_of, unopened
 
 _SILENT_S = 0.5  # a silence, in s, that is longer than any pause within a frame

@@ -31,8 +31,8 @@ from multidrop.cli.support.arguments import (
 )
 from multidrop.cli.support.output import command_line, confirm, print_text, reporting_interruption, warn
 from multidrop.cli.support.values import as_json, nearest_value
-from multidrop.control.audit_log import AuditLog
 from multidrop.control.outcome import Seen, Stopped
+from multidrop.control.records import AuditLog
 from multidrop.control.stops import LEAST_S
 from multidrop.drive.family import Drive
 from multidrop.drive.state import Direction, State

@@ -11,9 +11,8 @@ import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
-from multidrop.control.call import MOST_EXPIRY_S, Call, check_expiry
+from multidrop.control.call import MOST_EXPIRY_S, Call, Latches, check_expiry
 from multidrop.control.exit_hook import LastAct, exit_hook
-from multidrop.control.latches import Latches
 from multidrop.control.outcome import Outcome, Stopped
 from multidrop.control.performer import Performer
 from multidrop.control.stops import Stopper

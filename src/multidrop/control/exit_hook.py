@@ -21,7 +21,7 @@ from queue import SimpleQueue
 from types import FrameType
 from typing import Any
 
-from multidrop.core.fork import register_at_fork
+from multidrop.core.process import register_at_fork
 from multidrop.errors import BusError
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)

@@ -14,7 +14,7 @@ from math import inf
 from numbers import Real
 from typing import Any
 
-from multidrop.control.latches import Latches
+from multidrop.control.call import Latches
 from multidrop.control.outcome import Outcome, Seen, Stopped, result_of_stop
 from multidrop.control.writer import Writer
 from multidrop.core import Message

@@ -7,11 +7,10 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from typing import Any
 
-from multidrop.control.audit_log import check_author
 from multidrop.control.call import Call
 from multidrop.control.identity import EchoCheck, IdentityCheck
 from multidrop.control.outcome import Effect, Outcome
-from multidrop.control.records import WriteRecords
+from multidrop.control.records import WriteRecords, check_author
 from multidrop.control.rules import check_known, conditions, raw_count, wears
 from multidrop.core import Completion, Failure, Message, build_request
 from multidrop.drive.family import Drive

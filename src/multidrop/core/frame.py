@@ -1,11 +1,11 @@
-"""Build and parse frames in four framings."""
+"""Build and parse frames in four framings, and describe the format of their characters."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 from multidrop._core import ffi, lib
 
@@ -127,3 +127,25 @@ def find_replies(framing: Framing, received: bytes, request: Message) -> Iterato
 def reply_length(framing: Framing, request: Message) -> int:
     """Return the length in bytes of the good reply to `request`; 0 after a broadcast."""
     return int(lib.md_reply_length(framing, to_c(request)))
+
+
+# ---- characters ----
+
+
+class CharacterFormat(NamedTuple):
+    """Data bits, parity and stop bits of a character."""
+
+    databits: int
+    parity: str
+    stopbits: int
+
+    @classmethod
+    def parse(cls, text: str) -> CharacterFormat:
+        """Parse a format such as "8N1"."""
+        return cls(int(text[0]), text[1], int(text[2]))
+
+
+def settings_to_c(baudrate: int, format: str) -> dict[str, object]:
+    """Return the fields of a struct md_settings."""
+    bits = CharacterFormat.parse(format)
+    return {"baudrate": baudrate, **bits._asdict(), "parity": bits.parity.encode()}

@@ -9,7 +9,7 @@ from typing import Any
 from weakref import finalize
 
 from multidrop._core import ffi, lib
-from multidrop.core.fork import register_at_fork
+from multidrop.core.process import register_at_fork
 
 
 class Latch:

@@ -13,15 +13,14 @@ from typing import Any
 
 from multidrop.bus import Bus
 from multidrop.core import Peer, Port, RowQueue, Status
-from multidrop.core.fork import register_at_fork
+from multidrop.core.process import register_at_fork
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.errors import LineError
 from multidrop.planning.bus_time import in_order
 from multidrop.planning.schedule import Schedule
 from multidrop.plant.model import PlantLine, PolledDrive
-from multidrop.polling.jobs import JobMaker, PlannedJobs, PolledJob, RowNames
-from multidrop.polling.port_queue import PortQueue, Slot
+from multidrop.polling.jobs import JobMaker, PlannedJobs, PolledJob, PortQueue, RowNames, Slot
 from multidrop.polling.refusals import Refusals
 from multidrop.transport import clock
 from multidrop.transport.aside_log import log_aside, traceback_of, words_of

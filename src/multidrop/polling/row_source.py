@@ -14,7 +14,7 @@ from contextlib import suppress
 from functools import partial
 
 from multidrop.core import RowQueue
-from multidrop.core.undisturbed import undisturbed
+from multidrop.core.process import undisturbed
 from multidrop.errors import PollingFailed
 from multidrop.polling.added_rows import COMMENT, AddedRows
 from multidrop.polling.batch import Batch

@@ -11,8 +11,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any, Self
 
-from multidrop.polling.batch import Rows, schema, shown_span
-from multidrop.polling.tables import ArrowTable, WideRows
+from multidrop.polling.batch import ArrowTable, Rows, WideRows, schema, shown_span
 from multidrop.recording.phases import PhaseColumn, phase_names
 
 Metadata = Mapping[str, Any]

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from multidrop.extras import install_command
-from multidrop.polling.batch import Rows, schema
-from multidrop.polling.tables import nanoarrow
+from multidrop.polling.batch import Rows, nanoarrow, schema
 from multidrop.recording.format import (
     METADATA_KEY,
     Metadata,

@@ -14,8 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import accumulate
 from typing import Any
 
-from multidrop.polling.batch import Row, Rows, schema
-from multidrop.polling.tables import nanoarrow
+from multidrop.polling.batch import Row, Rows, nanoarrow, schema
 from multidrop.recording.rows import RecordedRows, from_rows, texts_of
 
 PHASE_DRIVE, PHASE = "test", "phase"

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from multidrop.planning.prediction import Prediction, predict
-from multidrop.planning.suggestions import duration_text, suggest
+from multidrop.planning.prediction import Prediction, duration_text, predict, suggest
 from multidrop.plant.model import PlantLine, planned_on
 from multidrop.runs.model import PlannedStep, RunPlan, timeline
 

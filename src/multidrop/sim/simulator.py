@@ -14,8 +14,7 @@ from collections.abc import Callable, Sequence
 from time import monotonic
 from typing import Self
 
-from multidrop.core.fork import register_at_fork
-from multidrop.core.undisturbed import undisturbed
+from multidrop.core.process import register_at_fork, undisturbed
 from multidrop.sim.port import SimulatedEnd
 from multidrop.sim.wire import Wire
 

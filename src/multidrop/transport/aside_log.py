@@ -11,7 +11,7 @@ from contextlib import suppress
 from functools import partial
 from queue import Empty, SimpleQueue
 
-from multidrop.core.fork import register_at_fork
+from multidrop.core.process import register_at_fork
 
 MOST_FRAMES = 30  # number of innermost frames in a logged traceback
 MOST_WAITING = 10_000  # limit of the queued pieces of work; further ones are dropped

@@ -25,7 +25,7 @@ from multidrop.errors import BadReply, DriveException, Expired, NoReply, NotMast
 from multidrop.planning.blocks import Block, blocks, halves, least, text_blocks
 from multidrop.transport import clock
 from multidrop.transport.line import Line
-from multidrop.transport.mixed_up import mixed_up, silence_hint
+from multidrop.transport.network_port import mixed_up, silence_hint
 from multidrop.transport.open_port import STALLED
 from multidrop.transport.peers import Peers
 from multidrop.transport.prepared import (

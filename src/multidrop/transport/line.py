@@ -22,12 +22,11 @@ from multidrop.core import (
     TransactionIds,
     build_request,
 )
-from multidrop.core.fork import register_at_fork
-from multidrop.core.undisturbed import undisturbed
+from multidrop.core.process import register_at_fork, undisturbed
 from multidrop.drive.line_settings import check_settle, speaks_tcp
 from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.transport.aside_log import flush, log_aside, words_of
-from multidrop.transport.bridge import PORT_FAILURES
+from multidrop.transport.network_port import PORT_FAILURES
 from multidrop.transport.open_port import (
     CLOSING_S,
     STALLED,

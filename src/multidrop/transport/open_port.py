@@ -33,9 +33,15 @@ from multidrop.core import (
 from multidrop.drive.line_settings import MODBUS_PORT, SCHEMES, URLS, speaks_tcp, url_of
 from multidrop.errors import LineError, NoSuchPort
 from multidrop.transport import clock, port_identity
-from multidrop.transport.bridge import PORT_FAILURES, Bridge, discard_late_bytes, set_up
-from multidrop.transport.mixed_up import mixed_up
-from multidrop.transport.network_port import RFC2217Port, SocketPort
+from multidrop.transport.network_port import (
+    PORT_FAILURES,
+    Bridge,
+    RFC2217Port,
+    SocketPort,
+    discard_late_bytes,
+    mixed_up,
+    set_up,
+)
 from multidrop.transport.port_identity import PseudoTerminal, USBAdapter, adapter_of, pseudo_terminal_of
 
 # struct serial_icounter_struct of linux/serial.h

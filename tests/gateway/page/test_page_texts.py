@@ -17,7 +17,7 @@ from watching import Opener, aborting, until, until_met, until_settled, violatio
 
 from multidrop.control import CommandOutcome
 from multidrop.control.outcome import Effect, Seen
-from multidrop.core.result import Status
+from multidrop.core.exchange import Status
 from multidrop.drive.register import Access
 from multidrop.drive.verbs import LISTED_VERBS
 from multidrop.fleet.leases.member import MemberState

@@ -20,7 +20,7 @@ from multidrop.drive import Drive
 from multidrop.drive.line_settings import speaks_tcp
 from multidrop.errors import BusError
 from multidrop.families import YD1000
-from multidrop.planning import back_off
+from multidrop.planning import schedule
 from multidrop.plant.model import PolledDrive
 from multidrop.polling import polled_line
 from multidrop.polling.batch import Row
@@ -97,7 +97,7 @@ class Story:
         Before that, the port must be reopened, and the pauses in polling silent drives must end.
         """
         cost = sum(drive.response_timeout for drive in self.drives) / 2  # s of timeouts per cycle, on average
-        longest = max(back_off.LONGEST_REST_NS / S, cost / back_off.SILENT_SHARE)
+        longest = max(schedule.LONGEST_REST_NS / S, cost / schedule.SILENT_SHARE)
         longest += Faults().away + polled_line.REOPEN_NS / S + poller.LOOK_NS / S
         ended = self.clocked.now
         asked: dict[str, int] = {}

@@ -1,4 +1,7 @@
-"""Run work that no signal interrupts: an exception from a signal handler ends only the wait for the work.
+"""Protect objects from forks, and work from signals.
+
+A forked child inherits all objects of its parent, but no threads: a lock that another thread held stays
+locked forever, and work of other threads never ends.
 
 Python raises KeyboardInterrupt and other exceptions of signal handlers between any two bytecodes of the main
 thread, even in `finally` and `__exit__`. Therefore separate threads open and close ports and lines.
@@ -6,13 +9,52 @@ thread, even in `finally` and `__exit__`. Therefore separate threads open and cl
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable
 from contextlib import suppress
 from contextvars import copy_context
 from functools import partial, wraps
 from queue import Empty, SimpleQueue
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar
+from weakref import WeakSet
+
+
+class Inherited(Protocol):
+    def forked(self) -> None:
+        """Give up the parent's resources without waiting; called in the child process."""
+
+
+_registered: WeakSet[Inherited] = WeakSet()
+
+
+def register_at_fork(inherited: Inherited) -> None:
+    """Call the object's `forked` in every child process while the object exists."""
+    _registered.add(inherited)
+
+
+def _call_all() -> None:
+    for inherited in list(_registered):  # the list keeps every object alive during the calls
+        inherited.forked()
+
+
+if hasattr(os, "register_at_fork"):  # Windows has no fork
+    os.register_at_fork(after_in_child=_call_all)
+
+
+def only_here(act: Callable[..., object]) -> Callable[..., None]:
+    """Return a function that calls `act` in this process, and does nothing in forked children."""
+    here = os.getpid()
+
+    def act_here(*details: object) -> None:
+        if os.getpid() == here:
+            act(*details)
+
+    return act_here
+
+
+# ---- signals ----
+
 
 HANDLING_S = 0.05  # s; longest delay in handling a signal that the kernel gave to another thread
 
