@@ -18,7 +18,7 @@ from terminals import on_terminal
 from toy import Toy
 
 import multidrop.cli.scan
-import multidrop.scan.identify
+import multidrop.scan.scanner
 from multidrop.cli import main
 from multidrop.cli.scan import sentence
 from multidrop.core import RS485, Framing
@@ -30,7 +30,7 @@ from multidrop.families.invt_che import InvtCHE
 from multidrop.families.registry import find_model
 from multidrop.plant.loader import load_plant
 from multidrop.scan import Crowd, Finding, Found, Noise, Untried, plant_text
-from multidrop.scan.results import Progress
+from multidrop.scan.findings import Progress
 from multidrop.scan.sweep import Sweep
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 from multidrop.transport import port_identity
@@ -44,7 +44,7 @@ TWO_MODELS = ("--model", "invt-che", "--model", "innovert-ibd")
 @pytest.fixture(autouse=True)
 def _slow_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Use a longer minimum timeout, because a busy computer may delay the replies of a fast drive."""
-    monkeypatch.setattr(multidrop.scan.identify, "LEAST_TIMEOUT", 0.1)
+    monkeypatch.setattr(multidrop.scan.scanner, "LEAST_TIMEOUT", 0.1)
 
 
 @pytest.fixture

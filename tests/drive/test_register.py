@@ -38,7 +38,7 @@ from multidrop.drive.text import Text, text
 from multidrop.drive.verbs import Script, read, verb
 from multidrop.families import MODELS
 from multidrop.families.registry import SHIPPED, shipped_family
-from multidrop.scan.identify import _read
+from multidrop.scan.scanner import _read
 from multidrop.sim import SimulatedDrive, Simulator, Wire
 
 

@@ -19,7 +19,7 @@ from multidrop.drive import ANOTHER_FAMILY, Drive
 from multidrop.errors import BusError, DriveException, NoReply, Unconfirmed, WriteForbidden
 from multidrop.families import MODELS, YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.families.registry import RECOGNISABLE, shipped_family
-from multidrop.scan.identify import identify
+from multidrop.scan.scanner import identify
 from multidrop.scan.sweep import ScanRequest, Sweep
 from multidrop.sim import MotorDrive, simulated
 

@@ -1,12 +1,12 @@
 """Find the drives on a serial line with unknown settings. Only reads are sent."""
 
-from multidrop.scan.plant_writer import plant_text as plant_text
-from multidrop.scan.results import Crowd as Crowd
-from multidrop.scan.results import Finding as Finding
-from multidrop.scan.results import Found as Found
-from multidrop.scan.results import Noise as Noise
-from multidrop.scan.results import Progress as Progress
-from multidrop.scan.results import Untried as Untried
+from multidrop.scan.findings import Crowd as Crowd
+from multidrop.scan.findings import Finding as Finding
+from multidrop.scan.findings import Found as Found
+from multidrop.scan.findings import Noise as Noise
+from multidrop.scan.findings import Progress as Progress
+from multidrop.scan.findings import Untried as Untried
+from multidrop.scan.findings import plant_text as plant_text
 from multidrop.scan.scanner import scan as scan
 from multidrop.scan.sweep import ADDRESSES as ADDRESSES
 from multidrop.scan.sweep import ScanRequest as ScanRequest

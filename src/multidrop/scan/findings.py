@@ -1,14 +1,97 @@
-"""Write a plant file for the drives that a scan has found; doubts become comments."""
+"""What a scan finds: drives, problems of addresses and settings, and progress; and a plant file of it."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 from multidrop.core import RS485, Framing
 from multidrop.drive.family import Drive
-from multidrop.scan.identify import candidate
-from multidrop.scan.results import GUESS, Found
+from multidrop.drive.line_settings import Settings
+
+GUESS = "it only reads like one: look at its name plate"
+
+
+@dataclass(frozen=True)
+class Found:
+    """A drive that answers; `models` are the equally likely families, empty if no family fits.
+
+    The settings are the first at which the drive answered. The drive's own number of stop bits may differ,
+    because a drive also answers requests with another number of stop bits.
+    """
+
+    address: int
+    settings: Settings
+    framing: Framing
+    models: tuple[str, ...]
+    response_delay: float  # in s
+    doubt: str = ""
+
+
+@dataclass(frozen=True)
+class Crowd:
+    """An address whose replies never match the request; probably several drives have this address.
+
+    If a reply had a valid checksum, `reply` says why it does not match; else `reply` is empty.
+    """
+
+    address: int
+    settings: Settings
+    framing: Framing
+    reply: str = ""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """A line setting at which so many addresses gave invalid bytes that these are probably noise."""
+
+    settings: Settings
+    framing: Framing
+    garbled: int
+    asked: int
+
+
+@dataclass(frozen=True)
+class Untried:
+    """A line setting that was skipped because the port does not support it."""
+
+    settings: Settings
+    framing: Framing
+    reason: str
+
+
+@dataclass(frozen=True)
+class Progress:
+    """A report after each address. `left` is the scan's remaining time in s if no further drive answers."""
+
+    settings: Settings
+    framing: Framing
+    address: int
+    left: float
+
+
+Finding = Found | Crowd | Noise | Untried | Progress
+
+
+# ---- a plant file; doubts become comments ----
+
+
+def candidate(family: type[Drive], settings: Settings, framing: Framing, address: int) -> Drive | None:
+    """Return a drive object of the family with these settings; None if its manual does not allow them.
+
+    A drive can answer in the sweep's serial format although its own format has other stop bits (on a
+    pseudo-terminal: another parity). If the family does not allow the sweep's format, the drive object gets
+    the family's usual format.
+    """
+    if not family.speaks(framing) or address not in family.addresses:
+        return None
+    if framing is Framing.TCP:  # only the gateway knows the serial settings
+        return family(address, framing=framing)
+    if settings.baudrate not in family.baudrates:
+        return None
+    format = settings.format if settings.format in family.formats_in(framing) else None
+    return family(address, framing=framing, baudrate=settings.baudrate, format=format)
 
 
 def plant_text(
