@@ -63,7 +63,7 @@ def by_pandas(table: Any, edge: float, step: float) -> tuple[Any, ...]:
 def test_figures_of_a_step_equal_those_computed_with_pandas(tmp_path: Path) -> None:
     pytest.importorskip("pandas")
     report = pytest.importorskip("multidrop.report")
-    from multidrop.report.steps import values_of
+    from multidrop.report.html import values_of
 
     path = tmp_path / "run.arrows"
     recorded_run(path)
