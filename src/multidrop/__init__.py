@@ -5,9 +5,27 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from multidrop.interpreter import refuse_other_interpreters
 
-refuse_other_interpreters()
+def _refuse_sub_interpreters() -> None:
+    """Raise ImportError in a sub-interpreter.
+
+    The compiled module keeps its engine, types and callbacks for the whole process. After a sub-interpreter
+    ended, its callbacks would still be called.
+    """
+    for name in ("_interpreters", "_xxsubinterpreters"):  # its names since Python 3.13, and before
+        try:
+            interpreters: Any = import_module(name)
+        except ImportError:
+            continue
+        if interpreters.get_current() != interpreters.get_main():
+            raise ImportError(
+                "multidrop works in a process's main interpreter only, and this is a sub-interpreter: "
+                "use it there, or in a process of its own"
+            )
+        return
+
+
+_refuse_sub_interpreters()
 
 
 def _homes(stub: str) -> dict[str, str]:

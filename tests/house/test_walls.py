@@ -21,7 +21,7 @@ OUTSIDE = {
 }
 # floors, the lowest first: a room may import from itself and from rooms on lower floors
 FLOORS = [
-    {"errors", "exposition", "extras", "printable", "iso_time", "interpreter", "supervisor", "whole_file"},
+    {"errors", "exposition", "printable", "supervisor", "whole_file"},
     {"toml_lines", "toml_syntax"},
     {"toml_document"},
     {"toml_check"},
@@ -92,8 +92,6 @@ OPEN = {
         "samples.sample_tables",
         "errors",
         "exposition",
-        "extras",
-        "iso_time",
         "printable",
         "supervisor",
         "toml_check",

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from multidrop import Batch, Plant
-from multidrop.extras import install_command
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.rights import Tokens
 from multidrop.gateway.live.alarms import Alarms
 from multidrop.gateway.live.hub import Hub
+from multidrop.printable import install_command
 from multidrop.supervisor import supervisor
 
 BUILD_S = 3.0  # how long a start or a reload waits for parts whose disks do not answer

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from multidrop.extras import install_command
+from multidrop.printable import install_command
 
 MOST_CHARACTERS = 1_000_000
 MOST_NODES = 50_000  # node limit; an alias counts as all nodes of its expansion

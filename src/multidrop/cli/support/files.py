@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from multidrop.cli.support.output import warn
 from multidrop.cli.support.values import counted
-from multidrop.extras import install_command
+from multidrop.printable import install_command
 from multidrop.recording.format import AppendFile, already_there, new_file, writing
 from multidrop.recording.segments import segments_of
 

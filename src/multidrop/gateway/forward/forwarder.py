@@ -27,8 +27,7 @@ from multidrop.gateway.clock import monotonic_ns
 from multidrop.gateway.http_post import Refused
 from multidrop.gateway.metrics import counter
 from multidrop.gateway.reload import changed_drives
-from multidrop.iso_time import format_time
-from multidrop.printable import printable
+from multidrop.printable import format_time, printable
 from multidrop.recording import parse_size
 from multidrop.samples import MessageError, PolledUnits, SinkError, Spool, StoredMessage, unpack
 from multidrop.supervisor import supervisor
