@@ -11,9 +11,11 @@ from itertools import count
 from pathlib import Path
 
 import pytest
+from clocked_lines import ClockedLines, ClockedWire
 from examples import usually
 from lines import line, plant, polled, rows_of, until
 from tables import table
+from toy import Toy
 
 from multidrop import poller as poller_module
 from multidrop.core import Framing, Message, build_reply, parse_request
@@ -23,8 +25,8 @@ from multidrop.errors import LineError, PollingFailed
 from multidrop.families import InvtCHE
 from multidrop.poller import Poller
 from multidrop.polling.batch import Row
-from multidrop.polling.polled_line import PolledLine
-from multidrop.sim import MotorDrive, Simulator, Wire, simulated
+from multidrop.polling.polled_line import MOST_AT_ONCE, PolledLine
+from multidrop.sim import Faults, MotorDrive, Simulator, Wire, simulated
 
 START = threading.Thread.start
 
@@ -247,3 +249,20 @@ def test_values_of_a_server_that_closes_each_connection_at_once_are_misses() -> 
 
             until(look)
     assert {row.status for row in rows} <= {"port lost", "reply cut short"}
+
+
+def test_a_port_that_is_lost_at_every_request_is_reopened_twice_a_second(tmp_path: Path) -> None:
+    """Some devices close each connection at its first request, while another client is connected."""
+    drives = [Toy(address, name=f"pump-{address}") for address in range(1, 6)]
+    port = str(tmp_path / "port")
+    wire = ClockedWire([simulated(drive) for drive in drives], Faults(hang_up=1, away=0.001), port=port)
+    with ClockedLines(wire, [polled(drive, [Toy.fault], 0.2) for drive in drives]) as clocked:
+        rows = clocked.run(10)
+        assert 2 * 10 <= len(clocked.opened) <= 1 + MOST_AT_ONCE + 2 * 10
+        wire.faults = Faults()
+        rows += clocked.run(1)
+        healthy = clocked.run(1)
+    assert {row.status for row in rows} == {"ok", "port lost", "not asked: drive is silent"}
+    assert {row.status for row in healthy} == {"ok"}
+    for drive in drives:
+        assert sum(row.drive == drive.name for row in rows + healthy) >= 12 / 0.2 - 1

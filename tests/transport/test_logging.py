@@ -18,8 +18,9 @@ from toy import PatientToy
 from multidrop import Bus, LineError, WriteForbidden
 from multidrop.families import InvtCHE
 from multidrop.sim import SimulatedDrive, Simulator, Wire
-from multidrop.transport import aside_log
+from multidrop.transport import aside_log, clock
 from multidrop.transport.aside_log import flush
+from multidrop.transport.line import MOST_LOSSES, LineLog
 
 pytestmark = pytest.mark.usefixtures("_patient")
 
@@ -80,6 +81,29 @@ def test_losing_and_reopening_a_port_is_logged_once(caplog: pytest.LogCaptureFix
         (level, text.split(": ")[1].split(" (")[0]) for level, text in messages(caplog, "multidrop.line")
     ]
     assert levels[:3] == [("INFO", "opened"), ("WARNING", "lost"), ("INFO", "opened again")]
+
+
+def test_frequent_losses_do_not_fill_the_log(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A server may close each connection after a request. The last entry states whether the port is open."""
+    now = 0.0
+    monkeypatch.setattr(clock, "now_ns", lambda: round(now * 1e9))
+    log = LineLog("port")
+    with caplog.at_level(logging.INFO, "multidrop"):
+        for second in range(100, 280):
+            now = float(second)
+            log.lost("hung up")
+            log.opened("port")
+        log.lost("hung up")
+        log.unopened("nothing listens there")
+        log.opened("port")
+        flush(PATIENCE)
+    told = [text for _, text in messages(caplog, "multidrop.line")]
+    assert len(told) == 2 * MOST_LOSSES * 3 + 2
+    assert told[:2] == ["port: lost (hung up)", "port: opened again (port)"]
+    assert sum("further losses are not logged" in text for text in told) == 3
+    assert told[-2:] == ["port: not opened again: nothing listens there", "port: opened again (port)"]
 
 
 def test_frames_are_logged_only_at_level_debug(caplog: pytest.LogCaptureFixture) -> None:

@@ -105,6 +105,9 @@ LEARN_NS = 1_000_000_000  # interval between updates of exchange durations from 
 # interval between updates of exchange durations while the core repeats the bus cycle
 RELEARN_NS = 2_000_000_000
 REOPEN_NS = 500_000_000  # interval between attempts to reopen a lost port
+# After so many losses without a reply in between, the port is reopened at once. More than one loss, because
+# some devices close each connection at one particular request.
+MOST_AT_ONCE = 2
 STANDBY_NS = 500_000_000  # interval between additions of miss rows while this process may not poll the line
 RETRY_NS = 500_000_000  # pause before polling is retried after a failure; each further failure doubles it
 LONGEST_RETRY_NS = 30_000_000_000
@@ -146,8 +149,10 @@ class PolledLine:
         self._learnt_ns = 0
         # Some servers close a connection that stays idle: send the next request at once.
         self._reopening = Reopening(bus, lambda: row_queue.call(number))
-        self._lost_ns = 0  # when the port was lost; 0 while it is open
-        self._reopen_ns = 0  # when the next attempt to reopen it is due
+        self._lost_ns = 0  # when the port was lost; 0 if a drive has answered since
+        self._losses = 0  # number of losses since a drive answered
+        self._tried_ns = 0  # when the last attempt to reopen the port was made
+        self._reopen_ns = 0  # when the next attempt is due
         self._standby_ns = 0
         self.failure = ""  # the last failure of polling; "" after SOUND_NS without another failure
         self._failures = 0  # number of failures in a row
@@ -397,10 +402,11 @@ class PolledLine:
                 self._queue.move_to(port)
                 port.report_to(self._row_queue, self.number)
             self._queue.conclude(port)
+            if self._lost_ns and any(peer.answered_ns > self._tried_ns for _, peer in self._polled):
+                self._lost_ns = self._losses = 0
             if port.lost:
                 self._lose(port, now_ns)
                 return
-            self._lost_ns = 0
             self.bus.line.note_news()
             if not self.bus.line.may_send:
                 self._queue.pause(port)
@@ -475,8 +481,10 @@ class PolledLine:
         port.stop()
         self._queue.give_back()
         self.bus.line.drop()
-        if not self._lost_ns:  # else the reopened port was lost before a request was queued
-            self._lost_ns = self._reopen_ns = now_ns
+        self._lost_ns = self._lost_ns or now_ns
+        self._losses += 1
+        if self._losses <= MOST_AT_ONCE:
+            self._reopen_ns = now_ns
 
     def _regain(self, now_ns: int) -> None:
         """Reopen the port in a thread; until that succeeds, add a miss row for each value that is due.
@@ -487,7 +495,7 @@ class PolledLine:
             return
         if now_ns - self._lost_ns >= REOPEN_NS:
             self._miss(self._schedule.pass_all(now_ns), Status.LINE_LOST)
-        self._reopen_ns = now_ns + REOPEN_NS
+        self._tried_ns, self._reopen_ns = now_ns, now_ns + REOPEN_NS
         self._reopening.begin()
 
     def leave(self) -> None:

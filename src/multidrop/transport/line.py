@@ -25,6 +25,7 @@ from multidrop.core import (
 from multidrop.core.process import register_at_fork, undisturbed
 from multidrop.drive.line_settings import check_settle, speaks_tcp
 from multidrop.errors import LineError, NoSuchPort, PortLost
+from multidrop.transport import clock
 from multidrop.transport.aside_log import flush, log_aside, words_of
 from multidrop.transport.network_port import PORT_FAILURES
 from multidrop.transport.open_port import (
@@ -44,10 +45,13 @@ MISCOUNTS = (
     "will not be noticed"
 )
 FOREIGN = "%s: another master: %d unexpected bytes came; only stops are sent until the line has been silent"
+MOST_LOSSES = 5  # number of losses that are logged within LOSSES_NS
+LOSSES_NS = 60_000_000_000
+UNLOGGED = "; it is lost often, so further losses are not logged until a minute after the first"
 
 
 class LineLog:
-    """The log of one line: reports each loss once, and counts bytes from another master."""
+    """The log of one line: reports each loss once, but not too often; counts another master's bytes."""
 
     def __init__(self, port: str) -> None:
         self.foreign = 0  # number of another master's bytes, received while listening
@@ -56,6 +60,8 @@ class LineLog:
         self._foreign_here = 0  # part of `foreign` since the port was last opened
         self._is_lost = self._is_stalled = self._miscounts = False
         self._why_unopened = ""
+        self._losses = 0  # number of losses since `_losses_ns`
+        self._losses_ns = 0
         self.forked()
 
     def forked(self) -> None:
@@ -65,14 +71,22 @@ class LineLog:
     def opened(self, identity: str) -> None:
         """Log that the port was opened; from now on, a loss of the port is logged again."""
         again = " again" if self._is_lost else ""
-        log_aside(_log, logging.INFO, "%s: opened%s (%s)", self._port, again, identity)
+        if not self._is_lost or self._losses <= MOST_LOSSES or self._why_unopened:
+            log_aside(_log, logging.INFO, "%s: opened%s (%s)", self._port, again, identity)
         self._is_lost, self._is_stalled, self._foreign_here, self._why_unopened = False, False, 0, ""
 
     def lost(self, why: str) -> None:
         """Log that the port was lost, unless this loss is already logged."""
-        if not self._is_lost:
-            self._is_lost = True
-            log_aside(_log, logging.WARNING, "%s: lost (%s)", self._port, why)
+        if self._is_lost:
+            return
+        self._is_lost = True
+        now_ns = clock.now_ns()
+        if now_ns >= self._losses_ns + LOSSES_NS:
+            self._losses, self._losses_ns = 0, now_ns
+        self._losses += 1
+        if self._losses <= MOST_LOSSES:
+            more = UNLOGGED if self._losses == MOST_LOSSES else ""
+            log_aside(_log, logging.WARNING, "%s: lost (%s)%s", self._port, why, more)
 
     def note_stall(self, is_stalled: bool) -> None:
         """Log that the adapter accepts no bytes, or accepts them again, unless this is already logged."""
