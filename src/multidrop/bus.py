@@ -211,7 +211,7 @@ class Bus:
             finally:
                 self._is_closed = True
                 overruns = self.line.overruns()
-                self._exchanges.close()
+                self._exchanges.peers.close()
                 self._meter.freeze(overruns)
                 self._records.close()
                 self._attached.free()
@@ -257,20 +257,20 @@ class Bus:
 
         The new bus must know the outstanding requests, because late replies to them may still arrive.
         """
-        self._exchanges.remember(before._exchanges)
+        self._exchanges.peers.remember(before._exchanges.peers)
 
     def peer(self, drive: Drive) -> Peer:
         """Return the Peer with the drive's learnt timing and late replies. Raises NotAttached."""
-        return self._exchanges.peer(drive)
+        return self._exchanges.peers.of(drive)
 
     def is_asking(self, peer: Peer) -> bool:
         """Return True while an exchange with this peer is about to start, queued or in flight."""
-        return self._exchanges.is_asking(peer)
+        return self._exchanges.peers.is_asking(peer)
 
     @property
     def peers(self) -> dict[Drive, Peer]:
         """The peer of each drive that is on this bus now."""
-        return self._exchanges.peers
+        return dict(self._exchanges.peers.present)
 
     # ---- commands ----
 

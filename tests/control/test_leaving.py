@@ -214,7 +214,7 @@ def test_closing_a_bus_releases_its_drives(monkeypatch: pytest.MonkeyPatch) -> N
 def test_threads_that_attach_concurrently_add_one_drive_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     line = SimulatedBus(monkeypatch)
     together = threading.Barrier(8)
-    add, inside, most = line.bus._exchanges.add, set[str](), 0
+    add, inside, most = line.bus._exchanges.peers.add, set[str](), 0
 
     def slow(drive: Drive) -> None:
         nonlocal most
@@ -224,7 +224,7 @@ def test_threads_that_attach_concurrently_add_one_drive_at_a_time(monkeypatch: p
         inside.discard(drive.name)
         add(drive)
 
-    monkeypatch.setattr(line.bus._exchanges, "add", slow)
+    monkeypatch.setattr(line.bus._exchanges.peers, "add", slow)
     outcomes: list[str] = []
 
     def attach(address: int) -> None:

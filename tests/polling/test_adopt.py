@@ -571,7 +571,7 @@ def test_memory_is_bounded_over_many_adoptions() -> None:
                 len(lines._numbered),
                 len(lines._free),
                 max(lines._numbered),
-                len(polled_line.bus._exchanges._peers._known),
+                len(polled_line.bus._exchanges.peers._known),
                 len(polled_line._gone),
             )
 

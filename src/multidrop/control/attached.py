@@ -134,7 +134,7 @@ class Attached:
                     f"{drive.name} is on the bus at {owner.line.port}: detach it there first, or create "
                     "another drive object"
                 )
-            self._exchanges.add(drive)
+            self._exchanges.peers.add(drive)
             drive.bus = self._bus
             drive.stops_called = self._latches.add(drive).c
             drive.link = self._link
@@ -143,7 +143,7 @@ class Attached:
     def remove(self, drive: Drive) -> None:
         """Remove a drive from the bus. Raises NotAttached if it is not there."""
         with self.lock:
-            self._exchanges.peer(drive)
+            self._exchanges.peers.of(drive)
             self.drives = [other for other in self.drives if other is not drive]
             self._exchanges.remove(drive)
             self._free([drive])
@@ -191,9 +191,7 @@ class Leaving:
         """
         if self._last_act is None:
             self._last_act = exit_hook().add(
-                self._latches.shut,
-                self._act,
-                lambda: [drive.name for drive in self._drives()],
+                self._latches.shut, self._act, lambda: [drive.name for drive in self._drives()]
             )
 
     def _act(self) -> None:

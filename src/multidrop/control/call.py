@@ -35,15 +35,12 @@ class Latches:
         self._exchanges = exchanges
         self._latches: dict[Drive, Latch] = {}
         self.is_shut = False
-        self._forget_stops()
-
-    def _forget_stops(self) -> None:
         # by unfinished stop: the identifier of the stop's thread, and the stop's drives
         self._stops: dict[object, tuple[int, frozenset[Drive]]] = {}
 
     def forked(self) -> None:
         """Shut all latches in a forked child, and forget the parent's stops."""
-        self._forget_stops()
+        self._stops = {}
         self.shut()
 
     def add(self, drive: Drive) -> Latch:
@@ -80,7 +77,7 @@ class Latches:
 
     def latch(self, drive: Drive) -> Latch:
         """Return a drive's latch. Raises NotAttached if the drive is not on this bus."""
-        self._exchanges.peer(drive)  # raises NotAttached
+        self._exchanges.peers.of(drive)  # raises NotAttached
         latch = self._latches.get(drive)
         if latch is None:  # the drive is being removed
             raise NotAttached(f"{drive.name} is not attached to this bus: use bus.attach(...)")
@@ -221,11 +218,7 @@ Limit = Callable[[], float]
 MOST_EXPIRY_S = 1e6
 
 
-def _none() -> float:
-    return inf
-
-
-_limit: ContextVar[Limit] = ContextVar("multidrop time limit", default=_none)
+_limit: ContextVar[Limit] = ContextVar("multidrop time limit", default=lambda: inf)
 
 
 def present_limit_ns() -> float:

@@ -153,10 +153,7 @@ class ExitHook:
         self._acts = []
 
     def add(
-        self,
-        begin: Callable[[], object],
-        work: Callable[[], object],
-        drives: Callable[[], list[str]] = list,
+        self, begin: Callable[[], object], work: Callable[[], object], drives: Callable[[], list[str]] = list
     ) -> LastAct:
         """Do `work` before the process ends; `begin` is called first, possibly in a signal handler.
 

@@ -17,21 +17,17 @@ from multidrop.drive.register import Register
 from multidrop.drive.verbs import Read, Script, Step, Wait, carry_out
 from multidrop.errors import (
     ANOTHER_FAMILY,
-    BadReply,
     BusError,
     CheckAgain,
     DriveException,
-    LineError,
     NoReply,
-    NotAttached,
-    NotMaster,
     NoValue,
     WriteForbidden,
 )
 from multidrop.families import MODELS
 from multidrop.families.makes import MAKES, Evidence, Make, easily_mistaken_for, run_by
 from multidrop.transport import clock
-from multidrop.transport.exchange import READ_ATTEMPTS, WRITE_TIMEOUT, Exchanges
+from multidrop.transport.exchange import READ_ATTEMPTS, READ_FAILURES, WRITE_TIMEOUT, Exchanges
 
 SURE = 2  # number of checks in a row that must find another family before a stop is withheld
 
@@ -70,7 +66,7 @@ class EchoCheck:
         If another client sends the same request, that request looks like our echo. Without this read, the
         line would from then on ignore the drive's confirmations of writes, which are copies of requests too.
         """
-        with suppress(NoReply, BadReply, LineError, NotAttached, NotMaster):
+        with suppress(*READ_FAILURES):
             self.read_any(drive, 1, insists=insists, timeout=WRITE_TIMEOUT)
 
     def why_doubtful(self, drive: Drive) -> str:
@@ -84,7 +80,7 @@ class EchoCheck:
             return ""
         try:
             self.read_any(drive, READ_ATTEMPTS)
-        except (NoReply, BadReply, LineError, NotAttached, NotMaster) as failure:
+        except READ_FAILURES as failure:
             return f"the reply may be the adapter's echo, because the drive has not answered since: {failure}"
         return "the reply was the adapter's echo" if line.has_echo else ""
 
@@ -124,7 +120,6 @@ class IdentityCheck:
         self._all_findings: WeakKeyDictionary[Drive, _Findings] = WeakKeyDictionary()
 
     def _findings(self, drive: Drive) -> _Findings:
-        """Return the results of this drive's checks since its port was opened."""
         port = self._exchanges.line.queue
         findings = self._all_findings.get(drive)
         if findings is None or findings.port is not port:
@@ -148,7 +143,7 @@ class IdentityCheck:
         before it could pass for the drive's confirmation. Each read runs within its own `timed()` block.
         """
         findings = self._findings(drive)
-        last, peer = findings.confirmed, self._exchanges.peer(drive)
+        last, peer = findings.confirmed, self._exchanges.peers.of(drive)
         silences = peer.silences
         was_heard = last is not None and last.was_heard(peer)
         if last and was_heard and last.silences == silences:
@@ -187,7 +182,7 @@ class IdentityCheck:
 
     def _know(self, drive: Drive, findings: _Findings, silences: int, *, was_heard: bool) -> None:
         """Record that the family was confirmed; `was_heard` is False if the drive had been silent before."""
-        before, pauses = findings.confirmed, self._exchanges.peer(drive).pauses
+        before, pauses = findings.confirmed, self._exchanges.peers.of(drive).pauses
         if not was_heard or before is None or before.pauses != pauses:
             _forget_setpoint(drive)
         findings.confirmed = _Confirmed(silences, pauses, clock.now_ns(), _slept_ns())
@@ -240,7 +235,7 @@ class IdentityCheck:
 
     def _is_in_step(self, drive: Drive) -> bool:
         """Return True if a late reply to an earlier request cannot be taken for the present reply."""
-        peer = self._exchanges.peer(drive)
+        peer = self._exchanges.peers.of(drive)
         return not (peer.counters().late or peer.silences or peer.late_until_ns)
 
     def _suspicion(self, drive: Drive, rivals: Sequence[Make]) -> Suspicion | None:
@@ -248,7 +243,7 @@ class IdentityCheck:
 
         Registers that show a make in `rivals` are read only if the family's identity is weak.
         """
-        findings, silences = self._findings(drive), self._exchanges.peer(drive).silences
+        findings, silences = self._findings(drive), self._exchanges.peers.of(drive).silences
         refused = None
 
         def do(step: Step) -> object:

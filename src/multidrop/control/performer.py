@@ -20,25 +20,11 @@ from multidrop.drive.register import Register
 from multidrop.drive.request import check_no_read
 from multidrop.drive.state import State
 from multidrop.drive.verbs import Insist, Read, Script, Step, Wait, Write, carry_out
-from multidrop.errors import (
-    BadReply,
-    BusError,
-    CancelledByStop,
-    DriveException,
-    LineError,
-    NoReply,
-    NotAttached,
-    NotMaster,
-    Unconfirmed,
-    WriteForbidden,
-)
+from multidrop.errors import BusError, CancelledByStop, DriveException, Unconfirmed, WriteForbidden
 from multidrop.transport import clock
-from multidrop.transport.exchange import Exchanges
+from multidrop.transport.exchange import READ_FAILURES, Exchanges
 
 _log = logging.getLogger("multidrop.control")
-
-# if a script's read fails with one of these errors, the effect of the write before that read is unknown
-_ENDING = (NoReply, BadReply, DriveException, LineError, NotAttached, NotMaster)
 
 
 class _Over(Exception):
@@ -175,7 +161,7 @@ class Performer:
 
         try:
             return carry_out(script, do)
-        except (*_ENDING, CancelledByStop, _Over) as failure:
+        except (*READ_FAILURES, CancelledByStop, _Over) as failure:
             why: Exception = cancelled[0] if isinstance(failure, _Over) else failure
             if not call.sent or why not in unseen:
                 raise why from None if why is failure else failure

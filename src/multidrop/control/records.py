@@ -11,11 +11,11 @@ import logging
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any, NamedTuple, TypeVar
 
 from multidrop.control.eeprom_ledger import LEAST_INTERVAL, YEARLY, Ledger, LedgerCell
 from multidrop.control.outcome import Effect, Stopped
@@ -28,6 +28,8 @@ from multidrop.printable import format_time, printable
 from multidrop.transport import clock
 from multidrop.transport.aside_log import AsideThread, log_aside
 from multidrop.transport.line import Line
+
+T = TypeVar("T")
 
 OPENING_S = 5.0  # timeout for opening the file
 
@@ -107,40 +109,37 @@ def read_audit(path: Path | str) -> Iterator[dict[str, Any]]:
 MOST_CHARACTERS = 200
 
 
-class Author(NamedTuple):
-    """Fields of an audit record: `by` names the author, `way` the interface, `id` is the command's id."""
+class _Author(NamedTuple):
+    """The fields of an audit record that `written_by` sets, and the error in its arguments, if any."""
 
-    by: str = ""
-    way: str = ""
-    id: str = ""
-
-
-class _Named(NamedTuple):
-    """An author as printable text, and the error in the arguments of `written_by`, if any."""
-
-    author: Author
+    fields: dict[str, str]
     mistake: Exception | None
 
 
-_named: ContextVar[_Named] = ContextVar("multidrop author")
-_NOBODY = _Named(Author(), None)
+_author: ContextVar[_Author] = ContextVar("multidrop author")
+_NOBODY = _Author({}, None)
 _noted_first: ContextVar[bool] = ContextVar("multidrop noted first", default=False)
-
-
-def present_author() -> Author:
-    """Return the author of writes in this context; all fields are empty if no author was named."""
-    return _named.get(_NOBODY).author
+_commissioning: ContextVar[bool] = ContextVar("multidrop commissioning", default=False)
 
 
 def check_author() -> None:
     """Raise TypeError or ValueError if the present author's name is invalid. Not called for stops."""
-    mistake = _named.get(_NOBODY).mistake
+    mistake = _author.get(_NOBODY).mistake
     if mistake is not None:
         raise mistake
 
 
 @contextmanager
-def written_by(who: str, way: str = "", command: str = "") -> Iterator[None]:
+def _within(variable: ContextVar[T], value: T) -> Iterator[None]:
+    """Set the variable within the block, in this thread or task."""
+    token = variable.set(value)
+    try:
+        yield
+    finally:
+        variable.reset(token)
+
+
+def written_by(who: str, way: str = "", command: str = "") -> AbstractContextManager[None]:
     """Record `who` as the author of all writes within the block, and `way` as the interface used.
 
     The audit record of a write or a stop then has `by`, such as "anna", and `way`, such as "web, 10.0.0.7",
@@ -156,31 +155,27 @@ def written_by(who: str, way: str = "", command: str = "") -> Iterator[None]:
     others = {"way": way, "command": command}
     given = {"who": who} | {name: text for name, text in others.items() if text != ""}
     mistakes = (_mistake(name, text) for name, text in given.items())
-    author = Author(_spelt(who), _spelt(way), _spelt(command))
-    token = _named.set(_Named(author, next(filter(None, mistakes), None)))
-    try:
-        yield
-    finally:
-        _named.reset(token)
+    fields = {"by": _spelt(who), "way": _spelt(way), "id": _spelt(command)}
+    known = {key: text for key, text in fields.items() if text}
+    return _within(_author, _Author(known, next(filter(None, mistakes), None)))
 
 
-@contextmanager
-def noted_first() -> Iterator[None]:
+def noted_first() -> AbstractContextManager[None]:
     """Within the block, write a record with the outcome "called" to the audit log before each write.
 
     A second record has the real outcome. If the first record cannot be written, the write raises OSError and
     is not sent; a stop is always sent. The block applies to this thread or task, like that of `written_by`.
     """
-    token = _noted_first.set(True)
-    try:
-        yield
-    finally:
-        _noted_first.reset(token)
+    return _within(_noted_first, True)
 
 
-def is_noted_first() -> bool:
-    """Return True if the caller is inside a `noted_first` block."""
-    return _noted_first.get()
+def commissioning() -> AbstractContextManager[None]:
+    """Within the block, do not apply LEAST_INTERVAL, because a person is setting up a drive.
+
+    Each write is still counted in the ledger, the yearly budget still applies, and the audit record has
+    `commissioning`. The block applies to this thread or task.
+    """
+    return _within(_commissioning, True)
 
 
 def _mistake(name: str, text: object) -> Exception | None:
@@ -209,23 +204,8 @@ CALLED_S = 0.05  # s; longest time that a stop waits for its record
 CLOSING_NS = 1_000_000_000  # longest time that closing waits for other threads' records
 
 _log = logging.getLogger("multidrop.control")
-_commissioning: ContextVar[bool] = ContextVar("multidrop commissioning", default=False)
 _audit_thread = AsideThread("multidrop audit")
 _ledger_thread = AsideThread("multidrop ledger")
-
-
-@contextmanager
-def commissioning() -> Iterator[None]:
-    """Within the block, do not apply LEAST_INTERVAL, because a person is setting up a drive.
-
-    Each write is still counted in the ledger, the yearly budget still applies, and the audit record has
-    `commissioning`. The block applies to this thread or task.
-    """
-    token = _commissioning.set(True)
-    try:
-        yield
-    finally:
-        _commissioning.reset(token)
 
 
 class WriteRecords:
@@ -273,7 +253,7 @@ class WriteRecords:
 
     def note_called(self, drive: Drive, request: Message, what: str) -> None:
         """Within `noted_first`, record that this write is about to be sent. Raises OSError if that fails."""
-        if self.audit is None or not is_noted_first():
+        if self.audit is None or not _noted_first.get():
             return
         record = self._record(drive, request, what, CALLED, "", None)
         del record["sent"]
@@ -329,16 +309,15 @@ class WriteRecords:
         if self.audit is not None:
             self._unlogged.append((clock.utc_ns(), record))
         why = f": {record['why']}" if "why" in record else ""
-        author = [record[key] for key in Author._fields if key in record]
+        author = [record[key] for key in ("by", "way", "id") if key in record]
         by = f" (by {', '.join(author)})" if "by" in record else ""
         text = text or f"{record['drive']}: {record['write']}: {record['outcome']}{why}"
         log(logging.INFO, "%s%s", text, by)
 
     def _complete(self, record: dict[str, Any]) -> dict[str, Any]:
         """Return the record with the port and the author added."""
-        author = {key: text for key, text in present_author()._asdict().items() if text}
         set_up = {"commissioning": True} if _commissioning.get() else {}
-        return {"port": self._line.port, **record, **author, **set_up}
+        return {"port": self._line.port, **record, **_author.get(_NOBODY).fields, **set_up}
 
     def catch_up(self) -> None:
         """Write the queued records and count the queued writes; log a failure as a warning."""
@@ -369,12 +348,16 @@ class WriteRecords:
             self._writers.pop()
 
     def _count_queued(self) -> None:
-        uncounted: list[LedgerCell] = []
+        cells: list[LedgerCell] = []
         with suppress(IndexError):
             while True:
-                uncounted.append(self._uncounted.popleft())
-        if uncounted:
-            self._note(uncounted)
+                cells.append(self._uncounted.popleft())
+        if not cells:
+            return
+        try:
+            self._ledger.at(cells[0].port).note(cells, clock.utc_ns() / 1e9)
+        except (OSError, ValueError) as failure:  # ValueError is raised if a port's name is not valid text
+            log_aside(_log, logging.WARNING, "stops were not counted: %s", failure)
 
     def _append(self, at_ns: int, record: dict[str, Any]) -> None:
         audit = self.audit
@@ -386,12 +369,6 @@ class WriteRecords:
         except (OSError, ValueError) as failure:  # ValueError is raised if the file was closed
             self.audit_trouble = getattr(failure, "strerror", None) or str(failure)
             log_aside(_log, logging.WARNING, "the audit log cannot be written: %s", self.audit_trouble)
-
-    def _note(self, cells: list[LedgerCell]) -> None:
-        try:
-            self._ledger.at(cells[0].port).note(cells, clock.utc_ns() / 1e9)
-        except (OSError, ValueError) as failure:  # ValueError is raised if a port's name is not valid text
-            log_aside(_log, logging.WARNING, "stops were not counted: %s", failure)
 
     def _cell(self, drive: Drive, register: Register[Any]) -> LedgerCell:
         return LedgerCell(

@@ -487,7 +487,7 @@ class Stopper:
 
     def ready(self, drive: Drive) -> float:
         """Return the time (in s) before which no request may be sent to the drive."""
-        peer = self._exchanges.peers.get(drive)
+        peer = self._exchanges.peers.present.get(drive)
         return peer.ready_ns / 1e9 if peer else 0.0
 
     def _regain(self) -> None:

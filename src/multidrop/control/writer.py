@@ -31,7 +31,7 @@ from multidrop.errors import (
     Unconfirmed,
 )
 from multidrop.transport import clock
-from multidrop.transport.exchange import Exchanges, good_reply
+from multidrop.transport.exchange import READ_FAILURES, Exchanges, good_reply
 
 ACKNOWLEDGED = 5  # exception code: the device accepted the request, but needs more time
 
@@ -217,12 +217,7 @@ class Writer:
         return completion
 
     def _outcome(
-        self,
-        drive: Drive,
-        register: Register[Any],
-        asked: Any,
-        completion: Completion,
-        call: Call | None,
+        self, drive: Drive, register: Register[Any], asked: Any, completion: Completion, call: Call | None
     ) -> Outcome:
         """Return the outcome according to the reply and the value read back."""
         lost: BusError | None = None
@@ -254,7 +249,7 @@ class Writer:
         try:
             with call.look() if call else nullcontext():
                 return self._exchanges.value(drive, register), None
-        except (NoReply, BadReply, DriveException, LineError, NotAttached, NotMaster) as failure:
+        except READ_FAILURES as failure:
             return None, failure
 
     def _look(self, drive: Drive, step: Step, call: Call) -> Any:

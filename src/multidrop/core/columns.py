@@ -37,10 +37,7 @@ LOW_BYTE_FIRST: int = lib.MD_LOW_BYTE_FIRST  # order flag: least significant byt
 MOST_INVALID: int = lib.MD_MOST_INVALID
 
 _MAY_LACK = frozenset(
-    {
-        *(NumberFormat.F16, NumberFormat.F32, NumberFormat.F64),
-        *(NumberFormat.BCD16, NumberFormat.BCD32),
-    }
+    {*(NumberFormat.F16, NumberFormat.F32, NumberFormat.F64), *(NumberFormat.BCD16, NumberFormat.BCD32)}
 )
 
 

@@ -528,11 +528,7 @@ class Port:
         return float(self._progress.switching_ns) / 1e9 / max(int(self._progress.switches), 1)
 
     def carry_out(
-        self,
-        exchange: Exchange,
-        not_before_ns: int = 0,
-        expires_ns: int = 0,
-        into: Completion | None = None,
+        self, exchange: Exchange, not_before_ns: int = 0, expires_ns: int = 0, into: Completion | None = None
     ) -> Completion:
         """Carry out an exchange before all queued ones, wait for it, and return its completion.
 

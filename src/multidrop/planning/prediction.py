@@ -66,28 +66,40 @@ class Prediction:
         return sum(rate.requests * rate.reached for rate in self.rates if rate.drive is drive)
 
 
-@dataclass(eq=False, kw_only=True)
-class _PredictedJob(Job):
-    """A job with the results of its exchanges on the simulated clock."""
+class _Done(NamedTuple):
+    """The results of a job's exchanges on the simulated clock."""
 
-    planned: Planned
-    own: float  # s from the end of the silence to the end of the reply
-    count: int = 0
+    exchanges: int = 0
+    skipped: int = 0
     first_ns: int = 0
     last_ns: int = 0
     taken: float = 0.0  # s of line time, including the silences before the exchanges
 
+
+NOT_RUN = _Done()
+
+
+@dataclass(eq=False)
+class _PredictedJob:
+    """A job, and the results of its simulation."""
+
+    planned: Planned
+    own: float  # s from the end of the silence to the end of the reply
+    done: _Done = NOT_RUN
+
     @property
     def cost(self) -> float:
         """The mean line time of an exchange, in s."""
-        return self.taken / self.count if self.count else self.own + silence(self.planned.drive)
+        done = self.done
+        return done.taken / done.exchanges if done.exchanges else self.own + silence(self.planned.drive)
 
     @property
     def reached(self) -> float:
         """The simulated number of exchanges per second."""
-        if self.skipped == 0 and self.planned.every:
+        done = self.done
+        if done.skipped == 0 and self.planned.every:
             return 1 / self.planned.every
-        return (self.count - 1) * 1e9 / (self.last_ns - self.first_ns) if self.count > 1 else 0.0
+        return (done.exchanges - 1) * 1e9 / (done.last_ns - done.first_ns) if done.exchanges > 1 else 0.0
 
 
 def predict(
@@ -108,7 +120,7 @@ def predict(
     load = sum(job.cost / job.planned.every for job in jobs if job.planned.every)
     turns = max(TURN_SHARE, 1 - load) / sum(job.cost for job in turn) if turn else 0.0
     # if a drive needs intervals between its requests, the line may be idle in these intervals
-    has_rests = any(job.interval_ns for job in jobs)
+    has_rests = any(job.planned.drive.least_interval for job in jobs)
     if has_rests:
         load += sum(job.cost * job.reached for job in turn)
     groups: dict[tuple[Drive, float | None], list[_PredictedJob]] = {}
@@ -153,36 +165,11 @@ def _jobs(
         of_drive.setdefault(exchange.drive, []).append(exchange)
     return [
         _PredictedJob(
-            drive=drive.address,
-            kind=kind(drive),
-            silence_ns=round(silence(drive) * 1e9),
-            interval_ns=round(drive.least_interval * 1e9),
-            period_ns=None if planned.every is None else round(planned.every * 1e9),
-            duration_ns=round((silence(drive) + own) * 1e9),
-            planned=planned,
-            own=own,
+            planned, lateness + sending(drive, planned.block) + delays.get(drive, drive.response_delay)
         )
         for drive in in_order(of_drive, switching)
         for planned in of_drive[drive]
-        for own in [lateness + sending(drive, planned.block) + delays.get(drive, drive.response_delay)]
     ]
-
-
-def _run(jobs: Sequence[_PredictedJob], switching: float) -> None:
-    """Run the jobs on a simulated clock, and store the results in them."""
-    # one drive represents each kind: the pause between two drives depends only on their kinds
-    ends = {job.kind: job.planned.drive for job in jobs}
-    numbers = {kind: number for number, kind in enumerate(ends)}
-    gaps = tuple(tuple(gap(before, after, switching) for after in ends.values()) for before in ends.values())
-    slots = tuple(
-        _Slots(
-            *(job.drive, numbers[job.kind], job.silence_ns, job.interval_ns, job.period_ns, job.duration_ns),
-            job.own,
-        )
-        for job in jobs
-    )
-    for job, done in zip(jobs, _carried_out(slots, gaps), strict=True):
-        job.count, job.skipped, job.first_ns, job.last_ns, job.taken = done
 
 
 class _Slots(NamedTuple):
@@ -194,46 +181,53 @@ class _Slots(NamedTuple):
     interval_ns: int
     period_ns: int | None
     duration_ns: int
-    own: float
 
 
-class _Done(NamedTuple):
-    exchanges: int
-    skipped: int
-    first_ns: int
-    last_ns: int
-    taken: float
+def _run(jobs: Sequence[_PredictedJob], switching: float) -> None:
+    """Run the jobs on a simulated clock, and store the results in them."""
+    # one drive represents each kind: the pause between two drives depends only on their kinds
+    ends = {kind(job.planned.drive): job.planned.drive for job in jobs}
+    numbers = {kind: number for number, kind in enumerate(ends)}
+    gaps = tuple(tuple(gap(before, after, switching) for after in ends.values()) for before in ends.values())
+    slots = tuple(
+        _Slots(
+            drive.address,
+            numbers[kind(drive)],
+            silence_ns=round(silence(drive) * 1e9),
+            interval_ns=round(drive.least_interval * 1e9),
+            period_ns=None if job.planned.every is None else round(job.planned.every * 1e9),
+            duration_ns=round((silence(drive) + job.own) * 1e9),
+        )
+        for job in jobs
+        for drive in [job.planned.drive]
+    )
+    found = _carried_out(slots, tuple(job.own for job in jobs), gaps)
+    for job, done in zip(jobs, found, strict=True):
+        job.done = done
 
 
 @lru_cache(64)  # a plant often has several equal lines, and may be predicted several times
-def _carried_out(slots: tuple[_Slots, ...], gaps: tuple[tuple[float, ...], ...]) -> tuple[_Done, ...]:
+def _carried_out(
+    slots: tuple[_Slots, ...], owns: tuple[float, ...], gaps: tuple[tuple[float, ...], ...]
+) -> tuple[_Done, ...]:
     """Simulate the jobs in the schedule's order; return the results of each job.
 
-    `gaps[a][b]` is the pause in s from a drive of kind a to a following drive of kind b.
+    `owns` are the jobs' times in s, without silence. `gaps[a][b]` is the pause in s from a drive of kind a to
+    a following drive of kind b.
     """
     schedule: Schedule[Job] = Schedule()
-    jobs = [
-        Job(
-            drive=one.drive,
-            kind=one.kind,
-            silence_ns=one.silence_ns,
-            interval_ns=one.interval_ns,
-            period_ns=one.period_ns,
-            duration_ns=one.duration_ns,
-        )
-        for one in slots
-    ]
+    jobs = [Job(**one._asdict()) for one in slots]
     for job in jobs:
         schedule.add(job, 0)
     of_job = {job: number for number, job in enumerate(jobs)}
-    done = [_Done(0, 0, 0, 0, 0.0)] * len(jobs)
+    done = [NOT_RUN] * len(jobs)
     at, before = 0, slots[-1].kind
     ready_ns: dict[int, int] = {}
     timed = any(job.period_ns is not None or job.interval_ns for job in jobs)
     for _ in range(max(LEAST_EXCHANGES, LEAST_ROUNDS * len(jobs)) if timed else len(jobs)):
         ((job, not_before_ns, _),) = schedule.take(at, at, FAR_NS, 1)
         number = of_job[job]
-        own, known = slots[number].own, done[number]
+        own, known = owns[number], done[number]
         silent = gaps[before][slots[number].kind]
         begin_ns = max(at + round(silent * 1e9), not_before_ns, ready_ns.get(job.drive, 0))
         first_ns = known.first_ns if known.exchanges else begin_ns
@@ -284,13 +278,7 @@ def _block_metadata(planned: Planned) -> dict[str, Any]:
 
 
 WORTH_SAYING = 0.02  # minimum fraction of the reading time that a suggestion must save
-_NAMES = {
-    HOLDING: "HOLDING",
-    HOLDING_MULTIPLE: "HOLDING",
-    INPUT: "INPUT",
-    COIL: "COIL",
-    DISCRETE: "DISCRETE",
-}
+_NAMES = {HOLDING: "HOLDING", HOLDING_MULTIPLE: "HOLDING", INPUT: "INPUT", COIL: "COIL", DISCRETE: "DISCRETE"}
 
 SLOWER = 1.05  # factor from one attempted period to the next
 

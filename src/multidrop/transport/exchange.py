@@ -6,35 +6,29 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, TypeVar
 
-from multidrop.core import (
-    STATUSES,
-    Completion,
-    Exchange,
-    Failure,
-    Framing,
-    Message,
-    Peer,
-    Permit,
-    build_request,
-)
+from multidrop.core import STATUSES, Completion, Exchange, Failure, Framing, Message, Permit, build_request
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.drive.request import any_read
 from multidrop.drive.text import Text
-from multidrop.errors import BadReply, DriveException, Expired, NoReply, NotMaster, NoValue, PortLost
+from multidrop.errors import (
+    BadReply,
+    DriveException,
+    Expired,
+    LineError,
+    NoReply,
+    NotAttached,
+    NotMaster,
+    NoValue,
+    PortLost,
+)
 from multidrop.planning.blocks import Block, blocks, halves, least, text_blocks
 from multidrop.transport import clock
 from multidrop.transport.line import Line
 from multidrop.transport.network_port import mixed_up, silence_hint
 from multidrop.transport.open_port import STALLED
 from multidrop.transport.peers import Peers
-from multidrop.transport.prepared import (
-    NO_ROWS,
-    PreparedRead,
-    PreparedReads,
-    make_exchange,
-    make_read,
-)
+from multidrop.transport.prepared import NO_ROWS, PreparedRead, PreparedReads, make_exchange, make_read
 
 
 def good_reply(drive: Drive, completion: Completion) -> Message:
@@ -89,6 +83,7 @@ def _port_of(drive: Drive) -> str:
 T = TypeVar("T")
 
 READ_ATTEMPTS = 3
+READ_FAILURES = (NoReply, BadReply, DriveException, LineError, NotAttached, NotMaster)  # errors of a read
 WRITE_TIMEOUT = 1.0  # s; long, because a write wrongly reported as unconfirmed is worse than a wait
 ILLEGAL_FUNCTION = 1  # exception code for an unsupported function: a shorter request would get it too
 
@@ -98,42 +93,15 @@ class Exchanges:
 
     def __init__(self, line: Line) -> None:
         self.line = line
-        self._peers = Peers(line)
+        self.peers = Peers(line)
         self._answered_on: dict[Drive, object] = {}  # the port object on which each drive last answered
         self._prepared: dict[Drive, PreparedReads] = {}
 
-    # ---- the drives ----
-
-    def add(self, drive: Drive) -> None:
-        """Add a drive. If it was on the line before, it keeps its learnt timing and late replies."""
-        self._peers.add(drive)
-
-    def close(self) -> None:
-        """Close the line, but remember which late replies are due, for the next opening of the port."""
-        self._peers.close()
-
-    def remember(self, before: Exchanges) -> None:
-        """Take over the peers (timing and late replies) of an earlier bus on the same line."""
-        self._peers.remember(before._peers)
-
     def remove(self, drive: Drive) -> None:
         """Remove a drive: later exchanges with it raise NotAttached."""
-        self._peers.remove(drive)
+        self.peers.remove(drive)
         self._answered_on.pop(drive, None)
         self._prepared.pop(drive, None)
-
-    @property
-    def peers(self) -> dict[Drive, Peer]:
-        """The peers of the present drives; a copy, because any thread may add and remove drives."""
-        return dict(self._peers.present)
-
-    def peer(self, drive: Drive) -> Peer:
-        """Return the drive's peer. Raises NotAttached for a drive that is not on this bus."""
-        return self._peers.of(drive)
-
-    def is_asking(self, peer: Peer) -> bool:
-        """Return True while an exchange with this peer is about to start, is queued, or is in flight."""
-        return self._peers.is_asking(peer)
 
     def has_answered(self, drive: Drive) -> bool:
         """Return True if the drive has answered a read since the port was opened."""
@@ -229,7 +197,7 @@ class Exchanges:
                 except IndexError:
                     into = None
                 try:  # a successful read is fast because it makes few calls: see Completion
-                    reply = self._peers.carry_out(drive, exchange, into=into)
+                    reply = self.peers.carry_out(drive, exchange, into=into)
                     if reply.count < 0:
                         reply = self._good(drive, exchange, attempts, self._settled(drive, exchange, reply))
                     if reply.count == read.whole:  # fast path: zip without `strict`, no call of `decode`
@@ -299,16 +267,16 @@ class Exchanges:
 
     def text(self, drive: Drive, text: Text, attempts: int = READ_ATTEMPTS, *, insists: bool = False) -> str:
         """Return a text, read in as many requests as the family's limit on their length requires."""
-        peer = self.peer(drive)
+        peer = self.peers.of(drive)
         reads = [make_read(drive, block, peer, insists=insists) for block in text_blocks(drive, text)]
         return text.decode(b"".join(self._ask(drive, read, attempts).data for read in reads))
 
     def _read_block(self, drive: Drive, block: Block) -> Completion:
-        return self._ask(drive, make_read(drive, block, self.peer(drive)), READ_ATTEMPTS)
+        return self._ask(drive, make_read(drive, block, self.peers.of(drive)), READ_ATTEMPTS)
 
     def _prepare(self, drive: Drive) -> PreparedReads:
         """Return the drive's cached reads; replace them if the port, the settings or the peer has changed."""
-        peer = self._peers.present.get(drive) or self.peer(drive)
+        peer = self.peers.present.get(drive) or self.peers.of(drive)
         asked_as = (drive.address, drive.framing, drive.settings, drive.agreed_silence, drive.response_delay)
         made_for = (peer, self.line.queue, *asked_as)
         prepared = self._prepared.get(drive)
@@ -322,11 +290,11 @@ class Exchanges:
         Each request is sent only once. It is sent even if a late reply could be mistaken for its reply.
         """
         if isinstance(register, Text):
-            peer, blocks_of = self.peer(drive), text_blocks(other, register)
+            peer, blocks_of = self.peers.of(drive), text_blocks(other, register)
             asked = [make_read(other, block, peer, insists=True) for block in blocks_of]
             return register.decode(b"".join(self._ask(drive, read, 1).data for read in asked))
         (block,) = blocks(other, [register])
-        read = PreparedRead(other, block, self.peer(drive))
+        read = PreparedRead(other, block, self.peers.of(drive))
         found = read.decode(self._ask(drive, read.insisting(other, 0.0), 1))
         if None in found.values():
             raise no_value(drive, found)
@@ -342,7 +310,7 @@ class Exchanges:
         """
         request = any_read(drive, function, start, count)
         expires_ns = clock.boottime_ns() + round(expiry * 1e9)
-        asked = make_exchange(drive, request, self.peer(drive), NO_ROWS)
+        asked = make_exchange(drive, request, self.peers.of(drive), NO_ROWS)
         completion = self._carry_out(drive, asked, expires_ns)
         is_late = completion.result == Failure.LATE_ANSWER_DUE and clock.boottime_ns() >= expires_ns
         if is_late or completion.result == Failure.EXPIRED:
@@ -408,7 +376,7 @@ class Exchanges:
         NoReply without sending if late replies are due and the drive is silent.
         """
         made = make_exchange(
-            drive, request, self.peer(drive), NO_ROWS, insists=insists, timeout=timeout, permit=permit
+            drive, request, self.peers.of(drive), NO_ROWS, insists=insists, timeout=timeout, permit=permit
         )
         completion = self._carry_out(drive, made, expires_ns)
         if completion.result == Failure.LATE_ANSWER_DUE:
@@ -421,7 +389,7 @@ class Exchanges:
         Raises NotMaster if another process may be the line's master.
         """
         try:
-            completion = self._peers.carry_out(drive, made, expires_ns=expires_ns)
+            completion = self.peers.carry_out(drive, made, expires_ns=expires_ns)
         except PortLost as failure:
             self._check_held_back(drive, failure)
             raise
@@ -445,6 +413,6 @@ class Exchanges:
             wait_ns = completion.late_until_ns - clock.now_ns()
             wait_ns = min(wait_ns, expires_ns + 1 - clock.boottime_ns()) if expires_ns else wait_ns
             clock.sleep(max(0, wait_ns) / 1e9)
-            completion = self._peers.carry_out(drive, made, expires_ns=expires_ns)
+            completion = self.peers.carry_out(drive, made, expires_ns=expires_ns)
         check_master(drive, completion)
         return completion

@@ -212,10 +212,7 @@ CLOSING_S = 0.75  # time for which closing a port waits until the adapter has ta
 _UNNOTICED_S = 0.05  # s; time in which a healthy adapter takes all bytes
 BY_PLACE = "/dev/serial/by-path/"  # links that name USB sockets, not adapters
 _NO_SETTINGS = -1
-_TRANSACTIONS = {
-    TransactionIds.MATCH: Transactions.MATCHED,
-    TransactionIds.IGNORE: Transactions.IGNORED,
-}
+_TRANSACTIONS = {TransactionIds.MATCH: Transactions.MATCHED, TransactionIds.IGNORE: Transactions.IGNORED}
 
 
 def _refusal(rs485: RS485, failure: OSError) -> str:
@@ -231,12 +228,7 @@ class OpenPort:
     """
 
     def __init__(
-        self,
-        name: str,
-        ids: TransactionIds,
-        rs485: RS485,
-        mastership: Mastership | None,
-        settle: float = 0.0,
+        self, name: str, ids: TransactionIds, rs485: RS485, mastership: Mastership | None, settle: float = 0.0
     ) -> None:
         self.name = name
         self.identity = name  # see port_identity; the given name until the port is opened

@@ -316,7 +316,7 @@ class LineMeter:
         return self._frozen or self._count(self._exchanges.line.overruns())
 
     def _count(self, overruns: int | None) -> Count:
-        peers = {drive.name: peer for drive, peer in self._exchanges.peers.items()}
+        peers = {drive.name: peer for drive, peer in dict(self._exchanges.peers.present).items()}
         for _ in range(LOOKS):
             counters_by_drive = {name: peer.counters() for name, peer in peers.items()}
             now_ns = clock.now_ns()
