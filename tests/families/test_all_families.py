@@ -362,7 +362,7 @@ def forgotten(tree: ast.AST, scripts: set[str]) -> list[int]:
 def test_every_script_call_uses_yield_from() -> None:
     """Without `yield from` a script silently does not run."""
     rooms = (Path(multidrop.families.__file__).parent, Path(multidrop.drive.__file__).parent)
-    trees = {path: ast.parse(path.read_text("utf-8")) for room in rooms for path in room.glob("*.py")}
+    trees = {path: ast.parse(path.read_text("utf-8")) for room in rooms for path in room.rglob("*.py")}
     scripts = {"script"}.union(*map(scripts_of, trees.values()))
     assert {"read", "write", "insist", "wait", "until", "_started", "_stopped", "script"} <= scripts
     assert {path.name: lines for path, tree in trees.items() if (lines := forgotten(tree, scripts))} == {}

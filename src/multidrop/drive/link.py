@@ -48,25 +48,10 @@ class Link(Protocol):
 class NoLink:
     """The link of a drive that was never attached: nothing is sent, and each call raises NotAttached."""
 
-    def values(self, drive: Any, registers: Sequence[Any]) -> NoReturn:
-        raise not_attached(drive)
+    def _refuse(self, drive: Any, *details: Any, **options: Any) -> NoReturn:
+        raise NotAttached(f"{drive.name} is not attached to a bus: use bus.attach(...)")
 
-    def text(self, drive: Any, text: Text) -> NoReturn:
-        raise not_attached(drive)
-
-    def write(self, drive: Any, register: Register[Any], value: Any) -> NoReturn:
-        raise not_attached(drive)
-
-    def read_raw(
-        self, drive: Any, function: int, start: int, count: int, expiry: float = 0.0, attempts: int = 1
-    ) -> NoReturn:
-        raise not_attached(drive)
-
-    def send_raw(self, drive: Any, function: int, start: int, data: bytes, count: int) -> NoReturn:
-        raise not_attached(drive)
-
-    def perform(self, drive: Any, script: Script[Any]) -> NoReturn:
-        raise not_attached(drive)
+    values = text = write = read_raw = send_raw = perform = _refuse
 
     def begin_call(self, drive: Any, verb: str, seen: int) -> None:
         return None
@@ -78,11 +63,6 @@ class NoLink:
         self, drive: Any, verb: str, make: Callable[[], Script[Any]], seconds: float | None
     ) -> CalledStop:
         return UnattachedStop(drive, make)
-
-
-def not_attached(drive: Any) -> NotAttached:
-    """Return the error for a call that needs a bus, when the drive is on none."""
-    return NotAttached(f"{drive.name} is not attached to a bus: use bus.attach(...)")
 
 
 NO_LINK = NoLink()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import Enum
@@ -55,13 +55,20 @@ class LineSettings:
 UNKNOWN_LINE = LineSettings()
 
 
-def serial_settings(given: Mapping[str, Any], *, port: Any = "", framing: Any = "rtu") -> LineSettings:
-    """Return a serial line's settings from the optional keys `baudrate`, `bits`, `parity` and `stop`."""
-    parity = _PARITIES.get(str(given.get("parity", "")).lower(), "")
-    bits, stop = _whole(given.get("bits")) or 8, _whole(given.get("stop")) or 1
+def serial_settings(
+    given: Mapping[str, Any],
+    *,
+    port: Any = "",
+    framing: Any = "rtu",
+    keys: Sequence[str] = ("baud_rate", "data_bits", "parity", "stop_bits"),
+) -> LineSettings:
+    """Return a serial line's settings. `keys` are the source's names for baud rate, bits, parity and stop."""
+    baudrate, bits, parity, stop = (given.get(key, "") for key in keys)
+    parity = _PARITIES.get(str(parity).lower(), "")
+    bits, stop = _whole(bits) or 8, _whole(stop) or 1
     return LineSettings(
         port[:200] if isinstance(port, str) and _PORT.fullmatch(port) else "",
-        _whole(given.get("baudrate")),
+        _whole(baudrate),
         f"{bits}{parity}{stop}" if parity else "",
         "ascii" if str(framing).lower() == "ascii" else "rtu",
     )

@@ -216,8 +216,7 @@ def _line(parts: list[dict[str, Any]], bus: str) -> LineSettings:
     chosen = [uart for uart in uarts if len(uarts) == 1 or (named and uart.get("id") == named[0])]
     if len(chosen) != 1:
         return UNKNOWN_LINE
-    keys = {"baudrate": "baud_rate", "bits": "data_bits", "parity": "parity", "stop": "stop_bits"}
-    return serial_settings({key: chosen[0][theirs] for key, theirs in keys.items() if theirs in chosen[0]})
+    return serial_settings(chosen[0])
 
 
 # ---- entities ----

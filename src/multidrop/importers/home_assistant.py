@@ -188,9 +188,8 @@ def _line(hub: Mapping[str, Any]) -> LineSettings:
         return network_settings(hub.get("host"), hub.get("port", 502), is_serial_frames=kind == "rtuovertcp")
     if kind != "serial":
         return UNKNOWN_LINE if "host" not in hub else network_settings(hub["host"], hub.get("port", 502))
-    keys = {"baudrate": "baudrate", "bits": "bytesize", "parity": "parity", "stop": "stopbits"}
-    given = {key: hub[theirs] for key, theirs in keys.items() if theirs in hub}
-    return serial_settings(given, port=hub.get("port", ""), framing=hub.get("method", "rtu"))
+    keys = ("baudrate", "bytesize", "parity", "stopbits")
+    return serial_settings(hub, port=hub.get("port", ""), framing=hub.get("method", "rtu"), keys=keys)
 
 
 def _entries(hub: Mapping[str, Any], lost: ImportedDevice) -> Iterator[tuple[str, Mapping[str, Any]]]:

@@ -131,9 +131,7 @@ def _line(plugin: Mapping[str, Any]) -> LineSettings:
         return network_settings(
             host, port, is_serial_frames=is_serial, framing=framing if is_serial else "rtu"
         )
-    keys = {"baudrate": "baud_rate", "bits": "data_bits", "parity": "parity", "stop": "stop_bits"}
-    given = {key: plugin[theirs] for key, theirs in keys.items() if theirs in plugin}
-    return serial_settings(given, port=controller.removeprefix("file://"), framing=mode)
+    return serial_settings(plugin, port=controller.removeprefix("file://"), framing=mode)
 
 
 def _fields(plugin: Mapping[str, Any]) -> Iterator[_Field]:

@@ -114,9 +114,7 @@ def _of_port(port: Mapping[str, Any]) -> Iterator[ImportedDevice]:
             port.get("address"), port.get("port", 502), is_serial_frames=not kind.startswith("modbus")
         )
     else:
-        keys = {"baudrate": "baud_rate", "bits": "data_bits", "parity": "parity", "stop": "stop_bits"}
-        given = {key: port[theirs] for key, theirs in keys.items() if theirs in port}
-        line = serial_settings(given, port=port.get("path", ""))
+        line = serial_settings(port, port=port.get("path", ""))
     for template in port.get("devices") or ():
         title = str(template.get("name") or template.get("device_type") or "device")
         try:

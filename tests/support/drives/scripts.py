@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from enum import Enum
 from fractions import Fraction
 from typing import Any
 
 from multidrop.control.rules import conditions, raw_count
 from multidrop.core import Message, build_request
-from multidrop.drive import Drive, Read, Script, Wait
+from multidrop.drive import Drive, Read, Script, Wait, carry_out
 from multidrop.drive.register import COIL, Carrier, Register
 
 
@@ -67,20 +67,7 @@ class Wire:
         self.says |= {name: list(each) if isinstance(each, list) else [each] for name, each in says.items()}
 
     def run(self, script: Script[Any]) -> Any:
-        return self._run(script, self._step)
-
-    def _run(self, script: Script[Any], carry_out: Callable[[Any], Any]) -> Any:
-        try:
-            step = next(script)
-            while True:
-                try:
-                    result = carry_out(step)
-                except Exception as failure:
-                    step = script.throw(failure)
-                else:
-                    step = script.send(result)
-        except StopIteration as end:
-            return end.value
+        return carry_out(script, self._step)
 
     def _step(self, step: Any) -> Any:
         if isinstance(step, Wait):
@@ -91,9 +78,7 @@ class Wire:
             assert step.register.readable
             return self._said(step.register)
         raw_count(self.drive, step.register, step.value)
-        self._run(
-            conditions(self.drive, step.register, step.value), lambda look: self.says[look.register.name][0]
-        )
+        carry_out(conditions(self.drive, step.register, step.value), self._peek)
         text = frame(self.drive, step.register, step.value)
         self.sent.append(text)
         is_setpoint = step.register.name == self.drive.setpoint_name
@@ -108,6 +93,10 @@ class Wire:
         if is_setpoint and held == step.value:
             self.drive.commanded = held
         return held
+
+    def _peek(self, step: Any) -> Any:
+        """Return the value that the next read of this register gets."""
+        return self.says[step.register.name][0]
 
     def _said(self, register: Register[Any]) -> Any:
         if register.name in self.held:
