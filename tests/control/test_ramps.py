@@ -87,7 +87,7 @@ class Ramped(Toy):
     def set_frequency(self, hz: float) -> Script[None]:
         """Write the setpoint unless the drive already has it."""
         if (yield from read(self.frequency)) != hz:
-            yield from self._hold(self.frequency, hz)
+            yield from self._write_setpoint(self.frequency, hz)
 
 
 def ramped(monkeypatch: pytest.MonkeyPatch, family: type[Drive], **options: float) -> tuple[Any, Any, Any]:
@@ -416,7 +416,7 @@ class ShareToy(Toy):
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
-        yield from self._hold(self.share, hz / 80 * 100)
+        yield from self._write_setpoint(self.share, hz / 80 * 100)
 
 
 def test_a_ramp_of_a_percentage_of_an_unknown_maximum_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -435,7 +435,7 @@ class AliasToy(Toy):
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
-        yield from self._hold(self.frequency, hz)
+        yield from self._write_setpoint(self.frequency, hz)
 
 
 def test_a_ramp_through_a_ram_alias_writes_no_eeprom(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -474,7 +474,7 @@ class KeptToy(Toy):
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
-        yield from self._hold(self.frequency, hz)
+        yield from self._write_setpoint(self.frequency, hz)
 
 
 def test_a_ramp_to_a_command_in_eeprom_is_refused_before_its_first_step(

@@ -406,7 +406,7 @@ class Drive(RegisterAccess):
         if not (yield from until(check, limit=limit)):
             raise Unconfirmed(self.name, "the stop", f"after {limit:g} s it is not seen to have stopped")
 
-    def _hold(self, register: Register[float], value: float) -> Script[None]:
+    def _write_setpoint(self, register: Register[float], value: float) -> Script[None]:
         """Write the setpoint. Raises NotVerified if the drive then holds another value."""
         held = yield from write(register, value)
         if held != register.decode(register.encode(value)):

@@ -158,7 +158,7 @@ class DelixiParameters(Drive):
                 setattr(cls, name, moved)
         super().__init_subclass__()
 
-    def _shows_its_line(self) -> Script[None]:
+    def _check_line_settings(self) -> Script[None]:
         """Raise WriteForbidden unless P04.30 and P04.28 are the declared address and baud rate."""
         address = yield from read(self.address_setting)
         if address != self.address:
@@ -176,7 +176,7 @@ class DelixiParameters(Drive):
             f"another make"
         )
 
-    def _may_start(self) -> Script[None]:
+    def _check_start(self) -> Script[None]:
         """Raise WriteForbidden in a fault, without a setpoint, or if the line does not command the drive."""
         fault = yield from read(self.fault)
         if fault:
@@ -186,10 +186,10 @@ class DelixiParameters(Drive):
         if (yield from read(self.run_source)) != DelixiRunSource.LINE:
             raise WriteForbidden(f"{self.name} does not take its commands from the line: {self.remote}")
 
-    def _limit(self) -> float:
+    def _stop_limit(self) -> float:
         return self.option.get("stop_time", STOP_TIME)
 
-    def _stands(self) -> Script[bool]:
+    def _is_at_rest(self) -> Script[bool]:
         return (yield from read(self.output_frequency)) == 0
 
 
@@ -285,7 +285,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     @verb
     def identify(self) -> Script[None]:
         """Check that P04.30 is the drive's address, P04.28 its baud rate, and P05.31 a fault code."""
-        yield from self._shows_its_line()
+        yield from self._check_line_settings()
         fault = yield from read(self.fault)
         if not isinstance(fault, type(self.fault.decode(0))):
             raise WriteForbidden(
@@ -296,9 +296,9 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start at the setpoint in force. Without a direction: forward, and only from rest."""
-        if self._jogged and not (yield from self._stands()):
+        if self._jogged and not (yield from self._is_at_rest()):
             raise self._stop_first("may still jog, and a start may not end the jog:")
-        forward = yield from self._forward(direction)
+        forward = yield from self._goes_forward(direction)
         if (yield from read(self.frequency_source)) != 1:
             raise WriteForbidden(f"{self.name} takes no setpoint from P00.02: set P00.01 to 1 on the keypad")
         yield from self._setpoint_in_force()
@@ -311,8 +311,8 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
         """Turn slowly from rest until stopped; without a direction, forward."""
-        forward = yield from self._forward(direction)
-        if not (yield from self._stands()):
+        forward = yield from self._goes_forward(direction)
+        if not (yield from self._is_at_rest()):
             raise self._stop_first("turns, and may continue to turn during a jog:")
         self._jogged = True
         yield from write(
@@ -320,9 +320,9 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         )
         yield from self._started(direction)
 
-    def _forward(self, direction: Direction | None) -> Script[bool]:
-        yield from self._may_start()
-        if direction is None and not (yield from self._stands()):
+    def _goes_forward(self, direction: Direction | None) -> Script[bool]:
+        yield from self._check_start()
+        if direction is None and not (yield from self._is_at_rest()):
             raise WriteForbidden(f"{self.name} turns, and cannot report which way: give the direction")
         return direction is not Direction.REVERSE
 
@@ -330,12 +330,12 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     def stop(self) -> Script[None]:
         """Stop. The motor counts as stopped when the output frequency is 0."""
         yield from insist(self.control, DelixiModbusControl.STOP)
-        yield from self._stopped(self._stands, self._limit())
+        yield from self._stopped(self._is_at_rest, self._stop_limit())
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
         """Write the setpoint, which is stored in EEPROM, if it changes."""
-        yield from self._hold(self.frequency, hz)
+        yield from self._write_setpoint(self.frequency, hz)
 
     @verb
     def state(self) -> Script[State]:
@@ -343,7 +343,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         fault = yield from read(self.fault)
         if fault:
             return State(Condition.FAULT, fault=self.fault.in_words(fault))
-        if (yield from self._stands()):
+        if (yield from self._is_at_rest()):
             return State(Condition.UNKNOWN, note="output frequency 0: stopped, or running at a setpoint of 0")
         return State(Condition.RUNNING)
 
@@ -448,7 +448,7 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
     @verb
     def identify(self) -> Script[None]:
         """Check that P04.30 is the drive's address and P04.28 its baud rate."""
-        yield from self._shows_its_line()
+        yield from self._check_line_settings()
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
@@ -456,7 +456,7 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
 
         Without a direction, a turning motor keeps its direction, and a resting motor turns forward.
         """
-        yield from self._may_start()
+        yield from self._check_start()
         status = yield from read(self.status)
         if status in (DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE):
             raise self._reset_first(status.name)
@@ -476,9 +476,9 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
     def stop(self) -> Script[None]:
         """Stop. The motor counts as stopped when neither run state nor output frequency shows a run."""
         yield from insist(self.control, DelixiNativeControl.STOP)
-        yield from self._stopped(self._stands, self._limit())
+        yield from self._stopped(self._is_at_rest, self._stop_limit())
 
-    def _stands(self) -> Script[bool]:
+    def _is_at_rest(self) -> Script[bool]:
         if (yield from read(self.status)) not in (
             DelixiNativeStatus.STOPPED,
             DelixiNativeStatus.FAULT,
@@ -490,7 +490,7 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
     @verb
     def reset_fault(self) -> Script[None]:
         """Reset a fault; never starts the motor. The command is sent once, then verified."""
-        if (yield from read(self.status)) in CONDITIONS and not (yield from self._stands()):
+        if (yield from read(self.status)) in CONDITIONS and not (yield from self._is_at_rest()):
             raise WriteForbidden(f"{self.name} runs: it has no fault to reset")
         yield from write(self.control, DelixiNativeControl.RESET_FAULT)
         status = yield from read(self.status)
@@ -501,7 +501,7 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
         """Write the setpoint to RAM; it cannot be read back."""
-        yield from self._hold(self.frequency, hz)
+        yield from self._write_setpoint(self.frequency, hz)
 
     @verb
     def state(self) -> Script[State]:

@@ -262,24 +262,24 @@ class ErmanERG220(Drive):
     def stop(self) -> Script[None]:
         """Stop along the ramp; if that is refused, or the motor then still runs, use the emergency stop."""
         try:
-            yield from self._hold_back(self.stop_coil)
+            yield from self._stop_and_clear_start(self.stop_coil)
         except DriveException:
             yield from self.emergency_stop.script()
             return
         limit = yield from self._longest_ramp()
         try:
-            yield from self._stopped(self._stands, limit)
+            yield from self._stopped(self._is_at_rest, limit)
         except Unconfirmed:
             yield from insist(self.emergency_stop_coil, Coil.ON)
-            yield from self._stopped(self._stands, limit)
+            yield from self._stopped(self._is_at_rest, limit)
 
     @verb
     def emergency_stop(self) -> Script[None]:
         """Stop the motor with the drive's own emergency stop."""
-        yield from self._hold_back(self.emergency_stop_coil)
-        yield from self._stopped(self._stands, (yield from self._longest_ramp()))
+        yield from self._stop_and_clear_start(self.emergency_stop_coil)
+        yield from self._stopped(self._is_at_rest, (yield from self._longest_ramp()))
 
-    def _hold_back(self, stop: Register[Coil]) -> Script[None]:
+    def _stop_and_clear_start(self, stop: Register[Coil]) -> Script[None]:
         """Set this stop coil and clear START, even if setting the stop coil is not confirmed."""
         try:
             yield from insist(stop, Coil.ON)
@@ -295,7 +295,7 @@ class ErmanERG220(Drive):
         except BusError:  # a drive that does not answer this read may not obey a stop either
             return UNKNOWN_RAMP
 
-    def _stands(self) -> Script[bool]:
+    def _is_at_rest(self) -> Script[bool]:
         status = yield from read(self.status)
         return not status & PHASE and (yield from read(self.output_frequency)) == 0
 
@@ -317,7 +317,7 @@ class ErmanERG220(Drive):
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
         """Write the setpoint, which must lie between the drive's minimum and maximum frequency."""
-        yield from self._hold(self.frequency, hz)
+        yield from self._write_setpoint(self.frequency, hz)
 
     @verb
     def state(self) -> Script[State]:

@@ -228,9 +228,9 @@ class InnovertIBD(Drive):
         If a family file extends this family and declares `run_state`, a second check is enough: `run_state`
         has a valid value, and the drive takes its commands and its setpoint from the line.
         """
-        if self.identity_is_weak or (yield from self._shows_its_line()):
+        if self.identity_is_weak or (yield from self._line_settings_match()):
             return
-        if not (self._has_state and (yield from self._shows_its_state())):
+        if not (self._has_state and (yield from self._state_matches())):
             raise WriteForbidden(
                 f"{self.name} does not show its own baud rate at 02BCH and its address at 02BEH: look at its "
                 "name plate, and declare confirmed = 1 if it is an IBD",
@@ -242,7 +242,7 @@ class InnovertIBD(Drive):
         """True if only the owner's confirmation shows that the drive is an IBD, because no register does."""
         return bool(self.option.get("confirmed")) and not self.declared_in
 
-    def _shows_its_state(self) -> Script[bool]:
+    def _state_matches(self) -> Script[bool]:
         """Return True if `run_state` is valid, and the drive takes commands and setpoint from the line."""
         try:
             state = yield from read(self.register("run_state"))
@@ -255,7 +255,7 @@ class InnovertIBD(Drive):
         except DriveException:
             return False
 
-    def _shows_its_line(self) -> Script[bool]:
+    def _line_settings_match(self) -> Script[bool]:
         try:
             baudrate = yield from read(self.baudrate_setting)
             address = yield from read(self.address_setting)
@@ -317,14 +317,14 @@ class InnovertIBD(Drive):
             raise WriteForbidden(f"{self.name} does not take its commands from the line: {self.remote}")
 
     def _runs(self) -> Script[bool]:
-        return (yield from super()._runs()) or not (yield from self._stands())
+        return (yield from super()._runs()) or not (yield from self._is_at_rest())
 
     @verb
     def stop(self) -> Script[None]:
         """Stop along the ramp; wait until the outputs, or else current and speed, show that it stopped."""
         yield from insist(self.control, IBDControl.STOP)
         limit = (yield from read(self.deceleration_time)) + STOP_MARGIN
-        look = self._stands
+        look = self._is_at_rest
         if not self._has_state and (yield from self._programmed()):
             look = self._is_off
         yield from self._stopped(look, limit)
@@ -340,7 +340,7 @@ class InnovertIBD(Drive):
     def _code(self) -> Script[int]:
         return int((yield from read(self.register("fault"))))
 
-    def _stands(self) -> Script[bool]:
+    def _is_at_rest(self) -> Script[bool]:
         if self._has_state:
             at_rest = bool((yield from read(self.register("run_state"))) == 0)
             return at_rest and bool((yield from read(self.register("output_frequency"))) == 0)
@@ -349,7 +349,7 @@ class InnovertIBD(Drive):
     @verb
     def reset_fault(self) -> Script[None]:
         """Reset a fault, after a stop; never starts the motor. The reset is sent once."""
-        if not (yield from self._stands()):
+        if not (yield from self._is_at_rest()):
             raise WriteForbidden(f"{self.name} turns: it has no fault to reset")
         yield from insist(self.control, IBDControl.STOP)
         yield from write(self.control, IBDControl.RESET_FAULT)
@@ -357,7 +357,7 @@ class InnovertIBD(Drive):
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
         """Write the setpoint, which cannot be read back."""
-        yield from self._hold(self.frequency, hz)
+        yield from self._write_setpoint(self.frequency, hz)
 
     @verb
     def state(self) -> Script[State]:

@@ -298,9 +298,9 @@ class InvtCHE(Drive):
 
         Without a direction, a turning motor keeps its direction, and a resting motor turns forward.
         """
-        if self._jogged and not (yield from self._stands()):
+        if self._jogged and not (yield from self._is_at_rest()):
             raise self._stop_first("may still jog, and a start may not end the jog:")
-        forward = yield from self._forward(direction)
+        forward = yield from self._goes_forward(direction)
         yield from self._setpoint_in_force()
         self._jogged = False
         yield from write(self.control, CHEControl.FORWARD if forward else CHEControl.REVERSE)
@@ -309,14 +309,14 @@ class InvtCHE(Drive):
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
         """Turn slowly from rest until stopped; without a direction, forward."""
-        forward = yield from self._forward(direction)
-        if not (yield from self._stands()):
+        forward = yield from self._goes_forward(direction)
+        if not (yield from self._is_at_rest()):
             raise self._stop_first("turns, and may continue to turn during a jog:")
         self._jogged = True
         yield from write(self.control, CHEControl.JOG_FORWARD if forward else CHEControl.JOG_REVERSE)
         yield from self._started(direction)
 
-    def _forward(self, direction: Direction | None) -> Script[bool]:
+    def _goes_forward(self, direction: Direction | None) -> Script[bool]:
         status = yield from read(self.status)
         if status == CHEStatus.FAULT:
             fault = self.fault.in_words((yield from read(self.fault)))
@@ -346,7 +346,7 @@ class InvtCHE(Drive):
             return
         if len(refusals) > 1:
             raise refusals[0]
-        yield from self._stopped(self._stands, self.option.get("stop_time", STOP_TIME))
+        yield from self._stopped(self._is_at_rest, self.option.get("stop_time", STOP_TIME))
 
     def _stands_by(self, word: CHEControl, refusals: list[DriveException]) -> Script[bool]:
         """Write a stop word; return True if the motor is then at rest. A refusal is added to `refusals`."""
@@ -354,15 +354,15 @@ class InvtCHE(Drive):
             yield from insist(self.control, word)
         except DriveException as refusal:  # some drives refuse this word in a fault, or without a jog
             refusals.append(refusal)
-        return (yield from self._stands())
+        return (yield from self._is_at_rest())
 
     @verb
     def coast(self) -> Script[None]:
         """Remove the voltage and let the motor coast."""
         yield from insist(self.control, CHEControl.COAST)
-        yield from self._stopped(self._stands, self.option.get("stop_time", STOP_TIME))
+        yield from self._stopped(self._is_at_rest, self.option.get("stop_time", STOP_TIME))
 
-    def _stands(self) -> Script[bool]:
+    def _is_at_rest(self) -> Script[bool]:
         """Return True if the status shows that the motor has no voltage, as in standby or a fault."""
         return (yield from read(self.status)) in (CHEStatus.STANDBY, CHEStatus.FAULT)
 
@@ -387,7 +387,7 @@ class InvtCHE(Drive):
             )
         if not 0 <= hz <= most:
             raise ValueError(f"{hz:g} Hz is outside 0 to {most:g} Hz, the maximum frequency of {self.name}")
-        yield from self._hold(self.setpoint, hz / most * 100)
+        yield from self._write_setpoint(self.setpoint, hz / most * 100)
 
     @verb
     def state(self) -> Script[State]:

@@ -476,13 +476,13 @@ class YD1000(Drive):
     def stop(self) -> Script[None]:
         """Stop along the ramp. The motor counts as stopped when 1100H is 0 twice in a row."""
         yield from insist(self.control, STOP)
-        yield from self._stopped(self._stands, (yield from self._limit()))
+        yield from self._stopped(self._is_at_rest, (yield from self._stop_limit()))
 
     @verb
     def coast(self) -> Script[None]:
         """Remove the voltage and let the motor coast; the coast bit stays set until the next command."""
         yield from insist(self.control, STOP | YD1000Control.COAST)
-        yield from self._stopped(self._stands, STOP_MARGIN)
+        yield from self._stopped(self._is_at_rest, STOP_MARGIN)
 
     @verb
     def emergency_stop(self) -> Script[None]:
@@ -496,17 +496,17 @@ class YD1000(Drive):
             yield from self.stop.script()
             return
         try:
-            yield from self._stopped(self._stands, (yield from self._limit()))
+            yield from self._stopped(self._is_at_rest, (yield from self._stop_limit()))
         except BusError:
             yield from insist(self.control, STOP)
             raise
         yield from insist(self.control, STOP)
 
-    def _limit(self) -> Script[float]:
+    def _stop_limit(self) -> Script[float]:
         known = self.option.get("stop_time")
         return known if known else (yield from read(self.deceleration_time)) + STOP_MARGIN
 
-    def _stands(self) -> Script[bool]:
+    def _is_at_rest(self) -> Script[bool]:
         if (yield from read(self.output_frequency)) > 0:
             return False
         yield from wait(0.1)
@@ -547,7 +547,7 @@ class YD1000(Drive):
 
         If the motor is then seen to turn, or the drive does not answer, the stop is written again.
         """
-        if not (yield from self._stands()):
+        if not (yield from self._is_at_rest()):
             raise self._stop_first("turns:")
         yield from self._no_terminal_runs("once the line no longer commands it")
         try:
@@ -576,12 +576,12 @@ class YD1000(Drive):
                 raise WriteForbidden(
                     f"{self.name} takes no setpoint from 1001H: its option {name} selects another source"
                 )
-        yield from self._hold(self.frequency, hz)
+        yield from self._write_setpoint(self.frequency, hz)
 
     @verb
     def state(self) -> Script[State]:
         """Return whether the motor turns. A frozen 1200H, or a change in the fault record, shows a fault."""
-        if not (yield from self._stands()):
+        if not (yield from self._is_at_rest()):
             return State(Condition.RUNNING, (yield from self._direction()))
         record = yield from read(self.fault_record_1)
         if self._record is None:

@@ -292,10 +292,10 @@ class SimulatedDrive:
     def changed(self, cell: MemoryCell) -> None:
         """React to a cell that was written over the line, or set by the user of the simulator."""
 
-    def wore(self) -> None:
+    def eeprom_written(self) -> None:
         """React to a write to the EEPROM."""
 
-    def takes_broadcast(self, request: Message) -> bool:
+    def accepts_broadcast(self, request: Message) -> bool:
         return self.drive.broadcasts
 
     @property
@@ -347,7 +347,7 @@ class SimulatedDrive:
             return None
         self.now = now
         is_broadcast = self._is_for_all(request.address)
-        if is_broadcast and self.takes_broadcast(request):
+        if is_broadcast and self.accepts_broadcast(request):
             self.counters.broadcasts += 1
         elif request.address == self.drive.address:
             self.counters.requests += 1
@@ -403,13 +403,13 @@ class SimulatedDrive:
         for at, (cell, raw) in enumerate(zip(cells, stored, strict=True)):
             cell.raw = raw
             self.counters.writes.append(Written(self.now, cell.name, start + at, raw))
-            if self.wears(cell, function, start + at):
+            if self.wears_eeprom(cell, function, start + at):
                 self.counters.eeprom_writes[cell.name] += 1
-                self.wore()
+                self.eeprom_written()
         for cell in cells:
             self.changed(cell)
 
-    def wears(self, cell: MemoryCell, function: int, address: int) -> bool:
+    def wears_eeprom(self, cell: MemoryCell, function: int, address: int) -> bool:
         """Return True if a write to this cell may wear the EEPROM.
 
         That includes settings whose memory the document does not state, unless they are coils.

@@ -92,7 +92,7 @@ class SimulatedCHE(MotorDrive):
             raise Refusal(Reason.CANNOT)
         return super().accept(cell, raw)
 
-    def wore(self) -> None:
+    def eeprom_written(self) -> None:
         self._busy_until = self.now + self.storing
 
     def refused(self, request: Message, code: int) -> Message:
@@ -106,8 +106,8 @@ class SimulatedCHE(MotorDrive):
             return 3
         return 2 if self.motor.frequency < 0 else 1
 
-    obeys = {"control": MotorDrive.carry_out_named}
-    shows = {
+    write_handlers = {"control": MotorDrive.carry_out_named}
+    read_handlers = {
         "status": _state,
         "output_power": lambda self: round(self.motor.power * 100),
         "device": lambda self: CHE_DEVICE_CODE,
@@ -136,13 +136,13 @@ class SimulatedDelixi(MotorDrive):
 
     functions = (0x03, 0x06)
     codes = {}
-    begins = DELIXI_BY_LINE
+    initial_values = DELIXI_BY_LINE
 
     @property
     def most_gap(self) -> float:
         return GAPS[Framing.DELIXI]
 
-    def takes_broadcast(self, request: Message) -> bool:
+    def accepts_broadcast(self, request: Message) -> bool:
         return request.function == 0x06 and request.start == 0x2000  # only run commands may be broadcast
 
     def setpoint(self) -> float:
@@ -157,8 +157,8 @@ class SimulatedDelixi(MotorDrive):
     def _format(self) -> int:
         return DELIXI_MODBUS_FORMATS.index(self.drive.settings.format)
 
-    obeys = {"control": _control}
-    shows = {
+    write_handlers = {"control": _control}
+    read_handlers = {
         "baudrate_setting": lambda self: DELIXI_BAUDRATES.index(self.drive.settings.baudrate),
         "format_setting": _format,
         "address_setting": lambda self: self.drive.address,
@@ -175,11 +175,11 @@ class SimulatedDelixiNative(MotorDrive):
     printed decimal digits.
     """
 
-    begins = DELIXI_BY_LINE
+    initial_values = DELIXI_BY_LINE
 
     locked = False
 
-    def takes_broadcast(self, request: Message) -> bool:
+    def accepts_broadcast(self, request: Message) -> bool:
         return request.function == COMMAND
 
     def accept(self, cell: MemoryCell, raw: int) -> int:
@@ -203,8 +203,8 @@ class SimulatedDelixiNative(MotorDrive):
             return 1
         return 3 if self.motor.frequency < 0 else 2
 
-    obeys = {"control": MotorDrive.carry_out_named}
-    shows = {
+    write_handlers = {"control": MotorDrive.carry_out_named}
+    read_handlers = {
         "status": _state,
         "baudrate_setting": lambda self: DELIXI_BAUDRATES.index(self.drive.settings.baudrate),
         "format_setting": lambda self: DELIXI_NATIVE_FORMATS.index(self.drive.settings.format),
@@ -250,7 +250,7 @@ class SimulatedERMAN(MotorDrive):
         self.memory.make_readable(COIL, ERMAN_COILS)
         self.memory.make_writable(COIL, ERMAN_COILS)
 
-    def takes_broadcast(self, request: Message) -> bool:
+    def accepts_broadcast(self, request: Message) -> bool:
         return True  # section 6 allows every request to address 0
 
     def _start(self, on: int) -> None:
@@ -279,13 +279,13 @@ class SimulatedERMAN(MotorDrive):
         overloaded = self.motor.current > 1.2 * self.motor.rating.current
         return ERMAN_STATES[self.motor.phase] | (ERMAN_OVERLOADED if overloaded else 0)
 
-    obeys = {
+    write_handlers = {
         "start_coil": _start,
         "stop_coil": _stop,
         "emergency_stop_coil": _emergency_stop,
         "fault_reset_coil": _reset,
     }
-    shows = {
+    read_handlers = {
         "status": _state,
         "last_fault": lambda self: self.motor.fault_record(1),  # not cleared by a reset
     }
@@ -322,7 +322,7 @@ class SimulatedIBD(MotorDrive):
     functions = (0x03, 0x06)
     needs_silence = True  # according to the manual's table "message in RTU mode"
     codes = {}
-    begins = {
+    initial_values = {
         IBD_FREQUENCY_SOURCE: IBD_BY_LINE,
         IBD_RUN_SOURCE: IBD_RUN_BY_LINE,
         323: IBD_RUNNING,
@@ -383,8 +383,8 @@ class SimulatedIBD(MotorDrive):
         first_rtu = 0 if self.drive.framing is Framing.ASCII else len(IBD_FORMATS)
         return first_rtu + IBD_FORMATS.index(self.drive.settings.format)
 
-    obeys = {"control": _control}
-    shows = {
+    write_handlers = {"control": _control}
+    read_handlers = {
         "terminals": _terminals,
         "run_state": _run_state,
         "baudrate_setting": lambda self: IBD_BAUDRATES.index(self.drive.settings.baudrate),
@@ -457,7 +457,7 @@ class SimulatedYD1000(MotorDrive):
     def most_gap(self) -> float:
         return 24 * self.drive.settings.character  # notes, section 4.2 (2)
 
-    def takes_broadcast(self, request: Message) -> bool:
+    def accepts_broadcast(self, request: Message) -> bool:
         return request.function == 0x06 and request.start in (YD_CONTROL, YD_COMMUNICATION_FREQUENCY)
 
     def setpoint(self) -> float:
@@ -481,8 +481,8 @@ class SimulatedYD1000(MotorDrive):
                 raise Refusal(Reason.VALUE)
         return super().accept(cell, raw)
 
-    def wears(self, cell: MemoryCell, function: int, address: int) -> bool:
-        return cell.address not in YD_PANEL_ONLY and super().wears(cell, function, address)
+    def wears_eeprom(self, cell: MemoryCell, function: int, address: int) -> bool:
+        return cell.address not in YD_PANEL_ONLY and super().wears_eeprom(cell, function, address)
 
     def pass_time(self, now: float) -> None:
         limit = self.word(YD_TIMEOUT_SETTING) or math.inf  # F803, in s; 0 disables the timeout
@@ -546,8 +546,8 @@ class SimulatedYD1000(MotorDrive):
             bits | YD_RUN | self._in_force & (YD_JOG | YD_DC_BRAKE)
         )  # YD_RUN is set while braking too (8.2, table 2)
 
-    obeys = {"control": _control}
-    shows = {
+    write_handlers = {"control": _control}
+    read_handlers = {
         "baudrate_setting": lambda self: YD_BAUDRATES.index(self.drive.settings.baudrate),
         "parity_setting": lambda self: "NEO".index(self.drive.settings.parity),
         "address_setting": lambda self: self.drive.address,

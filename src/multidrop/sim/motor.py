@@ -1,11 +1,6 @@
 """A simulated motor with its power stage, and MotorDrive: a simulated drive with such a motor.
 
 Only `run` and `jog` start the motor, and not during a fault. Time is an argument.
-
-Registers with usual names need no code: a setting such as `acceleration_time` configures the motor, and a
-reading such as `output_current` shows its state. A subclass of MotorDrive handles the other registers of its
-family in two tables, by register name. A function in `obeys` is called after a write to its register. A
-function in `shows` returns the number that a read of its register returns.
 """
 
 from __future__ import annotations
@@ -255,13 +250,16 @@ _SETTINGS = ("acceleration_time", "deceleration_time", "maximum_frequency")
 
 
 class MotorDrive(SimulatedDrive):
-    """A simulated drive with a motor. A monitor register set by `drive[name] = value` keeps that value."""
+    """A simulated drive with a motor. A monitor register set by `drive[name] = value` keeps that value.
 
-    obeys: ClassVar[Mapping[str, Callable[[Any, int], None]]] = {}
-    shows: ClassVar[
-        Mapping[str, Callable[[Any], int]]
-    ] = {}  # maps a register's name to a function that returns its raw count
-    begins: ClassVar[Mapping[int, int]] = {}  # address of holding register: raw count at power-up
+    Registers with usual names need no code: a setting such as `acceleration_time` configures the motor, and a
+    reading such as `output_current` shows its state. For other registers, a family names its functions by
+    register: `write_handlers` are called with a written raw count, `read_handlers` return the raw count read.
+    """
+
+    write_handlers: ClassVar[Mapping[str, Callable[[Any, int], None]]] = {}
+    read_handlers: ClassVar[Mapping[str, Callable[[Any], int]]] = {}
+    initial_values: ClassVar[Mapping[int, int]] = {}  # address of holding register: raw count at power-up
 
     def __init__(
         self, drive: Drive, *, response_delay: float | None = None, rating: Rating | None = None
@@ -275,7 +273,7 @@ class MotorDrive(SimulatedDrive):
             register = drive.registers.get(name)
             if register is not None and register.default is None:
                 self.memory.set(register, getattr(self.motor, name))
-        for address, raw in self.begins.items():
+        for address, raw in self.initial_values.items():
             cell = self.memory.writable(0x06, address)
             if cell is not None:
                 cell.raw = raw
@@ -343,15 +341,15 @@ class MotorDrive(SimulatedDrive):
 
     def changed(self, cell: MemoryCell) -> None:
         self.set_up()
-        if cell.name in self.obeys:
-            self.obeys[cell.name](self, cell.raw)
+        if cell.name in self.write_handlers:
+            self.write_handlers[cell.name](self, cell.raw)
 
     def refresh(self, cell: MemoryCell) -> None:
         register = cell.register
         if register is None or register in self._held:
             return
-        if register.name in self.shows:
-            self.memory.set_raw(register, self.shows[register.name](self))
+        if register.name in self.read_handlers:
+            self.memory.set_raw(register, self.read_handlers[register.name](self))
         elif register.name in MONITORS and not register.writable:
             value = MONITORS[register.name](self.motor)
             if register.unit == "%":

@@ -168,8 +168,8 @@ class SimulatedProfidrive(ProfileDrive):
     def _last(self, bit: int) -> bool:
         return bool(self.word_before & bit)
 
-    obeys = {"control": _control}
-    shows = {"status": _state}
+    write_handlers = {"control": _control}
+    read_handlers = {"status": _state}
 
 
 _COMMANDS = 0x8F  # bits 7 and 3 to 0
@@ -233,8 +233,8 @@ class SimulatedCiA402(ProfileDrive):
     def _remote(self) -> int:
         return 0 if self.is_local else CiA402Status.REMOTE
 
-    obeys = {"control": _control}
-    shows = {"status": _status}
+    write_handlers = {"control": _control}
+    read_handlers = {"status": _status}
 
 
 class SimulatedDanfossFC(ProfileDrive):
@@ -274,8 +274,8 @@ class SimulatedDanfossFC(ProfileDrive):
         }
         return sum(bit for bit, is_set in bits.items() if is_set)
 
-    obeys = {"control": _control}
-    shows = {"status": _state}
+    write_handlers = {"control": _control}
+    read_handlers = {"status": _state}
 
 
 EXTERNAL_FAULT = 49  # fault code of EF, an external fault
@@ -313,8 +313,8 @@ class SimulatedDelta(ProfileDrive):
         by_line = 0 if self.is_local else DeltaStatus.COMMANDED_BY_LINE | DeltaStatus.REFERENCE_BY_LINE
         return lamps | side << 3 | by_line
 
-    obeys = {"control": _control, "reset": _reset}
-    shows = {"status": _state}
+    write_handlers = {"control": _control, "reset": _reset}
+    read_handlers = {"status": _state}
 
 
 _STARTS = (InvtControl.FORWARD, InvtControl.REVERSE, InvtControl.JOG_FORWARD, InvtControl.JOG_REVERSE)
@@ -354,8 +354,8 @@ class SimulatedInvt(ProfileDrive):
             return InvtStatus.STANDBY
         return InvtStatus.REVERSE if self.motor.frequency < 0 else InvtStatus.FORWARD
 
-    obeys = {"control": _control}
-    shows = {"status": _state}
+    write_handlers = {"control": _control}
+    read_handlers = {"status": _state}
 
 
 class SimulatedInovance(SimulatedInvt):
@@ -366,7 +366,7 @@ class SimulatedInovance(SimulatedInvt):
             return InovanceStatus.STOPPED
         return InovanceStatus.REVERSE if self.motor.frequency < 0 else InovanceStatus.FORWARD
 
-    shows = {"status": _state}
+    read_handlers = {"status": _state}
 
 
 class SimulatedYaskawa(ProfileDrive):
@@ -405,8 +405,8 @@ class SimulatedYaskawa(ProfileDrive):
         }
         return sum(bit for bit, is_set in bits.items() if is_set)
 
-    obeys = {"control": _control}
-    shows = {"status": _state}
+    write_handlers = {"control": _control}
+    read_handlers = {"status": _state}
 
 
 class SimulatedOptidrive(ProfileDrive):
@@ -442,5 +442,5 @@ class SimulatedOptidrive(ProfileDrive):
         }
         return fault << 8 | sum(bit for bit, is_set in bits.items() if is_set)
 
-    obeys = {"control": _control}
-    shows = {"status": _state}
+    write_handlers = {"control": _control}
+    read_handlers = {"status": _state}

@@ -118,7 +118,7 @@ class Delta(Profile):
     def jog(self, direction: Direction | None = None) -> Script[None]:
         """Turn slowly from rest until stopped; without a direction, forward."""
         status = yield from self._status()
-        yield from self._may_jog(status)
+        yield from self._check_jog(status)
         reverses = self._reverses(direction, status)
         word = DeltaControl.JOG_REVERSE if reverses else DeltaControl.JOG_FORWARD
         yield from write(self.control, self._word(word))

@@ -99,9 +99,9 @@ class Invt(Profile):
     def _start_word(self, direction: Direction | None, status: int) -> int:
         return InvtControl.REVERSE if self._reverses(direction, status) else InvtControl.FORWARD
 
-    def _may_start(self, status: int) -> Script[None]:
-        yield from super()._may_start(status)
-        if self._jogged and not (yield from self._stands()):
+    def _check_start(self, status: int) -> Script[None]:
+        yield from super()._check_start(status)
+        if self._jogged and not (yield from self._is_at_rest()):
             raise self._stop_first("may still jog, and a start may not end the jog:")
         self._jogged = False
 
@@ -109,7 +109,7 @@ class Invt(Profile):
     def jog(self, direction: Direction | None = None) -> Script[None]:
         """Turn slowly from rest until stopped; without a direction, forward."""
         status = yield from self._status()
-        yield from self._may_jog(status)
+        yield from self._check_jog(status)
         reverses = self._reverses(direction, status)
         word = self._word(InvtControl.JOG_REVERSE if reverses else InvtControl.JOG_FORWARD)
         self._jogged = True

@@ -321,7 +321,7 @@ class Profile(Drive):
         return self._is_tripped(status)
         yield
 
-    def _stands(self) -> Script[bool]:
+    def _is_at_rest(self) -> Script[bool]:
         """Return True if neither the status nor the output frequency shows that the motor turns."""
         status = yield from self._status()
         if self._turns(status) and not (yield from self._tripped(status)):
@@ -379,7 +379,7 @@ class Profile(Drive):
         Without a direction, a turning motor keeps its direction, and a resting motor turns forward.
         """
         status = yield from self._status()
-        yield from self._may_start(status)
+        yield from self._check_start(status)
         word = self._start_word(direction, status)
         yield from self._setpoint_in_force()
         if not self._turns(status):
@@ -387,16 +387,16 @@ class Profile(Drive):
         yield from write(self.control, self._word(word))
         yield from self._started(direction)
 
-    def _may_start(self, status: int) -> Script[None]:
+    def _check_start(self, status: int) -> Script[None]:
         """Raise WriteForbidden in a fault, in local control, or if the status prevents a start."""
         if (yield from self._tripped(status)):
             raise self._reset_first((yield from self._fault()))
         if why := self._not_ready(status):
             raise WriteForbidden(f"{self.name} {why}; {self.remote}")
 
-    def _may_jog(self, status: int) -> Script[None]:
+    def _check_jog(self, status: int) -> Script[None]:
         """Raise WriteForbidden as before a start, or if the motor turns: no manual defines a jog then."""
-        yield from self._may_start(status)
+        yield from self._check_start(status)
         if self._turns(status):
             raise self._stop_first("turns, and may continue to turn during a jog:")
 
@@ -426,11 +426,11 @@ class Profile(Drive):
         try:
             yield from insist(self.control, self._word(word))
         except DriveException:  # some drives refuse this word in a fault, when they are already at rest
-            if not (yield from self._stands()):
+            if not (yield from self._is_at_rest()):
                 raise
 
     def _watch_stop(self) -> Script[None]:
-        yield from self._stopped(self._stands, self._stop_limit())
+        yield from self._stopped(self._is_at_rest, self._stop_limit())
 
     def _stop_limit(self) -> float:
         return self.option.get("stop_time", STOP_TIME)
@@ -440,7 +440,7 @@ class Profile(Drive):
         """Reset a fault after a stop; never starts the motor. The reset is sent once, then verified."""
         status = yield from self._status()
         if not (yield from self._tripped(status)):
-            if not (yield from self._stands()):
+            if not (yield from self._is_at_rest()):
                 raise WriteForbidden(f"{self.name} runs: it has no fault to reset")
             return
         if why := self._cannot_reset(status):
@@ -480,7 +480,7 @@ class Profile(Drive):
             span = "below 0 Hz" if most is None or hz < 0 else f"above {most:g} Hz, its maximum_frequency"
             raise ValueError(f"{hz:g} Hz is {span}: nothing is written to {self.name}")
         value = hz / most * 100 if self.reference.unit == "%" and most is not None else hz
-        yield from self._hold(self.reference, value)
+        yield from self._write_setpoint(self.reference, value)
 
     @verb
     def state(self) -> Script[State]:
