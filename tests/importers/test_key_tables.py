@@ -10,7 +10,7 @@ from imported import entries, gaps, omissions, only
 from tables import table
 
 from multidrop.importers import csv_tables, esphome, home_assistant, sunspec, telegraf, wb
-from multidrop.importers.device import KeyTable, Treatment, uncarried
+from multidrop.importers.device import KeyTable, Treatment, unimported_keys
 
 # Keys copied from each program's documentation and schemas, not from the importers.
 SCHEMAS: dict[str, tuple[KeyTable, str]] = {
@@ -173,7 +173,7 @@ def test_every_key_of_a_source_schema_has_a_treatment(source: str) -> None:
 
 @table("columns", [IOBROKER_COLUMNS, NEURON_COLUMNS])
 def test_every_column_of_a_known_table_layout_has_a_treatment(columns: str) -> None:
-    carried = {alias for aliases in csv_tables.CARRIED.values() for alias in aliases}
+    carried = {alias for aliases in csv_tables.COLUMNS.values() for alias in aliases}
     known = carried | csv_tables.IRRELEVANT | csv_tables.GAPS
     assert [column for column in columns.split() if column not in known] == []
 
@@ -181,7 +181,7 @@ def test_every_column_of_a_known_table_layout_has_a_treatment(columns: str) -> N
 def test_keys_that_are_not_carried_over_are_reported_unless_empty() -> None:
     table = home_assistant.KEYS["sensors"]
     given = {"name": "a", "icon": "x", "min_value": 0, "max_value": None, "zero_suppress": False, "new": 1}
-    assert uncarried(given, table) == [
+    assert unimported_keys(given, table) == [
         "min_value was not carried over",
         "new is not known here, and was not carried over",
     ]

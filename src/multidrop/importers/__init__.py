@@ -14,7 +14,7 @@ from typing import Any
 from multidrop.importers.csv_tables import read_table
 from multidrop.importers.device import ImportedDevice
 from multidrop.importers.esphome import is_esphome, read_esphome
-from multidrop.importers.family_writer import family_text, plant_text, settle
+from multidrop.importers.family_writer import drop_undeclarable, family_text, plant_text
 from multidrop.importers.home_assistant import read_home_assistant
 from multidrop.importers.sunspec import is_sunspec, read_sunspec
 from multidrop.importers.telegraf import read_telegraf
@@ -68,7 +68,7 @@ def all_devices(path: Path) -> list[ImportedDevice]:
     try:
         devices = read(read_bounded(path, MOST_BYTES, "file"), path)
         for device in devices:
-            settle(device)
+            drop_undeclarable(device)
     except KeyError as missing:
         key = printable(str(missing.args[0]))[:200]
         raise ValueError(f"{path} does not have the structure of such a file: {key} is missing") from missing

@@ -24,7 +24,7 @@ from multidrop.importers.numbers import (
     words_of,
 )
 
-CARRIED = {  # by key: its column names in lower case and without _, the most specific first
+COLUMNS = {  # by key: its column names in lower case and without _, the most specific first
     "name": (
         *("name", "register name", "signal name", "parameter name", "register", "description", "parameter"),
         *("tag", "signal", "variable", "point", "title"),
@@ -75,9 +75,9 @@ GAPS = frozenset(
         *("bytes", "byte count", "digits", "encoding"),
     }
 )
-_SPARE = frozenset(alias for key in ("name", "note", "at") for alias in CARRIED[key])
+_SPARE = frozenset(alias for key in ("name", "note", "at") for alias in COLUMNS[key])
 # Columns that may affect a value. They include further columns for an imported key, which may contradict it.
-_VALUE_COLUMNS = GAPS | frozenset(alias for aliases in CARRIED.values() for alias in aliases) - _SPARE
+_VALUE_COLUMNS = GAPS | frozenset(alias for aliases in COLUMNS.values() for alias in aliases) - _SPARE
 _KNOWN = IRRELEVANT | _VALUE_COLUMNS | _SPARE
 _NUMBER = re.compile(r"[0-9]{1,9}")
 _ORDERED = re.compile(r"(u?int(?:16|32|64)|float|double)(be|le|sw|sb)")  # ioBroker's type names
@@ -225,7 +225,7 @@ def _places(header: list[str]) -> dict[str, int]:
     key.
     """
     found: dict[str, int] = {}
-    for key, aliases in CARRIED.items():
+    for key, aliases in COLUMNS.items():
         for alias in aliases:
             if alias in header and header.index(alias) not in found.values():
                 found[key] = header.index(alias)

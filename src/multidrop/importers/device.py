@@ -106,7 +106,7 @@ _ANY_BASE = re.compile(r"0[xX][0-9a-fA-F]{1,8}|0|[1-9][0-9]{0,5}")
 class Treatment(Enum):
     """How an importer treats a key of the source's schema."""
 
-    CARRIED = "the importer reads it"
+    IMPORTED = "the importer reads it"
     IRRELEVANT = "it changes no value"
     GAP = "it may change the value: a gap is marked"
 
@@ -114,16 +114,16 @@ class Treatment(Enum):
 KeyTable = Mapping[str, Treatment]
 
 
-def key_table(*, carried: str = "", irrelevant: str = "", gap: str = "") -> KeyTable:
+def key_table(*, imported: str = "", irrelevant: str = "", gap: str = "") -> KeyTable:
     """Return the treatment of each key. An argument lists the keys of one treatment, separated by spaces."""
     return {
-        **dict.fromkeys(carried.split(), Treatment.CARRIED),
+        **dict.fromkeys(imported.split(), Treatment.IMPORTED),
         **dict.fromkeys(irrelevant.split(), Treatment.IRRELEVANT),
         **dict.fromkeys(gap.split(), Treatment.GAP),
     }
 
 
-def uncarried(entry: Mapping[Any, Any], table: KeyTable) -> list[str]:
+def unimported_keys(entry: Mapping[Any, Any], table: KeyTable) -> list[str]:
     """Return a sentence for each key of an entry that may affect the value but is not imported.
 
     Keys that the table lacks are included. Keys with empty or false values are ignored.
@@ -252,7 +252,7 @@ class ImportedDevice:
 
     def lose_keys(self, place: str, given: Mapping[Any, Any], table: KeyTable) -> None:
         """Record as lost the keys of a device or line that are not imported."""
-        for sentence in uncarried(given, table):
+        for sentence in unimported_keys(given, table):
             self.lose(place, sentence, is_entry=False)
 
 

@@ -17,7 +17,7 @@ from multidrop.importers.device import (
     LineSettings,
     key_table,
     serial_settings,
-    uncarried,
+    unimported_keys,
     unit_address,
 )
 from multidrop.importers.numbers import bits_text, number, put_number, scaled, whole, words_of
@@ -41,45 +41,45 @@ _TIMES = "skip_updates custom_command"  # an entry with custom_command (raw byte
 _WRITES = "write_lambda"
 KEYS = {  # treatment of keys, by kind of entity
     "sensor": key_table(
-        carried=f"{_ITEM} value_type unit_of_measurement filters",
+        imported=f"{_ITEM} value_type unit_of_measurement filters",
         irrelevant=f"{_SHOWN} register_count accuracy_decimals state_class force_update expire_after "
         "on_raw_value on_value_range last_reset_type",
         gap=_TIMES,
     ),
     "binary_sensor": key_table(
-        carried=f"{_ITEM} filters",
+        imported=f"{_ITEM} filters",
         irrelevant=f"{_SHOWN} register_count publish_initial_state trigger_on_initial_state on_press "
         "on_release on_click on_double_click on_multi_click on_state_change",
         gap=f"{_TIMES} inverted",
     ),
     "text_sensor": key_table(
-        carried=f"{_ITEM} register_count response_size raw_encode filters",
+        imported=f"{_ITEM} register_count response_size raw_encode filters",
         irrelevant=f"{_SHOWN} on_raw_value",
         gap=_TIMES,
     ),
     "switch": key_table(
-        carried=f"{_ITEM} use_write_multiple",
+        imported=f"{_ITEM} use_write_multiple",
         irrelevant=f"{_SHOWN} register_count restore_mode assumed_state on_turn_on on_turn_off",
         gap=f"{_TIMES} {_WRITES} inverted",
     ),
     "number": key_table(
-        carried=f"{_ITEM} value_type unit_of_measurement multiply use_write_multiple",
+        imported=f"{_ITEM} value_type unit_of_measurement multiply use_write_multiple",
         irrelevant=f"{_SHOWN} register_count min_value max_value step mode on_value_range",
         gap=f"{_TIMES} {_WRITES}",
     ),
     "select": key_table(
-        carried=f"{_ITEM} value_type optionsmap use_write_multiple",
+        imported=f"{_ITEM} value_type optionsmap use_write_multiple",
         irrelevant=f"{_SHOWN} register_count optimistic",
         gap=f"{_TIMES} {_WRITES}",
     ),
     "output": key_table(
-        carried=f"{_ITEM} value_type use_write_multiple",
+        imported=f"{_ITEM} value_type use_write_multiple",
         irrelevant=f"{_SHOWN} power_supply min_power max_power zero_means_zero",
         gap=f"{_TIMES} {_WRITES} multiply inverted",
     ),
 }
 CONTROLLER_KEYS = key_table(
-    carried="id address modbus_id",
+    imported="id address modbus_id",
     irrelevant="update_interval setup_priority allow_duplicate_commands max_cmd_retries on_command_sent "
     "on_online on_offline offline_skip_updates",
     gap="command_throttle server_registers server_courtesy_response",
@@ -238,7 +238,7 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
     register.note_write(is_written=kind in _WRITTEN)
     if entry.get("use_write_multiple"):
         register.of_writes["write"] = "multiple"
-    register.gaps += uncarried(entry, KEYS[kind])
+    register.gaps += unimported_keys(entry, KEYS[kind])
     if kind == "text_sensor":
         _text(device, register, entry, offset)
         return

@@ -152,11 +152,11 @@ def _short(text: str) -> str:
 _PLACE = Path("entry")
 
 
-def settle(device: ImportedDevice) -> None:
+def drop_undeclarable(device: ImportedDevice) -> None:
     """Move registers and texts that no family can declare to the device's `lost`, with the error."""
     held = _keep(device, device.registers, declare, MOST_REGISTERS, "registers")
     _keep(device, device.texts, declare_text, MOST_TEXTS, "texts")
-    _settle_together(device, held)
+    _drop_conflicts(device, held)
 
 
 def _keep(
@@ -212,11 +212,11 @@ def declare_text(found: ImportedRegister) -> Text:
     return texts[found.name]
 
 
-def _settle_together(device: ImportedDevice, held: dict[str, Register[Any]]) -> None:
+def _drop_conflicts(device: ImportedDevice, held: dict[str, Register[Any]]) -> None:
     """Make the registers fit into one class: drop first references to scale registers, then registers."""
     by_name = {found.name: found for found in device.registers}
     gaps = {HOLDING: device.readable} if device.readable else {}
-    while wrong := _refused_together({**held, "readable_gaps": gaps}):
+    while wrong := _conflicts({**held, "readable_gaps": gaps}):
         named = {name: sentence for name, sentence in wrong.items() if name in by_name}
         if not named:
             raise ValueError(f"its registers cannot form one family: {'; '.join(wrong.values())}")
@@ -231,7 +231,7 @@ def _settle_together(device: ImportedDevice, held: dict[str, Register[Any]]) -> 
                 device.lose(name, sentence)
 
 
-def _refused_together(members: dict[str, Any]) -> dict[str, str]:
+def _conflicts(members: dict[str, Any]) -> dict[str, str]:
     """Return the errors, by register name, of a class with these members; an empty dict if the class is
     valid.
     """

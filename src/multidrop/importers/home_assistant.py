@@ -18,7 +18,7 @@ from multidrop.importers.device import (
     key_table,
     network_settings,
     serial_settings,
-    uncarried,
+    unimported_keys,
     unit_address,
 )
 from multidrop.importers.numbers import count, put_number, scaled, whole, words_of
@@ -44,26 +44,28 @@ _STRUCTURES |= {"e": "F16", "f": "F32", "d": "F64"}
 _ENTITY = "name slave device_address address scan_interval"
 _SHOWN = "unique_id device_class lazy_error_count entity_category icon friendly_name hub"
 _SWITCH = key_table(
-    carried=f"{_ENTITY} write_type command_on command_off verify", irrelevant=f"{_SHOWN} optimistic"
+    imported=f"{_ENTITY} write_type command_on command_off verify", irrelevant=f"{_SHOWN} optimistic"
 )
 KEYS = {  # treatment of keys, by kind of entity
     "sensors": key_table(
-        carried=f"{_ENTITY} unit_of_measurement input_type data_type count structure scale offset swap "
+        imported=f"{_ENTITY} unit_of_measurement input_type data_type count structure scale offset swap "
         "reverse_order nan_value slave_count virtual_count",
         irrelevant=f"{_SHOWN} state_class",
         gap="zero_suppress min_value max_value precision",
     ),
-    "binary_sensors": key_table(carried=f"{_ENTITY} input_type slave_count virtual_count", irrelevant=_SHOWN),
+    "binary_sensors": key_table(
+        imported=f"{_ENTITY} input_type slave_count virtual_count", irrelevant=_SHOWN
+    ),
     "switches": _SWITCH,
     "lights": {**_SWITCH, **key_table(gap="brightness_address color_temp_address min_temp max_temp")},
     "fans": _SWITCH,
 }
 HUB_KEYS = key_table(
-    carried=f"name type host port method baudrate bytesize parity stopbits climates covers {' '.join(KEYS)}",
+    imported=f"name type host port method baudrate bytesize parity stopbits climates covers {' '.join(KEYS)}",
     irrelevant="timeout retries retry_on_empty close_comm_on_error unique_id",
     gap="delay message_wait_milliseconds",
 )
-VERIFY_KEYS = key_table(carried="address input_type state_on state_off", irrelevant="delay")
+VERIFY_KEYS = key_table(imported="address input_type state_on state_off", irrelevant="delay")
 _DEFAULT_TABLES = {"sensors": "holding", "binary_sensors": "coil"}
 _NOT_READ = ("climates", "covers")
 _LEGACY_KINDS = {"sensor": "sensors", "binary_sensor": "binary_sensors", "switch": "switches"}
@@ -219,7 +221,7 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
         register.gaps.append(f"its unit is {unit}")
     elif unit:
         register.details["unit"] = str(unit)
-    register.gaps += uncarried(entry, KEYS[kind])
+    register.gaps += unimported_keys(entry, KEYS[kind])
     if (interval := entry.get("scan_interval")) not in (None, 0):
         register.gaps.append(f"it was read every {str(interval)[:20]} s: `every` in the plant file")
     if is_written:
@@ -247,7 +249,7 @@ def _verify(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
         if register.address != written:
             register.gaps.append(f"it is written at another address, {written:04X}H")
         on, off = verify.get("state_on", on), verify.get("state_off", off)
-        register.gaps += [f"verify: {each}" for each in uncarried(verify, VERIFY_KEYS)]
+        register.gaps += [f"verify: {each}" for each in unimported_keys(verify, VERIFY_KEYS)]
     elif verify is not None:
         register.gaps.append("verify was not carried over")
     if (on, off) != (1, 0):

@@ -6,17 +6,17 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from multidrop.importers.device import ImportedDevice, ImportedRegister, key_table, uncarried
+from multidrop.importers.device import ImportedDevice, ImportedRegister, key_table, unimported_keys
 from multidrop.importers.numbers import number_format, put_number, whole, words_of
 
 POINT_KEYS = key_table(
-    carried="name type size count sf units access symbols label",
+    imported="name type size count sf units access symbols label",
     irrelevant="value mandatory static desc detail notes comments standards",
 )
 GROUP_KEYS = key_table(
-    carried="name label points groups", irrelevant="type count desc detail notes comments standards"
+    imported="name label points groups", irrelevant="type count desc detail notes comments standards"
 )
-MODEL_KEYS = key_table(carried="id group", irrelevant="label desc detail notes comments standards")
+MODEL_KEYS = key_table(imported="id group", irrelevant="label desc detail notes comments standards")
 MOST_REPEATED = 1000  # limit of the repetitions of a point
 FIRST = 40000  # assumed start address, because a model's file does not state it
 # Raw counts that mean "not implemented" (SunSpec information model specification, data types).
@@ -91,7 +91,7 @@ def _add(
 ) -> None:
     kind = str(point["type"])
     register = ImportedRegister(name, address)
-    register.gaps += uncarried(point, POINT_KEYS)
+    register.gaps += unimported_keys(point, POINT_KEYS)
     if kind == "string":
         register.details["length"] = whole(point, "size")
         device.add(register, is_text=True)

@@ -16,7 +16,7 @@ from multidrop.importers.device import (
     key_table,
     network_settings,
     serial_settings,
-    uncarried,
+    unimported_keys,
     unit_address,
 )
 from multidrop.importers.numbers import TABLES, number_format, put_number, scaled, whole, words_of
@@ -34,28 +34,28 @@ _ORDERS = {  # by the plugin's names; an order of four bytes also applies to num
     **dict.fromkeys(("DCBA", "BA", "HGFEDCBA", "LSW", "LSW-LE"), "DCBA"),
 }
 FIELD_KEYS = {  # treatment of keys, by style
-    "register": key_table(carried="name byte_order data_type scale address bit", irrelevant="measurement"),
+    "register": key_table(imported="name byte_order data_type scale address bit", irrelevant="measurement"),
     "request": key_table(
-        carried="address name type length scale omit bit", irrelevant="measurement", gap="output"
+        imported="address name type length scale omit bit", irrelevant="measurement", gap="output"
     ),
-    "metric": key_table(carried="register address length name type scale bit", gap="output"),
+    "metric": key_table(imported="register address length name type scale bit", gap="output"),
 }
 _PLACE = "slave_id byte_order fields"
 BLOCK_KEYS = {
     "request": key_table(
-        carried=f"{_PLACE} register",
+        imported=f"{_PLACE} register",
         irrelevant="measurement optimization optimization_max_register_fill tags",
     ),
-    "metric": key_table(carried=_PLACE, irrelevant="measurement tags"),
+    "metric": key_table(imported=_PLACE, irrelevant="measurement tags"),
 }
 WORKAROUND_KEYS = key_table(
-    carried="string_register_location",
+    imported="string_register_location",
     irrelevant="close_connection_after_gather read_coils_starting_at_zero",
     gap="pause_after_connect pause_between_requests one_request_per_field max_bit_registers_per_request "
     "max_word_registers_per_request",
 )
 PLUGIN_KEYS = key_table(
-    carried="name controller transmission_mode baud_rate data_bits parity stop_bits configuration_type "
+    imported="name controller transmission_mode baud_rate data_bits parity stop_bits configuration_type "
     f"slave_id workarounds request metric {' '.join(_REGISTER_STYLE)}",
     irrelevant="timeout busy_retries busy_retries_wait debug_connection log_level exclude_register_type_tag "
     "optimization optimization_max_register_fill alias interval precision collection_jitter "
@@ -162,7 +162,7 @@ def _add(device: ImportedDevice, field: _Field) -> None:
     if given.get("omit"):
         device.lose(name, "it is marked omit, and was left out", is_entry=False)
         return
-    register.gaps += [] if is_bit else uncarried(given, FIELD_KEYS[field.style])
+    register.gaps += [] if is_bit else unimported_keys(given, FIELD_KEYS[field.style])
     kind = given.get("data_type" if field.style == "register" else "type")
     if is_bit:
         device.add(register)

@@ -21,7 +21,7 @@ from multidrop.importers.device import (
     key_table,
     network_settings,
     serial_settings,
-    uncarried,
+    unimported_keys,
     unit_address,
 )
 from multidrop.importers.numbers import bits_text, count, float_of_bits, put_number, scaled, whole, words_of
@@ -55,14 +55,14 @@ _SHOWN = (
 CHANNEL_KEYS = {
     PART: Treatment.GAP,
     **key_table(
-        carried=f"{_ENTRY} error_value unsupported_value string_data_size readonly enum enum_titles "
+        imported=f"{_ENTRY} error_value unsupported_value string_data_size readonly enum enum_titles "
         "consists_of device_type oneOf shift stride",
         irrelevant=_SHOWN,
         gap="condition fw sporadic semi-sporadic round_to on_value off_value",
     ),
 }
 DEVICE_KEYS = key_table(
-    carried="name protocol channels parameters subdevices setup max_read_registers title shift stride "
+    imported="name protocol channels parameters subdevices setup max_read_registers title shift stride "
     "slave_id translations",
     irrelevant="response_timeout id enabled groups device_type deprecated hw "
     "read_rate_limit_ms max_reg_hole max_bit_hole min_read_registers max_write_registers "
@@ -71,9 +71,9 @@ DEVICE_KEYS = key_table(
     "continue_polling_on_illegal_modbus_exception",
     gap="min_request_interval guard_interval_us frame_timeout_ms access_level standard_channels",
 )
-TEMPLATE_KEYS = key_table(carried="title device", irrelevant="device_type group deprecated hw")
+TEMPLATE_KEYS = key_table(imported="title device", irrelevant="device_type group deprecated hw")
 PORT_KEYS = key_table(
-    carried="port_type path baud_rate parity data_bits stop_bits address port devices",
+    imported="port_type path baud_rate parity data_bits stop_bits address port devices",
     irrelevant="enabled response_timeout_ms read_rate_limit_ms connection_timeout_ms "
     "connection_max_fail_cycles connected_to_mge",
     gap="guard_interval_us",
@@ -263,7 +263,7 @@ def _add(
     base = shift + stride * size
     address, bits = _place(entry.get("address", elsewhere))
     register = ImportedRegister(name, base + address, table, is_read="address" in entry)
-    register.gaps += uncarried(entry, CHANNEL_KEYS)
+    register.gaps += unimported_keys(entry, CHANNEL_KEYS)
     if is_shifted:
         register.gaps.append("its address: modbus-io adds a shift that depends on the module's place")
     if is_number and format in _TEXTS:
