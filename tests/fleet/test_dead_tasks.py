@@ -47,7 +47,7 @@ STARTERS = {
     *("create_task", "ensure_future", "to_thread", "run_in_executor"),
 }
 WAITED_FOR = {  # modules that start tasks or threads, and wait for them themselves
-    *("connections", "direct_gets", "fleet_commands", "followed", "forwarder", "gateway", "hub", "leaders"),
+    *("connections", "fleet_commands", "followed", "forwarder", "gateway", "hub", "leaders"),
     *("line_keeper", "member", "observer", "page_part", "shares"),
     "spool",  # the gateway checks this thread
 }

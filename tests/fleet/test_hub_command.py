@@ -23,9 +23,9 @@ from multidrop import History
 from multidrop.cli import main
 from multidrop.fleet.samples import parquet_sink
 from multidrop.fleet.samples.forwarder import Forwarder
-from multidrop.fleet.samples.hub import Commit, KeptPlace, SampleHub
+from multidrop.fleet.samples.hub import Commit, SampleHub, StoredPosition
 from multidrop.fleet.samples.parquet_sink import ParquetSink, compact_for_ever
-from multidrop.fleet.samples.samples_stream import about, create_stream, publish, samples_path
+from multidrop.fleet.samples.samples_stream import create_stream, publish, samples_path, stream_info
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.history import compact as compact_module
 from multidrop.history.compact import main as compact
@@ -264,7 +264,7 @@ def test_the_files_of_a_past_hour_are_merged_into_one(sink: ParquetSink, tmp_pat
     assert names(tmp_path, "rows") == ["00000001-00000008", "00000009-00000016", *newest]
     assert names(tmp_path, "tens") == ["00000001-00000008", "00000009-00000016", *newest[:-1]]
     check(tmp_path, FILES)
-    assert sink.begin("made") == KeptPlace(24, {"a.x": 24})
+    assert sink.begin("made") == StoredPosition(24, {"a.x": 24})
     merge(tmp_path)
     check(tmp_path, FILES)
     write(sink, range(FILES, FILES + 2))
@@ -273,7 +273,9 @@ def test_the_files_of_a_past_hour_are_merged_into_one(sink: ParquetSink, tmp_pat
     for path in sorted((tmp_path / "rows").glob("*.parquet"))[3:]:
         path.unlink()
     assert names(tmp_path, "rows")[-1] == "00000017-00000024"
-    assert sink.begin("made") == KeptPlace(24, {"a.x": 24})  # a merged file also contains the hub's position
+    assert sink.begin("made") == StoredPosition(
+        24, {"a.x": 24}
+    )  # a merged file also contains the hub's position
 
 
 USUAL_PRIORITY = """
@@ -414,7 +416,7 @@ def test_a_stream_that_is_full_leaves_room_for_records(run: Run, tmp_path: Path)
     async def fill(path: ServerPath) -> None:
         for _ in range(60):
             await publish(path, "samples.gw-1.log", bytes(MESSAGE), {})
-        found = await about(path)
+        found = await stream_info(path)
         assert (found.last, 60 - found.first < 8_000_000 / MESSAGE) == (60, True)
 
     with cluster(tmp_path / "nats", 1) as one:

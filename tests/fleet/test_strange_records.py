@@ -15,7 +15,7 @@ from nats.aio.msg import Msg
 from nats_clusters import Cluster, connected_path
 from tables import table
 
-from multidrop.fleet.errors import FleetError, Unsure
+from multidrop.fleet.errors import FleetError, OutcomeUnknown
 from multidrop.fleet.gateway import FleetGateway, ask_gateway
 from multidrop.fleet.leases import member as member_module
 from multidrop.fleet.leases.lease import boottime_ns
@@ -299,11 +299,11 @@ async def test_invalid_answers_leave_the_outcome_unknown_and_are_reported(name: 
     path: Any = Liar({**STRANGE_ANSWERS, **PARTS}[name])
     bucket = Bucket("own_0", lambda: path)
     for request in (bucket.put("a", {}, 1), bucket.get("a")):
-        with pytest.raises(Unsure, match="the answer of NATS "):
+        with pytest.raises(OutcomeUnknown, match="the answer of NATS "):
             await request
     assert await bucket.put_all([Record("a", 1, {})]) == ([], set())
     for request in (
-        samples_stream.about(path),
+        samples_stream.stream_info(path),
         samples_stream.last_of(path, "samples.gw.log"),
         samples_stream.publish(path, "samples.gw.log", b"", {}),
     ):
@@ -328,7 +328,9 @@ async def test_invalid_cluster_states_are_reported_and_move_no_leader(
 @pytest.mark.parametrize("name", TIMES)
 async def test_an_invalid_server_time_is_reported(name: str) -> None:
     path: Any = Liar(TIMES[name])
-    with pytest.raises(Unsure, match="the answer of nats://liar about a bucket has no valid time stamp"):
+    with pytest.raises(
+        OutcomeUnknown, match="the answer of nats://liar about a bucket has no valid time stamp"
+    ):
         await check_buckets(path)
 
 

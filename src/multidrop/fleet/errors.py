@@ -40,7 +40,7 @@ class NobodyThere(NotDelivered):
     """The server reports that a request has no receiver."""
 
 
-class Unsure(FleetError):
+class OutcomeUnknown(FleetError):
     """A request got no timely or usable answer: it may have been carried out, or may still be carried out."""
 
 

@@ -18,7 +18,7 @@ import pyarrow as pa
 from multidrop import LineError, Plant, PlantLine
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.overview import FleetWatch
-from multidrop.fleet.samples.samples_stream import StreamMessage, about, end_if_cancelled, read_after
+from multidrop.fleet.samples.samples_stream import StreamMessage, read_after, stream_info
 from multidrop.fleet.servers.buckets import Record
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.plant_store import line_of
@@ -204,8 +204,7 @@ class FollowedFleet:
         """Read new messages until cancelled, starting after the present end of the stream."""
         while True:
             try:
-                place = (await about(self.path)).last
-                end_if_cancelled()
+                place = (await stream_info(self.path)).last
                 self.trouble = ""
                 while True:
                     place = await self._read_after(place)
@@ -215,7 +214,6 @@ class FollowedFleet:
 
     async def _read_after(self, place: int) -> int:
         messages = await read_after(self.path, place, MOST_READ, MOST_READ_BYTES)
-        end_if_cancelled()
         if not messages:
             await asyncio.sleep(PAUSE_S)
             return place

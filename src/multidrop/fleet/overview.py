@@ -142,7 +142,7 @@ class FleetWatch:
             self._looked, self.trouble = begun, None
 
     async def run(self) -> None:
-        """Read the fleet's state once a second, until cancelled."""
+        """Read the fleet's state once a second, forever."""
         while True:
             await self.look()
             await asyncio.sleep(EVERY_S)

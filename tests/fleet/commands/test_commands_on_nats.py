@@ -22,7 +22,7 @@ from multidrop.fleet.commands import fleet_commands
 from multidrop.fleet.commands.desk import CommandSubjects
 from multidrop.fleet.commands.fleet_commands import FleetCommands
 from multidrop.fleet.commands.messages import CommandOutcome, Offered
-from multidrop.fleet.errors import NobodyThere, Unsure
+from multidrop.fleet.errors import NobodyThere, OutcomeUnknown
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Bucket
 from multidrop.fleet.servers.connections import ServerPath, connect, paths_of
@@ -166,7 +166,7 @@ async def _moved_back(fleet: Fleet) -> None:
 
 
 async def _is_unheard(path: ServerPath, subject: str) -> bool:
-    with suppress(Unsure):
+    with suppress(OutcomeUnknown):
         try:
             await path.request(subject, b"{}", answer_s=0.1)
         except NobodyThere:

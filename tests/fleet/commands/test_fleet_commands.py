@@ -17,7 +17,7 @@ from multidrop.control import read_audit
 from multidrop.fleet.commands import fleet_commands as asker_module
 from multidrop.fleet.commands.fleet_commands import FleetCommands
 from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome
-from multidrop.fleet.errors import FleetError, MayNotSend, NobodyThere, NotDelivered, Unsure
+from multidrop.fleet.errors import FleetError, MayNotSend, NobodyThere, NotDelivered, OutcomeUnknown
 from multidrop.fleet.servers.buckets import Record
 
 DONE, NOT_SENT, UNKNOWN = CommandOutcome.DONE, CommandOutcome.NOT_SENT, CommandOutcome.UNKNOWN
@@ -108,7 +108,7 @@ def write(asker: FleetCommands) -> Awaitable[CommandAnswer]:
     return asker.write("pump-1", "frequency", 20.0)
 
 
-NOBODY, LOST, CUT = NobodyThere("nobody"), Unsure("no answer"), NotDelivered("no connection")
+NOBODY, LOST, CUT = NobodyThere("nobody"), OutcomeUnknown("no answer"), NotDelivered("no connection")
 NO_RIGHT = MayNotSend("no right")
 ANY = FleetError("no right")  # after this error, the gateway may or may not have received the request
 UNDER_WAY, TAKEN_BACK, IT_IS_DONE = answer("under way"), answer("not sent"), answer("done")

@@ -12,7 +12,7 @@ from controlled_loop import run_controlled
 from fleets import GatedBucket, HandClock, MemoryBucket, RecordingMastership
 from tables import table
 
-from multidrop.fleet.errors import FleetError, Unsure
+from multidrop.fleet.errors import FleetError, OutcomeUnknown
 from multidrop.fleet.leases import lease as leases
 from multidrop.fleet.leases.lease import Lease, LifeLock
 from multidrop.fleet.leases.observer import Observer
@@ -619,7 +619,7 @@ async def test_without_answers_no_gateway_counts_as_dead() -> None:
     for _ in range(60):
         trial.clock.pass_s(0.1)
         for path in range(3):
-            with pytest.raises(Unsure):
+            with pytest.raises(OutcomeUnknown):
                 await observer.look(path)
         assert observer.dead() == {}
     for bucket in trial.buckets:

@@ -19,7 +19,7 @@ from nats_clusters import Cluster
 from multidrop.fleet.errors import Conflict
 from multidrop.fleet.leases import member as member_module
 from multidrop.fleet.leases import rules as lease_rules
-from multidrop.fleet.leases.lease import Held, Lease, boottime_ns
+from multidrop.fleet.leases.lease import HeldRecord, Lease, boottime_ns
 from multidrop.fleet.leases.member import IncompatibleGateways, Member, MemberState
 from multidrop.fleet.leases.observer import Observer
 from multidrop.fleet.leases.rules import RULES, SECOND, USUAL, Terms
@@ -258,7 +258,7 @@ def test_while_a_server_is_silent_only_a_drained_gateway_releases_lines(
             drained.drain()
             await until(lambda: not drained.polled and running.all_are_polled(), "drain")
 
-    monkeypatch.setattr(member_module, "WAIT_S", math.inf)
+    monkeypatch.setattr(member_module, "SILENT_S", math.inf)
     asyncio.run(main())
 
 
@@ -484,7 +484,7 @@ def a_member() -> Member:
     mastership = RecordingMastership(boottime_ns)
     lines = Hall().add("a", mastership)
     member = Member("a", paths_of(["nats://nowhere.invalid:4222"]), lines, mastership)
-    member.lease.session, member.lease.held = 1, [Held(1, 0)] * 3
+    member.lease.session, member.lease.held = 1, [HeldRecord(1, 0)] * 3
     return member
 
 

@@ -10,7 +10,7 @@ from fleets import HandClock, MemoryBucket
 from nats_clusters import Cluster, connected_path
 from tables import table
 
-from multidrop.fleet.errors import Unsure
+from multidrop.fleet.errors import OutcomeUnknown
 from multidrop.fleet.leases.rules import SECOND, USUAL
 from multidrop.fleet.lines import records as line_records
 from multidrop.fleet.lines.ownership import NEEDED, owner_of, owner_value
@@ -219,11 +219,11 @@ def test_lines_read_before_a_failure_stay_known(monkeypatch: pytest.MonkeyPatch)
 
     async def fail_at_the_end(after: int) -> list[Record]:
         if after == 2:
-            raise Unsure("no answer")
+            raise OutcomeUnknown("no answer")
         return await changes(after)
 
     bucket.changes = fail_at_the_end  # type: ignore[method-assign]
-    with pytest.raises(Unsure):
+    with pytest.raises(OutcomeUnknown):
         asyncio.run(records._look_at_plant())
     assert records.lines() == ("line-1", "line-2")
 

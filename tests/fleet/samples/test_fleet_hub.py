@@ -24,10 +24,10 @@ from multidrop.fleet.samples import samples_stream
 from multidrop.fleet.samples.hub import (
     Commit,
     HubState,
-    KeptPlace,
     NotThisHubs,
     SampleHub,
     SampleSink,
+    StoredPosition,
 )
 from multidrop.fleet.samples.parquet_sink import ParquetSink
 from multidrop.fleet.samples.postgres_sink import PostgresSink
@@ -85,10 +85,12 @@ class Memory:
         self.fates = iter(fates)
         self.begun = 0
 
-    def begin(self, stream: str) -> KeptPlace:
+    def begin(self, stream: str) -> StoredPosition:
         self.begun += 1
         return (
-            KeptPlace(self.commits[-1].last, self.commits[-1].sources) if self.commits else KeptPlace(0, {})
+            StoredPosition(self.commits[-1].last, self.commits[-1].sources)
+            if self.commits
+            else StoredPosition(0, {})
         )
 
     def write(self, commit: Commit) -> None:
@@ -338,9 +340,9 @@ def test_a_file_is_renamed_after_its_sync(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_a_folder_of_another_stream_or_program_is_refused(tmp_path: Path) -> None:
     sink = ParquetSink(tmp_path)
-    assert sink.begin("then") == KeptPlace(0, {})
+    assert sink.begin("then") == StoredPosition(0, {})
     sink.write(commit_of())
-    assert sink.begin("then") == KeptPlace(1, {"a.x": 1})
+    assert sink.begin("then") == StoredPosition(1, {"a.x": 1})
     with pytest.raises(
         NotThisHubs, match="of a stream created at then, but the present stream was created at now: name"
     ):
@@ -426,13 +428,13 @@ def test_samples_in_postgresql_have_their_units(empty: Postgres) -> None:
 @pytest.mark.slow
 def test_a_second_hub_of_a_database_waits_until_the_first_ends(empty: Postgres) -> None:
     one, other = PostgresSink(empty.where), PostgresSink(empty.where)
-    assert one.begin("then") == KeptPlace(0, {})
+    assert one.begin("then") == StoredPosition(0, {})
     with pytest.raises(SinkError, match="another hub writes into this database; waiting until it ends"):
         other.begin("then")
     one.write(commit_of())
-    assert one.begin("then") == KeptPlace(1, {"a.x": 1})  # as after a failure
+    assert one.begin("then") == StoredPosition(1, {"a.x": 1})  # as after a failure
     one.close()
-    assert other.begin("then") == KeptPlace(1, {"a.x": 1})
+    assert other.begin("then") == StoredPosition(1, {"a.x": 1})
     with pytest.raises(
         NotThisHubs, match="created at then, but the present stream was created at now: name another database"
     ):

@@ -21,7 +21,7 @@ from spooled import empty_stream, exchanges_in, numbered, rows_of
 from tables import table
 
 from multidrop import History
-from multidrop.fleet.errors import FleetError, NoRight, Unsure
+from multidrop.fleet.errors import FleetError, NoRight, OutcomeUnknown
 from multidrop.fleet.samples import forwarder as forwarder_module
 from multidrop.fleet.samples import samples_stream
 from multidrop.fleet.samples.forwarder import Forwarder
@@ -29,13 +29,13 @@ from multidrop.fleet.samples.hub import HubState, SampleHub
 from multidrop.fleet.samples.parquet_sink import ParquetSink
 from multidrop.fleet.samples.samples_stream import (
     StreamMessage,
-    about,
     create_stream,
     digest_of,
     last_of,
     publish,
     read_after,
     samples_path,
+    stream_info,
     subject_of,
 )
 from multidrop.fleet.servers.connections import ServerPath
@@ -98,6 +98,34 @@ def test_names_invalid_in_subjects_are_rejected(name: str) -> None:
         Forwarder(spool, spool)
 
 
+class SwallowingPath:
+    """A path whose answer arrives at the moment of a cancellation, which `asyncio.wait_for` may swallow."""
+
+    async def request(self, *_: object, **__: object) -> Any:
+        with suppress(asyncio.CancelledError):
+            await asyncio.Event().wait()
+        return SimpleNamespace(data=b'{"seq": 1, "message": {"seq": 1}}')
+
+    gather = request
+
+
+@pytest.mark.parametrize(
+    "request_of",
+    [
+        lambda path: publish(path, "samples.a.b", b"", {}),
+        lambda path: last_of(path, "samples.a.b"),
+        lambda path: read_after(path, 0, 1, 1),
+    ],
+    ids=["publish", "last_of", "read_after"],
+)
+async def test_a_cancelled_request_ends_its_task_although_the_answer_came(request_of: Any) -> None:
+    task = asyncio.create_task(request_of(SwallowingPath()))
+    await asyncio.sleep(0)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+
+
 async def test_messages_are_stored_in_the_stream_in_order(running: Cluster, tmp_path: Path) -> None:
     spool = filled(tmp_path / "spool", 7)
     async with empty_stream(running) as path, forwarding(spool, path) as forwarder:
@@ -142,13 +170,13 @@ class Lossy:
     async def request(self, subject: str, data: bytes = b"", *details: Any, **more: Any) -> Any:
         fate = next(self._fates, "ok") if not subject.startswith("$JS") else "ok"
         if fate == "b":  # the message is lost
-            raise Unsure("no answer")
+            raise OutcomeUnknown("no answer")
         if fate == "l":  # late: the message arrives after its copy
             asyncio.get_running_loop().call_later(0.05, self._late, subject, data, *details)
-            raise Unsure("no answer")
+            raise OutcomeUnknown("no answer")
         answer = await self._path.request(subject, data, *details, **more)
         if fate == "a":  # the answer is lost
-            raise Unsure("no answer")
+            raise OutcomeUnknown("no answer")
         return answer
 
     def _late(self, subject: str, data: bytes, headers: dict[str, str], _: float) -> None:
@@ -283,7 +311,7 @@ async def test_the_largest_message_is_stored_and_read_back(running: Cluster) -> 
 async def test_a_missing_stream_is_reported_and_waited_for(running: Cluster, tmp_path: Path) -> None:
     async with empty_stream(running) as path:
         await samples_stream._ask(path, "STREAM.DELETE.samples", {})
-        for asked in (about(path), last_of(path, "samples.a.b")):
+        for asked in (stream_info(path), last_of(path, "samples.a.b")):
             with pytest.raises(FleetError, match="there is no stream 'samples': create it with"):
                 await asked
         with pytest.raises(FleetError, match="there is no stream 'samples', or it has no leader now"):

@@ -11,8 +11,8 @@ from nats.aio.client import Client
 from nats_clusters import Cluster, connected_path
 from tables import table
 
-from multidrop.fleet.errors import Unsure
-from multidrop.fleet.servers import batch_client, direct_gets
+from multidrop.fleet.errors import OutcomeUnknown
+from multidrop.fleet.servers import batch_client, connections
 from multidrop.fleet.servers.batch_client import (
     BatchClient,
     DirectGet,
@@ -64,9 +64,9 @@ async def test_answers_bypass_the_queue_of_nats_py(one: Cluster, monkeypatch: py
 
 def _rested(path: ServerPath) -> None:
     """Fill the path's budget for repeated reads, as after some time without load."""
-    for _ in range(round(direct_gets.MOST_SPARE / direct_gets.EARNED)):
-        path.spare.note(is_late=False)
-        path.spare.learn(0.01)
+    for _ in range(round(connections.MOST_REPEATS / connections.EARNED)):
+        path.budget.note(is_late=False)
+        path.budget.learn(0.01)
 
 
 @table(
@@ -158,7 +158,7 @@ async def test_unanswered_requests_are_distinguished_from_answered_ones(one: Clu
 async def test_reads_lost_on_a_cut_off_server_are_repeated(
     one: Cluster, monkeypatch: pytest.MonkeyPatch, deaf_to: int, is_told: bool
 ) -> None:
-    monkeypatch.setattr(direct_gets, "AGAIN_S", (0.1,) * 4 + (30.0 if is_told else 0.1,))
+    monkeypatch.setattr(connections, "AGAIN_S", (0.1,) * 4 + (30.0 if is_told else 0.1,))
     async with connected_path(one) as path:
         path.others = []
         _rested(path)
@@ -179,7 +179,7 @@ async def test_reads_lost_on_a_cut_off_server_are_repeated(
         if is_told:
             assert await path.collect("moody", b"") == []
         else:
-            with pytest.raises(Unsure, match="no answer to moody"):
+            with pytest.raises(OutcomeUnknown, match="no answer to moody"):
                 await path.collect("moody", b"")
         assert len(asked) > deaf_to or not is_told
         await other.close()
@@ -248,7 +248,7 @@ async def test_a_connection_that_is_no_longer_read_is_replaced(one: Cluster) -> 
         await asyncio.wait([former._reading_task])
         assert former.is_connected
         assert not path.is_open
-        await path.look_after()
+        await path.check()
         assert path.is_open
         assert path._client is not former
 

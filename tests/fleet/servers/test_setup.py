@@ -17,7 +17,7 @@ from nats_clusters import Cluster, cluster, connected_path, old_server_program, 
 from tables import table
 
 from multidrop import Plant
-from multidrop.fleet.errors import FleetError, Unsure
+from multidrop.fleet.errors import FleetError, OutcomeUnknown
 from multidrop.fleet.servers import connections as servers
 from multidrop.fleet.servers import names, setup
 from multidrop.fleet.servers.batch_client import DirectMessage
@@ -75,7 +75,7 @@ class Deaf:
         if not subject.endswith(self.buckets):
             return SimpleNamespace(data=b'{"cluster":{"leader":"n1"}}')
         if self.said is None:
-            raise Unsure("no answer")
+            raise OutcomeUnknown("no answer")
         return SimpleNamespace(data=self.said)
 
 
@@ -126,7 +126,7 @@ def test_an_unanswered_removal_of_a_bucket_is_checked_and_repeated(
             if len(removals) == 1:
                 if is_carried_out:
                     await ask(path, subject, data)
-                raise Unsure("no answer")
+                raise OutcomeUnknown("no answer")
         return await ask(path, subject, data)
 
     monkeypatch.setattr(setup, "ask", ask_in_vain)
@@ -188,7 +188,7 @@ def test_servers_that_cannot_decide_are_reported_as_no_quorum(
 @pytest.mark.slow
 def test_init_waits_until_a_new_plant_can_be_read(nats: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     """A direct get from a new bucket may at first find no server."""
-    collect, failures = ServerPath.collect, [Unsure("it ended with 503")] * 2
+    collect, failures = ServerPath.collect, [OutcomeUnknown("it ended with 503")] * 2
 
     async def fail_at_first(self: ServerPath, subject: str, data: bytes) -> list[DirectMessage]:
         if failures:
@@ -245,7 +245,7 @@ def test_init_waits_for_an_election_in_progress(fleet: Cluster, monkeypatch: pyt
     async def silent_at_first(path: ServerPath, subject: str) -> dict[str, Any]:
         if subject in silent:
             silent.remove(subject)
-            raise Unsure("no answer")
+            raise OutcomeUnknown("no answer")
         return await told(path, subject)
 
     monkeypatch.setattr(setup, "ask", silent_at_first)
@@ -286,15 +286,15 @@ def test_a_path_moves_to_another_server_and_returns_home(tmp_path: Path) -> None
             await path.open()
             assert path.server_name == "n2"
             three.nodes[1].pause()
-            await path.look_after()
+            await path.check()
             assert path.server_name == "n3"
             three.nodes[1].go_on()
-            await path.look_after()
+            await path.check()
             assert path.server_name == "n2"
             three.nodes[1].kill()
             while path.is_open:
                 await asyncio.sleep(0.01)
-            await path.look_after()
+            await path.check()
             assert path.server_name == "n3"
             await path.close()
 

@@ -207,10 +207,11 @@ def report(**what: object) -> None:
 
 async def live(urls: list[str], names: list[str]) -> None:
     members = []
+    mastership: Any = NoMastership()
     for name in names:
         paths = paths_of(urls)
         await open_all(paths)
-        members.append(Member(name, paths, NoLines(), NoMastership()))
+        members.append(Member(name, paths, NoLines(), mastership))
     tasks = [asyncio.create_task(member.run()) for member in members]
     asks = asyncio.create_task(answer(members))
     counts = dict.fromkeys(names, 0)

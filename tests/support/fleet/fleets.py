@@ -18,7 +18,7 @@ from multidrop.control import commands, read_audit, written_before
 from multidrop.fleet.commands.desk import CommandDesk, StopDesk
 from multidrop.fleet.commands.messages import CommandAnswer, CommandLog, CommandOutcome, Offered
 from multidrop.fleet.commands.offers import HeldLines
-from multidrop.fleet.errors import Conflict, Unsure
+from multidrop.fleet.errors import Conflict, OutcomeUnknown
 from multidrop.fleet.leases.rules import SECOND
 from multidrop.fleet.lines.line_keeper import PortLoss
 from multidrop.fleet.servers.buckets import Record, WriteAnswers
@@ -54,12 +54,12 @@ class MemoryBucket:
     async def put(self, key: str, value: Any, revision: int) -> int:
         self.before_put(key)
         if self.is_down:
-            raise Unsure("down")
+            raise OutcomeUnknown("down")
         if self.revision(key) != revision:
             raise Conflict(key)
         self.store(key, value)
         if self.loses_answers:
-            raise Unsure("no answer")
+            raise OutcomeUnknown("no answer")
         return self.last
 
     async def put_all(self, records: Sequence[Record]) -> WriteAnswers:
@@ -69,7 +69,7 @@ class MemoryBucket:
                 revision = await self.put(record.key, record.value, record.revision)
             except Conflict:
                 written.refused.add(record.key)
-            except Unsure:
+            except OutcomeUnknown:
                 continue
             else:
                 written.stored.append(record._replace(revision=revision))
@@ -84,18 +84,18 @@ class MemoryBucket:
 
     async def get(self, key: str) -> Record:
         if self.is_down:
-            raise Unsure("down")
+            raise OutcomeUnknown("down")
         return self.records.get(key, Record(key, 0, None))
 
     async def newest(self, keys: Sequence[str]) -> list[Record]:
         if self.is_down:
-            raise Unsure("down")
+            raise OutcomeUnknown("down")
         self.asked += 1
         return [self.records[key] for key in keys if key in self.records]
 
     async def changes(self, after: int) -> list[Record]:
         if self.is_down:
-            raise Unsure("down")
+            raise OutcomeUnknown("down")
         found = [record for record in self.records.values() if record.revision > after]
         return sorted(found, key=lambda record: record.revision)
 

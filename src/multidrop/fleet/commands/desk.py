@@ -89,9 +89,7 @@ class CommandDesk:
     def offer(self, line: str, data: bytes) -> Offered | CommandAnswer | None:
         """Check the command in a message; return an offer or a refusal.
 
-        Return None unless this gateway is the line's master.
-
-        The sender uses the first answer that it gets, so only the master may give one.
+        Return None unless this gateway is the line's master: the sender uses the first answer that it gets.
         """
         held = self._lines.for_command(line)
         if held is None:
@@ -106,12 +104,10 @@ class CommandDesk:
     # ---- carrying out an offered command ----
 
     async def do(self, data: bytes) -> CommandAnswer:
-        """Carry out an offered command once, and return its result.
+        """Carry out an offered command once; return its result, also for copies of the message.
 
-        A copy of the message gets the same result.
-
-        A message with `ask` instead of `do` only asks for the result. If `ask` comes before any `do`,
-        answer "not sent", and withdraw the offer so that this answer stays true.
+        A message with `ask` instead of `do` only asks for the result. If `ask` comes before any `do`, answer
+        "not sent", and withdraw the offer so that this answer stays true.
         """
         try:
             message = read_json(data)
@@ -132,10 +128,7 @@ class CommandDesk:
         return found._replace(gateway=self.gateway)
 
     async def await_commands(self, line: str, may_wait: Callable[[], bool]) -> None:
-        """Wait for the commands in progress on a line that is being released.
-
-        Wait for at most AWAITED_S, and only while `may_wait` returns True.
-        """
+        """Wait for commands in progress on a line, for at most AWAITED_S and while `may_wait()` is True."""
         loop = asyncio.get_running_loop()
         ends = loop.time() + AWAITED_S
         while self._under_way.get(line) and loop.time() < ends and may_wait():
@@ -204,7 +197,7 @@ class CommandDesk:
 
 
 def _prepared(held: HeldLine, request: CommandRequest) -> Prepared:
-    """Return the checked command for a request, ready to be carried out.
+    """Return the checked command for a request.
 
     Raises ValueError if the plant's list does not allow the command, and the errors of `prepare`.
     """
@@ -272,10 +265,6 @@ class StopDesk:
         return CommandAnswer(CommandOutcome.UNDER_WAY, text, self.gateway, drives=drives)
 
     async def _stop_or_report(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
-        """Carry out a stop and return its answer.
-
-        If an unexpected exception is raised, the answer reports it.
-        """
         try:
             return await self._stop(held, request)
         except Exception as failure:
@@ -319,7 +308,7 @@ class StopDesk:
 
 # ---- NATS ----
 
-Heard = Callable[[bytes], Awaitable[Offered | CommandAnswer | None]]
+Handler = Callable[[bytes], Awaitable[Offered | CommandAnswer | None]]
 
 
 class CommandSubjects:
@@ -332,32 +321,29 @@ class CommandSubjects:
         self._stops = StopDesk(gateway, lines, self.desk.offers, log)
 
     async def begin(self) -> None:
-        """Subscribe to the subject on which senders return this process's tokens."""
+        """Subscribe to the subject on which senders return the tokens of offers."""
         await self._subscribe(self.desk.subject, self.desk.do)
 
     def open(self, line: str, description: Any) -> None:
-        """Accept commands and stops for a line from now on."""
         self._lines.open(line, description)
         self._change(self._subscribe(names.command_subject(line), partial(self._offer, line)))
         self._change(self._subscribe(names.stop_subject(line), partial(self._stops.stop, line)))
 
     def leave(self, line: str) -> None:
-        """Accept only stops for a line from now on."""
         self._lines.leave(line)
         self._change(self._unsubscribe(names.command_subject(line)))
 
     def shut(self, line: str) -> None:
-        """Accept neither commands nor stops for a line from now on."""
         self._lines.shut(line)
         self._change(self._unsubscribe(names.command_subject(line), names.stop_subject(line)))
 
     async def _offer(self, line: str, data: bytes) -> Offered | CommandAnswer | None:
         return self.desk.offer(line, data)
 
-    async def _subscribe(self, subject: str, heard: Heard) -> None:
+    async def _subscribe(self, subject: str, handler: Handler) -> None:
         async def take(message: Msg) -> None:
             # in a task, so that messages do not wait for each other
-            supervisor().start("answer", _answer(message, heard))
+            supervisor().start("answer", _answer(message, handler))
 
         await asyncio.gather(*(path.subscribe(subject, take) for path in self._paths))
 
@@ -376,9 +362,9 @@ class CommandSubjects:
         supervisor().start("subjects", change())
 
 
-async def _answer(message: Msg, heard: Heard) -> None:
+async def _answer(message: Msg, handler: Handler) -> None:
     try:
-        answer = await heard(message.data)
+        answer = await handler(message.data)
     except Exception:
         _log.exception("a message to %s", message.subject)
         return

@@ -24,7 +24,7 @@ from multidrop.fleet.commands.messages import (
     spelt,
     worst,
 )
-from multidrop.fleet.errors import FleetError, MayNotSend, NobodyThere, NotDelivered, Unsure
+from multidrop.fleet.errors import FleetError, MayNotSend, NobodyThere, NotDelivered, OutcomeUnknown
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Bucket, Follower
 from multidrop.fleet.servers.connections import ServerPath, paths_of
@@ -85,7 +85,6 @@ class FleetCommands:
         await self.close()
 
     async def close(self) -> None:
-        """Disconnect from the servers, and close the log."""
         await end_tasks(*self._keeping)
         for path in self._paths:
             await path.close()
@@ -137,10 +136,7 @@ class FleetCommands:
         return answer
 
     async def _offer(self, line: str, request: CommandRequest) -> Offered | CommandAnswer:
-        """Ask for an offer on one path after another until one answers.
-
-        An unused offer has no effect, so two offers do no harm.
-        """
+        """Ask for an offer on one path after another until one answers. An unused offer has no effect."""
         why = ""
         for path in self._paths:
             try:
@@ -148,7 +144,7 @@ class FleetCommands:
                 return read_offer(message.data)
             except NobodyThere:
                 why = f"no gateway is master of line {line} now"
-            except Unsure:
+            except OutcomeUnknown:
                 why = f"the master of line {line} gives no answer"
             except FleetError as failure:
                 why = why or str(failure)
@@ -246,7 +242,6 @@ class FleetCommands:
         return found, unknown
 
     async def _stop(self, line: str, drives: list[str] | None, on_news: News, by: str) -> CommandAnswer:
-        """Send a stop until a gateway answers; return the final result."""
         request = StopRequest(uuid.uuid4().hex, by, None if drives is None else tuple(drives))
         what = f"the stop of {', '.join(drives) if drives else f'all drives of line {line}'}"
         record = {"id": request.id, "line": line, "what": what, "by": by}
@@ -264,7 +259,7 @@ class FleetCommands:
         return next((path for path in self._paths if path.is_open), self._paths[0])
 
     def _described(self) -> dict[str, list[str]]:
-        """Return the names of each line's drives."""
+        """Return the names of the drives by line."""
         found = {}
         for name, record in self._plant.records.items():
             line = record.value.get("line") if isinstance(record.value, dict) else None
@@ -278,10 +273,7 @@ class FleetCommands:
         return self._find(drive)
 
     async def _read_plant(self, otherwise: str) -> None:
-        """Read the changed records of the plant from the servers.
-
-        If that fails, use an older copy, because masters check each command anyway.
-        """
+        """Read the plant's changed records. If that fails, use an older copy: masters check each command."""
         try:
             await self._plant.look()
         except FleetError as failure:

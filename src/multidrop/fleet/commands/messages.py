@@ -40,7 +40,6 @@ class CommandAnswer(NamedTuple):
 
     @classmethod
     def of(cls, drive: str, result: CommandResult) -> CommandAnswer:
-        """Return the answer for a command's result on a drive."""
         return cls(result.outcome, with_name(drive, result.text), held=result.held)
 
     def as_json(self) -> dict[str, Any]:
@@ -98,7 +97,6 @@ class Offered(NamedTuple):
 
 
 def encode(message: NamedTuple) -> bytes:
-    """Return a request or an offer as JSON."""
     return json.dumps(message._asdict(), separators=(",", ":")).encode()
 
 
@@ -243,7 +241,7 @@ class CommandLog:
         self._is_closed = False
 
     def open(self) -> AuditLog:
-        """Open the file unless it is open; `note` calls this too. Raises OSError."""
+        """Open the file unless it is open. Raises OSError."""
         if self._log is None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._log = AuditLog(self.path)

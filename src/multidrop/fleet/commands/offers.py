@@ -114,10 +114,7 @@ class Offers:
         return len(self._by_token)
 
     def make(self, request: CommandRequest, prepared: Prepared, held: HeldLine) -> Offer:
-        """Return a new offer for a checked request.
-
-        For a copy of an earlier request, return the earlier offer.
-        """
+        """Return a new offer for a checked request; for a copy of an earlier request, the earlier offer."""
         known = self._by_request.get((held.name, request.id))
         if known is not None and known.request == request:
             return known
@@ -132,10 +129,7 @@ class Offers:
         return self._by_token.get(token)
 
     def take(self, offer: Offer) -> bool:
-        """Mark the offer as taken.
-
-        Return True only at the first call: only then may the command be carried out.
-        """
+        """Mark the offer as taken. Return True at the first call: only then carry out the command."""
         is_first = not offer.is_taken
         offer.is_taken = True
         return is_first
@@ -145,7 +139,7 @@ class Offers:
         return offer.made_ns + LIMIT_NS - self._clock()
 
     def why_late(self, offer: Offer) -> str:
-        """Return why it is too late to carry out an offer; "" if it is not too late."""
+        """Return why it is too late to carry out an offer; "" if there is time."""
         left = self.left_ns(offer)
         if left > 0:
             return ""
@@ -222,7 +216,7 @@ class HeldLines:
         self._held: dict[str, HeldLine] = {}
 
     def open(self, line: str, description: Mapping[str, Any]) -> None:
-        """Accept commands and stops for a line from now on, because it is polled."""
+        """Accept commands and stops for a line from now on."""
         self._held[line] = HeldLine(line, self._bus(line), lists_of(description))
 
     def leave(self, line: str) -> None:

@@ -13,9 +13,10 @@ import uuid
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
-from multidrop.fleet.errors import Conflict, FleetError, Unsure
+from multidrop.core import Mastership
+from multidrop.fleet.errors import Conflict, FleetError, OutcomeUnknown
 from multidrop.fleet.leases import rules as lease_rules
 from multidrop.fleet.leases.rules import RENEW_S, SECOND, SeenRevision, Terms
 from multidrop.fleet.servers.buckets import NONE_YET, Bucket, Record
@@ -32,24 +33,11 @@ def boottime_ns() -> int:
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
-class MayPoll(Protocol):
-    """The engine's right to send frames; `multidrop.core.Mastership` implements it."""
-
-    def extend(self, until_ns: int) -> object:
-        """Let the engine send until this time (CLOCK_BOOTTIME), and postpone the kernel's timer.
-
-        Raises ValueError without any change if that time is in the past.
-        """
-
-    def end(self) -> object:
-        """Forbid the engine to send, and cancel the kernel's timer."""
-
-
-class Held(NamedTuple):
-    """Our lease record on one path: its revision, and when its renewal was sent (CLOCK_BOOTTIME, ns)."""
+class HeldRecord(NamedTuple):
+    """Our lease record on one path."""
 
     revision: int
-    sent: int
+    sent: int  # when its renewal was sent (CLOCK_BOOTTIME, ns)
 
 
 class Lease:
@@ -63,7 +51,7 @@ class Lease:
         self,
         name: str,
         buckets: Sequence[Bucket],
-        mastership: MayPoll,
+        mastership: Mastership,
         *,
         lock: LifeLock | None = None,
         terms: Terms = lease_rules.USUAL,
@@ -76,7 +64,7 @@ class Lease:
         self.until = 0
         self.trouble = ""  # why the session cannot start
         self.began_ms = 0  # start of the session, UTC in ms
-        self.held: list[Held | None] = [None] * len(buckets)
+        self.held: list[HeldRecord | None] = [None] * len(buckets)
         self._buckets = buckets
         self._mastership = mastership
         self._lock = lock
@@ -110,10 +98,7 @@ class Lease:
 
     @property
     def is_weak(self) -> bool:
-        """Return True if other gateways have ended one of our three records.
-
-        Losing one more record ends the session.
-        """
+        """Return True if other gateways have ended one of our three records: one more ends the session."""
         return bool(self.session and self._ended)
 
     async def could_be_whole(self) -> bool:
@@ -166,10 +151,7 @@ class Lease:
             return None
 
     def _is_free(self, path: int, record: Record) -> bool:
-        """Return True if the record may be taken.
-
-        That is so if its session was ended, its process died, or the record is stale.
-        """
+        """Return True if the record's session was ended, its process died, or the record is stale."""
         value = record.value
         if record.revision == NONE_YET or (value and value["ended"] and "by" not in value):
             return True
@@ -191,7 +173,7 @@ class Lease:
         except (Conflict, FleetError):
             return
         if nonce == self._nonce:  # otherwise the answer belongs to an earlier session
-            self.held[path] = Held(revision, sent)
+            self.held[path] = HeldRecord(revision, sent)
 
     def _value(self, *, ended: bool = False) -> dict[str, Any]:
         return {
@@ -225,7 +207,6 @@ class Lease:
             await asyncio.sleep(max(rest, AGAIN_S))
 
     async def renew_once(self, path: int) -> None:
-        """Renew the record on one path. The time of the lease starts right before the request is sent."""
         held, nonce, sent = self.held[path], self._nonce, self.clock()
         if held is None:
             if path not in self._ended:
@@ -233,17 +214,16 @@ class Lease:
             return
         try:
             revision = await self._buckets[path].put(self.name, self._value(), held.revision)
-        except Conflict:
+        except (Conflict, OutcomeUnknown):
             await self._look_again(path, nonce, held)
-        except FleetError as failure:
-            if isinstance(failure, Unsure):
-                await self._look_again(path, nonce, held)
+        except FleetError:
+            pass  # not delivered, or not permitted
         else:
             if nonce == self._nonce:  # otherwise the answer belongs to an earlier session
-                self.held[path] = Held(revision, sent)
+                self.held[path] = HeldRecord(revision, sent)
                 self._extend()
 
-    async def _look_again(self, path: int, nonce: str, held: Held) -> None:
+    async def _look_again(self, path: int, nonce: str, held: HeldRecord) -> None:
         """Read the record again after a renewal that failed, or whose outcome is unknown."""
         record = await self._read(path)
         if record is None or nonce != self._nonce:
@@ -251,7 +231,7 @@ class Lease:
         value = record.value
         if value and value["nonce"] == nonce and not value["ended"]:
             # This renewal or an earlier one stored the record. The earlier one's time is safe in both cases.
-            self.held[path] = Held(record.revision, held.sent)
+            self.held[path] = HeldRecord(record.revision, held.sent)
         elif record.revision > held.revision:
             self._lose(path)
 
@@ -265,8 +245,8 @@ class Lease:
     async def _take_late(self, path: int) -> None:
         """Take the record on a path that was not available when the session started.
 
-        That record's session ended when we took its records on the other paths. While we hold too few of the
-        other paths' records, do nothing: another gateway of this name may still need this record.
+        That record's session ended when we took its records on the other paths. While we hold too few
+        records, another gateway of this name may still need this one.
         """
         nonce = self._nonce
         record = await self._read(path)
@@ -277,7 +257,7 @@ class Lease:
             await self._take(path, record)
             self._extend()
         elif value["nonce"] == nonce and not value["ended"]:
-            self.held[path] = Held(record.revision, 0)
+            self.held[path] = HeldRecord(record.revision, 0)
         else:
             self._lose(path)
 
@@ -307,10 +287,7 @@ class Lease:
 
 
 def _least_session(record: Record) -> int:
-    """Return a number that is not below any session number used so far: the next session needs a higher one.
-
-    That is the session in the record, or for an invalid record its revision.
-    """
+    """Return the session in a record; for an invalid record its revision, which is at least as high."""
     return int(record.value["session"]) if record.value else record.revision
 
 
@@ -335,12 +312,10 @@ IDS = (Path("/etc/machine-id"), Path("/proc/sys/kernel/random/boot_id"))
 
 
 class LifeLock:
-    """A lock on a local file, held until the process ends.
+    """A lock on a local file, held until the process ends: its next holder knows that this process is dead.
 
-    A process that gets the lock later knows that this process is dead.
-
-    The file holds a random id, because containers may share the machine id and the path. Raises
-    FleetError if another process of this computer holds the lock.
+    The file holds a random id, because containers may share the machine id and the path. Raises FleetError if
+    another process of this computer holds the lock.
     """
 
     def __init__(self, path: Path) -> None:
@@ -371,8 +346,7 @@ class LifeLock:
 def machine_id() -> str:
     """Return an id of this computer's present boot; "" if unknown: then no process can be proved to be dead.
 
-    Computers with copies of one disk have the same machine id and the same lock file, but different
-    boot ids. After a reboot, a gateway waits until the lease in its earlier record has expired.
+    Computers with copies of one disk have the same machine id and lock file, but different boot ids.
     """
     with suppress(OSError):
         ids = [path.read_text("utf-8", "replace").strip() for path in IDS]

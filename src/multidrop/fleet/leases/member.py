@@ -23,7 +23,8 @@ from enum import StrEnum
 from functools import partial
 from typing import Any
 
-from multidrop.fleet.leases.lease import Lease, LifeLock, MayPoll
+from multidrop.core import Mastership
+from multidrop.fleet.leases.lease import Lease, LifeLock
 from multidrop.fleet.leases.observer import Observer
 from multidrop.fleet.leases.rules import RULES, SECOND, USUAL, Terms
 from multidrop.fleet.lines.line_keeper import LineKeeper, Lines, TakenLine
@@ -46,8 +47,7 @@ WEAK_NS = 10 * SECOND
 class IncompatibleGateways:
     """Detects gateways with incompatible ownership rules. While one is alive, this gateway claims no line.
 
-    So no line has two masters while a fleet is updated: gateways of the new version wait until those of the
-    old version are stopped.
+    So while a fleet is updated, gateways of the new version wait until those of the old version are stopped.
     """
 
     def __init__(self, me: str, observer: Observer) -> None:
@@ -56,10 +56,7 @@ class IncompatibleGateways:
         self._observer = observer
 
     def look(self, present: Mapping[str, Mapping[str, Any]]) -> None:
-        """Update the set of incompatible gateways from the sessions in `present`.
-
-        A gateway that no longer renews its lease is left out, even if its session was not ended yet.
-        """
+        """Update the set from the sessions in `present`; ignore sessions that are no longer renewed."""
         others = {name for name, value in present.items() if value.get("rules") != RULES}
         found = frozenset(others - {self._me} - self._observer.dead(others).keys())
         if found != self.gateways:
@@ -68,7 +65,6 @@ class IncompatibleGateways:
 
     @property
     def trouble(self) -> str:
-        """Return a sentence about the incompatible gateways; "" if no such gateway is alive."""
         if not self.gateways:
             return ""
         names = ", ".join(sorted(self.gateways))
@@ -161,7 +157,7 @@ class Member:
         name: str,
         paths: Sequence[ServerPath],
         lines: Lines,
-        mastership: MayPoll,
+        mastership: Mastership,
         *,
         lock: LifeLock | None = None,
         terms: Terms = USUAL,
@@ -207,12 +203,11 @@ class Member:
 
     @property
     def polled(self) -> Mapping[str, TakenLine]:
-        """Return the lines that this gateway polls, by name."""
         return self.keeper.polled
 
     @property
     def wanted(self) -> Mapping[str, str]:
-        """Return the name of the gateway that each line is assigned to."""
+        """The name of the gateway that each line is assigned to, by line."""
         return self._shares.wanted
 
     @property
@@ -228,12 +223,11 @@ class Member:
         self._is_dirty = True
 
     def _wake(self) -> None:
-        """End the wait for the next step, so that it is taken immediately."""
+        """Take the next step immediately."""
         self._is_dirty = True
         self._woken.set()
 
     def drain(self) -> None:
-        """Release all lines, and take no more."""
         self.is_draining = self._is_dirty = True
 
     def _is_mine(self, record: Record) -> bool:
@@ -272,11 +266,10 @@ class Member:
             raise Ended(f"{task.get_name()} has ended: {supervisor().dead[task.get_name()]}") from failure
 
     def end(self) -> None:
-        """Make `run` end and return; further calls have no effect."""
+        """Make `run` return; further calls have no effect."""
         self._over.set()
 
     def _works(self) -> dict[str, Coroutine[Any, Any, None]]:
-        """Return the tasks that must run as long as the member, by name."""
         records = {f"records {at}": work for at, work in enumerate(self.records.works(), 1)}
         return {
             **{f"path {at}": path.keep() for at, path in enumerate(self.paths, 1)},
@@ -316,7 +309,7 @@ class Member:
                 await asyncio.wait_for(self._woken.wait(), STEP_S - LEAST_STEP_S)
 
     async def _prepare(self) -> None:
-        """Wait until all records were read. In a large plant, this takes longer than a lease lasts.
+        """Wait until all records were read, which may take longer than a lease lasts.
 
         Also wait until no incompatible gateway is alive.
         """
@@ -327,7 +320,7 @@ class Member:
             await asyncio.sleep(STEP_S)
 
     async def _guard(self) -> None:
-        """Close the lines before the lease expires, and cancel the kernel's timer when they are closed."""
+        """Close the lines before the lease expires; then cancel the kernel's timer."""
         is_armed = was_late = False
         while True:
             if self.keeper.may_poll:
@@ -393,7 +386,6 @@ class Member:
         return others
 
     async def _share_out(self, present: Mapping[str, Mapping[str, Any]]) -> None:
-        """Assign the lines to gateways again if gateways or lines were added or removed."""
         sharing = self._see(present)
         if not self.is_draining and self.lease.session:
             sharing.add(self.name)
@@ -410,10 +402,7 @@ class Member:
     def _unopened(
         self, present: Mapping[str, Mapping[str, Any]], sharing: Iterable[str], lines: Iterable[str]
     ) -> tuple[tuple[str, frozenset[str]], ...]:
-        """Return the lines that each gateway could not open.
-
-        Gateways whose lease record lacks the list of such lines are left out.
-        """
+        """Return the lines that each gateway could not open, of gateways whose lease record lists them."""
         unopened = {name: value.get("unopened") for name, value in present.items()}
         unopened[self.name] = list(self.keeper.unopened.named())
         known = {name: said for name in sorted(sharing) if isinstance(said := unopened.get(name), list)}

@@ -110,10 +110,7 @@ class Observer:
         return found
 
     def missing(self) -> dict[str, dict[str, Any]]:
-        """Return each gateway whose session was ended by other gateways, with its record.
-
-        A gateway is not missing if it has ended the session itself on at least one path.
-        """
+        """Return each gateway whose session only other gateways have ended, with its record."""
         present = self.sessions()
         found = {}
         for name in sorted({name for follower in self.paths for name in follower.records} - present.keys()):
@@ -137,7 +134,6 @@ class Observer:
         ]
 
     def _of(self, gateway: str) -> list[tuple[int, Record]]:
-        """Return the valid records of a gateway, with their paths."""
         records = enumerate(self.records(gateway))
         return [(path, record) for path, record in records if record and record.value is not None]
 
@@ -148,7 +144,7 @@ class Observer:
         return not is_ended_by_another(record) or self._is_stale(path, record, now)
 
     def unseen_s(self, gateway: str) -> float:
-        """Return how many seconds ago renewals were last seen on two paths, as a lease needs them."""
+        """Return how many seconds ago renewals were last seen on two paths."""
         seen = [watched[gateway].since for watched in self._watched if gateway in watched]
         latest = sorted(seen, reverse=True)[: self.terms.needed]
         return (self._clock() - latest[-1]) / lease_rules.SECOND if latest else 0.0
@@ -208,10 +204,9 @@ class Observer:
                 self._over[name] = max(session, self._over.get(name, 0))
 
     async def _end_enough(self, records: Mapping[int, Record]) -> bool:
-        """End these records concurrently; wait for as many answers as a session's end needs.
+        """End these records concurrently; return True if this call has ended one.
 
-        A path without a leader gives no answer. Return True if this call has ended a record. Another gateway
-        may have ended the other records; the next read shows that.
+        Wait only for as many answers as a session's end needs, because a path without a leader gives none.
         """
         ends = [asyncio.create_task(self._end(path, record)) for path, record in records.items()]
         answers: list[bool] = []
@@ -223,8 +218,7 @@ class Observer:
                     break
         except TimeoutError:
             pass  # the next step decides again, with newer records
-        finally:
-            # a cancelled request may still be stored; the next read shows whether it was
+        finally:  # a cancelled request may still be stored; the next read shows whether it was
             await end_tasks(*ends)
         return any(answers)
 

@@ -1,12 +1,11 @@
 """Lease rules: until when a gateway may send, and when another may end its session. No I/O.
 
-A session has one record on each of three paths. Its holder renews all three records; a gateway that takes
-over ends them. The holder must renew more than half of the paths (`needed`), and the other gateway must end
-more than half (`ended`). So both must write on at least one common path. That path's server accepts only one
-of the two writes. The holder's lease starts right before it sends a renewal. An observer starts to wait when
-it first sees a revision, by its own clock. After the time of a lease it ends the record only if the record
-still has that revision. So clocks of different computers are never compared. An ended path stays ended for
-its session.
+A session has one record on each of three paths. Its holder must renew two of them (`needed`). A gateway that
+takes over must end two of them (`ended`). So both must write on at least one common path, whose server
+accepts only one of the two writes. The holder's lease starts right before it sends a renewal. An observer
+starts to wait when it first sees a revision, by its own clock. After the time of a lease it ends the record
+only if the record still has that revision. So clocks of different computers are never compared. An ended
+path stays ended for its session.
 
 Once a session is over, its lines are claimed and opened immediately. The guard time starts then: before its
 first request on a line, the engine only listens for at least this time (csrc/line.c).
@@ -38,10 +37,10 @@ USUAL = Terms()
 
 
 class SeenRevision(NamedTuple):
-    """A revision of a record, and when this observer first saw it (by its own CLOCK_BOOTTIME, in ns)."""
+    """A revision of a record, and when this observer first saw it."""
 
     revision: int
-    since: int
+    since: int  # by the observer's own CLOCK_BOOTTIME, in ns
 
 
 def deadline(sent: Iterable[int | None], terms: Terms) -> int:

@@ -116,16 +116,15 @@ class LineKeeper:
 
     @property
     def is_silent(self) -> bool:
-        """Return True if no line is open and no task on a line is in progress."""
+        """True if no line is open and no task on a line is in progress."""
         return not self.polled and not self._at_work
 
     @property
     def moves(self) -> int:
-        """Return how often lines were claimed and released by this gateway."""
+        """The number of claims and releases of lines by this gateway."""
         return self._owners.moves
 
     def is_mine(self, line: str) -> bool:
-        """Return True if the line's records name us, and we have not sent its release."""
         return self._owners.is_mine(line)
 
     def claim_of(self, line: str) -> Claim | None:
@@ -281,7 +280,6 @@ class LineKeeper:
 
 
 def _some_at_once(lines: Iterable[str]) -> Iterator[list[str]]:
-    """Yield the lines in batches of at most WRITTEN_AT_ONCE."""
     left = iter(lines)
     while some := list(islice(left, WRITTEN_AT_ONCE)):
         yield some
@@ -345,7 +343,6 @@ class OwnerRecords:
         }
 
     def owned(self) -> set[str]:
-        """Return the lines for which at least one record names our session."""
         return self._records.owned_by(*self._me)
 
     def claim_of(self, line: str) -> Claim | None:
@@ -354,7 +351,7 @@ class OwnerRecords:
         return claim_of(self._me, self._records.of(line), is_over, self.doubted(line), self._leaderless())
 
     def _leaderless(self) -> set[str]:
-        """Return the bucket, if any, that may have no leader: our lease on its path is not being renewed."""
+        """Return the bucket, if any, that may have no leader: our lease on its path is not renewed."""
         sent = [path.sent if path else 0 for path in self._lease.held]
         since = sorted(sent)[1] - LAG_NS
         return {bucket for bucket, moment in zip(names.OWNERS, sent, strict=True) if moment < since}
@@ -429,7 +426,7 @@ class OwnerRecords:
         self.moves += sum(not self._naming_us(line) for line in lines)
 
     def _write(self, records: Iterable[tuple[str, Record]]) -> dict[str, asyncio.Task[set[str]]]:
-        """Start a task for each bucket that replaces the bucket's records; each returns the refused lines."""
+        """Start a task for each bucket that replaces its records; each task returns the refused lines."""
         by_bucket: dict[str, list[Record]] = {}
         for bucket, record in records:
             by_bucket.setdefault(bucket, []).append(record)
@@ -438,10 +435,7 @@ class OwnerRecords:
         }
 
     async def _write_in(self, bucket: str, records: Sequence[Record]) -> set[str]:
-        """Replace the records whose revision has not changed, and return the lines of the refused records.
-
-        Report each line that becomes ours.
-        """
+        """Replace the records whose revision has not changed; return the lines of the refused records."""
         follower = self._records.owners[bucket]
         async with self._writing[bucket]:
             if not self._may_write():

@@ -63,7 +63,6 @@ def owner_value(owner: Owner, turn: int, now_ms: int, votes: int = 1) -> dict[st
 
 
 def votes_of(owner: Owner, records: Iterable[Record | None]) -> int:
-    """Return how many votes these records give to an owner."""
     return sum(record.value["votes"] for record in records if record and owner_of(record) == owner)
 
 

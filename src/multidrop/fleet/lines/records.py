@@ -58,7 +58,6 @@ class FleetRecords:
         }
 
     def _owner_follower(self, bucket: Bucket, on_take: OnTake) -> Follower:
-        """Return the follower of one bucket of master records. This class reads the records of all lines."""
         return Follower(bucket, on_take)
 
     def of(self, line: str) -> LineRecords:
@@ -70,7 +69,7 @@ class FleetRecords:
         return owner_by(self.of(line))
 
     def lines(self) -> tuple[str, ...]:
-        """Return the plant's lines, sorted by name: the same tuple until lines are added or removed."""
+        """The plant's lines, sorted by name: the same tuple until lines are added or removed."""
         return self._lines
 
     def is_in_plant(self, line: str) -> bool:
@@ -84,9 +83,8 @@ class FleetRecords:
     async def look(self) -> None:
         """Read the changes in each bucket once. Raises FleetError if a read fails."""
         done = await asyncio.gather(*map(self._look, self._looks), return_exceptions=True)
-        for failure in done:
-            if failure is not None:
-                raise failure
+        for failure in filter(None, done):
+            raise failure
 
     def works(self) -> list[Coroutine[Any, Any, None]]:
         """Return one coroutine for each bucket, which reads it forever, so no bucket waits for another."""
@@ -171,7 +169,6 @@ class ShareFollower(Follower):
         self._is_urgent = asyncio.Event()
 
     def want(self, lines: Iterable[str]) -> None:
-        """Follow the records of exactly these lines from now on."""
         self._share = frozenset(lines)
         self._asked = None
         self._is_urgent.set()
@@ -182,7 +179,7 @@ class ShareFollower(Follower):
         self._is_urgent.set()
 
     def recompute(self) -> None:
-        """Before the next read, find again which lines must be read."""
+        """Find again, before the next read, which lines must be read."""
         self._asked = None
 
     async def look(self) -> list[Record]:
@@ -205,7 +202,7 @@ class ShareFollower(Follower):
         return sorted(self._doubted.keys() | self._asked)
 
     def _may_change(self, line: str) -> bool:
-        """Return True if the record must be read: it is unknown, or names another gateway.
+        """Return True if the record is unknown, or names another gateway.
 
         A record that names no gateway need not be read again: a claim shows whether the line is still free.
         """
@@ -249,13 +246,12 @@ class ShareRecords(FleetRecords):
             share.recompute()
 
     def want(self, lines: Iterable[str]) -> None:
-        """Follow the master records of exactly these lines from now on."""
+        """Read the master records of exactly these lines from now on."""
         wanted = frozenset(lines)
         for share in self._shares.values():
             share.want(wanted)
 
     def doubt(self, bucket: str, lines: Iterable[str]) -> None:
-        """Read these lines of this bucket again for DOUBT_S."""
         self._shares[bucket].doubt(lines)
 
 

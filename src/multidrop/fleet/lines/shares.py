@@ -81,7 +81,6 @@ _MIXER = _words([0x9E3779B97F4A7C15])[0]
 
 
 def _weigh(hashes: pa.UInt64Array, gateway: str, number: int) -> pa.UInt64Array:
-    """Return the weight of a gateway for each line."""
     own, place = _words([_hash(gateway), number])
     return pc.bit_wise_or(pc.bit_wise_and(pc.multiply(pc.bit_wise_xor(hashes, own), _MIXER), _WEIGHT), place)
 
@@ -95,11 +94,10 @@ QUIET_NS = SECOND // 2  # while settling, assign lines only after this time with
 
 
 class Sharers(NamedTuple):
-    """The gateways that share the lines, the lines, and the lines that some gateways could not open."""
+    """The gateways that share the lines, and each gateway's lines that it could not open."""
 
     gateways: tuple[str, ...]
     lines: tuple[str, ...]
-    # each gateway with the lines that it could not open
     unopened: tuple[tuple[str, frozenset[str]], ...] = ()
 
 
@@ -114,7 +112,7 @@ class Shares:
         self._seen_at = 0
 
     def reset(self) -> None:
-        """Force a new assignment at the next `make`, because a new session has started."""
+        """Assign the lines again at the next `make`, because a new session has started."""
         self._made = None
 
     def see(self, others: frozenset[str], now: int) -> None:
@@ -139,7 +137,6 @@ class Shares:
         return True
 
     def of(self, gateway: str) -> set[str]:
-        """Return the lines assigned to this gateway."""
         return {line for line, name in self.wanted.items() if name == gateway}
 
 
@@ -201,7 +198,6 @@ class UnopenedLines:
                 del self._named[other]
 
     def gone(self, line: str) -> None:
-        """Forget the line's failures, because it is no longer ours."""
         self._failures.pop(line, None)
         self._lost_since.pop(line, None)
 

@@ -20,7 +20,6 @@ from multidrop.fleet.samples.samples_stream import (
     LOST,
     SEQUENCE,
     digest_of,
-    end_if_cancelled,
     last_of,
     publish,
     subject_of,
@@ -40,10 +39,7 @@ _log = logging.getLogger("multidrop.fleet.samples.forwarder")
 
 
 class NotOurLog(Exception):
-    """The stream has a message of this log that this spool has never written.
-
-    The spool's folder was copied, or restored from an older state.
-    """
+    """The stream has a message that this spool never wrote: the folder was copied, or set back."""
 
 
 class Forwarder:
@@ -62,10 +58,9 @@ class Forwarder:
         self.trouble: str | None = None
 
     def lag_s(self) -> float | None:
-        """Return the age (s, by the system's clock) of the oldest message that the stream lacks.
+        """Return the age (s, by the system clock) of the oldest message that the stream lacks, else 0.
 
-        Return 0 if the stream has all messages. Return None if the stream's position is not known yet,
-        or if the spool has removed the message.
+        Return None if the stream's position is not known yet, or if the spool has removed the message.
         """
         if self.last is None:
             return None
@@ -103,14 +98,13 @@ class Forwarder:
             if stored is None:
                 self._note(None)
                 with suppress(TimeoutError):
-                    await asyncio.wait_for(self._news.wait(), LOOKING_S)
-                end_if_cancelled()
+                    async with asyncio.timeout(LOOKING_S):
+                        await self._news.wait()
                 continue
             data = await asyncio.to_thread(_read, stored.path)
             if data is None:  # the full spool has just removed the message
                 continue
             found = await publish(self._path, self._subject, data, self._headers(stored, data, place))
-            end_if_cancelled()
             if found is None:  # refused: our earlier attempt was stored after all
                 return
             place, sequence = found, stored.sequence
@@ -121,7 +115,6 @@ class Forwarder:
     async def _ask(self) -> tuple[int, int]:
         """Return the position and the sequence number of this log's last message in the stream."""
         last = await last_of(self._path, self._subject)
-        end_if_cancelled()
         if last is None or last.sequence == 0:  # no message is stored now, or the last message is forged
             sequence = self.last or 0
             self._have(sequence)

@@ -14,11 +14,10 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.samples.samples_stream import (
-    StreamAbout,
+    StreamInfo,
     StreamMessage,
-    about,
-    end_if_cancelled,
     read_after,
+    stream_info,
 )
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.samples import MessageError, SinkError, unpack
@@ -77,7 +76,7 @@ class NotThisHubs(SinkError):
     """The sink belongs to another stream or another hub, so the hub does not retry."""
 
 
-class KeptPlace(NamedTuple):
+class StoredPosition(NamedTuple):
     """The position up to which a sink has stored the stream."""
 
     place: int  # stream position of the last stored message
@@ -98,14 +97,13 @@ class Commit(NamedTuple):
 class SampleSink(Protocol):
     """A store of rows. Its methods are called in a thread, and raise SinkError."""
 
-    def begin(self, stream: str) -> KeptPlace:
+    def begin(self, stream: str) -> StoredPosition:
         """Return the stored position in this stream. Called at the start and after each failure."""
 
     def write(self, commit: Commit) -> None:
         """Store the whole commit; if that fails, leave the sink unchanged."""
 
-    def close(self) -> None:
-        """Close the sink's open files and connections."""
+    def close(self) -> None: ...
 
 
 async def _on_thread(act: Callable[..., T], *arguments: Any) -> T:
@@ -170,8 +168,7 @@ class SampleHub:
                 return
 
     async def _begin(self) -> None:
-        found = await about(self._path)
-        end_if_cancelled()
+        found = await stream_info(self._path)
         kept = await _on_thread(self._sink.begin, found.created)
         self._stream, self._place = found.created, kept.place
         # if `first` is above `last`, the stream is empty now
@@ -182,7 +179,7 @@ class SampleHub:
             gone = f"messages {kept.place + 1} to {found.first - 1}"
             self._sources.alarm(f"{gone} of the stream were removed before they were read")
 
-    def _check_end(self, found: StreamAbout) -> None:
+    def _check_end(self, found: StreamInfo) -> None:
         if found.last < self._place:
             raise NotThisHubs(
                 f"the stream ends at message {found.last}, but {self._place} are already stored: the stream "
@@ -199,7 +196,6 @@ class SampleHub:
         while rows < MOST_ROWS and size < MOST_BYTES and (ends is None or time.monotonic() < ends):
             place = messages[-1].place if messages else self._place
             found = await read_after(self._path, place, MOST_READ, MOST_READ_BYTES)
-            end_if_cancelled()
             if not found:
                 if once and place >= self._end:
                     is_end = True
@@ -208,8 +204,7 @@ class SampleHub:
                     raise FleetError(f"messages {place + 1} to {self._end} of the stream cannot be read now")
                 await asyncio.sleep(LOOKING_S)
                 if not messages:
-                    self._check_end(await about(self._path))
-                    end_if_cancelled()
+                    self._check_end(await stream_info(self._path))
                 continue
             ends = ends or time.monotonic() + self._every
             messages += found

@@ -29,7 +29,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from multidrop.fleet.samples.hub import Commit, KeptPlace, NotThisHubs
+from multidrop.fleet.samples.hub import Commit, NotThisHubs, StoredPosition
 from multidrop.printable import install_command
 from multidrop.recording import FileLock
 from multidrop.samples import ROWS, SinkError
@@ -76,7 +76,7 @@ class ParquetSink:
     def close(self) -> None:
         self._lock.close()
 
-    def begin(self, stream: str) -> KeptPlace:
+    def begin(self, stream: str) -> StoredPosition:
         """Return the position that the newest file contains, and remove unfinished files."""
         try:
             for part in self._rows.glob(UNFINISHED):
@@ -85,7 +85,7 @@ class ParquetSink:
         except OSError as failure:
             raise SinkError(f"the folder {self.folder} cannot be written: {failure.strerror}") from failure
         if newest is None:
-            return KeptPlace(0, {})
+            return StoredPosition(0, {})
         last, path = newest
         found = _metadata(path).get("hub")
         if not isinstance(found, dict) or not isinstance(found.get("sources"), dict):
@@ -95,7 +95,7 @@ class ParquetSink:
                 f"{self.folder} holds samples of a stream created at {found.get('stream')}, but the present "
                 f"stream was created at {stream}: name another folder"
             )
-        return KeptPlace(last, {str(name): int(number) for name, number in found["sources"].items()})
+        return StoredPosition(last, {str(name): int(number) for name, number in found["sources"].items()})
 
     def _files(self) -> list[tuple[int, Path]]:
         found = [(_NAME.fullmatch(path.name), path) for path in self._rows.iterdir()]

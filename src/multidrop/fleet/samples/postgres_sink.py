@@ -11,7 +11,7 @@ import json
 
 import psycopg
 
-from multidrop.fleet.samples.hub import Commit, KeptPlace, NotThisHubs
+from multidrop.fleet.samples.hub import Commit, NotThisHubs, StoredPosition
 from multidrop.samples import SinkError
 from multidrop.samples.sample_tables import SampleTables, sentences
 
@@ -41,7 +41,7 @@ class PostgresSink:
     def close(self) -> None:
         self._tables.close()
 
-    def begin(self, stream: str) -> KeptPlace:
+    def begin(self, stream: str) -> StoredPosition:
         """Reconnect, create missing tables, and return the position in `multidrop.hub`."""
         with sentences():
             connection = self._tables.open()
@@ -52,7 +52,7 @@ class PostgresSink:
             with connection.transaction():
                 return self._begin(stream)
 
-    def _begin(self, stream: str) -> KeptPlace:
+    def _begin(self, stream: str) -> StoredPosition:
         self._tables.prepare(POSITION, COLUMNS)
         first = (
             "insert into multidrop.hub (stream, place, sources) values (%s, 0, '{}') on conflict do nothing"
@@ -65,7 +65,7 @@ class PostgresSink:
                 f"the database holds samples of a stream created at {found[0]}, but the present stream was "
                 f"created at {stream}: name another database"
             )
-        return KeptPlace(found[1], found[2])
+        return StoredPosition(found[1], found[2])
 
     def write(self, commit: Commit) -> None:
         """Store the rows and their position in one transaction."""

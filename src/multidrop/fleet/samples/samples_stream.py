@@ -11,9 +11,9 @@ import asyncio
 import base64
 import hashlib
 import json
-from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from multidrop.fleet.errors import FleetError, NobodyThere
 from multidrop.fleet.servers.batch_client import (
@@ -42,10 +42,11 @@ SENTENCES = {  # messages of FleetError, by JetStream's error code
         "or raise max_file in their jetstream blocks",
     ),
 }
+T = TypeVar("T")
 
 
-class StreamAbout(NamedTuple):
-    """A stream's identity (the time of its creation), and its first and last positions."""
+class StreamInfo(NamedTuple):
+    """A stream's identity, which is the time of its creation, and its first and last positions."""
 
     created: str
     first: int
@@ -53,14 +54,12 @@ class StreamAbout(NamedTuple):
 
 
 class LastMessage(NamedTuple):
-    """The newest message of a subject: its position in the stream, its number in the log, its digest.
+    """The newest message of a subject."""
 
-    The number is 0 if the message is not from a gateway, but is a server's answer that was directed to this
-    subject.
-    """
-
-    place: int
-    sequence: int
+    place: int  # position in the stream
+    sequence: (
+        int  # number in the log; 0 if the message is a server's answer that was directed to this subject
+    )
     digest: str
 
 
@@ -72,14 +71,17 @@ def digest_of(data: bytes) -> str:
     return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 
-def end_if_cancelled() -> None:
-    """Raise CancelledError if this task was cancelled, but `asyncio.wait_for` has swallowed the exception.
+async def _answer_to(request: Awaitable[T]) -> T:
+    """Return the answer to a request. Raises CancelledError if this task was cancelled in the meantime.
 
-    In Python 3.11, it swallows the exception if an answer arrives at the moment of the cancellation.
+    In Python 3.11, `asyncio.wait_for` swallows that exception if an answer arrives at the same moment.
     """
-    task = asyncio.current_task()
-    if task and task.cancelling():
-        raise asyncio.CancelledError
+    try:
+        return await request
+    finally:
+        task = asyncio.current_task()
+        if task and task.cancelling():
+            raise asyncio.CancelledError
 
 
 @asynccontextmanager
@@ -103,9 +105,8 @@ async def samples_path(
 async def create_stream(path: ServerPath, *, replicas: int = 3, most_bytes: int = -1) -> int:
     """Create the stream if it is missing. Return the stream's size limit in bytes, or -1 if it is unlimited.
 
-    Above `most_bytes`, the oldest messages are removed. The servers reserve that much space. A stream
-    without a limit fills their disks, and then no lease can be renewed. An existing stream stays as it
-    is.
+    Above `most_bytes`, the oldest messages are removed. The servers reserve that much space. A stream without
+    a limit fills their disks, and then no lease can be renewed.
     """
     config = {
         "name": STREAM,
@@ -125,14 +126,13 @@ async def create_stream(path: ServerPath, *, replicas: int = 3, most_bytes: int 
         return int(found["config"].get("max_bytes", -1))
 
 
-async def about(path: ServerPath) -> StreamAbout:
-    """Return the stream's identity, and its first and last positions. Raises FleetError."""
+async def stream_info(path: ServerPath) -> StreamInfo:
     found = await _ask(path, f"STREAM.INFO.{STREAM}", {})
     with _as_wanted():
         config, state = found["config"], found["state"]
         if not config.get("allow_direct"):
             raise FleetError(f"the stream {STREAM!r} allows no direct gets: set allow_direct")
-        return StreamAbout(str(found["created"]), int(state["first_seq"]), int(state["last_seq"]))
+        return StreamInfo(str(found["created"]), int(state["first_seq"]), int(state["last_seq"]))
 
 
 async def last_of(path: ServerPath, subject: str) -> LastMessage | None:
@@ -154,7 +154,7 @@ async def publish(path: ServerPath, subject: str, data: bytes, headers: dict[str
     After a FleetError, the outcome is unknown: the message may have been stored.
     """
     try:
-        answer = await path.request(subject, data, headers, ANSWER_S)
+        answer = await _answer_to(path.request(subject, data, headers, ANSWER_S))
     except NobodyThere as failure:
         raise FleetError(f"no stream takes {subject}: it is missing, or has no leader now") from failure
     found = parsed_answer(answer.data)
@@ -174,7 +174,7 @@ def number_of(text: str | None) -> int:
 async def _ask(path: ServerPath, subject: str, what: Mapping[str, Any], *none: int) -> Any:
     """Return the answer of JetStream's API to a request; None for an error whose code is in `none`."""
     try:
-        return await ask(path, subject, what, ANSWER_S)
+        return await _answer_to(ask(path, subject, what, ANSWER_S))
     except NobodyThere as failure:
         raise FleetError("the NATS servers run without JetStream, or have no quorum now") from failure
     except ServerError as failure:
@@ -198,9 +198,8 @@ SUBJECT = f"$JS.API.DIRECT.GET.{STREAM}"
 class StreamMessage(NamedTuple):
     """A message as the hub reads it. `sequence` is 0 if the message cannot be from a gateway.
 
-    This is so if its header is missing or invalid, or if the message is a server's answer to a read. A client
-    that may read stored messages can direct such answers to any subject, and so into the samples of another
-    gateway.
+    Then its header is missing or invalid, or the message is a server's answer to a read: a client that may
+    read stored messages can direct such answers to any subject, and so into the samples of another gateway.
     """
 
     place: int
@@ -212,14 +211,14 @@ class StreamMessage(NamedTuple):
 
 
 async def read_after(path: ServerPath, place: int, messages: int, size: int) -> list[StreamMessage]:
-    """Return the next messages after this position, leaving none out: at most `messages`, and `size` bytes.
+    """Return the next messages after this position, without a gap: at most `messages`, and `size` bytes.
 
-    An empty list means that there are none now. Any replica may answer. Raises FleetError.
+    Any replica may answer. Raises FleetError.
     """
     wanted = {"seq": place + 1, "batch": messages, "max_bytes": size, "next_by_subj": f"{STREAM}.>"}
     get = SampleGet()
     try:
-        await path.gather(Request(SUBJECT, json.dumps(wanted).encode()), get, ANSWER_S)
+        await _answer_to(path.gather(Request(SUBJECT, json.dumps(wanted).encode()), get, ANSWER_S))
     except FleetError as failure:
         # no message before the lost one is missing; the next call reads the rest
         if get.found or get.has_hole:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple, get_args
 
-from multidrop.fleet.errors import Conflict, FleetError, Unsure
+from multidrop.fleet.errors import Conflict, FleetError, OutcomeUnknown
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.batch_client import Request
 from multidrop.fleet.servers.connections import ANSWER_S, ServerPath
@@ -43,20 +43,14 @@ class Record(NamedTuple):
 
 
 class WriteAnswers(NamedTuple):
-    """The records that were replaced, with their new revisions, and the keys of the refused records.
-
-    The outcome for any other record is unknown until that record is read.
-    """
+    """Replaced records with their new revisions, and keys of refused records. Other outcomes are unknown."""
 
     stored: list[Record]
     refused: set[str]
 
 
 def bucket_settings(name: str, replicas: int) -> dict[str, Any]:
-    """Return the settings of a bucket's stream: the newest record of each subject, on disk.
-
-    Records cannot be removed, neither by a request nor by a header of a new record.
-    """
+    """Return the settings of a bucket's stream: one record per subject, on disk, which cannot be removed."""
     return {
         "name": f"KV_{name}",
         "subjects": [f"$KV.{name}.>"],
@@ -80,34 +74,32 @@ async def ask(
 ) -> dict[str, Any]:
     """Return JetStream's answer to a request about streams.
 
-    Raises FleetError with the server's text for an error, Unsure if the servers cannot decide or the answer
-    is invalid.
+    Raises ServerError for an error, OutcomeUnknown if the servers cannot decide or the answer is invalid.
     """
     sent = json.dumps(data).encode() if data else b""
     message = await path.request(f"$JS.API.{subject}", sent, answer_s=answer_s)
     said = parsed_answer(message.data)
     error = said.get("error")
     if error and error.get("err_code") == _UNAVAILABLE:
-        raise Unsure(f"{path.url} says: {error.get('description')}")
+        raise OutcomeUnknown(f"{path.url} says: {error.get('description')}")
     if error:
         raise ServerError(error)
     return said
 
 
 def parsed_answer(data: bytes) -> dict[str, Any]:
-    """Return the JSON object in an answer. Raises Unsure for anything else: the outcome is unknown."""
+    """Return the JSON object in an answer. Raises OutcomeUnknown for any other bytes."""
     with suppress(ValueError, RecursionError):
         found = json.loads(data)
         if isinstance(found, dict) and isinstance(found.get("error") or {}, dict):
             return found
-    raise Unsure("the answer of NATS is not a JetStream answer")
+    raise OutcomeUnknown("the answer of NATS is not a JetStream answer")
 
 
 def _revision(said: Mapping[str, Any]) -> int:
-    """Return the sequence number of a stored record. Raises Unsure if the answer lacks that number."""
     revision = said.get("seq")
     if type(revision) is not int:
-        raise Unsure("the answer of NATS has no sequence number")
+        raise OutcomeUnknown("the answer of NATS has no sequence number")
     return revision
 
 
@@ -134,7 +126,7 @@ class Bucket:
     async def put(self, key: str, value: Any, revision: int) -> int:
         """Replace the record if it has exactly this revision, and return its new revision.
 
-        Raises Conflict if it has another revision, Unsure if the outcome is unknown.
+        Raises Conflict if it has another revision, OutcomeUnknown if the outcome is unknown.
         """
         message = await self.path().request(*self._put(Record(key, revision, value)))
         said = parsed_answer(message.data)
@@ -143,17 +135,14 @@ class Bucket:
             return _revision(said)
         if error.get("err_code") in _WRONG_REVISION:
             raise Conflict(f"{self.name}.{key} is no longer at revision {revision}")
-        raise Unsure(f"NATS did not store {self.name}.{key}: {error.get('description')}")
+        raise OutcomeUnknown(f"NATS did not store {self.name}.{key}: {error.get('description')}")
 
     async def put_all(self, records: Sequence[Record]) -> WriteAnswers:
-        """Replace each record if it still has its given revision.
-
-        All requests are sent together. The server decides on each record separately.
-        """
+        """Replace each record that still has its given revision. All requests are sent together."""
         answers = await self.path().request_all([self._put(record) for record in records])
         written = WriteAnswers([], set())
         for record, answer in zip(records, answers, strict=True):
-            with suppress(Unsure):
+            with suppress(OutcomeUnknown):
                 said = parsed_answer(answer or b"")
                 if not said.get("error"):
                     written.stored.append(record._replace(revision=_revision(said)))
@@ -185,7 +174,7 @@ class Bucket:
             found = said["message"]
             subject, data = str(found["subject"]), base64.b64decode(found.get("data", ""))
         except (AttributeError, KeyError, TypeError, ValueError):
-            raise Unsure(f"the answer of NATS about {self.name}.{key} is not a record") from None
+            raise OutcomeUnknown(f"the answer of NATS about {self.name}.{key} is not a record") from None
         return self._record(subject, _revision(found), data)
 
     async def changes(self, after: int) -> list[Record]:
@@ -254,7 +243,6 @@ class Follower:
                 return changed
 
     async def rest(self) -> None:
-        """Wait until the next read is due."""
         await asyncio.sleep(FOLLOW_S)
 
     def take(self, record: Record) -> bool:
@@ -335,7 +323,9 @@ def parsed(bucket: str, key: str, data: bytes) -> tuple[Any, str]:
         value = json.loads(data.decode())  # faster than loads(data), which detects the encoding
     except (ValueError, RecursionError):
         return None, "not JSON"
-    mistake = misshapen(value, SHAPES.get(bucket, {})) or _CHECKS.get(bucket, _nothing)(key, value)
+    mistake = misshapen(value, SHAPES.get(bucket, {}))
+    if not mistake and bucket in _CHECKS:
+        mistake = _CHECKS[bucket](key, value)
     return (None if mistake else value), mistake
 
 
@@ -358,10 +348,6 @@ def with_short_texts(value: Any) -> Any:
     if isinstance(value, list):
         return [*map(with_short_texts, value)]
     return value[:MOST_TEXT] if isinstance(value, str) else value
-
-
-def _nothing(key: str, value: Any) -> str:
-    return ""
 
 
 def _mistake_of_line(key: str, value: Any) -> str:

@@ -1,5 +1,10 @@
 """Connections to NATS: three paths. Each uses its own home server while that server answers.
 
+A direct get is a read that a server forwards to a random server that has the records: to itself, or to
+another one. A server that is cut off still gets its share of the reads for seconds, until the others notice.
+So a read without an early answer is repeated on all paths together. Each answer may be out of date. A write
+that depends on such an answer therefore names the revision that was read.
+
 A user's key is an Ed25519 key pair (an "nkey"). The secret key is in a file that only its user has; servers
 know the public key. Answers to a user go to an inbox that is named after the public key. No other user may
 read the inbox.
@@ -25,16 +30,17 @@ from multidrop.fleet.errors import (
     Denials,
     FleetError,
     NobodyThere,
+    NoRight,
     NotAdmitted,
     NotDelivered,
+    OutcomeUnknown,
     TooOld,
-    Unsure,
     failure_to_connect,
 )
 from multidrop.fleet.leases.rules import PATHS
 from multidrop.fleet.servers.batch_client import BatchClient, DirectGet, DirectMessage, Request
-from multidrop.fleet.servers.direct_gets import Spare, first_answer
 from multidrop.printable import masked
+from multidrop.supervisor import end_tasks
 
 # Minimum version of NATS. In 2.9.10, several clients may replace the same revision (nats-server issue 4320).
 OLDEST = (2, 12)
@@ -58,7 +64,7 @@ class ServerPath:
         self._full = dict(zip(self.urls, urls, strict=True))  # URLs with users and passwords, by masked URL
         self.url = ""  # URL of the present server
         self.others: Sequence[ServerPath] = ()  # the other paths of this process, for repeated reads
-        self.spare = Spare()  # budget for repeated reads, shared by all paths of this process
+        self.budget = RepeatBudget()  # shared by all paths of this process
         self._options = options or {}
         self._pong_s = pong_s
         self._client: BatchClient | None = None
@@ -75,12 +81,11 @@ class ServerPath:
 
     @property
     def server_name(self) -> str:
-        """Return the name of the present server; "" if there is no connection."""
+        """The name of the present server; "" if there is no connection."""
         return str(self._client._server_info.get("server_name", "")) if self._client else ""
 
     @property
     def version(self) -> str:
-        """Return the version of the present server."""
         assert self._client is not None
         found = self._client.connected_server_version
         return f"{found.major}.{found.minor}"
@@ -104,7 +109,7 @@ class ServerPath:
         """Check the connection forever: leave a silent server, and return to the home server if possible."""
         while True:
             try:
-                await self.look_after()
+                await self.check()
                 self._trouble = ""
             except NotAdmitted as failure:
                 if self._trouble != str(failure):
@@ -114,7 +119,7 @@ class ServerPath:
                 pass
             await asyncio.sleep(KEEP_S)
 
-    async def look_after(self) -> None:
+    async def check(self) -> None:
         """Check the connection once; `keep` repeats this."""
         if not self.is_open or not await self._answers():
             self._leave()
@@ -136,7 +141,7 @@ class ServerPath:
         async with self._changing:
             standing: dict[str, Subscription] = {}
             try:
-                await self._bring(client, standing)
+                await self._update_subscriptions(client, standing)
             except (NatsError, OSError) as failure:
                 await _close(client)
                 raise FleetError(f"{url} was lost again at once: {failure}") from None
@@ -153,25 +158,22 @@ class ServerPath:
     async def subscribe(self, subject: str, called: Callable[[Msg], Any]) -> None:
         """Call a coroutine function with each message of a subject, also after a change of server."""
         self._wanted[subject] = called
-        await self._follow_wanted()
+        await self._change_subscriptions()
 
     async def unsubscribe(self, subject: str) -> None:
         """End a subscription, if there is one."""
         self._wanted.pop(subject, None)
-        await self._follow_wanted()
+        await self._change_subscriptions()
 
-    async def _follow_wanted(self) -> None:
+    async def _change_subscriptions(self) -> None:
         async with self._changing:
             if self._client is not None:
                 # If this fails, `keep` soon connects again, and subscribes to all of `_wanted`.
                 with suppress(NatsError, OSError):
-                    await self._bring(self._client, self._standing)
+                    await self._update_subscriptions(self._client, self._standing)
 
-    async def _bring(self, client: BatchClient, standing: dict[str, Subscription]) -> None:
-        """Subscribe a client to all subjects in `_wanted`, and end its subscriptions to other subjects.
-
-        `standing` has the client's subscriptions by subject, and is updated.
-        """
+    async def _update_subscriptions(self, client: BatchClient, standing: dict[str, Subscription]) -> None:
+        """Subscribe the client to exactly the subjects in `_wanted`; `standing` is updated."""
         while standing.keys() != self._wanted.keys():
             for subject in self._wanted.keys() - standing.keys():
                 if called := self._wanted.get(subject):  # `unsubscribe` may have removed the subject
@@ -197,9 +199,9 @@ class ServerPath:
     ) -> Msg:
         """Send a request, and return the answer.
 
-        Raises Unsure if no answer comes in time, NoRight if our credentials do not allow the request or its
-        answer, NotDelivered if the request certainly reached no receiver, and NobodyThere if the server
-        reports that.
+        Raises OutcomeUnknown if no answer comes in time, NoRight if our credentials do not allow the request
+        or its answer, NotDelivered if the request certainly reached no receiver, and NobodyThere if the
+        server reports that.
         """
         client, denials = self._connected(), self._denials
         before = denials.of_request(subject)
@@ -209,15 +211,15 @@ class ServerPath:
             raise NobodyThere(f"no one answers {subject} at {self.url}") from None
         except (NatsError, OSError, TimeoutError) as failure:
             denials.check_request(subject, self._options.get("inbox_prefix", "_INBOX"), before)
-            raise Unsure(f"{self.url} gave no answer to {subject}: {failure}") from None
+            raise OutcomeUnknown(f"{self.url} gave no answer to {subject}: {failure}") from None
 
     async def collect(self, subject: str, data: bytes) -> list[DirectMessage]:
         """Return all messages of a direct get. If this path is slow, repeat the request on the other paths.
 
         Raises the errors of `request`.
         """
-        ways = [self, *(other for other in self.others if other.is_open)]
-        return await first_answer(ways, Request(subject, data), self.spare)
+        paths = [self, *(other for other in self.others if other.is_open)]
+        return await first_answer(paths, Request(subject, data), self.budget)
 
     async def gather(self, request: Request, get: DirectGet, silence_s: float = ANSWER_S) -> None:
         """Collect the messages of a direct get on this path only. Raises the errors of `request`."""
@@ -227,14 +229,18 @@ class ServerPath:
             await client.batch(request, get, silence_s)
         except (NatsError, OSError) as failure:
             denials.check_request(request.subject, self._options.get("inbox_prefix", "_INBOX"), before)
-            raise Unsure(f"{self.url} gave no complete answer to {request.subject}: {failure}") from None
+            raise OutcomeUnknown(
+                f"{self.url} gave no complete answer to {request.subject}: {failure}"
+            ) from None
 
     async def request_all(self, requests: Sequence[Request]) -> list[bytes | None]:
         """Send all requests together and return the answer to each; None for a request without an answer."""
         try:
             return await self._connected().replies(requests, ANSWER_S)
         except (NatsError, OSError) as failure:
-            raise Unsure(f"{self.url} was lost while {len(requests)} requests were sent: {failure}") from None
+            raise OutcomeUnknown(
+                f"{self.url} was lost while {len(requests)} requests were sent: {failure}"
+            ) from None
 
     def _connected(self) -> BatchClient:
         if self._client is None or not self._client.is_connected:
@@ -242,7 +248,6 @@ class ServerPath:
         return self._client
 
     async def close(self) -> None:
-        """Disconnect from the server."""
         self._leave()
         await asyncio.gather(*self._leaving)
 
@@ -286,16 +291,12 @@ async def _close(client: BatchClient) -> None:
 
 
 def _cut(client: BatchClient) -> None:
-    """Close the socket, and end the tasks that nats-py may leave behind.
-
-    nats-py leaves tasks behind if it is cancelled or the server is gone. Ignore the error of its reading
-    task.
-    """
+    """Close the socket, and end the tasks that nats-py leaves if it is cancelled or the server is gone."""
     for subscription in client._subs.values():
         subscription._stop_processing()
     reading = client._reading_task
     if reading is not None and reading.done() and not reading.cancelled():
-        reading.exception()
+        reading.exception()  # fetched, so that asyncio does not report it
     writer = getattr(client._transport, "_io_writer", None)
     if writer is not None and writer.transport is not None:
         writer.transport.abort()
@@ -305,7 +306,7 @@ def paths_of(urls: Sequence[str], options: Mapping[str, Any] | None = None) -> l
     """Return three paths. With three URLs, each path has a different home server."""
     paths = [ServerPath([*urls[at % len(urls) :], *urls[: at % len(urls)]], options) for at in range(PATHS)]
     for path in paths:
-        path.others, path.spare = [other for other in paths if other is not path], paths[0].spare
+        path.others, path.budget = [other for other in paths if other is not path], paths[0].budget
     return paths
 
 
@@ -316,7 +317,6 @@ CREDS = "-----BEGIN NATS USER JWT-----"
 
 
 def new_seed() -> str:
-    """Return a user's new secret key."""
     import nkeys
 
     return bytes(nkeys.encode_seed(os.urandom(32), nkeys.PREFIX_BYTE_USER)).decode()
@@ -334,7 +334,6 @@ def public_key(seed: str) -> str:
 
 
 def inbox_of(public: str) -> str:
-    """Return the prefix of a user's inboxes."""
     return f"_INBOX_{public}"
 
 
@@ -376,3 +375,101 @@ def _context(ca: Path | None) -> ssl.SSLContext:
         raise ValueError(f"{ca} has no certificate: it must be a PEM file") from None
     except OSError as failure:
         raise ValueError(f"{ca}: {failure.strerror}") from None
+
+
+# ---- repeated reads ----
+
+# silence before each repeat of a read; after the last silence the read fails
+AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)
+SLOW = 3.0  # silence before a repeat, as a multiple of the usual time of an answer
+MOST_SILENCE_S = 1.0  # limit of the silence before a repeat, because requests time out then
+FORGET = 0.97  # factor by which the usual time of an answer decays with each answer
+MOST_REPEATS = 300.0  # limit of the budget: twice the repeats needed until servers notice a dead route (3 s)
+EARNED = 0.5  # repeats that each timely answer adds to the budget
+
+
+class RepeatBudget:
+    """The budget for repeated reads of one process, and how long to wait before a repeat.
+
+    If all servers are slow, repeated reads make them even slower. So the budget is empty at first. Each
+    timely answer earns half a repeat. If a read was repeated, and its first request is answered after all,
+    the repeat was needless, and the budget is halved.
+
+    A client that has seen slow answers also waits proportionally longer before a repeat. Otherwise, when many
+    gateways start and read whole buckets, these large reads would use up the repeats that small reads have
+    earned.
+    """
+
+    def __init__(self) -> None:
+        self._left = 0.0
+        self._took_s = MOST_SILENCE_S / SLOW  # usual time of an answer; at first an assumed value
+
+    def note(self, *, is_late: bool) -> None:
+        """Update the budget when the first request of a read was answered.
+
+        `is_late` means that the read was repeated before the answer came.
+        """
+        self._left = self._left / 2 if is_late else min(self._left + EARNED, MOST_REPEATS)
+
+    def learn(self, took_s: float) -> None:
+        self._took_s = max(took_s, FORGET * self._took_s)
+
+    def silence_s(self, least_s: float) -> float:
+        """Return how many seconds to wait for a message: at least `least_s`, more if answers are slow."""
+        return max(least_s, min(SLOW * self._took_s, MOST_SILENCE_S))
+
+    def spend(self, paths: Sequence[ServerPath]) -> Sequence[ServerPath]:
+        """Return as many of these paths as the budget allows, and charge the budget for a repeat on each."""
+        asked = paths[: int(self._left)]
+        self._left -= len(asked)
+        return asked
+
+
+async def first_answer(
+    paths: Sequence[ServerPath], request: Request, budget: RepeatBudget
+) -> list[DirectMessage]:
+    """Return the messages of the first complete answer. Raises FleetError if no complete answer comes.
+
+    The request is first sent on the first path only, because that path usually answers immediately.
+    """
+    loop = asyncio.get_running_loop()
+    gets: dict[asyncio.Task[None], DirectGet] = {}
+    asked_at: dict[DirectGet, float] = {}
+    first: DirectGet | None = None
+    failure: BaseException = OutcomeUnknown(f"no answer to {request.subject}")
+    try:
+        for number, least_s in enumerate(AGAIN_S):
+            again = paths[1:] if number == 1 and paths[1:] else paths
+            for path in budget.spend(again) if number else paths[:1]:
+                get = DirectGet()
+                first = first or get
+                asked_at[get] = loop.time()
+                gets[asyncio.create_task(path.gather(request, get))] = get
+            while await _is_one_over(gets, budget.silence_s(least_s)):
+                for task in [task for task in gets if task.done()]:
+                    get = gets.pop(task)
+                    if not (failed := task.exception()):
+                        budget.learn(loop.time() - asked_at[get])
+                        if get is first:
+                            budget.note(is_late=number > 0)
+                        return get.messages
+                    failure = failed
+            is_refused = isinstance(failure, NoRight)  # all servers grant the same rights
+            if not gets and (number or not paths[1:] or is_refused):
+                break
+        raise failure
+    finally:
+        await end_tasks(*gets)
+
+
+async def _is_one_over(gets: Mapping[asyncio.Task[None], DirectGet], silence_s: float) -> bool:
+    """Wait until one of the requests has ended, and return True.
+
+    Return False after `silence_s` seconds without data, or if no request is left.
+    """
+    while gets:
+        before = sum(get.count for get in gets.values())
+        done, _ = await asyncio.wait(gets, timeout=silence_s, return_when=asyncio.FIRST_COMPLETED)
+        if done or sum(get.count for get in gets.values()) == before:
+            return bool(done)
+    return False

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any, NamedTuple
 
-from multidrop.fleet.errors import FleetError, Unsure
+from multidrop.fleet.errors import FleetError, OutcomeUnknown
 from multidrop.fleet.lines.ownership import NEEDED
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import ask
@@ -62,7 +62,6 @@ class Cluster(NamedTuple):
 
     @property
     def has_silent(self) -> bool:
-        """Return True if one of the followers is silent."""
         return any(follower.is_silent for follower in self.followers)
 
     @property
@@ -74,7 +73,7 @@ class Cluster(NamedTuple):
 def cluster_of(info: Mapping[str, Any], path: ServerPath) -> Cluster:
     """Return the leader and the followers of a stream, from its state in `info`.
 
-    If the stream is not replicated, the present server is the leader. Raises Unsure for an invalid state.
+    The present server is the leader of a stream without replicas. Raises OutcomeUnknown if `info` is invalid.
     """
     if "cluster" not in info:
         return Cluster(path.server_name)
@@ -91,7 +90,7 @@ def cluster_of(info: Mapping[str, Any], path: ServerPath) -> Cluster:
         ]
         return Cluster(str(found.get("leader") or ""), tuple(followers))
     except (AttributeError, KeyError, TypeError, ValueError):
-        raise Unsure("the answer of NATS about a bucket's servers is invalid") from None
+        raise OutcomeUnknown("the answer of NATS about a bucket's servers is invalid") from None
 
 
 SOON_S = 0.4  # time limit for leaders' answers, which usually take some milliseconds
@@ -126,23 +125,19 @@ async def led_clusters(path: ServerPath) -> dict[str, Cluster]:
 
 
 async def bring_leaders_home(path: ServerPath, clusters: Mapping[str, Cluster]) -> int:
-    """Hand each bucket over to its home server if that server is a ready follower.
-
-    Return the number of hand-overs.
-    """
+    """Hand over each bucket to its home server if that server is a ready follower. Return how many moved."""
     moved = 0
-    for group in (names.LEASES, names.OWNERS):
-        for place, bucket in enumerate(group):
-            if bucket in clusters:
-                home = clusters[bucket].home_of(place)
-                if home in clusters[bucket].ready:
-                    await hand_over(path, bucket, home)
-                    moved += 1
+    for place, bucket in (*enumerate(names.LEASES), *enumerate(names.OWNERS)):
+        if cluster := clusters.get(bucket):
+            home = cluster.home_of(place)
+            if home in cluster.ready:
+                await hand_over(path, bucket, home)
+                moved += 1
     return moved
 
 
 async def hand_over(path: ServerPath, bucket: str, server: str) -> None:
-    """Ask the leader of a bucket to step down in favour of this server. Failures are ignored."""
+    """Ask the leader of a bucket to step down in favour of this server; ignore a failure."""
     with suppress(FleetError):
         wanted = {"placement": {"preferred": server}}
         await ask(path, f"STREAM.LEADER.STEPDOWN.KV_{bucket}", wanted)

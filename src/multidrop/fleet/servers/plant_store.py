@@ -141,7 +141,6 @@ def line_of(record: Record, folder: Path) -> PlantLine:
 
 
 def _toml(value: Any) -> str:
-    """Return a value in TOML's notation, on one line."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{_toml(str(key))} = {_toml(one)}" for key, one in value.items()) + "}"
     if isinstance(value, list):

@@ -190,7 +190,7 @@ def account_of(user: str) -> str:
 
 
 def _wanted(mine: UserRights) -> list[str]:
-    """Return the subjects on which a user may send requests to gateways."""
+    """Return the subjects on which a user may send requests to gateways (not to the store)."""
     return [subject for subject in mine.publish if not subject.startswith(_STORED)]
 
 

@@ -10,7 +10,7 @@ from datetime import datetime
 from functools import partial
 from typing import Any, TypeVar
 
-from multidrop.fleet.errors import Conflict, FleetError, NobodyThere, NoRight, TooOld, Unsure
+from multidrop.fleet.errors import Conflict, FleetError, NobodyThere, NoRight, OutcomeUnknown, TooOld
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import NONE_YET, Bucket, LeaseBucket, ServerError, ask, bucket_settings
 from multidrop.fleet.servers.connections import ServerPath
@@ -75,12 +75,12 @@ async def check_buckets(path: ServerPath) -> None:
 def check_clock(path: ServerPath, server_time: Any) -> None:
     """Warn if this computer's clock differs from the server's: the times of samples would be wrong.
 
-    Raises Unsure if the server's time is invalid.
+    Raises OutcomeUnknown if the server's time is invalid.
     """
     try:
         apart = time.time() - datetime.fromisoformat(server_time).timestamp()
     except (TypeError, ValueError, OverflowError):
-        raise Unsure(f"the answer of {path.url} about a bucket has no valid time stamp") from None
+        raise OutcomeUnknown(f"the answer of {path.url} about a bucket has no valid time stamp") from None
     if abs(apart) > CLOCKS_APART_S:
         _log.warning(
             "this machine's clock is %.0f s %s that of %s: set it, because samples have its time",
@@ -89,7 +89,6 @@ def check_clock(path: ServerPath, server_time: Any) -> None:
 
 
 def no_quorum(path: ServerPath, failure: Exception) -> FleetError:
-    """Return the error for servers without a quorum."""
     if isinstance(failure, NobodyThere):
         return FleetError(
             f"no JetStream answers at {path.url}: the configuration of each server needs "
@@ -108,7 +107,7 @@ async def _kept_on(path: ServerPath) -> int:
 
 
 async def _info(path: ServerPath, stream: str) -> dict[str, Any] | None:
-    """Return the state of a stream; None if there is no such stream. Raises Unsure if it has no leader."""
+    """Return the state of a stream; None if it does not exist. Raises OutcomeUnknown without a leader."""
     try:
         info = await ask(path, f"STREAM.INFO.{stream}")
     except ServerError as failure:
@@ -116,7 +115,7 @@ async def _info(path: ServerPath, stream: str) -> dict[str, Any] | None:
             return None
         raise
     if not cluster_of(info, path).leader:
-        raise Unsure(f"the bucket {stream.removeprefix('KV_')} has no leader")
+        raise OutcomeUnknown(f"the bucket {stream.removeprefix('KV_')} has no leader")
     return info
 
 
@@ -156,11 +155,14 @@ async def _contest(paths: Sequence[ServerPath], replicas: int) -> None:
     settings = bucket_settings(CONTEST, replicas)
     await _retried(paths[0], partial(_create, paths[0], settings))
     try:
-        ways = [path for path in paths if path.is_open]
-        claimants = [_claimant(ways[at % len(ways)], f"claimant-{at}") for at in range(CLAIMANTS)]
-        revision, unsure = NONE_YET, 0
-        while revision == NONE_YET or unsure < ROUNDS:
-            unsure += 1
+        open_paths = [path for path in paths if path.is_open]
+        claimants = [
+            LeaseBucket(CONTEST, partial(open_paths.__getitem__, at % len(open_paths)), f"claimant-{at}")
+            for at in range(CLAIMANTS)
+        ]
+        revision, rounds = NONE_YET, 0
+        while revision == NONE_YET or rounds < ROUNDS:
+            rounds += 1
             claims = [_claim(claimant, revision) for claimant in claimants]
             granted = [found for found in await asyncio.gather(*claims) if found is not None]
             if len(granted) > 1:
@@ -173,14 +175,10 @@ async def _contest(paths: Sequence[ServerPath], replicas: int) -> None:
                 revision = granted[0]
             else:
                 revision = (await _retried(paths[0], partial(claimants[0].get, CONTEST))).revision
-            if unsure > 2 * ROUNDS:
-                raise no_quorum(paths[0], Unsure("no attempt to claim a key succeeded"))
+            if rounds > 2 * ROUNDS:
+                raise no_quorum(paths[0], OutcomeUnknown("no attempt to claim a key succeeded"))
     finally:
         await _retried(paths[0], partial(_remove, paths[0], settings["name"]))
-
-
-def _claimant(path: ServerPath, name: str) -> LeaseBucket:
-    return LeaseBucket(CONTEST, lambda: path, name)
 
 
 async def _claim(claimant: LeaseBucket, revision: int) -> int | None:
