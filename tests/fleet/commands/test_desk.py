@@ -24,7 +24,7 @@ from lines import PATIENCE, patient
 from tables import table
 
 from multidrop import InvtCHE, Stopped
-from multidrop.control import Seen, audit_log, read_audit
+from multidrop.control import Seen, read_audit, records
 from multidrop.control.commands import RepeatedStops, Results, begin_stops, stop_drive, stop_line
 from multidrop.fleet.commands import desk as desk_module
 from multidrop.fleet.commands.desk import MOST_WRITES
@@ -142,7 +142,7 @@ def test_a_command_is_on_the_disk_before_it_is_sent(tmp_path: Path, monkeypatch:
             os.fsync(file)
             synced.append((len(desk.notes), len(desk.writes)))
 
-        monkeypatch.setattr(audit_log, "_sync", sync)
+        monkeypatch.setattr(records, "_sync", sync)
         assert asyncio.run(desk.do(desk.offered())).ok
         assert synced == [(1, 0), (2, 1)]
 
