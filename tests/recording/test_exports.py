@@ -7,12 +7,12 @@ import random
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from itertools import count, product
 from pathlib import Path
+from threading import Semaphore, main_thread
 from typing import Any
 
 import pyarrow as pa
@@ -222,20 +222,53 @@ def test_interrupt_during_a_write_of_hdf5_leaves_no_file(
     assert [path.name for path in tmp_path.iterdir()] == ["run.arrows"]
 
 
-def swallowing(work: Callable[..., Any], interrupts: int) -> Callable[..., Any]:
-    """Return a function that presses Ctrl-C, catches everything as asammdf does, and then does the work."""
+def interrupted_once(
+    work: Callable[..., Any], interrupts: int, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., Any]:
+    """Return a function that at its first call sends SIGINT to the main thread, and then does the work.
+
+    The function catches all exceptions, as asammdf does. Each signal is sent after the main thread handed over
+    its next step: first the one that calls `work`, then the removal of the file.
+    """
+    handled, steps, calls = Semaphore(0), Semaphore(0), count()
+    submit = ThreadPoolExecutor.submit
+
+    def counting_submit(*words: Any) -> Any:
+        future = submit(*words)
+        steps.release()
+        return future
+
+    def interrupt(*_: object) -> None:
+        while steps.acquire(blocking=False):
+            pass
+        handled.release()
+        raise KeyboardInterrupt
 
     def interrupted(*words: Any, **details: Any) -> Any:
-        for _ in range(interrupts):
-            with suppress(BaseException):
-                signal.raise_signal(signal.SIGINT)
-                time.sleep(0.02)  # the handler runs in the main thread
+        if next(calls) == 0:
+            for _ in range(interrupts):
+                with suppress(BaseException):
+                    steps.acquire(timeout=5.0)
+                    signal.pthread_kill(main_thread().ident or 0, signal.SIGINT)
+                    handled.acquire(timeout=5.0)
         return work(*words, **details)
 
+    monkeypatch.setattr(ThreadPoolExecutor, "submit", counting_submit)
+    signal.signal(signal.SIGINT, interrupt)
     return interrupted
 
 
+@pytest.fixture
+def _usual_sigint() -> Iterator[None]:
+    """Restore the handler of SIGINT after the test."""
+    before = signal.getsignal(signal.SIGINT)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows interrupts no wait of the main thread")
+@pytest.mark.usefixtures("_usual_sigint")
 @pytest.mark.parametrize("interrupts", [1, 2])
 @pytest.mark.parametrize("step", ["attach", "append", "extend", "save"])
 def test_interrupt_in_a_step_of_mdf4_leaves_no_file(
@@ -246,7 +279,7 @@ def test_interrupt_in_a_step_of_mdf4_leaves_no_file(
 
     source = record(tmp_path / "run.arrows", rows(400), METADATA)
     monkeypatch.setattr("multidrop.recording.series.PIECE_ROWS", 100)
-    monkeypatch.setattr(MDF, step, swallowing(getattr(MDF, step), interrupts))
+    monkeypatch.setattr(MDF, step, interrupted_once(getattr(MDF, step), interrupts, monkeypatch))
     with pytest.raises(KeyboardInterrupt):
         convert(source, tmp_path / "run.mf4")
     until(lambda: [path.name for path in tmp_path.iterdir()] == ["run.arrows"])
