@@ -393,17 +393,24 @@ def _note(sim: MotorDrive, are_writes: list[bool], on_write: Callable[[], object
 # ---- interruptions, and lost ports ----
 
 SHORT = STEPS.replace('"2 s"', '"300 ms"')
+LONG = SHORT.replace("[20.0, 30.0]", str([20.0, 30.0] * 60))  # a setpoint every 300 ms, for 36 s
 FAST = CHE | {"baudrate": 38400}
+INTERRUPTED = 10  # processes of each seed
+INTERRUPTED_TURNING = 8  # those that are interrupted while their motor turns
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", first_in_ci(*range(10)))
 def test_no_motor_keeps_running_after_ctrl_c_at_a_random_moment(seed: int, tmp_path: Path) -> None:
-    """Each seed interrupts 10 processes in turn, at random moments."""
-    path = write_test(tmp_path, SHORT, fan=FAST)
+    """Each seed interrupts 10 processes in turn: 8 while the motor turns, and 2 at any moment of a short run.
+
+    The simulated drive says whether its motor turns when the signal is sent.
+    """
     chance = random.Random(seed)
-    outcomes = []
-    for _ in range(10):
+    turned = 0
+    for number in range(INTERRUPTED):
+        while_turning = number < INTERRUPTED_TURNING
+        path = write_test(tmp_path, LONG if while_turning else SHORT, fan=FAST)
         with (
             simulated_test(path) as (_plan, sims),
             BoundProcess(
@@ -413,14 +420,16 @@ def test_no_motor_keeps_running_after_ctrl_c_at_a_random_moment(seed: int, tmp_p
                 text=True,
             ) as process,
         ):
-            until(lambda sims=sims: sims[0].counters.requests > 3)  # type: ignore[misc]
-            time.sleep(chance.uniform(0.0, 2.5))
+            counters, motor = sims[0].counters, sims[0].motor
+            until(lambda: motor.energised if while_turning else counters.requests > 3)  # noqa: B023
+            time.sleep(chance.uniform(0.0, 2.0))
+            turned += motor.energised
             process.send_signal(chance.choice((signal.SIGINT, signal.SIGTERM)))
             _, errors = process.communicate()
-            outcomes.append(process.returncode)
             assert turning(sims) == [], errors
-    assert set(outcomes) <= {0, 130, -signal.SIGINT, -signal.SIGTERM}  # 0: the signal came after the run
-    assert 130 in outcomes
+            over = set() if while_turning else {0, -signal.SIGINT, -signal.SIGTERM}
+            assert process.returncode in {130, *over}, errors
+    assert turned >= INTERRUPTED_TURNING
 
 
 @pytest.mark.long
