@@ -24,7 +24,7 @@ from multidrop.core import Message
 from multidrop.drive import Direction, Drive, Script, read
 from multidrop.drive.register import Kept, command, setting
 from multidrop.drive.verbs import verb
-from multidrop.errors import Expired, NoReply, Unconfirmed, WriteForbidden
+from multidrop.errors import CancelledByStop, Expired, NoReply, NotAttached, Unconfirmed, WriteForbidden
 from multidrop.families import YD1000, DelixiModbus, InnovertIBD, InvtCHE
 from multidrop.sim import simulated
 from multidrop.transport import clock
@@ -215,6 +215,23 @@ def test_a_failed_staggered_start_sends_no_stop_to_a_drive_of_unknown_identity(
     with pytest.raises(WriteForbidden, match="multidrop stop PORT invt-goodrive 2"):
         drives[1].stop(seconds=1)  # sent to a Goodrive, this stop would run the motor
     assert {request.address for request, _ in line.frames if is_write(request)} == {1}
+
+
+def test_a_drive_that_leaves_its_bus_during_a_staggered_start_leaves_no_motor_running(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    line, drives, sims = che_drives(monkeypatch, 2)
+    line.frames.clear()
+
+    def leave(request: Message) -> None:
+        if request.address == 2 and drives[1].bus:
+            line.bus.detach(drives[1])
+
+    monkeypatch.setattr(line, "answers", leave)
+    with pytest.raises((CancelledByStop, NotAttached)):
+        start_staggered(drives, 1.0)
+    assert len(starts(line, "invt-che")) == 1
+    assert all_stopped(line, sims)
 
 
 class NotedCalls:

@@ -15,7 +15,7 @@ from multidrop.drive.family import Drive
 from multidrop.drive.register import Kept, Register
 from multidrop.drive.state import Direction
 from multidrop.drive.verbs import Script, Write, read, wait
-from multidrop.errors import WriteForbidden
+from multidrop.errors import NotAttached, WriteForbidden
 from multidrop.transport import clock
 
 # s between reads of waiting drives: a drive silent for PAUSE_NS may have lost its power (identity.py)
@@ -47,9 +47,18 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
                 unheard_s = _await_turn(drives[number:], gap, unheard_s, call)
             drive.carry_out_move(drive.start.script(direction), call)
         except BaseException:
-            is_safe_to_stop = call is None or call.sent or drive.bus.knows_identity(drive)
-            _stop(drives[: number + bool(is_safe_to_stop)])
+            _stop(drives[: number + _is_safe_to_stop(drive, call)])
             raise
+
+
+def _is_safe_to_stop(drive: Drive, call: Call | None) -> bool:
+    """Return False if nothing was sent to the drive, and its identity is unknown or it left its bus."""
+    if call is None or call.sent:
+        return True
+    try:
+        return bool(drive.bus and drive.bus.knows_identity(drive))
+    except NotAttached:  # the drive was removed after `drive.bus` was read
+        return False
 
 
 def _await_turn(waiting: Sequence[Drive], gap: float, unheard_s: float, call: Call | None) -> float:
