@@ -227,8 +227,8 @@ def interrupted_once(
 ) -> Callable[..., Any]:
     """Return a function that at its first call sends SIGINT to the main thread, and then does the work.
 
-    The function catches all exceptions, as asammdf does. Each signal is sent after the main thread handed over
-    its next step: first the one that calls `work`, then the removal of the file.
+    The function catches all exceptions, as asammdf does. A signal is sent only when the main thread has
+    submitted work to the export's thread: first the step that calls `work`, then the removal of the file.
     """
     handled, steps, calls = Semaphore(0), Semaphore(0), count()
     submit = ThreadPoolExecutor.submit
