@@ -20,11 +20,10 @@ from gateways import served
 from lines import PATIENCE, until
 from tables import table
 
-from multidrop.gateway import http_post
+from multidrop.gateway import sending
 from multidrop.gateway.live.alarms import FAULT, PORT, Alarm, AlarmChange, Alarms
 from multidrop.gateway.live.hub import RUNS, Shown
 from multidrop.gateway.notifications import (
-    MOST_RETRY_S,
     MOST_WAITING,
     AlarmQueue,
     AlarmTarget,
@@ -150,7 +149,7 @@ def test_failed_message_is_sent_again_after_growing_pauses() -> None:
     target.sender.put(BEGUN)
     target.failure = OSError("500")
     pauses = [target.send_all() for _ in range(8)]
-    assert (pauses[:3], pauses[-1]) == ([5, 10, 20], MOST_RETRY_S)
+    assert (pauses[:3], pauses[-1]) == ([5, 10, 20], Sender.most_pause_s)
     assert target.sender.problem == "target takes no messages: 500"
     target.failure = None
     assert target.send_all() == inf
@@ -269,12 +268,12 @@ def test_answer_that_is_not_http_is_reported_in_one_sentence() -> None:
         thread = threading.Thread(target=answer)
         thread.start()
         with pytest.raises(OSError, match=r"^the answer is not HTTP$"):
-            http_post.post(f"http://127.0.0.1:{listener.getsockname()[1]}/", b"", {})
+            sending.post(f"http://127.0.0.1:{listener.getsockname()[1]}/", b"", {})
         thread.join()
 
 
 def test_the_wait_for_an_answer_that_arrives_byte_by_byte_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http_post, "SEND_S", 0.1)
+    monkeypatch.setattr(sending, "SEND_S", 0.1)
     ends = time.monotonic() + PATIENCE
 
     def trickle() -> None:
@@ -288,7 +287,7 @@ def test_the_wait_for_an_answer_that_arrives_byte_by_byte_ends(monkeypatch: pyte
         thread = threading.Thread(target=trickle)
         thread.start()
         with pytest.raises(OSError, match=r"did not end within 0.1 s|timed out"):
-            http_post.post(f"http://127.0.0.1:{listener.getsockname()[1]}/", b"", {})
+            sending.post(f"http://127.0.0.1:{listener.getsockname()[1]}/", b"", {})
         thread.join()
 
 

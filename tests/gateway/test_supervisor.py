@@ -19,10 +19,11 @@ from peers import require_module
 
 import multidrop.gateway
 from multidrop import Plant, Poller
-from multidrop.gateway import historian, notifications
-from multidrop.gateway.forward import forwarder
+from multidrop.gateway import historian
+from multidrop.gateway.forward.forwarder import RowForwarder
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.live.alarms import FAULT, Alarm
+from multidrop.gateway.notifications import Sender
 from multidrop.gateway.settings import ServeSettings
 from multidrop.supervisor import Hung, Supervisor, in_time, supervisor
 
@@ -220,8 +221,8 @@ def test_each_thread_and_task_of_all_parts_is_listed_and_reported_if_it_ends(
     for library in ("paho.mqtt.client", "nats", "asyncua", "psycopg", "pyarrow"):
         require_module(library)
     (tmp_path / "targets").write_text("http://127.0.0.1:9/hook\n")
-    for module in (forwarder, notifications):
-        monkeypatch.setattr(module, "MOST_RETRY_S", 0.1)
+    for sender_type in (RowForwarder, Sender):
+        monkeypatch.setattr(sender_type, "most_pause_s", 0.1)
 
     def fail(*details: object) -> None:
         raise ZeroDivisionError("a bug")

@@ -359,7 +359,7 @@ T = TypeVar("T", bound=StopEnd)
 
 
 def drives_of(plant: Plant) -> dict[str, Drive]:
-    return {polled.drive.name: polled.drive for line in plant.lines for polled in line.drives}
+    return {polled.drive.name: polled.drive for polled in plant.drives}
 
 
 def names_of(lines: PolledLines) -> set[str]:

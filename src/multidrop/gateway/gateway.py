@@ -290,15 +290,12 @@ class Gateway:
             await asyncio.sleep(TAKE_S)
 
     def hand_out(self, poller: Poller) -> None:
-        """Give each batch of polled rows to the hub and to all parts; if one of them fails, continue with
-        the others.
-        """
+        """Give each batch of rows to the hub and to all parts; if one fails, continue with the others."""
         while batch := poller.take():
             self._has_news = True
             batch = self.reload.without_changed_drives(batch)
             self.guarded("hub", self.hub.take, batch)
-            for name, feed in self.feeds.items():
-                self.guarded(name, feed.take, batch)
+            self.parts.call("take", batch)
         if self.clock() - self._looked >= LOOK_S:
             self._looked = self.clock()
             self.guarded("events", self._look_for_events)
@@ -348,9 +345,7 @@ class Gateway:
             _log.warning("alarm of %s: %s: %s", where, alarm.kind, alarm.text)
         if self.alarm_file is not None:
             self.alarm_file.note(alarm)
-        for name, feed in self.feeds.items():
-            if hasattr(feed, "note_alarm"):
-                self.guarded(name, feed.note_alarm, alarm, change)
+        self.parts.call("note_alarm", alarm, change)
 
     def guarded(self, name: str, work: Callable[..., object], *arguments: object) -> None:
         try:

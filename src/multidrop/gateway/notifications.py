@@ -11,7 +11,6 @@ import json
 import logging
 import os
 import re
-import threading
 import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
@@ -23,22 +22,20 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
-from multidrop import Batch, Plant
+from multidrop import Plant
 from multidrop.exposition import MetricFamily
 from multidrop.gateway.clock import iso_time
-from multidrop.gateway.http_post import SEND_S, Refused, post
 from multidrop.gateway.live.alarms import KINDS, Alarm, AlarmChange
 from multidrop.gateway.metrics import counter
 from multidrop.gateway.parts import PartContext, missing_library
+from multidrop.gateway.sending import Refused, RetryingSender, post
 from multidrop.gateway.settings import Folders
-from multidrop.printable import printable
 from multidrop.supervisor import supervisor
 
 MOST_TARGETS = 20
 MOST_BYTES = 65_536  # limit of the size of the file of targets in bytes
 MOST_WAITING = 1000  # limit of alarms that wait for a target
 MOST_AN_HOUR = 1000
-RETRY_S, MOST_RETRY_S = 5.0, 300.0  # pause after the first failed attempt, and the longest pause
 CLOSE_S = 2.0
 SCHEME = re.compile(r"[a-z][a-z0-9+.-]*")
 
@@ -261,8 +258,11 @@ def _notify(service: Any, message: dict[str, Any]) -> None:
         raise OSError("the service did not accept the message")
 
 
-class Sender:
-    """Sends messages to one target. Only `run`, which has its own thread, waits for the target."""
+class Sender(RetryingSender):
+    """Sends messages about alarms to one target."""
+
+    log = _log
+    first_pause_s, most_pause_s = 5.0, 300.0
 
     def __init__(
         self,
@@ -272,80 +272,45 @@ class Sender:
         describe: Callable[[Alarm, int], dict[str, Any]],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.name = name
-        self._trouble = ""  # why the target does not take messages now
+        super().__init__(name, clock)
         self.sent = 0
         self._send = send
         self._queue = queue
         self._describe = describe
-        self._clock = clock
-        self._retry_s = RETRY_S
-        self._sending_since_s = inf
-        self._changed = threading.Condition()
-        self._is_closed = False
-
-    @property
-    def problem(self) -> str:
-        """Why the target accepts no messages now; "" if it accepts them."""
-        if self._clock() - self._sending_since_s > 2 * SEND_S:
-            return f"{self.name} has not answered for {2 * SEND_S:g} s"
-        return self._trouble
 
     def put(self, alarm: Alarm) -> None:
         """Queue a message for an alarm that began or ended."""
         with self._changed:
             self._queue.put(alarm)
-            self._changed.notify()
+        self.announce()
 
-    def close(self) -> None:
-        """Make `run` send the messages that the hourly limit still allows, and then return."""
-        with self._changed:
-            self._is_closed = True
-            self._changed.notify()
-
-    def run(self) -> None:
-        """Send queued messages until `close`."""
-        while True:
-            pause_s = self.step()
-            with self._changed:
-                if pause_s == inf:
-                    self._changed.wait_for(lambda: self._is_closed or len(self._queue))
-                elif pause_s > 0:
-                    self._changed.wait_for(lambda: self._is_closed, pause_s)
-                if self._is_closed and (0 < pause_s < inf or not len(self._queue)):
-                    return
+    def _may_end(self, pause_s: float) -> bool:
+        # first send the messages that the hourly limit still allows
+        return pause_s > 0 and not self._has_news
 
     def step(self) -> float:
-        """Send the next message, and return the seconds until the next attempt (inf: until `put`)."""
+        """Send the next message. Return the seconds until the next attempt (inf: until a new message)."""
+        with self._changed:
+            self._has_news = False
+            alarm, wait_s = self._queue.next(self._clock())
+        return wait_s if alarm is None else super().step()
+
+    def _send_next(self) -> float:
         with self._changed:
             alarm, wait_s = self._queue.next(self._clock())
             left_out = self._queue.left_out
-        if alarm is None:
+        if alarm is None:  # a later alarm has replaced it
             return wait_s
-        self._sending_since_s = self._clock()
         try:
             self._send(self._describe(alarm, left_out))
-        except Exception as failure:  # the library of any service may raise anything
-            self._note_failure(failure)
-            if isinstance(failure, (ValueError, Refused)):
-                with self._changed:
-                    self._queue.drop(alarm)  # drop the alarm, because it would block all later messages
-            pause_s, self._retry_s = self._retry_s, min(2 * self._retry_s, MOST_RETRY_S)
-            return pause_s
-        finally:
-            self._sending_since_s = inf
-        self._trouble, self._retry_s = "", RETRY_S
+        except (ValueError, Refused):
+            with self._changed:
+                self._queue.drop(alarm)  # it would block all later messages
+            raise
         self.sent += 1
         with self._changed:
             self._queue.note_sent(alarm)
         return 0.0
-
-    def _note_failure(self, failure: Exception) -> None:
-        reason = str(failure) if isinstance(failure, OSError) else type(failure).__name__
-        trouble = f"{self.name} takes no messages: {printable(reason)[:200]}"
-        if trouble != self._trouble:
-            self._trouble = trouble
-            _log.warning("%s", trouble)
 
 
 class Notifications:
@@ -355,9 +320,6 @@ class Notifications:
         self._senders = senders
         self._kinds = kinds
         self._threads: list[asyncio.Future[None]] = []
-
-    def take(self, batch: Batch) -> None:
-        """Ignore the batch: alarms arrive by `note_alarm`."""
 
     def note_alarm(self, alarm: Alarm, change: AlarmChange) -> None:
         """Queue a message for an alarm that began or ended, but none for an acknowledgement or a new text."""

@@ -1,7 +1,7 @@
 """The optional parts of the gateway, such as the history, MQTT, databases and the OPC UA server.
 
-Each part has a table in `[serve]` and receives every batch of rows. If a part fails, the failure is counted
-and logged, and the other parts continue.
+Each part has a table in `[serve]`. If a part fails, the failure is counted and logged, and the other parts
+continue.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from multidrop import Batch, Plant
+from multidrop import Plant
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.rights import Tokens
 from multidrop.gateway.live.alarms import Alarms
@@ -67,14 +67,11 @@ class PartContext(NamedTuple):
 class Part(Protocol):
     """The methods of a part, which is one interface of the gateway, such as MQTT.
 
-    Four more methods are optional: `adopt(plant)` is called after a reload, and `note_alarm(alarm,
-    change)` when an alarm starts, changes or ends. `health()` returns a problem or "", and `figures()`
-    returns metric families. The part `fleet` may have the attribute `source`, which the gateway
-    uses instead of a poller.
+    Five more methods are optional. `take(batch)` is called with each batch of rows, in the event loop, and
+    must return within 1 ms. `adopt(plant)` is called after a reload, and `note_alarm(alarm, change)` when an
+    alarm starts, changes or ends. `health()` returns a problem or "", and `figures()` returns metric
+    families. The part `fleet` may have the attribute `source`, which the gateway uses instead of a poller.
     """
-
-    def take(self, batch: Batch) -> None:
-        """Process a batch. Called in the loop; must return within 1 ms."""
 
     async def run(self) -> None:
         """Do the part's work until this task is cancelled."""
@@ -140,6 +137,12 @@ class LiveParts:
         built = [one.part.result() for one in self._built.values() if one.part.done()]
         sources = (getattr(part, "source", None) for part in built)
         return next((source for source in sources if source is not None), None)
+
+    def call(self, method: str, *arguments: object) -> None:
+        """Call this method of each running part that has it. If a part's method fails, continue."""
+        for name, part in self.feeds.items():
+            if hasattr(part, method):
+                self._host.guarded(name, getattr(part, method), *arguments)
 
     def take_up(self) -> None:
         """Start the new parts, because the plant for which they were built is in effect now."""

@@ -170,9 +170,7 @@ class Reload:
         gateway.side_reads.cancel()
         gateway.guarded("hub", gateway.hub.adopt, plant, planned)
         gateway.guarded("statistics", gateway.recent.adopt, plant, planned)
-        for name, feed in gateway.feeds.items():
-            if hasattr(feed, "adopt"):
-                gateway.guarded(name, feed.adopt, plant)
+        gateway.parts.call("adopt", plant)
         self._changed = frozenset()
         gateway.guarded("frames", gateway.frames.note_news)
 
@@ -228,8 +226,7 @@ def changed_drives(before: Plant, coming: Plant) -> frozenset[str]:
     meanings = [
         {
             one.drive.name: (type(one.drive), one.drive.address, one.polls, one.channels)
-            for line in plant.lines
-            for one in line.drives
+            for one in plant.drives
         }
         for plant in (before, coming)
     ]

@@ -15,8 +15,8 @@ from lines import until
 from spooled import exchanges_in, numbered, rows_of
 from tables import table
 
-from multidrop.gateway.forward.forwarder import MOST_GAPS, MOST_RETRY_S, SLOW_S, RowForwarder, SpoolPosition
-from multidrop.gateway.http_post import Refused
+from multidrop.gateway.forward.forwarder import MOST_GAPS, SLOW_S, RowForwarder, SpoolPosition
+from multidrop.gateway.sending import Refused
 from multidrop.samples import Spool
 
 
@@ -90,7 +90,7 @@ def test_after_two_hours_without_a_receiver_no_row_is_lost_or_doubled(clocked: C
         clocked.now_s += period_s
         if clocked.now_s >= due_s:
             pause_s = clocked.send_all()
-            assert pause_s <= MOST_RETRY_S
+            assert pause_s <= RowForwarder.most_pause_s
             due_s = clocked.now_s + pause_s
     assert clocked.forwarder.problem == "the receiver takes no rows: Connection refused"
     assert clocked.forwarder.behind == messages

@@ -32,7 +32,7 @@ from postgres_clusters import postgres
 from spooled import NOON, STEP, rows_of
 
 from multidrop.gateway.forward.influx import line_protocol
-from multidrop.gateway.http_post import post
+from multidrop.gateway.sending import post
 from multidrop.printable import parse_time
 from multidrop.samples import unpack
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import threading
 import time
 from collections.abc import Callable, Iterator
 from math import inf, isfinite
@@ -24,9 +23,9 @@ import pyarrow as pa
 from multidrop import Batch, Plant
 from multidrop.exposition import MetricFamily
 from multidrop.gateway.clock import monotonic_ns
-from multidrop.gateway.http_post import Refused
 from multidrop.gateway.metrics import counter
 from multidrop.gateway.reload import changed_drives
+from multidrop.gateway.sending import Refused, RetryingSender
 from multidrop.printable import format_time, printable
 from multidrop.recording import parse_size
 from multidrop.samples import MessageError, PolledUnits, SinkError, Spool, StoredMessage, unpack
@@ -35,7 +34,6 @@ from multidrop.whole_file import whole_file
 
 MOST_ROWS = 2000  # limit of rows in one request or MQTT message, about 250 kB of JSON
 NOT_FINITE = "not a finite number"  # status of a row whose value JSON and InfluxDB cannot represent
-RETRY_S, MOST_RETRY_S = 1.0, 30.0  # pause after the first failed attempt, and the longest pause
 SLOW_S = 40.0  # a receiver that takes longer than this (in s) for one message is reported
 REMOVED_S = 0.01  # pause if the full spool has just removed the message that was to be sent
 # A gap is a range of messages that were skipped to send a newer one first. At this limit, none are skipped.
@@ -161,91 +159,47 @@ class RepeatingReceiver:
         pass
 
 
-class RowForwarder:
-    """Sends a spool's messages to a receiver. `run` waits for the receiver, so it needs its own thread.
+class RowForwarder(RetryingSender):
+    """Sends a spool's messages to a receiver."""
 
-    `name` is the receiver's name in logs and in /health, without secrets.
-    """
+    log, what, slow_s = _log, "rows", SLOW_S
 
     def __init__(
         self, name: str, spool: Spool, receiver: RowReceiver, clock: Callable[[], float] = time.monotonic
     ) -> None:
+        super().__init__(name, clock)
         state = spool.state()
         self.rows = 0  # rows sent since the start
         self.refused = 0  # rows that the receiver does not accept
-        self._name = name
         self._spool = spool
         self._receiver = receiver
-        self._clock = clock
         self._earlier = state.newest  # number of the newest message of earlier runs
         self._position = SpoolPosition(max(0, state.oldest - 1))  # assumed before `_ask`
         self._is_asked = False
         self._accepted = 0  # messages sent since the start
         # by number of a refused message: the value of `_accepted` at the refusal
         self._refusals: dict[int, int] = {}
-        self._trouble = ""
-        self._retry_s = RETRY_S
-        self._sending_since_s = inf
-        self._changed = threading.Condition()
-        self._has_news = False
-        self._is_closed = False
         spool.acknowledge(self._position.newest)
-        spool.on_message = self._announce
-
-    # ---- called by the gateway ----
+        spool.on_message = self.announce
 
     @property
     def behind(self) -> int:
         """The number of stored messages that the receiver lacks."""
         return self._position.behind(self._spool.state().newest)
 
-    @property
-    def problem(self) -> str:
-        """Why no rows are sent now; "" if they are sent."""
-        if self._clock() - self._sending_since_s > SLOW_S:
-            return f"{self._name} has not answered for {SLOW_S:g} s"
-        return self._trouble
-
-    def _announce(self) -> None:
-        with self._changed:
-            self._has_news = True
-            self._changed.notify()
-
-    def close(self) -> None:
-        """End `run` after the message that is being sent."""
-        with self._changed:
-            self._is_closed = True
-            self._changed.notify()
-
     # ---- called in the forwarder's own thread ----
 
     def run(self) -> None:
         """Send messages until `close`."""
-        while not self._is_closed:
-            pause_s = self.step()
-            with self._changed:
-                if pause_s == inf:
-                    self._changed.wait_for(lambda: self._is_closed or self._has_news)
-                elif pause_s > 0:
-                    self._changed.wait_for(lambda: self._is_closed, pause_s)
+        super().run()
         self._receiver.close()
 
-    def step(self) -> float:
-        """Send the next message. Return the seconds until the next attempt (inf: until a new message)."""
-        self._has_news = False
-        self._sending_since_s = self._clock()
-        try:
-            pause_s = self._send_next()
-        except Exception as failure:  # a library may raise anything; the rows stay in the spool
-            self._is_asked = False
-            self._note(f"{self._name} takes no rows: {_reason(failure)}")
-            pause_s, self._retry_s = self._retry_s, min(2 * self._retry_s, MOST_RETRY_S)
-            return pause_s
-        finally:
-            self._sending_since_s = inf
-        self._note("")
-        self._retry_s = RETRY_S
-        return pause_s
+    def _may_end(self, pause_s: float) -> bool:
+        return True  # the rows stay in the spool
+
+    def _note_failure(self, failure: Exception) -> None:
+        self._is_asked = False
+        super()._note_failure(failure)
 
     def _send_next(self) -> float:
         if not self._is_asked:
@@ -311,19 +265,7 @@ class RowForwarder:
     def _leave_out(self, stored: StoredMessage, why: str) -> None:
         self._refusals.pop(stored.sequence, None)
         self.refused += stored.rows
-        _log.error("%s does not get %d rows: %s", self._name, stored.rows, printable(why)[:200])
-
-    def _note(self, trouble: str) -> None:
-        if trouble and trouble != self._trouble:
-            _log.warning("%s", trouble)
-        if self._trouble and not trouble:
-            _log.info("%s takes rows again", self._name)
-        self._trouble = trouble
-
-
-def _reason(failure: Exception) -> str:
-    text = str(failure) if isinstance(failure, OSError) else type(failure).__name__
-    return printable(text or type(failure).__name__)[:200]
+        _log.error("%s does not get %d rows: %s", self.name, stored.rows, printable(why)[:200])
 
 
 class Forwarding:

@@ -26,8 +26,8 @@ from multidrop.gateway.forward.settings import (
     spool_mistakes,
     url_mistakes,
 )
-from multidrop.gateway.http_post import post
 from multidrop.gateway.parts import PartContext
+from multidrop.gateway.sending import post
 from multidrop.toml_check import SIZE
 
 STDOUT = "stdout"

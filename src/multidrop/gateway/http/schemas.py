@@ -12,14 +12,14 @@ from multidrop.gateway.live.alarms import KINDS
 Schema = Mapping[str, Any]
 
 
-def record(**fields: Schema) -> Schema:
-    """Return the schema of an object that has these keys."""
-    return {"type": "object", "properties": fields, "required": [*fields]}
+def record(texts: str = "", /, **fields: Schema) -> Schema:
+    """Return the schema of an object that has these keys. `texts` names the keys whose values are strings."""
+    return {**some(texts, **fields), "required": [*texts.split(), *fields]}
 
 
-def some(**fields: Schema) -> Schema:
-    """Return the schema of an object that may lack any of these keys."""
-    return {"type": "object", "properties": fields}
+def some(texts: str = "", /, **fields: Schema) -> Schema:
+    """Return the schema of an object that may lack any of these keys; else like `record`."""
+    return {"type": "object", "properties": dict.fromkeys(texts.split(), TEXT) | fields}
 
 
 def listed(schema: Schema) -> Schema:
@@ -36,7 +36,6 @@ def maybe(schema: Schema) -> Schema:
 
 
 TEXT: Schema = {"type": "string"}
-SENTENCE = {"text": TEXT}
 GIVEN: Schema = {"type": "string", "minLength": 1}
 NUMBER: Schema = {"type": "number"}
 WHOLE: Schema = {"type": "integer"}
@@ -64,7 +63,7 @@ SEEN: Schema = {
     "maximum": (1 << 63) - 1,
     "description": "The number n of the newest frame that you have received",
 }
-ERROR = record(error=TEXT)
+ERROR = record("error")
 
 # ---- plant ----
 
@@ -74,15 +73,10 @@ LANGUAGE: Schema = {
     "examples": ["ru"],
 }
 _REGISTER = record(
-    name=TEXT,
-    title=TEXT,
-    unit=TEXT,
+    "name title unit access place note",
     digits=maybe(WHOLE),
     kind={"enum": ["number", "bits", "words"]},
     words=REASONS,
-    access=TEXT,
-    place=TEXT,
-    note=TEXT,
     least=maybe(NUMBER),
     most=maybe(NUMBER),
     at_least=maybe(TEXT),
@@ -92,19 +86,15 @@ _REGISTER = record(
     holds_s=maybe(NUMBER),
 )
 _DRIVE = record(
-    name=TEXT,
-    family=TEXT,
-    title=TEXT,
+    "name family title speed",
     address=WHOLE,
-    speed=TEXT,
     key=record(frequency=maybe(TEXT), current=maybe(TEXT), setpoint=maybe(TEXT)),
     registers=listed(_REGISTER),
     verbs=TEXTS,
 )
 PLANT = record(
+    "version name",
     revision=WHOLE,
-    version=TEXT,
-    name=TEXT,
     demo=FLAG,
     file=FLAG,
     history=FLAG,
@@ -112,23 +102,18 @@ PLANT = record(
     fleet_stop=FLAG,
     mistakes=TEXTS,
     may=record(role=maybe({"enum": ["look", "stop", "write"]}), write=TEXTS, verbs=TEXTS),
-    lines=listed(record(name=TEXT, port=TEXT, speed=TEXT, drives=listed(_DRIVE))),
+    lines=listed(record("name port speed", drives=listed(_DRIVE))),
 )
 
 # ---- live values ----
 
 ALARM = record(
-    id=TEXT,
+    "id drive text line by note",
     time=TIME,
-    drive=TEXT,
-    **SENTENCE,
     ended=maybe(TIME),
     kind={"enum": [*KINDS]},
-    line=TEXT,
     is_before=FLAG,
     acknowledged=maybe(TIME),
-    by=TEXT,
-    note=TEXT,
 )
 ALARMS = record(alarms=listed(ALARM), since=TIME)
 _VALUE: Schema = {
@@ -139,10 +124,10 @@ _VALUE: Schema = {
     "description": "value, index of its age; of a missing value also status, last value, index of its age",
 }
 _SHOWN = some(
+    "note",
     state={"enum": ["runs", "stands", "fault", "silent", "unknown"]},
     fault=maybe(TEXT),
     why=maybe(TEXT),
-    note=TEXT,
     seen=maybe(WHOLE),
     ages_ms=listed(WHOLE),
     values=by_name(_VALUE),
@@ -174,7 +159,7 @@ FRAME: Schema = {
 }
 _USUAL = {"p50": maybe(NUMBER), "p99": maybe(NUMBER)}
 DRIVE = record(
-    drive=TEXT,
+    "drive",
     delays=maybe(record(**_USUAL, longest=NUMBER, replies=WHOLE, counts=listed(listed(NUMBER)))),
     misses=COUNTS,
     asked=WHOLE,
@@ -187,7 +172,7 @@ DRIVE = record(
             "description": 'value or null, UTC in ms, "ok" or the reason',
         }
     ),
-    ledger=listed(record(register=TEXT, year=WHOLE, budget=WHOLE, total=WHOLE)),
+    ledger=listed(record("register", year=WHOLE, budget=WHOLE, total=WHOLE)),
 )
 LINES = by_name(
     record(
@@ -199,49 +184,38 @@ LINES = by_name(
 MINUTE = by_name(by_name(listed({**NUMBERS, "description": "UTC in ms, and the value or null"})))
 PARAMETERS: Schema = {
     **some(
+        "error saved",
         state={"enum": ["none", "reading", "failed", "read"]},
-        error=TEXT,
         done=WHOLE,
         total=WHOLE,
-        saved=TEXT,
         parameters=listed({"type": "object"}),
     ),
     "required": ["state"],
 }
 MODBUS_MAP = listed(
     record(
-        line=TEXT,
-        drive=TEXT,
+        "line drive name title format order bits unit unknown note",
         tcp_port=WHOLE,
         unit_id=WHOLE,
         status_address=WHOLE,
-        name=TEXT,
-        title=TEXT,
         access={"enum": ["read", "write", "read and write"]},
         function=maybe(WHOLE),
         write_function=maybe(WHOLE),
         address=WHOLE,
         words=WHOLE,
-        format=TEXT,
-        order=TEXT,
-        bits=TEXT,
         step=maybe(NUMBER),
         offset=NUMBER,
         scale_address=maybe(WHOLE),
-        unit=TEXT,
-        unknown=TEXT,
         source={"enum": ["polled", "drive", "gateway"]},
-        note=TEXT,
     )
 )
 HEALTH = record(
+    "version audit",
     status={"enum": ["ok", "degraded", "failed"]},
-    version=TEXT,
     uptime_s=NUMBER,
     newest_row=maybe(TIME),
     lines=REASONS,
     parts=REASONS,
-    audit=TEXT,
     dead=REASONS,
     hung=REASONS,
     mistakes=TEXTS,
@@ -268,11 +242,10 @@ HISTORY = record(
 TRIGGERS = record(
     triggers=listed(
         record(
-            name=TEXT,
-            condition=TEXT,
+            "name condition",
             time=TIME,
             **{"from": TIME, "to": TIME},
-            signals=listed(record(drive=TEXT, register=TEXT)),
+            signals=listed(record("drive register")),
         )
     )
 )
@@ -307,14 +280,14 @@ ACT: Schema = {
         {**some(drive=GIVEN, verb={"enum": sorted(STOPPING)}), "required": ["drive", "verb"]},
     ]
 }
-COMMANDED = record(done=FLAG, **SENTENCE, id=ID)
+COMMANDED = record("text", done=FLAG, id=ID)
 STOPPED = by_name(COMMANDED)
-FLEET_STOPPED = by_name(record(done=FLAG, **SENTENCE))
+FLEET_STOPPED = by_name(record("text", done=FLAG))
 ACKNOWLEDGE: Schema = {
     **some(alarm=GIVEN, note={"type": "string", "maxLength": 500}),
     "required": ["alarm"],
 }
 RELOAD: Schema = record(confirm={"const": True})
-RELOADED = record(done=FLAG, **SENTENCE, mistakes=TEXTS, restart=TEXTS)
+RELOADED = record("text", done=FLAG, mistakes=TEXTS, restart=TEXTS)
 TOKEN = record(token=GIVEN)
-LOGGED_IN = record(name=TEXT, role={"enum": ["look", "stop", "write"]})
+LOGGED_IN = record("name", role={"enum": ["look", "stop", "write"]})

@@ -359,8 +359,7 @@ def read_limits(tables: Any, plant: Plant, place: TomlPlace) -> tuple[Limit, ...
     """Return the limits in the tables `[[serve.limit]]`; mistakes are added to `place`."""
     units = {
         (polled.drive.name, poll.register.name): poll.register.unit
-        for line in plant.lines
-        for polled in line.drives
+        for polled in plant.drives
         for poll in polled.series
     }
     found = []

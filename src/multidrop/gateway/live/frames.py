@@ -63,8 +63,7 @@ def frame_of(
             polled.drive.name: _drive(hub, polled.drive.name, time_ns)
             | {"stops": stops.get(polled.drive.name, 0)}
             | recent.drive_figures(polled.drive.name)
-            for line in hub.plant.lines
-            for polled in line.drives
+            for polled in hub.plant.drives
         },
         "lines": {
             line.name: recent.line(line.name) | {"lost": lost_of(hub, line.name)} for line in hub.plant.lines

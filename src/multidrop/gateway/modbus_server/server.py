@@ -10,7 +10,7 @@ from collections.abc import Awaitable
 from functools import partial
 from typing import Any
 
-from multidrop import Batch, BusError, Plant
+from multidrop import BusError, Plant
 from multidrop.gateway.clock import monotonic_ns
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.connections import listen
@@ -95,9 +95,6 @@ class ModbusServer:
             self._standstill.note()
             for port in self._listening:
                 port.sweep()
-
-    def take(self, batch: Batch) -> None:
-        """Ignore the batch: the hub has the rows."""
 
     def _close_sockets(self) -> None:
         for listener in self._sockets.values():

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
-from multidrop import Batch, BusError, Plant, PlantLine
+from multidrop import BusError, Plant, PlantLine
 from multidrop.core import Framing
 from multidrop.drive import DEVICE_ID, MEI_DEVICE_ID, SERVER_ID, STATUS
 from multidrop.gateway.commands import Commands
@@ -439,9 +439,6 @@ class ToolPorts:
             self._standstill.note()
             for tools in self._tools.values():
                 self._sweep(tools, loop.time())
-
-    def take(self, batch: Batch) -> None:
-        """Ignore the batch: tools read from the drives."""
 
     def adopt(self, plant: Plant) -> None:
         """Continue with another plant; tools stay connected."""

@@ -206,7 +206,7 @@ class PlantNodes:
 
     async def adopt(self, plant: Plant) -> None:
         """Remove the nodes of drives that changed or are gone, and add those of new drives."""
-        wanted = {polled.drive.name: polled for line in plant.lines for polled in line.drives}
+        wanted = {polled.drive.name: polled for polled in plant.drives}
         for name in [name for name, known in self._drives.items() if wanted.get(name) != known.polled]:
             await self._remove(name)
             self._removed += 1

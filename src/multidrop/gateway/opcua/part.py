@@ -19,7 +19,7 @@ from importlib import import_module
 from math import inf
 from typing import TYPE_CHECKING, Any
 
-from multidrop import Batch, NoReply, Plant
+from multidrop import NoReply, Plant
 from multidrop.control import CommandResult
 from multidrop.gateway.commands import MOST_STOPS
 from multidrop.gateway.http.connections import listen
@@ -75,9 +75,6 @@ class OpcUa:
         self._writing: Future[None] | None = None  # pending while the server takes over values
 
     # ---- in the gateway's loop ----
-
-    def take(self, batch: Batch) -> None:
-        """Ignore the batch: the hub has the rows."""
 
     def adopt(self, plant: Plant) -> None:
         """Use another plant; the server gets it before the next values."""

@@ -55,8 +55,7 @@ class OpcUaSettings:
             if name and not path.is_file():
                 yield f'{key} = "{name}": there is no file {path}'
         drives = drives_of(plant)
-        declared = [polled for line in plant.lines for polled in line.drives]
-        channels = {polled.drive.name: {one.name for one in polled.channels} for polled in declared}
+        channels = {polled.drive.name: {one.name for one in polled.channels} for polled in plant.drives}
         for name in drives:
             owner, _, rest = name.rpartition(".")
             if owner in drives and rest in {*drives[owner].registers, *channels[owner], *MEMBERS}:

@@ -1,0 +1,187 @@
+"""Send messages to other servers: by POST, and in a thread that repeats failed attempts."""
+
+from __future__ import annotations
+
+import io
+import logging
+import socket
+import threading
+import time
+import urllib.error
+import urllib.request
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from http.client import HTTPException, HTTPResponse
+from math import inf
+from typing import Any
+
+from multidrop.printable import printable
+
+SEND_S = 20.0  # time limit of each step: connecting, sending the request, and receiving the whole answer
+REFUSED = (400, 413, 422)  # HTTP statuses of a body that the server does not accept
+MOST_ANSWER = 300  # an error reports at most this many bytes of the server's answer
+USER_AGENT = "multidrop"
+
+
+class Refused(OSError):
+    """The receiver rejected this message; it may reject every other message too."""
+
+
+class _NoRedirects(urllib.request.HTTPRedirectHandler):
+    """Refuses redirects: they would change a POST to a GET, and could name any host."""
+
+    def redirect_request(self, *arguments: Any) -> None:
+        return None
+
+
+class _Answer(HTTPResponse):
+    """An answer that must arrive within SEND_S. Else a server that sends single bytes could take days."""
+
+    def __init__(self, sock: socket.socket, *arguments: Any, **more: Any) -> None:
+        super().__init__(sock, *arguments, **more)
+        self.fp: Any = io.BufferedReader(_TimedBytes(self.fp.detach(), sock))
+
+
+class _TimedBytes(io.RawIOBase):
+    """The bytes of a socket. Reading raises TimeoutError once this object is older than SEND_S."""
+
+    def __init__(self, raw: io.RawIOBase, sock: socket.socket) -> None:
+        self._raw, self._sock = raw, sock
+        self._ends = time.monotonic() + SEND_S
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> Any:
+        left_s = self._ends - time.monotonic()
+        if left_s <= 0:
+            raise TimeoutError(f"the answer did not end within {SEND_S:g} s")
+        self._sock.settimeout(left_s)
+        return self._raw.readinto(buffer)
+
+    def close(self) -> None:
+        self._raw.close()
+        super().close()
+
+
+class _AnswerOpener(urllib.request.HTTPSHandler, urllib.request.HTTPHandler):
+    """Opens connections whose answers are `_Answer`."""
+
+    def do_open(self, http_class: Any, req: urllib.request.Request, **options: Any) -> HTTPResponse:
+        def connection(host: str, **more: Any) -> Any:
+            made = http_class(host, **more)
+            made.response_class = _Answer
+            return made
+
+        return super().do_open(connection, req, **options)
+
+
+_opener = urllib.request.build_opener(_NoRedirects, _AnswerOpener)
+
+
+def post(url: str, body: bytes, headers: Mapping[str, str]) -> None:
+    """Send this body. Raises Refused if the server will never accept the body, and OSError after any other
+    failure.
+    """
+    request = urllib.request.Request(url, body, {"user-agent": USER_AGENT, **headers})
+    try:
+        with _opener.open(request, timeout=SEND_S):
+            pass
+    except urllib.error.HTTPError as answer:
+        if answer.code not in REFUSED:
+            raise
+        with answer:
+            said = answer.read(MOST_ANSWER).decode("utf-8", "replace")
+        raise Refused(f"{answer}: {said}") from answer
+    except urllib.error.URLError as failure:
+        raise OSError(getattr(failure.reason, "strerror", None) or failure.reason) from failure
+    except HTTPException as failure:
+        raise OSError("the answer is not HTTP") from failure
+
+
+# ---- the thread of a receiver ----
+
+
+class RetryingSender(ABC):
+    """Sends messages to one receiver, with growing pauses after failures.
+
+    `name` is the receiver's name in logs and in /health, without secrets. Only `run`, which has its own
+    thread, waits for the receiver.
+    """
+
+    log = logging.getLogger("multidrop.gateway")
+    what = "messages"
+    slow_s = 2 * SEND_S  # a receiver that takes longer than this for one message is reported
+    first_pause_s, most_pause_s = 1.0, 30.0  # pause after the first failed attempt, and the longest pause
+
+    def __init__(self, name: str, clock: Callable[[], float]) -> None:
+        self.name = name
+        self._clock = clock
+        self._trouble = ""  # why the receiver takes no messages now
+        self._pause_s = self.first_pause_s
+        self._sending_since_s = inf
+        self._changed = threading.Condition()
+        self._has_news = False  # True: messages were added since the last attempt began
+        self._is_closed = False
+
+    @property
+    def problem(self) -> str:
+        """Why the receiver takes no messages now; "" if it takes them."""
+        if self._clock() - self._sending_since_s > self.slow_s:
+            return f"{self.name} has not answered for {self.slow_s:g} s"
+        return self._trouble
+
+    def announce(self) -> None:
+        """Wake `run`, because a message was added."""
+        with self._changed:
+            self._has_news = True
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Make `run` return, as soon as `_may_end` allows it."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify()
+
+    def run(self) -> None:
+        """Send messages until `close`."""
+        pause_s = 0.0
+        while not (self._is_closed and self._may_end(pause_s)):
+            pause_s = self.step()
+            with self._changed:
+                if pause_s == inf:
+                    self._changed.wait_for(lambda: self._is_closed or self._has_news)
+                elif pause_s > 0:
+                    self._changed.wait_for(lambda: self._is_closed, pause_s)
+
+    def step(self) -> float:
+        """Send the next message. Return the seconds until the next attempt (inf: until a new message)."""
+        self._has_news = False
+        self._sending_since_s = self._clock()
+        try:
+            wait_s = self._send_next()
+        except Exception as failure:  # a library may raise anything
+            self._note_failure(failure)
+            wait_s, self._pause_s = self._pause_s, min(2 * self._pause_s, self.most_pause_s)
+            return wait_s
+        finally:
+            self._sending_since_s = inf
+        if self._trouble:
+            self.log.info("%s takes %s again", self.name, self.what)
+        self._trouble, self._pause_s = "", self.first_pause_s
+        return wait_s
+
+    def _note_failure(self, failure: Exception) -> None:
+        reason = (isinstance(failure, OSError) and str(failure)) or type(failure).__name__
+        trouble = f"{self.name} takes no {self.what}: {printable(reason)[:200]}"
+        if trouble != self._trouble:
+            self._trouble = trouble
+            self.log.warning("%s", trouble)
+
+    @abstractmethod
+    def _send_next(self) -> float:
+        """Send the next message, if any. Return what `step` returns; raise any exception after a failure."""
+
+    @abstractmethod
+    def _may_end(self, pause_s: float) -> bool:
+        """Return True if `run` may return after `close`; `pause_s` is the result of the last step."""
