@@ -16,7 +16,7 @@ from controlled_loop import ControlledLoop
 from modbus_gateway import FakeCommands, FakeHub, FakeLine, plant_of
 
 from multidrop.families import ErmanERG220, InvtCHE
-from multidrop.gateway.modbus_server.protocol import Garbage, MbapRequest, take_request
+from multidrop.gateway.modbus_server.protocol import InvalidHeader, MbapRequest, take_request
 from multidrop.gateway.modbus_server.server import ModbusServer
 from multidrop.gateway.modbus_server.settings import ModbusSettings
 
@@ -54,7 +54,7 @@ def taken(stream: bytes, size: int) -> list[MbapRequest]:
         try:
             while request := take_request(buffer):
                 found.append(request)
-        except Garbage:
+        except InvalidHeader:
             break
     return found
 

@@ -26,7 +26,7 @@ from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.settings import ServeSettings
 from multidrop.sim import EncodedDrive, Simulator, Wire
 
-# Garbage collection of objects from an earlier interruption may also be interrupted.
+# InvalidHeader collection of objects from an earlier interruption may also be interrupted.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 

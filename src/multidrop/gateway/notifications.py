@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import os
 import re
 import time
 from collections.abc import Callable, Collection
@@ -29,7 +28,7 @@ from multidrop.gateway.live.alarms import KINDS, Alarm, AlarmChange
 from multidrop.gateway.metrics import counter
 from multidrop.gateway.parts import PartContext, missing_library
 from multidrop.gateway.sending import Refused, RetryingSender, post
-from multidrop.gateway.settings import Folders
+from multidrop.gateway.settings import input_file
 from multidrop.supervisor import supervisor
 
 MOST_TARGETS = 20
@@ -76,7 +75,7 @@ class NotifySettings:
 
     def check(self, plant: Plant) -> list[str]:
         """Return a sentence for each mistake in the file of targets, and for a missing library."""
-        path = _path_of(self.targets, plant)
+        path = input_file(self.targets, plant)
         try:
             targets, wrong = read_targets(path)
         except OSError as failure:
@@ -87,13 +86,6 @@ class NotifySettings:
 
 
 Settings = NotifySettings
-
-
-def _path_of(targets: str, plant: Plant) -> Path:
-    """Return the path of the file of targets: a credential of the systemd service, else a file beside
-    the plant file.
-    """
-    return Folders(plant.path, os.environ).find(targets)
 
 
 def read_targets(path: Path) -> tuple[list[AlarmTarget], list[str]]:
@@ -137,7 +129,7 @@ def _shown(url: str) -> str:
 
 def build(settings: NotifySettings, context: PartContext) -> Notifications:
     """Return the part. Raises ImportError without a needed Apprise, OSError if the targets are unreadable."""
-    targets, _ = read_targets(_path_of(settings.targets, context.plant))
+    targets, _ = read_targets(input_file(settings.targets, context.plant))
     describe = partial(message_of, context.plant.path.stem, context.page)
     senders = [
         Sender(target.name, sender_to(target), AlarmQueue(settings.most, time.monotonic()), describe)

@@ -91,8 +91,8 @@ def post(url: str, body: bytes, headers: Mapping[str, str]) -> None:
         if answer.code not in REFUSED:
             raise
         with answer:
-            said = answer.read(MOST_ANSWER).decode("utf-8", "replace")
-        raise Refused(f"{answer}: {said}") from answer
+            text = answer.read(MOST_ANSWER).decode("utf-8", "replace")
+        raise Refused(f"{answer}: {text}") from answer
     except urllib.error.URLError as failure:
         raise OSError(getattr(failure.reason, "strerror", None) or failure.reason) from failure
     except HTTPException as failure:

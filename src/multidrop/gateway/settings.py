@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 import ssl
 from collections.abc import Callable, Iterable, Mapping
@@ -125,6 +126,11 @@ class Folders:
         if self._credentials and not Path(name).is_absolute() and (self._credentials / name).exists():
             return self._credentials / name
         return self._beside / name
+
+
+def input_file(name: str, plant: Plant) -> Path:
+    """Return the path of an input file of a plant, by the environment of this process; see `Folders`."""
+    return Folders(plant.path, os.environ).find(name)
 
 
 def read_plant(load: Callable[[], Plant], environment: Mapping[str, str]) -> tuple[Plant, ServeSettings]:

@@ -37,7 +37,7 @@ from multidrop.errors import PortLost
 from multidrop.families import DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.gateway.commands import BUSY, MOST_STOPS
 from multidrop.gateway.http.rights import NOT_ALLOWED, NOT_LISTED, Caller, Right
-from multidrop.gateway.modbus_server.line_share import PassingBusy
+from multidrop.gateway.modbus_server.protocol import PassingBusy
 from multidrop.gateway.modbus_server.settings import ModbusSettings
 
 CHE_OUTPUT_VOLTAGE, CHE_SETPOINT, CHE_CONTROL = 0x3003, 0x2000, 0x1000  # CHE100 manual v1.4, p. 117

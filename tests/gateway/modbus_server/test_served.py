@@ -22,7 +22,7 @@ from multidrop.drive import COIL, HOLDING, Carrier
 from multidrop.families import MODELS, InnovertIBD
 from multidrop.families.registry import find_model
 from multidrop.gateway.modbus_server import clients as modbus_clients
-from multidrop.gateway.modbus_server import line_share as passing
+from multidrop.gateway.modbus_server import passed_requests as passing
 from multidrop.gateway.modbus_server import words
 from multidrop.gateway.modbus_server.protocol import ModbusCode
 from multidrop.gateway.modbus_server.settings import MAIN, ModbusSettings, StopWrite, Unit, Units

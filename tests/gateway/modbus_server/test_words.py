@@ -20,7 +20,7 @@ from tables import table
 from multidrop.core import Columns, Names, NumberFormat, RowLayout
 from multidrop.drive import Drive
 from multidrop.drive.register import COIL, DISCRETE, HOLDING, INPUT, Register, reading, row_field
-from multidrop.gateway.modbus_server.protocol import Garbage, MbapRequest, take_request
+from multidrop.gateway.modbus_server.protocol import InvalidHeader, MbapRequest, take_request
 from multidrop.gateway.modbus_server.words import DriveWords, Lack, exact_data
 from multidrop.plant.model import Polled, PolledDrive
 from multidrop.polling.batch import Batch
@@ -292,7 +292,7 @@ def test_request_that_arrives_byte_by_byte_is_parsed() -> None:
     ],
 )
 def test_an_invalid_header_raises_garbage_as_soon_as_it_arrives(header: str) -> None:
-    with pytest.raises(Garbage):
+    with pytest.raises(InvalidHeader):
         take_request(bytearray.fromhex(header))
 
 

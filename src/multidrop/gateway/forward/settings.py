@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
-from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 from multidrop import Plant
-from multidrop.gateway.settings import Folders
+from multidrop.gateway.settings import input_file
 from multidrop.printable import masked
 from multidrop.recording import parse_size
 
@@ -43,9 +41,9 @@ def secret_mistakes(key: str, name: str, plant: Plant) -> Iterator[str]:
     try:
         secret = secret_in(name, plant)
         if name and len(secret.splitlines()) != 1:
-            yield f'{key} = "{name}": {_path_of(name, plant)} has {len(secret.splitlines())} lines, not one'
+            yield f'{key} = "{name}": {input_file(name, plant)} has {len(secret.splitlines())} lines, not one'
     except OSError as failure:
-        yield f'{key} = "{name}": {_path_of(name, plant)} cannot be read: {failure.strerror}'
+        yield f'{key} = "{name}": {input_file(name, plant)} cannot be read: {failure.strerror}'
 
 
 def secret_in(name: str, plant: Plant) -> str:
@@ -55,12 +53,8 @@ def secret_in(name: str, plant: Plant) -> str:
     """
     if not name:
         return ""
-    with _path_of(name, plant).open("rb") as file:
+    with input_file(name, plant).open("rb") as file:
         return file.read(MOST_SECRET).decode("utf-8", "replace").strip()
-
-
-def _path_of(name: str, plant: Plant) -> Path:
-    return Folders(plant.path, os.environ).find(name)
 
 
 def host_of(url: str) -> str:

@@ -72,7 +72,7 @@ class AlarmFile:
             self._note_failure(failure)
         self.past = list(known.values())
         self._since = float("inf")
-        while alarms := self._taken():
+        while alarms := self._waiting_alarms():
             self._since = time.monotonic()
             changed = [alarm for alarm in alarms if alarm is not None]
             known |= {alarm.id: alarm for alarm in changed}
@@ -89,7 +89,7 @@ class AlarmFile:
     def _note_failure(self, failure: OSError) -> None:
         self._failure = f"{self.path}: {failure.strerror or failure}"
 
-    def _taken(self) -> list[Alarm | None]:
+    def _waiting_alarms(self) -> list[Alarm | None]:
         found = [self._waiting.get()]
         while True:
             try:

@@ -77,20 +77,20 @@ def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
     shown = hub.seen(name)
     answer = hub.last_answer(name)
     now = time_ns, hub.now_ns()
-    places = Places()
+    times = TimeNumbers()
     values: dict[str, tuple[Any, ...]] = {}
     for register, newest, good, is_current in hub.known(name):
         if is_current and good is not None and newest is good:
-            values[register.name] = _finite(good[2]), places[good[:2]]
+            values[register.name] = _finite(good[2]), times[good[:2]]
         else:
-            values[register.name] = _unknown(hub, newest, good, places, now)
+            values[register.name] = _unknown(hub, newest, good, times, now)
     return {
         "state": shown.state,
         "fault": shown.fault,
         "why": shown.why_silent,
         "note": shown.note,
-        "seen": None if answer is None else places[answer[:2]],
-        "ages_ms": [_age_ms(now, asked) for asked in places],
+        "seen": None if answer is None else times[answer[:2]],
+        "ages_ms": [_age_ms(now, asked) for asked in times],
         "values": values,
     }
 
@@ -103,27 +103,27 @@ def _age_ms(now: Times, asked: Times) -> int:
     return max(one // 1_000_000 - then // 1_000_000 for one, then in zip(now, asked, strict=True))
 
 
-class Places(dict[Times, int]):
+class TimeNumbers(dict[Times, int]):
     """Numbers the distinct request times of a frame from 0. All values of one request share one number."""
 
     def __missing__(self, time: Times) -> int:
-        self[time] = place = len(self)
-        return place
+        self[time] = number = len(self)
+        return number
 
 
 def _unknown(
-    hub: Hub, newest: KeptRow | None, good: KeptRow | None, places: Places, now: Times
+    hub: Hub, newest: KeptRow | None, good: KeptRow | None, times: TimeNumbers, now: Times
 ) -> tuple[Any, ...]:
     """Return the entry of a value that is not fresh: None, index of the age, status.
 
     If there is an earlier good value, that value and the index of its age follow.
     """
     if newest is None:
-        return None, places[now], "not asked yet"
-    last = () if good is None else (_finite(good[2]), places[good[:2]])
+        return None, times[now], "not asked yet"
+    last = () if good is None else (_finite(good[2]), times[good[:2]])
     if newest[3]:
-        return None, places[newest[:2]], hub.status(newest[3]), *last
-    return None, places[now], "overdue", *last
+        return None, times[newest[:2]], hub.status(newest[3]), *last
+    return None, times[now], "overdue", *last
 
 
 def _finite(value: float) -> float | None:

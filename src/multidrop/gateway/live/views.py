@@ -268,11 +268,11 @@ def audit_trouble_of(gateway: Gateway) -> str:
 
 def troubles_of(gateway: Gateway) -> list[str]:
     """Return a sentence for the page about each problem other than a lost line."""
-    said = {f"line {line}": why for line, why in failing_lines_of(gateway).items()}
-    said |= supervisor().hung | supervisor().dead
-    said |= {name: one for name, one in parts_of(gateway).items() if one != "ok"}
+    troubles = {f"line {line}": why for line, why in failing_lines_of(gateway).items()}
+    troubles |= supervisor().hung | supervisor().dead
+    troubles |= {name: one for name, one in parts_of(gateway).items() if one != "ok"}
     audit = audit_trouble_of(gateway)
-    return [f"{name}: {one}" for name, one in (said | ({"audit log": audit} if audit else {})).items()]
+    return [f"{name}: {one}" for name, one in (troubles | ({"audit log": audit} if audit else {})).items()]
 
 
 def _health_of_part(feed: object) -> str:

@@ -13,7 +13,7 @@ from typing import Any, cast
 
 from multidrop.gateway.modbus_server.protocol import (
     WRITES,
-    Garbage,
+    InvalidHeader,
     MbapRequest,
     ModbusCode,
     function_of,
@@ -152,8 +152,8 @@ class ModbusClient(asyncio.Protocol):
     def _next_frame(self) -> bytes | None:
         try:
             return take_frame(self._came)
-        except Garbage as garbage:
-            _log.info("modbus client %s is closed: %s", self.address, garbage)
+        except InvalidHeader as mistake:
+            _log.info("modbus client %s is closed: %s", self.address, mistake)
             self._refuse()
             return None
 

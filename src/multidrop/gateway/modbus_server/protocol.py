@@ -29,14 +29,13 @@ from multidrop.control import NotAttached
 from multidrop.drive import Carrier
 from multidrop.gateway.commands import BUSY, STOOD_STILL
 from multidrop.gateway.http.rights import NOT_ALLOWED, NOT_LISTED
-from multidrop.gateway.modbus_server.line_share import PassingBusy
 
 MOST_DATA = 253  # limit, in bytes, of a function code and its data (application protocol V1.1b3, 4.1)
 _HEADER = struct.Struct(">HHHB")
 _FUNCTION = _HEADER.size  # offset of the function code
 
 
-class Garbage(ValueError):
+class InvalidHeader(ValueError):
     """Received bytes that are not a valid header of Modbus TCP."""
 
 
@@ -65,15 +64,15 @@ class MbapRequest(NamedTuple):
 def take_frame(buffer: bytearray) -> bytes | None:
     """Remove the first frame from the buffer and return it; None if it is incomplete.
 
-    Raises Garbage for an invalid header, after which the start of the next frame is unknown.
+    Raises InvalidHeader for an invalid header, after which the start of the next frame is unknown.
     """
     if len(buffer) >= 4 and buffer[2:4] != b"\0\0":
-        raise Garbage(f"protocol id {int.from_bytes(buffer[2:4]):04X}H, but in Modbus TCP it is 0")
+        raise InvalidHeader(f"protocol id {int.from_bytes(buffer[2:4]):04X}H, but in Modbus TCP it is 0")
     if len(buffer) < 6:
         return None
     length = int.from_bytes(buffer[4:6])
     if not 2 <= length <= 1 + MOST_DATA:
-        raise Garbage(f"length {length}, but it must be 2 to {1 + MOST_DATA}")
+        raise InvalidHeader(f"length {length}, but it must be 2 to {1 + MOST_DATA}")
     if len(buffer) < 6 + length:
         return None
     frame = bytes(buffer[: 6 + length])
@@ -93,7 +92,7 @@ def request_of(frame: bytes) -> MbapRequest:
 
 
 def take_request(buffer: bytearray) -> MbapRequest | None:
-    """Remove the first request from the buffer and return it; None if incomplete. Raises Garbage."""
+    """Remove the first request from the buffer and return it; None if incomplete. Raises InvalidHeader."""
     frame = take_frame(buffer)
     return None if frame is None else request_of(frame)
 
@@ -109,6 +108,10 @@ class ModbusCode(IntEnum):
     BUSY = 0x06
     NO_PATH = 0x0A
     NO_RESPONSE = 0x0B
+
+
+class PassingBusy(Exception):
+    """A request was dropped: the queue was full, or the line was not free in time."""
 
 
 class Declined(Exception):

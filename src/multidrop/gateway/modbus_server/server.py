@@ -18,19 +18,19 @@ from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live.hub import Hub
 from multidrop.gateway.modbus_server.address_map import AddressRow, address_map
 from multidrop.gateway.modbus_server.clients import SWEEP_S, Answer, ModbusClient, ModbusPort, RoundShare
-from multidrop.gateway.modbus_server.line_share import LineShare, PassingBusy
+from multidrop.gateway.modbus_server.passed_requests import ClientWrites, LineShare, Standstill
 from multidrop.gateway.modbus_server.protocol import (
     WRITES,
     Declined,
     MbapRequest,
     ModbusCode,
+    PassingBusy,
     code_of,
     read_range,
     reply_data,
 )
 from multidrop.gateway.modbus_server.settings import MAIN, ModbusSettings, Unit, Units
 from multidrop.gateway.modbus_server.words import Lack
-from multidrop.gateway.modbus_server.writes import ClientWrites, Standstill
 from multidrop.gateway.parts import Ask, PartContext
 
 Settings = ModbusSettings

@@ -21,12 +21,13 @@ from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.connections import listen
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live.hub import SILENT, Hub
-from multidrop.gateway.modbus_server.line_share import LineShare, PassingBusy
+from multidrop.gateway.modbus_server.passed_requests import ClientWrites, LineShare, Standstill
 from multidrop.gateway.modbus_server.protocol import (
     WRITES,
     Declined,
     MbapRequest,
     ModbusCode,
+    PassingBusy,
     code_of,
     read_range,
     reply_data,
@@ -47,7 +48,6 @@ from multidrop.gateway.modbus_server.tool_connections import (
     Terminal,
     rtu_reply,
 )
-from multidrop.gateway.modbus_server.writes import ClientWrites, Standstill
 from multidrop.gateway.parts import Ask, PartContext
 from multidrop.printable import did_you_mean
 from multidrop.supervisor import supervisor

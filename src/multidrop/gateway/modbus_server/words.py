@@ -117,7 +117,7 @@ def _neighbours(raw: float, number_format: NumberFormat) -> Iterable[float]:
     return [other for other in near if math.isfinite(other)]
 
 
-class _Place:
+class _PolledRegister:
     """A polled register, with the words computed from its latest value."""
 
     __slots__ = ("_data", "_register", "_value", "name")
@@ -149,19 +149,19 @@ class DriveWords:
     """The polled words of one drive, by function code and address."""
 
     def __init__(self, polled: PolledDrive) -> None:
-        self._at: dict[tuple[int, int], list[tuple[_Place, int]]] = {}
+        self._at: dict[tuple[int, int], list[tuple[_PolledRegister, int]]] = {}
         self.registers: set[str] = set()  # names of the registers whose words are usually known
         for poll in polled.polls:
             register = poll.register
             function = reading_function(register.table)
             if not function:
                 continue
-            place = _Place(register)
+            found = _PolledRegister(register)
             if is_certain(register):
                 self.registers.add(register.name)
             for at in range(register.words):
                 key = function, register.address + at
-                self._at.setdefault(key, []).append((place, at))
+                self._at.setdefault(key, []).append((found, at))
 
     def read(
         self,
@@ -182,10 +182,10 @@ class DriveWords:
             if found is None:
                 return Lack.UNPOLLED
             if len(found) == 1:
-                place, at = found[0]
-                word = place.word(newest(place.name), at, now_ns, since_ns)
+                polled, at = found[0]
+                word = polled.word(newest(polled.name), at, now_ns, since_ns)
             else:
-                rows = [(newest(place.name), place, at) for place, at in found]
+                rows = [(newest(polled.name), polled, at) for polled, at in found]
                 word = _newest_word(rows, now_ns, since_ns)
             if isinstance(word, Lack):
                 lacks.append(word)
@@ -196,11 +196,13 @@ class DriveWords:
         return words
 
 
-def _newest_word(found: list[tuple[Newest | None, _Place, int]], now_ns: int, since_ns: int) -> int | Lack:
+def _newest_word(
+    found: list[tuple[Newest | None, _PolledRegister, int]], now_ns: int, since_ns: int
+) -> int | Lack:
     """Return the word at an address that several registers share, from the newest of their rows."""
     lack = Lack.STALE
-    for row, place, at in sorted(found, key=lambda one: -one[0].monotonic_ns if one[0] else 0):
-        word = place.word(row, at, now_ns, since_ns)
+    for row, polled, at in sorted(found, key=lambda one: -one[0].monotonic_ns if one[0] else 0):
+        word = polled.word(row, at, now_ns, since_ns)
         if not isinstance(word, Lack):
             return word
         if word is Lack.UNPOLLED:

@@ -128,6 +128,19 @@ class Login(NamedTuple):
     authorities: str | None = None  # file of trusted certificates; None: those of the system
 
 
+def make_client(address: Address, login: Login, name: str) -> Any:
+    """Return a paho client with this login, which is not connected yet."""
+    from paho.mqtt.client import Client
+    from paho.mqtt.enums import CallbackAPIVersion
+
+    client: Any = Client(CallbackAPIVersion.VERSION2, client_id=name, clean_session=True)
+    if login.user:
+        client.username_pw_set(login.user, login.password or None)
+    if address.is_tls:
+        client.tls_set_context(ssl.create_default_context(cafile=login.authorities))
+    return client
+
+
 class Speaker(Protocol):
     """A message format on one connection, such as JsonTopics. Its methods run in the event loop."""
 
@@ -154,9 +167,6 @@ class Broker:
     """A speaker's connection to a broker. Paho's thread sends; only `close` waits for that thread."""
 
     def __init__(self, address: Address, login: Login, name: str, speaker: Speaker) -> None:
-        from paho.mqtt.client import Client
-        from paho.mqtt.enums import CallbackAPIVersion
-
         self._address = address
         self._name = name
         self._thread: threading.Thread | None = None  # the thread of the paho client for this connection
@@ -167,13 +177,9 @@ class Broker:
         self.failure = ""  # why the speaker cannot publish now
         self._connections = 0
         self._confirming: dict[int, asyncio.Future[None]] = {}  # by number of the packet
-        self._client: Any = Client(CallbackAPIVersion.VERSION2, client_id=name, clean_session=True)
+        self._client = make_client(address, login, name)
         self._client.reconnect_delay_set(*RETRY_S)
         self._client.max_inflight_messages_set(0)  # the outbox sets the limit
-        if login.user:
-            self._client.username_pw_set(login.user, login.password or None)
-        if address.is_tls:
-            self._client.tls_set_context(ssl.create_default_context(cafile=login.authorities))
         self._client.on_connect = self._on_connect
         self._client.on_connect_fail = lambda *_: self._call(self._failed, "no answer")
         self._client.on_disconnect = lambda *given: self._call(self._lost, str(given[3]))

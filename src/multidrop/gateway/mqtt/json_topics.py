@@ -107,12 +107,12 @@ def _state_topic(payload: bytes) -> str:
     if len(payload) > MOST_DISCOVERY:
         return ""
     try:
-        said = json.loads(payload)
+        message = json.loads(payload)
     except (ValueError, RecursionError):
         return ""
-    parts = said.get("cmps") if isinstance(said, dict) else None
+    parts = message.get("cmps") if isinstance(message, dict) else None
     # older messages have the state topic at the top level
-    state = parts.get("state") if isinstance(parts, dict) else said
+    state = parts.get("state") if isinstance(parts, dict) else message
     found = state.get("state_topic") if isinstance(state, dict) else None
     return found if isinstance(found, str) else ""
 
@@ -270,18 +270,18 @@ class JsonTopics:
     def _state(self, drive: str) -> bytes:
         answer = self._hub.last_answer(drive)
         shown = self._hub.seen(drive)
-        said = {
+        payload = {
             "time": None if answer is None else answer[0] // 1_000_000,
             "state": shown.state,
             "fault": shown.fault,
             "values": published_values(self._hub, drive),
         }
-        return json.dumps(said, ensure_ascii=False).encode()
+        return json.dumps(payload, ensure_ascii=False).encode()
 
     def _report(self, drive: str, what: str, result: CommandResult, command: str) -> None:
         outcome = {"what": what, "done": result.ok, "text": result.text, "id": command}
-        said = json.dumps(outcome, ensure_ascii=False)
-        self.outbox.put(Publication(self._topic(drive, "told"), said.encode))
+        payload = json.dumps(outcome, ensure_ascii=False)
+        self.outbox.put(Publication(self._topic(drive, "told"), payload.encode))
 
     def _discover(self, name: str) -> None:
         _, drive = self._plant.find_drive(name)
@@ -294,7 +294,7 @@ class JsonTopics:
             "set": self._topic(name, "set"),
             "stop": self._topic(name, "stop"),
         }
-        said = discovery(
+        payload = discovery(
             drive,
             [register for register, *_ in self._hub.known(name)],
             topics,
@@ -305,7 +305,7 @@ class JsonTopics:
             takes_commands=self._settings.commands,
             page=self._context.page,
         )
-        self.outbox.put(self._kept(discovery_topic(self._settings.prefix, name), said))
+        self.outbox.put(self._kept(discovery_topic(self._settings.prefix, name), payload))
 
 
 def _read_write(given: Mapping[str, Any]) -> tuple[float, int]:

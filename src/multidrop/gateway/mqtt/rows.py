@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import ssl
 import time
 from functools import cache
 from math import isfinite
@@ -21,7 +20,7 @@ from multidrop.gateway.forward.forwarder import (
     row_objects,
 )
 from multidrop.gateway.live.hub import published_value
-from multidrop.gateway.mqtt.broker import Address, Broker, Login
+from multidrop.gateway.mqtt.broker import Address, Broker, Login, make_client
 from multidrop.gateway.mqtt.settings import MqttSettings
 from multidrop.gateway.mqtt.sparkplug_node import PastValue, SparkplugNode
 from multidrop.gateway.parts import PartContext
@@ -71,8 +70,8 @@ def _past_values(rows: Any, node: SparkplugNode) -> list[PastValue]:
     for time_ns, name, register, value, _, unit in listed(rows):
         drive, known = find(name, register)
         if value is not None and drive is not None and known is not None and unit_of(drive, known) == unit:
-            said = published_value(known, value) if isfinite(value) else None
-            found.append(PastValue(name, register, time_ns // 1_000_000, said))
+            published = published_value(known, value) if isfinite(value) else None
+            found.append(PastValue(name, register, time_ns // 1_000_000, published))
     return found
 
 
@@ -105,20 +104,13 @@ class RowPublisher:
             for row in row_objects(rows):
                 by_drive.setdefault(row["drive"], []).append(row)
             for drive, its in by_drive.items():
-                said = {"id": f"{message.id}-{number}", "historical": message.is_historical, "rows": its}
-                payload = json.dumps(said, ensure_ascii=False).encode()
+                content = {"id": f"{message.id}-{number}", "historical": message.is_historical, "rows": its}
+                payload = json.dumps(content, ensure_ascii=False).encode()
                 found.append((f"{self._prefix}/{drive}/rows", payload))
         return found
 
     def _connect(self) -> None:
-        from paho.mqtt.client import Client
-        from paho.mqtt.enums import CallbackAPIVersion
-
-        client: Any = Client(CallbackAPIVersion.VERSION2, client_id=self._name, clean_session=True)
-        if self._login.user:
-            client.username_pw_set(self._login.user, self._login.password or None)
-        if self._address.is_tls:
-            client.tls_set_context(ssl.create_default_context(cafile=self._login.authorities))
+        client = make_client(self._address, self._login, self._name)
         answers: list[Any] = []
         client.on_connect = lambda *given: answers.append(given[3])
         client.connect(self._address.host, self._address.port, KEEP_ALIVE_S)

@@ -59,7 +59,7 @@ class SparkplugNode:
         self._commands = BrokerCommands(context.commands, settings.caller, utc_ms, self._report)
         self._birth = -1  # the node's bdSeq (birth/death sequence number)
         self._seq = 0
-        self._said: dict[str, dict[str, Value]] = {}  # values last sent, of drives whose birth was sent
+        self._sent: dict[str, dict[str, Value]] = {}  # values last sent, of drives whose birth was sent
         self._changed: dict[str, dict[str, tuple[Value, int]]] = {}  # new values and their times in ms
         self._past: dict[str, list[PastValue]] = {}  # historical values for the next messages
         self._aliases: dict[tuple[str, str], int] = {}
@@ -78,7 +78,7 @@ class SparkplugNode:
         return [*listened, (self._topic("DCMD", "+"), 1)] if self._settings.commands else listened
 
     def connected(self) -> None:
-        self._said.clear()
+        self._sent.clear()
         self._changed.clear()
         self.outbox.put(Publication(self._topic("NBIRTH"), self._node_birth, qos=0))
         self.publish()
@@ -105,20 +105,20 @@ class SparkplugNode:
     def adopt(self, plant: Plant) -> None:
         """Use another plant, and send deaths of removed devices."""
         self._plant = plant
-        for drive in self._said.keys() - drives_of(plant).keys():
-            del self._said[drive]
+        for drive in self._sent.keys() - drives_of(plant).keys():
+            del self._sent[drive]
             self._replace_pending(drive, "DDEATH", self._device_death)
 
     def publish(self) -> None:
         """Send changed values, births and deaths."""
         for drive in self._hub.drives:
             if self._hub.state(drive) == SILENT:
-                if self._said.pop(drive, None) is not None:
+                if self._sent.pop(drive, None) is not None:
                     self._replace_pending(drive, "DDEATH", self._device_death)
                 continue
             values = self._values(drive)
-            before = self._said.get(drive)
-            self._said[drive] = values
+            before = self._sent.get(drive)
+            self._sent[drive] = values
             if before is None:
                 self._replace_pending(drive, "DBIRTH", self._device_birth)
                 continue
@@ -156,8 +156,8 @@ class SparkplugNode:
                     self._past.setdefault(one.drive, []).append(one)
             try:
                 for drive in [*self._past]:
-                    if drive not in self._said:
-                        self._said[drive] = self._values(drive)
+                    if drive not in self._sent:
+                        self._sent[drive] = self._values(drive)
                         self._replace_pending(drive, "DBIRTH", self._device_birth)
                     self._put(drive, "DDATA", self._data)
                 await confirm()
@@ -197,7 +197,7 @@ class SparkplugNode:
 
     def _device_birth(self, drive: str) -> bytes:
         now, values, times = self._utc_ms(), self._values(drive), self._times(drive)
-        self._said[drive] = values
+        self._sent[drive] = values
         self._changed.pop(drive, None)
         metrics = []
         for name, value in values.items():
