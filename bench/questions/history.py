@@ -21,6 +21,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from struct import calcsize
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -148,9 +149,8 @@ def taking() -> None:
     """Print the cost of `HistoryWriter.take` for a batch of all series."""
     names = Names([f"drive-{number}" for number in range(DRIVES)]), Names(["value"] * REGISTERS)
     rows = GatheredRows(*names)
-    rows._rows = DRIVES * REGISTERS
     for name, kind in COLUMNS.items():
-        rows._gathered[name] += bytes(memoryview(bytes(8 * rows._rows)).cast(kind)[: rows._rows])
+        rows._gathered[name] += bytes(calcsize(kind) * DRIVES * REGISTERS)
     batch = Batch(rows, *names)
     found = []
     with TemporaryDirectory() as folder:

@@ -20,7 +20,7 @@ from multidrop.core import Columns
 from multidrop.core.columns import COLUMNS
 from multidrop.drive.family import Drive
 from multidrop.plant.model import Plant, series_of
-from multidrop.polling.batch import Batch, bitmap_of, slot_rows, status_code
+from multidrop.polling.batch import Batch, CopiedColumns, slot_rows, status_code
 from multidrop.polling.jobs import RowNames
 from multidrop.transport import clock
 from multidrop.transport.aside_log import AsideThread, log_aside
@@ -50,23 +50,17 @@ class AddedRow(NamedTuple):
     value: float
 
 
-class JoinedColumns(Columns):
+class JoinedColumns(CopiedColumns):
     """Copies of other columns, followed by added rows."""
 
     def __init__(self, columns: Columns | None, added: Sequence[AddedRow]) -> None:
-        self._joined = {
-            name: (bytes(columns.array(name)) if columns is not None else b"")
-            + array(kind, [getattr(row, name) for row in added]).tobytes()
-            for name, kind in COLUMNS.items()
-        }
-
-    def __len__(self) -> int:
-        return len(self._joined["time"]) // 8
-
-    def array(self, name: str) -> memoryview[Any]:
-        if name == "valid":
-            return bitmap_of(self.array("status"))
-        return memoryview(self._joined[name]).cast(COLUMNS[name])
+        super().__init__(
+            {
+                name: (bytes(columns.array(name)) if columns is not None else b"")
+                + array(kind, [getattr(row, name) for row in added]).tobytes()
+                for name, kind in COLUMNS.items()
+            }
+        )
 
 
 class AddedRows:

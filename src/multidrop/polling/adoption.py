@@ -6,11 +6,11 @@ new ports are opened. Lines without changes are not touched.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 from multidrop.bus import Bus
 from multidrop.control.exit_hook import exit_hook
@@ -22,14 +22,6 @@ from multidrop.plant.loader import PlantError
 from multidrop.plant.model import Plant, PlantLine, PolledDrive
 from multidrop.polling.line_set import MOST_LINES, LineSet
 from multidrop.polling.polled_line import PolledLine
-
-
-class DriveChanges(NamedTuple):
-    """Changes to the drives of a kept line."""
-
-    leaving: list[PolledDrive]
-    joining: list[PolledDrive]
-    repolled: list[PolledDrive]  # kept drives with changed registers or rates
 
 
 def check_plant(plant: Plant, *, is_free: Callable[[Drive], bool]) -> None:
@@ -101,32 +93,28 @@ def _description(drive: Drive) -> tuple[object, ...]:
     )
 
 
-def drive_changes(present: Iterable[PolledDrive], wanted: Iterable[PolledDrive]) -> DriveChanges:
-    """Return the changes to a line's drives; kept drives remain the same objects."""
-    left = list(present)
-    changes = DriveChanges(left, [], [])
-    for polled in wanted:
-        description = _description(polled.drive)
-        same = next((each for each in left if _description(each.drive) == description), None)
-        if same is None:
-            changes.joining.append(polled)
-            continue
-        left.remove(same)
-        if (same.polls, same.channels) != (polled.polls, polled.channels):
-            changes.repolled.append(PolledDrive(same.drive, polled.polls, channels=polled.channels))
-    return changes
-
-
 GONE = "its line is no longer polled"
 
 
-@dataclass(frozen=True)
-class Staying:
-    """A kept line, whose port stays open, and its new description."""
+class KeptLine:
+    """A kept line, whose port stays open, its new description, and the changes to its drives."""
 
-    line: PolledLine
-    wanted: PlantLine
-    drives: DriveChanges
+    def __init__(self, line: PolledLine, wanted: PlantLine) -> None:
+        self.line = line
+        self.wanted = wanted
+        self.joining: list[PolledDrive] = []
+        self._repolled: list[PolledDrive] = []  # kept drives with changed registers or rates
+        left = list(line.polled)
+        for polled in wanted.drives:
+            description = _description(polled.drive)
+            same = next((each for each in left if _description(each.drive) == description), None)
+            if same is None:
+                self.joining.append(polled)
+                continue
+            left.remove(same)
+            if (same.polls, same.channels) != (polled.polls, polled.channels):
+                self._repolled.append(PolledDrive(same.drive, polled.polls, channels=polled.channels))
+        self.leaving = [polled.drive for polled in left]
 
     def await_stops(self) -> None:
         """Cancel the calls of the leaving drives, and wait for their stops.
@@ -135,35 +123,21 @@ class Staying:
         is not stopped, because its stop could be a different command to the joining drive. Drives are removed
         only after all stops have ended: until then, every drive can be stopped again.
         """
-        taken = {polled.drive.address for polled in self.drives.joining}
-        leaving = [polled.drive for polled in self.drives.leaving]
-        self.line.bus.part_with(leaving, [drive for drive in leaving if drive.address not in taken])
+        taken = {polled.drive.address for polled in self.joining}
+        self.line.bus.part_with(self.leaving, [one for one in self.leaving if one.address not in taken])
 
     def let_leave(self, names: Collection[str]) -> None:
-        """Remove the leaving drives. If a drive's name is in `names`, wait for the end of its last
-        exchange.
-        """
-        leaving = [polled.drive for polled in self.drives.leaving]
-        for drive in leaving:
+        """Remove the leaving drives. If a drive's name is in `names`, wait for its last exchange's end."""
+        for drive in self.leaving:
             self.line.remove(drive)
             self.line.forget(drive)
-        for drive in leaving:
+        for drive in self.leaving:
             if drive.name in names:
                 self.line.await_gone(drive.address)
 
-    @property
-    def leaving(self) -> set[str]:
-        """The names of the drives that leave."""
-        return {polled.drive.name for polled in self.drives.leaving}
-
-    @property
-    def moves(self) -> bool:
-        """True if any drive leaves or joins the line."""
-        return bool(self.drives.leaving or self.drives.joining)
-
-    def is_free(self, leaving: Mapping[str, Staying]) -> bool:
+    def is_free(self, leaving: Mapping[str, KeptLine]) -> bool:
         """Return False if a joining drive has the name of a drive that has not left another line yet."""
-        return all(leaving.get(polled.drive.name, self) is self for polled in self.drives.joining)
+        return all(leaving.get(polled.drive.name, self) is self for polled in self.joining)
 
     def take_in(self) -> None:
         """Start polling the joining drives, and the changed registers and rates of kept drives.
@@ -171,16 +145,16 @@ class Staying:
         Raises LineError if the port does not support a drive's settings.
         """
         self.line.declared, self.line.switching = self.wanted, self.wanted.switching
-        for polled in self.drives.repolled:
+        for polled in self._repolled:
             self.line.set_polls(polled)
-        for polled in self.drives.joining:
+        for polled in self.joining:
             self.line.add(polled)
-        if self.drives.joining:
+        if self.joining:
             self.line.put_in_order()
 
 
 @dataclass(frozen=True)
-class Coming:
+class NewLine:
     """A line to open; `before` is the present line on the same port, or None."""
 
     wanted: PlantLine
@@ -211,7 +185,7 @@ class Adoption:
         for line in self._lines:
             if line not in taken:
                 ported.setdefault(line.declared.port, []).append(line)
-        coming: list[Coming] = []
+        new: list[NewLine] = []
         for wanted in self._plant.lines:
             if wanted.name in found:
                 continue
@@ -221,15 +195,13 @@ class Adoption:
                 others.remove(same)
                 found[wanted.name] = same
             else:
-                coming.append(Coming(wanted, others[0] if others and not speaks_tcp(wanted.port) else None))
-        self._staying = [
-            Staying(line, wanted, drive_changes(line.polled, wanted.drives))
-            for wanted in self._plant.lines
-            if (line := found.get(wanted.name))
+                new.append(NewLine(wanted, others[0] if others and not speaks_tcp(wanted.port) else None))
+        self._kept = [
+            KeptLine(found[wanted.name], wanted) for wanted in self._plant.lines if wanted.name in found
         ]
-        self._coming = coming
-        staying = set(found.values())
-        self._going = [line for line in self._lines if line not in staying]
+        self._new = new
+        kept = set(found.values())
+        self._removed = [line for line in self._lines if line not in kept]
 
     def _check(self) -> None:
         if len(self._plant.lines) > MOST_LINES:
@@ -237,11 +209,11 @@ class Adoption:
                 f"{len(self._plant.lines)} lines are too many for one poller: {MOST_LINES} at most"
             )
         self._lines.names.check_room(self._plant.drives)
-        for coming in self._coming:
-            self._lines.check_port(coming.wanted.port)
-        if self._coming:
+        for new in self._new:
+            self._lines.check_port(new.wanted.port)
+        if self._new:
             self._lines.check_audit()
-        if self._coming and self._lines.stops_on_exit:
+        if self._new and self._lines.stops_on_exit:
             exit_hook().take_signals()
 
     # ---- carrying out the change ----
@@ -256,12 +228,12 @@ class Adoption:
         return failures
 
     def _let_go(self) -> None:
-        wanted = {coming.before: coming.wanted for coming in self._coming if coming.before}
-        for line in self._going:
+        wanted = {new.before: new.wanted for new in self._new if new.before}
+        for line in self._removed:
             for drive in line.bus.drives:
                 if line in wanted and _is_another(drive, wanted[line]):
                     line.remove(drive)
-        self._lines.let_go(self._going, GONE)
+        self._lines.let_go(self._removed, GONE)
 
     def _change(self) -> dict[str, LineError]:
         """Change the kept lines one by one; return the errors of ports, by line name.
@@ -272,24 +244,26 @@ class Adoption:
         """
         failures: dict[str, LineError] = {}
         names = {polled.drive.name for polled in self._plant.drives}
-        for staying in self._staying:
-            if not staying.moves:
-                staying.take_in()
-        left = [staying for staying in self._staying if staying.moves]
+        left: list[KeptLine] = []
+        for kept in self._kept:
+            if kept.leaving or kept.joining:
+                left.append(kept)
+            else:
+                kept.take_in()
         while left:
-            leaving = {name: staying for staying in left for name in staying.leaving}
-            free = next((staying for staying in left if staying.is_free(leaving)), None)
+            leaving = {drive.name: kept for kept in left for drive in kept.leaving}
+            free = next((kept for kept in left if kept.is_free(leaving)), None)
             together = [free] if free else left
-            for staying in together:
-                staying.await_stops()
-            for staying in together:
-                staying.let_leave(names)
-            for staying in together:
+            for kept in together:
+                kept.await_stops()
+            for kept in together:
+                kept.let_leave(names)
+            for kept in together:
                 try:
-                    staying.take_in()
+                    kept.take_in()
                 except LineError as failure:
-                    failures[staying.wanted.name] = failure
-            left = [staying for staying in left if staying is not free] if free else []
+                    failures[kept.wanted.name] = failure
+            left = [kept for kept in left if kept not in together]
         return failures
 
     def _open(self, start: bool) -> dict[str, LineError]:
@@ -298,29 +272,29 @@ class Adoption:
         A line whose port cannot be opened is added too. The poller opens the port later, like a lost port.
         """
         failures: dict[str, LineError] = {}
-        for place, bus in self._lines.open([coming.wanted for coming in self._coming]):
-            coming = self._coming[place]
+        for place, bus in self._lines.open([new.wanted for new in self._new]):
+            new = self._new[place]
             if isinstance(bus, LineError):
-                failures[coming.wanted.name] = bus
-                bus = self._lines.await_port(coming.wanted)
+                failures[new.wanted.name] = bus
+                bus = self._lines.await_port(new.wanted)
             elif isinstance(bus, OSError):
                 raise bus
             try:
-                self._put(coming, bus, start)
+                self._put(new, bus, start)
             except LineError as failure:
-                failures[coming.wanted.name] = failure
+                failures[new.wanted.name] = failure
         return failures
 
-    def _put(self, coming: Coming, bus: Bus, start: bool) -> None:
+    def _put(self, new: NewLine, bus: Bus, start: bool) -> None:
         """Add a line with this bus; if `start` is set, start to poll it.
 
         Raises LineError if the port does not support a drive's settings.
         """
-        if coming.before:
-            bus.remember(coming.before.bus)
-        line = self._lines.add(replace(coming.wanted, drives=()), bus)
+        if new.before:
+            bus.remember(new.before.bus)
+        line = self._lines.add(replace(new.wanted, drives=()), bus)
         try:
-            for polled in coming.wanted.drives:
+            for polled in new.wanted.drives:
                 line.add(polled)
         finally:
             if start:

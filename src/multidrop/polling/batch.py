@@ -346,7 +346,11 @@ class Batch(Rows):
 
     def at(self, places: Sequence[int]) -> Batch:
         """Return a copy of the rows at these indices."""
-        return Batch(PickedColumns(self._columns, places), self._drives, self._registers)
+        copies = {
+            name: array(kind, map(self._columns.array(name).__getitem__, places)).tobytes()
+            for name, kind in COLUMNS.items()
+        }
+        return Batch(CopiedColumns(copies), self._drives, self._registers)
 
     def parts(self) -> tuple[Columns, Names, Names]:
         """Return the core's columns, and the names of drives and registers."""
@@ -374,26 +378,28 @@ class Batch(Rows):
         )
 
 
-class PickedColumns(Columns):
-    """Copies of some rows of other columns."""
+class CopiedColumns(Columns):
+    """Rows in Python's memory: one buffer for each column except `valid`."""
 
-    def __init__(self, columns: Columns, places: Sequence[int]) -> None:
-        self._rows = len(places)
-        self._picked = {
-            name: array(kind, map(columns.array(name).__getitem__, places)) for name, kind in COLUMNS.items()
-        }
+    def __init__(self, copies: Mapping[str, bytes | bytearray]) -> None:
+        self._copies = copies
 
     def __len__(self) -> int:
-        return self._rows
+        return len(self._copies["time"]) // 8
 
     def array(self, name: str) -> memoryview[Any]:
-        return bitmap_of(self.array("status")) if name == "valid" else memoryview(self._picked[name])
+        if name == "valid":
+            return bitmap_of(self.array("status"))
+        return memoryview(bytes(self._copies[name])).cast(COLUMNS[name])
 
 
 def bitmap_of(statuses: memoryview[Any]) -> memoryview[Any]:
     """Return a bitmap with one bit per row, the least significant bit first: 1 if the row's status is 0."""
+    size = (len(statuses) + 7) // 8
+    if statuses.tobytes().count(0) == statuses.nbytes:
+        return memoryview(b"\xff" * size)
     bits = "".join("0" if code else "1" for code in reversed(statuses))
-    return memoryview(int(bits or "0", 2).to_bytes((len(statuses) + 7) // 8, "little"))
+    return memoryview(int(bits, 2).to_bytes(size, "little"))
 
 
 def status_code(text: str) -> int:
@@ -436,16 +442,13 @@ def assemble(rows: int, *columns: tuple[Any, ...]) -> Any:
     return c_array_from_buffers(schema(), rows, [None], children=children, move=True)
 
 
-class GatheredRows(Columns):
+class GatheredRows(CopiedColumns):
     """Columns that grow by a copy of each batch, so that the core can reuse the batch's memory."""
 
     def __init__(self, drives: Names, registers: Names) -> None:
         self._drives, self._registers = drives, registers
-        self._rows = 0
         self._gathered = {name: bytearray() for name in COLUMNS}
-
-    def __len__(self) -> int:
-        return self._rows
+        super().__init__(self._gathered)
 
     def add(self, batch: Batch) -> bool:
         """Append a copy of a batch's rows; return True.
@@ -457,16 +460,7 @@ class GatheredRows(Columns):
             return False
         for name, gathered in self._gathered.items():
             gathered += columns.array(name).cast("B")
-        self._rows += len(columns)
         return True
-
-    def array(self, name: str) -> memoryview[Any]:
-        if name != "valid":
-            return memoryview(bytes(self._gathered[name])).cast(COLUMNS[name])
-        size, codes = (self._rows + 7) // 8, self._gathered["status"]
-        if codes.count(0) == len(codes):
-            return memoryview(b"\xff" * size)
-        return bitmap_of(self.array("status"))
 
     def batch(self) -> Batch:
         """Return all rows so far. No rows may be added afterwards."""
