@@ -463,9 +463,9 @@ def test_command_line_prints_text_registers_and_missing_values(run: RunCommand, 
         "speed": {"value": 1440.0, "unit": "rpm"},
         "serial": {"value": "EM3-0042"},
     }
-    told = run("models", model)[1]
-    assert "0014H  serial  input register  8 characters  section 2" in told
-    assert "no value: 7FFFH" in told
+    printed = run("models", model)[1]
+    assert "0014H  serial  input register  8 characters  section 2" in printed
+    assert "no value: 7FFFH" in printed
 
 
 # ---- titles of registers in Russian and Chinese, and the choice of a language ----

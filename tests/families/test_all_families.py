@@ -48,7 +48,7 @@ def registers(wanted: Callable[[Register[Any]], object]) -> list[tuple[type[Driv
     return [(family, each) for family in FAMILIES for each in family.registers.values() if wanted(each)]
 
 
-def told(one: type[Drive] | Register[Any]) -> str:
+def label(one: type[Drive] | Register[Any]) -> str:
     return one.name if isinstance(one, Register) else one.model
 
 
@@ -273,7 +273,7 @@ def test_every_number_of_a_register_survives_decoding_and_encoding(
         assert register.format(value).startswith(f"{value:.{register.decimals}f}")
 
 
-@pytest.mark.parametrize(("family", "register"), registers(lambda each: each.writable), ids=told)
+@pytest.mark.parametrize(("family", "register"), registers(lambda each: each.writable), ids=label)
 @settings(max_examples=examples(10))
 @given(data=st.data())
 def test_value_survives_a_write_and_a_read(
@@ -297,9 +297,9 @@ def test_value_survives_a_write_and_a_read(
         (block,) = blocks(drive, [register])
         answer = Message(drive.address, block.request.function, block.start, data=kept)
         frame = build_reply(drive.framing, answer)
-        used, told = parse_reply(drive.framing, frame, block.request)
-        assert told is not None
-        assert (used, told.data) == (len(frame), kept)
+        used, reply = parse_reply(drive.framing, frame, block.request)
+        assert reply is not None
+        assert (used, reply.data) == (len(frame), kept)
     assert register.decode(raw_value(kept, 0, register.number_format)) == value
 
 
@@ -325,7 +325,7 @@ def _values(register: Register[Any]) -> st.SearchStrategy[Any]:
 NUMBERS = registers(lambda each: each.values is None and each.writable)
 
 
-@pytest.mark.parametrize(("family", "register"), NUMBERS, ids=told)
+@pytest.mark.parametrize(("family", "register"), NUMBERS, ids=label)
 @settings(max_examples=examples(10))
 @given(data=st.data())
 def test_formatted_values_can_be_parsed(

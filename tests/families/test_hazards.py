@@ -494,9 +494,9 @@ def test_d13_y15_any_exception_code_is_a_refusal(monkeypatch: pytest.MonkeyPatch
         line, drive, _ = one(monkeypatch, make())
         refusal = build_reply(Framing.RTU, Message(1, 3, exception=code))
         line.answers = lambda request, refusal=refusal: refusal
-        with pytest.raises(DriveException) as told:
+        with pytest.raises(DriveException) as raised:
             drive.read(drive.output_frequency)
-        assert told.value.code == code
+        assert raised.value.code == code
 
 
 def test_d7_faults_10_to_14_are_decoded_in_decimal_and_hex() -> None:
@@ -575,9 +575,9 @@ OF_PRINT_ALONE = {
 
 
 def test_every_erratum_has_a_test_or_a_reason_for_having_none() -> None:
-    told = [*HAZARDS, *(name.upper() for name in globals() if name.startswith("test_"))]
+    names = [*HAZARDS, *(name.upper() for name in globals() if name.startswith("test_"))]
     for family, last in FAMILIES.items():
         for number in range(1, last + 1):
             erratum = f"{family}{number}"
-            shown = [record for record in told if re.search(rf"(^|[^A-Z0-9]){erratum}($|[^0-9])", record)]
+            shown = [name for name in names if re.search(rf"(^|[^A-Z0-9]){erratum}($|[^0-9])", name)]
             assert bool(shown) != (erratum in OF_PRINT_ALONE), erratum

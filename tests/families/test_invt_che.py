@@ -238,9 +238,9 @@ def test_stop_refused_at_rest_counts_as_stopped() -> None:
     wire.drive.stop()
     loses = {STOP: [refusal] * 3, STOP_JOG: [DriveException("drive", 0x12, "")] * 3}
     wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, loses)
-    with pytest.raises(DriveException) as told:
+    with pytest.raises(DriveException) as raised:
         wire.drive.stop()
-    assert told.value is refusal
+    assert raised.value is refusal
     wire = Wire(InvtCHE(1), {"status": [CHEStatus.FORWARD, CHEStatus.STANDBY]}, loses)
     wire.drive.stop()  # both stops are refused, but the motor is at rest
     assert wire.sent == [STOP] * 3 + [STOP_JOG] * 3

@@ -322,7 +322,7 @@ class Responder:
         self.memory = dict(sheet.rest)
         self.words: list[Word] = []
 
-    def hear(self, frame: bytes) -> bytes:
+    def answer(self, frame: bytes) -> bytes:
         """Carry out a request; return the reply."""
         _, asked, rest = split(frame)
         assert asked is not None, "the checksum is right"
@@ -389,7 +389,7 @@ def connected(monkeypatch: pytest.MonkeyPatch, name: str) -> tuple[Any, Responde
 
     def answer(request: object) -> bytes:
         sent = line.frames[-1][1]
-        return there.hear(f"{sent}\r\n".encode() if sent.startswith(":") else bytes.fromhex(sent))
+        return there.answer(f"{sent}\r\n".encode() if sent.startswith(":") else bytes.fromhex(sent))
 
     line.answers = answer
     return line.attach(made(name)), there

@@ -277,7 +277,7 @@ def bomb(levels: int) -> str:
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "expected"),
     [
         *usually(
             (bomb(9), "has more than 50000 entries, each alias counted as what it stands for"),
@@ -290,10 +290,10 @@ def bomb(levels: int) -> str:
         ("modbus: [}", "is not YAML"),
     ],
 )
-def test_costly_or_unsafe_yaml_is_refused(tmp_path: Path, text: str, told: str) -> None:
+def test_costly_or_unsafe_yaml_is_refused(tmp_path: Path, text: str, expected: str) -> None:
     pytest.importorskip("yaml")
     (tmp_path / "a.yaml").write_text(text)
-    with pytest.raises(ValueError, match=re.escape(told)):
+    with pytest.raises(ValueError, match=re.escape(expected)):
         read_devices(tmp_path / "a.yaml")
 
 
@@ -320,7 +320,7 @@ def test_registers_beyond_the_limit_of_a_family_are_reported_as_not_imported(
 
 
 @table(
-    ("name", "text", "told"),
+    ("name", "text", "expected"),
     [
         ("a.csv", "", "is empty"),
         ("a.csv", "x,y\n1,2\n", "no column is called address"),
@@ -335,10 +335,10 @@ def test_registers_beyond_the_limit_of_a_family_are_reported_as_not_imported(
         ("a.xls", "a", "its suffix is not one of .csv"),
     ],
 )
-def test_file_that_is_not_a_table_is_refused(tmp_path: Path, name: str, text: str, told: str) -> None:
+def test_file_that_is_not_a_table_is_refused(tmp_path: Path, name: str, text: str, expected: str) -> None:
     path = tmp_path / name
     path.write_text(text)
-    with pytest.raises(ValueError, match=re.escape(told)):
+    with pytest.raises(ValueError, match=re.escape(expected)):
         read_devices(path)
 
 

@@ -485,7 +485,7 @@ SCANNED = "is a port, not a plant file; `multidrop scan {} --out plant.toml` wri
 
 
 @table(
-    ("name", "told"),
+    ("name", "expected"),
     [
         ("http://10.0.0.7:8750", "a gateway's page is for a browser"),
         ("HTTPS://plant.example/", "a gateway's page is for a browser"),
@@ -494,12 +494,12 @@ SCANNED = "is a port, not a plant file; `multidrop scan {} --out plant.toml` wri
         ("/dev/ttyUSB0", SCANNED.format("/dev/ttyUSB0")),
     ],
 )
-def test_a_url_or_port_given_as_a_plant_file_is_reported_as_such(name: str, told: str) -> None:
+def test_a_url_or_port_given_as_a_plant_file_is_reported_as_such(name: str, expected: str) -> None:
     for given in (name, Path(name)):  # Path reduces two slashes to one
         with pytest.raises(PlantError) as raised:
             load_plant(given)
         assert str(raised.value).lower().startswith(name.lower().rstrip("/"))
-        assert told in str(raised.value)
+        assert expected in str(raised.value)
 
 
 def test_a_device_given_as_a_plant_file_is_not_read() -> None:

@@ -35,19 +35,19 @@ class Bench:
         self.wire = Wire([sim], unpaced=True)
         self.now = 100.0
 
-    def hear(self, frame: bytes) -> bytes:
+    def send(self, frame: bytes) -> bytes:
         """Send a frame; return the reply, empty if the drive does not reply."""
         self.wire.receive(frame, self.now)
         self.now += 0.1
         return self.wire.advance(self.now)
 
-    def say(self, frame: str) -> str:
+    def exchange(self, frame: str) -> str:
         """Send a frame and return the reply as documents print them: RTU in hex, text without line end."""
         if frame.startswith(":"):
-            return self.hear(f"{frame}\r\n".encode()).decode().removesuffix("\r\n")
-        return self.hear(bytes.fromhex(frame)).hex(" ").upper()
+            return self.send(f"{frame}\r\n".encode()).decode().removesuffix("\r\n")
+        return self.send(bytes.fromhex(frame)).hex(" ").upper()
 
-    def ask(self, function: int, start: int, count: int = 1) -> list[int]:
+    def read(self, function: int, start: int, count: int = 1) -> list[int]:
         """Read `count` registers; return their raw counts."""
         reply = self.sim.answer(Message(self.sim.drive.address, function, start, count), self.now)
         assert reply is not None
@@ -78,27 +78,27 @@ def test_erman_control_registers_are_read_as_printed(erman: Bench) -> None:
     erman.sim["frequency"] = 50.0
     erman.sim["maximum_frequency"] = 50.0
     erman.sim["minimum_frequency"] = 5.0
-    assert erman.say("01 03 00 01 00 04 15 C9") == "01 03 08 01 00 01 F4 01 F4 00 32 25 C4"
+    assert erman.exchange("01 03 00 01 00 04 15 C9") == "01 03 08 01 00 01 F4 01 F4 00 32 25 C4"
 
 
 def test_erman_state_registers_are_read_as_printed_with_a_corrected_checksum(erman: Bench) -> None:
     erman.sim["output_frequency"] = 50.0
     erman.sim["output_current"] = 21.4
     erman.sim["dc_bus_voltage"] = 562
-    assert erman.say("01 04 00 01 00 05 61 C9") == "01 04 0A 01 F4 00 00 00 D6 00 00 02 32 7F 1B"
+    assert erman.exchange("01 04 00 01 00 05 61 C9") == "01 04 0A 01 F4 00 00 00 D6 00 00 02 32 7F 1B"
 
 
 def test_erman_writes_several_registers_with_function_10(erman: Bench) -> None:
-    assert erman.say("01 10 00 0C 00 02 04 00 C8 01 90 73 F8") == "01 10 00 0C 00 02 81 CB"
+    assert erman.exchange("01 10 00 0C 00 02 04 00 C8 01 90 73 F8") == "01 10 00 0C 00 02 81 CB"
     assert (erman.sim["acceleration_time"], erman.sim["deceleration_time"]) == (20, 40)
     assert (erman.motor.acceleration_time, erman.motor.deceleration_time) == (20, 40)
-    assert erman.say("01 0F 00 00 00 09 02 01 01 25 2C") == "01 0F 00 00 00 09 95 CD"
+    assert erman.exchange("01 0F 00 00 00 09 02 01 01 25 2C") == "01 0F 00 00 00 09 95 CD"
 
 
 def test_erman_coils_are_read_as_printed(erman: Bench) -> None:
-    assert erman.say("01 01 00 00 00 0C 3C 0F")[:11] == "01 01 02 00"
-    erman.say("01 05 00 00 FF 00 8C 3A")
-    assert erman.say("01 01 00 00 00 0C 3C 0F")[:14] == "01 01 02 01 00"
+    assert erman.exchange("01 01 00 00 00 0C 3C 0F")[:11] == "01 01 02 00"
+    erman.exchange("01 05 00 00 FF 00 8C 3A")
+    assert erman.exchange("01 01 00 00 00 0C 3C 0F")[:14] == "01 01 02 01 00"
 
 
 @pytest.mark.parametrize(
@@ -117,11 +117,11 @@ def test_erman_coils_are_read_as_printed(erman: Bench) -> None:
 def test_erman_refuses_wrong_addresses_with_the_printed_reply(
     erman: Bench, request_: Message, reply: str
 ) -> None:
-    assert erman.hear(build_request(Framing.RTU, request_)) == bytes.fromhex(reply)
+    assert erman.send(build_request(Framing.RTU, request_)) == bytes.fromhex(reply)
 
 
 def test_erman_refuses_an_unknown_function_with_exception_01(erman: Bench) -> None:
-    assert erman.hear(checksums.rtu("01 2B")) == checksums.rtu("01 AB 01")
+    assert erman.send(checksums.rtu("01 2B")) == checksums.rtu("01 AB 01")
 
 
 @pytest.mark.parametrize(
@@ -135,49 +135,49 @@ def test_erman_refuses_an_unknown_function_with_exception_01(erman: Bench) -> No
     ],
 )
 def test_erman_does_not_reply_to_damaged_foreign_or_broadcast_frames(erman: Bench, frame: bytes) -> None:
-    assert erman.hear(frame) == b""
+    assert erman.send(frame) == b""
     assert erman.sim.counters.replies == 0
 
 
 def test_erman_start_and_stop_ramp_the_motor(erman: Bench) -> None:
-    erman.say("01 06 00 02 01 1D E9 93")  # setpoint 28.5 Hz
-    assert erman.ask(4, 0x400, 2) == [0, 0]
-    erman.say("01 05 00 00 FF 00 8C 3A")
+    erman.exchange("01 06 00 02 01 1D E9 93")  # setpoint 28.5 Hz
+    assert erman.read(4, 0x400, 2) == [0, 0]
+    erman.exchange("01 05 00 00 FF 00 8C 3A")
     erman.wait(1)
-    assert erman.ask(4, 0x400, 2) == [0, 2]
+    assert erman.read(4, 0x400, 2) == [0, 2]
     erman.wait(60)
-    assert erman.ask(4, 0x400, 2) == [0, 1]
-    assert erman.ask(4, 0x01) == [285]
-    erman.say("01 05 00 01 FF 00 DD FA")  # stop (built)
+    assert erman.read(4, 0x400, 2) == [0, 1]
+    assert erman.read(4, 0x01) == [285]
+    erman.exchange("01 05 00 01 FF 00 DD FA")  # stop (built)
     erman.wait(0.1)
-    assert erman.ask(4, 0x400, 2) == [0, 3]
+    assert erman.read(4, 0x400, 2) == [0, 3]
     erman.wait(60)
-    assert (erman.ask(4, 0x400, 2), erman.ask(4, 0x01)) == ([0, 0], [0])
+    assert (erman.read(4, 0x400, 2), erman.read(4, 0x01)) == ([0, 0], [0])
 
 
 def test_erman_start_is_ignored_while_stop_is_on_and_clearing_stop_starts_nothing(erman: Bench) -> None:
-    erman.say("01 06 00 02 01 1D E9 93")
-    erman.say("01 05 00 01 FF 00 DD FA")  # stop on
-    erman.say("01 05 00 00 FF 00 8C 3A")  # start on
+    erman.exchange("01 06 00 02 01 1D E9 93")
+    erman.exchange("01 05 00 01 FF 00 DD FA")  # stop on
+    erman.exchange("01 05 00 00 FF 00 8C 3A")  # start on
     assert not erman.motor.energised
-    erman.say("01 05 00 01 00 00 9C 0A")  # stop off
+    erman.exchange("01 05 00 01 00 00 9C 0A")  # stop off
     assert not erman.motor.energised
-    erman.say("01 05 00 00 FF 00 8C 3A")
+    erman.exchange("01 05 00 00 FF 00 8C 3A")
     assert erman.motor.energised
 
 
 def test_erman_emergency_stop_prevents_a_start_until_a_reset_and_stays_the_last_fault(erman: Bench) -> None:
-    erman.say("01 05 00 00 FF 00 8C 3A")
-    erman.say("01 05 00 02 FF 00 2D FA")  # emergency stop (built)
+    erman.exchange("01 05 00 00 FF 00 8C 3A")
+    erman.exchange("01 05 00 02 FF 00 2D FA")  # emergency stop (built)
     assert not erman.motor.energised
-    assert erman.ask(4, 0x402, 2) == [0, 1]
-    erman.hear(checksums.rtu("01 05 00 02 00 00"))
-    erman.say("01 05 00 00 FF 00 8C 3A")
+    assert erman.read(4, 0x402, 2) == [0, 1]
+    erman.send(checksums.rtu("01 05 00 02 00 00"))
+    erman.exchange("01 05 00 00 FF 00 8C 3A")
     assert not erman.motor.energised
-    erman.say("01 05 00 09 FF 00 5C 38")  # reset (built)
+    erman.exchange("01 05 00 09 FF 00 5C 38")  # reset (built)
     assert not erman.motor.energised
-    assert erman.ask(4, 0x402, 2) == [0, 1]
-    erman.say("01 05 00 00 FF 00 8C 3A")
+    assert erman.read(4, 0x402, 2) == [0, 1]
+    erman.exchange("01 05 00 00 FF 00 8C 3A")
     assert erman.motor.energised
 
 
@@ -196,23 +196,23 @@ def che() -> Bench:
 
 
 def test_che_device_code_register_reads_0101(che: Bench) -> None:
-    assert che.say("01 03 30 16 00 01 6A CE")[:14] == "01 03 02 01 01"
+    assert che.exchange("01 03 30 16 00 01 6A CE")[:14] == "01 03 02 01 01"
 
 
 def test_che_stores_a_written_parameter() -> None:
     che = Bench(MyCHE(2))
     frame = "02 06 00 08 13 88 05 6D"  # example of section 11.6.2
-    assert che.say(frame) == frame
+    assert che.exchange(frame) == frame
     assert che.sim["jump"] == 0x1388
 
 
 def test_che_setpoint_is_a_percentage_of_the_maximum_frequency(che: Bench) -> None:
-    che.say("01 06 20 00 13 88 8F 5C")  # 50.00 %
-    che.say("01 06 10 00 00 01 4C CA")
+    che.exchange("01 06 20 00 13 88 8F 5C")  # 50.00 %
+    che.exchange("01 06 10 00 00 01 4C CA")
     che.wait(60)
-    assert che.ask(3, 0x3000) == [3000]
-    assert che.ask(3, 0x3001) == [3000]
-    assert che.ask(3, 0x1001) == [1]
+    assert che.read(3, 0x3000) == [3000]
+    assert che.read(3, 0x3001) == [3000]
+    assert che.read(3, 0x1001) == [1]
 
 
 def test_che_negative_setpoint_reverses_the_motor(che: Bench) -> None:
@@ -220,7 +220,7 @@ def test_che_negative_setpoint_reverses_the_motor(che: Bench) -> None:
     che.write(0x1000, 1)
     che.wait(60)
     assert che.motor.frequency == pytest.approx(-30)
-    assert che.ask(3, 0x1001) == [2]
+    assert che.read(3, 0x1001) == [2]
     assert che.write(0x2000, 10_001) == 0x12
 
 
@@ -231,20 +231,20 @@ def test_che_stop_words_ramp_down_and_coast_word_stops_immediately(
     che.write(0x2000, 10_000)
     che.write(0x1000, 2)
     che.wait(60)
-    assert che.ask(3, 0x1001) == [2]
+    assert che.read(3, 0x1001) == [2]
     che.write(0x1000, word)
     che.wait(0.01)
-    assert (che.ask(3, 0x1001) == [3]) is stopped_after
+    assert (che.read(3, 0x1001) == [3]) is stopped_after
     che.wait(60)
-    assert che.ask(3, 0x1001) == [3]
+    assert che.read(3, 0x1001) == [3]
 
 
 def test_che_refuses_a_start_during_a_fault_until_a_reset(che: Bench) -> None:
     che.sim.trip(10)
-    assert (che.ask(3, 0x1001), che.ask(3, 0x5000)) == ([4], [10])
+    assert (che.read(3, 0x1001), che.read(3, 0x5000)) == ([4], [10])
     assert che.write(0x1000, 1) == 0x01  # the manual uses this code also for a command during a fault
     assert che.write(0x1000, 7) == 0
-    assert (che.ask(3, 0x1001), che.ask(3, 0x5000)) == ([3], [0])
+    assert (che.read(3, 0x1001), che.read(3, 0x5000)) == ([3], [0])
 
 
 @pytest.mark.parametrize(
@@ -260,7 +260,7 @@ def test_che_refuses_a_start_during_a_fault_until_a_reset(che: Bench) -> None:
 def test_che_refuses_invalid_requests_with_the_documented_exception(
     che: Bench, body: str, reply: str
 ) -> None:
-    assert che.hear(checksums.rtu(body)) == checksums.rtu(reply)
+    assert che.send(checksums.rtu(body)) == checksums.rtu(reply)
 
 
 def test_che_parameter_writes_wear_the_eeprom_but_alias_writes_do_not(che: Bench) -> None:
@@ -276,7 +276,7 @@ def test_che_refuses_a_write_while_it_stores_the_previous_value(che: Bench) -> N
     che.sim.storing = 0.5
     assert che.write(11, 50) == 0
     assert che.write(11, 60) == 6
-    assert che.ask(3, 0x5001) == [8]
+    assert che.read(3, 0x5001) == [8]
     che.wait(0.6)
     assert che.write(11, 60) == 0
 
@@ -290,8 +290,8 @@ def test_che_refuses_to_change_a_locked_parameter_while_running(che: Bench) -> N
 
 
 def test_che_replies_to_a_damaged_frame_with_exception_11(che: Bench) -> None:
-    assert che.hear(bytes.fromhex("01 03 10 01 00 01 D1 0B")) == checksums.rtu("01 83 11")
-    assert che.hear(bytes.fromhex("02 03 10 01 00 01 D1 0B")) == b""
+    assert che.send(bytes.fromhex("01 03 10 01 00 01 D1 0B")) == checksums.rtu("01 83 11")
+    assert che.send(bytes.fromhex("02 03 10 01 00 01 D1 0B")) == b""
     assert che.sim.counters.damaged == 1
 
 
@@ -304,23 +304,23 @@ def ibd() -> Bench:
 
 
 def test_ibd_shows_its_terminals(ibd: Bench) -> None:
-    assert ibd.say("01 03 00 16 00 01 65 CE") == "01 03 02 18 00 B2 44"
+    assert ibd.exchange("01 03 00 16 00 01 65 CE") == "01 03 02 18 00 B2 44"
 
 
 def test_ibd_programmed_outputs_show_the_motor_s_state(ibd: Bench) -> None:
-    ibd.say("01 06 20 01 13 88 DE 9C")
-    ibd.say("01 06 20 00 00 02 03 CB")
+    ibd.exchange("01 06 20 01 13 88 DE 9C")
+    ibd.exchange("01 06 20 00 00 02 03 CB")
     ibd.wait(1)
-    assert ibd.ask(3, 22) == [0x1800 | 1 << 8 | 1 << 9]
+    assert ibd.read(3, 22) == [0x1800 | 1 << 8 | 1 << 9]
     ibd.wait(60)
-    assert ibd.ask(3, 22) == [0x1800 | 1 << 8]
-    ibd.say("01 06 20 00 00 01 43 CA")
+    assert ibd.read(3, 22) == [0x1800 | 1 << 8]
+    ibd.exchange("01 06 20 00 00 01 43 CA")
     ibd.wait(1)
-    assert ibd.ask(3, 22) == [0x1800 | 1 << 8 | 1 << 10]
+    assert ibd.read(3, 22) == [0x1800 | 1 << 8 | 1 << 10]
     ibd.sim.trip(1)
-    assert ibd.ask(3, 22) == [0x1800 | 1 << 13]
+    assert ibd.read(3, 22) == [0x1800 | 1 << 13]
     ibd.sim["output_virtual"] = 1
-    assert ibd.ask(3, 22) == [0x1800]
+    assert ibd.read(3, 22) == [0x1800]
 
 
 def test_ibd_direction_bits_alone_reverse_a_running_motor(ibd: Bench) -> None:
@@ -376,7 +376,7 @@ def test_ibd_obeys_the_line_only_if_its_source_parameters_select_it(ibd: Bench) 
 
 def test_ibd_stores_the_maximum_for_a_larger_value(ibd: Bench) -> None:
     assert ibd.write(107, 60_000) == 0
-    assert ibd.ask(3, 107) == [36_000]
+    assert ibd.read(3, 107) == [36_000]
     assert ibd.write(0x2001, 50_000) == 0
     assert ibd.sim["frequency"] == 400
 
@@ -387,28 +387,28 @@ def test_ibd_stores_the_maximum_for_a_larger_value(ibd: Bench) -> None:
 def test_ibd_does_not_reply_to_invalid_requests(ibd: Bench, function: int, start: int, count: int) -> None:
     data = b"\0\1" if function == 0x10 else b""
     assert ibd.sim.answer(Message(1, function, start, count, data), 0.0) is None
-    assert len(ibd.ask(3, 100, 3)) == 3
+    assert len(ibd.read(3, 100, 3)) == 3
 
 
 def test_ibd_answers_a_read_of_4_registers_but_not_of_5(ibd: Bench) -> None:
     """The other reasons for silence are excluded: all five registers are readable."""
     ibd.sim.memory.make_readable(HOLDING, range(100, 105))
-    assert len(ibd.ask(3, 100, 4)) == 4
+    assert len(ibd.read(3, 100, 4)) == 4
     assert ibd.sim.answer(Message(1, 3, 100, 5), 0.0) is None
 
 
 def test_ibd_carries_out_a_broadcast_without_a_reply(ibd: Bench) -> None:
-    ibd.say("01 06 20 01 13 88 DE 9C")
-    ibd.say("01 06 20 00 00 02 03 CB")
+    ibd.exchange("01 06 20 01 13 88 DE 9C")
+    ibd.exchange("01 06 20 00 00 02 03 CB")
     ibd.wait(60)
-    assert ibd.say("00 06 20 00 00 01 42 1B") == ""  # stop (built)
+    assert ibd.exchange("00 06 20 00 00 01 42 1B") == ""  # stop (built)
     ibd.wait(60)
     assert not ibd.motor.energised
 
 
 def test_ibd_0010h_which_is_delixis_forward_bit_resets_the_fault(ibd: Bench) -> None:
     ibd.sim.trip(1)
-    ibd.say("01 06 20 00 00 10 83 C6")  # built
+    ibd.exchange("01 06 20 00 00 10 83 C6")  # built
     assert (ibd.motor.fault, ibd.motor.energised) == (0, False)
 
 
@@ -421,36 +421,36 @@ def delixi() -> Bench:
 
 
 def test_delixi_output_frequency_is_read_as_printed(delixi: Bench) -> None:
-    delixi.say("01 06 00 02 13 88 25 5C")
-    delixi.say("01 06 20 00 00 12 02 07")
+    delixi.exchange("01 06 00 02 13 88 25 5C")
+    delixi.exchange("01 06 20 00 00 12 02 07")
     delixi.wait(60)
-    assert delixi.say("01 03 01 F4 00 01 C4 04") == "01 03 02 13 88 B5 12"
+    assert delixi.exchange("01 03 01 F4 00 01 C4 04") == "01 03 02 13 88 B5 12"
     delixi.sim.trip(9)
-    assert delixi.ask(3, 0x0213) == [9]
-    assert delixi.ask(3, 0x020D) == [9]
+    assert delixi.read(3, 0x0213) == [9]
+    assert delixi.read(3, 0x020D) == [9]
 
 
 def test_delixi_output_frequency_is_read_in_ascii_as_printed() -> None:
     delixi = Bench(DelixiModbus(1, framing=Framing.ASCII))
     delixi.sim["output_frequency"] = 50
-    assert delixi.say(":010301F4000106") == ":01030213885F"
+    assert delixi.exchange(":010301F4000106") == ":01030213885F"
 
 
 def test_delixi_obeys_the_line_only_if_its_source_parameters_select_it(delixi: Bench) -> None:
-    delixi.say("01 06 00 02 13 88 25 5C")
+    delixi.exchange("01 06 00 02 13 88 25 5C")
     delixi.sim["run_source"] = 0  # P00.00
-    assert delixi.say("01 06 20 00 00 12 02 07") == "01 06 20 00 00 12 02 07"
+    assert delixi.exchange("01 06 20 00 00 12 02 07") == "01 06 20 00 00 12 02 07"
     assert not delixi.motor.energised
     delixi.sim["run_source"] = 2
     delixi.sim["frequency_source"] = 0  # P00.01
-    delixi.say("01 06 20 00 00 12 02 07")
+    delixi.exchange("01 06 20 00 00 12 02 07")
     delixi.wait(60)
     assert (delixi.motor.energised, delixi.motor.frequency) == (True, 0)
 
 
 def test_delixi_reverse_word_turns_the_motor_in_reverse(delixi: Bench) -> None:
-    delixi.say("01 06 00 02 13 88 25 5C")
-    delixi.say("01 06 20 00 00 22 02 13")  # built
+    delixi.exchange("01 06 00 02 13 88 25 5C")
+    delixi.exchange("01 06 20 00 00 22 02 13")  # built
     delixi.wait(60)
     assert delixi.motor.frequency == -50
 
@@ -478,15 +478,15 @@ def native() -> Bench:
 
 
 def test_native_frequency_and_run_state_are_read(native: Bench) -> None:
-    assert native.say(":010300000000000004")[:9] == ":01030001"  # built; stopped
-    native.say(":0104000100001388A1")
-    native.say(":010200020000000005")
+    assert native.exchange(":010300000000000004")[:9] == ":01030001"  # built; stopped
+    native.exchange(":0104000100001388A1")
+    native.exchange(":010200020000000005")
     native.wait(60)
-    assert native.say(":010701F400000000FD") == ":010701F40000138898"
-    assert native.say(":010300000000000004")[:9] == ":01030002"
-    native.say(":010200030000000006")  # reverse (built)
+    assert native.exchange(":010701F400000000FD") == ":010701F40000138898"
+    assert native.exchange(":010300000000000004")[:9] == ":01030002"
+    native.exchange(":010200030000000006")  # reverse (built)
     native.wait(60)
-    assert native.say(":010300000000000004")[:9] == ":01030003"
+    assert native.exchange(":010300000000000004")[:9] == ":01030003"
 
 
 @pytest.mark.parametrize(
@@ -497,14 +497,14 @@ def test_native_fault_and_fault_record_show_the_printed_digits(
     native: Bench, fault: int, shown: str, state: int
 ) -> None:
     native.sim.trip(fault)
-    assert native.say(":01070213000000001D")[9:17] == shown
+    assert native.exchange(":01070213000000001D")[9:17] == shown
     assert native.sim["fault"] == fault
     for number, record in enumerate((shown, "00000000", "00000000", "00000000")):
         asked = checksums.delixi(f"0107{0x020D + number:04X}00000000")
-        assert native.hear(asked)[9:17].decode() == record
-    assert native.say(":010300000000000004")[5:9] == f"{state:04X}"
-    assert native.say(":010200040000000007") == ":010200040000000007"  # reset
-    assert native.say(":010300000000000004")[5:9] == "0001"
+        assert native.send(asked)[9:17].decode() == record
+    assert native.exchange(":010300000000000004")[5:9] == f"{state:04X}"
+    assert native.exchange(":010200040000000007") == ":010200040000000007"  # reset
+    assert native.exchange(":010300000000000004")[5:9] == "0001"
 
 
 @pytest.mark.parametrize(
@@ -519,7 +519,7 @@ def test_native_fault_and_fault_record_show_the_printed_digits(
 def test_native_invalid_requests_get_the_documented_error_replies(
     native: Bench, frame: bytes, reply: bytes
 ) -> None:
-    assert native.hear(frame) == reply
+    assert native.send(frame) == reply
 
 
 class MyNative(DelixiNative):
@@ -528,18 +528,18 @@ class MyNative(DelixiNative):
 
 def test_native_refuses_values_beyond_limits_and_locked_parameters() -> None:
     native = Bench(MyNative(1))
-    assert native.hear(checksums.delixi("0106001100000064")) == checksums.delixi("0106001100000064")
-    assert native.hear(checksums.delixi("0106001100001771")) == checksums.delixi(
+    assert native.send(checksums.delixi("0106001100000064")) == checksums.delixi("0106001100000064")
+    assert native.send(checksums.delixi("0106001100001771")) == checksums.delixi(
         "01FD000000000000"
     )  # 600.1 s
-    native.say(":010200020000000005")
-    assert native.hear(checksums.delixi("0106001100000032")) == checksums.delixi("01FE000000000000")
+    native.exchange(":010200020000000005")
+    assert native.send(checksums.delixi("0106001100000032")) == checksums.delixi("01FE000000000000")
     assert native.sim["ramp"] == 10
 
 
 def test_native_start_during_a_fault_is_refused(native: Bench) -> None:
     native.sim.trip(1)
-    assert native.say(":010200020000000005") == ":01F0000000000000F1"
+    assert native.exchange(":010200020000000005") == ":01F0000000000000F1"
     assert not native.motor.energised
 
 
@@ -547,39 +547,39 @@ def test_native_refuses_parameter_writes_while_locked(native: Bench) -> None:
     assert isinstance(native.sim, SimulatedDelixiNative)
     native.sim.locked = True
     locked = checksums.delixi("01FE000000000000")
-    assert native.say(":0106000200001388A4").encode() + b"\r\n" == locked
-    assert native.hear(checksums.delixi("0105000200001388")) == locked
-    assert native.say(":0104000100001388A1") == ":0104000100001388A1"  # the run setpoint is not locked
-    assert native.say(":010200020000000005") == ":010200020000000005"
+    assert native.exchange(":0106000200001388A4").encode() + b"\r\n" == locked
+    assert native.send(checksums.delixi("0105000200001388")) == locked
+    assert native.exchange(":0104000100001388A1") == ":0104000100001388A1"  # the run setpoint is not locked
+    assert native.exchange(":010200020000000005") == ":010200020000000005"
     native.sim.locked = False
-    assert native.say(":0106000200001388A4") == ":0106000200001388A4"
+    assert native.exchange(":0106000200001388A4") == ":0106000200001388A4"
 
 
 def test_native_drive_refuses_commands_unless_its_run_source_is_the_line(native: Bench) -> None:
     native.sim["run_source"] = 0  # P00.00
-    assert native.say(":010200020000000005") == ":01F0000000000000F1"
+    assert native.exchange(":010200020000000005") == ":01F0000000000000F1"
     assert not native.motor.energised
 
 
 def test_native_only_function_06_wears_the_eeprom(native: Bench) -> None:
-    native.say(":0104000100001388A1")
+    native.exchange(":0104000100001388A1")
     assert not native.sim.counters.eeprom_writes
-    native.say(":0106000200001388A4")
+    native.exchange(":0106000200001388A4")
     assert native.sim.counters.eeprom_writes == {"stored_frequency": 1}
 
 
 def test_native_carries_out_a_broadcast_run_command_without_a_reply(native: Bench) -> None:
-    native.say(":0104000100001388A1")
-    native.say(":010200020000000005")
+    native.exchange(":0104000100001388A1")
+    native.exchange(":010200020000000005")
     native.wait(60)
-    assert native.say(":000200010000000003") == ""  # stop (built)
+    assert native.exchange(":000200010000000003") == ""  # stop (built)
     native.wait(60)
     assert not native.motor.energised
 
 
 def test_native_and_modbus_drives_ignore_frames_of_the_other_protocol(native: Bench) -> None:
-    assert native.say(":010301F4000106") == ""
-    assert Bench(DelixiModbus(1, framing=Framing.ASCII)).say(":010701F400000000FD") == ""
+    assert native.exchange(":010301F4000106") == ""
+    assert Bench(DelixiModbus(1, framing=Framing.ASCII)).exchange(":010701F400000000FD") == ""
 
 
 # ---- YD1000 ----
@@ -601,8 +601,8 @@ def run_at(yd: Bench, setpoint: int, word: int = FORWARD) -> None:
 
 
 def test_yd_address_and_maximum_frequency_are_readable(yd: Bench) -> None:
-    assert yd.say("01 03 08 02 00 01 27 AA")[:14] == "01 03 02 00 01"
-    assert yd.say("01 03 00 11 00 01 D4 0F")[:14] == "01 03 02 1F 40"  # FH, the maximum frequency: 80 Hz
+    assert yd.exchange("01 03 08 02 00 01 27 AA")[:14] == "01 03 02 00 01"
+    assert yd.exchange("01 03 00 11 00 01 D4 0F")[:14] == "01 03 02 1F 40"  # FH, the maximum frequency: 80 Hz
 
 
 def test_yd_refuses_to_read_two_registers_at_once(yd: Bench) -> None:
@@ -611,19 +611,19 @@ def test_yd_refuses_to_read_two_registers_at_once(yd: Bench) -> None:
 
 def test_yd_runs_at_the_setpoint_written_over_the_line(yd: Bench) -> None:
     run_at(yd, 5000)
-    assert (yd.ask(3, 0x1100), yd.ask(3, 0x1201)) == ([5000], [1 << 10])
+    assert (yd.read(3, 0x1100), yd.read(3, 0x1201)) == ([5000], [1 << 10])
     yd.write(0x1000, FORWARD | 1 << 9)
     yd.wait(60)
-    assert (yd.motor.frequency, yd.ask(3, 0x1201)) == (-50, [1 << 10 | 1 << 9])
+    assert (yd.motor.frequency, yd.read(3, 0x1201)) == (-50, [1 << 10 | 1 << 9])
     yd.write(0x1000, STOP)
     yd.wait(60)
-    assert yd.ask(3, 0x1100) == [0]
+    assert yd.read(3, 0x1100) == [0]
 
 
 def test_yd_shows_current_and_voltage_in_percent(yd: Bench) -> None:
     run_at(yd, 5000)
-    assert yd.ask(3, 0x1203) == [round(10_000 * yd.motor.current / yd.motor.rating.current)]
-    assert yd.ask(3, 0x1205) == [10_000]  # 50 Hz are the rated frequency
+    assert yd.read(3, 0x1203) == [round(10_000 * yd.motor.current / yd.motor.rating.current)]
+    assert yd.read(3, 0x1205) == [10_000]  # 50 Hz are the rated frequency
 
 
 def test_yd_obeys_the_panel_while_bit_15_is_off(yd: Bench) -> None:
@@ -637,15 +637,15 @@ def test_yd_obeys_the_panel_while_bit_15_is_off(yd: Bench) -> None:
 
 def test_yd_trip_freezes_only_1200h_and_1201h(yd: Bench) -> None:
     run_at(yd, 5000)
-    yd.ask(3, 0x1200)
+    yd.read(3, 0x1200)
     yd.write(0x1000, STOP | 1 << 12)  # emergency stop
     yd.wait(1)
-    assert yd.ask(3, 0x1100) == [0]
-    assert yd.ask(3, 0x1200) == [5000]
-    assert yd.ask(3, 0x1201) == [1 << 10]
-    assert yd.ask(3, 0x1202) == [5000]
-    assert (yd.ask(3, 0x1203), yd.ask(3, 0x1205)) == ([0], [0])  # only 1200H and 1201H are frozen
-    assert yd.ask(3, 0x1210) != [0]
+    assert yd.read(3, 0x1100) == [0]
+    assert yd.read(3, 0x1200) == [5000]
+    assert yd.read(3, 0x1201) == [1 << 10]
+    assert yd.read(3, 0x1202) == [5000]
+    assert (yd.read(3, 0x1203), yd.read(3, 0x1205)) == ([0], [0])  # only 1200H and 1201H are frozen
+    assert yd.read(3, 0x1210) != [0]
 
 
 def test_yd_reset_restarts_the_drive_which_ignores_requests_meanwhile(yd: Bench) -> None:
@@ -654,9 +654,9 @@ def test_yd_reset_restarts_the_drive_which_ignores_requests_meanwhile(yd: Bench)
     assert yd.write(0x1000, RESET) == 0
     assert yd.write(0x1000, STOP) is None
     yd.wait(2.5)
-    assert yd.ask(3, 0x1210) == [3]
-    assert yd.ask(3, 0x1001) == [0]
-    assert yd.ask(3, 0x1200) == [0]
+    assert yd.read(3, 0x1210) == [3]
+    assert yd.read(3, 0x1001) == [0]
+    assert yd.read(3, 0x1200) == [0]
 
 
 @pytest.mark.parametrize("bit", [13, 12, 11, 10, 8, 7], ids=lambda bit: f"bit {bit}")
@@ -668,7 +668,7 @@ def test_yd_command_bit_without_bit_15_has_no_effect(yd: Bench, bit: int) -> Non
     assert yd.write(0x1000, 1 << 14 | 1 << bit) == 0
     yd.wait(60)
     assert (yd.motor.frequency, yd.motor.fault) == (30, 0)
-    assert yd.ask(3, 0x1001) == [3000]
+    assert yd.read(3, 0x1001) == [3000]
 
 
 @pytest.mark.parametrize(
@@ -684,7 +684,7 @@ def test_yd_command_bit_without_bit_15_has_no_effect(yd: Bench, bit: int) -> Non
 )
 def test_yd_status_bits_show_the_motors_state(yd: Bench, word: int, state: int) -> None:
     run_at(yd, 3000, word)
-    assert yd.ask(3, 0x1201) == [state]
+    assert yd.read(3, 0x1201) == [state]
     yd.write(0x1000, STOP)
     yd.wait(60)
     assert not yd.motor.energised
@@ -694,7 +694,7 @@ def test_yd_direct_current_brake_keeps_the_motor_energised_at_0_hz(yd: Bench) ->
     run_at(yd, 3000)
     yd.write(0x1000, STOP | 1 << 7)
     yd.wait(10)
-    assert (yd.ask(3, 0x1100), yd.motor.energised) == ([0], True)
+    assert (yd.read(3, 0x1100), yd.motor.energised) == ([0], True)
 
 
 @pytest.mark.parametrize(
@@ -706,7 +706,7 @@ def test_yd_preset_speed_bits_select_the_speed(yd: Bench, bits: int, speed: int)
         assert yd.write(address, 1000 + number * 100) == 0
     yd.write(0x1000, FORWARD | bits)
     yd.wait(60)
-    assert yd.ask(3, 0x1100) == yd.ask(3, 0x1202) == [1000 + speed * 100]
+    assert yd.read(3, 0x1100) == yd.read(3, 0x1202) == [1000 + speed * 100]
 
 
 @pytest.mark.parametrize(
@@ -725,9 +725,9 @@ def test_yd_preset_speed_bits_select_the_speed(yd: Bench, bits: int, speed: int)
     ids=lambda each: f"{each:04X}",
 )
 def test_yd_refuses_values_beyond_the_documented_limits(yd: Bench, address: int, value: int) -> None:
-    before = yd.ask(3, address)
+    before = yd.read(3, address)
     assert yd.write(address, value) == 3
-    assert yd.ask(3, address) == before
+    assert yd.read(3, address) == before
 
 
 def test_yd_limits_follow_the_present_values_of_other_parameters(yd: Bench) -> None:
@@ -740,7 +740,7 @@ def test_yd_limits_follow_the_present_values_of_other_parameters(yd: Bench) -> N
 @pytest.mark.parametrize("address", [0x0001, 0x0007, 0x0015])
 def test_yd_does_not_store_the_panel_s_setpoint(yd: Bench, address: int) -> None:
     assert yd.write(address, 1) == 0
-    assert yd.ask(3, address) == [0]
+    assert yd.read(3, address) == [0]
     assert not yd.sim.counters.eeprom_writes
 
 
@@ -748,9 +748,9 @@ def test_yd_watchdog_is_inactive_after_a_reset_until_the_first_message(yd: Bench
     yd.write(0x0803, 1)
     yd.write(0x1000, RESET)
     yd.now += 5
-    assert yd.ask(3, 0x1210) == [0]
+    assert yd.read(3, 0x1210) == [0]
     yd.now += 5
-    assert yd.ask(3, 0x1210) != [0]
+    assert yd.read(3, 0x1210) != [0]
 
 
 def test_yd_obeys_a_broadcast_setpoint_but_no_broadcast_setting(yd: Bench) -> None:
@@ -778,9 +778,9 @@ def test_yd_watchdog_trips_when_the_line_is_silent_too_long(yd: Bench) -> None:
     yd.write(0x1001, 5000)
     yd.write(0x1000, FORWARD)
     yd.now += 4
-    assert yd.ask(3, 0x1100) != [0]
+    assert yd.read(3, 0x1100) != [0]
     yd.now += 6
-    assert yd.ask(3, 0x1100) == [0]
+    assert yd.read(3, 0x1100) == [0]
     assert yd.motor.fault
 
 
@@ -828,7 +828,7 @@ CONFIRMED = {  # frames that are confirmed with a copy; those of InvtCHE and YD1
 
 @table(("make", "frame"), [(make, frame) for make, *frames in CONFIRMED.values() for frame in frames])
 def test_write_is_confirmed_with_a_copy_of_the_request(make: Callable[[], Drive], frame: str) -> None:
-    assert Bench(make()).say(frame) == frame
+    assert Bench(make()).exchange(frame) == frame
 
 
 @table("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, DelixiNative, YD1000])

@@ -320,9 +320,9 @@ def test_an_invalid_faults_file_is_refused(text: str | None, sentence: str, tmp_
 
 def test_the_help_lists_the_keys_of_a_faults_file(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", "--help"]) == 0
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     keys = {*rates_of(Faults), *rates_of(DriveFaults), "seed", "late", "silence", "trip"}
-    assert {name for name in keys if not re.search(rf"^  {name} = ", told, re.MULTILINE)} == set()
+    assert {name for name in keys if not re.search(rf"^  {name} = ", printed, re.MULTILINE)} == set()
 
 
 def test_simulate_command_reports_a_mistake_in_the_faults_file(

@@ -35,7 +35,6 @@ CHE100 = "CHE100 manual v1.4, p. 117"
 CHE100_NEXT = "CHE100 manual v1.4, p. 118"
 CHE100_CODES = "CHE100 manual v1.4, p. 119"
 SCALE = f"{CHE100}; scale: Goodrive300L manual, p. 130 (compatible with CHF100A and CHV100)"
-SCALE_NEXT = f"{CHE100_NEXT}; scale: Goodrive300L manual, p. 130 (compatible with CHF100A and CHV100)"
 
 STOP_TIME = 60.0  # s; the address of the deceleration time is not known
 

@@ -184,7 +184,7 @@ speed = { at = 0x0032 }
 gain = { at = 0x0033, while_running = "no" }
 """
 TWENTY_CSV = "name;at;step;access\nan;1E10;0,1;reading\nbn;0x12;0.1;readings\n"
-TOLD = [
+TWENTY_MISTAKES = [
     "twenty.toml:3: [family]: unknown key 'manuel'; did you mean manual?",
     "twenty.toml:8: [family]: silence = 'soon' is not a duration from 100 us to 24 h, such as \"50 ms\", "
     '"2 s" or "1 min"',
@@ -230,8 +230,10 @@ def test_more_than_twenty_mistakes_are_reported_together(tmp_path: Path) -> None
     path.write_text(TWENTY)
     with pytest.raises(FamilyError) as wrong:
         load_family(path)
-    assert [mistake.removeprefix(f"{tmp_path}{os.sep}") for mistake in wrong.value.mistakes] == TOLD
-    assert len(TOLD) > 20
+    assert [
+        mistake.removeprefix(f"{tmp_path}{os.sep}") for mistake in wrong.value.mistakes
+    ] == TWENTY_MISTAKES
+    assert len(TWENTY_MISTAKES) > 20
 
 
 DEVICE = HEAD + "[reading]\ndevice = { at = 3 }\nspeed = { at = 4, unit = 'Hz', step = 0.1 }\n"
@@ -271,12 +273,12 @@ def test_mistakes_in_the_sections_identify_and_verb_are_reported(
 ) -> None:
     first, rest = ("", DEVICE + section) if section.startswith("[") else (section + "\n", DEVICE)
     (tmp_path / "t.toml").write_text(first + rest)
-    told: tuple[str, ...] = ()
+    found: tuple[str, ...] = ()
     try:
         load_family(tmp_path / "t.toml")
     except FamilyError as wrong:
-        told = wrong.mistakes
-    assert [mistake.partition("t.toml:")[2].partition(": ")[2] for mistake in told] == mistakes
+        found = wrong.mistakes
+    assert [mistake.partition("t.toml:")[2].partition(": ")[2] for mistake in found] == mistakes
 
 
 WRONG_KEYS = [  # a wrong key of a register
@@ -339,21 +341,21 @@ WRONG_FILES = [  # a whole wrong file
 
 
 @table(
-    ("text", "told"),
+    ("text", "expected"),
     [
-        *((f"{HEAD}[reading]\na = {{ at = 1, {key} }}\n", told) for key, told in WRONG_KEYS),
-        *((f"{HEAD}{part}\n[reading]\na = {{ at = 1 }}\n", told) for part, told in WRONG_SECTIONS),
-        *((HEAD + text, told) for text, told in WRONG_TEXTS),
+        *((f"{HEAD}[reading]\na = {{ at = 1, {key} }}\n", expected) for key, expected in WRONG_KEYS),
+        *((f"{HEAD}{part}\n[reading]\na = {{ at = 1 }}\n", expected) for part, expected in WRONG_SECTIONS),
+        *((HEAD + text, expected) for text, expected in WRONG_TEXTS),
         *WRONG_FILES,
     ],
 )
-def test_a_mistake_is_reported_with_its_file_and_line(tmp_path: Path, text: str, told: str) -> None:
+def test_a_mistake_is_reported_with_its_file_and_line(tmp_path: Path, text: str, expected: str) -> None:
     found = mistakes(tmp_path, text)
-    assert any(told in mistake for mistake in found), found
+    assert any(expected in mistake for mistake in found), found
 
 
 @table(
-    ("data", "told"),
+    ("data", "expected"),
     [
         (b"", "c.csv: is empty; its first line names the columns"),
         (
@@ -381,10 +383,10 @@ def test_a_mistake_is_reported_with_its_file_and_line(tmp_path: Path, text: str,
         (b"name,at\n\na b,1\n", "c.csv: line 3, a b: 'a b' cannot be a register's name"),
     ],
 )
-def test_mistake_in_a_csv_file_is_reported_with_its_line(tmp_path: Path, data: bytes, told: str) -> None:
+def test_mistake_in_a_csv_file_is_reported_with_its_line(tmp_path: Path, data: bytes, expected: str) -> None:
     (tmp_path / "c.csv").write_bytes(data)
     found = mistakes(tmp_path, HEAD + 'registers = ["c.csv"]\n')
-    assert any(told in mistake for mistake in found), found
+    assert any(expected in mistake for mistake in found), found
 
 
 @pytest.mark.parametrize(
@@ -447,7 +449,7 @@ def test_text_registers_can_be_declared_and_read(tmp_path: Path) -> None:
 
 
 @table(
-    ("entry", "told"),
+    ("entry", "expected"),
     [
         ("a = { at = 1 }", "[text] a: 'length' is missing; add length = 8"),
         ("a = { at = 1, length = 126 }", "a text has 126 registers; it must have 1 to 125"),
@@ -461,10 +463,10 @@ def test_text_registers_can_be_declared_and_read(tmp_path: Path) -> None:
     ],
 )
 def test_mistakes_in_declarations_of_text_registers_are_reported(
-    tmp_path: Path, entry: str, told: str
+    tmp_path: Path, entry: str, expected: str
 ) -> None:
     found = mistakes(tmp_path, HEAD + "[text]\n" + entry + "\n")
-    assert any(told in mistake for mistake in found), found
+    assert any(expected in mistake for mistake in found), found
 
 
 # ---- parameters ----
@@ -491,7 +493,7 @@ def test_parameters_section_gives_the_address_rule(tmp_path: Path) -> None:
 
 
 @table(
-    ("rule", "told"),
+    ("rule", "expected"),
     [
         ("line = []", "[parameters]: 'groups' is missing; add groups = "),
         ("groups = [{ code = 1 }]", "[parameters], group number 1: code = 1 is not right; write code = "),
@@ -501,9 +503,9 @@ def test_parameters_section_gives_the_address_rule(tmp_path: Path) -> None:
         ('groups = [{ code = "P", at = 0, count = 2 }]\nfirmware = "x"', "firmware = 'x' is not a register"),
     ],
 )
-def test_mistakes_in_the_parameters_section_are_reported(tmp_path: Path, rule: str, told: str) -> None:
+def test_mistakes_in_the_parameters_section_are_reported(tmp_path: Path, rule: str, expected: str) -> None:
     text = f"{HEAD}[reading]\na = {{ at = 1 }}\n[parameters]\n{rule}\n"
-    assert any(told in mistake for mistake in mistakes(tmp_path, text))
+    assert any(expected in mistake for mistake in mistakes(tmp_path, text))
 
 
 EXTENDING = {
@@ -529,14 +531,14 @@ EXTENDING = {
 
 
 @table(
-    ("extended", "declared", "told"),
+    ("extended", "declared", "expected"),
     [(extended, *row) for extended, rows in EXTENDING.items() for row in rows],
 )
 def test_file_that_extends_a_family_replaces_none_of_its_safeguards(
-    tmp_path: Path, extended: str, declared: str, told: str
+    tmp_path: Path, extended: str, declared: str, expected: str
 ) -> None:
     (only,) = mistakes(tmp_path, f'{HEAD}extends = "{extended}"\n{declared}\n')
-    assert told in only
+    assert expected in only
 
 
 def test_file_that_extends_a_family_may_read_its_addresses_and_add_settings(tmp_path: Path) -> None:

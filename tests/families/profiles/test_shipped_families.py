@@ -437,8 +437,8 @@ def test_shipped_files_are_loaded_on_demand() -> None:
         "from multidrop.families.files import loader; "
         "print(len(registry.SHIPPED), loader._loaded, 'multidrop.families.profiles' in sys.modules)"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.split() == [str(len(SHIPPED)), "{}", "False"]
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [str(len(SHIPPED)), "{}", "False"]
 
 
 # ---- profiles in users' files ----
@@ -472,7 +472,7 @@ def test_all_mistakes_of_a_file_with_a_profile_are_reported_together(tmp_path: P
             "[reading]\nstatus = { at = 4, step = 0.5 }\n"
             "[verb.stop]\nsteps = []\n",
         )
-    told = str(wrong.value)
+    message = str(wrong.value)
     for sentence in (
         'formats has "7N1", and an RTU frame needs 8 data bits',
         "[verb] is not supported; name a profile",
@@ -481,7 +481,7 @@ def test_all_mistakes_of_a_file_with_a_profile_are_reported_together(tmp_path: P
         "reference: this profile needs a register of this name",
         "reset: this profile needs",
     ):
-        assert sentence in told
+        assert sentence in message
 
 
 def test_unknown_profile_is_reported(tmp_path: Path) -> None:
