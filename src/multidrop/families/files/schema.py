@@ -5,6 +5,7 @@ from __future__ import annotations
 import keyword
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from string import ascii_lowercase, digits
 from typing import Any
 
 from multidrop.core import NumberFormat
@@ -66,6 +67,7 @@ def family_schema(tables: Sequence[str] = ()) -> dict[str, Any]:
         "definitions": {
             "ascending": ascending(),
             **distinct(),
+            **_references(),
             "register": _register(),
             **{one.name: _of_format(one) for one in WORDS},
             **{f"roles-{name}": _of_roles(profile.roles) for name, profile in PROFILES.items()},
@@ -76,6 +78,10 @@ def family_schema(tables: Sequence[str] = ()) -> dict[str, Any]:
         "allOf": [
             *_by_default(),
             *_counting(),
+            {
+                "if": {"not": {"anyOf": [*map(_says, _MORE_NAMES)]}},
+                "then": {"$ref": "#/definitions/references"},
+            },
             *(_extending(name, base) for name, base in bases("extends").items()),
             *(_with_profile(name, profile.roles) for name, profile in PROFILES.items()),
         ],
@@ -91,6 +97,38 @@ def _says(key: str, *values: object) -> dict[str, Any]:
 def _each(entry: dict[str, Any], sections: Iterable[str] = ACCESSES) -> dict[str, Any]:
     """Return a schema that applies `entry` to each register or text in these sections."""
     return {"properties": {name: {"additionalProperties": entry} for name in sections}}
+
+
+# ---- names of registers ----
+
+
+_MORE_NAMES = ("registers", "extends", "profile")  # keys of [family] that add registers or options
+_REFERENCES = "^(register|firmware|scale_register|at_least|at_most)$"  # keys with a register's name
+
+
+def _references() -> dict[str, Any]:
+    """Return the JSON Schema "references" and its parts: keys such as `at_most` have names of the same file.
+
+    A JSON Schema cannot look up a name, but it can compare lengths and single characters of names. If all
+    names begin with other letters than a reference, the reference is misspelt. The schema compares the first
+    two and the last two characters. A correct reference is never refused; most misspelt ones are.
+    """
+    letters = [f"[{small}{small.upper()}]" for small in ascii_lowercase]
+    characters = [*letters, "_", *digits]
+    forms = [form.format(one) for form in ("^{}", "^.{}", "{}$", "{}.$") for one in characters]
+    forms += [f"^.{{{length}}}$" for length in range(1, 40)]
+    parts: dict[str, Any] = {}
+    for number, form in enumerate(forms):
+        other = {"$ref": f"#/definitions/other-{number}"}
+        referring: dict[str, Any] = {"patternProperties": {_REFERENCES: other}}
+        entries = {"additionalProperties": referring, "items": referring}
+        parts[f"other-{number}"] = {"not": {"type": "string", "pattern": form}}
+        parts[f"reference-{number}"] = {
+            "if": {"patternProperties": {f"^({'|'.join([*ACCESSES, 'option'])})$": {"propertyNames": other}}},
+            "then": {"additionalProperties": {**referring, **entries}},
+        }
+    rules = [{"$ref": f"#/definitions/{name}"} for name in parts if name.startswith("reference")]
+    return {"references": {"allOf": rules}, **parts}
 
 
 # ---- addresses ----
