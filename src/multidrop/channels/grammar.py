@@ -191,9 +191,7 @@ class _ExpressionParser:
             self.steps.append(CallStep(sign.column, SIGN, 1))
 
     def _name(self, token: _Token) -> None:
-        """Parse a function call if "(" follows the name; otherwise the name is a register of the channel's
-        drive.
-        """
+        """Parse a call if "(" follows the name; else the name is a register of the channel's drive."""
         if self._token.text != "(":
             self.steps.append(ReferenceStep(token.column, "", token.text))
             return

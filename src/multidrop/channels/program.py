@@ -57,9 +57,7 @@ class Channel:
 
 
 class DriveSeries(NamedTuple):
-    """A drive's polled registers and channels. Each register has its unit, and the time in s for which
-    a value stays current.
-    """
+    """A drive's registers and channels; each register with its unit, and the s for which it stays current."""
 
     name: str
     polled: Mapping[str, tuple[str, float]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from multidrop.drive.number_format import arranged
 from multidrop.drive.register import HOLDING, Table
 from multidrop.printable import is_whole
 
@@ -50,7 +51,7 @@ class Text:
         Bytes above 7FH are Latin-1. An unprintable character becomes a question mark.
         """
         if self.order == "BA":
-            data = b"".join(data[at : at + 2][::-1] for at in range(0, len(data), 2))
+            data = arranged(data, "BA")
         elif self.order == "B":
             data = data[1::2]
         found = data.partition(b"\0")[0].decode("latin-1").rstrip()
@@ -65,9 +66,7 @@ class Text:
         if self.order == "B":
             return b"".join(bytes((0, character)) for character in data.ljust(most, b"\0"))
         data = data.ljust(2 * self.length, b"\0")
-        if self.order == "BA":
-            data = b"".join(data[at : at + 2][::-1] for at in range(0, len(data), 2))
-        return data
+        return arranged(data, "BA") if self.order == "BA" else data
 
 
 def text(address: int, length: int, *, table: Table = HOLDING, order: str = "AB", place: str = "") -> Text:

@@ -194,9 +194,7 @@ class _Layout:
         return {name for place, name in self._others.items() if place < len(row) and row[place].strip()}
 
     def gaps(self, cells: Cells, further: set[str]) -> list[str]:
-        """Return sentences about a row's unknown facts: unimported columns that may affect the value,
-        unclear lengths or addresses.
-        """
+        """Return sentences about a row's unknown facts, such as columns that may affect the value."""
         columns = further & _VALUE_COLUMNS
         if _parse_tag(cells["at"]):
             columns -= {"precision"}  # a tag's precision is only the number of digits shown
@@ -221,9 +219,7 @@ def _plain_name(cell: str) -> tuple[str, str]:
 
 
 def _places(header: list[str]) -> dict[str, int]:
-    """Return the indexes of the imported columns, by key. A column that fits two keys is used for the first
-    key.
-    """
+    """Return the indexes of the imported columns, by key; a column that fits two keys has the first."""
     found: dict[str, int] = {}
     for key, aliases in COLUMNS.items():
         for alias in aliases:
@@ -251,9 +247,7 @@ def _row(devices: dict[int | None, ImportedDevice], cells: Cells, gaps: list[str
 
 
 def _placed(name: str, cells: Cells, tag: _Tag | None) -> ImportedRegister:
-    """Return a register at the row's address; add sentences to `gaps` if the register's table or the address
-    numbering is ambiguous.
-    """
+    """Return a register at the row's address; note in `gaps` if the table or the numbering is ambiguous."""
     register = ImportedRegister(name, 0)
     stated = _table(register, cells)
     given = tag.address if tag else cells["at"]
@@ -275,9 +269,7 @@ def _assume_number(register: ImportedRegister, stated: str | None) -> None:
 
 
 def _referred(register: ImportedRegister, given: str, stated: str | None, cells: Cells) -> tuple[int, str]:
-    """Return the address and the table that a number such as 40001 means. If other cells contradict that
-    table, take the number as a plain address.
-    """
+    """Return the address and table that 40001 means; a plain address if the table contradicts other cells."""
     address, table = Counting(None).address_in_cell(given, None, "holding")
     is_bit = table in ("coil", "discrete")
     if (stated not in (None, table)) or (is_bit and stated is None and _is_number(cells)):
@@ -308,9 +300,7 @@ def _steps(cells: Cells) -> list[tuple[str, str]]:
 
 
 def _table(register: ImportedRegister, cells: Cells) -> str | None:
-    """Return the table that a row states, or None. Adds a sentence to `gaps` if the cell is ambiguous or
-    unknown.
-    """
+    """Return the table that a row states, or None; note in `gaps` if the cell is ambiguous or unknown."""
     if function := cells.get("function"):
         codes = {int(code, 0) for code in re.findall(r"0x[0-9a-f]{1,4}|(?!0\d)\d{1,5}", function.lower())}
         tables = {(_FUNCTIONS | _WRITES).get(code) for code in codes}
@@ -364,7 +354,7 @@ def _fill(device: ImportedDevice, register: ImportedRegister, cells: Cells, tag:
 
 
 def _access(register: ImportedRegister, given: str) -> None:
-    """Set whether the register can be read and written; add a sentence to `gaps` for an unknown word."""
+    """Set whether the register can be read and written; note an unknown word in `gaps`."""
     words = re.sub(r"subscribe|static|only|[^a-z]", "", given.lower())
     if not given:
         return
@@ -425,9 +415,7 @@ def _number(device: ImportedDevice, register: ImportedRegister, cells: Cells, ta
 
 
 def _part(register: ImportedRegister, kind: str, cells: Cells, tag: _Tag | None) -> str:
-    """Return the bits of the word that the register uses ("" for all). Add a sentence to `gaps` if the row
-    lacks the bit number.
-    """
+    """Return the bits of the word that the register uses, or "" for all; note a missing bit in `gaps`."""
     if tag and tag.part:
         return tag.part
     stated = re.fullmatch(r"([0-9]{1,2})(?:\s*(?:-|\.\.|:|to)\s*([0-9]{1,2}))?", cells.get("bit", ""))
@@ -443,7 +431,7 @@ def _part(register: ImportedRegister, kind: str, cells: Cells, tag: _Tag | None)
 
 
 def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
-    """Return the number format of a row; add a sentence to `gaps` if the type or width is missing."""
+    """Return the number format of a row; note a missing type or width in `gaps`."""
     length = cells.get("length", "")
     words = int(length) if _NUMBER.fullmatch(length) else 0
     signed = _SIGNED.get(cells.get("signed", "").lower())
@@ -473,7 +461,7 @@ def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
 
 
 def _order(register: ImportedRegister, given: str) -> str:
-    """Return the byte order that a cell states; add a sentence to `gaps` if the cell states no byte order."""
+    """Return the byte order that a cell states; note a missing one in `gaps`."""
     word = re.sub(r"[^a-z]|endian|first", "", given.lower())
     if not given:
         register.gaps.append("the order of its words is not stated")
@@ -483,9 +471,7 @@ def _order(register: ImportedRegister, given: str) -> str:
 
 
 def _scale(register: ImportedRegister, cells: Cells, *, is_neuron: bool) -> None:
-    """Set step and offset; if a column's meaning varies by program, add a sentence to `gaps` with the assumed
-    meaning.
-    """
+    """Set step and offset; note in `gaps` what was assumed if programs differ about a column."""
     found = _steps(cells)
     key, given = found[0] if found else ("scale", "")
     offset = cells.get("offset", "")
@@ -560,7 +546,7 @@ def _parse_tag(cell: str) -> _Tag | None:
 
 
 def _tag_order(register: ImportedRegister, tag: _Tag, number: str) -> str:
-    """Return a number's byte order; add a sentence to `gaps` if the tag does not state it."""
+    """Return a number's byte order; note in `gaps` if the tag does not state it."""
     if tag.order in _TAG_ORDERS:
         return _TAG_ORDERS[tag.order]
     if tag.order:

@@ -158,9 +158,7 @@ class ImportedRegister:
     of_writes: dict[str, Any] = field(default_factory=dict)  # further details if the register is written
 
     def note_write(self, *, is_written: bool = True) -> None:
-        """Record whether the source program writes the register; if so, add a sentence to `gaps`: the effect
-        is unknown.
-        """
+        """Record whether the source program writes the register; a write is noted in `gaps`."""
         self.is_written = is_written
         if is_written:
             self.gaps.append(WRITTEN)
@@ -186,9 +184,7 @@ class ImportedRegister:
 
 @dataclass(frozen=True)
 class Lost:
-    """An entry that could not be imported, and why. `is_entry` is False if only a key or another fact was
-    lost.
-    """
+    """An entry that was not imported, and why. `is_entry` is False if only a key or a fact was lost."""
 
     name: str
     reason: str
@@ -236,9 +232,7 @@ class ImportedDevice:
 
     @contextmanager
     def entry(self, name: str) -> Iterator[None]:
-        """Record the entry as lost if the `with` block raises an error. Raises ValueError after too many
-        entries.
-        """
+        """Record the entry as lost if the block raises an error. Raises ValueError after too many entries."""
         if len(self.registers) + len(self.texts) + len(self.lost) >= MOST_ENTRIES:
             raise ValueError(f"has more than {MOST_ENTRIES} entries, which no device has")
         try:

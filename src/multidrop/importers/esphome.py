@@ -198,9 +198,7 @@ class _Devices:
             _add(device, kind, name, entry)
 
     def _device_of(self, given: Any) -> ImportedDevice:
-        """Return the device of the controller with this id. Its address is unknown if another file declares
-        the controller.
-        """
+        """Return the device of this controller; its address is unknown if another file declares it."""
         if given is None and self._by_controller:
             return next(iter(self._by_controller.values()))
         return self._by_controller.setdefault(
@@ -258,9 +256,7 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
 
 
 def _filters(register: ImportedRegister, filters: Any) -> None:
-    """Combine factors and offsets, in order, into a step and an offset; add a sentence to `gaps` for any
-    other filter.
-    """
+    """Combine factors and offsets, in order, into a step and an offset; note other filters in `gaps`."""
     step, offset = Fraction(1), Fraction(0)
     others: list[str] = []
     for each in _listed(filters):

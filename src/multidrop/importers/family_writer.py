@@ -166,9 +166,7 @@ def _keep(
     most: int,
     kind: str,
 ) -> dict[str, Any]:
-    """Drop the entries of `listed` that no family can declare. Return the declarations of the others, by
-    name.
-    """
+    """Drop the entries of `listed` that no family can declare; return the other declarations by name."""
     held: dict[str, Any] = {}
     kept: list[ImportedRegister] = []
     for found in listed:
@@ -232,9 +230,7 @@ def _drop_conflicts(device: ImportedDevice, held: dict[str, Register[Any]]) -> N
 
 
 def _conflicts(members: dict[str, Any]) -> dict[str, str]:
-    """Return the errors, by register name, of a class with these members; an empty dict if the class is
-    valid.
-    """
+    """Return the errors, by register name, of a class with these members; {} if it is valid."""
     try:
         type("Imported", (Drive,), {"__doc__": "Of an importer.", **members})
     except DeclarationError as refusal:

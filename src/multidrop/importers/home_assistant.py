@@ -235,8 +235,9 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
 
 
 def _verify(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
-    """Take the switch's state from its separate state register, if it has one. Add a sentence to `gaps` if
-    that register's values for on and off are not 1 and 0.
+    """Take the switch's state from its state register, if it has one.
+
+    Values for on and off other than 1 and 0 are noted in `gaps`.
     """
     on, off = entry.get("command_on", 1), entry.get("command_off", 0)
     verify = entry.get("verify")
@@ -294,9 +295,7 @@ def _swap(register: ImportedRegister, entry: Mapping[str, Any]) -> str:
 
 
 def _format(register: ImportedRegister, kind: str, entry: Mapping[str, Any]) -> str | None:
-    """Return a data type's number format, or None if it has none. Add a sentence to `gaps` if the width is
-    doubtful.
-    """
+    """Return a data type's number format, or None; note a doubtful width in `gaps`."""
     registers = whole(entry, "count", 1)
     if kind in _LEGACY_TYPES:
         # only for floats, because an int has 16 bits in every version

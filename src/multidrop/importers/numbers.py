@@ -38,9 +38,7 @@ def number_format(kind: str) -> str | None:
 
 
 def format_of_width(kind: str, words: int) -> str | None:
-    """Return the number format of a type that states no width, for `words` 16-bit words. None for other
-    types.
-    """
+    """Return the number format of a type without a width, such as int, in `words` words; None for others."""
     letter = _ANY_WIDTH.get(kind.strip().lower())
     return f"{letter}{16 * words}" if letter and words in (1, 2, *((4,) if letter != "BCD" else ())) else None
 
@@ -55,9 +53,7 @@ def bits_text(low: int, high: int) -> str:
 
 
 def put_number(details: dict[str, Any], number: str, order: str = "") -> None:
-    """Set the number format and byte order in `details`. `order` is the byte order of a four-byte number,
-    such as "CDAB".
-    """
+    """Set the number format in `details`, and the byte order of a four-byte number, such as "CDAB"."""
     if number != "U16":
         details["number_format"] = number
     if words_of(number) == 1:

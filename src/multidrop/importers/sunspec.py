@@ -66,9 +66,7 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
 
 
 def _size(point: Mapping[str, Any]) -> int:
-    """Return a point's number of registers. Raises ValueError if it is not stated, because the addresses of
-    later points depend on it.
-    """
+    """Return a point's number of registers, which later addresses need. Raises ValueError without it."""
     try:
         return whole(point, "size")
     except KeyError:
@@ -127,9 +125,7 @@ def _add(
 
 
 def _tie(register: ImportedRegister, names: Mapping[str, str]) -> None:
-    """Set the register's step, if the point states its scale factor, or else the name of the register with
-    the factor.
-    """
+    """Set the register's step if the point states its scale factor, else the name of its scale register."""
     scale = register.details.pop("scale_register", None)
     if isinstance(scale, int):
         register.details["step"] = 10**scale if 0 <= scale <= 10 else float(f"1e{scale}")

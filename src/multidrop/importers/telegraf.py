@@ -114,9 +114,7 @@ def _lose_settings(device: ImportedDevice, plugin: Mapping[str, Any]) -> None:
 
 
 def _line(plugin: Mapping[str, Any]) -> LineSettings:
-    """Return the line settings from a plugin's mode and controller, such as file:///dev/ttyUSB0 or
-    tcp://host:port.
-    """
+    """Return the line settings of a controller such as file:///dev/ttyUSB0 or tcp://host:port."""
     controller, mode = str(plugin.get("controller", "")), str(plugin.get("transmission_mode", ""))
     if controller.startswith("tcp://"):
         try:
@@ -224,9 +222,7 @@ def _plain_type(style: str, kind: str, words: int) -> str:
 
 
 def _part(kind: str, field: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the bits of the word that a type narrower than 16 bits uses ("" for all), and the number's
-    type.
-    """
+    """Return the bits of the word that a type below 16 bits uses ("" for all), and the number's type."""
     if kind == "BIT":
         return str(whole(field, "bit", 0)), "UINT16"
     if kind in ("INT8L", "UINT8L", "INT8H", "UINT8H"):

@@ -307,9 +307,7 @@ def _number(
 
 
 def _number_of_bits(register: ImportedRegister, format: str, bits: tuple[int, int] | None) -> tuple[str, str]:
-    """Return the number format, and the bits of the number that the template's format or address selects (""
-    for all).
-    """
+    """Return the number format, and the bits that the format or the address selects ("" for all)."""
     number = _FORMATS[format]
     own = _WIDTHS.get(format, 16 * words_of(number))
     if bits is None and (own == 16 * words_of(number) or number == "I8"):
@@ -368,9 +366,7 @@ def _text(device: ImportedDevice, register: ImportedRegister, format: str, entry
 
 
 def _place(address: Any) -> tuple[int, tuple[int, int] | None]:
-    """Split "register:shift:width" into the address and the pair (shift, width). The pair is None if it is
-    missing; a width of 0 means that none is stated.
-    """
+    """Split "register:shift:width" into address and (shift, width); None without them, 0 without a width."""
     register, *bits = str(address).split(":")
     at = whole({"address": register}, "address")
     if not bits:

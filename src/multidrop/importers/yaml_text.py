@@ -12,9 +12,7 @@ MOST_NODES = 50_000  # node limit; an alias counts as all nodes of its expansion
 
 
 class YamlTag(str):
-    """A tagged value as spelt in the file, such as `!secret host`; the value that it stands for is not in
-    the file.
-    """
+    """A tagged value as spelt in the file, such as `!secret host`; its value is not in the file."""
 
 
 def parse_yaml(text: str) -> Any:

@@ -212,7 +212,16 @@ class Plant:
 
     def metadata(self) -> dict[str, Any]:
         """Return the metadata of a recording: versions, drives, registers, predictions."""
-        return _metadata(self)
+        return {
+            "multidrop": multidrop.__version__,
+            "plant": str(self.path),
+            "planned": {
+                line.name: prediction_metadata(planned_on(line), line.switching) for line in self.lines
+            },
+            "drives": {
+                polled.drive.name: _of_drive(line, polled) for line in self.lines for polled in line.drives
+            },
+        }
 
 
 def current_for(period: float) -> float:
@@ -258,17 +267,6 @@ def series_of(plant: Plant, planned: Mapping[str, Any] | None = None) -> list[Dr
             drive = polled.drive
             found.append(DriveSeries(drive.name, units, drive.registers.keys(), polled.channels))
     return found
-
-
-def _metadata(plant: Plant) -> dict[str, Any]:
-    return {
-        "multidrop": multidrop.__version__,
-        "plant": str(plant.path),
-        "planned": {line.name: prediction_metadata(planned_on(line), line.switching) for line in plant.lines},
-        "drives": {
-            polled.drive.name: _of_drive(line, polled) for line in plant.lines for polled in line.drives
-        },
-    }
 
 
 def _of_drive(line: PlantLine, polled: PolledDrive) -> dict[str, Any]:
