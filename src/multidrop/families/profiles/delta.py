@@ -117,11 +117,8 @@ class Delta(Profile):
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
         """Turn slowly from rest until stopped; without a direction, forward."""
-        status = yield from self._status()
-        yield from self._check_jog(status)
-        reverses = self._reverses(direction, status)
-        word = DeltaControl.JOG_REVERSE if reverses else DeltaControl.JOG_FORWARD
-        yield from write(self.control, self._word(word))
+        word = yield from self._jog_word(direction, DeltaControl.JOG_FORWARD, DeltaControl.JOG_REVERSE)
+        yield from write(self.control, word)
         yield from self._started(direction)
 
     def _take_reset_back(self) -> Script[None]:

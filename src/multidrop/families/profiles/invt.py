@@ -108,10 +108,7 @@ class Invt(Profile):
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
         """Turn slowly from rest until stopped; without a direction, forward."""
-        status = yield from self._status()
-        yield from self._check_jog(status)
-        reverses = self._reverses(direction, status)
-        word = self._word(InvtControl.JOG_REVERSE if reverses else InvtControl.JOG_FORWARD)
+        word = yield from self._jog_word(direction, InvtControl.JOG_FORWARD, InvtControl.JOG_REVERSE)
         self._jogged = True
         yield from write(self.control, word)
         yield from self._started(direction)

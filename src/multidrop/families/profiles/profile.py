@@ -394,11 +394,13 @@ class Profile(Drive):
         if why := self._not_ready(status):
             raise WriteForbidden(f"{self.name} {why}; {self.remote}")
 
-    def _check_jog(self, status: int) -> Script[None]:
-        """Raise WriteForbidden as before a start, or if the motor turns: no manual defines a jog then."""
+    def _jog_word(self, direction: Direction | None, forward: int, reverse: int) -> Script[Any]:
+        """Return the word of a jog. Raises WriteForbidden as `start` does, and if the motor turns."""
+        status = yield from self._status()
         yield from self._check_start(status)
-        if self._turns(status):
+        if self._turns(status):  # no manual defines a jog then
             raise self._stop_first("turns, and may continue to turn during a jog:")
+        return self._word(reverse if self._reverses(direction, status) else forward)
 
     def _word(self, count: int, role: str = "control") -> Any:
         """Decode one of the profile's words to a value of the role's register."""
