@@ -89,7 +89,7 @@ class Denials:
 
     def __init__(self) -> None:
         # number of denials by kind ("publish" or "subscription") and subject
-        self._said: Counter[tuple[str, str]] = Counter()
+        self._counts: Counter[tuple[str, str]] = Counter()
         self._raised = ""  # the subject whose denied subscription is raised instead of logged
 
     async def note(self, failure: Exception) -> None:
@@ -98,16 +98,16 @@ class Denials:
         if not found:
             return
         kind, subject = found[1].lower(), found[2].lower()  # nats-py converts messages to lower case
-        if (kind, subject) not in self._said:
-            if len(self._said) >= MOST_DENIALS:
+        if (kind, subject) not in self._counts:
+            if len(self._counts) >= MOST_DENIALS:
                 return
             if (kind, subject) != ("subscription", self._raised):
                 _log.warning("%s", _sentence(kind, subject))
-        self._said[kind, subject] += 1
+        self._counts[kind, subject] += 1
 
     def of_request(self, subject: str) -> int:
         """Return how often a request to this subject was denied."""
-        return self._said["publish", subject.lower()]
+        return self._counts["publish", subject.lower()]
 
     def check_request(self, subject: str, inbox: str, before: int) -> None:
         """Raise MayNotSend or NoRight if missing rights explain why a request got no answer.
@@ -117,7 +117,7 @@ class Denials:
         """
         if self.of_request(subject) > before:
             raise MayNotSend(_sentence("publish", subject))
-        for kind, denied in self._said:
+        for kind, denied in self._counts:
             if kind == "subscription" and denied.startswith(inbox.lower()):
                 raise NoRight(_sentence(kind, denied))
 
@@ -129,7 +129,7 @@ class Denials:
             yield
         finally:
             self._raised = ""
-        if self._said["subscription", subject.lower()]:
+        if self._counts["subscription", subject.lower()]:
             raise NoRight(_sentence("subscription", subject))
 
 

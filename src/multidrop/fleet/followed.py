@@ -236,7 +236,6 @@ class FollowedFleet:
             await asyncio.sleep(AGAIN_S)
 
     def health(self) -> str:
-        """Return why rows are missing or have wrong times; "" if all is well."""
         now_ns = time.time_ns()
         ages_s = {
             gateway: (arrived_ns - asked_ns) / 1e9

@@ -58,7 +58,6 @@ _PREFIX = "multidrop_fleet_"
 
 
 def families_of(state: Mapping[str, Any], version: str) -> Iterator[MetricFamily]:
-    """Yield the metrics of a gateway's state."""
     about = {"gateway": state["gateway"], "version": version}
     yield MetricFamily(f"{_PREFIX}gateway", "info", "Name and version.", [("_info", about, 1.0)])
     label = f"{_PREFIX}gateway_state"
@@ -130,7 +129,6 @@ def listen(text: str) -> socket.socket:
 
 @asynccontextmanager
 async def serving(listener: socket.socket, metrics: Metrics) -> AsyncIterator[None]:
-    """Serve metrics while the context lasts."""
     clients: set[asyncio.StreamWriter] = set()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -60,7 +60,6 @@ class FleetView:
         return None
 
     def line_records(self) -> dict[str, Record]:
-        """Return the record of each line of the plant."""
         return {name: self._records.plant.records[name] for name in self._records.lines()}
 
     def fleet(self) -> dict[str, Any]:
@@ -153,7 +152,6 @@ class FleetWatch:
         return None if self._looked is None else round(self._clock() - self._looked, 3)
 
     def lines(self) -> dict[str, Record]:
-        """Return the record of each line of the plant."""
         return self._view.line_records()
 
     def state(self) -> dict[str, Any]:

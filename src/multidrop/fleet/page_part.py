@@ -87,7 +87,6 @@ class FleetPart:
 
     @property
     def can_stop(self) -> bool:
-        """Return True if the plant file names a commander's key."""
         return self._command is not None
 
     def take(self, batch: object) -> None:
@@ -153,7 +152,6 @@ class FleetPart:
         return f"{seen}: {self._watch.trouble or 'the first read is in progress'}"
 
     def state(self) -> dict[str, Any]:
-        """Return the fleet's state for the page, with its age."""
         return self._watch.state()
 
 

@@ -101,7 +101,6 @@ class _Table:
         self._length: int = _U16.unpack_from(data, self._fields)[0]
 
     def _field(self, number: int) -> int:
-        """Return the offset of a field; 0 if the field is missing."""
         entry = 4 + 2 * number
         offset = _U16.unpack_from(self._data, self._fields + entry)[0] if entry < self._length else 0
         return self._place + offset if offset else 0
@@ -115,7 +114,6 @@ class _Table:
         return _Table(self._data, place + _U32.unpack_from(self._data, place)[0]) if place else None
 
     def pairs(self, number: int) -> Any:
-        """Return a vector of pairs of numbers."""
         place = self._field(number)
         if not place:
             return ()

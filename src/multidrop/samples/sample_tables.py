@@ -228,7 +228,6 @@ class SampleTables:
         return self._connection
 
     def close(self) -> None:
-        """Close the connection, if there is one."""
         if self._connection:
             self._connection.close()
             self._connection = None

@@ -131,7 +131,6 @@ class SpoolFolder:
         return StoredMessage(number, rows, len(data), path)
 
     def add(self, stored: StoredMessage) -> None:
-        """Add a message that `write` has written to `messages`."""
         self.messages[stored.sequence] = stored
         self.newest = stored.sequence
 
@@ -249,7 +248,6 @@ class Spool:
             return self._changing.wait_for(lambda: self._written >= wanted, timeout)
 
     def is_alive(self) -> bool:
-        """Return True while the spool's thread is running."""
         return self._thread.is_alive()
 
     def state(self) -> SpoolState:

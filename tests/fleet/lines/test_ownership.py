@@ -265,7 +265,7 @@ class Trial:
 
     def sees(self, *others: str) -> None:
         """Note these other gateways, as gateway a does before its session starts."""
-        self.member._see(dict.fromkeys(others, VALUE))
+        self.member._note_others(dict.fromkeys(others, VALUE))
 
     def shared_among(self, *others: str) -> set[str]:
         """Take a step while these other gateways are present; return the gateways that have lines now."""

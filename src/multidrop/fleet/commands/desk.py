@@ -197,10 +197,6 @@ class CommandDesk:
 
 
 def _prepared(held: HeldLine, request: CommandRequest) -> Prepared:
-    """Return the checked command for a request.
-
-    Raises ValueError if the plant's list does not allow the command, and the errors of `prepare`.
-    """
     drive = held.drive(request.drive)
     if request.verb == "stop":
         raise ValueError("a stop needs no offer: send it to the line's own subject for stops")

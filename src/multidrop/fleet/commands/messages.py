@@ -72,7 +72,6 @@ class CommandRequest(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Return the command as text, for logs and answers."""
         if self.register:
             return f"{self.entry} = {self.value}"
         options = ", ".join(f"{name} = {value}" for name, value in self.options.items())
@@ -180,7 +179,6 @@ def read_offer(data: bytes) -> Offered | CommandAnswer:
 
 
 def read_answer(data: bytes) -> CommandAnswer:
-    """Return a gateway's answer. Raises ValueError for an invalid message."""
     return _answer(read_json(data))
 
 

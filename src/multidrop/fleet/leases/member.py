@@ -314,7 +314,7 @@ class Member:
         Also wait until no incompatible gateway is alive.
         """
         while True:
-            self._see(self.records.observer.sessions())
+            self._note_others(self.records.observer.sessions())
             if self.records.is_complete and not self._incompatible.gateways:
                 break
             await asyncio.sleep(STEP_S)
@@ -376,17 +376,17 @@ class Member:
                 self._claim_and_release()
             self.keeper.reconcile()
 
-    def _see(self, present: Mapping[str, Mapping[str, Any]]) -> set[str]:
+    def _note_others(self, present: Mapping[str, Mapping[str, Any]]) -> set[str]:
         """Return the other gateways that take lines, and note the time if this set has changed."""
         self._incompatible.look(present)
         self.keeper.may_claim = not self._incompatible.gateways
         others = {name for name, value in present.items() if not value["draining"]}
         others -= {self.name} | self._incompatible.gateways
-        self._shares.see(frozenset(others), self.lease.clock())
+        self._shares.note_others(frozenset(others), self.lease.clock())
         return others
 
     async def _share_out(self, present: Mapping[str, Mapping[str, Any]]) -> None:
-        sharing = self._see(present)
+        sharing = self._note_others(present)
         if not self.is_draining and self.lease.session:
             sharing.add(self.name)
         lines = self.records.lines()

@@ -188,7 +188,7 @@ class Observer:
         A record is replaced only if it still has the revision that was found to be stale.
         """
         before = self.ended
-        self._keep_what_is_over()
+        self._remember_ended_sessions()
         for name, records in self.dead(present).items():
             session = max(record.value["session"] for record in records.values())
             if await self._end_enough(records):
@@ -196,7 +196,7 @@ class Observer:
                 _log.warning("the lease of %s (session %d) expired; %s ended it", name, session, self.me)
         return self.ended > before
 
-    def _keep_what_is_over(self) -> None:
+    def _remember_ended_sessions(self) -> None:
         """Remember the sessions that are over, so that `restart_waits` does not revive them."""
         for name in {name for follower in self.paths for name in follower.records}:
             session = max((record.value["session"] for _, record in self._of(name)), default=0)

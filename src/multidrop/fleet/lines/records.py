@@ -77,7 +77,6 @@ class FleetRecords:
         return bool(record and record.value and "line" in record.value)
 
     def owned_by(self, gateway: str, session: int) -> set[str]:
-        """Return the lines for which at least one record names this session."""
         return set(self._owned.get((gateway, session), ()))
 
     async def look(self) -> None:

@@ -115,7 +115,7 @@ class Shares:
         """Assign the lines again at the next `make`, because a new session has started."""
         self._made = None
 
-    def see(self, others: frozenset[str], now: int) -> None:
+    def note_others(self, others: frozenset[str], now: int) -> None:
         """Note the other gateways that take lines now; `now` is in ns."""
         if others != self._others:
             self._others, self._seen_at = others, now

@@ -72,7 +72,6 @@ class Forwarder:
         return None
 
     async def run(self) -> None:
-        """Forward until cancelled. Each failure is logged once, and retried."""
         loop = asyncio.get_running_loop()
 
         def announce() -> None:

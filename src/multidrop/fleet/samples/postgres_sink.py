@@ -68,7 +68,6 @@ class PostgresSink:
         return StoredPosition(found[1], found[2])
 
     def write(self, commit: Commit) -> None:
-        """Store the rows and their position in one transaction."""
         with sentences(), self._tables.connection.transaction():
             moved = self._tables.connection.execute(
                 MOVE, (commit.last, json.dumps(commit.sources), commit.stream, commit.first - 1)

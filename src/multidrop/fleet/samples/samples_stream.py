@@ -122,13 +122,13 @@ async def create_stream(path: ServerPath, *, replicas: int = 3, most_bytes: int 
     found = await _ask(path, f"STREAM.INFO.{STREAM}", {}, NO_STREAM)
     if found is None:
         found = await _ask(path, f"STREAM.CREATE.{STREAM}", config)
-    with _as_wanted():
+    with _checked_fields():
         return int(found["config"].get("max_bytes", -1))
 
 
 async def stream_info(path: ServerPath) -> StreamInfo:
     found = await _ask(path, f"STREAM.INFO.{STREAM}", {})
-    with _as_wanted():
+    with _checked_fields():
         config, state = found["config"], found["state"]
         if not config.get("allow_direct"):
             raise FleetError(f"the stream {STREAM!r} allows no direct gets: set allow_direct")
@@ -140,7 +140,7 @@ async def last_of(path: ServerPath, subject: str) -> LastMessage | None:
     found = await _ask(path, f"STREAM.MSG.GET.{STREAM}", {"last_by_subj": subject}, NO_MESSAGE)
     if found is None:
         return None
-    with _as_wanted():
+    with _checked_fields():
         message = found["message"]
         lines = base64.b64decode(message.get("hdrs", "")).decode("utf-8", "replace").splitlines()
         headers = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
@@ -162,7 +162,7 @@ async def publish(path: ServerPath, subject: str, data: bytes, headers: dict[str
         if error.get("err_code") == WRONG_SEQUENCE:
             return None
         raise FleetError(f"the stream {STREAM!r} refuses a message: {error.get('description')}")
-    with _as_wanted():
+    with _checked_fields():
         return int(found["seq"])
 
 
@@ -184,7 +184,7 @@ async def _ask(path: ServerPath, subject: str, what: Mapping[str, Any], *none: i
 
 
 @contextmanager
-def _as_wanted() -> Iterator[None]:
+def _checked_fields() -> Iterator[None]:
     """Raise FleetError if an answer lacks a field or has a wrong type."""
     try:
         yield

@@ -164,7 +164,6 @@ class BatchClient(Client):
         self._take(subject, headers or b"", data)
 
     async def _take_message(self, message: Msg) -> None:
-        """Handle an answer that came through nats-py's queue."""
         headers = message.headers or {}
         lines = "".join(f"\r\n{name}: {value}" for name, value in headers.items())
         block = f"NATS/1.0 {headers.get('Status', '')}{lines}\r\n\r\n"

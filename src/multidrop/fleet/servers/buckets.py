@@ -157,13 +157,13 @@ class Bucket:
             b"" if value is None else json.dumps(value, separators=(",", ":")).encode(),
             {
                 "Nats-Expected-Last-Subject-Sequence": str(record.revision),
-                "Nats-Expected-Last-Subject-Sequence-Subject": self._all_of(record.key),
+                "Nats-Expected-Last-Subject-Sequence-Subject": self._pattern(record.key),
             },
         )
 
     async def get(self, key: str) -> Record:
         """Return a key's record, read from the bucket's leader; a missing record has revision 0."""
-        wanted = {"last_by_subj": self._all_of(key)}
+        wanted = {"last_by_subj": self._pattern(key)}
         try:
             said = await ask(self.path(), f"STREAM.MSG.GET.KV_{self.name}", wanted)
         except ServerError as failure:
@@ -186,7 +186,7 @@ class Bucket:
 
     async def newest(self, keys: Sequence[str]) -> list[Record]:
         """Return the records of at most 1000 keys. Any server may answer, so some may be out of date."""
-        return await self._direct_get({"multi_last": [self._all_of(key) for key in keys]})
+        return await self._direct_get({"multi_last": [self._pattern(key) for key in keys]})
 
     async def _direct_get(self, wanted: Mapping[str, Any]) -> list[Record]:
         subject = f"$JS.API.DIRECT.GET.KV_{self.name}"
@@ -197,7 +197,7 @@ class Bucket:
         """Return the subject to write a record to."""
         return f"$KV.{self.name}.{key}"
 
-    def _all_of(self, key: str) -> str:
+    def _pattern(self, key: str) -> str:
         """Return the pattern of all subjects of a key. The newest message among them is its record."""
         return self._subject(key)
 
@@ -271,7 +271,7 @@ class LeaseBucket(Bucket):
     def _subject(self, key: str) -> str:
         return f"$KV.{self.name}.{key}.{self.writer}"
 
-    def _all_of(self, key: str) -> str:
+    def _pattern(self, key: str) -> str:
         return f"$KV.{self.name}.{key}.*"
 
     def _record(self, subject: str, revision: int, data: bytes) -> Record:

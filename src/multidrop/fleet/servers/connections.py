@@ -161,7 +161,6 @@ class ServerPath:
         await self._change_subscriptions()
 
     async def unsubscribe(self, subject: str) -> None:
-        """End a subscription, if there is one."""
         self._wanted.pop(subject, None)
         await self._change_subscriptions()
 
@@ -267,10 +266,10 @@ async def connect(url: str, options: Mapping[str, Any], denials: Denials | None 
     try:
         await asyncio.wait_for(client.connect(url, error_cb=note, **{**options, **settings}), 2 * CONNECT_S)
     except asyncio.CancelledError:
-        _cut(client)
+        _abort(client)
         raise
     except (NatsError, OSError, TimeoutError, ValueError) as failure:
-        _cut(client)
+        _abort(client)
         raise failure_to_connect(url, refusals[-1] if refusals else failure) from None
     found = client.connected_server_version
     if (found.major, found.minor) < OLDEST:
@@ -287,10 +286,10 @@ async def _close(client: BatchClient) -> None:
         with suppress(NatsError, OSError, TimeoutError):
             await asyncio.wait_for(client.close(), CONNECT_S)
     finally:
-        _cut(client)
+        _abort(client)
 
 
-def _cut(client: BatchClient) -> None:
+def _abort(client: BatchClient) -> None:
     """Close the socket, and end the tasks that nats-py leaves if it is cancelled or the server is gone."""
     for subscription in client._subs.values():
         subscription._stop_processing()
@@ -445,7 +444,7 @@ async def first_answer(
                 first = first or get
                 asked_at[get] = loop.time()
                 gets[asyncio.create_task(path.gather(request, get))] = get
-            while await _is_one_over(gets, budget.silence_s(least_s)):
+            while await _has_one_ended(gets, budget.silence_s(least_s)):
                 for task in [task for task in gets if task.done()]:
                     get = gets.pop(task)
                     if not (failed := task.exception()):
@@ -462,7 +461,7 @@ async def first_answer(
         await end_tasks(*gets)
 
 
-async def _is_one_over(gets: Mapping[asyncio.Task[None], DirectGet], silence_s: float) -> bool:
+async def _has_one_ended(gets: Mapping[asyncio.Task[None], DirectGet], silence_s: float) -> bool:
     """Wait until one of the requests has ended, and return True.
 
     Return False after `silence_s` seconds without data, or if no request is left.

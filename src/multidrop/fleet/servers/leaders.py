@@ -37,7 +37,6 @@ class Replica(NamedTuple):
 
     @property
     def is_ready(self) -> bool:
-        """Return True if this server could become leader now."""
         return self.is_current and not self.is_offline
 
     @property

@@ -46,7 +46,6 @@ def is_inbox(subject: str) -> bool:
 
 
 def command_subject(line: str) -> str:
-    """Return the subject on which a line's master accepts requests for offers."""
     return f"cmd.{line}"
 
 
@@ -56,7 +55,6 @@ def do_subject(gateway: str, run: str) -> str:
 
 
 def stop_subject(line: str) -> str:
-    """Return the subject on which a line's master accepts stops."""
     return f"stop.{line}"
 
 

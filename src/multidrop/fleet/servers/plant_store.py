@@ -49,11 +49,11 @@ def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
             raise ValueError(
                 f"{path}: {mistake}; in a fleet, a channel may only use drives of its own line"
             ) from None
-    may = _lists(document.get("fleet", {}), plant)
+    may = _allowed_commands(document.get("fleet", {}), plant)
     return plant, {table["name"]: _description(table, path.parent, may) for table in document["line"]}
 
 
-def _lists(table: Any, plant: Plant) -> dict[str, frozenset[str]]:
+def _allowed_commands(table: Any, plant: Plant) -> dict[str, frozenset[str]]:
     """Return the entries of [fleet.may]: registers and verbs that may be commanded through the fleet."""
     root = TomlPlace.in_file(plant.path)
     place = root.within("[fleet]", "fleet")

@@ -168,16 +168,16 @@ def accounts(rights: Mapping[str, UserRights], public: Mapping[str, str]) -> Ite
         others = [other for other in rights if other != name] if mine.answers else []
         yield f"  {account_of(name)} {{"
         yield "    exports: ["
-        if wanted := _wanted(mine):
+        if wanted := _request_subjects(mine):
             yield from (f"      {{ stream: {json.dumps(subject)} }}" for subject in wanted)
-            yield f"      {{ service: {json.dumps(_answers(public[name]))} }}"
+            yield f"      {{ service: {json.dumps(_inboxes(public[name]))} }}"
         yield "    ]"
         yield "    imports: ["
         yield from (_import("service", STORE, subject) for subject in (_INFO, *asked[name]))
         for other in others:
-            if heard := list(_shared(_wanted(rights[other]), mine.subscribe)):
+            if heard := list(_shared(_request_subjects(rights[other]), mine.subscribe)):
                 yield from (_import("stream", account_of(other), subject) for subject in heard)
-                yield _import("service", account_of(other), _answers(public[other]))
+                yield _import("service", account_of(other), _inboxes(public[other]))
         yield "    ]"
         yield from _user(name, mine, public[name])
         yield "  }"
@@ -189,12 +189,12 @@ def account_of(user: str) -> str:
     return f"{STORE}-{user}"
 
 
-def _wanted(mine: UserRights) -> list[str]:
+def _request_subjects(mine: UserRights) -> list[str]:
     """Return the subjects on which a user may send requests to gateways (not to the store)."""
     return [subject for subject in mine.publish if not subject.startswith(_STORED)]
 
 
-def _answers(public: str) -> str:
+def _inboxes(public: str) -> str:
     return f"{inbox_of(public)}.>"
 
 
@@ -217,7 +217,7 @@ def _user(name: str, mine: UserRights, public: str) -> Iterator[str]:
     yield f"      {{ # {name}"
     yield f"        nkey: {public}, permissions: {{"
     yield f"          publish: {{ allow: {json.dumps(list(mine.publish))} }}"
-    yield f"          subscribe: {{ allow: {json.dumps([_answers(public), *mine.subscribe])} }}"
+    yield f"          subscribe: {{ allow: {json.dumps([_inboxes(public), *mine.subscribe])} }}"
     if mine.answers:
         yield f"          allow_responses: {ANSWER}"
     yield "        }"
@@ -251,7 +251,6 @@ class ServerAddress(NamedTuple):
 
     @property
     def routes(self) -> int:
-        """Return the port on which this server accepts routes from the others."""
         return self.port + ROUTE_PORTS
 
 

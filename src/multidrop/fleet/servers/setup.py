@@ -35,7 +35,7 @@ async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
     """
     await open_all(paths)
     reached = min(MOST_REPLICAS, len({path.server_name for path in paths}))
-    replicas = await _kept_on(paths[0])
+    replicas = await _replicas(paths[0])
     away = [path.urls[0] for path in paths if path.url != path.urls[0]]
     if away and not replicas:
         raise FleetError(
@@ -100,7 +100,7 @@ def no_quorum(path: ServerPath, failure: Exception) -> FleetError:
     )
 
 
-async def _kept_on(path: ServerPath) -> int:
+async def _replicas(path: ServerPath) -> int:
     """Return the smallest number of servers that store a bucket; 0 if a bucket is missing."""
     infos = [await _retried(path, partial(_info, path, f"KV_{bucket}")) for bucket in names.BUCKETS]
     return min(1 + len(cluster_of(info, path).followers) if info else 0 for info in infos)
