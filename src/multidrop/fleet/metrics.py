@@ -11,77 +11,48 @@ import asyncio
 import logging
 import re
 import socket
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
 from ipaddress import ip_address
-from typing import Any, NamedTuple
+from typing import Any
 
 from multidrop.exposition import MetricFamily, expose_metrics
 from multidrop.fleet.leases.member import MemberState
 from multidrop.toml_check import parse_address
 
-
-class _Figure(NamedTuple):
-    """A metric, and where its value is in a gateway's state."""
-
-    name: str
-    kind: str  # "gauge" or "counter"
-    text: str
-    keys: tuple[str, ...]
-
-
-_FIGURES = (
-    _Figure("lines", "gauge", "Lines that are polled.", ("lines",)),
-    _Figure("moves", "counter", "Lines that were claimed or released.", ("moves",)),
-    _Figure("spool_bytes", "gauge", "Bytes of all messages on the disk.", ("spool", "bytes")),
-    _Figure("spool_waiting_rows", "gauge", "Rows in memory, not yet on the disk.", ("spool", "waiting")),
-    _Figure("spool_rows", "counter", "Rows that reached the disk.", ("spool", "rows")),
-    _Figure(
-        "spool_lost_rows",
-        "counter",
-        "Rows that never reached the disk, or were removed unsent.",
-        ("spool", "lost"),
-    ),
-    _Figure("sent_messages", "counter", "Messages that the servers stored.", ("spool", "sent")),
-    _Figure("behind_messages", "gauge", "Messages that the servers lack.", ("spool", "behind")),
-    _Figure(
-        "behind_seconds", "gauge", "Age of the oldest message that the servers lack.", ("spool", "lag_s")
-    ),
-)
-_LINES = {
-    "lost": "The gateway's lines that are not polled because their port is lost.",
-    "failing": "Lines on which polling raised an exception and is retried.",
-    "unopened": "Lines that other gateways should take, because this one cannot open their ports.",
-}
 _SUFFIXES = {"gauge": "", "counter": "_total"}
 _PREFIX = "multidrop_fleet_"
 
 
 def families_of(state: Mapping[str, Any], version: str) -> Iterator[MetricFamily]:
+    """Yield the metrics of a gateway's state."""
     about = {"gateway": state["gateway"], "version": version}
     yield MetricFamily(f"{_PREFIX}gateway", "info", "Name and version.", [("_info", about, 1.0)])
     label = f"{_PREFIX}gateway_state"
     states = [("", {label: one.value}, float(one.value == state["state"])) for one in MemberState]
     yield MetricFamily(label, "stateset", "State of the gateway.", states)
-    if state["session"]:
-        margin, text = state["margin_s"], "Time until the lease expires."
-        yield _family("lease_margin_seconds", "gauge", text, margin)
-        yield _family("session", "gauge", "Number of the session.", state["session"])
-    servers = len(set(filter(None, state["paths"])))
-    yield _family("servers", "gauge", "Servers that its three connections use.", servers)
-    yield _family("troubled_lines", "gauge", "Lines that cannot be opened, or fail.", len(state["troubles"]))
-    for key, text in _LINES.items():
-        yield _family(f"{key}_lines", "gauge", text, len(state[key]))
-    for figure in _FIGURES:
-        value: Any = state
-        for key in figure.keys:
-            value = value[key]
+    spool, margin_s = state["spool"], state["margin_s"] if state["session"] else None
+    figures: Sequence[tuple[str, str, str, float | None]] = (
+        ("lease_margin_seconds", "gauge", "Time until the lease expires.", margin_s),
+        ("session", "gauge", "Number of the session.", state["session"] or None),
+        ("servers", "gauge", "Servers that its three connections use.", len({*state["paths"]} - {""})),
+        ("troubled_lines", "gauge", "Lines that cannot be opened, or fail.", len(state["troubles"])),
+        ("lost_lines", "gauge", "Lines that are not polled: their port is lost.", len(state["lost"])),
+        ("failing_lines", "gauge", "Lines on which polling failed and is retried.", len(state["failing"])),
+        ("unopened_lines", "gauge", "Lines that other gateways should open.", len(state["unopened"])),
+        ("lines", "gauge", "Lines that are polled.", state["lines"]),
+        ("moves", "counter", "Lines that were claimed or released.", state["moves"]),
+        ("spool_bytes", "gauge", "Bytes of all messages on the disk.", spool["bytes"]),
+        ("spool_waiting_rows", "gauge", "Rows in memory, not yet on the disk.", spool["waiting"]),
+        ("spool_rows", "counter", "Rows that reached the disk.", spool["rows"]),
+        ("spool_lost_rows", "counter", "Rows not written, or removed unsent.", spool["lost"]),
+        ("sent_messages", "counter", "Messages that the servers stored.", spool["sent"]),
+        ("behind_messages", "gauge", "Messages that the servers lack.", spool["behind"]),
+        ("behind_seconds", "gauge", "Age of the oldest message that the servers lack.", spool["lag_s"]),
+    )
+    for name, kind, text, value in figures:
         if value is not None:
-            yield _family(figure.name, figure.kind, figure.text, value)
-
-
-def _family(name: str, kind: str, text: str, value: float) -> MetricFamily:
-    return MetricFamily(_PREFIX + name, kind, text, [(_SUFFIXES[kind], {}, float(value))])
+            yield MetricFamily(_PREFIX + name, kind, text, [(_SUFFIXES[kind], {}, float(value))])
 
 
 EXAMPLE = "127.0.0.1:9464"

@@ -271,25 +271,14 @@ class Move(NamedTuple):
 
     def as_json(self) -> dict[str, Any]:
         """Return this move as gateways send it and `--json` prints it."""
-        return {
-            "line": self.line,
-            "turn": self.turn,
-            "at_ms": self.at_ms,
-            "from": self.before,
-            "to": self.after,
-        }
+        line, turn, at_ms, before, after = self
+        return {"line": line, "turn": turn, "at_ms": at_ms, "from": before, "to": after}
 
 
 def move_of(sent: Any) -> Move:
     """Parse a move that another gateway sent. Raises KeyError, TypeError or ValueError for an invalid one."""
-    before = sent["from"]
-    return Move(
-        str(sent["line"]),
-        int(sent["turn"]),
-        int(sent["at_ms"]),
-        None if before is None else str(before),
-        str(sent["to"]),
-    )
+    line, turn, at_ms, before, after = (sent[key] for key in ("line", "turn", "at_ms", "from", "to"))
+    return Move(str(line), int(turn), int(at_ms), None if before is None else str(before), str(after))
 
 
 class Moves:

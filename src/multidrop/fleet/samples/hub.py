@@ -13,12 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 from multidrop.fleet.errors import FleetError
-from multidrop.fleet.samples.samples_stream import (
-    StreamInfo,
-    StreamMessage,
-    read_after,
-    stream_info,
-)
+from multidrop.fleet.samples.samples_stream import StreamInfo, StreamMessage, read_after, stream_info
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.samples import MessageError, SinkError, unpack
 
