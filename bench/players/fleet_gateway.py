@@ -15,8 +15,6 @@ import traceback
 from contextlib import suppress
 from pathlib import Path
 
-sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterdir()))
-
 from spooled import numbered
 
 from multidrop.core import Names

@@ -12,8 +12,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterdir()))
-
 from own_drives import Fan
 from responder_drives import KINDS
 

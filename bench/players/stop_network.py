@@ -11,9 +11,6 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
-
-sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterdir()))
 
 from namespaces import changing_network
 from responder import Responder, ResponderLine

@@ -14,8 +14,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterdir()))
-
 from responder import ReceivedFrame, Responder, ResponderLine
 from responder_drives import KINDS, ResponderDrive
 

@@ -14,9 +14,6 @@ import random
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from pathlib import Path
-
-sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterdir()))
 
 from fencing import Fence, Round
 

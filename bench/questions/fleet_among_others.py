@@ -18,9 +18,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from bench.support import tables
+from fleet_scale import cpu_s_of, groups, large_fleet, plant_of_fake_lines, until
+from nats_clusters import cluster
+from serial_hall import SerialHall
 
-ROOT = Path(__file__).parents[2]
+from bench.support import tables
+from multidrop.fleet.lines.shares import assign
+from multidrop.fleet.servers.plant_store import read_plant
+
 REAL = "gw-00"
 SETTLE_S = 5.0
 
@@ -41,13 +46,6 @@ def main() -> None:
     parser.add_argument("--every", default="500 ms", help="between two exchanges of a line")
     parser.add_argument("--seconds", type=float, default=30.0, help="of each run")
     arguments = parser.parse_args()
-    sys.path.extend(map(str, (ROOT / "tests" / "support").iterdir()))
-    from fleet_scale import cpu_s_of, groups, large_fleet, plant_of_fake_lines, until
-    from nats_clusters import cluster
-    from serial_hall import SerialHall
-
-    from multidrop.fleet.lines.shares import assign
-    from multidrop.fleet.servers.plant_store import read_plant
 
     tables.heading("Does a real gateway among a fleet's others keep the rate of its lines?")
     _, most_files = resource.getrlimit(resource.RLIMIT_NOFILE)

@@ -22,8 +22,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterdir()))
-
 import duckdb
 from nats_clusters import Cluster, cluster
 from postgres_clusters import Postgres, postgres

@@ -15,9 +15,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from bench.support import tables
+from command_drills import command_drill
 
-ROOT = Path(__file__).parents[2]
+from bench.support import tables
 
 
 def main() -> int:
@@ -29,8 +29,6 @@ def main() -> int:
     )
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
-    sys.path.extend(map(str, (ROOT / "tests" / "support").iterdir()))
-    from command_drills import command_drill
 
     tables.heading("Is a command carried out twice, or its asker told wrongly, whatever is killed?")
     seconds = arguments.seconds or arguments.commands / 10

@@ -18,9 +18,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bench.support import tables
+from fleet_drills import (
+    CUTS,
+    DEEDS,
+    MACHINES,
+    FleetDrill,
+    cut,
+    drilled,
+    drilled_in_network,
+    drilled_on_machines,
+)
+from namespaces import why_none
 
-ROOT = Path(__file__).parents[2]
+from bench.support import tables
 
 
 def main() -> None:
@@ -29,18 +39,6 @@ def main() -> None:
     parser.add_argument("--lines", type=int, default=12)
     parser.add_argument("--deed", action="append", help="only this one; may be given again")
     arguments = parser.parse_args()
-    sys.path.extend(map(str, (ROOT / "tests" / "support").iterdir()))
-    from fleet_drills import (
-        CUTS,
-        DEEDS,
-        MACHINES,
-        FleetDrill,
-        cut,
-        drilled,
-        drilled_in_network,
-        drilled_on_machines,
-    )
-    from namespaces import why_none
 
     tables.heading("How long is a line silent when something of its fleet dies, and do masters overlap?")
     rows: list[tuple[object, ...]] = []

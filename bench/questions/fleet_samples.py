@@ -13,7 +13,6 @@ import heapq
 import os
 import random
 import resource
-import sys
 import time
 from array import array
 from collections.abc import Callable, Iterator
@@ -23,8 +22,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any, cast
-
-sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterdir()))
 
 from postgres_clusters import Postgres, postgres
 

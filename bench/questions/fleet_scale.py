@@ -14,9 +14,10 @@ import tempfile
 import time
 from pathlib import Path
 
-from bench.support import tables
+from fleet_scale import groups, large_fleet, plant_of_fake_lines
+from nats_clusters import cluster
 
-ROOT = Path(__file__).parents[2]
+from bench.support import tables
 
 
 def main() -> None:
@@ -25,9 +26,6 @@ def main() -> None:
     parser.add_argument("--gateways", type=int, default=20)
     parser.add_argument("--kills", type=int, default=3)
     arguments = parser.parse_args()
-    sys.path.extend(map(str, (ROOT / "tests" / "support").iterdir()))
-    from fleet_scale import groups, large_fleet, plant_of_fake_lines
-    from nats_clusters import cluster
 
     tables.heading("How soon has each line of a large fleet a gateway?")
     rows: list[tuple[object, ...]] = []

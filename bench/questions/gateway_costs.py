@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import struct
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -20,8 +19,6 @@ from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-
-sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterdir()))
 
 from gateway_users import COMMON, COMMON_WORDS, WORDS
 from simulated_pumps import FIRST_READING, POLLED, write_plant

@@ -29,8 +29,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterdir()))
-
 from free_ports import free_ports
 from gateway_users import GatewayUsers, Place, gateway_users, place_of, serve_tables
 from simulated_pumps import POLLED, SimulatedPumps, simulated_pumps, write_plant

@@ -26,8 +26,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterdir()))
-
 from free_ports import free_ports
 from kills import BoundProcess
 from simulated_pumps import simulated_pumps, write_plant

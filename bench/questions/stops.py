@@ -16,9 +16,6 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
-
-sys.path.extend(map(str, (Path(__file__).parents[2] / "tests" / "support").iterdir()))
 
 from responder_drives import KINDS
 
