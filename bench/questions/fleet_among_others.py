@@ -58,10 +58,7 @@ def main() -> None:
     def run(words: Sequence[str]) -> Seen:
         """Poll the lines of `hall` with this `multidrop` command for a while; return the results."""
         log, command = Path(folder) / "log", [sys.executable, "-m", "multidrop", *words]
-        with (
-            log.open("wb") as output,
-            subprocess.Popen(command, stdout=output, stderr=output) as process,
-        ):
+        with log.open("wb") as output, subprocess.Popen(command, stdout=output, stderr=output) as process:
             try:
 
                 def are_polled() -> bool:
@@ -84,10 +81,7 @@ def main() -> None:
         plant.write_text(hall.plant(arguments.every))
         rows = [("multidrop poll, alone", run(["poll", str(plant), "--out", f"{folder}/alone.arrows"]))]
         _, real = read_plant(plant)
-        with (
-            cluster(Path(folder) / "nats") as nats,
-            large_fleet(nats, everywhere | real) as fleet,
-        ):
+        with cluster(Path(folder) / "nats") as nats, large_fleet(nats, everywhere | real) as fleet:
             fleet.start(*[[name for name in group if name != REAL] for group in every])
             until(lambda: fleet.polled() == arguments.lines, "the others have all lines")
             serve = ["fleet", "serve", REAL, "--folder", f"{folder}/{REAL}", "--nats", ",".join(nats.urls)]
