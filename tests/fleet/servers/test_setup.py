@@ -107,7 +107,7 @@ def test_servers_that_ignore_other_writers_records_are_refused(
     nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Such servers would grant a lease to two gateways. Some of their answers may come too late."""
-    monkeypatch.setattr(LeaseBucket, "_all_of", LeaseBucket._subject)
+    monkeypatch.setattr(LeaseBucket, "_pattern", LeaseBucket._subject)
     with pytest.raises(FleetError, match=r"accepted [2-6] of 6 concurrent writes to the same revision"):
         asyncio.run(_init(nats.urls))
 
