@@ -7,7 +7,6 @@ plant file, except its table `[serve]`, which `multidrop serve --check` checks.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from multidrop.cli.models import INDENT, facts, sheet
 from multidrop.cli.support.arguments import add_json_argument, whole
 from multidrop.cli.support.files import refuse_overwriting, write_new
-from multidrop.cli.support.output import print_text, warn
+from multidrop.cli.support.output import print_json, print_text, warn
 from multidrop.cli.support.values import counted, wrapped
 from multidrop.control.eeprom_ledger import BUDGET, LEAST_INTERVAL
 from multidrop.control.rules import wears
@@ -65,7 +64,7 @@ def _run_check(arguments: argparse.Namespace) -> int:
         family = _family(arguments.file)
     except FamilyError as wrong:
         if arguments.json:
-            print_text(json.dumps({"mistakes": wrong.mistakes}, indent=2))
+            print_json({"mistakes": wrong.mistakes})
         else:
             warn(str(wrong))
         return 1
@@ -76,7 +75,7 @@ def _run_check(arguments: argparse.Namespace) -> int:
             "not_known": not_known,
             "will_be_refused": will_be_refused,
         }
-        print_text(json.dumps(facts(family) | more, indent=2))
+        print_json(facts(family) | more)
         return 0
     lines = [sheet(family)]
     for heading, remarks in (("not known", not_known), ("will be refused", will_be_refused)):
@@ -105,7 +104,7 @@ def _check_plant(arguments: argparse.Namespace) -> int:
     except PlantError as wrong:
         mistakes = wrong.mistakes
     if arguments.json:
-        print_text(json.dumps({"mistakes": mistakes, "remarks": remarks}, indent=2))
+        print_json({"mistakes": mistakes, "remarks": remarks})
     elif mistakes:
         warn("\n".join(mistakes))
     else:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import time
@@ -39,7 +38,7 @@ from multidrop.cli.support.arguments import (
     usual_settings,
     whole,
 )
-from multidrop.cli.support.output import print_text
+from multidrop.cli.support.output import print_json, print_text
 from multidrop.cli.support.values import wrapped
 from multidrop.core import (
     RS485,
@@ -115,7 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
             | ({"line": target.line} if target.line else {})
             for target, findings in found
         ]
-        print_text(json.dumps(records[0] if len(records) == 1 else {"lines": records}, indent=2))
+        print_json(records[0] if len(records) == 1 else {"lines": records})
     else:
         heads = [f"{target.line}: {target.port}\n" if len(found) > 1 else "" for target, _ in found]
         texts = ("\n".join(_text(findings)) for _, findings in found)

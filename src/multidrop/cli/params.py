@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from multidrop.cli.support.arguments import (
     mistaken,
     target_of,
 )
-from multidrop.cli.support.output import confirm, print_text, reporting_interruption
+from multidrop.cli.support.output import confirm, print_json, print_text, reporting_interruption
 from multidrop.cli.support.values import aligned, counted
 from multidrop.drive.parameters import parameters_of
 from multidrop.errors import Unsupported, WriteForbidden
@@ -35,13 +34,24 @@ ACTIONS = {  # action: (its module in this package, or "" for this module; its h
     "apply": ("", "write a file's parameters to a stopped drive, if they differ"),
     "list": ("", "list the parameters of a drive or a model"),
 }
-_FURTHER = {"save": ("FILE",), "diff": (), "apply": (), "list": ()}
+_DRIVES = ("PORT MODEL ADDRESS", "PLANT.toml DRIVE")
+_WAYS = {  # action: its usage lines
+    "save": [f"{drive} FILE" for drive in _DRIVES],
+    "diff": [
+        *(f"FILE {drive}" for drive in _DRIVES),
+        "FILE FILE",
+        "PLANT.toml DRIVE PLANT.toml DRIVE",
+        *(f"--defaults {drive}" for drive in _DRIVES),
+    ],
+    "apply": [f"FILE {drive}" for drive in _DRIVES],
+    "list": [*_DRIVES, "MODEL"],
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     action = parser.get_default("command")
     parser.set_defaults(command=f"params {action}", action=action)
-    add_target_arguments(parser, *_FURTHER[action])
+    add_target_arguments(parser)
     parser.usage = "\n       ".join(f"{parser.prog} {way} [options]" for way in _WAYS[action])
     if action == "diff":
         parser.add_argument("--defaults", action="store_true", help="compare a drive with the factory values")
@@ -63,22 +73,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_json_argument(parser)
 
 
-_DRIVES = ("PORT MODEL ADDRESS", "PLANT.toml DRIVE")
-_WAYS = {
-    "save": [f"{drive} FILE" for drive in _DRIVES],
-    "diff": [
-        *(f"FILE {drive}" for drive in _DRIVES),
-        "FILE FILE",
-        "PLANT.toml DRIVE PLANT.toml DRIVE",
-        *(f"--defaults {drive}" for drive in _DRIVES),
-    ],
-    "apply": [f"FILE {drive}" for drive in _DRIVES],
-    "list": [*_DRIVES, "MODEL"],
-}
-
-
 def run(arguments: argparse.Namespace) -> int:
-    return _ACTS[arguments.action](arguments)
+    acts = {"save": _save, "diff": _diff, "apply": _apply, "list": _list}
+    return acts[arguments.action](arguments)
 
 
 # ---- save ----
@@ -92,14 +89,15 @@ def _save(arguments: argparse.Namespace) -> int:
     found = _read(target)
     params.save(found, words[0], type(target.drive))
     if arguments.json:
-        print_text(json.dumps(_as_json(found) | {"file": words[0]}, indent=2))
+        facts = {name: getattr(found, name) for name in files.FACTS if getattr(found, name)}
+        print_json({"source": found.source, **facts, "parameters": dict(found.values), "file": words[0]})
     else:
         print_text(f"{words[0]}: {counted(len(found.values), 'parameter')} of {target.drive.name}")
     return DONE
 
 
 def _read(target: Target, codes: Sequence[str] | None = None) -> ParameterSet:
-    with _Progress() as progress, target.open_bus():
+    with _progress() as progress, target.open_bus():
         return params.read(target.drive, codes, progress=progress)
 
 
@@ -125,7 +123,8 @@ def _diff(arguments: argparse.Namespace) -> int:
         family = _family_of(one, other, first)
     different = params.compare(first, second, family)
     if arguments.json:
-        print_text(json.dumps(_differences_as_json(first, second, different), indent=2))
+        differences = [each._asdict() for each in different]
+        print_json({"first": first.source, "second": second.source, "differences": differences})
     elif different:
         head = ("CODE", "NAME", first.source, second.source)
         rows = [(each.code, each.name, each.first_text, each.second_text) for each in different]
@@ -193,12 +192,16 @@ def _apply(arguments: argparse.Namespace) -> int:
     drive = target.drive
     with reporting_interruption(drive, "apply") as known, target.open_bus(arguments.audit):
         known.clear()
-        with _Progress() as progress:
+        with _progress() as progress:
             made = params.plan(drive, given, also=arguments.also, progress=progress)
         if not arguments.json:
             print_text("\n".join(made.lines()) or f"{drive.name} has these parameters already")
         if arguments.dry_run:
-            return _print_plan(arguments, made)
+            if arguments.json:
+                print_json(_plan_as_json(made))
+            else:
+                print_text(f"{counted(len(made.writes), 'parameter')} to write; nothing was written")
+            return DONE
         if made.writes:
             count = counted(len(made.writes), "parameter")
             confirm(f"Write {count} to {drive.name} on {target.port}?", arguments)
@@ -213,20 +216,12 @@ def _apply(arguments: argparse.Namespace) -> int:
 
         result = params.apply_plan(made, commissioning=arguments.commissioning, report=report)
     if arguments.json:
-        print_text(json.dumps(_applied_as_json(result), indent=2))
+        print_json(_applied_as_json(result))
     else:
         print_text("\n".join(_applied_lines(result)))
     if result.failure is not None:
         raise result.failure
     return DONE if result.ok else FAILED
-
-
-def _print_plan(arguments: argparse.Namespace, made: params.ApplyPlan) -> int:
-    if arguments.json:
-        print_text(json.dumps(_plan_as_json(made), indent=2))
-    else:
-        print_text(f"{counted(len(made.writes), 'parameter')} to write; nothing was written")
-    return DONE
 
 
 def _applied_lines(result: params.Applied) -> list[str]:
@@ -255,7 +250,7 @@ def _list(arguments: argparse.Namespace) -> int:
         held = _read(target)
     rows = params.rows(family, held)
     if arguments.json:
-        print_text(json.dumps({"model": family.model, "parameters": rows}, indent=2))
+        print_json({"model": family.model, "parameters": rows})
         return DONE
     head = ("CODE", "NAME", "VALUE", "FACTORY", "NOT WRITTEN BECAUSE")
     keys = ("code", "name", "value", "factory", "not_written")
@@ -279,37 +274,16 @@ def _check_no_more(arguments: argparse.Namespace, words: Sequence[str]) -> None:
         raise mistaken(arguments, f"unrecognized arguments: {' '.join(words)}")
 
 
-class _Progress:
-    """Shows the progress of reading in one line on a terminal's stderr, and removes it at the end."""
-
-    def __init__(self) -> None:
-        self._is_shown = sys.stderr.isatty()
-
-    def __enter__(self) -> _Progress:
-        return self
-
-    def __call__(self, done: int, total: int) -> None:
-        if self._is_shown:
-            print(f"\rread {done} of {total}", end="", file=sys.stderr, flush=True)
-
-    def __exit__(self, *failure: object) -> None:
-        if self._is_shown:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
-
-
-def _as_json(found: ParameterSet) -> dict[str, Any]:
-    facts = {name: getattr(found, name) for name in files.FACTS if getattr(found, name)}
-    return {"source": found.source, **facts, "parameters": dict(found.values)}
-
-
-def _differences_as_json(
-    first: ParameterSet, second: ParameterSet, different: list[params.Difference]
-) -> dict[str, Any]:
-    return {
-        "first": first.source,
-        "second": second.source,
-        "differences": [each._asdict() for each in different],
-    }
+@contextmanager
+def _progress() -> Iterator[Callable[[int, int], None] | None]:
+    """Show the progress of reading in one line on a terminal's stderr, and remove it at the end."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    try:
+        yield lambda done, total: print(f"\rread {done} of {total}", end="", file=sys.stderr, flush=True)
+    finally:
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
 
 def _plan_as_json(made: params.ApplyPlan) -> dict[str, Any]:
@@ -344,6 +318,3 @@ def _applied_as_json(result: params.Applied) -> dict[str, Any]:
         "earlier": result.earlier,
         "failure": "" if result.failure is None else _reason(result.failure),
     }
-
-
-_ACTS = {"save": _save, "diff": _diff, "apply": _apply, "list": _list}

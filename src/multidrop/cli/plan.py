@@ -6,13 +6,12 @@ No port is opened.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 from multidrop.cli.support.arguments import add_json_argument, add_plant_argument
-from multidrop.cli.support.output import print_text
+from multidrop.cli.support.output import print_json, print_text
 from multidrop.cli.support.values import Row, aligned, counted, shortened, wrapped
 from multidrop.families.registry import is_users_own
 from multidrop.planning.prediction import (
@@ -39,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     plans = [_plan(line) for line in load_plant(arguments.plant).lines]
     if arguments.json:
-        print_text(json.dumps({"lines": {plan.line.name: _as_json(plan) for plan in plans}}, indent=2))
+        print_json({"lines": {plan.line.name: _as_json(plan) for plan in plans}})
     else:
         print_text("\n\n".join("\n".join(_text(plan)) for plan in plans))
     return 0 if all(plan.prediction.fits for plan in plans) else 1
@@ -50,19 +49,21 @@ class _PredictedLine:
     line: PlantLine
     prediction: Prediction
     suggestions: Suggestions | None  # None if the plan fits
+    misfits: list[str]  # a sentence for each polling rate that cannot be reached
+    warnings: list[str]
 
 
 def _plan(line: PlantLine) -> _PredictedLine:
     wanted = planned_on(line)
     prediction = predict(wanted, switching=line.switching)
-    return _PredictedLine(
-        line, prediction, None if prediction.fits else suggest(wanted, prediction, line.switching)
-    )
-
-
-def _misfits(plan: _PredictedLine) -> list[str]:
-    """Return a sentence for each polling rate that cannot be reached."""
-    return [_misfit(rate, rate.every) for rate in plan.prediction.rates if rate.every and not rate.fits]
+    suggestions = None if prediction.fits else suggest(wanted, prediction, line.switching)
+    misfits = [_misfit(rate, rate.every) for rate in prediction.rates if rate.every and not rate.fits]
+    warnings = [*_long_cycle(line, prediction)]
+    for polled in line.drives:  # the bus time that `readable_gaps` would save for users' own classes
+        gain = reading_gain(polled.drive, polled.wanted) if is_users_own(type(polled.drive)) else None
+        if gain:
+            warnings.append(f"{polled.drive.name}: {gain}")
+    return _PredictedLine(line, prediction, suggestions, misfits, warnings)
 
 
 def _misfit(rate: Rate, every: float) -> str:
@@ -73,37 +74,22 @@ def _misfit(rate: Rate, every: float) -> str:
     return f"{rate.drive.name}: {shown} {verb} not fit: {reached}"
 
 
-def _warnings(plan: _PredictedLine) -> list[str]:
-    return [*_long_cycle(plan), *_gains(plan)]
-
-
-def _gains(plan: _PredictedLine) -> list[str]:
-    """Return sentences about the bus time that `readable_gaps` would save for users' own classes."""
-    gains = {
-        polled.drive.name: reading_gain(polled.drive, polled.wanted)
-        for polled in plan.line.drives
-        if is_users_own(type(polled.drive))
-    }
-    return [f"{name}: {gain}" for name, gain in gains.items() if gain]
-
-
-def _long_cycle(plan: _PredictedLine) -> list[str]:
-    """Return a list with a warning if all readings of a drive are polled and a cycle exceeds LONG_CYCLE."""
+def _long_cycle(line: PlantLine, prediction: Prediction) -> Iterator[str]:
+    """Yield a warning if all readings of a drive are polled and a bus cycle exceeds LONG_CYCLE."""
     whole = [
         polled.drive
-        for polled in plan.line.drives
+        for polled in line.drives
         if tuple(poll.register for poll in polled.polls) == polled.drive.readings()
     ]
-    if plan.prediction.cycle <= LONG_CYCLE or not whole:
-        return []
-    costs = ", ".join(
-        f"{drive.name} ({counted(plan.prediction.requests(drive), 'request')} for {len(drive.readings())})"
-        for drive in whole
-    )
-    return [
-        f"a bus cycle takes longer than {duration_text(LONG_CYCLE)}; all readings are polled of {costs}: "
-        'name the registers you need, such as poll = ["output_current"]'
-    ]
+    if prediction.cycle > LONG_CYCLE and whole:
+        costs = ", ".join(
+            f"{drive.name} ({counted(prediction.requests(drive), 'request')} for {len(drive.readings())})"
+            for drive in whole
+        )
+        yield (
+            f"a bus cycle takes longer than {duration_text(LONG_CYCLE)}; all readings are polled of {costs}: "
+            'name the registers you need, such as poll = ["output_current"]'
+        )
 
 
 # ---- as text ----
@@ -120,11 +106,11 @@ def _text(plan: _PredictedLine) -> Iterator[str]:
     rows: list[Row] = [("DRIVE", "REQUESTS", "REGISTERS", "EVERY", "ASKED", "REACHED")]
     rows += [_row(rate) for rate in prediction.rates]
     yield from (f"  {row}" for row in aligned(rows, "<>>>>>"))
-    for sentence in _misfits(plan):
+    for sentence in plan.misfits:
         yield from _indented(f"! {sentence}")
     if plan.suggestions:
         yield from _indented(f"! {plan.suggestions}")
-    for sentence in _warnings(plan):
+    for sentence in plan.warnings:
         yield from _indented(f"? {sentence}")
 
 
@@ -155,39 +141,33 @@ def _indented(sentence: str) -> list[str]:
 
 
 def _as_json(plan: _PredictedLine) -> dict[str, Any]:
-    prediction = plan.prediction
+    prediction, found = plan.prediction, plan.suggestions
+    drives: dict[str, list[dict[str, Any]]] = {polled.drive.name: [] for polled in plan.line.drives}
+    for rate in prediction.rates:
+        drives[rate.drive.name].append(
+            {
+                "registers": [register.name for register in rate.registers],
+                "requests": rate.requests,
+                "every_ms": None if rate.every is None else rate.every * 1e3,
+                "asked_per_second": None if rate.every is None else round(1 / rate.every, 3),
+                "reached_per_second": round(rate.reached, 3),
+                "fits": rate.fits,
+            }
+        )
+    remedies = found and {
+        "every_ms": [{"asked": old * 1e3, "fits": new * 1e3} for old, new in found.every],
+        "baudrate": found.baudrate and found.baudrate[0],
+        "baudrate_for": [drive.name for drive in found.baudrate[1]] if found.baudrate else [],
+        "registers": found.registers,
+    }
     return {
         "fits": prediction.fits,
         "cycle_ms": round(prediction.cycle * 1e3, 3),
         "utilisation": round(prediction.utilisation, 4),
         "switches": prediction.switches,
         "switching_ms": plan.line.switching * 1e3,
-        "drives": {polled.drive.name: _drive_as_json(plan, polled.drive.name) for polled in plan.line.drives},
-        "misfits": _misfits(plan),
-        "remedies": _suggestions_as_json(plan.suggestions) if plan.suggestions else None,
-        "warnings": _warnings(plan),
-    }
-
-
-def _drive_as_json(plan: _PredictedLine, name: str) -> list[dict[str, Any]]:
-    return [
-        {
-            "registers": [register.name for register in rate.registers],
-            "requests": rate.requests,
-            "every_ms": None if rate.every is None else rate.every * 1e3,
-            "asked_per_second": None if rate.every is None else round(1 / rate.every, 3),
-            "reached_per_second": round(rate.reached, 3),
-            "fits": rate.fits,
-        }
-        for rate in plan.prediction.rates
-        if rate.drive.name == name
-    ]
-
-
-def _suggestions_as_json(found: Suggestions) -> dict[str, Any]:
-    return {
-        "every_ms": [{"asked": old * 1e3, "fits": new * 1e3} for old, new in found.every],
-        "baudrate": found.baudrate and found.baudrate[0],
-        "baudrate_for": [drive.name for drive in found.baudrate[1]] if found.baudrate else [],
-        "registers": found.registers,
+        "drives": drives,
+        "misfits": plan.misfits,
+        "remedies": remedies,
+        "warnings": plan.warnings,
     }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,7 +15,7 @@ from multidrop.cli.support.arguments import (
     check_words,
     target_of,
 )
-from multidrop.cli.support.output import confirm, print_text, reporting_interruption
+from multidrop.cli.support.output import confirm, print_json, print_text, reporting_interruption
 from multidrop.cli.support.values import Row, aligned, as_json, as_row, nearest_value, user_title
 from multidrop.control.eeprom_ledger import BUDGET, CYCLES, Ledger, Wear, default_path
 from multidrop.control.rules import check_plain, raw_count, refused
@@ -65,7 +64,7 @@ def _run_read(arguments: argparse.Namespace) -> int:
     if arguments.json:
         record = {"drive": drive.name, "model": drive.model, "address": drive.address}
         shown = {one.name: _as_json(one, value) for one, value in (values | read_texts).items()}
-        print_text(json.dumps(record | {"values": shown}, indent=2))
+        print_json(record | {"values": shown})
     else:
         rows = [(*_row(one, value), user_title(one)) for one, value in values.items()]
         lines = aligned(rows, "<><<")
@@ -129,7 +128,7 @@ def _run_write(arguments: argparse.Namespace) -> int:
     if arguments.json:
         held = outcome.asked if outcome.held is None else outcome.held
         record = {"drive": drive.name, "register": register.name} | as_json(register, held)
-        print_text(json.dumps(record | {"outcome": outcome.effect.value}, indent=2))
+        print_json(record | {"outcome": outcome.effect.value})
     else:
         print_text(outcome, file=sys.stdout if outcome.ok else sys.stderr)
     return 0 if outcome.ok else 1
@@ -147,7 +146,7 @@ def _run_wear(arguments: argparse.Namespace) -> int:
     ledger = Ledger(arguments.ledger)
     found = ledger.wear((now_ns() + utc_minus_monotonic_ns()) / 1e9)
     if arguments.json:
-        print_text(json.dumps([_wear_as_json(wear) for wear in found], indent=2))
+        print_json([_wear_as_json(wear) for wear in found])
     elif not found:
         print_text(f"{ledger.path}: no writes to EEPROM yet")
     else:

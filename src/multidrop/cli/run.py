@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -23,7 +22,7 @@ from multidrop.cli.support.arguments import (
 )
 from multidrop.cli.support.demo_plant import simulator
 from multidrop.cli.support.files import refuse_overwriting
-from multidrop.cli.support.output import confirm, print_text, warn
+from multidrop.cli.support.output import confirm, print_json, print_text, warn
 from multidrop.cli.support.values import aligned, counted
 from multidrop.cli.verbs import stop_sentence
 from multidrop.control.exit_hook import signal_has_come
@@ -151,7 +150,7 @@ def _conclude(result: RunResult, arguments: argparse.Namespace) -> int:
         ]
         recording = str(arguments.out) if arguments.out else None
         found = {"ok": result.ok, "abort": result.abort, "stops": stops, "recording": recording}
-        print_text(json.dumps(found, indent=2))
+        print_json(found)
     else:
         print_text("\n".join(map(stop_sentence, result.stopped.values())))
         if arguments.out:
@@ -168,7 +167,7 @@ def _show(test: TestRun, arguments: argparse.Namespace) -> int:
     """Print the planned times; return the exit status: FAILED if a line is too slow for the test."""
     misfits = test.misfits()
     if arguments.json:
-        print_text(json.dumps({"steps": [*_steps(test)], "misfits": misfits}, indent=2))
+        print_json({"steps": [*_steps(test)], "misfits": misfits})
     else:
         print_text("\n".join(_text(test)))
         for sentence in misfits:

@@ -7,7 +7,6 @@ and settings, and writes a plant file.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import time
@@ -27,7 +26,7 @@ from multidrop.cli.support.arguments import (
     plant_at,
 )
 from multidrop.cli.support.files import check_writable, write_new
-from multidrop.cli.support.output import print_text
+from multidrop.cli.support.output import print_json, print_text
 from multidrop.cli.support.values import counted, wrapped
 from multidrop.core import RS485
 from multidrop.drive.declaration_check import UNIT_IDS
@@ -89,7 +88,7 @@ class SerialPort:
 def _run_ports(arguments: argparse.Namespace) -> int:
     found = sorted(_linux_ports() if sys.platform == "linux" else _other_ports(), key=lambda port: port.name)
     if arguments.json:
-        print_text(json.dumps([asdict(port) for port in found], indent=2))
+        print_json([asdict(port) for port in found])
     else:
         print_text("\n".join(line for port in found for line in _port_text(port)) or NO_PORTS)
     return 0 if found else 1
@@ -186,7 +185,7 @@ def _run_scan(arguments: argparse.Namespace) -> int:
         written = str(arguments.out)
     if arguments.json:
         record = {"port": arguments.port, "seconds": seconds, "finished": finished}
-        print_text(json.dumps(record | _as_json(found) | {"plant": written}, indent=2))
+        print_json(record | _as_json(found) | {"plant": written})
     else:
         print_text(_summary(len(drives), seconds, arguments.addresses, finished))
         if written:

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -29,7 +28,14 @@ from multidrop.cli.support.arguments import (
     plant_of,
     target_of,
 )
-from multidrop.cli.support.output import command_line, confirm, print_text, reporting_interruption, warn
+from multidrop.cli.support.output import (
+    command_line,
+    confirm,
+    print_json,
+    print_text,
+    reporting_interruption,
+    warn,
+)
 from multidrop.cli.support.values import as_json, nearest_value
 from multidrop.control.outcome import Seen, Stopped
 from multidrop.control.records import AuditLog
@@ -116,7 +122,7 @@ def run(arguments: argparse.Namespace) -> int:
             except Unsupported:
                 state = None
     if arguments.json:
-        print_text(json.dumps(_record(arguments.command, drive, state, setpoint, watchdog), indent=2))
+        print_json(_record(arguments.command, drive, state, setpoint, watchdog))
     elif arguments.command == "state":
         print_text(f"{state}\nwatchdog: {watchdog}")
     else:
@@ -281,7 +287,7 @@ def stop_plant(arguments: argparse.Namespace, audit: str | None) -> int:
             interruption.add_note(note)
         raise
     if arguments.json:
-        print_text(json.dumps([record for stop in stops for record in stop.records()], indent=2))
+        print_json([record for stop in stops for record in stop.records()])
     results = [result for stop in stops for result in stop.results]
     return DONE if all(result.ok for result in results) and not arguments.is_partial else FAILED
 

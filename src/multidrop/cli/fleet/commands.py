@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import getpass
-import json
 import os
 import socket
 import sys
@@ -24,7 +23,7 @@ from multidrop.cli.fleet.connection import (
     run_action,
     state_folder,
 )
-from multidrop.cli.support.output import confirm, print_text, warn
+from multidrop.cli.support.output import confirm, print_json, print_text, warn
 from multidrop.printable import plain_number, printable
 
 if TYPE_CHECKING:
@@ -164,7 +163,7 @@ def _annotating(what: str) -> Iterator[None]:
 
 def _show(arguments: argparse.Namespace, answer: CommandAnswer) -> int:
     if arguments.json:
-        print_text(json.dumps(answer.as_json(), indent=2))
+        print_json(answer.as_json())
     else:
         print_text(_sentence(answer), file=sys.stdout if answer.ok else sys.stderr)
     return 0 if answer.ok else 1

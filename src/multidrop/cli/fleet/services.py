@@ -28,7 +28,7 @@ from multidrop.cli.fleet.connection import (
 from multidrop.cli.support.arguments import add_json_argument, duration
 from multidrop.cli.support.files import require_extra
 from multidrop.cli.support.log_thread import LogThread, add_log_argument, logging_to_stderr
-from multidrop.cli.support.output import print_text
+from multidrop.cli.support.output import print_json, print_text
 from multidrop.cli.support.signals import end_signals_cancel, on_end_signals, run_loop
 from multidrop.cli.support.values import counted
 from multidrop.supervisor import end_tasks, supervisor
@@ -126,7 +126,7 @@ async def _drain(arguments: argparse.Namespace, paths: list[ServerPath]) -> int:
         await asyncio.sleep(0.1)
         said = await ask_gateway(path, name, "state")
     if arguments.json:
-        print_text(json.dumps(said, indent=2))
+        print_json(said)
     else:
         print_text(
             f"{name} has {counted(said['lines'], 'line')} left; it takes none until it is started again"

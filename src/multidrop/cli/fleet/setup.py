@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING
 from multidrop.cli.fleet.connection import add_server_arguments, nats_urls, require_fleet, run_with_paths
 from multidrop.cli.fleet.views import size
 from multidrop.cli.support.files import require_extra
-from multidrop.cli.support.output import print_text, warn
+from multidrop.cli.support.output import print_json, print_text, warn
 
 if TYPE_CHECKING:
     from multidrop.fleet.servers.buckets import Record
@@ -66,7 +65,7 @@ def _rights(arguments: argparse.Namespace) -> int:
     tls = _tls(arguments, urls)
     written = write_files(folder, gateways, urls, tls)
     if arguments.json:
-        print_text(json.dumps([str(path) for path in written], indent=2))
+        print_json([str(path) for path in written])
     else:
         print_text(
             f"{folder}: copy rights.conf to each server, with the .conf of its name, and each key of keys/ "
@@ -121,7 +120,7 @@ async def _set_up(
         )
         warn(f"the stream of samples {word}; `nats stream edit samples --max-bytes {keep}` changes that")
     if arguments.json:
-        print_text(json.dumps(made, indent=2))
+        print_json(made)
         return 0
     servers = ", ".join(f"{name} {version}" for name, version in made["servers"].items())
     print_text(f"servers: {servers}; each bucket on {made['replicas']}")

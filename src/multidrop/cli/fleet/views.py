@@ -19,7 +19,7 @@ from math import inf
 from typing import TYPE_CHECKING, Any
 
 from multidrop.cli.fleet.connection import add_server_arguments, open_path, run_with_paths
-from multidrop.cli.support.output import print_text
+from multidrop.cli.support.output import print_json, print_text
 from multidrop.cli.support.signals import on_end_signals
 from multidrop.cli.support.terminal import Screen, TextLine, cut
 from multidrop.cli.support.values import Row, aligned, columns_of, counted
@@ -101,7 +101,7 @@ async def _fleet_state(paths: list[ServerPath]) -> dict[str, Any]:
 async def _print_status(arguments: argparse.Namespace, paths: list[ServerPath]) -> int:
     found = await _fleet_state(paths)
     if arguments.json:
-        print_text(json.dumps(found, indent=2))
+        print_json(found)
     else:
         print_text("\n".join(_status_table(found)))
     unpolled = (kind(found) for kind in (free_lines, unsure_lines, lost_lines, failing_lines))

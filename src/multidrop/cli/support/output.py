@@ -32,6 +32,12 @@ def print_text(text: object, *, file: TextIO | None = None, flush: bool = False)
     print("\n".join(map(printable, masked(str(text)).split("\n"))), file=file, flush=flush)
 
 
+def print_json(found: object) -> None:
+    import json  # imported here: many commands print no JSON
+
+    print_text(json.dumps(found, indent=2))
+
+
 def command_line(words: Sequence[str]) -> str:
     """Return the words as one command, quoted for this system's shell."""
     if sys.platform == "win32":
