@@ -70,11 +70,7 @@ def _run_check(arguments: argparse.Namespace) -> int:
         return 1
     not_known, will_be_refused = list(unknown(family)), list(refused(family))
     if arguments.json:
-        more = {
-            "mistakes": [],
-            "not_known": not_known,
-            "will_be_refused": will_be_refused,
-        }
+        more = {"mistakes": [], "not_known": not_known, "will_be_refused": will_be_refused}
         print_json(facts(family) | more)
         return 0
     lines = [sheet(family)]

@@ -14,14 +14,7 @@ from logging import WARNING
 from pathlib import Path
 from typing import Any
 
-from multidrop.cli.monitor_screen import (
-    LEAST_HEIGHT,
-    LEAST_WIDTH,
-    Position,
-    SideRead,
-    overview,
-    page,
-)
+from multidrop.cli.monitor_screen import LEAST_HEIGHT, LEAST_WIDTH, Position, SideRead, overview, page
 from multidrop.cli.support.arguments import add_plant_argument, add_port_option, plant_of
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.cli.support.output import logging_to, warn

@@ -311,10 +311,7 @@ def _applied_as_json(result: params.Applied) -> dict[str, Any]:
     return {
         "drive": result.plan.drive.name,
         "written": [_change_as_json(change) for change in result.written],
-        "not_written": {
-            **result.plan.left,
-            **{code: _reason(why) for code, why in result.refused.items()},
-        },
+        "not_written": {**result.plan.left, **{code: _reason(why) for code, why in result.refused.items()}},
         "earlier": result.earlier,
         "failure": "" if result.failure is None else _reason(result.failure),
     }

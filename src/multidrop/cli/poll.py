@@ -125,10 +125,7 @@ def follow(
     show = not arguments.json and sys.stdout.isatty()
     table = LiveTable(plant, sys.stdout) if show else None
     consumers = [table.add] if table else []
-    with (
-        polling_session(plant, arguments.out, *consumers, how=how) as session,
-        ExitStack() as stack,
-    ):
+    with polling_session(plant, arguments.out, *consumers, how=how) as session, ExitStack() as stack:
         if table:
             stack.enter_context(table.showing_warnings())
         taps = _Taps(session.poller, arguments, stack)

@@ -28,11 +28,7 @@ def add_writing_arguments(parser: argparse.ArgumentParser, *, asks: bool = True)
     """Add --yes and --audit, for commands that may write. `asks` is False if the command never asks first."""
     yes = "do not ask; needed without a terminal" if asks else "no effect: this command never asks"
     parser.add_argument("--yes", action="store_true", help=yes)
-    parser.add_argument(
-        "--audit",
-        metavar="FILE",
-        help="append every write and its outcome to this file",
-    )
+    parser.add_argument("--audit", metavar="FILE", help="append every write and its outcome to this file")
 
 
 def add_json_argument(parser: argparse.ArgumentParser) -> None:
