@@ -37,7 +37,6 @@ EXPIRY = 1.0  # s; default of `expiry`
 
 
 def _facts(port: str, echo: str, transaction: str, rs485: str) -> tuple[Echo, TransactionIds, RS485]:
-    """Parse the port options. Raises ValueError for an invalid option."""
     switch = RS485(rs485)
     switch.check_port(port)
     return Echo(echo), TransactionIds(transaction), switch

@@ -122,7 +122,6 @@ def _replace_closed_streams() -> None:
 
 
 def _describe_itself(words: list[str]) -> int:
-    """Print the version; or print the help, if there are no words or help was requested."""
     if words[:1] == ["--version"]:
         from importlib.metadata import version
 

@@ -61,7 +61,6 @@ def _operator(poller: Poller) -> Operator:
 
 
 def _text(summary: Mapping[str, Any], out: Path) -> Iterator[str]:
-    """Yield the summary as text: a row for each line, the number of samples, and commands to try next."""
     rows = [("LINE", "DRIVES", "EXCHANGES/S", "WIRE USED", "MISSES")]
     for name, line in summary["lines"].items():
         rate = line["exchanges"] / line["seconds"] if line["seconds"] else 0.0
@@ -85,7 +84,6 @@ class NextCommand(NamedTuple):
 
     @property
     def lacks(self) -> bool:
-        """Return True if the command needs an optional extra, and one of the extra's libraries is missing."""
         return not all(map(find_spec, LIBRARIES[self.extra]))
 
 

@@ -246,7 +246,6 @@ def _local(port: str, rs485: RS485) -> Iterator[Finding]:
 
 
 def _opened_com(port: str) -> Iterator[Finding]:
-    """Yield the facts that Windows reports about an open COM port."""
     yield Finding("port", f"{port} is a serial port")
     yield Finding("set here", SETTING_UP_COM)
     yield Finding("adapter", com_description(port) or "the system lists none")

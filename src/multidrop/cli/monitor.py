@@ -337,7 +337,6 @@ class Monitor:
 
 
 def _check_size(screen: Screen) -> None:
-    """Raise ValueError if the terminal is too small."""
     width, height = screen.size
     if width < LEAST_WIDTH or height < LEAST_HEIGHT:
         raise ValueError(

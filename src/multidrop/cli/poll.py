@@ -180,7 +180,6 @@ class _Taps:
 
 
 def conclude(plant: Plant, polled: Mapping[str, Any], arguments: argparse.Namespace) -> int:
-    """Print the poller's summary beside the predicted rates; return the exit status."""
     has_file = arguments.out and "triggers" not in polled
     summary = {**polled, "recording": str(arguments.out) if has_file else None}
     for line in plant.lines:
@@ -305,7 +304,6 @@ class LiveTable:
         self._next_draw = now + EVERY
 
     def draw_if_due(self, now: float) -> None:
-        """Draw the table, unless the previous drawing is younger than EVERY."""
         if now >= self._next_draw:
             self._next_draw = now + EVERY
             self.draw()
@@ -472,7 +470,6 @@ def _figures(prediction: Prediction) -> Figures:
 
 
 def comparison_text(found: dict[str, Figures]) -> Iterator[str]:
-    """Yield the comparison as lines of a table."""
     columns = list(found.values())
     cycles = ("-" if column["cycle_ms"] is None else f"{column['cycle_ms']:.1f} ms" for column in columns)
     rows = [

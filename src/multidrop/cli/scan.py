@@ -116,7 +116,6 @@ def _linux_ports(sysfs: Path = SYSFS, devices: Path = Path("/dev")) -> Iterator[
 
 
 def _permission_advice(device: Path) -> str:
-    """Return how this user gets the permission to open a device."""
     import grp
     import pwd
 
@@ -290,7 +289,6 @@ def _duration(seconds: float) -> str:
 
 
 def sentence(finding: Finding) -> str:
-    """Return the finding as a sentence."""
     at = f"{finding.settings} {finding.framing}"
     match finding:
         case Found():

@@ -314,7 +314,6 @@ _ALWAYS = ("exchanges", "unknown_bytes")  # counts that are printed even if 0
 
 
 def summary(counts: Mapping[str, int]) -> str:
-    """Return the counts of exchanges, errors and unknown bytes as text."""
     return ", ".join(
         f"{counts.get(name, 0)} {words[counts.get(name, 0) != 1]}"
         for name, words in _COUNTED.items()

@@ -157,7 +157,6 @@ def _reasons(series: Sequence[Series]) -> Counter[str]:
 
 
 def reasons_of(recording: Recording, drive: str) -> Counter[str]:
-    """Count a drive's misses by reason."""
     return _reasons(recording.of(drive))
 
 

@@ -51,7 +51,6 @@ div.wide { overflow-x: auto; }
 
 
 def plot_page(recording: Recording, figure: Figure) -> str:
-    """Return an HTML page with this figure, a plot of the recording's values."""
     return _page(f"{recording.path.name}", [_about(recording), _image(figure, "values over time")])
 
 
@@ -101,7 +100,6 @@ def _utc(time_ns: int) -> str:
 
 
 def _counts(series: Sequence[Series]) -> tuple[int, int]:
-    """Return how many values and how many misses these series have."""
     misses = sum(int(one.missed.sum()) for one in series)
     return sum(len(one.time) for one in series) - misses, misses
 

@@ -101,7 +101,6 @@ class Series:
         return Counter({self.statuses[number]: int(n) for number, n in zip(numbers, counts, strict=True)})
 
     def times_of(self, reason: str) -> Array:
-        """Return the times of the misses with this reason."""
         return np.asarray(self.time[self.missed & (self.status == self.statuses.index(reason))])
 
     def faults(self) -> list[TimeSpan]:

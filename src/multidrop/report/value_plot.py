@@ -391,7 +391,6 @@ def _lane(series: Series, title: str, value: Array, name_of: Callable[[float], s
 
 
 def lanes_inches(lanes: Sequence[Lane]) -> float:
-    """Return a panel's height in inches for these lanes."""
     return 0.45 + LANE_INCHES * len(lanes)
 
 

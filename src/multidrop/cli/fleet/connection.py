@@ -81,7 +81,6 @@ def add_server_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_address_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options for the servers' URLs and the credentials."""
     parser.add_argument(
         "--nats", metavar="URLS", help=f"servers, with commas; else MULTIDROP_NATS, or {URLS}"
     )
@@ -98,7 +97,6 @@ def state_folder() -> Path:
 
 
 def require_fleet() -> None:
-    """Raise ValueError if a library that all actions need is missing."""
     for library in ("nats", "pyarrow"):
         require_extra(library, "fleet", "fleet")
 

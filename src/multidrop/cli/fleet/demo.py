@@ -70,7 +70,6 @@ class Stage:
         return set(self.masters().values()) == set(gateways)
 
     def shares(self) -> str:
-        """Return the number of each gateway's lines, as text."""
         found = list(self.masters().values())
         return ", ".join(f"{name} {found.count(name)}" for name in GATEWAYS if name in found)
 
@@ -119,7 +118,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def plant_file(ports: Mapping[str, int]) -> str:
-    """Return the text of a plant file whose lines are on these TCP ports of this computer."""
     return "\n".join(
         f'[[line]]\nname = "{line}"\nport = "tcp://127.0.0.1:{port}"\n'
         + "".join(
@@ -270,7 +268,6 @@ class Children:
         self._libc, self._parent = ctypes.CDLL(None), os.getpid()
 
     def _die_with_parent(self) -> None:
-        """Let the kernel kill this child process when its parent ends."""
         self._libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != self._parent:
             os._exit(1)
@@ -319,7 +316,6 @@ class Children:
                 raise OSError(f"{name} of the demo did not end: {self._last_line(name)}") from None
 
     def close(self) -> None:
-        """Kill all processes that are still running."""
         for process in self._running.values():
             process.kill()
         for process in self._running.values():
@@ -425,7 +421,6 @@ def _is_healthy(monitor: int) -> bool:
 
 
 def free_ports(number: int) -> list[int]:
-    """Return this many ports that are free now."""
     sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(number)]
     ports = [int(one.getsockname()[1]) for one in sockets]
     for one in sockets:

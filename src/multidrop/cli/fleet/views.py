@@ -82,7 +82,6 @@ def _print_json(fleet: FleetState) -> None:
 
 @contextmanager
 def drawing(head: str = "multidrop fleet watch") -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Yield a function that draws a fleet on the full screen of the terminal."""
     with Screen() as screen:
         yield lambda fleet: screen.draw(picture(fleet, screen.size, head))
 
@@ -332,7 +331,6 @@ def silent_gateways(fleet: FleetState) -> set[str]:
 
 
 def free_lines(fleet: FleetState) -> list[str]:
-    """Return the lines without a master."""
     return [name for name, line in fleet["lines"].items() if not line["master"]]
 
 
@@ -381,7 +379,6 @@ def _from_to(move: FleetState) -> tuple[str, str]:
 
 
 def trouble_sentences(fleet: FleetState) -> list[str]:
-    """Return a sentence for each problem that a gateway reports."""
     found = [
         f"{name} on {gateway['host']} is missing: last seen {moment(gateway['seen_ms'])}"
         for name, gateway in fleet.get("missing", {}).items()

@@ -73,7 +73,6 @@ def add_plant_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def add_port_option(parser: argparse.ArgumentParser) -> None:
-    """Add --port NAME=PORT, which replaces the port of a line of the plant file."""
     parser.add_argument(
         "--port",
         metavar="LINE=PORT",
@@ -86,7 +85,6 @@ def add_port_option(parser: argparse.ArgumentParser) -> None:
 
 
 def add_speed_option(parser: argparse.ArgumentParser, meaning: str) -> None:
-    """Add --speed N: simulated time passes N times as fast as real time."""
     parser.add_argument("--speed", metavar="N", type=_speed, default=1.0, help=f"{meaning}; default: 1")
 
 
@@ -306,7 +304,6 @@ def check_words(arguments: argparse.Namespace, words: Sequence[str], names: Sequ
 
 
 def number_of(arguments: argparse.Namespace, name: str, text: str) -> float:
-    """Return the number that a word contains. Raises ValueError if it is not a number."""
     try:
         return plain_number(text)
     except ValueError:

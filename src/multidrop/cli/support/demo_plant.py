@@ -150,7 +150,6 @@ def _start(drive: Any) -> None:
 
 
 def _look_after(drive: Any) -> None:
-    """Reset the drive's trip, start its stopped motor, or sometimes change its setpoint."""
     condition = drive.state().condition
     if condition is Condition.FAULT:
         drive.reset_fault()

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 
 def refuse_overwriting(path: Path) -> None:
-    """Raise ValueError if a file exists at this path."""
     if path.is_file():
         raise already_there(path)
 
@@ -52,7 +51,6 @@ def write_new(path: Path, content: str | bytes) -> None:
 
 
 def check_capture(path: Path) -> None:
-    """Raise ValueError if no capture can be written at this path."""
     if path.suffix != ".pcapng":
         raise ValueError(f"{path}: a capture's name must end in .pcapng")
     refuse_overwriting(path)

@@ -39,7 +39,6 @@ class LogThread(logging.Handler):
         self._thread.start()
 
     def is_alive(self) -> bool:
-        """Return True while the writing thread is running."""
         return self._thread.is_alive()
 
     def emit(self, record: logging.LogRecord) -> None:

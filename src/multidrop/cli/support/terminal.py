@@ -39,7 +39,6 @@ def cut(text: str, width: int) -> str:
 
 
 def filled(text: str, width: int) -> str:
-    """Cut a text to a width in columns, or pad it with spaces."""
     return padded(cut(text, width), "<", width)
 
 
@@ -146,7 +145,6 @@ def sparkline(
 
 
 def keys_are_readable() -> bool:
-    """Return True if stdin and stdout are a terminal whose keys can be read."""
     return sys.platform != "win32" and sys.stdin.isatty() and sys.stdout.isatty()
 
 
