@@ -40,9 +40,12 @@ def run(arguments: argparse.Namespace) -> int:
         families = [*MODELS.values(), *map(shipped_family, SHIPPED), *_installed()]
         summaries = [_summary(family) for family in families]
         print_text(json.dumps(summaries, indent=2) if arguments.json else _list(families))
+        return 0
+    if arguments.drive is None:
+        family = find_model(arguments.model)
     else:
-        family = _family(arguments.model, arguments.drive)
-        print_text(json.dumps(facts(family), indent=2) if arguments.json else sheet(family))
+        family = type(load_plant(arguments.model).find_drive(arguments.drive)[1])
+    print_text(json.dumps(facts(family), indent=2) if arguments.json else sheet(family))
     return 0
 
 
@@ -53,10 +56,6 @@ def _installed() -> Iterator[type[Drive]]:
             yield find_model(name)
         except ValueError as failure:
             warn(str(failure))
-
-
-def _family(model: str, drive: str | None) -> type[Drive]:
-    return find_model(model) if drive is None else type(load_plant(model).find_drive(drive)[1])
 
 
 def _list(families: list[type[Drive]]) -> str:
@@ -256,16 +255,13 @@ def needed_silence(family: type[Drive], framing: Framing) -> float:
 
 
 def _response(family: type[Drive]) -> str:
+    delay = _ms(family.response_delay)
+    if family.response_delay_characters:
+        drive = family(family.addresses[0])
+        at = f"{_ms(drive.response_delay)} at {drive.settings.baudrate} bit/s"
+        delay = f"{family.response_delay_characters:g} characters ({at})"
     stated = f", less than {_ms(family.answering_time)} by its manual" if family.answering_time else ""
-    return f"{_response_delay(family)} until measured{stated}; timeout {_ms(family.response_timeout)}"
-
-
-def _response_delay(family: type[Drive]) -> str:
-    if not family.response_delay_characters:
-        return _ms(family.response_delay)
-    drive = family(family.addresses[0])
-    at = f"{_ms(drive.response_delay)} at {drive.settings.baudrate} bit/s"
-    return f"{family.response_delay_characters:g} characters ({at})"
+    return f"{delay} until measured{stated}; timeout {_ms(family.response_timeout)}"
 
 
 def verbs_of(family: type[Drive]) -> list[str]:

@@ -65,7 +65,7 @@ def overview(
     if room < len(curves) + LEAST_DRIVES:
         curves = []
     room -= len(curves)
-    first = _first_seen(at.chosen, len(plant.drives), room)
+    first = max(0, min(at.chosen - room // 2, len(plant.drives) - room))
     rows = [
         _drive(drive, number == at.chosen, columns, width, now_ns, blocks)
         for number, drive in enumerate(plant.drives[first : first + room], first)
@@ -266,10 +266,6 @@ def _foot(at: Position, width: int, helps: Sequence[str], note: str) -> list[Tex
     helps = ACKNOWLEDGE if at.failures else helps
     help_text = next((help_text for help_text in helps if len(help_text) < width), helps[-1])
     return [TextLine(cut(text, width), style="bold"), TextLine(cut(f" {help_text}", width), style="dim")]
-
-
-def _first_seen(chosen: int, count: int, room: int) -> int:
-    return max(0, min(chosen - room // 2, count - room))
 
 
 def _age(seconds: float | None) -> str:

@@ -6,19 +6,17 @@ import argparse
 import importlib
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from multidrop.cli.support.files import (
-    beside,
-    check_no_segments,
-    load_recording,
-    refuse_overwriting,
-    warn_truncated,
-    write_new,
-)
-from multidrop.cli.support.output import print_text
+from multidrop.cli.support.files import refuse_overwriting, require_extra, write_new
+from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.signals import noting_signals
 from multidrop.cli.support.values import counted
 from multidrop.recording import EXPORTS, FORMATS, convert, open_recording
+from multidrop.recording.segments import segments_of
+
+if TYPE_CHECKING:
+    from multidrop.report.load import Recording
 
 PICTURES = (".png", ".html")
 
@@ -51,10 +49,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _report(arguments: argparse.Namespace) -> None:
-    out = arguments.out or beside(arguments.recording, ".html")
+    out = arguments.out or _beside(arguments.recording, ".html")
     if out.suffix.lower() != ".html":
         raise ValueError(f"{out}: a report's name must end in .html")
-    recording = load_recording(arguments.recording, out, "report")
+    recording = _load_recording(arguments.recording, out, "report")
     from multidrop.report import report_page
 
     write_new(out, report_page(recording))
@@ -62,10 +60,10 @@ def _report(arguments: argparse.Namespace) -> None:
 
 
 def _plot(arguments: argparse.Namespace) -> None:
-    out = arguments.out or beside(arguments.recording, ".png")
+    out = arguments.out or _beside(arguments.recording, ".png")
     if out.suffix.lower() not in PICTURES:
         raise ValueError(f"{out}: a plot's name must end in {' or '.join(PICTURES)}")
-    recording = load_recording(arguments.recording, out, "plot")
+    recording = _load_recording(arguments.recording, out, "plot")
     from multidrop.report import plot, plot_page, png
 
     figure, left_out = plot(recording, arguments.drive, arguments.register)
@@ -77,10 +75,10 @@ def _plot(arguments: argparse.Namespace) -> None:
 
 def _convert(arguments: argparse.Namespace) -> None:
     refuse_overwriting(arguments.out)
-    check_no_segments(arguments.recording)
+    _check_no_segments(arguments.recording)
     _import_library(arguments.out)
     rows = convert(arguments.recording, arguments.out)
-    warn_truncated(arguments.recording, rows, open_recording(arguments.recording).truncated)
+    _warn_truncated(arguments.recording, rows, open_recording(arguments.recording).truncated)
     print_text(f"{counted(rows, 'row')} in {arguments.out}")
 
 
@@ -97,3 +95,55 @@ def _import_library(out: Path) -> None:
         importlib.import_module(library)
     if interruption.came:
         raise KeyboardInterrupt
+
+
+# ---- the recording ----
+
+
+def _warn_truncated(path: Path, rows: int, left_out: int) -> None:
+    """Warn that a recording ends with `left_out` bytes of an incomplete row, after `rows` complete rows."""
+    if left_out:
+        warn(
+            f"{path} ends within a row: {counted(rows, 'row')} read, "
+            f"and the last {counted(left_out, 'byte')} skipped"
+        )
+
+
+def _check_no_segments(path: Path) -> None:
+    """Raise ValueError if the path is a folder, or names a recording that was split into segments."""
+    if path.is_dir():
+        kept = [*sorted(path.glob("rows/*.parquet")), *sorted(path.glob("rows.*.arrows"))]
+        if not kept:
+            raise _is_folder(path)
+        raise ValueError(
+            f"{path} is the folder of a history: name one of its files, such as {kept[-1]}, or read it from "
+            "Python with `multidrop.History`"
+        )
+    if not path.exists() and path.parent.is_dir() and (segments := segments_of(path)):
+        raise ValueError(f"{path} was recorded in segments: name one, such as {segments[-1][1]}")
+
+
+def _is_folder(path: Path) -> ValueError:
+    return ValueError(f"{path} is a folder: name the recording in it")
+
+
+def _beside(recording: Path, suffix: str) -> Path:
+    """Return a recording's path with another suffix. Raises ValueError if the path does not name a file."""
+    if not recording.name:
+        raise _is_folder(recording)
+    return recording.with_suffix(suffix)
+
+
+def _load_recording(path: Path, out: Path, command: str) -> Recording:
+    """Load a recording for a command that draws it into the new file `out`.
+
+    Raises ValueError if `out` exists, or if `path` is a folder or names segments.
+    """
+    require_extra("matplotlib", "plot", command)
+    refuse_overwriting(out)
+    _check_no_segments(path)
+    from multidrop.report import load
+
+    recording = load(path)
+    _warn_truncated(recording.path, recording.rows, recording.truncated)
+    return recording

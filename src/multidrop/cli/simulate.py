@@ -12,7 +12,7 @@ from multidrop.cli.support.output import print_text
 from multidrop.drive.line_settings import speaks_tcp
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine
-from multidrop.sim import FaultyWire, SimulatedDrive, Simulator, load_faults, serve, simulated
+from multidrop.sim import FaultyWire, Simulator, load_faults, serve, simulated
 from multidrop.sim.faults import HELP, Faults
 from multidrop.sim.port import is_dead_link
 
@@ -51,7 +51,8 @@ def run(arguments: argparse.Namespace) -> int:
     directory: Path | None = arguments.ports
     if directory is not None and not hasattr(os, "openpty"):
         raise ValueError(NO_TERMINALS)
-    if directory is None and (serial := [line.name for line in plant.lines if not _has_place(line.port)]):
+    serial = [line.name for line in plant.lines if not (speaks_tcp(line.port) or _is_local_socket(line.port))]
+    if directory is None and serial:
         raise ValueError(f"line {serial[0]} needs a pseudo-terminal: add --ports DIR")
     if directory is not None and directory.exists() and not directory.is_dir():
         raise ValueError(f"--ports {directory} is a file: name a directory; it is created if missing")
@@ -59,25 +60,22 @@ def run(arguments: argparse.Namespace) -> int:
     if directory is not None:
         directory.mkdir(parents=True, exist_ok=True)
     wires = [
-        FaultyWire(_drives(line), faults, name=line.name, port=port, unpaced=arguments.unpaced)
+        FaultyWire(
+            [simulated(polled.drive) for polled in line.drives],
+            faults,
+            name=line.name,
+            port=port,
+            unpaced=arguments.unpaced,
+        )
         for line, port in zip(plant.lines, ports, strict=True)
     ]
     serve(wires, _announce, speed=arguments.speed)
     return 0
 
 
-def _has_place(port: str) -> bool:
-    """Return True for a TCP port of this computer, which needs no --ports."""
-    return speaks_tcp(port) or _is_here(port)
-
-
-def _is_here(port: str) -> bool:
+def _is_local_socket(port: str) -> bool:
     url = urlsplit(port)
     return url.scheme == "socket" and url.hostname in LOOPBACK and bool(url.port)
-
-
-def _drives(line: PlantLine) -> list[SimulatedDrive]:
-    return [simulated(polled.drive) for polled in line.drives]
 
 
 def _port(line: PlantLine, directory: Path | None) -> str:

@@ -32,7 +32,7 @@ from multidrop.cli.support.files import check_capture, refuse_overwriting
 from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.signals import noting_signals
 from multidrop.cli.support.values import counted
-from multidrop.core import FrameSpan, Kind, Splitter, Stream, must_take, refused_names, set_settings
+from multidrop.core import Kind, Splitter, Stream, must_take, refused_names, set_settings
 from multidrop.drive.line_settings import Settings
 from multidrop.errors import LineError
 from multidrop.plant.loader import load_plant
@@ -47,24 +47,24 @@ _GIVEN_UP_S = 1.5  # silence, in s, after which a request counts as unanswered
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     if parser.get_default("command") == "decode":
-        _add_decode_arguments(parser)
+        parser.add_argument("capture", metavar="FILE", type=Path, help="a capture: pcap or pcapng")
+        parser.add_argument("--plant", metavar="PLANT.toml", help="for names and engineering units")
+        into = f"a new recording: {', '.join(FORMATS)}; printed as text if not given"
+        parser.add_argument("--out", metavar="FILE", type=Path, help=into)
     else:
-        _add_sniff_arguments(parser)
+        add_line_arguments(parser)
+        parser.add_argument("--replay", metavar="FILE", type=Path, help="read a capture instead of a port")
+        parser.add_argument("--plant", metavar="PLANT.toml", help="for names and engineering units")
+        into = "write a capture, for Wireshark too"
+        parser.add_argument("--out", metavar="FILE.pcapng", type=Path, help=into)
+        parser.add_argument("--baudrate", type=whole, metavar="N", help="default: the plant file's, or 9600")
+        parser.add_argument("--format", metavar="8N1", help="default: the plant file's, or 8N1")
+        parser.add_argument("--seconds", type=duration, metavar="S", help="how long; default: until Ctrl-C")
     add_json_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     return _decode(arguments) if arguments.command == "decode" else _sniff(arguments)
-
-
-def _add_sniff_arguments(parser: argparse.ArgumentParser) -> None:
-    add_line_arguments(parser)
-    parser.add_argument("--replay", metavar="FILE", type=Path, help="read a capture instead of a port")
-    parser.add_argument("--plant", metavar="PLANT.toml", help="for names and engineering units")
-    parser.add_argument("--out", metavar="FILE.pcapng", type=Path, help="write a capture, for Wireshark too")
-    parser.add_argument("--baudrate", type=whole, metavar="N", help="default: the plant file's, or 9600")
-    parser.add_argument("--format", metavar="8N1", help="default: the plant file's, or 8N1")
-    parser.add_argument("--seconds", type=duration, metavar="S", help="how long; default: until Ctrl-C")
 
 
 def _sniff(arguments: argparse.Namespace) -> int:
@@ -82,7 +82,8 @@ def _sniff(arguments: argparse.Namespace) -> int:
             line = _line(arguments, plant)
             listener = stack.enter_context(closing(Listener(arguments.port, _settings(arguments, line))))
             out = stack.enter_context(CaptureWriter(arguments.out)) if arguments.out else None
-            name = line.name if line else _name(arguments.port)
+            port = arguments.port
+            name = line.name if line else port if "://" in port else Path(port).name
             printer = TrafficPrinter(name, line, as_json=arguments.json, out=out)
             _listen(listener, printer, arguments.seconds)
             counts = printer.pairing.counts()
@@ -106,10 +107,6 @@ def _line(arguments: argparse.Namespace, plant: Plant | None) -> PlantLine | Non
     line = line_of(named, arguments.name)
     arguments.port = line.port
     return line
-
-
-def _name(port: str) -> str:
-    return port if "://" in port else Path(port).name
 
 
 def _settings(arguments: argparse.Namespace, line: PlantLine | None) -> Settings:
@@ -266,16 +263,13 @@ class TrafficPrinter:
         """Print the complete exchanges of the stream so far."""
         spans = list(self._splitter.spans(stream))
         if self._out:
-            self._write(spans, self._out)
+            for span in spans:
+                self._out.write(span.raw, _SIDES[span.kind], span.time_ns, self.name)
         self._print(self.pairing.pair(spans))
 
     def finish(self) -> None:
         """Print the pending requests as unanswered."""
         self._print(self.pairing.flush())
-
-    def _write(self, spans: list[FrameSpan], out: CaptureWriter) -> None:
-        for span in spans:
-            out.write(span.raw, _SIDES[span.kind], span.time_ns, self.name)
 
     def _print(self, traffic: Iterable[Sniffed]) -> None:
         for sniffed in traffic:
@@ -322,17 +316,6 @@ def summary(counts: Mapping[str, int]) -> str:
 
 
 # ---- captures ----
-
-
-def _add_decode_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("capture", metavar="FILE", type=Path, help="a capture: pcap or pcapng")
-    parser.add_argument("--plant", metavar="PLANT.toml", help="for names and engineering units")
-    parser.add_argument(
-        "--out",
-        metavar="FILE",
-        type=Path,
-        help=f"a new recording: {', '.join(FORMATS)}; printed as text if not given",
-    )
 
 
 def _decode(arguments: argparse.Namespace) -> int:

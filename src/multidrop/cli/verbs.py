@@ -62,13 +62,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     command = parser.get_default("command")
     add_target_arguments(parser, *_FURTHER.get(command, ()))
     if command == "stop":
-        add_plant_stop_arguments(parser)
-    if command in _DIRECTED:
+        parser.usage = f"{parser.usage}\n       {parser.prog} PLANT.toml [--line LINE] [options]"
         parser.add_argument(
-            "--direction",
-            choices=[direction.value for direction in Direction],
-            help="default: the current direction",
+            "--all", action="store_true", help="all drives of the plant; the default if no drive is named"
         )
+        parser.add_argument("--line", metavar="LINE", help="all drives of this line of the plant")
+    if command in _DIRECTED:
+        directions = [direction.value for direction in Direction]
+        parser.add_argument("--direction", choices=directions, help="default: the current direction")
     if command == "start":
         parser.add_argument("--frequency", metavar="HZ", type=number, help="write this setpoint first")
     if command in STOPS:
@@ -93,8 +94,8 @@ def _stop_time(text: str) -> float | None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    if names_plant(arguments):
-        return stop_plant(arguments, _audit_file(arguments))
+    if _names_plant(arguments):
+        return _stop_plant(arguments, _audit_file(arguments))
     target, words = _target(arguments)
     if words and arguments.command not in STOPS:
         arguments.frequency = number_of(arguments, "HZ", words[0])
@@ -248,23 +249,17 @@ def _as_json(state: State | None) -> dict[str, Any] | None:
     }
 
 
-def add_plant_stop_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add --all and --line, and a usage line for a plant file without a drive."""
-    parser.usage = f"{parser.usage}\n       {parser.prog} PLANT.toml [--line LINE] [options]"
-    parser.add_argument(
-        "--all", action="store_true", help="all drives of the plant; the default if no drive is named"
-    )
-    parser.add_argument("--line", metavar="LINE", help="all drives of this line of the plant")
+# ---- the stop of a whole plant ----
 
 
-def names_plant(arguments: argparse.Namespace) -> bool:
+def _names_plant(arguments: argparse.Namespace) -> bool:
     """Return True if the words name a whole plant or one of its lines, not a single drive."""
     if arguments.command != "stop" or not arguments.words or not is_plant(arguments.words[0]):
         return False
     return len(arguments.words) == 1 or arguments.all or arguments.line is not None
 
 
-def stop_plant(arguments: argparse.Namespace, audit: str | None) -> int:
+def _stop_plant(arguments: argparse.Namespace, audit: str | None) -> int:
     """Stop the lines in parallel; print the results of each line's drives when the line is done.
 
     Raises ValueError if the plant file has no drive that can be stopped, or if the named line does not exist.

@@ -102,21 +102,21 @@ async def _print_status(arguments: argparse.Namespace, paths: list[ServerPath]) 
     if arguments.json:
         print_json(found)
     else:
-        print_text("\n".join(_status_table(found)))
+        lines = [*gateway_table(found), "", count_sentence(found), *trouble_sentences(found)]
+        if found["moves"]:
+            lines += ["", "last moves:", *move_table(found["moves"])]
+        print_text("\n".join(lines))
     unpolled = (kind(found) for kind in (free_lines, unsure_lines, lost_lines, failing_lines))
     return int(any((found.get("missing"), *unpolled)))
-
-
-def _status_table(found: dict[str, Any]) -> list[str]:
-    table = [*gateway_table(found), "", count_sentence(found), *trouble_sentences(found)]
-    return [*table, "", "last moves:", *move_table(found["moves"])] if found["moves"] else table
 
 
 async def _print_lines(arguments: argparse.Namespace, paths: list[ServerPath]) -> int:
     found = await _fleet_state(paths)
     names = sorted(found["lines"], key=natural)
-    ordered = {name: found["lines"][name] for name in names}
-    print_text(json.dumps(ordered, indent=2) if arguments.json else "\n".join(line_table(found, names)))
+    if arguments.json:
+        print_json({name: found["lines"][name] for name in names})
+    else:
+        print_text("\n".join(line_table(found, names)))
     return 0
 
 
@@ -158,7 +158,9 @@ def _body(fleet: FleetState, width: int, room: int) -> list[str]:
     if len(lines) > room // 2:
         columns = line_columns(fleet, sorted(names, key=natural), width - 1)
         lines = columns if len(columns) <= room // 2 else lines
-    moves = _moves(fleet, width, max(min(MOVES, room // 2), room - len(lines)))
+    moves_room = max(min(MOVES, room // 2), room - len(lines)) - 2
+    rows = move_table(fleet["moves"][: max(0, moves_room)], width - 1)
+    moves = ["", "last moves:", *rows] if rows else []
     return [*begin, *_first_lines(lines, room - len(moves)), *moves]
 
 
@@ -171,11 +173,6 @@ def _notes(fleet: FleetState, width: int) -> list[str]:
             break
         notes = [*wrapped, *notes]
     return notes
-
-
-def _moves(fleet: FleetState, width: int, room: int) -> list[str]:
-    rows = move_table(fleet["moves"][: max(0, room - 2)], width - 1)
-    return ["", "last moves:", *rows] if rows else []
 
 
 def _first_lines(lines: list[str], room: int) -> list[str]:
@@ -366,16 +363,19 @@ def count_sentence(fleet: FleetState) -> str:
 
 def move_table(moves: Iterable[FleetState], width: float = inf) -> list[str]:
     """Return a line of text for each move: time, line, former master (if there is room) and new master."""
-    rows = [(moment(move["at_ms"]), move["line"], *_from_to(move)) for move in moves]
+    rows = [
+        (
+            moment(move["at_ms"]),
+            move["line"],
+            "" if move["from"] is None else f"from {move['from'] or 'none'}",
+            f"to {move['to'] or 'none'}",
+        )
+        for move in moves
+    ]
     found = aligned(rows, "<<<<")
     if max(map(len, found), default=0) <= width:
         return found
     return aligned([(at, line, to) for at, line, _, to in rows], "<<<")
-
-
-def _from_to(move: FleetState) -> tuple[str, str]:
-    before = "" if move["from"] is None else f"from {move['from'] or 'none'}"
-    return before, f"to {move['to'] or 'none'}"
 
 
 def trouble_sentences(fleet: FleetState) -> list[str]:
