@@ -32,8 +32,7 @@ from simulated_pumps import simulated_pumps, write_plant
 
 from bench.questions.gateway_costs import Worker
 from bench.support import tables
-from multidrop.gateway.opcua.part import build
-from multidrop.gateway.opcua.settings import OpcUaSettings
+from multidrop.gateway.opcua.part import OpcUaSettings, build
 from multidrop.supervisor import supervisor
 
 LINES = (25, 25, 25, 25)  # numbers of drives on each line

@@ -19,6 +19,7 @@ from multidrop import Batch, History, Plant
 from multidrop.exposition import MetricFamily
 from multidrop.gateway.metrics import counter
 from multidrop.gateway.parts import PartContext
+from multidrop.gateway.settings import parsing_mistakes, refuse
 from multidrop.history import Buckets, HistoryState, HistoryWriter
 from multidrop.recording import parse_age, parse_size
 from multidrop.supervisor import supervisor
@@ -46,14 +47,7 @@ class HistorySettings:
     rotate: str = field(default="10 min", metadata={"pattern": AGE})
 
     def __post_init__(self) -> None:
-        mistakes = []
-        for key, parse in (("keep", parse_age), ("most", parse_size), ("rotate", parse_age)):
-            try:
-                parse(getattr(self, key))
-            except ValueError as mistake:
-                mistakes.append(f"{key} = {mistake}")
-        if mistakes:
-            raise ValueError("\n".join(mistakes))
+        refuse(parsing_mistakes(self, keep=parse_age, most=parse_size, rotate=parse_age))
 
 
 Settings = HistorySettings

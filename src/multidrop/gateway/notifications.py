@@ -28,7 +28,7 @@ from multidrop.gateway.live.alarms import KINDS, Alarm, AlarmChange
 from multidrop.gateway.metrics import counter
 from multidrop.gateway.parts import PartContext, missing_library
 from multidrop.gateway.sending import Refused, RetryingSender, post
-from multidrop.gateway.settings import input_file
+from multidrop.gateway.settings import input_file, refuse
 from multidrop.supervisor import supervisor
 
 MOST_TARGETS = 20
@@ -70,8 +70,7 @@ class NotifySettings:
         ]
         if not 1 <= self.most <= MOST_AN_HOUR:
             wrong.append(f"most = {self.most} is not 1 to {MOST_AN_HOUR} messages an hour")
-        if wrong:
-            raise ValueError("\n".join(wrong))
+        refuse(wrong)
 
     def check(self, plant: Plant) -> list[str]:
         """Return a sentence for each mistake in the file of targets, and for a missing library."""

@@ -10,17 +10,39 @@ import time
 import urllib.error
 import urllib.request
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from http.client import HTTPException, HTTPResponse
 from math import inf
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
-from multidrop.printable import printable
+from multidrop.printable import masked, printable
 
 SEND_S = 20.0  # time limit of each step: connecting, sending the request, and receiving the whole answer
 REFUSED = (400, 413, 422)  # HTTP statuses of a body that the server does not accept
 MOST_ANSWER = 300  # an error reports at most this many bytes of the server's answer
+SECRETS = ("p", "u", "token", "password", "api_key", "apikey", "key")  # query parameters with secrets
 USER_AGENT = "multidrop"
+
+
+def url_mistakes(url: str, example: str) -> Iterator[str]:
+    """Yield a sentence if this is not an http:// or https:// URL, or if the URL contains a secret."""
+    try:
+        parts = urlsplit(url)
+        host, user = parts.hostname, parts.username
+        is_valid = url.isascii() and url.isprintable() and " " not in url and parts.port != 0
+    except ValueError:
+        parts, host, user, is_valid = urlsplit(""), None, None, False
+    if user is not None or set(parse_qs(parts.query)) & {*SECRETS}:
+        yield 'url has a login in it; write token = "FILE" instead'
+    elif parts.scheme not in ("http", "https") or not host or not is_valid:
+        yield f'url = "{masked(url)}" is not a URL; write url = "{example}"'
+
+
+def host_of(url: str) -> str:
+    """Return the scheme and host of a URL, for logs."""
+    parts = urlsplit(url)
+    return f"{parts.scheme}://{parts.hostname}"
 
 
 class Refused(OSError):

@@ -1,4 +1,4 @@
-"""The table `[serve]` of a plant file. All its mistakes are reported before the gateway starts."""
+"""The table `[serve]` of a plant file, and the files that it names. All mistakes are found at the start."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import os
 import re
 import ssl
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import partial
@@ -25,6 +25,7 @@ from multidrop.supervisor import Hung, in_time
 from multidrop.toml_check import ADDRESS, Key, TomlPlace, json_schema, parse_address
 
 LISTEN = "127.0.0.1:8750"
+MOST_SECRET = 4096  # limit, in bytes, of the size of a file with a secret
 AUDIT_S = 2.0  # how long to wait for the disk of the audit log
 HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
 EXAMPLES = {  # example values in error messages, by type
@@ -131,6 +132,42 @@ class Folders:
 def input_file(name: str, plant: Plant) -> Path:
     """Return the path of an input file of a plant, by the environment of this process; see `Folders`."""
     return Folders(plant.path, os.environ).find(name)
+
+
+def secret_in(name: str, plant: Plant) -> str:
+    """Return the secret in a file: one of the systemd service's credentials, or a file beside the plant file.
+
+    Raises OSError. If `name` is "", return "".
+    """
+    if not name:
+        return ""
+    with input_file(name, plant).open("rb") as file:
+        return file.read(MOST_SECRET).decode("utf-8", "replace").strip()
+
+
+def secret_mistakes(key: str, name: str, plant: Plant) -> Iterator[str]:
+    """Yield a sentence if the file with a secret cannot be read, or does not have exactly one line."""
+    try:
+        secret = secret_in(name, plant)
+        if name and len(secret.splitlines()) != 1:
+            yield f'{key} = "{name}": {input_file(name, plant)} has {len(secret.splitlines())} lines, not one'
+    except OSError as failure:
+        yield f'{key} = "{name}": {input_file(name, plant)} cannot be read: {failure.strerror}'
+
+
+def refuse(mistakes: Iterable[str]) -> None:
+    """Raise ValueError with a line for each mistake, if there are any."""
+    if wrong := "\n".join(mistakes):
+        raise ValueError(wrong)
+
+
+def parsing_mistakes(settings: object, **parsers: Callable[[str], object]) -> Iterator[str]:
+    """Yield a sentence for each of these settings whose text its parser refuses with ValueError."""
+    for key, parse in parsers.items():
+        try:
+            parse(getattr(settings, key))
+        except ValueError as mistake:
+            yield f"{key} = {mistake}"
 
 
 def read_plant(load: Callable[[], Plant], environment: Mapping[str, str]) -> tuple[Plant, ServeSettings]:

@@ -28,8 +28,7 @@ from multidrop.families import MODELS
 from multidrop.families.registry import SHIPPED, find_model
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live import hub
-from multidrop.gateway.opcua.part import SWITCH_S, USUAL_SWITCH_S, OpcUa
-from multidrop.gateway.opcua.settings import OpcUaSettings
+from multidrop.gateway.opcua.part import SWITCH_S, USUAL_SWITCH_S, OpcUa, OpcUaSettings
 from multidrop.gateway.settings import read_settings
 
 try:

@@ -19,15 +19,10 @@ from multidrop.gateway.forward.forwarder import (
     listed,
     pieces,
 )
-from multidrop.gateway.forward.settings import (
-    host_of,
-    secret_in,
-    secret_mistakes,
-    spool_mistakes,
-    url_mistakes,
-)
 from multidrop.gateway.parts import PartContext
-from multidrop.gateway.sending import post
+from multidrop.gateway.sending import host_of, post, url_mistakes
+from multidrop.gateway.settings import parsing_mistakes, refuse, secret_in, secret_mistakes
+from multidrop.recording import parse_size
 from multidrop.toml_check import SIZE
 
 STDOUT = "stdout"
@@ -50,9 +45,8 @@ class InfluxSettings:
             wrong.append("url names another precision; times are in ns: write precision=ns, or none")
         if not self.measurement.strip() or self.measurement.startswith("#"):
             wrong.append(f'measurement = "{self.measurement}" is not a name; write measurement = "multidrop"')
-        wrong += spool_mistakes(self.most)
-        if wrong:
-            raise ValueError("\n".join(wrong))
+        wrong += parsing_mistakes(self, most=parse_size)
+        refuse(wrong)
 
     def check(self, plant: Plant) -> list[str]:
         """Return a sentence if the file with the token cannot be read."""

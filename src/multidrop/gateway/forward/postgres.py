@@ -14,8 +14,9 @@ from psycopg.conninfo import conninfo_to_dict
 
 from multidrop import Plant
 from multidrop.gateway.forward.forwarder import Forwarding, Outgoing, SpoolPosition
-from multidrop.gateway.forward.settings import secret_in, secret_mistakes, spool_mistakes
 from multidrop.gateway.parts import PartContext
+from multidrop.gateway.settings import parsing_mistakes, refuse, secret_in, secret_mistakes
+from multidrop.recording import parse_size
 from multidrop.samples import SinkError
 from multidrop.samples.sample_tables import SampleTables, sentences
 from multidrop.toml_check import SIZE
@@ -38,14 +39,13 @@ class PostgresSettings:
     most: str = field(default="1 GB", metadata=SIZE)
 
     def __post_init__(self) -> None:
-        wrong = [*spool_mistakes(self.most)]
+        wrong = [*parsing_mistakes(self, most=parse_size)]
         try:
             if PASSWORDS & conninfo_to_dict(self.database).keys():
                 wrong.append('database has a password in it; write password = "FILE" instead')
         except psycopg.Error:  # the library's own message may quote a password
             wrong.append('database is not a connection string; write database = "host=db dbname=plant"')
-        if wrong:
-            raise ValueError("\n".join(wrong))
+        refuse(wrong)
 
     def check(self, plant: Plant) -> list[str]:
         """Return a sentence if the file with the password cannot be read."""

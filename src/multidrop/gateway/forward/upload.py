@@ -7,15 +7,10 @@ from dataclasses import dataclass, field
 
 from multidrop import Plant
 from multidrop.gateway.forward.forwarder import Forwarding, Outgoing, RepeatingReceiver, pieces, row_objects
-from multidrop.gateway.forward.settings import (
-    host_of,
-    secret_in,
-    secret_mistakes,
-    spool_mistakes,
-    url_mistakes,
-)
 from multidrop.gateway.parts import PartContext
-from multidrop.gateway.sending import post
+from multidrop.gateway.sending import host_of, post, url_mistakes
+from multidrop.gateway.settings import parsing_mistakes, refuse, secret_in, secret_mistakes
+from multidrop.recording import parse_size
 from multidrop.toml_check import SIZE
 
 
@@ -29,9 +24,8 @@ class UploadSettings:
     most: str = field(default="1 GB", metadata=SIZE)
 
     def __post_init__(self) -> None:
-        wrong = [*url_mistakes(self.url, "https://plant.example/rows"), *spool_mistakes(self.most)]
-        if wrong:
-            raise ValueError("\n".join(wrong))
+        wrong = url_mistakes(self.url, "https://plant.example/rows")
+        refuse((*wrong, *parsing_mistakes(self, most=parse_size)))
 
     def check(self, plant: Plant) -> list[str]:
         """Return a sentence if the file with the token cannot be read."""

@@ -13,6 +13,7 @@ from multidrop import Batch, Plant
 from multidrop.channels import ChannelSet, DriveSeries
 from multidrop.gateway.clock import iso_time
 from multidrop.gateway.parts import PartContext
+from multidrop.gateway.settings import parsing_mistakes, refuse
 from multidrop.plant import FAULT, POST_S, PRE_S, TriggerSeries, series_of, with_triggers
 from multidrop.polling import slot_rows
 from multidrop.supervisor import supervisor
@@ -36,11 +37,7 @@ class TriggerSettings:
 
     def __post_init__(self) -> None:
         mistakes = [] if self.conditions else [f"conditions is missing; add {EXAMPLE}"]
-        for key in ("pre", "post"):
-            try:
-                parse_duration(getattr(self, key))
-            except ValueError as mistake:
-                mistakes.append(f"{key} = {mistake}")
+        mistakes += parsing_mistakes(self, pre=parse_duration, post=parse_duration)
         for name, condition in self.conditions.items():
             if not 0 < len(name) <= LONGEST_NAME or not name.isprintable():
                 mistakes.append(
@@ -48,8 +45,7 @@ class TriggerSettings:
                 )
             if not isinstance(condition, str) or not condition:
                 mistakes.append(f"{name} = {condition!r} is not a condition; write {EXAMPLE}")
-        if mistakes:
-            raise ValueError("\n".join(mistakes))
+        refuse(mistakes)
 
     def check(self, plant: Plant) -> list[str]:
         """Return a sentence for each condition that does not fit the plant."""

@@ -20,6 +20,7 @@ from multidrop.gateway.modbus_server.words import (
     DriveWords,
     reading_function,
 )
+from multidrop.gateway.settings import refuse
 from multidrop.printable import did_you_mean, is_whole
 from multidrop.toml_check import ADDRESS, parse_address
 
@@ -60,9 +61,7 @@ class ModbusSettings:
     channels: int = field(default=0xF100, metadata={"minimum": 0, "maximum": 0xFFFF})
 
     def __post_init__(self) -> None:
-        wrong = [*self._mistakes()]
-        if wrong:
-            raise ValueError("\n".join(wrong))
+        refuse(self._mistakes())
 
     def check(self, plant: Plant) -> list[str]:
         """Return a sentence for each conflict with the plant, such as two drives with the same unit id."""
@@ -280,8 +279,7 @@ class Units:
                 self._units[port, number] = units[0]
                 for unit in units:
                     wrong += _overlap(unit, settings)
-        if wrong:
-            raise ValueError("\n".join(wrong))
+        refuse(wrong)
 
     def find(self, port: str, number: int) -> Unit | None:
         """Return the unit of this number on a port; None if there is none."""

@@ -49,6 +49,7 @@ from multidrop.gateway.modbus_server.tool_connections import (
     rtu_reply,
 )
 from multidrop.gateway.parts import Ask, PartContext
+from multidrop.gateway.settings import refuse
 from multidrop.printable import did_you_mean
 from multidrop.supervisor import supervisor
 from multidrop.toml_check import ADDRESS, parse_address
@@ -93,9 +94,7 @@ class ToolSettings:
     timeout: float = field(default=0.4, metadata={"minimum": LEAST_TIMEOUT_S, "maximum": MOST_TIMEOUT_S})
 
     def __post_init__(self) -> None:
-        wrong = [*self._mistakes()]
-        if wrong:
-            raise ValueError("\n".join(wrong))
+        refuse(self._mistakes())
 
     def check(self, plant: Plant) -> list[str]:
         """Return a sentence for each line in `pty` or `rtu` that the plant lacks, or that has no Modbus."""

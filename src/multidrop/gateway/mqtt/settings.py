@@ -10,10 +10,11 @@ from pathlib import Path
 
 from multidrop import Plant
 from multidrop.gateway.commands import drives_of
-from multidrop.gateway.forward.settings import spool_mistakes
 from multidrop.gateway.http.rights import Caller, Right
 from multidrop.gateway.mqtt.broker import Login, parse_broker
+from multidrop.gateway.settings import parsing_mistakes, refuse
 from multidrop.plant import check_drive_name
+from multidrop.recording import parse_size
 from multidrop.toml_check import DURATION, SIZE, parse_duration
 
 LEVEL = re.compile(r"[^+#/\x00]+")  # one level of a topic
@@ -59,7 +60,7 @@ class MqttSettings:
             wrong.append(f'prefix = "{self.prefix}" is not a valid topic; write prefix = "multidrop"')
         if self.prefix.split("/")[0] in OTHERS:
             wrong.append(f'prefix = "{self.prefix}" is a reserved topic; write prefix = "multidrop"')
-        wrong += spool_mistakes(self.most)
+        wrong += parsing_mistakes(self, most=parse_size)
         if self.sparkplug == "STATE":
             wrong.append('sparkplug = "STATE" is reserved for Sparkplug hosts; name another group')
         wrong += [
@@ -67,8 +68,7 @@ class MqttSettings:
             for key, name in (("sparkplug", self.sparkplug), ("node", self.node))
             if name and not LEVEL.fullmatch(name)
         ]
-        if wrong:
-            raise ValueError("\n".join(wrong))
+        refuse(wrong)
 
     @property
     def every_s(self) -> float:

@@ -17,7 +17,7 @@ from asyncua.server.internal_server import InternalServer
 
 from multidrop import Plant, PolledDrive, Register
 from multidrop.gateway.live import hub
-from multidrop.gateway.opcua.settings import FAULT, STATE, STOP
+from multidrop.gateway.opcua import FAULT, STATE, STOP
 
 INDEX = 2  # index of the namespace of all nodes below
 PLANT, PLANT_STOP = ua.NodeId(1, INDEX), ua.NodeId(2, INDEX)

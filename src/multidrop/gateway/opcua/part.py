@@ -15,33 +15,84 @@ from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from importlib import import_module
 from math import inf
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from multidrop import NoReply, Plant
 from multidrop.control import CommandResult
-from multidrop.gateway.commands import MOST_STOPS
+from multidrop.gateway.commands import MOST_STOPS, drives_of
 from multidrop.gateway.http.connections import listen
 from multidrop.gateway.http.rights import Caller, Right, Tokens, caller_with, is_loopback
-from multidrop.gateway.opcua.settings import FAULT, STATE, OpcUaSettings
+from multidrop.gateway.opcua import FAULT, MEMBERS, STATE
 from multidrop.gateway.parts import PartContext
 from multidrop.supervisor import supervisor
+from multidrop.toml_check import ADDRESS, parse_address
 
 if TYPE_CHECKING:
     from multidrop.gateway.opcua.nodes import PlantNodes, VariableState
     from multidrop.gateway.opcua.server import Identity, Visitor
 
+EXAMPLE = "127.0.0.1:4840"
 EVERY_S = 0.1  # interval of passing new values to the server
 SWITCH_S = 0.0005  # how long a thread may run, in s, while other threads wait for their turn
 USUAL_SWITCH_S = sys.getswitchinterval()  # the interpreter's default, used without an OPC UA server: 5 ms
 STATE_TURNS = 10  # a drive's state is passed on once in this many intervals: computing it takes 50 us
 STOP_WAIT_S = 0.4  # how long a stop's answer waits for the motor; the client's other requests wait as long
-
-Settings = OpcUaSettings
-
 _unended: set[OpcUa] = set()  # all parts in this process whose server has not ended
 _log = logging.getLogger("multidrop.gateway")
+
+
+@dataclass(frozen=True)
+class OpcUaSettings:
+    """The settings of the OPC UA server. Raises ValueError with a line for each mistake."""
+
+    listen: str = field(default=EXAMPLE, metadata=ADDRESS)
+    certificate: str = ""  # path of a PEM file, relative to the plant file; "": no encryption
+    key: str = ""  # path of the certificate's RSA key
+    libraries: ClassVar[tuple[str, ...]] = ("asyncua",)  # imported when the part is built
+
+    def __post_init__(self) -> None:
+        if bool(self.certificate) != bool(self.key):
+            raise ValueError("certificate and key belong together: give both, or none")
+        _ = self.address
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """The address and the port to listen on. Raises ValueError if `listen` is invalid."""
+        return parse_address(self.listen, f'listen = "{EXAMPLE}"')
+
+    @property
+    def addresses(self) -> dict[str, tuple[str, int]]:
+        """Host and port of the listening socket, by the key of its setting."""
+        return {"listen": self.address}
+
+    def check(self, plant: Plant) -> list[str]:
+        """Return a sentence for each missing file, unprotected address and ambiguous name."""
+        return [*self._mistakes_in(plant)]
+
+    def _mistakes_in(self, plant: Plant) -> Iterator[str]:
+        if not is_loopback(self.address[0]) and not (self.certificate and "tokens" in plant.serve):
+            yield (
+                f'listen = "{self.listen}" is open to other machines: that needs certificate and key here '
+                f"and tokens in [serve]; or listen on 127.0.0.1"
+            )
+        for key, name in (("certificate", self.certificate), ("key", self.key)):
+            path = plant.path.parent / name
+            if name and not path.is_file():
+                yield f'{key} = "{name}": there is no file {path}'
+        drives = drives_of(plant)
+        channels = {polled.drive.name: {one.name for one in polled.channels} for polled in plant.drives}
+        for name in drives:
+            owner, _, rest = name.rpartition(".")
+            if owner in drives and rest in {*drives[owner].registers, *channels[owner], *MEMBERS}:
+                yield f'drive "{name}" has the node id of a value of "{owner}": choose another name'
+            for channel in channels[name] & {*MEMBERS}:
+                yield f'channel "{channel}" of "{name}" has the node id of another value: choose another name'
+
+
+Settings = OpcUaSettings
 
 
 def build(settings: OpcUaSettings, context: PartContext) -> OpcUa:
