@@ -58,7 +58,7 @@ def _written(family: MetricFamily, name: str, kind: str) -> str:
 @lru_cache(maxsize=MOST_LABELS)
 def _braced(*labels: tuple[str, str]) -> str:
     """Return labels as text in braces. Cached, because the next scrape has the same labels."""
-    inside = ",".join(f'{label}="{_escaped(said)}"' for label, said in labels)
+    inside = ",".join(f'{label}="{_escaped(value)}"' for label, value in labels)
     return f"{{{inside}}}" if inside else ""
 
 

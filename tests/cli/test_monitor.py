@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import math
-import os
 import re
-import select
 import string
-import sys
 import termios
 import threading
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
-from io import BytesIO, StringIO, TextIOWrapper
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
@@ -36,13 +31,9 @@ from multidrop.cli.support.terminal import (
     PAGE_DOWN,
     PAGE_UP,
     PLAIN_BLOCKS,
-    UNKNOWN,
     UP,
     Screen,
-    TextLine,
-    next_key,
     sparkline,
-    terminal_keys,
 )
 from multidrop.cli.support.values import columns_of
 from multidrop.control.outcome import Seen, Stopped
@@ -176,13 +167,6 @@ def test_history_has_a_gap_for_a_miss(watched: LivePlant) -> None:
     assert sparkline([0, 5e-324], 5) == "▁█"
 
 
-def test_a_long_history_is_drawn_as_means_that_keep_their_columns() -> None:
-    assert sparkline([0, 7, 0, 7, 7, 7, None, None, 0, 0], 5) == "▅▅█ ▁"
-    steps = [0.0] * 60 + [7.0] * 60 + [0.0] * 120
-    pictures = [sparkline(steps[at : at + 120], 30, points=120 + at) for at in range(100)]
-    assert {picture.strip("▁") for picture in pictures[:60]} == {"█" * 15}
-
-
 def test_a_history_has_values_of_one_register_only(tmp_path: Path) -> None:
     live = LivePlant(a_plant(tmp_path, 1))
     for name, value in (("status", 3.0), ("output_frequency", 50.0)):
@@ -243,26 +227,6 @@ def test_reads_of_unpolled_registers_take_at_most_5_percent_of_a_lines_time(tmp_
     plant = a_plant(tmp_path, 1)
     (drive,) = LivePlant(plant, plant.metadata()["planned"]).drives
     assert drive.line_utilisation == 1.0  # this drive is polled as fast as the line allows
-
-
-def test_replaced_characters_keep_the_text_in_its_columns() -> None:
-    text = "Июль 主 26 °C"
-    for encoding, shown in (("ascii", "???? ?? 26 ?C"), ("utf-8", text)):
-        with TextIOWrapper(BytesIO(), encoding) as terminal:
-            assert Screen(terminal).encodable(text) == shown
-        assert columns_of(shown) == columns_of(text)
-
-
-def test_each_picture_replaces_the_last_and_is_removed_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "6")
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    terminal = StringIO()
-    with Screen(terminal) as screen:
-        screen.draw([TextLine("pump", "red reverse"), TextLine("fan")])
-    assert terminal.getvalue() == (
-        "\x1b[?1049h\x1b[?25l\x1b[H\x1b[31;7mpump\x1b[m  \r\nfan   \x1b[?25h\x1b[?1049l"
-    )
 
 
 @pytest.mark.long
@@ -380,55 +344,6 @@ def test_a_page_scrolls_to_its_last_row(watched: LivePlant) -> None:
 
 
 # ---- keys ----
-
-
-@table(
-    ("pressed", "told"),
-    [
-        (b"q", ["q"]),
-        (b"\x1b[A\x1b[B\r", [UP, DOWN, ENTER]),
-        (b"\x1bOBsy", [DOWN, "s", "y"]),
-        (b"\x1b[5~\x1b", ["page up", "escape"]),
-        ("ыk ".encode(), ["ы", "k", " "]),
-        (b"\xd1s\xff", ["\ufffd", "s", "\ufffd"]),
-        (b"\x1bOSy\x1b[1;2S\x1b[[As\x1b[a\x1bOq", [UNKNOWN, "y", UNKNOWN, UNKNOWN, "s", UNKNOWN, UNKNOWN]),
-    ],
-)
-def test_keys_that_arrive_together_are_separated(pressed: bytes, told: list[str]) -> None:
-    found = []
-    while pressed:
-        key, pressed = next_key(pressed)
-        found.append(key)
-    assert found == told
-
-
-@table(
-    ("pieces", "pressed"),
-    [
-        ([b"\x1b", b"OS", b"s"], [UNKNOWN, "s"]),  # bytes of F4
-        ([b"j\x1b[", b"5", b"~y"], ["j", PAGE_UP, "y"]),
-        (["\u044b".encode()[:1], "\u044b".encode()[1:]], ["\u044b"]),
-        ([b"\x1b", b""], ["escape"]),
-    ],
-)
-def test_a_key_whose_bytes_arrive_separately_is_one_key(
-    monkeypatch: pytest.MonkeyPatch, pieces: list[bytes], pressed: list[str]
-) -> None:
-    """A network may split a key's bytes: those of F4 end in S, which must not stop all drives."""
-    terminal, end = os.openpty()
-    left = iter(pieces)
-
-    def wait(*waited: object) -> object:
-        os.write(terminal, next(left, b""))
-        return real(*waited)  # type: ignore[arg-type]
-
-    real = select.select
-    with open(end, closefd=True) as stdin:  # noqa: PTH123
-        monkeypatch.setattr(sys, "stdin", stdin)
-        with terminal_keys() as wait_for_key:
-            monkeypatch.setattr("multidrop.cli.support.terminal.select", SimpleNamespace(select=wait))
-            assert [wait_for_key(PATIENCE) for _ in pressed] == pressed
-    os.close(terminal)
 
 
 class Poller:
@@ -671,17 +586,6 @@ def test_no_key_can_do_more_than_stop_motors(screened: Screened) -> None:
 
 
 # ---- on a terminal ----
-
-
-def test_a_closed_terminal_is_not_read_in_a_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reads of a closed terminal return immediately, empty or with an error. There may be no signal."""
-    fd, slave = os.openpty()
-    with open(slave) as stdin:  # noqa: PTH123 (it is no path)
-        monkeypatch.setattr(sys, "stdin", stdin)
-        with terminal_keys() as wait_for_key:
-            os.close(fd)
-            with pytest.raises(OSError):  # noqa: PT011 (in the system's words)
-                wait_for_key(PATIENCE)
 
 
 def leave(terminal: Terminal) -> None:

@@ -365,10 +365,10 @@ def _programs() -> Iterator[str]:
 def version_of(program: str) -> tuple[int, int]:
     """Return the version of a nats-server; (0, 0) if it is another program."""
     try:
-        said = subprocess.run([program, "--version"], capture_output=True, check=False).stdout
+        printed = subprocess.run([program, "--version"], capture_output=True, check=False).stdout
     except OSError:
         return 0, 0
-    found = re.search(rb"v?(\d+)\.(\d+)\.", said)
+    found = re.search(rb"v?(\d+)\.(\d+)\.", printed)
     return (int(found[1]), int(found[2])) if found else (0, 0)
 
 

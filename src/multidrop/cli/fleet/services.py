@@ -120,18 +120,18 @@ async def _drain(arguments: argparse.Namespace, paths: list[ServerPath]) -> int:
     name = arguments.gateway
     path = await open_path(paths)
     await check_buckets(path)
-    said = await ask_gateway(path, name, "drain")
+    answer = await ask_gateway(path, name, "drain")
     ends = time.monotonic() + DRAIN_S
-    while said["lines"] and time.monotonic() < ends:
+    while answer["lines"] and time.monotonic() < ends:
         await asyncio.sleep(0.1)
-        said = await ask_gateway(path, name, "state")
+        answer = await ask_gateway(path, name, "state")
     if arguments.json:
-        print_json(said)
+        print_json(answer)
     else:
         print_text(
-            f"{name} has {counted(said['lines'], 'line')} left; it takes none until it is started again"
+            f"{name} has {counted(answer['lines'], 'line')} left; it takes none until it is started again"
         )
-    return 1 if said["lines"] else 0
+    return 1 if answer["lines"] else 0
 
 
 # ---- the hub ----

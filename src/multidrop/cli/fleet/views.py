@@ -106,7 +106,7 @@ async def _print_status(arguments: argparse.Namespace, paths: list[ServerPath]) 
         if found["moves"]:
             lines += ["", "last moves:", *move_table(found["moves"])]
         print_text("\n".join(lines))
-    unpolled = (kind(found) for kind in (free_lines, unsure_lines, lost_lines, failing_lines))
+    unpolled = (kind(found) for kind in (free_lines, unanswered_lines, lost_lines, failing_lines))
     return int(any((found.get("missing"), *unpolled)))
 
 
@@ -331,7 +331,7 @@ def free_lines(fleet: FleetState) -> list[str]:
     return [name for name, line in fleet["lines"].items() if not line["master"]]
 
 
-def unsure_lines(fleet: FleetState) -> list[str]:
+def unanswered_lines(fleet: FleetState) -> list[str]:
     """Return the lines whose master does not answer."""
     silent = silent_gateways(fleet)
     return [name for name, line in fleet["lines"].items() if line["master"] in silent]
@@ -354,8 +354,8 @@ def _lines_in(says: FleetState | None, key: str) -> list[str]:
 
 
 def count_sentence(fleet: FleetState) -> str:
-    unsure, lost, failing = (len(lines(fleet)) for lines in (unsure_lines, lost_lines, failing_lines))
-    more = f", {unsure} whose master does not answer" if unsure else ""
+    unanswered, lost, failing = (len(lines(fleet)) for lines in (unanswered_lines, lost_lines, failing_lines))
+    more = f", {unanswered} whose master does not answer" if unanswered else ""
     more += f", {lost} with a lost port" if lost else ""
     more += f", {failing} on which polling fails" if failing else ""
     return f"{counted(len(fleet['lines']), 'line')}, {len(free_lines(fleet))} without a master{more}"

@@ -189,9 +189,9 @@ def simulator(
             found = {}
             for name in names:
                 ready = f"ready {name} "
-                if not (said := process.stdout.readline().rstrip("\n")).startswith(ready):
+                if not (printed := process.stdout.readline().rstrip("\n")).startswith(ready):
                     raise OSError("the simulator did not start; its reason is above")
-                found[name] = said.removeprefix(ready)
+                found[name] = printed.removeprefix(ready)
             yield found
         finally:
             process.stdin.close()

@@ -60,9 +60,9 @@ class LogThread(logging.Handler):
         while (line := self._waiting.get()) is not None:
             if self._lost:
                 lost, self._lost = self._lost, 0
-                said = f"{lost} later lines of the log are lost: its reader was too slow"
+                text = f"{lost} later lines of the log are lost: its reader was too slow"
                 self._put(
-                    self.format(logging.LogRecord("multidrop", logging.WARNING, "", 0, said, None, None))
+                    self.format(logging.LogRecord("multidrop", logging.WARNING, "", 0, text, None, None))
                 )
             self._put(line)
         if self._file is not self._stream:
