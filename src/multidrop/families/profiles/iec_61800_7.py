@@ -12,6 +12,11 @@ from multidrop.drive.state import Condition, Direction
 from multidrop.drive.verbs import Script, insist, until, wait, write
 from multidrop.families.profiles.profile import COMMON, Profile, Role
 
+READY_TIME = 1.0  # s allowed for each step before the start word
+
+
+# ---- CiA 402 ----
+
 
 class CiA402Control(IntFlag):
     """The control word, 6040H. Bits 0 to 3 and 7 are those of the standard; each make defines the others."""
@@ -118,7 +123,8 @@ class CiA402(Profile):
         return (yield from self._status()) & MASK == state
 
 
-READY_TIME = 1.0  # s allowed for each step before the start word
+# ---- PROFIdrive ----
+
 BETWEEN = 0.1  # s; least pause between "ready to switch on" and the next word (ACS550-02/U2 manual, p. 246)
 
 
