@@ -334,9 +334,9 @@ def test_a_start_succeeds_although_its_first_reads_are_lost(monkeypatch: pytest.
 def test_a_trip_during_a_start_raises_not_verified(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
-    control = sim.obeys["control"]
+    control = sim.write_handlers["control"]
     trips = {"control": lambda sim, raw: sim.trip(4) if raw == 1 else control(sim, raw)}
-    monkeypatch.setattr(type(sim), "obeys", trips)
+    monkeypatch.setattr(type(sim), "write_handlers", trips)
     with pytest.raises(NotVerified, match=r"tripped: overcurrent while accelerating .OC1"):
         drive.start()
     assert len(starts(line, "invt-che")) == 1

@@ -546,7 +546,7 @@ def test_ibd_without_line_registers_is_reported_with_a_doubt() -> None:
 def test_unusual_upper_bits_of_the_terminals_exclude_an_ibd() -> None:
     for bits in (0x0000, 0x0800, 0x1000, 0x9800, 0xFFFF):
         drive = Bare(InnovertIBD(3))
-        drive.shows = {(0x03, 22): lambda self, bits=bits: bits}
+        drive.read_handlers = {**Bare.read_handlers, "terminals": lambda self, bits=bits: bits}
         line = Line(Pair([drive]))
         assert drives(found(line, sweeps(FAMILIES, baudrates=[9600], formats=["8N1"]))) == {
             (3, "", "9600 8N1", "rtu")
