@@ -38,7 +38,7 @@ from __future__ import annotations
 
 import json
 import secrets
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
@@ -91,42 +91,25 @@ def _gateway(name: str) -> UserRights:
     )
 
 
-def _operator(_: str) -> UserRights:
-    made = [*(f"KV_{bucket}" for bucket in names.BUCKETS), STREAM]
-    trial = f"KV_{CONTEST}"
-    return UserRights(
+_CREATED = [*(f"KV_{bucket}" for bucket in names.BUCKETS), STREAM]
+OTHERS: Mapping[str, UserRights] = {
+    "hub": UserRights([f"{API}.STREAM.INFO.{STREAM}", f"{API}.DIRECT.GET.{STREAM}"]),
+    "operator": UserRights(
         [
             *LOOK,
             *LEADERS,
-            *(f"{API}.STREAM.CREATE.{stream}" for stream in made),
+            *(f"{API}.STREAM.CREATE.{stream}" for stream in _CREATED),
             f"{API}.STREAM.INFO.{STREAM}",
             f"$KV.{names.PLANT}.*",
-            *(f"{API}.STREAM.{request}.{trial}" for request in ("CREATE", "INFO", "MSG.GET", "DELETE")),
+            *(f"{API}.STREAM.{request}.KV_{CONTEST}" for request in ("CREATE", "INFO", "MSG.GET", "DELETE")),
             f"$KV.{CONTEST}.*.*",
             names.gateway_subject("*", "drain"),
         ]
-    )
-
-
-def _hub(_: str) -> UserRights:
-    return UserRights([f"{API}.STREAM.INFO.{STREAM}", f"{API}.DIRECT.GET.{STREAM}"])
-
-
-def _viewer(_: str) -> UserRights:
-    return UserRights(LOOK)
-
-
-def _commander(_: str) -> UserRights:
-    return UserRights(
+    ),
+    "viewer": UserRights(LOOK),
+    "commander": UserRights(
         [*LOOK, names.command_subject("*"), names.stop_subject("*"), names.do_subject("*", "*")]
-    )
-
-
-OTHERS: Mapping[str, Callable[[str], UserRights]] = {
-    "hub": _hub,
-    "operator": _operator,
-    "viewer": _viewer,
-    "commander": _commander,
+    ),
 }
 
 
@@ -141,8 +124,7 @@ def rights_of(gateways: Sequence[str]) -> dict[str, UserRights]:
             raise ValueError(
                 f"{name!r} is taken: each gateway needs its own name, other than {', '.join(OTHERS)}"
             )
-    found = {name: _gateway(name) for name in gateways}
-    return found | {name: make(name) for name, make in OTHERS.items()}
+    return {**{name: _gateway(name) for name in gateways}, **OTHERS}
 
 
 STORE = "multidrop"
