@@ -258,7 +258,7 @@ def test_while_a_server_is_silent_only_a_drained_gateway_releases_lines(
             drained.drain()
             await until(lambda: not drained.polled and running.all_are_polled(), "drain")
 
-    monkeypatch.setattr(member_module, "SILENT_S", math.inf)
+    monkeypatch.setattr(member_module, "SILENT_SERVER_S", math.inf)
     asyncio.run(main())
 
 

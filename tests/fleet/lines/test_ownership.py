@@ -12,7 +12,7 @@ from nats_clusters import Cluster as Servers
 from tables import table
 
 from multidrop.fleet.leases import member
-from multidrop.fleet.leases.member import SILENT_S, Releases
+from multidrop.fleet.leases.member import SILENT_SERVER_S, Releases
 from multidrop.fleet.lines.ownership import NEEDED, Claim, Step, claim_of, decide, owner_by, owner_value
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Record
@@ -257,10 +257,10 @@ def test_releases_ignore_a_long_silent_server(monkeypatch: pytest.MonkeyPatch) -
     trial.maimed = {"own_0", "own_1"}
     trial.releases.due(FIRST_LINES)
     trial.look()
-    trial.now_s = SILENT_S - 1
+    trial.now_s = SILENT_SERVER_S - 1
     trial.look()
     assert trial.releases.due(FIRST_LINES) == set()
-    trial.now_s = SILENT_S
+    trial.now_s = SILENT_SERVER_S
     trial.look()
     assert trial.releases.due(FIRST_LINES) == FIRST_LINES
     trial.maimed.clear()  # the server answered once and is silent again, so the wait restarts

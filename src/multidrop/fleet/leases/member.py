@@ -39,9 +39,19 @@ from multidrop.supervisor import Ended, end_tasks, supervisor
 
 _log = logging.getLogger("multidrop.fleet")
 
+GUARD_LOOK_S = 0.02
+STEP_S = 0.05  # time between steps while no record changes
+LEAST_STEP_S = 0.01  # least time between steps
+TIDY_NS = SECOND // 2  # time between checks of this gateway's lines, if no change was reported
+SETTLE_S = 3.0
+# End other gateways' sessions only while this much of our own lease (in s) is left. If less is left, the
+# servers may be failing for all gateways.
+SOUND_S = 1.0
 WEAK_LOOK_S = 1.0
 # After the STARTING state, a session that has lost one of its three records is kept for at least this long.
 WEAK_NS = 10 * SECOND
+SERVERS_LOOK_S = 0.05  # pause between checks of the servers
+SILENT_SERVER_S = 60.0  # a server that is silent for longer than this (in s) is ignored
 
 
 class IncompatibleGateways:
@@ -67,12 +77,8 @@ class IncompatibleGateways:
     def trouble(self) -> str:
         if not self.gateways:
             return ""
-        names = ", ".join(sorted(self.gateways))
-        return f"incompatible version of multidrop in this fleet: no line is taken while it runs on {names}"
-
-
-SERVERS_LOOK_S = 0.05  # pause between checks of the servers
-SILENT_S = 60.0  # a server that is silent for longer than this (in s) is ignored
+        others = ", ".join(sorted(self.gateways))
+        return f"incompatible version of multidrop in this fleet: no line is taken while it runs on {others}"
 
 
 class Releases:
@@ -99,7 +105,7 @@ class Releases:
         # them answer
         self._led: dict[str, float | None] = {}
 
-    def due(self, lines: Set[str], wait_s: float = SILENT_S) -> set[str]:
+    def due(self, lines: Set[str], wait_s: float = SILENT_SERVER_S) -> set[str]:
         """Return the lines in `lines` that may be closed now; the other lines must wait.
 
         At least two buckets must be ready. One of them must be the line's first bucket, whose record may have
@@ -128,16 +134,6 @@ class Releases:
                 self._led[bucket] = (now if since is None else since) if cluster.has_silent else None
         if self._led != before:
             self._on_change()
-
-
-GUARD_LOOK_S = 0.02
-STEP_S = 0.05  # time between steps while no record changes
-LEAST_STEP_S = 0.01  # least time between steps
-TIDY_NS = SECOND // 2  # time between checks of this gateway's lines, if no change was reported
-SETTLE_S = 3.0
-# End other gateways' sessions only while this much of our own lease (in s) is left. If less is left, the
-# servers may be failing for all gateways.
-SOUND_S = 1.0
 
 
 class MemberState(StrEnum):
@@ -429,5 +425,7 @@ class Member:
             is_draining=self.is_draining,
         )
         gone = {line for line in owned if not self.records.is_in_plant(line)}
-        self.keeper.releasing = gone | self._releases.due(step.releases, 0 if self.is_draining else SILENT_S)
+        self.keeper.releasing = gone | self._releases.due(
+            step.releases, 0 if self.is_draining else SILENT_SERVER_S
+        )
         self.keeper.claim(step.claims)
