@@ -11,6 +11,20 @@ from contextlib import contextmanager
 
 from multidrop.printable import masked
 
+MOST_DENIALS = 1000
+REFUSALS = (  # a part of nats-py's error message, and the sentence that users see instead of it
+    ("authorization violation", "{} refuses these credentials, or the lack of any: see --credentials"),
+    ("certificate_verify_failed", "the certificate of {} is not trusted ({why}); name its issuer with --ca"),
+    (
+        "[ssl",
+        "{} does not start with TLS, which these options require: set `handshake_first: true` in its tls "
+        "block, or name it with nats:// and no --ca",
+    ),
+    ("empty response", "{} requires TLS: write tls:// and --ca"),
+)
+_DENIAL = re.compile(r"permissions violation for (publish|subscription) to \"([^\"]+)\"", re.IGNORECASE)
+_log = logging.getLogger("multidrop.fleet")
+
 
 class FleetError(OSError):
     """The fleet's servers cannot be used. The error's message says why, in one sentence."""
@@ -46,22 +60,6 @@ class OutcomeUnknown(FleetError):
 
 class Conflict(Exception):
     """A record was not replaced, because its revision is not the expected one."""
-
-
-MOST_DENIALS = 1000
-REFUSALS = (  # a part of nats-py's error message, and the sentence that users see instead of it
-    ("authorization violation", "{} refuses these credentials, or the lack of any: see --credentials"),
-    ("certificate_verify_failed", "the certificate of {} is not trusted ({why}); name its issuer with --ca"),
-    (
-        "[ssl",
-        "{} does not start with TLS, which these options require: set `handshake_first: true` in its tls "
-        "block, or name it with nats:// and no --ca",
-    ),
-    ("empty response", "{} requires TLS: write tls:// and --ca"),
-)
-_DENIAL = re.compile(r"permissions violation for (publish|subscription) to \"([^\"]+)\"", re.IGNORECASE)
-
-_log = logging.getLogger("multidrop.fleet")
 
 
 def failure_to_connect(url: str, failure: BaseException) -> FleetError:

@@ -239,9 +239,6 @@ async def ask_gateway(path: ServerPath, gateway: str, wanted: str) -> dict[str, 
     return found
 
 
-# ---- the gateway's lines ----
-
-
 class FleetLines:
     """The lines that a gateway polls, in one Poller that sends only while the lease is valid.
 

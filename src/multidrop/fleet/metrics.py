@@ -22,6 +22,15 @@ from multidrop.toml_check import parse_address
 
 _SUFFIXES = {"gauge": "", "counter": "_total"}
 _PREFIX = "multidrop_fleet_"
+EXAMPLE = "127.0.0.1:9464"
+MOST_HEAD = 8192  # size limit of a request's head, in bytes
+MOST_CLIENTS = 32
+PATIENCE_S = 5.0  # time limit for receiving a request and sending its answer
+NAMES = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:[0-9]{1,5})?")
+REASONS = {200: "OK", 400: "Bad Request", 403: "Forbidden", 404: "Not Found", 405: "Method Not Allowed"}
+REASONS |= {500: "Internal Server Error"}
+_log = logging.getLogger("multidrop.fleet")
+Metrics = Callable[[], Iterable[MetricFamily]]
 
 
 def families_of(state: Mapping[str, Any], version: str) -> Iterator[MetricFamily]:
@@ -53,18 +62,6 @@ def families_of(state: Mapping[str, Any], version: str) -> Iterator[MetricFamily
     for name, kind, text, value in figures:
         if value is not None:
             yield MetricFamily(_PREFIX + name, kind, text, [(_SUFFIXES[kind], {}, float(value))])
-
-
-EXAMPLE = "127.0.0.1:9464"
-MOST_HEAD = 8192  # size limit of a request's head, in bytes
-MOST_CLIENTS = 32
-PATIENCE_S = 5.0  # time limit for receiving a request and sending its answer
-NAMES = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:[0-9]{1,5})?")
-REASONS = {200: "OK", 400: "Bad Request", 403: "Forbidden", 404: "Not Found", 405: "Method Not Allowed"}
-REASONS |= {500: "Internal Server Error"}
-
-_log = logging.getLogger("multidrop.fleet")
-Metrics = Callable[[], Iterable[MetricFamily]]
 
 
 def local_address(text: str) -> tuple[str, int]:

@@ -21,6 +21,7 @@ from multidrop.printable import masked
 
 MOVES_SHOWN = 20
 MISSED_MS = 30 * 24 * 3600 * 1000  # a missing gateway is reported for this long: 30 days
+EVERY_S = 1.0  # pause between two reads of the fleet
 
 
 class FleetView:
@@ -116,9 +117,6 @@ class FleetView:
 
 def _ms(found: object) -> int | None:
     return found if type(found) is int else None
-
-
-EVERY_S = 1.0  # pause between two reads of the fleet
 
 
 class FleetWatch:

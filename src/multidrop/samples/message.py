@@ -54,6 +54,37 @@ _I8, _U16, _I32, _U32, _I64 = (Struct(f"<{kind}") for kind in "bHiIq")
 _BUFFER = Struct("<qq")  # a buffer's offset in the body, and its length
 # stands in place of the unpacked size if a buffer is not compressed, because compression would not shrink it
 _NOT_COMPRESSED = -1
+MOST_BYTES = 900_000  # limit of a message; NATS accepts 1 MiB by default, including headers
+MOST_ROWS = 1 << 16
+MOST_UNPACKED = 4 << 20  # limit of the unpacked size in bytes; enough for 2.4 MB of rows and their names
+MOST_NAME = 1000  # limit of a name, status or unit in bytes, because PostgreSQL indexes names
+MOST_SAID = 300  # limit of characters of an error's text
+LONGEST_US = (1 << 31) - 1
+COMPRESSED = pa.ipc.IpcWriteOptions(compression=pa.Codec("zstd", 1))
+# type of names; its codes are wide enough for tables that join many messages
+NAMED = pa.dictionary(pa.int32(), pa.utf8())
+TIMES = pa.timestamp("ns", "UTC")
+ROWS = pa.schema(  # columns that `unpack` returns, the same as in recordings
+    [
+        pa.field("time", TIMES, nullable=False),
+        pa.field("monotonic_ns", pa.int64(), nullable=False),
+        pa.field("uncertainty_ns", pa.int64()),
+        pa.field("drive", NAMED, nullable=False),
+        pa.field("register", NAMED, nullable=False),
+        pa.field("value", pa.float64()),
+        pa.field("status", NAMED, nullable=False),
+        pa.field("unit", NAMED),
+    ]
+)
+_TYPES: Mapping[str, Sequence[Any]] = {  # allowed types of a message's columns, except dictionaries
+    "time": [TIMES],
+    "clock_ns": [pa.int64()],
+    "uncertainty_us": [pa.int32(), pa.int64()],
+    "value": [pa.float64()],
+}
+_KINDS = {"time": pa.int64(), "monotonic_ns": pa.int64(), "uncertainty_ns": pa.int64()}
+_KINDS |= {"drive": pa.uint16(), "register": pa.uint16(), "value": pa.float64(), "status": pa.uint16()}
+RAW = "raw count"  # unit of values without a known scale, as in a `History`
 
 
 def unpacked_size(data: bytes | memoryview) -> int:
@@ -121,38 +152,6 @@ class _Table:
         count = _U32.unpack_from(self._data, place)[0]
         begin = place + _U32.size
         return _BUFFER.iter_unpack(self._data[begin : begin + count * _BUFFER.size])
-
-
-MOST_BYTES = 900_000  # limit of a message; NATS accepts 1 MiB by default, including headers
-MOST_ROWS = 1 << 16
-MOST_UNPACKED = 4 << 20  # limit of the unpacked size in bytes; enough for 2.4 MB of rows and their names
-MOST_NAME = 1000  # limit of a name, status or unit in bytes, because PostgreSQL indexes names
-MOST_SAID = 300  # limit of characters of an error's text
-LONGEST_US = (1 << 31) - 1
-COMPRESSED = pa.ipc.IpcWriteOptions(compression=pa.Codec("zstd", 1))
-# type of names; its codes are wide enough for tables that join many messages
-NAMED = pa.dictionary(pa.int32(), pa.utf8())
-TIMES = pa.timestamp("ns", "UTC")
-ROWS = pa.schema(  # columns that `unpack` returns, the same as in recordings
-    [
-        pa.field("time", TIMES, nullable=False),
-        pa.field("monotonic_ns", pa.int64(), nullable=False),
-        pa.field("uncertainty_ns", pa.int64()),
-        pa.field("drive", NAMED, nullable=False),
-        pa.field("register", NAMED, nullable=False),
-        pa.field("value", pa.float64()),
-        pa.field("status", NAMED, nullable=False),
-        pa.field("unit", NAMED),
-    ]
-)
-_TYPES: Mapping[str, Sequence[Any]] = {  # allowed types of a message's columns, except dictionaries
-    "time": [TIMES],
-    "clock_ns": [pa.int64()],
-    "uncertainty_us": [pa.int32(), pa.int64()],
-    "value": [pa.float64()],
-}
-_KINDS = {"time": pa.int64(), "monotonic_ns": pa.int64(), "uncertainty_ns": pa.int64()}
-_KINDS |= {"drive": pa.uint16(), "register": pa.uint16(), "value": pa.float64(), "status": pa.uint16()}
 
 
 class MessageError(ValueError):
@@ -330,8 +329,6 @@ def _stream(rows: Any) -> bytes:
 
 
 # ---- the unit of each row, from the register's description at the time of the poll ----
-
-RAW = "raw count"  # unit of values without a known scale, as in a `History`
 
 
 class UnitChange(NamedTuple):

@@ -40,6 +40,34 @@ PIECE = 1 << 18  # approximate size of one piece of COPY data, in bytes
 _FIRST = Struct(">hiqiq")  # number of columns; then time and time_ns, each after its length
 _NUMBER = Struct(">ii")
 _ARRAY = Struct(">iiiiii")
+ANSWER_S = 10  # time limit for connecting
+# libpq's time limits if the server's computer does not answer: in s; the last one in ms
+SILENT_SERVER: dict[str, int] = {
+    "keepalives_idle": 10,
+    "keepalives_interval": 5,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 25_000,
+}
+TABLES = """
+create table if not exists multidrop.drives (id serial primary key, name text unique not null);
+create table if not exists multidrop.register_sets (
+    id serial primary key, names text[] not null, units text[] not null);
+create table if not exists multidrop.exchanges (
+    time timestamptz not null, time_ns bigint not null, uncertainty_us integer, drive integer not null,
+    registers integer not null, values float8[] not null, misses text[]);
+create index if not exists exchanges_drive_time on multidrop.exchanges (drive, time);
+create or replace view multidrop.samples as
+    select e.time, e.time_ns, e.uncertainty_us, d.name as drive, v.register, v.value,
+        coalesce(v.miss, 'ok') as status, v.unit
+    from multidrop.exchanges e
+    join multidrop.drives d on d.id = e.drive
+    join multidrop.register_sets r on r.id = e.registers
+    cross join lateral unnest(r.names, e.values, e.misses, r.units) as v(register, value, miss, unit);
+"""
+COPY = (
+    "copy multidrop.exchanges (time, time_ns, uncertainty_us, drive, registers, values, misses)"
+    " from stdin (format binary)"
+)
 
 
 class RegisterSet(NamedTuple):
@@ -177,36 +205,6 @@ def _texts(texts: list[str]) -> bytes:
 def _array(kind: int, elements: list[bytes], *, has_nulls: bool) -> bytes:
     body = b"".join(elements)
     return _ARRAY.pack(20 + len(body), 1, int(has_nulls), kind, len(elements), 1) + body
-
-
-ANSWER_S = 10  # time limit for connecting
-# libpq's time limits if the server's computer does not answer: in s; the last one in ms
-SILENT_SERVER: dict[str, int] = {
-    "keepalives_idle": 10,
-    "keepalives_interval": 5,
-    "keepalives_count": 3,
-    "tcp_user_timeout": 25_000,
-}
-TABLES = """
-create table if not exists multidrop.drives (id serial primary key, name text unique not null);
-create table if not exists multidrop.register_sets (
-    id serial primary key, names text[] not null, units text[] not null);
-create table if not exists multidrop.exchanges (
-    time timestamptz not null, time_ns bigint not null, uncertainty_us integer, drive integer not null,
-    registers integer not null, values float8[] not null, misses text[]);
-create index if not exists exchanges_drive_time on multidrop.exchanges (drive, time);
-create or replace view multidrop.samples as
-    select e.time, e.time_ns, e.uncertainty_us, d.name as drive, v.register, v.value,
-        coalesce(v.miss, 'ok') as status, v.unit
-    from multidrop.exchanges e
-    join multidrop.drives d on d.id = e.drive
-    join multidrop.register_sets r on r.id = e.registers
-    cross join lateral unnest(r.names, e.values, e.misses, r.units) as v(register, value, miss, unit);
-"""
-COPY = (
-    "copy multidrop.exchanges (time, time_ns, uncertainty_us, drive, registers, values, misses)"
-    " from stdin (format binary)"
-)
 
 
 class SampleTables:

@@ -36,6 +36,13 @@ FORMAT = "multidrop spool 1"
 HEAD = "spool.json"
 _NAME = re.compile(r"(\d{12,})-(\d+)\.(arrows|damaged)")
 _TEMPORARY = re.compile(r"\..+\.tmp")
+ENOUGH_ROWS = 1 << 14  # number of waiting rows at which a message is written
+ENOUGH_S = 1.0  # age of the oldest waiting row at which a message is written
+MOST_WAITING = 1_000_000  # limit of rows that wait in memory while the disk is slow or full: 38 MB
+AGAIN_S = 1.0  # pause after a disk error
+LOG_S = 60.0  # time between log lines about lost rows
+ENDING_S = 10.0  # time limit of `close` for the disk
+_log = logging.getLogger("multidrop.samples.spool")
 
 
 class SpoolError(ValueError):
@@ -149,16 +156,6 @@ def _parsed(path: Path) -> dict[str, Any]:
     except ValueError:
         found = None
     return found if isinstance(found, dict) else {}
-
-
-ENOUGH_ROWS = 1 << 14  # number of waiting rows at which a message is written
-ENOUGH_S = 1.0  # age of the oldest waiting row at which a message is written
-MOST_WAITING = 1_000_000  # limit of rows that wait in memory while the disk is slow or full: 38 MB
-AGAIN_S = 1.0  # pause after a disk error
-LOG_S = 60.0  # time between log lines about lost rows
-ENDING_S = 10.0  # time limit of `close` for the disk
-
-_log = logging.getLogger("multidrop.samples.spool")
 
 
 class SpoolState(NamedTuple):

@@ -19,6 +19,8 @@ from multidrop.supervisor import supervisor
 MOST_BYTES = 64 * 1024  # limit of a message's size in bytes
 MOST_CHARACTERS = 200  # limit of a name's, an id's or a value's length
 UNNAMED = "somebody"  # name of a stop's sender if the message has no name
+WRITING_S = 10.0  # if writing a record takes longer, the disk is reported as hanging
+CLOSING_S = 1.0  # how long, in s, closing waits for the record that is being written
 
 
 class CommandAnswer(NamedTuple):
@@ -215,12 +217,6 @@ def worst(answers: Sequence[CommandAnswer]) -> CommandOutcome:
         CommandOutcome.DONE,
     )
     return min((answer.outcome for answer in answers), key=order.index, default=CommandOutcome.REFUSED)
-
-
-# ---- the log ----
-
-WRITING_S = 10.0  # if writing a record takes longer, the disk is reported as hanging
-CLOSING_S = 1.0  # how long, in s, closing waits for the record that is being written
 
 
 class CommandLog:

@@ -24,6 +24,7 @@ from multidrop.fleet.leases.rules import SECOND
 LIMIT_NS = 1 * SECOND  # time from the offer to the command's first frame
 REMEMBERED = 10_000  # limit of offers in memory; the oldest are removed
 _MOVING = ("start", "jog", "reset_fault", "set_frequency")
+LISTS = ("write", "verbs")  # keys of [fleet.may]
 
 
 # ---- checking a request ----
@@ -167,8 +168,6 @@ class Offers:
 
 
 # ---- the lines for which this gateway accepts commands ----
-
-LISTS = ("write", "verbs")  # keys of [fleet.may]
 
 
 class HeldLine:

@@ -26,6 +26,7 @@ _log = logging.getLogger("multidrop.fleet")
 
 JOIN_S = 0.25  # pause between attempts to start a session
 AGAIN_S = 0.1  # pause before a failed renewal is repeated
+IDS = (Path("/etc/machine-id"), Path("/proc/sys/kernel/random/boot_id"))
 
 
 def boottime_ns() -> int:
@@ -303,12 +304,6 @@ async def put_end(bucket: Bucket, end: Record) -> None:
         if not newest.value or newest.value["ended"] or newest.value["nonce"] != end.value["nonce"]:
             raise
         await bucket.put(end.key, end.value, newest.revision)
-
-
-# ---- the lock of a gateway's process ----
-
-
-IDS = (Path("/etc/machine-id"), Path("/proc/sys/kernel/random/boot_id"))
 
 
 class LifeLock:

@@ -44,6 +44,11 @@ SILENT_S = 0.5
 TAKE_AGAIN_S = 2.0  # pause between attempts to open a line
 WRITTEN_AT_ONCE = 64  # limit of records written together: larger batches would delay renewals of the lease
 LINES_AT_ONCE = 32
+WRITERS = 2  # limit of concurrent batches of writes in each bucket
+# Two renewal periods. If the last renewal of our lease on one path is this much older than those on the other
+# paths, that path's bucket may have no leader.
+LAG_NS = SECOND
+SPARE_S = 0.15  # how long to wait after the first bucket's answer before the spare bucket is used
 
 
 class Lines(Protocol):
@@ -283,15 +288,6 @@ def _some_at_once(lines: Iterable[str]) -> Iterator[list[str]]:
     left = iter(lines)
     while some := list(islice(left, WRITTEN_AT_ONCE)):
         yield some
-
-
-# ---- the records of our lines ----
-
-WRITERS = 2  # limit of concurrent batches of writes in each bucket
-# Two renewal periods. If the last renewal of our lease on one path is this much older than those on the other
-# paths, that path's bucket may have no leader.
-LAG_NS = SECOND
-SPARE_S = 0.15  # how long to wait after the first bucket's answer before the spare bucket is used
 
 
 class OwnerRecords:

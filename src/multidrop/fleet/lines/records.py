@@ -24,6 +24,12 @@ from multidrop.fleet.servers.buckets import FOLLOW_S, NONE_YET, Bucket, Follower
 from multidrop.fleet.servers.connections import ServerPath
 
 _UNREAD: LineRecords = {}
+ASKED_AT_ONCE = 500  # limit of lines in one request; servers allow 1024
+# how long a line with an unanswered write is read again: longer than an election takes, because the write may
+# still be stored after an election
+DOUBT_S = 30.0
+MOST_MOVES = 100
+MOST_REPORTED = 20  # limit of the moves that a gateway reports with its state
 
 
 class FleetRecords:
@@ -143,12 +149,6 @@ class FleetRecords:
                 self.moves.add([Move(line, turn, record.value["since"], known, master)])
 
 
-ASKED_AT_ONCE = 500  # limit of lines in one request; servers allow 1024
-# how long a line with an unanswered write is read again: longer than an election takes, because the write may
-# still be stored after an election
-DOUBT_S = 30.0
-
-
 class ShareFollower(Follower):
     """The master records of this gateway's share of lines, in one bucket.
 
@@ -252,12 +252,6 @@ class ShareRecords(FleetRecords):
 
     def doubt(self, bucket: str, lines: Iterable[str]) -> None:
         self._shares[bucket].doubt(lines)
-
-
-# ---- the latest changes of lines' masters, derived from the lines' records ----
-
-MOST_MOVES = 100
-MOST_REPORTED = 20  # limit of the moves that a gateway reports with its state
 
 
 class Move(NamedTuple):

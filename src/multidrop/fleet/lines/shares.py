@@ -27,6 +27,13 @@ from multidrop.fleet.leases.rules import SECOND
 
 BOUND = 110  # limit of a gateway's lines, in percent of the mean
 NUMBER_BITS = 16  # the low bits of a weight hold its gateway's number
+QUIET_NS = SECOND // 2  # while settling, assign lines only after this time without new or lost gateways
+OPENINGS = 3  # number of failed attempts to open a line before the line is reported
+LOST_NS = 6 * SECOND  # a lost port is reported this long after the last reply
+REPLY_NS = 3 * SECOND  # a newest reply that is older than this does not show when the port was lost
+FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND  # first and longest wait before a trial
+TRIAL_NS = 60 * SECOND  # if the line does not come back within this time, its trial ends
+MOST_BYTES = 8_000  # limit, in bytes, of all line names in a lease record
 
 
 def assign(lines: Sequence[str], gateways: Sequence[str]) -> dict[str, str]:
@@ -90,9 +97,6 @@ def _hash(name: str) -> int:
     return int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
 
 
-QUIET_NS = SECOND // 2  # while settling, assign lines only after this time without new or lost gateways
-
-
 class Sharers(NamedTuple):
     """The gateways that share the lines, and each gateway's lines that it could not open."""
 
@@ -138,16 +142,6 @@ class Shares:
 
     def of(self, gateway: str) -> set[str]:
         return {line for line, name in self.wanted.items() if name == gateway}
-
-
-# ---- lines that this gateway cannot open ----
-
-OPENINGS = 3  # number of failed attempts to open a line before the line is reported
-LOST_NS = 6 * SECOND  # a lost port is reported this long after the last reply
-REPLY_NS = 3 * SECOND  # a newest reply that is older than this does not show when the port was lost
-FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND  # first and longest wait before a trial
-TRIAL_NS = 60 * SECOND  # if the line does not come back within this time, its trial ends
-MOST_BYTES = 8_000  # limit, in bytes, of all line names in a lease record
 
 
 class UnopenedLines:

@@ -17,6 +17,15 @@ from multidrop.fleet.samples.samples_stream import StreamInfo, StreamMessage, re
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.samples import MessageError, SinkError, unpack
 
+MOST_READ = 64  # limit of messages in one answer
+MOST_READ_BYTES = 8 << 20
+MOST_ROWS = 1_000_000  # limit of rows in one commit: 50 MB
+MOST_BYTES = 256 << 20  # limit in bytes of messages and rows in one commit; a single answer may exceed it
+LOOKING_S = 0.2  # pause before the next read if there is no new message
+AGAIN_S = 1.0  # pause after a failure
+BEHIND_S = 5.0  # how long to wait for a server that has not received the stream's newest messages yet
+T = TypeVar("T")
+
 _log = logging.getLogger("multidrop.fleet.samples.hub")
 
 
@@ -54,17 +63,6 @@ class SourceCheck:
         """Log and count an event that must never happen."""
         self.alarms += 1
         _log.error("%s", sentence)
-
-
-MOST_READ = 64  # limit of messages in one answer
-MOST_READ_BYTES = 8 << 20
-MOST_ROWS = 1_000_000  # limit of rows in one commit: 50 MB
-MOST_BYTES = 256 << 20  # limit in bytes of messages and rows in one commit; a single answer may exceed it
-LOOKING_S = 0.2  # pause before the next read if there is no new message
-AGAIN_S = 1.0  # pause after a failure
-BEHIND_S = 5.0  # how long to wait for a server that has not received the stream's newest messages yet
-
-T = TypeVar("T")
 
 
 class NotThisHubs(SinkError):

@@ -46,6 +46,8 @@ WRITTEN = {  # in the file, names are dictionary-encoded; `History` and DuckDB r
 OWN = {"rows", "tens", "damaged"}
 _NAME = re.compile(r"(\d{8,})-(\d{8,})\.(\d{8}T\d{6}Z)-(\d{8}T\d{6}Z)\.parquet")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+EVERY_S = 300.0
+_log = logging.getLogger("multidrop.fleet.samples.hub")
 
 
 class ParquetSink:
@@ -145,11 +147,6 @@ def _metadata(path: Path) -> dict[str, Any]:
     except (pa.ArrowException, ValueError, OSError) as error:
         raise SinkError(f"{path} cannot be read: {error}") from error
     return found if isinstance(found, dict) else {}
-
-
-EVERY_S = 300.0
-
-_log = logging.getLogger("multidrop.fleet.samples.hub")
 
 
 async def compact_for_ever(folder: Path, every: float = EVERY_S) -> None:

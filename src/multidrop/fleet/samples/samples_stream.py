@@ -42,6 +42,7 @@ SENTENCES = {  # messages of FleetError, by JetStream's error code
         "or raise max_file in their jetstream blocks",
     ),
 }
+SUBJECT = f"$JS.API.DIRECT.GET.{STREAM}"
 T = TypeVar("T")
 
 
@@ -190,9 +191,6 @@ def _checked_fields() -> Iterator[None]:
         yield
     except (AttributeError, KeyError, TypeError, ValueError):
         raise FleetError("the answer of NATS lacks a field") from None
-
-
-SUBJECT = f"$JS.API.DIRECT.GET.{STREAM}"
 
 
 class StreamMessage(NamedTuple):

@@ -27,6 +27,24 @@ _WRONG_REVISION = (10071, 10164)
 _NO_MESSAGE = 10037
 _NO_STREAM = 10059
 _UNAVAILABLE = 10008  # JetStream's error code: no leader, and none can be elected
+LEASE = {
+    **dict.fromkeys(("session", "began", "pid"), int),
+    **dict.fromkeys(("nonce", "host", "machine", "lock", "lock_id"), str),
+    **dict.fromkeys(("ended", "draining"), bool),
+}
+OWNER = {"gateway": str, "session": int, "votes": int, "turn": int, "since": int}
+LINE = {"line": dict, "files": dict}
+SHAPES: Mapping[str, Mapping[str, Any]] = {
+    **dict.fromkeys(names.LEASES, LEASE),
+    **dict.fromkeys(names.OWNERS, OWNER),
+    names.PLANT: LINE,
+}
+MOST_TEXT = 300  # limit of characters of a text in a gateway's state
+SMALL, LARGE = 1 << 14, 1 << 20  # limits of a record's bytes; a line's record contains its family files
+_KINDS: Mapping[Any, str] = {
+    **{int: "a whole number", float: "a number", str: "a text", bool: "true or false", dict: "a table"},
+    **{int | None: "a whole number or null", float | None: "a number or null", str | None: "a text or null"},
+}
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -285,25 +303,6 @@ class LeaseBucket(Bucket):
 
 
 # ---- the shapes of records ----
-
-LEASE = {
-    **dict.fromkeys(("session", "began", "pid"), int),
-    **dict.fromkeys(("nonce", "host", "machine", "lock", "lock_id"), str),
-    **dict.fromkeys(("ended", "draining"), bool),
-}
-OWNER = {"gateway": str, "session": int, "votes": int, "turn": int, "since": int}
-LINE = {"line": dict, "files": dict}
-SHAPES: Mapping[str, Mapping[str, Any]] = {
-    **dict.fromkeys(names.LEASES, LEASE),
-    **dict.fromkeys(names.OWNERS, OWNER),
-    names.PLANT: LINE,
-}
-MOST_TEXT = 300  # limit of characters of a text in a gateway's state
-SMALL, LARGE = 1 << 14, 1 << 20  # limits of a record's bytes; a line's record contains its family files
-_KINDS: Mapping[Any, str] = {
-    **{int: "a whole number", float: "a number", str: "a text", bool: "true or false", dict: "a table"},
-    **{int | None: "a whole number or null", float | None: "a number or null", str | None: "a text or null"},
-}
 
 
 def largest(bucket: str) -> int:

@@ -50,6 +50,15 @@ PONG_S = 0.7  # time limit of a ping; if a server is slower, the path moves to a
 KEEP_S = 1.0  # pause between checks of a connection
 # If the limit of attempts were 0, nats-py would retry a closed port until `connect` times out.
 ONE_TRY = {"allow_reconnect": False, "max_reconnect_attempts": 1, "reconnect_time_wait": 0.05}
+SEED = "SU"  # prefix of a user's secret key
+CREDS = "-----BEGIN NATS USER JWT-----"
+# silence before each repeat of a read; after the last silence the read fails
+AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)
+SLOW = 3.0  # silence before a repeat, as a multiple of the usual time of an answer
+MOST_SILENCE_S = 1.0  # limit of the silence before a repeat, because requests time out then
+FORGET = 0.97  # factor by which the usual time of an answer decays with each answer
+MOST_REPEATS = 300.0  # limit of the budget: twice the repeats needed until servers notice a dead route (3 s)
+EARNED = 0.5  # repeats that each timely answer adds to the budget
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -311,9 +320,6 @@ def paths_of(urls: Sequence[str], options: Mapping[str, Any] | None = None) -> l
 
 # ---- credentials: the identity of a connection, and the servers that it trusts ----
 
-SEED = "SU"  # prefix of a user's secret key
-CREDS = "-----BEGIN NATS USER JWT-----"
-
 
 def new_seed() -> str:
     import nkeys
@@ -377,14 +383,6 @@ def _context(ca: Path | None) -> ssl.SSLContext:
 
 
 # ---- repeated reads ----
-
-# silence before each repeat of a read; after the last silence the read fails
-AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)
-SLOW = 3.0  # silence before a repeat, as a multiple of the usual time of an answer
-MOST_SILENCE_S = 1.0  # limit of the silence before a repeat, because requests time out then
-FORGET = 0.97  # factor by which the usual time of an answer decays with each answer
-MOST_REPEATS = 300.0  # limit of the budget: twice the repeats needed until servers notice a dead route (3 s)
-EARNED = 0.5  # repeats that each timely answer adds to the budget
 
 
 class RepeatBudget:

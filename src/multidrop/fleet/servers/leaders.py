@@ -25,6 +25,13 @@ from multidrop.supervisor import end_tasks
 
 # a server counts as silent after this time (in ns); followers contact their leader once a second
 SILENT_NS = 2_000_000_000
+SOON_S = 0.4  # time limit for leaders' answers, which usually take some milliseconds
+HAND_OVER_S = 3.0  # time between hand-overs of a bucket: shorter than the time between two elections
+SILENT_FOR_S = 60.0  # a server that is silent for longer than this is ignored
+HANDED_S = 1.0  # time limit of a hand-over; it takes 0.03 to 0.3 s
+LEADER_LOOK_S = 0.02
+# interval of `keep_leaders`: leaders notice a silent server after 2 s, and it starts elections after 4 s
+KEEP_S = 0.4
 
 
 class Replica(NamedTuple):
@@ -92,9 +99,6 @@ def cluster_of(info: Mapping[str, Any], path: ServerPath) -> Cluster:
         raise OutcomeUnknown("the answer of NATS about a bucket's servers is invalid") from None
 
 
-SOON_S = 0.4  # time limit for leaders' answers, which usually take some milliseconds
-
-
 async def known_cluster(path: ServerPath, bucket: str) -> Cluster:
     """Return a bucket's leader and followers; a cluster without a leader if no server answers."""
     with suppress(FleetError):
@@ -140,12 +144,6 @@ async def hand_over(path: ServerPath, bucket: str, server: str) -> None:
     with suppress(FleetError):
         wanted = {"placement": {"preferred": server}}
         await ask(path, f"STREAM.LEADER.STEPDOWN.KV_{bucket}", wanted)
-
-
-HAND_OVER_S = 3.0  # time between hand-overs of a bucket: shorter than the time between two elections
-SILENT_FOR_S = 60.0  # a server that is silent for longer than this is ignored
-HANDED_S = 1.0  # time limit of a hand-over; it takes 0.03 to 0.3 s
-LEADER_LOOK_S = 0.02
 
 
 class LeaseTerms:
@@ -195,10 +193,6 @@ async def _leads_now(path: ServerPath, bucket: str, server: str) -> bool:
                 await asyncio.sleep(LEADER_LOOK_S)
             return True
     return False
-
-
-# interval of `keep_leaders`: leaders notice a silent server after 2 s, and it starts elections after 4 s
-KEEP_S = 0.4
 
 
 async def keep_leaders(

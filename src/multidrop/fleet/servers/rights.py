@@ -51,6 +51,19 @@ from multidrop.printable import masked
 from multidrop.whole_file import whole_file
 
 API = "$JS.API"
+STORE = "multidrop"
+LAST_ANSWER = "10s"  # how long the server forwards further answers to one request
+ANSWER = '{ max: 1, expires: "1m" }'  # limits of an answer; a stop of many drives may take long
+_STORED = ("$JS.", "$KV.", f"{STREAM}.")
+_MANY = "$JS.API.DIRECT.GET."  # prefix of the requests that get several answers
+# Without this import, a server answers every JetStream request in a user's account with "not enabled".
+# No user has the right to send this request.
+_INFO = "$JS.API.INFO"
+CLUSTER = "multidrop"
+ROUTE_PORTS = 2000  # a server's port for routes is its client port plus this, such as 6222 for 4222
+MOST_PORTS = 65535
+DATA = Path("/var/lib/nats")
+PINGS = 'ping_interval: "1s", ping_max: 2'  # for routes: a dead route is noticed after 3 s
 
 
 class UserRights(NamedTuple):
@@ -127,16 +140,6 @@ def rights_of(gateways: Sequence[str]) -> dict[str, UserRights]:
     return {**{name: _gateway(name) for name in gateways}, **OTHERS}
 
 
-STORE = "multidrop"
-LAST_ANSWER = "10s"  # how long the server forwards further answers to one request
-ANSWER = '{ max: 1, expires: "1m" }'  # limits of an answer; a stop of many drives may take long
-_STORED = ("$JS.", "$KV.", f"{STREAM}.")
-_MANY = "$JS.API.DIRECT.GET."  # prefix of the requests that get several answers
-# Without this import, a server answers every JetStream request in a user's account with "not enabled".
-# No user has the right to send this request.
-_INFO = "$JS.API.INFO"
-
-
 def accounts(rights: Mapping[str, UserRights], public: Mapping[str, str]) -> Iterator[str]:
     """Yield the lines of a server's configuration for these users, with their public keys."""
     asked = {name: [one for one in mine.publish if one.startswith(_STORED)] for name, mine in rights.items()}
@@ -208,12 +211,6 @@ def _user(name: str, mine: UserRights, public: str) -> Iterator[str]:
 
 
 # ---- the servers' files ----
-
-CLUSTER = "multidrop"
-ROUTE_PORTS = 2000  # a server's port for routes is its client port plus this, such as 6222 for 4222
-MOST_PORTS = 65535
-DATA = Path("/var/lib/nats")
-PINGS = 'ping_interval: "1s", ping_max: 2'  # for routes: a dead route is noticed after 3 s
 
 
 class TlsFiles(NamedTuple):
