@@ -279,7 +279,6 @@ static int is_identification(const struct md_message *message)
     return objects_length(body, 2U + message->data_len) == 2 + message->data_len;
 }
 
-/* Check that the message fits a body of this layout. */
 static int fits(int layout, const struct function *function, const struct md_message *message)
 {
     switch (layout) {

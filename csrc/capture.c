@@ -27,7 +27,6 @@ static const struct { uint32_t port; uint8_t side; } senders[] = {
     {50000, MD_ASKING}, {502, MD_ANSWERING}, {1, MD_FAILED}, {2, MD_NOISE},
 };
 
-/* Read a 32-bit number in the capture file's byte order. */
 static uint32_t number(const struct md_capture *capture, const uint8_t *at)
 {
     uint32_t value = 0;

@@ -3,7 +3,7 @@
 #ifndef MULTIDROP_CAPTURE_H
 #define MULTIDROP_CAPTURE_H
 
-#include "multidrop.h"
+#include "rows.h"
 
 /* cdef: start */
 /* ---- tap.c: functions return a length in bytes ---- */

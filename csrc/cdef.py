@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cffi import FFI
 
-HEADERS = ("multidrop.h", "capture.h", "internal.h", "line.h")
+HEADERS = ("multidrop.h", "rows.h", "capture.h", "internal.h", "line.h")
 
 
 def main(output: str) -> None:

@@ -6,16 +6,9 @@ enum {
     MOST_TRIES = 4     /* attempts to read both clocks without an interruption in between */
 };
 
-static int64_t read_clock(clockid_t clock)
-{
-    struct timespec now;
-    clock_gettime(clock, &now);
-    return now.tv_sec * MD_SECOND_NS + now.tv_nsec;
-}
-
 int64_t md_now_ns(void)
 {
-    return read_clock(CLOCK_MONOTONIC);
+    return md_clock_ns(CLOCK_MONOTONIC);
 }
 
 int64_t md_utc_ahead_ns(int64_t now_ns)
@@ -24,7 +17,7 @@ int64_t md_utc_ahead_ns(int64_t now_ns)
     int64_t known = atomic_load(&kept), found = 0;
     int is_interrupted = 1;
     for (int i = 0; i < MOST_TRIES && is_interrupted; i++) {
-        found = read_clock(CLOCK_REALTIME) - now_ns;
+        found = md_clock_ns(CLOCK_REALTIME) - now_ns;
         if (known && found - known <= WRONG_NS && known - found <= WRONG_NS)
             return known;
         int64_t after_ns = md_now_ns();

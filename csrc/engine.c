@@ -41,7 +41,6 @@ static void bring_exchange(const struct md_exchange *exchange)
     bring(exchange, offsetof(struct md_exchange, request.data));
 }
 
-/* Return the exchange in flight; NULL: none. */
 static const struct md_exchange *present(const struct md_port *port)
 {
     return port->turn.source != MD_NO_SOURCE ? port->turn.line.exchange : NULL;
@@ -129,7 +128,6 @@ static int wait_until(struct md_engine *engine, void **ready, int64_t until_ns)
 
 /* ---- ports come and go ---- */
 
-/* Make room for one more port; return 0 if there is no memory. */
 static int grow(struct md_engine *engine)
 {
     if (engine->count < engine->room)

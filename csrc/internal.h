@@ -4,7 +4,6 @@
 #define MULTIDROP_INTERNAL_H
 
 #include "capture.h"
-#include "multidrop.h"
 
 #include <pthread.h>
 #include <stdatomic.h>
@@ -220,6 +219,13 @@ static inline void md_mutex_init(pthread_mutex_t *mutex)
 
 #define MD_NEVER INT64_MAX
 #define MD_SECOND_NS INT64_C(1000000000)
+
+static inline int64_t md_clock_ns(clockid_t clock)
+{
+    struct timespec now;
+    clock_gettime(clock, &now);
+    return now.tv_sec * MD_SECOND_NS + now.tv_nsec;
+}
 
 /* The fields of a timespec are 32 bits wide on some systems. */
 static inline struct timespec timespec_of(int64_t ns)

@@ -285,7 +285,6 @@ int64_t md_line_hold_ns(const struct md_line *line, int was_wrong)
     return (line->exchange->drive->failures ? SILENT_S : SECONDS) * MD_SECOND_NS;
 }
 
-/* Return the earliest time at which the request may be sent. */
 static int64_t free_ns(const struct md_line *line)
 {
     int64_t silent_ns = md_line_silent_ns(line);

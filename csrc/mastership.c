@@ -19,9 +19,7 @@ static int set_timer(struct md_mastership *mastership, int64_t at_ns)
 
 int64_t md_boottime_ns(void)
 {
-    struct timespec now;
-    clock_gettime(CLOCK_BOOTTIME, &now);
-    return now.tv_sec * MD_SECOND_NS + now.tv_nsec;
+    return md_clock_ns(CLOCK_BOOTTIME);
 }
 
 struct md_mastership *md_mastership_new(int64_t guard_ns)

@@ -141,7 +141,6 @@ static int is_recovering(struct md_port *port, int64_t now_ns)
     return !exchange->insists && now_ns - port->taken_ns < exchange->drive->most_timeout_ns;
 }
 
-/* Return 1 if the read must wait for a stalled adapter. */
 static int must_recover(struct md_port *port, int64_t now_ns)
 {
     const struct md_line *line = &port->turn.line;
@@ -203,7 +202,6 @@ static int is_in_force(const struct md_port *port, const struct md_settings *wan
             settings->parity == wanted->parity && settings->stopbits == wanted->stopbits);
 }
 
-/* Switch baud rate and format; return the time afterwards. */
 static int64_t apply(struct md_port *port, const struct md_settings *settings)
 {
     struct md_progress *progress = &port->turn.progress;
@@ -223,7 +221,6 @@ static int64_t apply(struct md_port *port, const struct md_settings *settings)
     return now_ns;
 }
 
-/* Return 1 if the request has been sent and its reply is awaited. */
 static int is_sent(const struct md_port *port)
 {
     return port->turn.source != MD_NO_SOURCE && port->turn.line.completion->sent_ns;
@@ -288,7 +285,6 @@ static int is_client_expected(const struct md_turn *turn, int64_t now_ns)
            md_line_silent_ns(&turn->line) - now_ns > MD_MOST_LATENESS;
 }
 
-/* Return the next time to check the transceiver's direction. */
 static int64_t direction_ns(const struct md_port *port)
 {
     return port->rs485.is_sending ? port->rs485.look_ns : MD_NEVER;

@@ -64,9 +64,7 @@ static void change_memory(change_function *change)
 
 static int64_t used_ns(void)
 {
-    struct timespec used;
-    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &used);
-    return used.tv_sec * MD_SECOND_NS + used.tv_nsec;
+    return md_clock_ns(CLOCK_THREAD_CPUTIME_ID);
 }
 
 /* With SCHED_RESET_ON_FORK, threads and processes that this thread starts get normal scheduling. */

@@ -98,7 +98,6 @@ static size_t seek(struct md_line *line, const uint8_t *bytes, size_t len, int64
     return taken;
 }
 
-/* Drop a frame that belongs to no exchange. */
 static void drop(struct md_line *line, int64_t now_ns)
 {
     md_tap_put(line->tap, MD_NOISE, now_ns, line->frame + line->frame_tapped,
@@ -168,7 +167,6 @@ static void remember(struct md_line *line)
     md_late_link(line, drive);
 }
 
-/* Record that the ended exchange's reply may still come. */
 static void expect(struct md_line *line)
 {
     if (line->transactions == MD_IGNORED)

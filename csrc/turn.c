@@ -259,7 +259,6 @@ static void stop_repeating(struct md_turn *turn)
 
 /* ---- turns ---- */
 
-/* Update the line time that urgent requests owe to polling. */
 static void settle(struct md_turn *turn, int64_t took_ns)
 {
     if (turn->source == MD_URGENT)
@@ -331,7 +330,6 @@ static void step_back(struct md_turn *turn)
         turn->round_at = (turn->round_at ? turn->round_at : turn->round_len) - 1;
 }
 
-/* Record the end of the exchange in flight. */
 static void finish(struct md_turn *turn)
 {
     int source = turn->source;

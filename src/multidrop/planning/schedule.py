@@ -16,11 +16,53 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, NamedTuple, TypeVar
 
+TURN_SHARE = 0.05  # minimum share of the line for jobs without a period
+CREDIT_NS = 50_000_000  # limit of the line time that these jobs can use in advance of their share
+NEVER_NS = 1 << 63
 SILENT_AFTER = 2  # number of consecutive failures after which a drive rests
 FIRST_REST_NS = 500_000_000
 LONGEST_REST_NS = 2_000_000_000
 SILENT_SHARE = 0.015  # share of the line's time for requests to silent drives
 SECOND_COST_NS = 400_000_000  # limit of the line time for second requests to all silent new drives
+
+
+@dataclass(eq=False, kw_only=True)
+class Job:
+    """One exchange that is carried out repeatedly with the drive at this address.
+
+    Jobs of one `kind` have the same line settings and silence. They take the least time if they follow each
+    other.
+    """
+
+    drive: int
+    period_ns: int | None
+    duration_ns: int
+    silence_ns: int = 0  # silence before the request, included in `duration_ns`; may pass on an idle line
+    interval_ns: int = 0  # minimum time from the end of an exchange to the drive's next request
+    kind: Hashable = None
+    due_ns: int = 0
+    taken_ns: int = 0
+    skipped: int = 0  # number of slots skipped because the line was busy
+    number: int = 0  # place in the bus cycle
+
+    @property
+    def end_ns(self) -> int:
+        """The end of the job's present slot."""
+        return self.due_ns + (self.period_ns or 0)
+
+
+J = TypeVar("J", bound=Job)
+
+
+class Turn(NamedTuple, Generic[J]):
+    """One execution of a job."""
+
+    job: J
+    not_before_ns: int
+    due_ns: int | None  # start of the job's slot; None for a job without slots
+
+
+# ---- silent drives ----
 
 
 @dataclass
@@ -150,47 +192,6 @@ class BackOff:
 
 
 # ---- the schedule ----
-
-
-TURN_SHARE = 0.05  # minimum share of the line for jobs without a period
-CREDIT_NS = 50_000_000  # limit of the line time that these jobs can use in advance of their share
-NEVER_NS = 1 << 63
-
-
-@dataclass(eq=False, kw_only=True)
-class Job:
-    """One exchange that is carried out repeatedly with the drive at this address.
-
-    Jobs of one `kind` have the same line settings and silence. They take the least time if they follow each
-    other.
-    """
-
-    drive: int
-    period_ns: int | None
-    duration_ns: int
-    silence_ns: int = 0  # silence before the request, included in `duration_ns`; may pass on an idle line
-    interval_ns: int = 0  # minimum time from the end of an exchange to the drive's next request
-    kind: Hashable = None
-    due_ns: int = 0
-    taken_ns: int = 0
-    skipped: int = 0  # number of slots skipped because the line was busy
-    number: int = 0  # place in the bus cycle
-
-    @property
-    def end_ns(self) -> int:
-        """The end of the job's present slot."""
-        return self.due_ns + (self.period_ns or 0)
-
-
-J = TypeVar("J", bound=Job)
-
-
-class Turn(NamedTuple, Generic[J]):
-    """One execution of a job."""
-
-    job: J
-    not_before_ns: int
-    due_ns: int | None  # start of the job's slot; None for a job without slots
 
 
 class Schedule(Generic[J]):
