@@ -174,7 +174,6 @@ class Commands:
         return await stop_meant(self._lines, drives, partial(self._stop, caller=caller))
 
     async def _stop(self, plant: Plant, wanted: Iterable[str], caller: Caller) -> dict[str, CommandResult]:
-        """Stop the plant's drives with the names in `wanted`."""
         wanted = dict.fromkeys(wanted)
         lines: list[LineStop] = []
         for line in plant.lines:
@@ -500,7 +499,6 @@ class FleetStops(Commands):
     async def write(
         self, drive: str, register: str, value: float, caller: Caller, admit: Admit = lambda what: inf
     ) -> CommandResult:
-        """Refuse the write, because a fleet's page can only stop drives."""
         if caller.role < Right.WRITE:
             return denied(caller, Right.WRITE, f"a write of {drive}.{register}")
         return _only_stops("write")
@@ -513,13 +511,11 @@ class FleetStops(Commands):
         caller: Caller,
         admit: Admit = lambda what: inf,
     ) -> CommandResult:
-        """Carry out a stop; refuse any other verb."""
         if verb == "stop":
             return await super().act(drive, verb, options, caller, admit)
         return _only_stops(verb.replace("_", "-"))
 
 
 def _only_stops(verb: str) -> CommandResult:
-    """Return the result for a command other than a stop."""
     sentence = f"this page only stops a fleet's drives; use `multidrop fleet {verb}`"
     return CommandResult(CommandOutcome.REFUSED, sentence, WriteForbidden(sentence, rule=NOT_LISTED))

@@ -334,7 +334,6 @@ class Gateway:
         return True
 
     def _note_alarm(self, alarm: Alarm, change: AlarmChange) -> None:
-        """Log and save an alarm that started, ended or changed."""
         where = alarm.drive or f"line {alarm.line}"
         if alarm.ended is not None:
             _log.info("alarm of %s is over: %s: %s", where, alarm.kind, alarm.text)
@@ -407,7 +406,6 @@ class Gateway:
 
     @property
     def plant_coming(self) -> Plant | None:
-        """The plant of a reload in progress; None otherwise."""
         return self.reload.coming
 
     # ---- for commands, parts and pages ----

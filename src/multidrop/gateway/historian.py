@@ -118,7 +118,6 @@ class Historian:
         return f"nothing is recorded: {trouble}" if trouble else ""
 
     def figures(self) -> list[MetricFamily]:
-        """Return metrics: rows written and rows lost since the start."""
         state = self.state
         return [
             counter("multidrop_history_rows", "Rows written to the history.", state.rows),

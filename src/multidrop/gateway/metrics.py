@@ -97,7 +97,6 @@ def families_of(gateway: Gateway) -> Iterator[MetricFamily]:
 
 
 def plant_families(hub: Hub, statistics: Mapping[str, LineStatistics]) -> Iterator[MetricFamily]:
-    """Yield the metrics of values, drives and lines."""
     models = "Model and address of each drive."
     yield MetricFamily("multidrop_drive", "info", models, _models(hub))
     yield from _value_families(hub)
@@ -141,7 +140,6 @@ def _value_families(hub: Hub) -> Iterator[MetricFamily]:
 
 
 def base_unit(register: Register[Any]) -> BaseUnit:
-    """Return the unit of a register's metric."""
     return CODE if register.values is not None else UNITS.get(register.value_unit, OTHER)
 
 

@@ -184,7 +184,6 @@ class AlarmQueue:
         return len(self._waiting)
 
     def put(self, alarm: Alarm) -> None:
-        """Add an alarm that began or ended."""
         self._waiting.append(alarm)
         if len(self._waiting) > MOST_WAITING:
             self._keep_newest()
@@ -270,7 +269,6 @@ class Sender(RetryingSender):
         self._describe = describe
 
     def put(self, alarm: Alarm) -> None:
-        """Queue a message for an alarm that began or ended."""
         with self._changed:
             self._queue.put(alarm)
         self.announce()
@@ -331,10 +329,8 @@ class Notifications:
             await asyncio.wait(self._threads, timeout=CLOSE_S)
 
     def health(self) -> str:
-        """Return why messages cannot be sent; "" if sending works."""
         return next((one.problem for one in self._senders if one.problem), "")
 
     def figures(self) -> list[MetricFamily]:
-        """Return a metric: messages sent since the start."""
         sent = sum(one.sent for one in self._senders)
         return [counter("multidrop_notifications_sent", "Messages about alarms that targets took.", sent)]

@@ -64,7 +64,6 @@ class Reload:
 
     @property
     def has_file(self) -> bool:
-        """Return True if the plant has a file that can be read again."""
         return self._read is not None
 
     def begin(self, by: str = "a signal") -> None:
@@ -81,7 +80,6 @@ class Reload:
             await self.carry_out(self._by)
 
     async def close(self) -> None:
-        """Cancel a reload that `begin` started."""
         if self._soon is not None:
             self._soon.cancel()
             await asyncio.gather(self._soon, return_exceptions=True)

@@ -190,7 +190,6 @@ class RowForwarder(RetryingSender):
     # ---- called in the forwarder's own thread ----
 
     def run(self) -> None:
-        """Send messages until `close`."""
         super().run()
         self._receiver.close()
 

@@ -49,7 +49,6 @@ class InfluxSettings:
         refuse(wrong)
 
     def check(self, plant: Plant) -> list[str]:
-        """Return a sentence if the file with the token cannot be read."""
         return [*secret_mistakes("token", self.token, plant)]
 
 

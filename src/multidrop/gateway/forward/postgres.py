@@ -48,7 +48,6 @@ class PostgresSettings:
         refuse(wrong)
 
     def check(self, plant: Plant) -> list[str]:
-        """Return a sentence if the file with the password cannot be read."""
         return [*secret_mistakes("password", self.password, plant)]
 
 
@@ -86,7 +85,6 @@ class PostgresReceiver:
         return self._kept
 
     def write(self, message: Outgoing, after: SpoolPosition) -> None:
-        """Store the message's rows, and the position after this message."""
         positions = [(one.newest, json.dumps(one.gaps)) for one in (after, self._kept)]
         with sentences(), self._tables.connection.transaction():
             values = (*positions[0], self._log, *positions[1])
@@ -96,5 +94,4 @@ class PostgresReceiver:
         self._kept = after
 
     def close(self) -> None:
-        """Close the connection."""
         self._tables.close()

@@ -28,7 +28,6 @@ class UploadSettings:
         refuse((*wrong, *parsing_mistakes(self, most=parse_size)))
 
     def check(self, plant: Plant) -> list[str]:
-        """Return a sentence if the file with the token cannot be read."""
         return [*secret_mistakes("token", self.token, plant)]
 
 

@@ -169,7 +169,6 @@ class CountingSocket(socket.socket):
     connections: Connections | None = None
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Return the next connection and its client's address."""
         peer, address = super().accept()
         if self.connections is not None:
             self.connections.add(peer, address)

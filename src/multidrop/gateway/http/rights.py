@@ -138,7 +138,6 @@ class Tokens:
         return len(self._tokens)
 
     def replace(self, tokens: Iterable[Token]) -> None:
-        """Use the tokens in a reloaded token file."""
         self._tokens = tuple(tokens)
 
     def find(self, secret: str) -> Token | None:
@@ -225,7 +224,6 @@ class OwnNames:
         self.replace(names)
 
     def replace(self, names: Iterable[str]) -> None:
-        """Use the names in a reloaded plant file."""
         self._hosts = frozenset({*self._always, *(name.lower() for name in names)})
 
     def has_host(self, host: str) -> bool:

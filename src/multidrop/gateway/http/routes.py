@@ -138,7 +138,6 @@ def _status(result: CommandResult) -> int:
 
 
 def _answer(caller: Caller, result: CommandResult) -> Response:
-    """Return the HTTP answer with a command's outcome."""
     status = _status(result)
     error = {} if status == 200 else {"error": result.text}
     return JsonResponse(_fields(result, caller) | error, status)
@@ -208,7 +207,6 @@ class Pages(PageFiles):
     # ---- queries ----
 
     async def plant(self, request: Request) -> Response:
-        """Return the plant's description, with titles in the language of the request."""
         content = describe(self._gateway, caller_of(request).role, language_of(request))
         return JsonResponse(content, headers={"vary": "accept-language"})
 
@@ -285,7 +283,6 @@ class Pages(PageFiles):
         return JsonResponse({"triggers": [] if part is None else part.as_answer()})
 
     async def acknowledge(self, request: Request) -> Response:
-        """Acknowledge an alarm, with the caller's note."""
         body = await body_of(request)
         alarm, note = text_in(body, "alarm"), body.get("note", "")
         if not isinstance(note, str) or len(note) > MOST_NOTE or not note.isprintable():

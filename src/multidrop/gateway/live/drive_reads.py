@@ -77,7 +77,6 @@ class SideReads:
 
     @property
     def under_way(self) -> int:
-        """The number of drives being read."""
         return len(self._tasks)
 
     def cancel(self) -> None:
@@ -88,7 +87,6 @@ class SideReads:
         self._found.clear()
 
     async def close(self) -> None:
-        """Cancel all reads, and wait for their end."""
         tasks = [*self._tasks.values()]
         self.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -223,7 +221,6 @@ class ParameterReads:
         return read
 
     async def close(self) -> None:
-        """Cancel all reads, and wait for their end."""
         tasks = [read.task for read in self._reads.values() if read.task is not None]
         for task in tasks:
             task.cancel()

@@ -186,7 +186,6 @@ class Frames:
 
     @property
     def viewers(self) -> int:
-        """The number of viewers that wait for the next frame."""
         return len(self._waiting)
 
     def note_news(self) -> None:

@@ -314,7 +314,6 @@ class Hub:
             yield cell.register, cell.newest, cell.good, cell.is_current(now_ns, woke_ns)
 
     def status(self, code: int) -> str:
-        """Return the text of a row's status code."""
         return self._statuses[code]
 
     def last_answer(self, drive: str) -> KeptRow | None:

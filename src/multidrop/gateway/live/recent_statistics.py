@@ -56,7 +56,6 @@ class RecentStatistics:
         self._figures = {line: self._line_figures(line, minute) for line, minute in self._minute.items()}
 
     def _refresh(self) -> None:
-        """Compute the figures of the last minute."""
         self._minute = {line: self._last_minute(line) for line in self.newest}
         self._drives = {
             name: _of_minute(statistics)

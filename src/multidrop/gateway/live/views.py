@@ -52,7 +52,6 @@ def describe(gateway: Gateway, right: Right | None, language: str) -> dict[str, 
 
 
 def describe_line(hub: Hub, line: PlantLine, language: str) -> dict[str, Any]:
-    """Return a line's part of the description."""
     speeds = dict.fromkeys(str(polled.drive.settings) for polled in line.drives)
     return {
         "name": line.name,
@@ -190,7 +189,6 @@ async def _wear_within(ledger: Ledger, port: str, drive: Drive) -> list[dict[str
 
 
 def line_views(gateway: Gateway) -> dict[str, Any]:
-    """Return the details of all lines."""
     return {
         line.name: {
             "lost": lost_of(gateway.hub, line.name),

@@ -68,7 +68,6 @@ def address_map(
 
 
 def to_csv(rows: Sequence[AddressRow]) -> str:
-    """Return the table as CSV."""
     out = io.StringIO()
     table = csv.writer(out, lineterminator="\n")
     table.writerow(AddressRow._fields)

@@ -70,7 +70,6 @@ class ModbusClient(asyncio.Protocol):
 
     @property
     def is_idle(self) -> bool:
-        """True while no request is in progress."""
         return not self._under_way
 
     # ---- called by asyncio ----
@@ -225,7 +224,6 @@ class ModbusClient(asyncio.Protocol):
             self.transport.close()
 
     def abort(self) -> None:
-        """Close this connection immediately."""
         if self.transport is not None:
             self.transport.abort()
 
@@ -279,7 +277,6 @@ class ModbusPort:
         self._server: asyncio.Server | None = None
 
     async def open(self, listener: Any) -> None:
-        """Accept clients on a listening socket."""
         loop = asyncio.get_running_loop()
         self._server = await loop.create_server(lambda: ModbusClient(self), sock=listener)
 
@@ -307,7 +304,6 @@ class ModbusPort:
         return True
 
     def forget(self, client: ModbusClient) -> None:
-        """Remove a disconnected client."""
         self.clients.discard(client)
 
     def sweep(self) -> None:

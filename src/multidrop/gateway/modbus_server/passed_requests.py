@@ -315,5 +315,4 @@ class ClientWrites:
         return ModbusCode.NO_RESPONSE if code == ModbusCode.DEVICE_FAILURE else code
 
     def _caller(self, client: WritingClient) -> Caller:
-        """Return the client as the sender of a command."""
         return Caller("anyone", self._way, client.address, self._role)

@@ -53,11 +53,9 @@ class MbapRequest(NamedTuple):
         return bytes([self.unit, self.function, *self.data]).hex(" ").upper()
 
     def reply(self, data: bytes) -> bytes:
-        """Return the frame of a normal reply."""
         return _HEADER.pack(self.transaction, 0, 2 + len(data), self.unit) + bytes([self.function]) + data
 
     def exception(self, code: int) -> bytes:
-        """Return the frame of an exception reply."""
         return _HEADER.pack(self.transaction, 0, 3, self.unit) + bytes([self.function | 0x80, code])
 
 
@@ -81,12 +79,10 @@ def take_frame(buffer: bytearray) -> bytes | None:
 
 
 def function_of(frame: bytes) -> int:
-    """Return the function code of a whole frame."""
     return frame[_FUNCTION]
 
 
 def request_of(frame: bytes) -> MbapRequest:
-    """Return the request of a whole frame."""
     transaction, _, _, unit = _HEADER.unpack_from(frame)
     return MbapRequest(transaction, unit, frame[_FUNCTION], frame[_FUNCTION + 1 :])
 

@@ -115,12 +115,10 @@ class ModbusServer:
         self._units = Units(plant, self.settings)
 
     def address_map(self) -> list[AddressRow]:
-        """Return a row for each value that clients can read or write."""
         return address_map(self._units, self.settings, self.ports, self._commands.may)
 
     @property
     def clients(self) -> int:
-        """The number of connections."""
         return sum(len(port.clients) for port in self._listening)
 
     # ---- requests ----

@@ -73,7 +73,6 @@ class ModbusSettings:
 
     @property
     def host(self) -> str:
-        """The address to listen on."""
         return parse_address(self.listen, EXAMPLE)[0]
 
     @property
@@ -89,11 +88,9 @@ class ModbusSettings:
 
     @property
     def common_addresses(self) -> range:
-        """Addresses of the common block."""
         return range(self.common, self.common + COMMON_LENGTH)
 
     def may_connect(self, address: str) -> bool:
-        """Return True if a client at this address may connect."""
         return is_allowed(address, self.clients)
 
     def _mistakes(self) -> Iterator[str]:

@@ -166,7 +166,6 @@ class RequestCutter:
         self._is_in_step = True  # False while the start of the next request is unknown
 
     def add(self, data: bytes) -> None:
-        """Append received bytes."""
         self._came += data
 
     def take(self) -> MbapRequest | None:

@@ -102,7 +102,6 @@ class ToolSettings:
         return [*self._line_mistakes(lines)] if lines else []
 
     def may_connect(self, address: str) -> bool:
-        """Return True if a tool at this address may connect."""
         return is_allowed(address, self.clients)
 
     @property
@@ -112,7 +111,6 @@ class ToolSettings:
 
     @property
     def lines(self) -> list[str]:
-        """The names of all lines that have a tool port."""
         return [*dict.fromkeys((*self.pty, *self.rtu))]
 
     def _line_mistakes(self, lines: Mapping[str, PlantLine]) -> Iterator[str]:
@@ -427,7 +425,6 @@ class ToolPorts:
             raise
 
     async def run(self) -> None:
-        """Serve tools until cancelled."""
         loop = asyncio.get_running_loop()
         self.adopt(self._plant)
         self._at_terminals = [self._tool(line, terminal) for line, terminal in self._terminals.items()]

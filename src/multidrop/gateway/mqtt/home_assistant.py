@@ -38,7 +38,6 @@ COMMAND = '{{"value": {{{{ {} }}}}, "time": {{{{ (now().timestamp() * 1000) | in
 
 
 def discovery_topic(prefix: str, drive: str) -> str:
-    """Return the topic of a drive's discovery message."""
     return f"{DISCOVERY}/device/{object_id(prefix, drive)}/config"
 
 

@@ -62,7 +62,6 @@ class RetainedTopics:
         self._looked_at = 0
 
     def topics(self) -> list[str]:
-        """Return the topics to subscribe to."""
         kept = [f"{self._prefix}/gateway", f"{self._prefix}/+/available"]
         return [*kept, f"{DISCOVERY}/device/+/config"] if self._home_assistant else kept
 
@@ -242,14 +241,12 @@ class JsonTopics:
     # ---- published messages ----
 
     def publish_alarms(self) -> None:
-        """Publish the list of active alarms."""
         self.outbox.put(Publication(self._topic("alarms"), self._active_alarms, is_retained=True))
 
     def _active_alarms(self) -> bytes:
         return json.dumps([one.as_json() for one in self._context.alarms.lasting]).encode()
 
     def publish(self) -> None:
-        """Publish the newest values of each drive."""
         for drive in self._hub.drives:
             self.outbox.put(Publication(self._topic(drive), partial(self._state, drive), is_retained=True))
             available = OFFLINE if self._hub.state(drive) == SILENT else ONLINE

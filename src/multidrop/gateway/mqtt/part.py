@@ -79,7 +79,6 @@ class Mqtt:
             one.take(batch)
 
     def note_alarm(self, alarm: Alarm, change: AlarmChange) -> None:
-        """Publish the list of active alarms, because an alarm began, changed or ended."""
         if self._brokers[0].is_connected:
             self._topics.publish_alarms()
 
@@ -123,13 +122,11 @@ class Mqtt:
             await broker.close()
 
     def health(self) -> str:
-        """Return why publishing fails; "" if it works."""
         troubles = [broker.failure if broker.is_connected else broker.trouble for broker in self._brokers]
         troubles += [one.health() for one in self._forwarded]
         return next(filter(None, troubles), "")
 
     def figures(self) -> list[MetricFamily]:
-        """Return metrics: messages sent and dropped since the start, and connections."""
         outboxes = [broker.outbox for broker in self._brokers]
         connected = sum(broker.is_connected for broker in self._brokers)
         return [

@@ -72,12 +72,10 @@ class MqttSettings:
 
     @property
     def every_s(self) -> float:
-        """The time in s between two messages of a drive."""
         return parse_duration(self.every)
 
     @property
     def caller(self) -> Caller:
-        """The caller of all commands from the broker."""
         return Caller(self.user or "anyone", "mqtt", parse_broker(self.broker).host, Right.WRITE)
 
     @property

@@ -287,5 +287,4 @@ def _datatype(register: Register[Any] | None) -> DataType:
 
 
 def _metric_of(register: str) -> str:
-    """Return the name of a register's metric."""
     return f"{REGISTERS}{register}" if register in OWN else register

@@ -158,7 +158,6 @@ class _Variable:
         self._register = register
 
     def value(self, *node: object) -> _Value:
-        """Return the value for clients, made from the newest state."""
         _, _, code, value, time_ns = self.state
         if isinstance(value, float) and self._register is not None:
             value = hub.published_value(self._register, value)
@@ -275,7 +274,6 @@ class PlantNodes:
 
 
 async def _notify(variable: _Variable, attribute: AttributeValue) -> None:
-    """Send a variable's value to its subscribers."""
     if not attribute.datachange_callbacks:
         return
     value = variable.value()

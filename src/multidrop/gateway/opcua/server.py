@@ -228,7 +228,6 @@ class _Internal(InternalServer):
 
     @property
     def items(self) -> int:
-        """The number of subscribed values of all clients."""
         there = self.subscription_service.subscriptions.values()
         return sum(len(one.monitored_item_srv._monitored_items) for one in there)
 
@@ -328,7 +327,6 @@ class PlantServer(Server):
             await self.get_node(node).write_value(MOST_OPERATIONS, ua.VariantType.UInt32)
 
     async def start(self) -> None:
-        """Start the server, and accept clients from then on."""
         await self._setup_server_nodes()
         await self.iserver.start()
         self.bserver = _Network(self.iserver, self._listener, self.limits)
