@@ -71,7 +71,7 @@ def stands(gateway: Served, drive: str) -> bool:
     ("path", "body"), [("/api/stop", {"drives": None}), ("/api/act", {"drive": "pump-1", "verb": "coast"})]
 )
 def test_the_http_head_of_the_answer_confirms_a_stop_in_progress(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str, body: dict[str, object]
+    gateway: Served, monkeypatch: pytest.MonkeyPatch, path: str, body: dict[str, object]
 ) -> None:
     """If no HTTP head arrives, the page knows that the gateway has not accepted the stop."""
     held = threading.Event()
@@ -81,21 +81,20 @@ def test_the_http_head_of_the_answer_confirms_a_stop_in_progress(
         told = CommandResult(CommandOutcome.DONE, "stopped: seen to stand")
         return told if path == "/api/act" else {"pump-1": told}
 
-    with served(tmp_path, MAY) as gateway:
-        monkeypatch.setattr(gateway.gateway.commands, "act" if path == "/api/act" else "stop", slow)
-        connection = http.client.HTTPConnection("127.0.0.1", gateway.gateway.port, timeout=PATIENCE)
-        connection.request("POST", path, json.dumps(body), {"content-type": "application/json"})
-        response = connection.getresponse()  # returns after the HTTP head
-        assert (response.status, held.is_set()) == (200, False)
-        assert response.getheader("x-accel-buffering") == "no"
-        held.set()
-        told = json.loads(response.read())
-        stopped = told if path == "/api/act" else told["pump-1"]
-        assert (stopped["done"], stopped["text"]) == (True, "stopped: seen to stand")
-        connection.close()
+    monkeypatch.setattr(gateway.gateway.commands, "act" if path == "/api/act" else "stop", slow)
+    connection = http.client.HTTPConnection("127.0.0.1", gateway.gateway.port, timeout=PATIENCE)
+    connection.request("POST", path, json.dumps(body), {"content-type": "application/json"})
+    response = connection.getresponse()  # returns after the HTTP head
+    assert (response.status, held.is_set()) == (200, False)
+    assert response.getheader("x-accel-buffering") == "no"
+    held.set()
+    told = json.loads(response.read())
+    stopped = told if path == "/api/act" else told["pump-1"]
+    assert (stopped["done"], stopped["text"]) == (True, "stopped: seen to stand")
+    connection.close()
 
 
-def test_stop_continues_when_its_client_disconnects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_continues_when_its_client_disconnects(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     ends: list[str] = []
     held = threading.Event()
 
@@ -108,28 +107,26 @@ def test_stop_continues_when_its_client_disconnects(tmp_path: Path, monkeypatch:
             raise
         return {}
 
-    with served(tmp_path, MAY) as gateway:
-        monkeypatch.setattr(gateway.gateway.commands, "stop", slow)
-        with calling(gateway) as leaving:
-            leaving.sendall(STOP + b'16\r\n\r\n{"drives": null}')
-            assert leaving.recv(64).startswith(b"HTTP/1.1 200")
-        gateway.frame()
-        held.set()
-        until(lambda: ends)
-        assert ends == ["over"]
+    monkeypatch.setattr(gateway.gateway.commands, "stop", slow)
+    with calling(gateway) as leaving:
+        leaving.sendall(STOP + b'16\r\n\r\n{"drives": null}')
+        assert leaving.recv(64).startswith(b"HTTP/1.1 200")
+    gateway.frame()
+    held.set()
+    until(lambda: ends)
+    assert ends == ["over"]
 
 
 @pytest.mark.slow
-def test_all_drives_are_stopped_and_verified(tmp_path: Path) -> None:
-    with served(tmp_path, MAY) as gateway:
-        start(gateway, "pump-1", "pump-2")
-        gateway.await_state("pump-1", "runs")
-        told = gateway.post("/api/stop", {"drives": None}).json
-        assert {name: one["done"] for name, one in told.items()} == {"pump-1": True, "pump-2": True}
-        assert all("seen to stand" in one["text"] for one in told.values())
-        assert stands(gateway, "pump-1")
-        assert stands(gateway, "pump-2")
-        gateway.await_state("pump-1", "stands")
+def test_all_drives_are_stopped_and_verified(gateway: Served) -> None:
+    start(gateway, "pump-1", "pump-2")
+    gateway.await_state("pump-1", "runs")
+    told = gateway.post("/api/stop", {"drives": None}).json
+    assert {name: one["done"] for name, one in told.items()} == {"pump-1": True, "pump-2": True}
+    assert all("seen to stand" in one["text"] for one in told.values())
+    assert stands(gateway, "pump-1")
+    assert stands(gateway, "pump-2")
+    gateway.await_state("pump-1", "stands")
 
 
 @pytest.mark.slow
@@ -186,22 +183,20 @@ def test_stop_with_an_unreadable_body_stops_all_drives(
 
 
 @pytest.mark.slow
-def test_stop_accepts_a_single_name(tmp_path: Path) -> None:
-    with served(tmp_path, MAY) as gateway:
-        start(gateway, "pump-1", "pump-2")
-        assert [*gateway.request("POST", "/api/stop", {"drives": "pump-1"}).json] == ["pump-1"]
-        assert stands(gateway, "pump-1")
-        assert not stands(gateway, "pump-2")
+def test_stop_accepts_a_single_name(gateway: Served) -> None:
+    start(gateway, "pump-1", "pump-2")
+    assert [*gateway.request("POST", "/api/stop", {"drives": "pump-1"}).json] == ["pump-1"]
+    assert stands(gateway, "pump-1")
+    assert not stands(gateway, "pump-2")
 
 
 @pytest.mark.slow
-def test_stop_of_unknown_names_stops_known_drives_and_reports_each(tmp_path: Path) -> None:
+def test_stop_of_unknown_names_stops_known_drives_and_reports_each(gateway: Served) -> None:
     """The unknown names: a lone surrogate, a terminal's escape sequence, a drive's name in capitals."""
     names = ["pump-1", "\ud800", "\x1b[2J\n", "PUMP-2", ""]
-    with served(tmp_path, MAY) as gateway:
-        start(gateway, "pump-1")
-        told = gateway.request("POST", "/api/stop", {"drives": names}).json
-        assert stands(gateway, "pump-1")
+    start(gateway, "pump-1")
+    told = gateway.request("POST", "/api/stop", {"drives": names}).json
+    assert stands(gateway, "pump-1")
     assert [name for name, one in told.items() if one["done"]] == ["pump-1"]
     assert [*told] == names
 
@@ -209,22 +204,20 @@ def test_stop_of_unknown_names_stops_known_drives_and_reports_each(tmp_path: Pat
 @pytest.mark.long
 @table("verb", ["stop", "coast"])
 @table("options", [None, [], "now", {"direction": "forward"}])
-def test_wrong_options_do_not_prevent_a_stop_verb(tmp_path: Path, verb: str, options: object) -> None:
+def test_wrong_options_do_not_prevent_a_stop_verb(gateway: Served, verb: str, options: object) -> None:
     """Some programs send null instead of an empty object."""
-    with served(tmp_path, MAY) as gateway:
-        start(gateway, "pump-1")
-        body = {"drive": "pump-1", "verb": verb, "options": options}
-        assert gateway.post("/api/act", body).json["done"] is True
-        assert stands(gateway, "pump-1")
+    start(gateway, "pump-1")
+    body = {"drive": "pump-1", "verb": verb, "options": options}
+    assert gateway.post("/api/act", body).json["done"] is True
+    assert stands(gateway, "pump-1")
 
 
 @pytest.mark.slow
-def test_stop_with_a_truncated_body_is_sent(tmp_path: Path) -> None:
-    with served(tmp_path, MAY) as gateway:
-        start(gateway, "pump-1", "pump-2")
-        with calling(gateway) as client:
-            client.sendall(STOP + b'100\r\n\r\n{"drives": ["pump-1", "pu')
-        until(lambda: stands(gateway, "pump-1") and stands(gateway, "pump-2"))
+def test_stop_with_a_truncated_body_is_sent(gateway: Served) -> None:
+    start(gateway, "pump-1", "pump-2")
+    with calling(gateway) as client:
+        client.sendall(STOP + b'100\r\n\r\n{"drives": ["pump-1", "pu')
+    until(lambda: stands(gateway, "pump-1") and stands(gateway, "pump-2"))
 
 
 @pytest.mark.slow
@@ -237,14 +230,13 @@ def test_stop_without_the_right_is_not_sent(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_stop_of_one_drive_leaves_the_other_running(tmp_path: Path) -> None:
-    with served(tmp_path, MAY) as gateway:
-        start(gateway, "pump-1", "pump-2")
-        told = gateway.post("/api/stop", {"drives": ["pump-1", "pump-9"]}).json
-        assert told["pump-1"]["done"] is True
-        assert (told["pump-9"]["done"], told["pump-9"]["text"]) == (False, "there is no drive 'pump-9'")
-        assert stands(gateway, "pump-1")
-        assert not stands(gateway, "pump-2")
+def test_stop_of_one_drive_leaves_the_other_running(gateway: Served) -> None:
+    start(gateway, "pump-1", "pump-2")
+    told = gateway.post("/api/stop", {"drives": ["pump-1", "pump-9"]}).json
+    assert told["pump-1"]["done"] is True
+    assert (told["pump-9"]["done"], told["pump-9"]["text"]) == (False, "there is no drive 'pump-9'")
+    assert stands(gateway, "pump-1")
+    assert not stands(gateway, "pump-2")
 
 
 @pytest.mark.slow
@@ -270,63 +262,61 @@ def test_stop_works_while_all_parts_fail(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_stop_works_while_the_hub_and_the_frames_are_broken(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with served(tmp_path, MAY) as gateway:
-        start(gateway, "pump-1", "pump-2")
+    start(gateway, "pump-1", "pump-2")
 
-        def fail(*arguments: object, **more: object) -> None:
-            raise ZeroDivisionError
+    def fail(*arguments: object, **more: object) -> None:
+        raise ZeroDivisionError
 
-        for broken in ("hub.take", "hub.seen", "alarms.look", "frames.note_news", "recent.tick"):
-            name, method = broken.split(".")
-            monkeypatch.setattr(getattr(gateway.gateway, name), method, fail)
-        until(lambda: gateway.gateway.failures.get("hub", 0) > 3)
-        gateway.gateway.frames._has_news = True  # otherwise no new frame would be made
-        assert gateway.get("/api/frame").status == 500
-        assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
+    for broken in ("hub.take", "hub.seen", "alarms.look", "frames.note_news", "recent.tick"):
+        name, method = broken.split(".")
+        monkeypatch.setattr(getattr(gateway.gateway, name), method, fail)
+    until(lambda: gateway.gateway.failures.get("hub", 0) > 3)
+    gateway.gateway.frames._has_news = True  # otherwise no new frame would be made
+    assert gateway.get("/api/frame").status == 500
+    assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
 
 
 @pytest.mark.slow
-def test_stop_does_not_wait_for_hanging_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_does_not_wait_for_hanging_writes(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     """MOST_WRITES writes hang, and further writes are refused; stops are still sent."""
     held, entered = threading.Event(), []
-    with served(tmp_path, MAY) as gateway:
-        start(gateway, "pump-1", "pump-2")
-        pump = gateway.gateway.bus("hall").drives[0]
+    start(gateway, "pump-1", "pump-2")
+    pump = gateway.gateway.bus("hall").drives[0]
 
-        def hang(*arguments: object) -> None:
-            entered.append(arguments)
-            held.wait()
-            raise ValueError("it was held up")
+    def hang(*arguments: object) -> None:
+        entered.append(arguments)
+        held.wait()
+        raise ValueError("it was held up")
 
-        monkeypatch.setattr(type(pump), "try_write", hang)
-        writer = {"authorization": gateway.bearer(Right.WRITE)}
-        found: list[str] = []
+    monkeypatch.setattr(type(pump), "try_write", hang)
+    writer = {"authorization": gateway.bearer(Right.WRITE)}
+    found: list[str] = []
 
-        def write(value: float) -> None:
-            body = {"drive": "pump-1", "register": "setpoint", "value": value}
-            found.append(gateway.command("/api/write", body, **writer).json["text"])
+    def write(value: float) -> None:
+        body = {"drive": "pump-1", "register": "setpoint", "value": value}
+        found.append(gateway.command("/api/write", body, **writer).json["text"])
 
-        writes = [threading.Thread(target=write, args=(float(value),)) for value in range(12)]
-        try:
-            for write in writes:
-                write.start()
-            until(lambda: len(entered) == 8 and len(found) == 4)
-            coast = {"drive": "pump-1", "verb": "coast", "options": {}}
-            assert gateway.post("/api/act", coast).json["done"]
-            assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
-        finally:
-            held.set()
+    writes = [threading.Thread(target=write, args=(float(value),)) for value in range(12)]
+    try:
         for write in writes:
-            write.join()
-        refused = [text for text in found if text != "it was held up"]
-        assert len(refused) == 4
-        assert all(text.endswith(" was not sent: 8 others are under way on line hall") for text in refused)
+            write.start()
+        until(lambda: len(entered) == 8 and len(found) == 4)
+        coast = {"drive": "pump-1", "verb": "coast", "options": {}}
+        assert gateway.post("/api/act", coast).json["done"]
+        assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
+    finally:
+        held.set()
+    for write in writes:
+        write.join()
+    refused = [text for text in found if text != "it was held up"]
+    assert len(refused) == 4
+    assert all(text.endswith(" was not sent: 8 others are under way on line hall") for text in refused)
 
 
 @pytest.mark.slow
-def test_commands_called_before_a_stop_are_not_sent_after_it(tmp_path: Path) -> None:
+def test_commands_called_before_a_stop_are_not_sent_after_it(gateway: Served) -> None:
     """A command whose thread starts only after a stop was called is refused because of the stop."""
     begun: list[threading.Thread] = []
 
@@ -334,66 +324,63 @@ def test_commands_called_before_a_stop_are_not_sent_after_it(tmp_path: Path) -> 
         def start(self) -> None:
             begun.append(self)
 
-    with served(tmp_path, MAY) as gateway:
-        commands = gateway.gateway.commands
-        start(gateway, "pump-1")
-        writer = {"authorization": gateway.bearer(Right.WRITE)}
-        body = {"drive": "pump-1", "verb": "start", "options": {}}
-        told: list[str] = []
-        asked = threading.Thread(
-            target=lambda: told.append(gateway.command("/api/act", body, **writer).json["text"])
-        )
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("multidrop.supervisor.threading", SimpleNamespace(Thread=Late))
-            asked.start()
-            until(lambda: len(begun) == 1)
-        assert gateway.post("/api/stop").json["pump-1"]["done"] is True
-        threading.Thread.start(begun[0])
-        asked.join()
-        assert told == ["pump-1.start was not sent: a stop was called"]
-        assert stands(gateway, "pump-1")
-        assert commands.called == 4
+    commands = gateway.gateway.commands
+    start(gateway, "pump-1")
+    writer = {"authorization": gateway.bearer(Right.WRITE)}
+    body = {"drive": "pump-1", "verb": "start", "options": {}}
+    told: list[str] = []
+    asked = threading.Thread(
+        target=lambda: told.append(gateway.command("/api/act", body, **writer).json["text"])
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("multidrop.supervisor.threading", SimpleNamespace(Thread=Late))
+        asked.start()
+        until(lambda: len(begun) == 1)
+    assert gateway.post("/api/stop").json["pump-1"]["done"] is True
+    threading.Thread.start(begun[0])
+    asked.join()
+    assert told == ["pump-1.start was not sent: a stop was called"]
+    assert stands(gateway, "pump-1")
+    assert commands.called == 4
 
 
 @pytest.mark.slow
-def test_stop_is_sent_although_no_thread_can_be_started(tmp_path: Path) -> None:
+def test_stop_is_sent_although_no_thread_can_be_started(gateway: Served) -> None:
     class NoThread(threading.Thread):
         def start(self) -> None:
             raise RuntimeError("can't start new thread")
 
-    with served(tmp_path, MAY) as gateway:
-        start(gateway, "pump-1")
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("multidrop.supervisor.threading", SimpleNamespace(Thread=NoThread))
-            writer = {"authorization": gateway.bearer(Right.WRITE)}
-            body = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
-            told = gateway.command("/api/write", body, **writer).json
-            assert (told["done"], told["text"]) == (False, "can't start new thread")
-            assert gateway.post("/api/stop").json["pump-1"]["done"] is True
-        assert stands(gateway, "pump-1")
+    start(gateway, "pump-1")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("multidrop.supervisor.threading", SimpleNamespace(Thread=NoThread))
+        writer = {"authorization": gateway.bearer(Right.WRITE)}
+        body = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
+        told = gateway.command("/api/write", body, **writer).json
+        assert (told["done"], told["text"]) == (False, "can't start new thread")
+        assert gateway.post("/api/stop").json["pump-1"]["done"] is True
+    assert stands(gateway, "pump-1")
 
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_stop_is_repeated_to_a_silent_drive_and_delays_no_other(tmp_path: Path) -> None:
-    with served(tmp_path, MAY) as gateway:
-        start(gateway, "pump-1", "pump-2")
-        gateway.sims["pump-2"].deaf_until = float("inf")
-        gateway.await_state("pump-2", "silent")
-        found: list[object] = []
-        asked = threading.Thread(target=lambda: found.append(gateway.post("/api/stop").json))
-        asked.start()
-        until(lambda: stands(gateway, "pump-1"))
-        gateway.sims["pump-2"].deaf_until = 0.0
-        asked.join()
-        assert stands(gateway, "pump-2")
-        assert [one["done"] for one in found[0].values()] == [True, True]  # type: ignore[attr-defined]
+def test_stop_is_repeated_to_a_silent_drive_and_delays_no_other(gateway: Served) -> None:
+    start(gateway, "pump-1", "pump-2")
+    gateway.sims["pump-2"].deaf_until = float("inf")
+    gateway.await_state("pump-2", "silent")
+    found: list[object] = []
+    asked = threading.Thread(target=lambda: found.append(gateway.post("/api/stop").json))
+    asked.start()
+    until(lambda: stands(gateway, "pump-1"))
+    gateway.sims["pump-2"].deaf_until = 0.0
+    asked.join()
+    assert stands(gateway, "pump-2")
+    assert [one["done"] for one in found[0].values()] == [True, True]  # type: ignore[attr-defined]
 
 
 @pytest.mark.long
-def test_many_stops_of_a_silent_drive_delay_no_other(tmp_path: Path) -> None:
+def test_many_stops_of_a_silent_drive_delay_no_other(gateway: Served) -> None:
     """The gateway repeats one of the 40 stops, not each, so it can send another drive's stop immediately."""
-    with served(tmp_path, MAY) as gateway, ThreadPoolExecutor(40) as callers:
+    with ThreadPoolExecutor(40) as callers:
         start(gateway, "pump-1", "pump-2")
         gateway.sims["pump-2"].deaf_until = float("inf")
         calls = [callers.submit(gateway.post, "/api/stop", {"drives": ["pump-2"]}) for _ in range(40)]
@@ -429,9 +416,9 @@ def test_only_one_of_many_coasts_is_repeated(tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.mark.long
-def test_stop_of_a_restarted_drive_is_sent_as_a_new_stop(tmp_path: Path) -> None:
+def test_stop_of_a_restarted_drive_is_sent_as_a_new_stop(gateway: Served) -> None:
     """The first stop is still repeated for the silent drive, but has ended for the restarted drive."""
-    with served(tmp_path, MAY) as gateway, ThreadPoolExecutor(1) as caller:
+    with ThreadPoolExecutor(1) as caller:
         start(gateway, "pump-1", "pump-2")
         gateway.sims["pump-2"].deaf_until = float("inf")
         whole = caller.submit(gateway.post, "/api/stop", {})
@@ -450,49 +437,47 @@ def test_stop_of_a_restarted_drive_is_sent_as_a_new_stop(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_verbs_and_writes_report_their_results(tmp_path: Path) -> None:
-    with served(tmp_path, MAY) as gateway:
-        writer = {"authorization": gateway.bearer(Right.WRITE)}
+def test_verbs_and_writes_report_their_results(gateway: Served) -> None:
+    writer = {"authorization": gateway.bearer(Right.WRITE)}
 
-        def act(verb: str, **options: object) -> str:
-            body = {"drive": "pump-1", "verb": verb, "options": options}
-            text: str = gateway.command("/api/act", body, **writer).json["text"]
-            return text
+    def act(verb: str, **options: object) -> str:
+        body = {"drive": "pump-1", "verb": verb, "options": options}
+        text: str = gateway.command("/api/act", body, **writer).json["text"]
+        return text
 
-        def write(value: float) -> str:
-            body = {"drive": "pump-1", "register": "setpoint", "value": value}
-            text: str = gateway.command("/api/write", body, **writer).json["text"]
-            return text
+    def write(value: float) -> str:
+        body = {"drive": "pump-1", "register": "setpoint", "value": value}
+        text: str = gateway.command("/api/write", body, **writer).json["text"]
+        return text
 
-        assert write(50.0) == "pump-1: setpoint = 50.00 %: done (read back)"
-        assert write(150.0) == (
-            "pump-1: setpoint = 150 is outside 0 to 100 % (manual: CHE100 manual v1.4, p. 117)"
-        )
-        assert "takes a finite number, not nan" in write(float("nan"))
-        told = gateway.command(
-            "/api/write", {"drive": "pump-1", "register": "control", "value": 1.5}, **writer
-        ).json
-        assert told["text"] == "control takes the name or the number of a choice, not 1.5"
-        told = gateway.command(
-            "/api/write", {"drive": "pump-1", "register": "control", "value": 1}, **writer
-        ).json
-        assert told["done"] is False
-        assert "start" in told["text"]
-        assert stands(gateway, "pump-1")
-        assert act("fly") == (
-            "there is no verb 'fly'; there are start, jog, reset_fault, set_frequency, coast, "
-            "emergency_stop, stop"
-        )
-        assert act("start", direction="up") == "direction = 'up' is neither forward nor reverse"
-        assert act("start", at=5) == "start has no option 'at'; it has direction"
-        assert act("set_frequency") == "set_frequency needs a frequency: hz = 20.0"
-        assert act("set_frequency", hz="fast") == "hz = 'fast' is not a number"
-        assert act("set_frequency", hz=10**400).endswith("0 is not a number")
-        assert act("set_frequency", hz=None) == "set_frequency needs a frequency: hz = 20.0"
-        assert act("set_frequency", hz=20) == (
-            "pump-1 takes its setpoint in percent of P0.04: "
-            "write maximum_frequency = HZ below its [[line.drive]]"
-        )
+    assert write(50.0) == "pump-1: setpoint = 50.00 %: done (read back)"
+    assert write(150.0) == (
+        "pump-1: setpoint = 150 is outside 0 to 100 % (manual: CHE100 manual v1.4, p. 117)"
+    )
+    assert "takes a finite number, not nan" in write(float("nan"))
+    told = gateway.command(
+        "/api/write", {"drive": "pump-1", "register": "control", "value": 1.5}, **writer
+    ).json
+    assert told["text"] == "control takes the name or the number of a choice, not 1.5"
+    told = gateway.command(
+        "/api/write", {"drive": "pump-1", "register": "control", "value": 1}, **writer
+    ).json
+    assert told["done"] is False
+    assert "start" in told["text"]
+    assert stands(gateway, "pump-1")
+    assert act("fly") == (
+        "there is no verb 'fly'; there are start, jog, reset_fault, set_frequency, coast, "
+        "emergency_stop, stop"
+    )
+    assert act("start", direction="up") == "direction = 'up' is neither forward nor reverse"
+    assert act("start", at=5) == "start has no option 'at'; it has direction"
+    assert act("set_frequency") == "set_frequency needs a frequency: hz = 20.0"
+    assert act("set_frequency", hz="fast") == "hz = 'fast' is not a number"
+    assert act("set_frequency", hz=10**400).endswith("0 is not a number")
+    assert act("set_frequency", hz=None) == "set_frequency needs a frequency: hz = 20.0"
+    assert act("set_frequency", hz=20) == (
+        "pump-1 takes its setpoint in percent of P0.04: write maximum_frequency = HZ below its [[line.drive]]"
+    )
 
 
 def test_only_stops_are_sent_while_the_audit_log_cannot_be_written(

@@ -390,7 +390,7 @@ def test_an_invalid_host_in_an_address_is_reported(tmp_path: Path, host: str) ->
     clients = 'clients = ["::1"]\n[serve.tool]\nclients = ["::1"]\nrtu = {{ hall = "{0}" }}'
     found = mistakes(tmp_path, tables.format(f"{host}:80", clients.format(f"{host}:80")))
     assert [one.split(": ")[0] for one in found] == [
-        *("[serve]", "[serve.modbus]", "[serve.opcua]", "[serve.tool]"),
+        *("[serve]", "[serve.modbus]", "[serve.opcua]", "[serve.tool]")
     ]
     assert all(f'"{host}:80" is not an address and port; write ' in one for one in found)
 

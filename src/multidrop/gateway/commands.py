@@ -14,16 +14,10 @@ from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Se
 from contextlib import contextmanager, suppress
 from functools import partial
 from math import inf
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol
 
 from multidrop import Bus, BusError, Drive, Plant, WriteForbidden
-from multidrop.control import (
-    CommandOutcome,
-    CommandResult,
-    noted_first,
-    result_of_failure,
-    written_by,
-)
+from multidrop.control import CommandOutcome, CommandResult, noted_first, result_of_failure, written_by
 from multidrop.control.commands import (
     LineStop,
     RepeatedStops,
@@ -347,16 +341,6 @@ def _printable(text: str) -> str:
 # ---- stops during a reload ----
 
 
-class StopEnd(Protocol):
-    """The result of a stop. CommandResult has these attributes."""
-
-    @property
-    def ok(self) -> bool: ...
-
-
-T = TypeVar("T", bound=StopEnd)
-
-
 def drives_of(plant: Plant) -> dict[str, Drive]:
     return {polled.drive.name: polled.drive for polled in plant.drives}
 
@@ -369,8 +353,8 @@ def names_of(lines: PolledLines) -> set[str]:
 async def stop_meant(
     lines: PolledLines,
     drives: Iterable[str] | None,
-    stop: Callable[[Plant, list[str]], Coroutine[Any, Any, dict[str, T]]],
-) -> dict[str, T]:
+    stop: Callable[[Plant, list[str]], Coroutine[Any, Any, dict[str, CommandResult]]],
+) -> dict[str, CommandResult]:
     """Stop the drives with these names, or all if None; return the result of each drive's latest stop.
 
     Names may have another spelling (see `drive_meant`). `stop` is called with the present plant and the
@@ -382,7 +366,7 @@ async def stop_meant(
     meant = {name: drive_meant(name, known) for name in drives or ()}
     before = lines.plant_now.lines
     sent: dict[str, Drive | None] = {}
-    begun: list[asyncio.Task[dict[str, T]]] = []
+    begun: list[asyncio.Task[dict[str, CommandResult]]] = []
     while True:
         is_settled, plant = lines.plant_coming is None, lines.plant_now
         there = drives_of(plant)

@@ -102,7 +102,8 @@ def plant_families(hub: Hub, statistics: Mapping[str, LineStatistics]) -> Iterat
     yield from _value_families(hub)
     yield MetricFamily("multidrop_drive_state", "stateset", "State of each drive.", _states(hub))
     up = "1 while a line's port is present, 0 while it is lost."
-    yield MetricFamily("multidrop_line_up", "gauge", up, _ups(hub))
+    ups = [("", {"line": line.name}, float(lost_of(hub, line.name) is None)) for line in hub.plant.lines]
+    yield MetricFamily("multidrop_line_up", "gauge", up, ups)
     yield from _line_families(statistics)
     yield from _drive_families(statistics)
 
@@ -164,19 +165,11 @@ def _states(hub: Hub) -> Iterator[Sample]:
                 yield "", labels, float(state == present)
 
 
-def _ups(hub: Hub) -> Iterator[Sample]:
-    for line in hub.plant.lines:
-        yield "", {"line": line.name}, float(lost_of(hub, line.name) is None)
-
-
 def _line_families(statistics: Mapping[str, LineStatistics]) -> Iterator[MetricFamily]:
     counters: dict[str, tuple[str, Callable[[LineStatistics], float]]] = {
         "multidrop_line_exchanges": ("Requests sent.", lambda line: line.exchanges),
         "multidrop_line_samples": ("Values received.", lambda line: line.samples),
-        "multidrop_line_used_seconds": (
-            "Line time of answered exchanges.",
-            lambda line: line.used_s,
-        ),
+        "multidrop_line_used_seconds": ("Line time of answered exchanges.", lambda line: line.used_s),
     }
     for name, (text, count) in counters.items():
         samples = [("_total", {"line": line}, count(found)) for line, found in statistics.items()]

@@ -244,7 +244,7 @@ def test_clients_can_write_exactly_the_rows_that_are_marked_writable(tmp_path: P
     with served(tmp_path, "declared") as gateway, closing(Client()) as client:
         rows = get(gateway, "/api/modbus-map")
         assert [row["name"] for row in rows if "write" in row["access"]] == [
-            *("common_stop", "setpoint", "common_stop"),
+            *("common_stop", "setpoint", "common_stop")
         ]
         known = [row for row in rows if row["function"] in (1, 3) and row["format"] != "text"]
         refused = [row for row in known if client.write(row)]

@@ -21,13 +21,7 @@ from multidrop.control import CommandResult
 from multidrop.families import InvtCHE
 from multidrop.gateway.modbus_server import clients as modbus_clients
 from multidrop.gateway.modbus_server.clients import ModbusClient, ModbusPort
-from multidrop.gateway.modbus_server.passed_requests import (
-    BURST_S,
-    EXPIRY_S,
-    MOST_WAITING,
-    SHARE,
-    LineShare,
-)
+from multidrop.gateway.modbus_server.passed_requests import BURST_S, EXPIRY_S, MOST_WAITING, SHARE, LineShare
 from multidrop.gateway.modbus_server.protocol import MbapRequest, PassingBusy, take_request
 from multidrop.gateway.modbus_server.settings import ModbusSettings
 

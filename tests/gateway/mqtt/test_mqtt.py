@@ -214,6 +214,14 @@ def test_everything_is_published_again_to_a_restarted_broker(
 # ---- commands ----
 
 
+@pytest.fixture
+def commanded(listener: Listener, start: Start) -> Any:
+    """The context of a part that is online and carries out commands."""
+    known, _ = start(commands=True)
+    listener.wait_for(has("multidrop/gateway", b"online"))
+    return known
+
+
 def told(listener: Listener, drive: str = "pump-1") -> Any:
     return json_of(listener.wait_for(has(f"multidrop/{drive}/told")))
 
@@ -223,29 +231,25 @@ def write_of(value: object, time_ms: int, **more: object) -> bytes:
 
 
 def test_a_fresh_write_is_carried_out_but_its_copy_is_not(
-    broker: Broker, listener: Listener, start: Start
+    broker: Broker, listener: Listener, commanded: Any
 ) -> None:
-    known, _ = start(commands=True)
-    listener.wait_for(has("multidrop/gateway", b"online"))
     fresh = write_of(25, now_ms(), id="order-7")
     publish(broker, "multidrop/pump-1/set/setpoint", fresh)
     assert told(listener) == {"what": "setpoint = 25", "done": True, "text": "done", "id": "order-7"}
     publish(broker, "multidrop/pump-1/set/setpoint", fresh)
     assert told(listener)["text"] == "not sent: it came a second time"
-    assert known.commands.noted == [("write", "pump-1", "setpoint", 25)]
+    assert commanded.commands.noted == [("write", "pump-1", "setpoint", 25)]
 
 
 @pytest.mark.parametrize("age_ms", [60_000, -60_000])
-def test_delayed_command_is_refused(broker: Broker, listener: Listener, start: Start, age_ms: int) -> None:
-    known, _ = start(commands=True)
-    listener.wait_for(has("multidrop/gateway", b"online"))
+def test_delayed_command_is_refused(broker: Broker, listener: Listener, commanded: Any, age_ms: int) -> None:
     sent_ms = now_ms() - age_ms
     publish(broker, "multidrop/pump-1/set/setpoint", write_of(25, sent_ms))
     assert "s ago by the clocks of sender and gateway" in told(listener)["text"]
     act = json.dumps({"verb": "start", "drive": "pump-1", "time": sent_ms}).encode()
     publish(broker, "multidrop/pump-1/act", act)
     assert "s ago by the clocks of sender and gateway" in told(listener)["text"]
-    assert known.commands.noted == []
+    assert commanded.commands.noted == []
 
 
 @pytest.mark.parametrize("topic", ["multidrop/pump-1/set/setpoint", "multidrop/pump-1/act"])
@@ -281,14 +285,12 @@ def test_a_stop_is_always_carried_out(broker: Broker, listener: Listener, start:
     ids=range(5),
 )
 def test_stop_is_carried_out_whatever_its_payload(
-    broker: Broker, listener: Listener, start: Start, topic: str, payload: bytes, stopped: list[str] | None
+    broker: Broker, listener: Listener, commanded: Any, topic: str, payload: bytes, stopped: list[str] | None
 ) -> None:
     """The payloads are too long, truncated, or not text."""
-    known, _ = start(commands=True)
-    listener.wait_for(has("multidrop/gateway", b"online"))
     publish(broker, f"multidrop/{topic}", payload)
     assert told(listener)["what"] == "stop"
-    assert known.commands.noted == [("stop", stopped)]
+    assert commanded.commands.noted == [("stop", stopped)]
 
 
 @pytest.mark.parametrize(
@@ -307,17 +309,15 @@ def test_stop_is_carried_out_whatever_its_payload(
     ),
 )
 def test_stop_verb_is_carried_out_whatever_its_age(
-    broker: Broker, listener: Listener, start: Start, verb: str, more: dict[str, Any]
+    broker: Broker, listener: Listener, commanded: Any, verb: str, more: dict[str, Any]
 ) -> None:
-    known, _ = start(commands=True)
-    listener.wait_for(has("multidrop/gateway", b"online"))
-    known.commands.stopped_at["pump-1"] = known.commands.plant_ns = boottime_ns()
+    commanded.commands.stopped_at["pump-1"] = commanded.commands.plant_ns = boottime_ns()
     for _ in range(2):
         publish(broker, "multidrop/pump-1/act", json.dumps({"verb": verb, "id": [], **more}).encode())
         answer = told(listener)
         assert COMMAND_ID.fullmatch(answer.pop("id"))  # the gateway made an id in place of the invalid one
         assert answer == {"what": verb, "done": True, "text": "done"}
-    assert known.commands.noted == [("act", "pump-1", verb, {})] * 2
+    assert commanded.commands.noted == [("act", "pump-1", verb, {})] * 2
 
 
 def test_retained_stop_verb_is_carried_out(broker: Broker, listener: Listener, start: Start) -> None:
@@ -332,16 +332,14 @@ def test_retained_stop_verb_is_carried_out(broker: Broker, listener: Listener, s
     in_turn([FAN.name, "no-such-drive", "pump-1", 7, ["pump-1"], {}, None, "", "#", "pump-1/+"], STOPS),
 )
 def test_stop_verb_stops_the_drive_of_its_topic_and_the_drive_it_names(
-    broker: Broker, listener: Listener, start: Start, verb: str, named: object
+    broker: Broker, listener: Listener, commanded: Any, verb: str, named: object
 ) -> None:
-    known, _ = start(commands=True)
-    listener.wait_for(has("multidrop/gateway", b"online"))
     publish(broker, "multidrop/pump-1/act", json.dumps({"verb": verb, "drive": named, "time": 1}).encode())
     assert told(listener)["done"]
     others = [("act", FAN.name, verb, {})] if named == FAN.name else []
     if others:
         assert told(listener, FAN.name)["done"]
-    assert known.commands.noted == [("act", "pump-1", verb, {}), *others]
+    assert commanded.commands.noted == [("act", "pump-1", verb, {}), *others]
 
 
 @pytest.mark.parametrize(
@@ -365,37 +363,31 @@ async def test_stop_verb_finds_drives_by_another_spelling(
     assert known.commands.noted == [("act", drive, "coast", {}) for drive in stopped]
 
 
-def test_unknown_verb_or_ambiguous_drive_is_refused(broker: Broker, listener: Listener, start: Start) -> None:
-    known, _ = start(commands=True)
-    listener.wait_for(has("multidrop/gateway", b"online"))
+def test_unknown_verb_or_other_drive_is_refused(broker: Broker, listener: Listener, commanded: Any) -> None:
     order = {"verb": "start", "drive": FAN.name, "time": now_ms()}
     publish(broker, "multidrop/pump-1/act", json.dumps(order).encode())
     assert f"it names drive '{FAN.name}'" in told(listener)["text"]
     publish(broker, "multidrop/pump-1/act", b'{"verb": ["coast"], "drive": "pump-1", "time": 1}')
     assert not told(listener)["done"]
-    assert known.commands.noted == []
+    assert commanded.commands.noted == []
 
 
-def test_command_older_than_a_reload_is_refused(broker: Broker, listener: Listener, start: Start) -> None:
+def test_command_older_than_a_reload_is_refused(broker: Broker, listener: Listener, commanded: Any) -> None:
     """After a reload, the name may mean another drive."""
-    known, _ = start(commands=True)
-    listener.wait_for(has("multidrop/gateway", b"online"))
     for after_ms, text in ((1900, "not sent: it may have been sent before the plant"), (2500, "done")):
         sent_ms, sent_ns = now_on_both_clocks()
-        known.commands.plant_ns = sent_ns - after_ms * 1_000_000
+        commanded.commands.plant_ns = sent_ns - after_ms * 1_000_000
         publish(broker, "multidrop/pump-1/set/setpoint", write_of(25, sent_ms))
         assert told(listener)["text"].startswith(text)
 
 
 @pytest.mark.parametrize(("after_ms", "is_taken"), [(-3000, False), (0, False), (1900, False), (2500, True)])
 def test_command_older_than_a_stop_is_refused(
-    broker: Broker, listener: Listener, start: Start, after_ms: int, is_taken: bool
+    broker: Broker, listener: Listener, commanded: Any, after_ms: int, is_taken: bool
 ) -> None:
     """A broker may deliver a delayed command after the stop. The sender's clock may be up to 2 s fast."""
-    known, _ = start(commands=True)
-    listener.wait_for(has("multidrop/gateway", b"online"))
     sent_ms, sent_ns = now_on_both_clocks()
-    known.commands.stopped_at["pump-1"] = sent_ns - after_ms * 1_000_000
+    commanded.commands.stopped_at["pump-1"] = sent_ns - after_ms * 1_000_000
     for topic, payload in (
         ("act", {"verb": "start", "drive": "pump-1", "time": sent_ms}),
         ("set/setpoint", {"value": 25, "time": sent_ms}),
@@ -407,20 +399,18 @@ def test_command_older_than_a_stop_is_refused(
     act = {"verb": "emergency_stop", "drive": "pump-1", "time": sent_ms}
     publish(broker, "multidrop/pump-1/act", json.dumps(act).encode())
     assert told(listener)["text"] == "done"
-    assert len(known.commands.noted) == (3 if is_taken else 1)
+    assert len(commanded.commands.noted) == (3 if is_taken else 1)
 
 
 def test_verb_that_does_not_name_the_drive_of_its_topic_is_refused(
-    broker: Broker, listener: Listener, start: Start
+    broker: Broker, listener: Listener, commanded: Any
 ) -> None:
-    known, _ = start(commands=True)
-    listener.wait_for(has("multidrop/gateway", b"online"))
     act = {"verb": "start", "drive": "pump-1", "options": {"direction": "forward"}, "time": now_ms()}
     publish(broker, f"multidrop/{FAN.name}/act", json.dumps(act).encode())
     assert "it names drive 'pump-1'" in told(listener, FAN.name)["text"]
     publish(broker, "multidrop/pump-1/act", json.dumps(act).encode())
     assert told(listener)["done"]
-    assert known.commands.noted == [("act", "pump-1", "start", {"direction": "forward"})]
+    assert commanded.commands.noted == [("act", "pump-1", "start", {"direction": "forward"})]
 
 
 @pytest.mark.parametrize(
@@ -438,13 +428,11 @@ def test_verb_that_does_not_name_the_drive_of_its_topic_is_refused(
     ],
 )
 def test_invalid_commands_are_reported(
-    broker: Broker, listener: Listener, start: Start, payload: bytes, why: str
+    broker: Broker, listener: Listener, commanded: Any, payload: bytes, why: str
 ) -> None:
-    known, _ = start(commands=True)
-    listener.wait_for(has("multidrop/gateway", b"online"))
     publish(broker, "multidrop/pump-1/set/setpoint", payload)
     assert why in told(listener)["text"]
-    assert known.commands.noted == []
+    assert commanded.commands.noted == []
 
 
 @pytest.mark.parametrize(("drive", "verb"), [("pump-1", "\ud800"), ("x" * 65_521, "")])

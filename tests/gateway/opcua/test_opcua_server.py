@@ -418,11 +418,7 @@ CHANNEL = '[[line.drive.channel]]\nname = "{}"\nvalue = "output_frequency / 2"\n
 @pytest.mark.parametrize(
     ("serve", "drives", "sentence"),
     [
-        (
-            'listen = "4840"',
-            (),
-            'not an address and port; write listen = "127.0.0.1:4840"',
-        ),
+        ('listen = "4840"', (), 'not an address and port; write listen = "127.0.0.1:4840"'),
         ('listen = "0.0.0.0:4840"', (), OPEN),
         ('listen = "0.0.0.0:4840"\ncertificate = "plant.toml"\nkey = "plant.toml"', (), OPEN),
         ('certificate = "cert.pem"', (), "certificate and key belong together: give both, or none"),

@@ -323,10 +323,7 @@ def test_each_view_fits_a_narrow_screen_and_has_no_english_text(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("locale", "language"),
-    [("ru-RU", "ru"), ("zh-TW", "zh"), ("de-DE", "en")],
-)
+@pytest.mark.parametrize(("locale", "language"), [("ru-RU", "ru"), ("zh-TW", "zh"), ("de-DE", "en")])
 def test_browser_chooses_the_language(opened: Opener, locale: str, language: str) -> None:
     page = opened(live=False, locale=locale)
     page.locator("#link").get_by_text(LIVE[language], exact=True).wait_for()

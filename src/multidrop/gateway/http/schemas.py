@@ -283,10 +283,7 @@ ACT: Schema = {
 COMMANDED = record("text", done=FLAG, id=ID)
 STOPPED = by_name(COMMANDED)
 FLEET_STOPPED = by_name(record("text", done=FLAG))
-ACKNOWLEDGE: Schema = {
-    **some(alarm=GIVEN, note={"type": "string", "maxLength": 500}),
-    "required": ["alarm"],
-}
+ACKNOWLEDGE: Schema = {**some(alarm=GIVEN, note={"type": "string", "maxLength": 500}), "required": ["alarm"]}
 RELOAD: Schema = record(confirm={"const": True})
 RELOADED = record("text", done=FLAG, mistakes=TEXTS, restart=TEXTS)
 TOKEN = record(token=GIVEN)

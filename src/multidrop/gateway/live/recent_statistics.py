@@ -135,10 +135,7 @@ def asked_of(statistics: Statistics) -> int:
 
 def _of_minute(statistics: Statistics) -> dict[str, Any]:
     asked = asked_of(statistics)
-    return {
-        "missed": round(1 - statistics.samples / asked, 4) if asked else None,
-        "p99": _p99(statistics),
-    }
+    return {"missed": round(1 - statistics.samples / asked, 4) if asked else None, "p99": _p99(statistics)}
 
 
 def _p99(statistics: Statistics) -> float | None:

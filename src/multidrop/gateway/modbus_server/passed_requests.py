@@ -208,12 +208,7 @@ class ClientWrites:
     """
 
     def __init__(
-        self,
-        commands: Commands,
-        role: Right,
-        way: str,
-        common: range | None,
-        standstill: Standstill,
+        self, commands: Commands, role: Right, way: str, common: range | None, standstill: Standstill
     ) -> None:
         self._commands = commands
         self._role = role

@@ -51,12 +51,7 @@ class ModbusServer:
     """
 
     def __init__(
-        self,
-        plant: Plant,
-        hub: Hub,
-        commands: Commands,
-        settings: ModbusSettings,
-        ask: Ask,
+        self, plant: Plant, hub: Hub, commands: Commands, settings: ModbusSettings, ask: Ask
     ) -> None:
         self.settings = settings
         self.ports: dict[str, int] = {}  # TCP port by line; MAIN: of the lines without a port of their own

@@ -385,13 +385,7 @@ class ToolPorts:
     """
 
     def __init__(
-        self,
-        plant: Plant,
-        hub: Hub,
-        commands: Commands,
-        settings: ToolSettings,
-        ask: Ask,
-        folder: Path,
+        self, plant: Plant, hub: Hub, commands: Commands, settings: ToolSettings, ask: Ask, folder: Path
     ) -> None:
         self.settings = settings
         self.lines: dict[str, ToolLine] = {}
@@ -400,12 +394,7 @@ class ToolPorts:
         self._folder = folder
         self._standstill = Standstill()
         self._make = partial(
-            ToolLine,
-            hub=hub,
-            commands=commands,
-            settings=settings,
-            ask=ask,
-            standstill=self._standstill,
+            ToolLine, hub=hub, commands=commands, settings=settings, ask=ask, standstill=self._standstill
         )
         self._terminals: dict[str, Terminal] = {}
         self._listeners: dict[str, socket.socket] = {}

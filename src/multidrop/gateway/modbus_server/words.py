@@ -26,11 +26,7 @@ from multidrop.core import NumberFormat
 from multidrop.drive import Carrier, Table
 from multidrop.gateway.live.hub import Hub, Newest
 
-_FLOATS = {
-    NumberFormat.F16: (">e", ">H"),
-    NumberFormat.F32: (">f", ">I"),
-    NumberFormat.F64: (">d", ">Q"),
-}
+_FLOATS = {NumberFormat.F16: (">e", ">H"), NumberFormat.F32: (">f", ">I"), NumberFormat.F64: (">d", ">Q")}
 _OPEN = frozenset({NumberFormat.I8, NumberFormat.U32_EITHER})
 MOST_KNOWN = 8192  # limit of cached values; all drives of a family share the cache
 _MOST_EXACT = 1 << 53  # a float64 represents every whole number up to this one

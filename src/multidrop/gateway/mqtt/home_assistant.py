@@ -109,10 +109,7 @@ def discovery(
 
 
 # The value of each binary sensor by the drive's state; in all other states the value is unknown.
-BINARY = {
-    "problem": {RUNS: "OFF", STANDS: "OFF", FAULT: "ON"},
-    "running": {RUNS: "ON", STANDS: "OFF"},
-}
+BINARY = {"problem": {RUNS: "OFF", STANDS: "OFF", FAULT: "ON"}, "running": {RUNS: "ON", STANDS: "OFF"}}
 
 
 def _unused(key: str, parts: Mapping[str, Any]) -> str:
