@@ -274,7 +274,6 @@ def test_a_stop_that_raises_in_the_desk_is_answered(tmp_path: Path, monkeypatch:
     with desks(tmp_path) as desk:
         monkeypatch.setattr(desk.stops._repeated, "begin", lambda *details: asyncio.run(fail()))
         answer = asyncio.run(desk.stop())
-    assert answer is not None
     assert (answer.outcome, answer.ok) == (CommandOutcome.UNKNOWN, False)
     assert "it is not known whether the stop was sent" in answer.text
 
@@ -355,7 +354,7 @@ def test_lines_with_failing_polls_are_reported(tmp_path: Path, monkeypatch: pyte
         made = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
         state = made.state()
         await made._close()
-        return json.loads(json.dumps(state))  # type: ignore[no-any-return]
+        return json.loads(json.dumps(state))
 
     state = asyncio.run(main())
     assert (state["failing"], state["troubles"]) == (["hall"], {"hall": "polling fails: Ill: of its class"})
@@ -406,5 +405,5 @@ async def test_the_error_of_an_ended_task_is_returned() -> None:
 
 async def test_closing_a_commander_ends_a_path_that_ignored_a_cancellation(tmp_path: Path) -> None:
     fleet = FleetCommands(["nats://127.0.0.1:1"], by="anna", log=tmp_path / "commands.jsonl")
-    fleet._keeping = [await _begun(1)]  # type: ignore[list-item]
+    fleet._keeping = [await _begun(1)]
     await asyncio.wait_for(fleet.close(), PATIENCE_S)

@@ -260,7 +260,6 @@ async def test_an_interrupted_stop_reports_that_its_outcome_is_unknown(
 
         async def stop(self, *what: object, **more: object) -> None:
             task = asyncio.current_task()
-            assert task is not None
             task.cancel()  # as on Ctrl-C
             await asyncio.sleep(60)
 
@@ -364,7 +363,6 @@ def started() -> Iterator[tuple[subprocess.Popen[str], str]]:
 @pytest.mark.long
 def test_the_demo_shows_a_takeover() -> None:
     with started() as (demo, folder):
-        assert demo.stdout is not None
         said = demo.stdout.read()
         assert demo.wait() == 0, said
     for word in ("gw-2 is KILLED, the master of ", "the others are masters of its lines now", "again"):
@@ -388,7 +386,7 @@ def test_the_demo_removes_processes_and_files_however_it_ends(number: signal.Sig
 def test_on_a_terminal_the_demo_draws_and_after_ctrl_c_prints_its_notes() -> None:
     with on_terminal("fleet", "demo", size=(110, 30)) as terminal:
         terminal.wait_for_match(r"in (/\S+)\r")
-        folder = re.search(r"in (/\S+)\r", terminal.text)[1]  # type: ignore[index]
+        folder = re.search(r"in (/\S+)\r", terminal.text)[1]
         terminal.wait_for("GATEWAY  HOST")
         terminal.wait_for("every line has a master")
         terminal.process.send_signal(signal.SIGINT)

@@ -241,7 +241,7 @@ async def test_after_a_failed_read_the_last_view_is_shown_with_its_age(
         if len(shown) == 3:
             over.set()
 
-    await views.follow(FleetWatch(FailingView()), show, over)  # type: ignore[arg-type]
+    await views.follow(FleetWatch(FailingView()), show, over)
     assert [one["trouble"] for one in shown] == [None, "no server", "no server"]
     assert shown[0]["age_s"] < shown[1]["age_s"] < shown[2]["age_s"]
 
@@ -250,7 +250,7 @@ async def test_watch_ends_when_the_task_of_its_connection_ends(monkeypatch: pyte
     """Otherwise `fleet watch` would show the last view forever."""
     monkeypatch.setattr(views, "EVERY_S", 0.01)
     supervisor().keep("path", asyncio.sleep(0)).cancel()
-    watch: Any = FleetWatch(FailingView())  # type: ignore[arg-type]
+    watch: Any = FleetWatch(FailingView())
     with pytest.raises(Ended, match="path has ended: it was cancelled"):
         await views.follow(watch, lambda told: None, asyncio.Event())
 

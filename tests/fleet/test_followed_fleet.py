@@ -84,7 +84,6 @@ def test_an_ok_row_without_a_value_is_not_shown_as_0(monkeypatch: pytest.MonkeyP
     empty = table.set_column(at, table.schema.field("value"), pa.nulls(len(table), pa.float64()))
     monkeypatch.setattr(followed, "unpack", lambda data: empty)
     found = reader_by(Clocks(1.0)).rows([message(0)])
-    assert found is not None
     columns = found.columns()
     assert {columns.statuses[code] for code in columns.status} == {"no valid value"}
     assert not any(columns.valid)
@@ -104,7 +103,6 @@ def test_a_gateway_that_sends_endless_names_and_statuses_does_not_end_the_view(
     monkeypatch.setattr(followed, "unpack", lambda data: hostile)
     reader.known = {("pump", register) for register in registers}
     found = reader.rows([message(0)])
-    assert found is not None
     columns = found.columns()
     assert (len(columns.registers), columns.registers[-1], max(columns.register)) == (6, "", 5)
     assert (len(columns.statuses), columns.statuses[-1], max(columns.status)) == (4, "other", 3)
@@ -113,7 +111,6 @@ def test_a_gateway_that_sends_endless_names_and_statuses_does_not_end_the_view(
 def test_the_newest_row_of_each_register_gets_this_computers_monotonic_time() -> None:
     reader = reader_by(Clocks(1.0))
     found = reader.rows([message(0)])
-    assert found is not None
     columns = found.columns()
     assert len(columns.time) == 4 * 10  # four drives with ten registers each
     assert len(columns.valid) == 5
@@ -132,7 +129,6 @@ def test_rows_of_a_former_master_do_not_replace_newer_rows() -> None:
     assert reader.rows([message(8, "gw-2")]) is not None
     assert reader.rows([message(0, "gw-1")]) is None
     codes = reader.rows([message(16, "gw-2")])
-    assert codes is not None
     assert codes.columns().statuses[0] == "ok"
 
 
@@ -165,7 +161,6 @@ def test_wrong_clocks_are_reported_and_never_make_rows_newer_than_now(
     found = source._reader.rows([message(0)])
     source.close()
     monkeypatch.setattr(followed.time, "time_ns", lambda: clocks()[1])
-    assert found is not None
     assert max(found.columns().monotonic_ns) <= clocks()[0]
     assert source.health() == sentence
     clocks.utc_s += 7.0
@@ -401,16 +396,16 @@ def lease(session: int, *, ended: bool = False) -> dict[str, Any]:
 
 def view(answers: dict[str, Any] | None = None) -> FleetView:
     """Return a view of five lines and three gateways, of which gw-3 has ended."""
-    made = FleetView(Answering(answers or {}))  # type: ignore[arg-type]
+    made = FleetView(Answering(answers or {}))
     records, leases = made._records, [MemoryBucket(name) for name in names.LEASES]
     for follower, bucket in zip(records.observer.paths, leases, strict=True):
-        follower.bucket = bucket  # type: ignore[assignment]
+        follower.bucket = bucket
         for gateway, found in (("gw-1", lease(2)), ("gw-2", lease(1)), ("gw-3", lease(4, ended=True))):
             bucket.store(gateway, found)
-    plant = records.plant.bucket = MemoryBucket(names.PLANT)  # type: ignore[assignment]
+    plant = records.plant.bucket = MemoryBucket(names.PLANT)
     owners = {name: MemoryBucket(name) for name in names.OWNERS}
     for name, bucket in owners.items():
-        records.owners[name].bucket = bucket  # type: ignore[assignment]
+        records.owners[name].bucket = bucket
     owned = {"line-1": ("gw-1", 2), "line-2": ("gw-1", 1), "line-3": ("gw-3", 4), "line-4": ("", 0)}
     for number in range(1, 6):
         line = f"line-{number}"
@@ -448,7 +443,7 @@ def test_a_silent_gateway_is_shown_without_a_state() -> None:
     assert found["gateways"]["gw-1"]["says"] == STATE
     assert found["gateways"]["gw-2"]["says"] is None
     assert [move["from"] for move in found["moves"] if move["line"] == "line-1"] == ["gw-9"]
-    made._path.answers.clear()  # type: ignore[attr-defined]
+    made._path.answers.clear()
     assert looked(made)["gateways"]["gw-1"]["says"] is None  # the gateway's earlier answer is no longer shown
 
 
@@ -474,7 +469,7 @@ def test_a_gateway_whose_session_others_ended_is_missing() -> None:
     for at, follower in enumerate(made._records.observer.paths):
         for name, (record, _) in died.items():
             if name != "gw-9" or at == 0:
-                follower.bucket.store(name, record)  # type: ignore[attr-defined]
+                follower.bucket.store(name, record)
     asyncio.run(made.look())
     clock.pass_s(60)  # the view accepts an end that another gateway wrote once the lease has expired
     found = looked(made)["missing"]
@@ -482,7 +477,7 @@ def test_a_gateway_whose_session_others_ended_is_missing() -> None:
     assert found["gw-4"] == {"host": "pc", "session": 2, "seen_ms": now_ms - 60_000}
     assert found["gw-8"]["seen_ms"] is None
     for follower in made._records.observer.paths[:2]:
-        follower.bucket.store("gw-4", lease(3))  # type: ignore[attr-defined]
+        follower.bucket.store("gw-4", lease(3))
     found = looked(made)
     assert "gw-4" not in found["missing"]
     assert found["gateways"]["gw-4"]["session"] == 3
@@ -490,7 +485,7 @@ def test_a_gateway_whose_session_others_ended_is_missing() -> None:
 
 def test_without_a_connection_the_error_names_the_servers() -> None:
     made = view()
-    made._path.is_open = False  # type: ignore[misc]
+    made._path.is_open = False
     with pytest.raises(FleetError, match="no NATS server can be reached at nats://a:4222"):
         looked(made)
 
@@ -502,8 +497,8 @@ def test_a_gateways_silence_counts_from_the_time_when_two_paths_were_renewed() -
     observer._clock = lambda: now[0]
     looked(made)
     now[0] += 2 * 10**9
-    observer.paths[0].bucket.store("gw-1", lease(2))  # type: ignore[attr-defined]
+    observer.paths[0].bucket.store("gw-1", lease(2))
     found = looked(made)  # a renewal on only one of three paths is not enough
     assert found["gateways"]["gw-1"]["unseen_s"] == 2.0
-    observer.paths[1].bucket.store("gw-1", lease(2))  # type: ignore[attr-defined]
+    observer.paths[1].bucket.store("gw-1", lease(2))
     assert looked(made)["gateways"]["gw-1"]["unseen_s"] == 0.0

@@ -199,7 +199,6 @@ def test_kills_at_any_moment_lose_no_reported_row(folder: Path, kills: int, long
         words = [sys.executable, spooled.__file__, str(folder), str(run * 1_000_000)]
         here = {**os.environ, "PYTHONPATH": support}
         with BoundProcess(words, stdout=subprocess.PIPE, text=True, env=here) as child:
-            assert child.stdout is not None
             child.stdout.readline()
             least = int(child.stdout.readline())  # the second report: more than 0 rows are on the disk
             time.sleep(dice.uniform(0, longest_s))
@@ -393,5 +392,4 @@ def test_a_stored_batch_is_read_back_unchanged(spool: Spool, folder: Path) -> No
     assert spool.sync(30.0)
     wanted = [(*row[:2], row[2] and -(-row[2] // 1000) * 1000, *row[3:], None) for row in batch]
     stored = spool.following(0)
-    assert stored is not None
     assert rows_of(unpack(stored.path.read_bytes())) == sorted(wanted, key=lambda row: (row[0], row[3:5]))

@@ -62,7 +62,6 @@ class OnNats:
     async def _settled(self) -> None:
         await asyncio.gather(*supervisor().started)
         for path in self.paths:
-            assert path._client is not None
             await path._client.flush()
 
     async def die(self) -> None:

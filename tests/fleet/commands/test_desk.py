@@ -103,7 +103,6 @@ def do_after(desk: Desks, deed: Callable[[], object], waited_s: float = 0.0) -> 
     """Let `waited_s` pass, then carry out an offer; its thread calls `deed` before it sends the command."""
     token = desk.offered()
     offer = desk.desk.offers.find(token)
-    assert offer is not None
     work = offer.prepared.work
 
     def late() -> CommandAnswer:
@@ -221,9 +220,7 @@ def test_a_command_waits_for_the_guard_and_a_stop_does_not(desk: Desks) -> None:
     """A new master accepts only stops until the guard time has passed."""
     desk.is_guarded = True
     assert desk.ask(register=SETPOINT, value=20.0) is None
-    stopped = asyncio.run(desk.stop())
-    assert stopped is not None
-    assert stopped.outcome is DONE
+    assert asyncio.run(desk.stop()).outcome is DONE
     assert desk.written == {"control"}
 
 
@@ -248,9 +245,7 @@ def test_without_a_permission_list_only_stops_are_carried_out(tmp_path: Path) ->
             assert answer.outcome is REFUSED
             assert "is not in the plant's list" in answer.text
         assert desk.writes == []
-        stopped = asyncio.run(desk.stop())
-        assert stopped is not None
-        assert stopped.outcome is DONE
+        assert asyncio.run(desk.stop()).outcome is DONE
         assert desk.written == {"control"}
 
 
@@ -270,7 +265,6 @@ def test_a_start_runs_the_motor_and_a_stop_stops_it(desk: Desks) -> None:
         found = [(await desk.do(desk.offered(20.0))).outcome]
         found.append((await desk.do(desk.offered(verb="start", options={"direction": "forward"}))).outcome)
         stopped = await desk.stop(drives=None)
-        assert stopped is not None
         return [*found, stopped.outcome]
 
     assert asyncio.run(main()) == [DONE, DONE, DONE]
@@ -288,7 +282,6 @@ def test_a_long_stop_reports_its_progress(desk: Desks) -> None:
     async def main() -> CommandAnswer:
         while True:
             answer = await desk.stops.stop(LINE, data)
-            assert answer is not None
             if answer.outcome is not CommandOutcome.UNDER_WAY:
                 return answer
             if answer.text.startswith(sentence):
@@ -322,9 +315,7 @@ def test_a_gateway_that_loses_the_line_does_not_answer_its_stop(
         assert asyncio.run(desk.stop(**same)) is None
     desk.is_master = True
     desk.take()
-    again = asyncio.run(desk.stop(**same))
-    assert again is not None
-    assert again.outcome is DONE
+    assert asyncio.run(desk.stop(**same)).outcome is DONE
     assert desk.written == {"control"}
 
 
@@ -356,9 +347,7 @@ def test_a_full_disk_blocks_commands_but_not_stops(desk: Desks) -> None:
     assert answer.outcome is NOT_SENT
     assert "the log of commands cannot be written" in answer.text
     assert desk.writes == []
-    stopped = asyncio.run(desk.stop())
-    assert stopped is not None
-    assert stopped.outcome is DONE
+    assert asyncio.run(desk.stop()).outcome is DONE
 
 
 @patient
@@ -482,7 +471,6 @@ def test_a_malformed_stop_is_carried_out(
     # A repeated request without an id would be a new stop.
     monkeypatch.setattr(desk_module, "HOLD_S", PATIENCE_S)
     answer = asyncio.run(desk.stop_by(data))
-    assert answer is not None
     assert answer.drives["pump"].outcome is DONE
     assert desk.written == {"control"}
     assert all(record.getMessage().isprintable() for record in caplog.records)
@@ -516,7 +504,6 @@ def test_a_request_with_another_id_is_a_new_stop(
 @patient
 def test_a_stop_with_an_unknown_drive_stops_the_others(desk: Desks) -> None:
     answer = asyncio.run(desk.stop(drives=["pump", "fan"]))
-    assert answer is not None
     assert answer.outcome is REFUSED
     assert {name: one.outcome for name, one in answer.drives.items()} == {"pump": DONE, "fan": REFUSED}
 
@@ -530,7 +517,6 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_p
         assert isinstance(told, CommandAnswer)
         assert told.outcome is REFUSED
         answer = asyncio.run(desk.stop(drives=[spelt, fan]))
-        assert answer is not None
         assert {name: one.outcome for name, one in answer.drives.items()} == {fan: DONE}
         assert desk.writes == [("control", 0xC000)]
 
@@ -605,7 +591,6 @@ async def test_a_killed_log_thread_blocks_commands_but_not_stops(tmp_path: Path)
         assert answer.text.endswith("commands.jsonl: RuntimeError: SystemExit: killed")
         assert desk.writes == []
         stopped = await desk.stop()
-        assert stopped is not None
         assert stopped.ok
         assert desk.written == {"control"}
 
@@ -656,7 +641,7 @@ def test_only_one_of_many_stops_of_a_silent_drive_is_repeated(
         desk.sim.deaf_until = inf
         called = [asyncio.create_task(desk.stop())]
         async with asyncio.timeout(PATIENCE):
-            while not desk.lines.for_stop(LINE).bus.stops_under_way():  # type: ignore[union-attr]
+            while not desk.lines.for_stop(LINE).bus.stops_under_way():
                 await asyncio.sleep(0.002)
             called += [asyncio.create_task(desk.stop()) for _ in range(8)]
             while len(desk.stops._repeated._tasks) < 8:

@@ -91,8 +91,8 @@ def asked(
 
     async def main() -> CommandAnswer:
         asker = FleetCommands(["nats://nobody"], by="anna", log=folder / "asked.jsonl")
-        asker._paths = [path]  # type: ignore[list-item]
-        asker._plant = plant or Plant()  # type: ignore[assignment]
+        asker._paths = [path]
+        asker._plant = plant or Plant()
         try:
             return await what(asker)
         finally:
@@ -258,7 +258,7 @@ def test_a_stop_does_not_wait_for_a_hanging_path(tmp_path: Path) -> None:
     hanging, path = HangingPath(), ScriptedPath(stop=[IT_IS_DONE])
 
     async def stop_on_both(asker: FleetCommands) -> CommandAnswer:
-        asker._paths = [hanging, path]  # type: ignore[list-item]
+        asker._paths = [hanging, path]
         return await asyncio.wait_for(asker.stop(["pump-1"]), 60)
 
     assert asked(tmp_path, path, stop_on_both).outcome is DONE
@@ -270,7 +270,7 @@ def test_a_stop_is_unsent_only_if_every_path_reports_it(tmp_path: Path, others: 
     paths = [ScriptedPath(stop=[given]) for given in (NOBODY, *others)]
 
     async def stop_on_all(asker: FleetCommands) -> CommandAnswer:
-        asker._paths = paths  # type: ignore[assignment]
+        asker._paths = paths
         return await asker.stop(["pump-1"])
 
     told = asked(tmp_path, paths[0], stop_on_all)

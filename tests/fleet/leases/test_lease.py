@@ -480,7 +480,7 @@ async def test_ending_a_dead_session_does_not_wait_for_a_path_without_a_leader(h
         await asyncio.Event().wait()
         return 0
 
-    trial.buckets[0].put = give_no_answer  # type: ignore[method-assign]
+    trial.buckets[0].put = give_no_answer
     if has_rival:
         trial.buckets[1].store("a", {**trial.values()[1], "ended": True, "by": "c"})
     assert await asyncio.wait_for(observer.end_the_dead(), 10)

@@ -89,7 +89,7 @@ class Gateways:
     async def die(self, name: str) -> None:
         """End the gateway as SIGKILL would: its sockets are closed without further bytes."""
         member, task = self.members.pop(name), self.tasks.pop(name)
-        member._leave = _do_nothing  # type: ignore[method-assign]
+        member._leave = _do_nothing
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
         for path in member.paths:
@@ -184,8 +184,8 @@ class Ports:
     def __init__(self, member: Member) -> None:
         self.is_cut = False
         self._take = member.keeper.lines.take
-        member.keeper.lines.take = self.take  # type: ignore[method-assign]
-        member.keeper.lines.port_loss = self.loss  # type: ignore[method-assign]
+        member.keeper.lines.take = self.take
+        member.keeper.lines.port_loss = self.loss
 
     def loss(self, line: str) -> PortLoss | None:
         return PortLoss(f"{line}: No route to host", None) if self.is_cut else None
@@ -499,7 +499,7 @@ def steps(wake: Callable[[Member], object]) -> list[float]:
         async def step() -> None:
             taken.append(round(loop.time() - 1000.0, 3))
 
-        member.step = step  # type: ignore[method-assign]
+        member.step = step
         living = asyncio.create_task(member._live())
         loop.call_later(0.06, wake, member)
         await asyncio.sleep(0.12)
@@ -549,7 +549,7 @@ def test_a_gateway_with_an_expiring_lease_ends_no_other_session(left_s: float, e
             asked.append(present)
             return False
 
-        member.records.observer.end_the_dead = note  # type: ignore[method-assign, assignment]
+        member.records.observer.end_the_dead = note
         member.lease.until = clock.now + round(left_s * SECOND)
         await member.step()
         return bool(asked)

@@ -83,8 +83,8 @@ async def settled(subjects: CommandSubjects) -> None:
 
 async def test_a_closing_line_answers_its_stops_until_it_is_closed(desk: Desks) -> None:
     path, lines = HeardPath(), SlowLines()
-    subjects = CommandSubjects("gw-1", [path], desk.lines, desk.log)  # type: ignore[list-item]
-    commanded = CommandedLines(lines, subjects)  # type: ignore[arg-type]
+    subjects = CommandSubjects("gw-1", [path], desk.lines, desk.log)
+    commanded = CommandedLines(lines, subjects)
     await commanded.take(LINE, {"may": MAY})
     await settled(subjects)
     offered = desk.offered()
@@ -110,7 +110,7 @@ async def test_a_stop_is_answered_only_on_an_inbox(desk: Desks) -> None:
     answered: list[str] = []
 
     path = HeardPath()
-    subjects = CommandSubjects("gw-1", [path], desk.lines, desk.log)  # type: ignore[list-item]
+    subjects = CommandSubjects("gw-1", [path], desk.lines, desk.log)
     subjects.open(LINE, {"may": MAY})
     await settled(subjects)
     for number, reply in enumerate(("$KV.plant.line-1", "", "_INBOX_UABC.1")):
@@ -137,13 +137,12 @@ async def test_closing_a_line_waits_for_its_command_if_the_lease_leaves_time(
     monkeypatch.setattr(command_desk, "AWAITED_S", PATIENCE_S)
     lines = SlowLines()
     lines.closes.set()
-    subjects = CommandSubjects("gw-1", [HeardPath()], desk.lines, desk.log)  # type: ignore[list-item]
+    subjects = CommandSubjects("gw-1", [HeardPath()], desk.lines, desk.log)
     subjects.desk = desk.desk
-    commanded = CommandedLines(lines, subjects, lambda: may_wait)  # type: ignore[arg-type]
+    commanded = CommandedLines(lines, subjects, lambda: may_wait)
     await commanded.take(LINE, {"may": MAY})
     first, second = desk.offered(20.0), desk.offered(30.0)
     offer = desk.desk.offers.find(first)
-    assert offer is not None
     work = offer.prepared.work
 
     def held_up() -> CommandAnswer:
@@ -187,8 +186,8 @@ async def test_a_stop_on_a_closed_line_is_left_to_the_next_master(
     """If this gateway refused the stop, the sender would ask no other gateway."""
 
     lines = ClosedLines(desk.bus.close)
-    subjects = CommandSubjects("gw-1", [HeardPath()], desk.lines, desk.log)  # type: ignore[list-item]
-    commanded = CommandedLines(lines, subjects)  # type: ignore[arg-type]
+    subjects = CommandSubjects("gw-1", [HeardPath()], desk.lines, desk.log)
+    commanded = CommandedLines(lines, subjects)
     await commanded.take(LINE, {"may": MAY})
     going = asyncio.create_task(commanded.let_go(LINE))
     await lines.are_closed.wait()
@@ -361,7 +360,7 @@ def test_late_answers_have_a_row_marked_as_late(tmp_path: Path, gateways: list[G
         for delay in (0.02, 0.45, 0.02, 0.9, 0.02):
             drives[0].response_delay = delay
             begun = drives[0].answers
-            until(lambda begun=begun: drives[0].answers >= begun + 3)  # type: ignore[misc]
+            until(lambda begun=begun: drives[0].answers >= begun + 3)
         judged = judge(drives, gateways)
     assert [(one.lost, one.doubled) for one in judged] == [(0, 0), (0, 0)]
     assert judged[0].late > 0

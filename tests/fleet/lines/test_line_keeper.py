@@ -386,7 +386,7 @@ async def test_a_late_answer_does_not_undo_a_release() -> None:
     trial = Trial()
     await trial.read_and_begin()
     bucket = trial.buckets[0] = GatedBucket(trial.buckets[0].name, answers=True)
-    trial.records.owners[bucket.name].bucket = bucket  # type: ignore[assignment]
+    trial.records.owners[bucket.name].bucket = bucket
     bucket.shut()
     trial.claim_now()
     await asyncio.wait_for(bucket.arrived.wait(), 10)
@@ -426,7 +426,7 @@ async def test_a_line_that_cannot_be_closed_ends_the_gateway() -> None:
     async def fail(line: str) -> None:
         raise RuntimeError("the port is stuck")
 
-    trial.lines.let_go = fail  # type: ignore[method-assign]
+    trial.lines.let_go = fail
     failing = asyncio.create_task(trial.keeper.fail())
     with pytest.raises(RuntimeError, match="the port is stuck"):
         await asyncio.wait_for(trial.keeper.let_all_go(), 10)
@@ -445,7 +445,7 @@ async def test_a_failure_on_one_line_affects_only_that_line(caplog: pytest.LogCa
             raise failures.pop()
         await take(line, description)
 
-    trial.lines.take = fail  # type: ignore[method-assign]
+    trial.lines.take = fail
     await trial.read_and_begin()
     trial.claim_now()
     await until(lambda: bool(trial.keeper.troubles))
@@ -544,6 +544,6 @@ async def test_a_lost_port_is_reported_before_a_slow_reopening_fails(
     trial = await claimed()
     await until(lambda: "hall" in trial.keeper.polled)
     await until(lambda: not trial.keeper._at_work)
-    trial.lines.port_loss = lambda line: loss  # type: ignore[method-assign]
+    trial.lines.port_loss = lambda line: loss
     trial.keeper._look_at_ports()
     assert trial.keeper.lost.get("hall") == reported

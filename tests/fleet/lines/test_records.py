@@ -199,7 +199,7 @@ def test_lines_read_before_a_failure_stay_known(monkeypatch: pytest.MonkeyPatch)
     path: Any = None
     records = ShareRecords("a", lambda: path, USUAL, lambda: None, is_mine)
     bucket = MemoryBucket(names.PLANT)
-    records.plant.bucket = bucket  # type: ignore[assignment]
+    records.plant.bucket = bucket
     for name in ("line-1", "line-2"):
         bucket.store(name, {"line": {"name": name}, "files": {}})
     changes = bucket.changes
@@ -209,7 +209,7 @@ def test_lines_read_before_a_failure_stay_known(monkeypatch: pytest.MonkeyPatch)
             raise OutcomeUnknown("no answer")
         return await changes(after)
 
-    bucket.changes = fail_at_the_end  # type: ignore[method-assign]
+    bucket.changes = fail_at_the_end
     with pytest.raises(OutcomeUnknown):
         asyncio.run(records._look_at_plant())
     assert records.lines() == ("line-1", "line-2")

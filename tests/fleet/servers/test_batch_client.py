@@ -197,7 +197,7 @@ async def test_reads_on_a_cut_off_path_are_repeated_on_the_others(one: Cluster) 
     _rested(paths[0])
     deaf = paths[0]._client
     assert deaf
-    deaf.batch = swallow  # type: ignore[method-assign]
+    deaf.batch = swallow
     bucket = Bucket("plant", lambda: paths[0])
     assert await asyncio.wait_for(bucket.changes(0), 60) == []
     assert asked
@@ -210,7 +210,7 @@ async def test_a_late_answer_is_not_taken_for_another_request(one: Cluster) -> N
     asked: asyncio.Queue[str] = asyncio.Queue()
 
     async def keep(message: object) -> None:
-        asked.put_nowait(message.reply)  # type: ignore[attr-defined]
+        asked.put_nowait(message.reply)
 
     await other.subscribe("slow", cb=keep)
     await other.flush()  # may return before the server has the subscription; the second cannot

@@ -164,7 +164,7 @@ def test_clocks_an_hour_apart_are_logged_and_harmless(tmp_path: Path) -> None:
         until(are_two, "both")
         for name in ("gw-b", "gw-a"):
             fleet.kill(name)
-            until(lambda name=name: name not in fleet.status()["gateways"], "its end")  # type: ignore[misc]
+            until(lambda name=name: name not in fleet.status()["gateways"], "its end")
             fleet.wait_for_polling()
             if name == "gw-b":
                 fleet.start(name)
