@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 from commands import MULTIDROP, Run
 from examples import usually
+from fleets import plant_text
 from free_ports import free_ports
 from kills import BoundProcess
 from lines import PATIENCE, until
@@ -30,21 +31,10 @@ from multidrop.cli.fleet.demo import Stage, plant_file
 from multidrop.control import eeprom_ledger
 from multidrop.plant.loader import load_plant
 
-LINE = """
-[[line]]
-name = "{name}"
-port = "{port}"
-[[line.drive]]
-name = "pump-{name}"
-model = "{model}"
-address = 1
-poll = ["output_current"]
-"""
 
-
-def plant(folder: Path, name: str = "hall-1", port: str = "", model: str = "innovert-ibd") -> Path:
+def plant(folder: Path, **details: str) -> Path:
     path = folder / "plant.toml"
-    path.write_text(LINE.format(name=name, port=port or "socket://127.0.0.1:4001", model=model))
+    path.write_text(plant_text(**details))
     return path
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import nats_clusters
 import pytest
 from commands import Run
+from fleets import plant_text
 from free_ports import free_ports
 from nats_clusters import Cluster, cluster
 from peers import require_module
@@ -385,16 +386,6 @@ async def test_the_hub_compacts_files_while_it_reads_the_stream(
 
 
 MESSAGE = 500_000  # bytes
-PLANT = """
-[[line]]
-name = "hall-1"
-port = "socket://127.0.0.1:4001"
-[[line.drive]]
-name = "pump-1"
-model = "innovert-ibd"
-address = 1
-poll = ["output_current"]
-"""
 
 
 @pytest.fixture
@@ -424,7 +415,7 @@ def test_a_stream_that_is_full_leaves_room_for_records(run: Run, tmp_path: Path)
         status, out, _ = run(*words)
         assert (status, json.loads(out)["samples_bytes"]) == (0, 8_000_000)
         with_path(one, fill)
-        (tmp_path / "plant.toml").write_text(PLANT)
+        (tmp_path / "plant.toml").write_text(plant_text())
         status, out, _ = run(*words, tmp_path / "plant.toml")
         assert (status, json.loads(out)["lines"]["new"]) == (0, 1)
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from commands import Run
+from fleets import plant_text
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats_clusters import cluster
@@ -49,22 +50,12 @@ from multidrop.fleet.servers.rights import OTHERS, rights_of
 from multidrop.fleet.servers.setup import set_up
 from multidrop.samples.spool import Spool
 
-LINE = """
-[[line]]
-name = "hall-1"
-port = "socket://127.0.0.1:4001"
-[[line.drive]]
-name = "pump-1"
-model = "innovert-ibd"
-address = 1
-"""
-
 
 @pytest.fixture(scope="module")
 def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecuredCluster]:
     """Yield one server with a fleet's buckets and rights."""
     folder = tmp_path_factory.mktemp("nats")
-    (folder / "plant.toml").write_text(LINE)
+    (folder / "plant.toml").write_text(plant_text())
     with secured_cluster(folder, 1) as running:
         made = multidrop(running, "operator", "fleet", "init", str(folder / "plant.toml"))
         assert made.returncode == 0, made.stderr

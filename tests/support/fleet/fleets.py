@@ -26,6 +26,16 @@ from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 from multidrop.supervisor import supervisor
 
 
+def plant_text(
+    name: str = "hall-1", port: str = "socket://127.0.0.1:4001", model: str = "innovert-ibd"
+) -> str:
+    """Return a plant file with one line, whose drive is polled."""
+    return (
+        f'[[line]]\nname = "{name}"\nport = "{port}"\n'
+        f'[[line.drive]]\nname = "pump-{name}"\nmodel = "{model}"\naddress = 1\npoll = ["output_current"]\n'
+    )
+
+
 class HandClock:
     """A clock in ns that the test sets."""
 
