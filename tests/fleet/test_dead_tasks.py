@@ -25,12 +25,13 @@ from toy import Toy
 import multidrop.fleet
 from multidrop import Poller, PollingFailed
 from multidrop.cli.fleet.views import count_sentence, failing_lines
+from multidrop.control import CommandOutcome
 from multidrop.core import Mastership
 from multidrop.fleet import gateway as fleet_gateway
 from multidrop.fleet import metrics
 from multidrop.fleet.commands.desk import CommandSubjects
 from multidrop.fleet.commands.fleet_commands import FleetCommands
-from multidrop.fleet.commands.messages import CommandLog, CommandOutcome
+from multidrop.fleet.commands.messages import CommandLog
 from multidrop.fleet.gateway import CommandedLines, FleetGateway, FleetLines
 from multidrop.fleet.samples import forwarder as forwarder_module
 from multidrop.fleet.samples import parquet_sink

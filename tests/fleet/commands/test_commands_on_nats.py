@@ -18,10 +18,11 @@ from nats.errors import TimeoutError as NatsTimeout
 from nats_clusters import Cluster
 from secured_clusters import GATEWAYS, SecuredCluster, secured_cluster
 
+from multidrop.control import CommandOutcome
 from multidrop.fleet.commands import fleet_commands
 from multidrop.fleet.commands.desk import CommandSubjects
 from multidrop.fleet.commands.fleet_commands import FleetCommands
-from multidrop.fleet.commands.messages import CommandOutcome, Offered
+from multidrop.fleet.commands.messages import Offered
 from multidrop.fleet.errors import NobodyThere, OutcomeUnknown
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Bucket

@@ -24,14 +24,13 @@ from lines import PATIENCE, patient
 from tables import table
 
 from multidrop import InvtCHE, Stopped
-from multidrop.control import Seen, read_audit, records
+from multidrop.control import CommandOutcome, Seen, read_audit, records
 from multidrop.control.commands import RepeatedStops, Results, begin_stops, stop_drive, stop_line
 from multidrop.fleet.commands import desk as desk_module
 from multidrop.fleet.commands.desk import MOST_WRITES
 from multidrop.fleet.commands.messages import (
     CommandAnswer,
     CommandLog,
-    CommandOutcome,
     CommandRequest,
     Offered,
     read_answer,

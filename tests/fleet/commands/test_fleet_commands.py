@@ -13,10 +13,10 @@ from unittest.mock import patch
 import pytest
 from tables import table
 
-from multidrop.control import read_audit
+from multidrop.control import CommandOutcome, read_audit
 from multidrop.fleet.commands import fleet_commands as asker_module
 from multidrop.fleet.commands.fleet_commands import FleetCommands
-from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome
+from multidrop.fleet.commands.messages import CommandAnswer
 from multidrop.fleet.errors import FleetError, MayNotSend, NobodyThere, NotDelivered, OutcomeUnknown
 from multidrop.fleet.servers.buckets import Record
 

@@ -18,11 +18,12 @@ from fleets import LINE, MAY, PATIENCE_S, Desks
 from lines import until
 from tables import table
 
+from multidrop.control import CommandOutcome
 from multidrop.core import UNASKED, Mastership
 from multidrop.families import InnovertIBD
 from multidrop.fleet.commands import desk as command_desk
 from multidrop.fleet.commands.desk import CommandSubjects
-from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome
+from multidrop.fleet.commands.messages import CommandAnswer
 from multidrop.fleet.gateway import CommandedLines
 from multidrop.fleet.servers import names
 from multidrop.plant.loader import load_plant

@@ -21,9 +21,9 @@ from fleet_drills import GATEWAYS, PATIENCE_S, FleetProcesses
 from nats_clusters import Cluster, cluster
 
 from multidrop import YD1000
-from multidrop.control import read_audit
+from multidrop.control import CommandOutcome, read_audit
 from multidrop.fleet.commands.fleet_commands import FleetCommands
-from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome, Offered
+from multidrop.fleet.commands.messages import CommandAnswer, Offered
 from multidrop.fleet.errors import FleetError
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 

@@ -14,9 +14,9 @@ from unittest.mock import patch
 from motors import quick
 
 from multidrop import Bus
-from multidrop.control import commands, read_audit, written_before
+from multidrop.control import CommandOutcome, commands, read_audit, written_before
 from multidrop.fleet.commands.desk import CommandDesk, StopDesk
-from multidrop.fleet.commands.messages import CommandAnswer, CommandLog, CommandOutcome, Offered
+from multidrop.fleet.commands.messages import CommandAnswer, CommandLog, Offered
 from multidrop.fleet.commands.offers import HeldLines
 from multidrop.fleet.errors import Conflict, OutcomeUnknown
 from multidrop.fleet.leases.rules import SECOND

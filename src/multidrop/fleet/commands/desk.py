@@ -29,12 +29,11 @@ from typing import Any
 from nats.aio.msg import Msg
 
 from multidrop import Unsupported
-from multidrop.control import CommandResult, written_by
+from multidrop.control import CommandOutcome, CommandResult, written_by
 from multidrop.control.commands import LineStop, RepeatedStops, begin_command, stop_line
 from multidrop.fleet.commands.messages import (
     CommandAnswer,
     CommandLog,
-    CommandOutcome,
     CommandRequest,
     Offered,
     StopRequest,

@@ -10,11 +10,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+from multidrop.control import CommandOutcome
 from multidrop.fleet.commands.messages import (
     UNNAMED,
     CommandAnswer,
     CommandLog,
-    CommandOutcome,
     CommandRequest,
     Offered,
     StopRequest,

@@ -11,8 +11,7 @@ from pathlib import Path
 from sys import float_info
 from typing import Any, NamedTuple
 
-from multidrop.control import AuditLog, CommandResult, with_name
-from multidrop.control import CommandOutcome as CommandOutcome
+from multidrop.control import AuditLog, CommandOutcome, CommandResult, with_name
 from multidrop.printable import is_number
 from multidrop.supervisor import supervisor
 

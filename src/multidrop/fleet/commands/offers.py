@@ -15,10 +15,10 @@ from itertools import count
 from typing import Any, NamedTuple
 
 from multidrop import Bus, Drive, WriteForbidden
-from multidrop.control import CommandResult
+from multidrop.control import CommandOutcome, CommandResult
 from multidrop.control.commands import carry_out_verb, stop_drive_by, typed_value, write_register
 from multidrop.drive import verb_arguments, verbs_of
-from multidrop.fleet.commands.messages import CommandAnswer, CommandOutcome, CommandRequest
+from multidrop.fleet.commands.messages import CommandAnswer, CommandRequest
 from multidrop.fleet.leases.rules import SECOND
 
 LIMIT_NS = 1 * SECOND  # time from the offer to the command's first frame

@@ -28,7 +28,7 @@ ASKED_AT_ONCE = 500  # limit of lines in one request; servers allow 1024
 # how long a line with an unanswered write is read again: longer than an election takes, because the write may
 # still be stored after an election
 DOUBT_S = 30.0
-MOST_MOVES = 100
+MOST_MOVES = 100  # number of the latest moves that are kept
 MOST_REPORTED = 20  # limit of the moves that a gateway reports with its state
 
 
