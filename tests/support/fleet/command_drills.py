@@ -13,7 +13,7 @@ import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -248,9 +248,9 @@ class CommandDrill(FleetProcesses):
 def command_drill(folder: Path, lines: int = 12) -> Iterator[CommandDrill]:
     sims = {f"drive-{at}": simulated(YD1000(address=1, name=f"drive-{at}")) for at in range(lines)}
     wires = [Wire([sim], name=name, port="socket://127.0.0.1:0", unpaced=True) for name, sim in sims.items()]
-    with cluster(folder / "nats") as nats, Simulator(wires) as simulator:
-        drill = CommandDrill(folder, nats, simulator, sims)
-        try:
-            yield drill
-        finally:
-            drill.close()
+    with (
+        cluster(folder / "nats") as nats,
+        Simulator(wires) as simulator,
+        closing(CommandDrill(folder, nats, simulator, sims)) as drill,
+    ):
+        yield drill

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import random
@@ -11,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, redirect_stderr, redirect_stdout, suppress
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from functools import partial
 from io import StringIO
 from pathlib import Path
@@ -46,7 +47,11 @@ class CommandEnd(NamedTuple):
 def run_here(environment: Mapping[str, str], *words: str) -> CommandEnd:
     """Run a `multidrop` command in this process, because a new one would take a second of CPU to start."""
     out, err = StringIO(), StringIO()
-    with patch.dict(os.environ, environment), redirect_stdout(out), redirect_stderr(err):
+    with (
+        patch.dict(os.environ, environment),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
         status = main([*words])
     return CommandEnd(status, out.getvalue(), err.getvalue())
 
@@ -311,12 +316,8 @@ def judged_at_end(drills: AbstractContextManager[D]) -> Iterator[D]:
 
 @contextmanager
 def drilled(folder: Path, lines: int = 12, seed: int = 1) -> Iterator[FleetDrill]:
-    with cluster(folder / "nats") as nats:
-        drill = FleetDrill(folder, nats, lines, seed)
-        try:
-            yield drill
-        finally:
-            drill.close()
+    with cluster(folder / "nats") as nats, closing(FleetDrill(folder, nats, lines, seed)) as drill:
+        yield drill
 
 
 # ---- the state that `multidrop fleet status` prints ----
@@ -417,11 +418,8 @@ def drilled_in_network(folder: Path, lines: int = 12, seed: int = 1) -> Iterator
         cluster(folder / "nats", places=made.namespaces[:NODES]) as nats,
     ):
         places = dict(zip(GATEWAYS, made.namespaces[NODES:], strict=True))
-        drill = FleetDrill(folder, nats, lines, seed, places, made.address)
-        try:
+        with closing(FleetDrill(folder, nats, lines, seed, places, made.address)) as drill:
             yield drill
-        finally:
-            drill.close()
 
 
 class MachineDrill(FleetDrill):
@@ -456,8 +454,5 @@ def drilled_on_machines(folder: Path, lines: int = 12, seed: int = 1) -> Iterato
     """Yield a fleet on three simulated machines; skip or fail if the machine allows no namespaces."""
     with network(NODES) as made, cluster(folder / "nats", places=made.namespaces) as nats:
         places = dict(zip(GATEWAYS, made.namespaces, strict=True))
-        drill = MachineDrill(folder, nats, lines, seed, places, made.address)
-        try:
+        with closing(MachineDrill(folder, nats, lines, seed, places, made.address)) as drill:
             yield drill
-        finally:
-            drill.close()
