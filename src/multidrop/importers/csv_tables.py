@@ -133,8 +133,9 @@ def read_table(text: str, stem: str) -> list[ImportedDevice]:
         raise ValueError(f"is not CSV: {failure}") from failure
     if rows[0] and rows[0][0].strip().lower() in ("device", "poll", "ref"):
         return read_modpoll(rows)
-    titles = [at for at, row in enumerate(rows[:MOST_TITLES]) if "at" in _places(_names(row))]
-    return _columns(rows[titles[0] :] if titles else rows, stem)
+    names = ([_plain_name(cell)[0] for cell in row] for row in rows[:MOST_TITLES])
+    header = next((at for at, row in enumerate(names) if "at" in _places(row)), 0)
+    return _columns(rows[header:], stem)
 
 
 # ---- columns ----
@@ -205,10 +206,6 @@ class _Layout:
         if self._may_be_hex and _NUMBER.fullmatch(cells["at"]):
             found.append(f"its address {cells['at']} may be hex, as others of its column are")
         return found
-
-
-def _names(row: list[str]) -> list[str]:
-    return [_plain_name(cell)[0] for cell in row]
 
 
 def _plain_name(cell: str) -> tuple[str, str]:
@@ -471,7 +468,7 @@ def _order(register: ImportedRegister, given: str) -> str:
 
 
 def _scale(register: ImportedRegister, cells: Cells, *, is_neuron: bool) -> None:
-    """Set step and offset; note in `gaps` what was assumed if programs differ about a column."""
+    """Set step and offset; note the assumption in `gaps` if programs differ about a column."""
     found = _steps(cells)
     key, given = found[0] if found else ("scale", "")
     offset = cells.get("offset", "")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -127,18 +127,14 @@ def entry_line(register: ImportedRegister) -> str:
 def _value(value: Any) -> str:
     """Return a value in TOML's notation, on one line."""
     if isinstance(value, dict):
-        return f"{{ {', '.join(_pairs(value))} }}"
+        pairs = (f"{name} = {_value(given)}" for name, given in value.items())
+        return f"{{ {', '.join(pairs)} }}"
     if isinstance(value, list):
         return f"[{', '.join(map(_value, value))}]"
     if isinstance(value, str):
         text = "".join(character if character.isprintable() else " " for character in _short(value))
         return json.dumps(text, ensure_ascii=False)
     return repr(value)
-
-
-def _pairs(value: dict[str, Any]) -> Iterator[str]:
-    for name, given in value.items():
-        yield f"{name} = {_value(given)}"
 
 
 def _comment(text: str) -> str:

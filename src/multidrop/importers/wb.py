@@ -288,7 +288,8 @@ def _number(
     register: ImportedRegister, format: str, bits: tuple[int, int] | None, entry: Mapping[str, Any]
 ) -> None:
     number, part = _number_of_bits(register, format, bits)
-    put_number(register.details, number, _order(entry))
+    order = _ORDER_OF[_is_little(entry, "word_order"), _is_little(entry, "byte_order")]
+    put_number(register.details, number, order)
     if part:
         register.details["part"] = part
     if format in ("bcd8", "bcd24"):
@@ -372,10 +373,6 @@ def _place(address: Any) -> tuple[int, tuple[int, int] | None]:
     if not bits:
         return at, None
     return at, (whole({"shift": bits[0]}, "shift"), whole({"width": bits[1]}, "width") if bits[1:] else 0)
-
-
-def _order(entry: Mapping[str, Any]) -> str:
-    return _ORDER_OF[_is_little(entry, "word_order"), _is_little(entry, "byte_order")]
 
 
 def _is_little(entry: Mapping[str, Any], key: str) -> bool:

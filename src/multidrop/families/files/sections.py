@@ -293,15 +293,13 @@ def options_of(table: Any, registers: Collection[str], place: TomlPlace) -> dict
             at.wrong("a register has this name too; call one of the two otherwise")
         good = at.check(given, OPTION_KEYS)
         span = good.get("span", [])
-        if span and (len(span) != 2 or not all(map(_is_finite, span)) or span[0] > span[1]):
+        if span and (
+            len(span) != 2 or not all(is_number(end) and abs(end) < inf for end in span) or span[0] > span[1]
+        ):
             at.wrong(f"span = {shown(span)} is not right; write the least and the most, span = [1, 600]")
         elif span and "meaning" in good:
             options[name] = Option(good.get("unit", ""), (span[0], span[1]), good["meaning"])
     return options
-
-
-def _is_finite(value: Any) -> bool:
-    return is_number(value) and abs(value) < float("inf")
 
 
 MOST_TEXTS = 100

@@ -237,9 +237,7 @@ class Profidrive(Profile):
             raise NotVerified(self.name, "the start", f"{why}; {self.remote}")
 
     def _is_ready(self) -> Script[bool]:
-        return self._ready_to_switch_on((yield from self._status()))
-
-    def _ready_to_switch_on(self, status: int) -> bool:
+        status = yield from self._status()
         wanted = ProfidriveStatus.READY_TO_SWITCH_ON | ProfidriveStatus.NO_OFF2 | ProfidriveStatus.NO_OFF3
         return status & wanted == wanted and not status & ProfidriveStatus.SWITCH_ON_INHIBITED
 
