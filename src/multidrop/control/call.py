@@ -227,7 +227,6 @@ def present_limit_ns() -> float:
 
 
 def check_expiry(expiry: float) -> None:
-    """Raise ValueError unless `expiry` is a positive number of seconds."""
     if not is_number(expiry) or not 0 < expiry <= MOST_EXPIRY_S:
         raise ValueError(
             f"expiry = {expiry!r} must be a number of seconds above 0, at most {MOST_EXPIRY_S:.0f}"

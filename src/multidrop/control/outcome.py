@@ -135,7 +135,6 @@ def result_of_failed_stop(failure: BaseException) -> CommandResult:
 
 
 def result_of_stop(stopped: Stopped) -> CommandResult:
-    """Return the result of one drive's stop."""
     outcome = _STOP_OUTCOMES[stopped.seen]
     if outcome is CommandOutcome.DONE:
         return CommandResult(outcome, f"stopped: seen to stand after {stopped.seconds:.1f} s")
@@ -143,7 +142,6 @@ def result_of_stop(stopped: Stopped) -> CommandResult:
 
 
 def result_of_write(outcome: Outcome) -> CommandResult:
-    """Return the result of a plain write."""
     text = str(outcome)
     if outcome.failure is not None:
         return CommandResult(_outcome_of(outcome.failure), text, outcome.failure)

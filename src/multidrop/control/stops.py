@@ -274,7 +274,6 @@ class StopAttempt:
         return unknown
 
     def result(self) -> Stopped:
-        """Return the result of the stop, once it is over."""
         known, seconds = self.known, self.ended - self._begun
         if known is None:
             return Stopped(self.drive.name, Seen.STOPPED, seconds)

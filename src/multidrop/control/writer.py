@@ -279,7 +279,6 @@ def _in_words(register: Register[Any], value: Any) -> str:
 
 
 def _is_unsent(failure: BaseException) -> bool:
-    """Return True if this failure means that the write was not sent."""
     if isinstance(failure, (LineError, NotMaster)):
         return not failure.is_sent
     return isinstance(failure, (Expired, CancelledByStop, NotAttached, NoReply))

@@ -6,11 +6,23 @@ from collections.abc import Callable, Iterable, Sequence
 from enum import IntEnum
 from functools import cached_property, lru_cache
 from itertools import accumulate
+from operator import attrgetter
 from struct import calcsize
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 from multidrop._core import ffi, lib
 from multidrop.core.memory import new_beside
+
+
+def number_at(path: str) -> int:
+    """Return a property that reads a number of a C struct. It uses attrgetter, which is fastest."""
+    return cast(int, property(attrgetter(path)))
+
+
+def flag_at(path: str) -> bool:
+    """Return a property that reads a number of a C struct as a bool."""
+    read = attrgetter(path)
+    return cast(bool, property(lambda owner: bool(read(owner))))
 
 
 class NumberFormat(IntEnum):
@@ -78,7 +90,6 @@ class Field(NamedTuple):
 
     @property
     def may_lack(self) -> bool:
-        """True if the field may have no value in a good reply."""
         may = self.number_format & (LOW_WORD_FIRST - 1) in _MAY_LACK
         return may or (self.extra is not None and self.extra.may_lack)
 
@@ -134,20 +145,9 @@ class RowLayout:
     def refusals(self, count: int) -> None:
         self.c.refusals = count
 
-    @property
-    def refusal(self) -> int:
-        """The code of the newest exception reply; `refusals` counts these replies."""
-        return int(self.c.refusal)
-
-    @property
-    def failures(self) -> int:
-        """Number of consecutive exchanges without a good reply."""
-        return int(self.c.failures)
-
-    @property
-    def is_answered(self) -> bool:
-        """True once a good reply came, not only exceptions."""
-        return bool(self.c.is_answered)
+    refusal = number_at("c.refusal")  # code of the newest exception reply; `refusals` counts these replies
+    failures = number_at("c.failures")  # number of consecutive exchanges without a good reply
+    is_answered = flag_at("c.is_answered")  # whether a good reply came, not only exceptions
 
     def forget(self) -> None:
         """Reset `refusals`, `failures` and `is_answered`, as before the first exchange."""
@@ -287,7 +287,6 @@ class CodeTable:
         self.used: tuple[str, ...] = ()
 
     def forget(self) -> None:
-        """Forget all assigned one-byte codes."""
         self._numbers[0 : len(self._names)] = [-1] * len(self._names)
         self.used = ()
 

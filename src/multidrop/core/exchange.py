@@ -6,11 +6,10 @@ from collections import Counter
 from collections.abc import Sequence
 from enum import IntEnum
 from itertools import count
-from operator import attrgetter
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple
 
 from multidrop._core import ffi, lib
-from multidrop.core.columns import RowLayout
+from multidrop.core.columns import RowLayout, number_at
 from multidrop.core.frame import Framing, Message, build_request, from_c, settings_to_c, to_c
 from multidrop.core.memory import new_apart, new_beside
 from multidrop.core.permissions import Permit
@@ -50,65 +49,47 @@ class Failure(IntEnum):
 class Status(IntEnum):
     """A row's status: OK, or why the row has no value (enum md_status). Exception codes are not members."""
 
-    OK = lib.MD_OK
-    NO_START = -FrameFault.NO_START
-    BAD_CHARACTER = -FrameFault.BAD_CHARACTER
-    BAD_CHECKSUM = -FrameFault.BAD_CHECKSUM
-    BAD_ADDRESS = -FrameFault.BAD_ADDRESS
-    BAD_FUNCTION = -FrameFault.BAD_FUNCTION
-    BAD_LENGTH = -FrameFault.BAD_LENGTH
-    BAD_ECHO = -FrameFault.BAD_ECHO
-    BAD_REQUEST = -FrameFault.BAD_REQUEST
-    CUT_SHORT = -Failure.CUT_SHORT
-    NO_REPLY = -Failure.NO_REPLY
-    LINE_LOST = -Failure.LINE_LOST
-    SETTINGS_REFUSED = -Failure.SETTINGS_REFUSED
-    LATE_ANSWER_DUE = -Failure.LATE_ANSWER_DUE
-    EXPIRED = -Failure.EXPIRED
-    NOT_ASKED = lib.MD_NOT_ASKED
-    POLL_ENDED = -Failure.POLL_ENDED
-    MAYBE_ECHO = -Failure.MAYBE_ECHO
-    NO_VALUE = lib.MD_NO_VALUE
-    NOT_MASTER = -Failure.NOT_MASTER
-    OTHER_MASTER = -Failure.OTHER_MASTER
-    POLLING_FAILED = -Failure.POLLING_FAILED
-    STALLED = -Failure.STALLED
+    text: str
+
+    def __new__(cls, code: int, text: str) -> Status:
+        one = int.__new__(cls, code)
+        one._value_, one.text = code, text
+        return one
+
+    OK = lib.MD_OK, "ok"
+    NO_START = -FrameFault.NO_START, "no frame in what was received"
+    BAD_CHARACTER = -FrameFault.BAD_CHARACTER, "bad character"
+    BAD_CHECKSUM = -FrameFault.BAD_CHECKSUM, "bad checksum"
+    BAD_ADDRESS = -FrameFault.BAD_ADDRESS, "reply from another address"
+    BAD_FUNCTION = -FrameFault.BAD_FUNCTION, "reply to another function"
+    BAD_LENGTH = -FrameFault.BAD_LENGTH, "reply of another length"
+    BAD_ECHO = -FrameFault.BAD_ECHO, "write confirmed with another address or value"
+    BAD_REQUEST = -FrameFault.BAD_REQUEST, "request cannot be built"
+    CUT_SHORT = -Failure.CUT_SHORT, "reply cut short"
+    NO_REPLY = -Failure.NO_REPLY, "no reply"
+    LINE_LOST = -Failure.LINE_LOST, "port lost"
+    SETTINGS_REFUSED = -Failure.SETTINGS_REFUSED, "port refused its settings"
+    LATE_ANSWER_DUE = -Failure.LATE_ANSWER_DUE, "not asked: late reply due"
+    EXPIRED = -Failure.EXPIRED, "not sent: expired"
+    NOT_ASKED = lib.MD_NOT_ASKED, "not asked: drive is silent"
+    POLL_ENDED = -Failure.POLL_ENDED, "poll ended"
+    MAYBE_ECHO = -Failure.MAYBE_ECHO, "maybe the adapter's echo"
+    NO_VALUE = lib.MD_NO_VALUE, "no valid value"
+    NOT_MASTER = -Failure.NOT_MASTER, "not sent: not master"
+    OTHER_MASTER = -Failure.OTHER_MASTER, "not sent: another master"
+    POLLING_FAILED = -Failure.POLLING_FAILED, "not asked: polling failed"
+    STALLED = -Failure.STALLED, "not sent: port stalled"
 
     def __str__(self) -> str:
-        return STATUSES[self]
+        return self.text
 
-
-_WORDS: dict[int, str] = {
-    Status.OK: "ok",
-    Status.NO_START: "no frame in what was received",
-    Status.BAD_CHARACTER: "bad character",
-    Status.BAD_CHECKSUM: "bad checksum",
-    Status.BAD_ADDRESS: "reply from another address",
-    Status.BAD_FUNCTION: "reply to another function",
-    Status.BAD_LENGTH: "reply of another length",
-    Status.BAD_ECHO: "write confirmed with another address or value",
-    Status.BAD_REQUEST: "request cannot be built",
-    Status.CUT_SHORT: "reply cut short",
-    Status.NO_REPLY: "no reply",
-    Status.LINE_LOST: "port lost",
-    Status.SETTINGS_REFUSED: "port refused its settings",
-    Status.LATE_ANSWER_DUE: "not asked: late reply due",
-    Status.EXPIRED: "not sent: expired",
-    Status.NOT_ASKED: "not asked: drive is silent",
-    Status.POLL_ENDED: "poll ended",
-    Status.MAYBE_ECHO: "maybe the adapter's echo",
-    Status.NO_VALUE: "no valid value",
-    Status.NOT_MASTER: "not sent: not master",
-    Status.OTHER_MASTER: "not sent: another master",
-    Status.POLLING_FAILED: "not asked: polling failed",
-    Status.STALLED: "not sent: port stalled",
-}
 
 UNASKED = "not "  # start of the texts of statuses for values that were not requested
 EXCEPTION_STATUS: int = lib.MD_EXCEPTION  # status of an exception, to which its code is added
 
+_STATUS_OF: dict[int, Status] = {status.value: status for status in Status}
 STATUSES = (
-    *(_WORDS.get(code, "") for code in range(EXCEPTION_STATUS)),
+    *(_STATUS_OF[code].text if code in _STATUS_OF else "" for code in range(EXCEPTION_STATUS)),
     *(f"exception {code:02X}" for code in range(256)),
 )
 """The text of every status code."""
@@ -171,18 +152,13 @@ def read_counters(drive: Any, timeout_ns: int, unasked: Counter[Status]) -> Coun
 
 
 def _by_status(array: Any) -> Counter[Status]:
-    return Counter({Status(code): count for code, count in _by_place(array, "Q").items()})
+    return Counter({_STATUS_OF[code]: count for code, count in _by_place(array, "Q").items()})
 
 
 def _by_place(array: Any, kind: Literal["I", "Q"]) -> Counter[int]:
     """Return the elements of a C array that are not 0, by their index."""
     numbers = memoryview(ffi.buffer(array)).cast(kind)
     return Counter({index: number for index, number in enumerate(numbers) if number})
-
-
-def _number(path: str) -> int:
-    """Return a property that reads a number of the struct `c`. It uses attrgetter, which is fastest."""
-    return cast(int, property(attrgetter(path)))
 
 
 _COMPLETION = ffi.typeof("struct md_completion *")
@@ -208,15 +184,15 @@ class Completion:
         self.values = ffi.new(_VALUES, room)
         self.numbers = memoryview(ffi.buffer(self.values)).cast("d") if room else _NO_NUMBERS
 
-    result = _number("c.result")  # > 0: length of the reply; 0: a broadcast; < 0: a Failure or FrameFault
-    error = _number("c.error")  # the errno of a lost line, or the mask of refused settings (REFUSALS)
-    begun_ns = _number("c.begun_ns")  # start of the exchange's turn
-    sent_ns = _number("c.sent_ns")  # when the request was sent; 0: never
-    first_ns = _number("c.first_ns")  # when the first byte after the request arrived; 0: none came
-    last_ns = _number("c.last_ns")  # when the last byte arrived; 0: none came
-    late_until_ns = _number("c.late_until_ns")  # the peer's `late_until_ns` when the exchange was requested
-    stale = _number("c.stale")  # number of bytes discarded before the request was sent
-    skipped = _number("c.skipped")  # number of bytes after the request that are not part of the reply
+    result = number_at("c.result")  # > 0: length of the reply; 0: a broadcast; < 0: a Failure or FrameFault
+    error = number_at("c.error")  # the errno of a lost line, or the mask of refused settings (REFUSALS)
+    begun_ns = number_at("c.begun_ns")  # start of the exchange's turn
+    sent_ns = number_at("c.sent_ns")  # when the request was sent; 0: never
+    first_ns = number_at("c.first_ns")  # when the first byte after the request arrived; 0: none came
+    last_ns = number_at("c.last_ns")  # when the last byte arrived; 0: none came
+    late_until_ns = number_at("c.late_until_ns")  # the peer's `late_until_ns` when the exchange was requested
+    stale = number_at("c.stale")  # number of bytes discarded before the request was sent
+    skipped = number_at("c.skipped")  # number of bytes after the request that are not part of the reply
 
     @property
     def reply(self) -> Message:
@@ -275,26 +251,26 @@ class Peer:
         self.proofs: tuple[Exchange, ...] = ()
         self.unasked: Counter[Status] = Counter()  # due values that were not requested, by status
 
-    exchanges = _number("c.counters.exchanges")  # number of exchanges so far
+    exchanges = number_at("c.counters.exchanges")  # number of exchanges so far
 
     @property
     def has_answered(self) -> bool:
         """True once any reply came, even an exception, a late reply or a doubtful reply."""
         return bool(self.c.counters.answered or self.c.history.late or self.c.doubtful)
 
-    failures = _number("c.failures")  # number of consecutive exchanges without a reply
-    late = _number("c.history.late")  # number of replies recognised after their timeout
-    late_until_ns = _number("c.late_until_ns")  # time until which replies to earlier requests may come
+    failures = number_at("c.failures")  # number of consecutive exchanges without a reply
+    late = number_at("c.history.late")  # number of replies recognised after their timeout
+    late_until_ns = number_at("c.late_until_ns")  # time until which replies to earlier requests may come
 
     @property
     def owes(self) -> bool:
         """True while replies to earlier requests may still come through a slow gateway or network."""
         return bool(self.c.owed_count)
 
-    answered_ns = _number("c.answered_ns")  # ns; approximate time of the last reply; 0 before the first
+    answered_ns = number_at("c.answered_ns")  # ns; approximate time of the last reply; 0 before the first
     # number of replies that came PAUSE_NS or more after the previous reply
-    pauses = _number("c.history.pauses")
-    ready_ns = _number("c.ready_ns")  # ns; earliest time of the next request
+    pauses = number_at("c.history.pauses")
+    ready_ns = number_at("c.ready_ns")  # ns; earliest time of the next request
 
     def inherit(self, before: Peer) -> None:
         """Take over the outstanding requests of `before`, the peer that this peer replaces at its address."""
@@ -345,7 +321,6 @@ class Peer:
         return int(self.c.history.ended[Status.NO_REPLY])
 
     def counters(self) -> Counters:
-        """Return the counters of all exchanges so far."""
         return read_counters(self.c, int(lib.md_present_timeout_ns(self.c)), self.unasked)
 
 

@@ -15,7 +15,7 @@ from weakref import finalize
 
 from multidrop._core import ffi, lib
 from multidrop.core.capture import Tap
-from multidrop.core.columns import Columns, RowLayout
+from multidrop.core.columns import Columns, RowLayout, flag_at, number_at
 from multidrop.core.exchange import Completion, Exchange, Peer, Status
 from multidrop.core.frame import settings_to_c
 from multidrop.core.permissions import Mastership
@@ -255,7 +255,6 @@ NO_DIVISOR = int(lib.MD_REFUSED_DIVISOR)  # no whole divisor of the UART's clock
 
 
 def is_pseudo_terminal(device: str) -> bool:
-    """Return True if the device's path is that of a pseudo-terminal."""
     return device.startswith(("/dev/pts/", "/dev/ttys"))
 
 
@@ -268,7 +267,6 @@ def must_take(device: str) -> int:
 
 
 def refused_names(mask: int) -> str:
-    """Return the names of the refused settings, as text."""
     return ", ".join(name for bit, name in REFUSALS.items() if mask & bit)
 
 
@@ -392,6 +390,22 @@ class Port:
         ffi.gc(self._owner, None)
         self._is_inherited = True
 
+    done = number_at("_progress.done")  # number of queued exchanges that ended; wraps around at 2^32
+    lost = flag_at("_progress.lost")  # whether the descriptor failed: no further exchange is sent
+    lost_error = number_at("_progress.lost_error")  # errno of the loss; 0 if the far end hung up
+    # whether the port repeats exchanges: until it is lost, or an exchange cannot be sent
+    repeating = flag_at("_progress.repeating")
+    # whether the port was lost during a polled exchange, after an earlier good reply on it
+    cut_off = flag_at("_progress.cut_off")
+    # whether at the last timeout the driver still held the request, and no reply has come since
+    is_stalled = flag_at("_progress.stalled")
+    # whether the driver's count of unsent bytes is ignored: it stayed above 0 although replies came
+    miscounts = flag_at("_progress.miscounts")
+    # whether the driver may still hold bytes of a command that has ended: they must be discarded
+    called_off = flag_at("_progress.called_off")
+    # number of another master's bytes, received while the port listened before its first request
+    foreign = number_at("_progress.foreign")
+
     def tap(self, tap: Tap) -> None:
         """Copy all bytes of the line to this tap from now on, and none to the previous tap."""
         with self._memory.replacing("tap", tap):
@@ -423,11 +437,6 @@ class Port:
         """Let `peer` take over the outstanding requests of `before`, the peer that it replaces."""
         self._memory.lasting.update((peer, before))
         lib.md_port_inherit(self.c, peer.c, before.c)
-
-    @property
-    def cut_off(self) -> bool:
-        """True if the port was lost during a polled exchange, after an earlier good reply on it."""
-        return bool(self._progress.cut_off)
 
     def end(self) -> bool:
         """Start only urgent exchanges from now on. Return True while a polled exchange is in flight."""
@@ -462,11 +471,6 @@ class Port:
         with self._memory.replacing("round", rounds):
             return int(lib.md_port_repeat(self.c, rounds, len(exchanges)))
 
-    @property
-    def repeating(self) -> bool:
-        """True while the port repeats exchanges: until it is lost, or an exchange cannot be sent."""
-        return bool(self._progress.repeating)
-
     def submit(self, exchanges: Sequence[Exchange], not_before_ns: Sequence[int]) -> int:
         """Queue exchanges, each with its earliest start in ns; return how many fitted into the queue."""
         todo = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
@@ -478,49 +482,14 @@ class Port:
         return int(lib.md_port_submit(self.c, todo, times, len(free)))
 
     @property
-    def done(self) -> int:
-        """The number of queued exchanges that ended; it wraps around at 2^32."""
-        return int(self._progress.done)
-
-    @property
     def pending(self) -> int:
         """The number of queued exchanges that have not ended."""
         return (int(self._progress.submitted) - self.done) & 0xFFFF_FFFF
 
     @property
-    def lost(self) -> bool:
-        """True once the descriptor failed: no further exchange is sent."""
-        return bool(self._progress.lost)
-
-    @property
-    def lost_error(self) -> int:
-        """The errno with which the descriptor failed; 0 if the far end hung up."""
-        return int(self._progress.lost_error)
-
-    @property
-    def is_stalled(self) -> bool:
-        """True if at the last timeout the driver still held the request, and no reply has come since."""
-        return bool(self._progress.stalled)
-
-    @property
-    def miscounts(self) -> bool:
-        """True if the driver's count of unsent bytes is ignored: it stayed above 0 although replies came."""
-        return bool(self._progress.miscounts)
-
-    @property
-    def called_off(self) -> bool:
-        """True if the driver may still hold bytes of a command that has ended: they must be discarded."""
-        return bool(self._progress.called_off)
-
-    @property
     def has_echo(self) -> bool:
         """True once the adapter is known to echo; the core then never mistakes an echo for a reply."""
         return int(self._progress.echo) == int(lib.MD_ECHO)
-
-    @property
-    def foreign(self) -> int:
-        """Number of another master's bytes, received while the port listened before its first request."""
-        return int(self._progress.foreign)
 
     @property
     def switching(self) -> float:

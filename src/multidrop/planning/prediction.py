@@ -159,7 +159,6 @@ def _rests(jobs: Iterable[_PredictedJob]) -> dict[Drive, float]:
 def _jobs(
     exchanges: Iterable[Planned], delays: Mapping[Drive, float], switching: float, lateness: float
 ) -> list[_PredictedJob]:
-    """Return the jobs in the order of the bus cycle."""
     of_drive: dict[Drive, list[Planned]] = {}
     for exchange in exchanges:
         of_drive.setdefault(exchange.drive, []).append(exchange)
@@ -370,7 +369,6 @@ def _baudrate(exchanges: Sequence[Planned], switching: float) -> tuple[int, tupl
 
 
 def _at(drive: Drive, baudrate: int) -> Drive:
-    """Return a copy of the drive with another baud rate."""
     return type(drive)(
         drive.address,
         name=drive.name,

@@ -47,7 +47,6 @@ class Job:
 
     @property
     def end_ns(self) -> int:
-        """The end of the job's present slot."""
         return self.due_ns + (self.period_ns or 0)
 
 
@@ -103,7 +102,6 @@ class BackOff:
         self.health[drive].is_new = self.has_silent = True
 
     def forget(self, drive: int) -> None:
-        """Forget a drive that has no jobs left."""
         self.health.pop(drive, None)
 
     def conclude(self, drive: int) -> None:

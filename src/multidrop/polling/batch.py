@@ -138,7 +138,6 @@ class WideRows(ArrowTable):
 
     @property
     def columns(self) -> list[str]:
-        """Names of all columns."""
         return [*TIMES, *self._columns]
 
     def __len__(self) -> int:

@@ -120,7 +120,6 @@ class JobMaker:
                 self._skipped += job.skipped
 
     def forget_drive(self, drive: Drive) -> None:
-        """Forget the jobs of a drive that was removed for good."""
         for key in [key for key in self._made if key[0] is drive]:
             self._skipped += self._made.pop(key).skipped
         self._rows = {key: rows for key, rows in self._rows.items() if key[0] is not drive}
@@ -128,7 +127,6 @@ class JobMaker:
     def make(
         self, drive: Drive, block: Block, period_ns: int | None, *, rows: RowLayout | None = None
     ) -> PolledJob:
-        """Return a new job that is not cached."""
         rows = rows or self._names.layout(drive, block)
         own_ns = round((silence(drive) + sending(drive, block)) * 1e9)
         return PolledJob(
@@ -237,7 +235,6 @@ class PortQueue:
         self._ahead_ns = sum(turn.job.duration_ns for turn in self._queued)
 
     def slots(self) -> list[Slot]:
-        """Return the slots of the queued turns."""
         return [(turn.job, turn.due_ns) for turn in self._queued if turn.due_ns is not None]
 
     def give_back(self) -> None:

@@ -59,7 +59,6 @@ class LineSet:
         return [line for number in numbers if (line := self._numbered.get(number))]
 
     def find(self, name: str) -> PolledLine:
-        """Return the line of this name. Raises ValueError if there is none."""
         for line in self._lines:
             if line.name == name:
                 return line
@@ -180,11 +179,9 @@ class LineSet:
         self._lines = tuple(sorted(self._lines, key=lambda line: places[line.name]))
 
     def check_port(self, port: str) -> None:
-        """Raise NoSuchPort for an invalid port name."""
         check_port(port, self._mastership)
 
     def check_audit(self) -> None:
-        """Raise OSError if the audit log cannot be opened."""
         if self._audit:
             AuditLog(self._audit).close()
 

@@ -169,7 +169,6 @@ class PolledLine:
             raise
 
     def forked(self) -> None:
-        """Make a new lock in a forked child."""
         self._lock = threading.Lock()
 
     @property
@@ -215,7 +214,6 @@ class PolledLine:
         self._row_queue.call(self.number)
 
     def _schedule_jobs(self, drive: Drive, due_ns: int) -> None:
-        """Schedule the jobs of a drive; each is first due at `due_ns`."""
         jobs = self._planned[self._present[drive]].jobs
         for job in jobs:
             self._schedule.add(job, due_ns)
@@ -541,7 +539,6 @@ class PolledLine:
     # ---- summary ----
 
     def summary(self) -> dict[str, Any]:
-        """Return the summary of the line and its drives since the start, as plain numbers."""
         with self._lock:
             seconds = max(((self._over_ns or clock.now_ns()) - self.started_ns) / 1e9, 1e-9)
             line, peers = self.bus.line, {drive.name: peer for drive, peer in self.bus.peers.items()}

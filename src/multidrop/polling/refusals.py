@@ -141,7 +141,6 @@ class Refusals:
             self._schedule.remove(self._probes.pop(address))
 
     def forget(self, drive: Drive) -> None:
-        """Forget the refusals of a drive that is being removed."""
         self._set_aside = {rare: job for rare, job in self._set_aside.items() if rare.owner is not drive}
         self._rare = {job: rare for job, rare in self._rare.items() if job.owner is not drive}
         self._trials = {trial: job for trial, job in self._trials.items() if trial.owner is not drive}

@@ -37,7 +37,6 @@ else:
 
 
 def utc_ns() -> int:
-    """Return the present time as UTC in ns."""
     return int(now_ns() + utc_minus_monotonic_ns())
 
 

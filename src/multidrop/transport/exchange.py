@@ -260,7 +260,6 @@ class Exchanges:
         *,
         insists: bool = False,
     ) -> Any:
-        """Return the value of one register, or a text."""
         if isinstance(register, Text):
             return self.text(drive, register, attempts, insists=insists)
         return self.values(drive, [register], attempts, insists=insists)[register.name]
@@ -329,7 +328,6 @@ class Exchanges:
             self._answered_on[drive] = self.line.queue
 
     def _ask(self, drive: Drive, exchange: Exchange, attempts: int) -> Completion:
-        """Send a read up to `attempts` times; return its good reply."""
         reply = self._good(drive, exchange, attempts, self._carry_out(drive, exchange))
         self._note_answer(drive, reply)
         return reply

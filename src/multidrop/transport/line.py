@@ -117,7 +117,6 @@ class LineLog:
         log_aside(_log, logging.INFO, "%s: closed", self._port)
 
     def note_foreign(self, core: Port) -> None:
-        """Log the number of foreign bytes since the last call; any thread may call it."""
         if core.foreign == self._foreign_here:
             return
         with self._noting:
@@ -444,5 +443,4 @@ class Line:
 
     @property
     def has_echo(self) -> bool:
-        """True if the adapter is known to echo requests."""
         return self.queue is not None and self.queue.has_echo

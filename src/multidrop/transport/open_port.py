@@ -176,7 +176,6 @@ def check_port(port: str, mastership: Mastership | None) -> None:
 
 
 def connection_of(port: serial.SerialBase | None) -> socket.socket | None:
-    """Return the socket of a network port, None for other ports."""
     return getattr(port, "_socket", None)
 
 

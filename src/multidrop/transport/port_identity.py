@@ -67,7 +67,6 @@ def has_twin(adapter: USBAdapter) -> bool:
 
 
 def _adapters() -> dict[str, USBAdapter]:
-    """Return the present USB adapters by device name."""
     return {tty.name: one for tty in TTYS.iterdir() if (one := adapter_of(tty.name))}
 
 
