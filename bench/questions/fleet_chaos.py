@@ -304,7 +304,7 @@ def run(folder: Path, seconds: float, dice: random.Random) -> int:
 
 def alarms(folder: Path) -> list[str]:
     lines = [line for path in sorted(folder.glob("*.log")) for line in path.read_text().splitlines()]
-    return [line for line in lines if line.endswith("are missing") or " came again behind " in line]
+    return [line for line in lines if line.endswith("are missing") or " came again after " in line]
 
 
 def main() -> int:

@@ -25,7 +25,7 @@ from multidrop.fleet.errors import FleetError, NoRight, OutcomeUnknown
 from multidrop.fleet.samples import forwarder as forwarder_module
 from multidrop.fleet.samples import samples_stream
 from multidrop.fleet.samples.forwarder import Forwarder
-from multidrop.fleet.samples.hub import HubState, SampleHub
+from multidrop.fleet.samples.hub import HubState, SampleHub, SourceCheck
 from multidrop.fleet.samples.parquet_sink import ParquetSink
 from multidrop.fleet.samples.samples_stream import (
     StreamMessage,
@@ -378,6 +378,19 @@ def test_lost_and_duplicated_rows_are_found(chaos: Any) -> None:
     assert chaos.compare(told, hole) == (9, 0, 1, 0)
     doubled = {**whole, "gateway-2": Counter([0, 1, 1, 2])}
     assert chaos.compare(told, doubled) == (9, 0, 0, 1)
+
+
+def test_the_hubs_alarms_about_lost_and_repeated_messages_are_found(
+    chaos: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    check = SourceCheck({})
+    for sequence in (1, 3, 3):
+        check.take(StreamMessage(sequence, "gateway-1", "log", sequence, 0, b""))
+    (tmp_path / "hub.log").write_text("".join(f"{record.getMessage()}\n" for record in caplog.records))
+    assert [line.partition(": message")[2] for line in chaos.alarms(tmp_path)] == [
+        "s 2 to 2 are missing",
+        " 3 came again after 3 and is ignored",
+    ]
 
 
 @pytest.mark.long
