@@ -410,6 +410,13 @@ async def test_unchanged_lines_keep_their_records_revision() -> None:
     assert await store(bucket, first) == {"new": 1, "changed": 1, "removed": 0, "kept": 1}
 
 
+async def test_a_plant_that_another_command_changes_meanwhile_is_reported() -> None:
+    bucket = MemoryBucket(names.PLANT)
+    bucket.before_put = lambda key: bucket.store(key, {"line": {"name": key}, "files": {}})
+    with pytest.raises(FleetError, match=r"line hall-1 has changed in the meantime: run `multidrop fleet"):
+        await store(bucket, {"hall-1": {"line": {"name": "hall-1", "port": "socket://a:1"}, "files": {}}})
+
+
 def test_a_lines_record_has_only_its_own_permissions(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT)

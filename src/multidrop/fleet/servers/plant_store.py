@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from multidrop import Plant, PlantError, PlantLine
+from multidrop.fleet.errors import Conflict, FleetError
 from multidrop.fleet.servers import names
-from multidrop.fleet.servers.buckets import Bucket, Follower, Record
+from multidrop.fleet.servers.buckets import NONE_YET, Bucket, Follower, Record
 from multidrop.plant import FLEET_KEYS, MAY_KEYS, allowed, check_channels
 from multidrop.toml_check import TomlPlace
 
@@ -102,7 +103,8 @@ def _family_files(folder: Path, model: str) -> dict[str, str]:
 async def store(bucket: Bucket, records: Mapping[str, Any]) -> dict[str, int]:
     """Store these lines as the plant, and return how many are new, changed, removed and unchanged.
 
-    An unchanged line keeps its record's revision, so it is polled without a break.
+    An unchanged line keeps its revision, so it is polled without a break. Raises FleetError if a line
+    was changed at the same time, by another `fleet init`.
     """
     follower = Follower(bucket)
     await follower.look()
@@ -115,7 +117,12 @@ async def store(bucket: Bucket, records: Mapping[str, Any]) -> dict[str, int]:
     async def put(name: str) -> None:
         async with limit:
             known = follower.records.get(name)
-            await bucket.put(name, records.get(name), known.revision if known else 0)
+            try:
+                await bucket.put(name, records.get(name), known.revision if known else NONE_YET)
+            except Conflict:
+                raise FleetError(
+                    f"the fleet's line {name} has changed in the meantime: run `multidrop fleet init` again"
+                ) from None
 
     await asyncio.gather(*(put(name) for name in (*changed, *came, *gone)))
     kept = len(records) - len(changed) - len(came)
