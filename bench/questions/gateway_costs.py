@@ -28,7 +28,7 @@ from multidrop import Plant
 from multidrop.core import Columns, Counters, Names, Status
 from multidrop.exposition import expose_metrics
 from multidrop.gateway.gateway import Gateway
-from multidrop.gateway.http.connections import Connections, Watched
+from multidrop.gateway.http.connections import Connections, WatchedApp
 from multidrop.gateway.http.routes import make_app
 from multidrop.gateway.live.frames import WHOLE
 from multidrop.gateway.metrics import families_of
@@ -179,7 +179,7 @@ class Worker:
         from uvicorn.protocols.http.h11_impl import H11Protocol
         from uvicorn.server import ServerState
 
-        app = Watched(make_app(self.gateway), Connections(time.monotonic))
+        app = WatchedApp(make_app(self.gateway), Connections(time.monotonic))
         config = Config(app, http="h11", ws="none", lifespan="off", log_config=None, access_log=False)
         config.load()
         protocol = H11Protocol(config, ServerState(), {})

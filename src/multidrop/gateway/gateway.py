@@ -22,7 +22,7 @@ from multidrop import Bus, LineError, Plant, Poller
 from multidrop.control import Ledger
 from multidrop.gateway.clock import boottime_ns, now_and_slept_ns, utc_ms
 from multidrop.gateway.commands import Commands, FleetStops
-from multidrop.gateway.http.connections import BACKLOG, Connections, Watched, WatchedProtocol, listen
+from multidrop.gateway.http.connections import BACKLOG, Connections, WatchedApp, WatchedProtocol, listen
 from multidrop.gateway.http.guard import MOST_HEAD
 from multidrop.gateway.http.rights import OwnNames, Tokens
 from multidrop.gateway.http.routes import make_app
@@ -260,7 +260,7 @@ class Gateway:
     def _server_config(self) -> uvicorn.Config:
         context = self.settings.tls
         return uvicorn.Config(
-            Watched(make_app(self), self.connections),
+            WatchedApp(make_app(self), self.connections),
             backlog=BACKLOG,
             http=WatchedProtocol,
             h11_max_incomplete_event_size=MOST_HEAD,  # limit, in bytes, of an incomplete HTTP head

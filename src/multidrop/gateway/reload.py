@@ -33,7 +33,7 @@ NO_FILE = "this plant has no file to be read again"
 _log = logging.getLogger("multidrop.gateway")
 
 
-class Reloaded(NamedTuple):
+class ReloadResult(NamedTuple):
     """The result of a reload: the file's mistakes, or sentences about changes that need a restart."""
 
     is_done: bool
@@ -84,7 +84,7 @@ class Reload:
             self._soon.cancel()
             await asyncio.gather(self._soon, return_exceptions=True)
 
-    async def carry_out(self, by: str) -> Reloaded:
+    async def carry_out(self, by: str) -> ReloadResult:
         """Read the file and poll its plant. If that fails, keep the old plant and return the reason."""
         self._is_overtaken.set()
         async with self._turn:
@@ -118,10 +118,10 @@ class Reload:
             raise Hung("a later reload replaces this one")
         return reading.result()
 
-    async def _carry_out(self) -> Reloaded:
+    async def _carry_out(self) -> ReloadResult:
         gateway, poller = self._gateway, self._gateway.poller
         if self._read is None or poller is None:
-            return Reloaded(False, NO_FILE)
+            return ReloadResult(False, NO_FILE)
         plant, settings, planned = await self._read_within(self._read)
         is_followed = not isinstance(poller, Poller)
         if is_followed and (plant.lines or settings.parts.get("fleet") != gateway.settings.parts["fleet"]):
@@ -152,7 +152,7 @@ class Reload:
         for sentence in self.restart:
             _log.warning("%s", sentence)
         _log.info("the plant file is in effect")
-        return Reloaded(True, f"{plant.path.name} is in effect", (), self.restart)
+        return ReloadResult(True, f"{plant.path.name} is in effect", (), self.restart)
 
     def _take_up(self, poller: Poller, settings: ServeSettings, planned: Mapping[str, Any] | None) -> None:
         """Show the plant that is polled now, and apply those of its settings that need no restart."""
@@ -207,14 +207,14 @@ class Reload:
         gateway.own_names.replace(settings.names)
         gateway.tokens.replace(settings.tokens)
 
-    def _refused(self, failure: Exception) -> Reloaded:
+    def _refused(self, failure: Exception) -> ReloadResult:
         if not isinstance(failure, (ValueError, OSError)):
             _log.exception("a reload failed")
         mistakes = failure.mistakes if isinstance(failure, PlantError) else (_sentence(failure),)
         for mistake in mistakes:
             _log.error("the previous plant stays in use: %s", mistake)
         self.mistakes = tuple(mistakes)
-        return Reloaded(False, "the previous plant stays in use: the file has mistakes", self.mistakes)
+        return ReloadResult(False, "the previous plant stays in use: the file has mistakes", self.mistakes)
 
 
 def changed_drives(before: Plant, coming: Plant) -> frozenset[str]:

@@ -21,7 +21,7 @@ from multidrop.core import Columns, Names, NumberFormat, RowLayout
 from multidrop.drive import Drive
 from multidrop.drive.register import COIL, DISCRETE, HOLDING, INPUT, Register, reading, row_field
 from multidrop.gateway.modbus_server.protocol import InvalidHeader, MbapRequest, take_request
-from multidrop.gateway.modbus_server.words import DriveWords, Lack, exact_data
+from multidrop.gateway.modbus_server.words import DriveWords, Unavailable, exact_data
 from multidrop.plant.model import Polled, PolledDrive
 from multidrop.polling.batch import Batch
 
@@ -211,7 +211,9 @@ def cached() -> DriveWords:
     return DriveWords(PolledDrive(Meter(1), polls))
 
 
-def read(function: int, start: int, count: int, *, since_ns: int = 0, **changed: FakeRow) -> list[int] | Lack:
+def read(
+    function: int, start: int, count: int, *, since_ns: int = 0, **changed: FakeRow
+) -> list[int] | Unavailable:
     rows = {**ROWS, **changed}
     return cached().read(function, range(start, start + count), rows.get, NOW, since_ns)
 
@@ -226,25 +228,25 @@ def test_range_is_answered_with_the_drives_words() -> None:
 
 
 def test_range_with_one_unknown_word_is_not_answered() -> None:
-    assert read(3, 3, 2) is Lack.UNPOLLED  # includes a register that is part of a word
-    assert read(3, 9, 1) is Lack.UNPOLLED
-    assert read(4, 0, 2) is Lack.UNPOLLED
-    assert read(1, 0, 1) is Lack.UNPOLLED
-    assert read(3, 5, 2, level=FakeRow(NOW, 0.0)) is Lack.UNPOLLED  # a float zero may be +0 or -0
+    assert read(3, 3, 2) is Unavailable.UNPOLLED  # includes a register that is part of a word
+    assert read(3, 9, 1) is Unavailable.UNPOLLED
+    assert read(4, 0, 2) is Unavailable.UNPOLLED
+    assert read(1, 0, 1) is Unavailable.UNPOLLED
+    assert read(3, 5, 2, level=FakeRow(NOW, 0.0)) is Unavailable.UNPOLLED  # a float zero may be +0 or -0
 
 
 def test_range_with_a_stale_row_or_a_miss_is_not_answered() -> None:
-    assert read(3, 0, 4, status=FakeRow(NOW, None)) is Lack.STALE
+    assert read(3, 0, 4, status=FakeRow(NOW, None)) is Unavailable.STALE
     assert read(3, 0, 4, status=FakeRow(NOW - S, 3.0)) == [1450, 2, 1, 3]
-    assert read(3, 0, 4, status=FakeRow(NOW - S - 1, 3.0)) is Lack.STALE
+    assert read(3, 0, 4, status=FakeRow(NOW - S - 1, 3.0)) is Unavailable.STALE
     assert read(3, 3, 1, status=FakeRow(NOW - 6 * S, 3.0, 6 * S)) == [3]
-    assert read(3, 3, 1, status=FakeRow(NOW - 6 * S - 1, 3.0, 6 * S)) is Lack.STALE
-    assert cached().read(3, range(1), lambda name: None, NOW) is Lack.STALE
+    assert read(3, 3, 1, status=FakeRow(NOW - 6 * S - 1, 3.0, 6 * S)) is Unavailable.STALE
+    assert cached().read(3, range(1), lambda name: None, NOW) is Unavailable.STALE
 
 
 def test_rows_from_before_a_write_are_not_used() -> None:
     assert read(3, 1, 1, since_ns=NOW) == [2]
-    assert read(3, 1, 1, since_ns=NOW + 1) is Lack.STALE
+    assert read(3, 1, 1, since_ns=NOW + 1) is Unavailable.STALE
 
 
 def test_newest_row_of_registers_at_the_same_address_is_used() -> None:

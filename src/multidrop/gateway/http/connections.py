@@ -242,7 +242,7 @@ class WatchedProtocol(H11Protocol):
         self._connections.note_stall(self.client, is_stalled=False)
 
 
-class Watched:
+class WatchedApp:
     """An ASGI application that notes the start and end of each request in `connections`.
 
     Each request waits for its turn; requests that may be stops go first.

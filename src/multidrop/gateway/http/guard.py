@@ -57,7 +57,7 @@ _RAW_HEADERS, _RAW_PAGE_HEADERS = _raw(HEADERS), _raw(PAGE_HEADERS)
 _log = logging.getLogger("multidrop.gateway")
 
 
-class Needed(NamedTuple):
+class RouteAccess(NamedTuple):
     """The HTTP method and the right that a path needs; if the right is None, no token is checked."""
 
     method: str
@@ -71,7 +71,7 @@ class Guard:
         self,
         app: ASGIApp,
         *,
-        needed: Mapping[str, Needed],
+        needed: Mapping[str, RouteAccess],
         names: OwnNames,
         tokens: Tokens,
         may: Callable[[], May],
@@ -134,7 +134,7 @@ class Guard:
             return Caller(ANYONE, "page", self.address(scope, headers), Right.LOOK)
         return self._admit(scope, headers, needed.right)
 
-    def _find(self, path: str) -> Needed:
+    def _find(self, path: str) -> RouteAccess:
         """Return the method and the right for a path: the entry of its longest prefix in `needed`."""
         while path not in self._needed:
             head, slash, _ = path.rstrip("/").rpartition("/")
@@ -143,13 +143,13 @@ class Guard:
             path = f"{head}/"
         return self._needed[path]
 
-    def _check_site(self, headers: Headers, host: str, needed: Needed, schemes: Sequence[str]) -> None:
+    def _check_site(self, headers: Headers, host: str, needed: RouteAccess, schemes: Sequence[str]) -> None:
         """Raise Denied if the browser's headers say that a page of another site sent the request."""
         origin = headers.get("origin")
         if origin is not None and not self._names.has_origin(origin, host, schemes):
             raise Denied(403, f"the request comes from a page of {origin[:100]!r}, not of this gateway")
         site = headers.get("sec-fetch-site", "none")
-        is_page = needed == Needed("GET", None) and headers.get("sec-fetch-mode") == "navigate"
+        is_page = needed == RouteAccess("GET", None) and headers.get("sec-fetch-mode") == "navigate"
         if site not in ("none", "same-origin") and not is_page:
             raise Denied(403, "the request comes from a page of another site")
         if needed.method == "POST":

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from multidrop.gateway.http import schemas
 from multidrop.gateway.http.files import TYPES
-from multidrop.gateway.http.guard import Needed
+from multidrop.gateway.http.guard import RouteAccess
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.http.schemas import Schema
 
@@ -264,9 +264,9 @@ OPERATIONS = (
     Operation("/api/forget", "forget", None, "Remove the cookie with the token.", json_of(ANY), body=ANY),
 )
 
-NEEDED: Mapping[str, Needed] = {
-    "/api/": Needed("GET", Right.LOOK),  # for the paths under /api/ that are not in the table
-    **{one.path.partition("{")[0]: Needed(one.method, one.right) for one in OPERATIONS},
+NEEDED: Mapping[str, RouteAccess] = {
+    "/api/": RouteAccess("GET", Right.LOOK),  # for the paths under /api/ that are not in the table
+    **{one.path.partition("{")[0]: RouteAccess(one.method, one.right) for one in OPERATIONS},
 }
 
 

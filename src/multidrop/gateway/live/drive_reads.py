@@ -22,7 +22,7 @@ READ_S = 30.0  # time limit of one read
 
 UNANSWERED = "no reply"
 
-Found = dict[str, list[Any]]  # by register: value or None, time (UTC, ms), "ok" or the failure
+ReadValues = dict[str, list[Any]]  # by register: value or None, time (UTC, ms), "ok" or the failure
 ROUND_S = 2.0  # pause between two rounds of identity checks
 ASKED_S = 30.0  # time limit of one identity check
 REST_S = 0.1  # pause before each read of an identity check, which leaves time for polling
@@ -53,10 +53,10 @@ class SideReads:
         self._clock = clock
         self._utc_ms = utc_ms
         self._looked: dict[str, float] = {}
-        self._found: dict[str, Found] = {}
+        self._found: dict[str, ReadValues] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
 
-    def look(self, plant: Plant, name: str) -> Found:
+    def look(self, plant: Plant, name: str) -> ReadValues:
         """Return the values read so far, and read on for LOOKED_S. Raises ValueError for an unknown drive."""
         line, drive = plant.find_drive(name)
         self._looked[name] = self._clock()

@@ -138,7 +138,7 @@ def _rows_of(polls: Iterable[Polled], cycle_s: float, since_ns: int) -> dict[str
     }
 
 
-class _Watched:
+class _WatchedDrive:
     """One drive of the plant, with the rows of its polled registers and its fault record."""
 
     def __init__(self, polled: PolledDrive, cycle_s: float, since_ns: int) -> None:
@@ -176,7 +176,7 @@ class Hub:
         # by the codes of drive and register in a batch, as one number; None: not in the plant
         self._cells: dict[int, RegisterRows | None] = {}
         self._statuses: tuple[str, ...] = ("ok",)
-        self._watched: dict[str, _Watched] = {}
+        self._watched: dict[str, _WatchedDrive] = {}
         self.adopt(plant)
 
     def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
@@ -198,7 +198,7 @@ class Hub:
                 known = before.get(polled.drive.name)
                 stays = known is not None and known.polled == polled
                 self._watched[polled.drive.name] = (
-                    known if known is not None and stays else _Watched(polled, cycle_s, since_ns)
+                    known if known is not None and stays else _WatchedDrive(polled, cycle_s, since_ns)
                 )
         for (drive, name), seconds in ChannelSet(series_of(plant, planned)).holds_s.items():
             cell = self._watched[drive].channels[name]
@@ -345,7 +345,7 @@ class Hub:
         if watched is not None:
             _forget_trip(watched)
 
-    def _look(self, watched: _Watched) -> Shown:
+    def _look(self, watched: _WatchedDrive) -> Shown:
         fresh = FreshValues(watched.cells, *self._times())
         shown = self._shown(watched, fresh)
         if FAULT_REGISTER not in watched.cells:
@@ -357,7 +357,7 @@ class Hub:
             return shown
         return shown if shown.state == FAULT else Shown(FAULT, watched.trip.words, shown.note)
 
-    def _shown(self, watched: _Watched, fresh: FreshValues) -> Shown:
+    def _shown(self, watched: _WatchedDrive, fresh: FreshValues) -> Shown:
         found = watched.reader.state(fresh)
         if found is not None and found.condition is not Condition.UNKNOWN:
             fault = found.fault or UNNAMED
@@ -374,7 +374,7 @@ class Hub:
         note = found.note if found is not None else _lack(watched)
         return Shown(UNKNOWN, INCOMPLETE if any(name not in fresh for name in watched.cells) else None, note)
 
-    def _unseen(self, watched: _Watched) -> Shown:
+    def _unseen(self, watched: _WatchedDrive) -> Shown:
         """Return SILENT for a drive without fresh values, or UNKNOWN if it has replied or was not asked."""
         newest = [cell.newest for cell in watched.cells.values() if cell.newest]
         misses = [row for row in newest if row[3] != 0]
@@ -387,7 +387,7 @@ class Hub:
         return Shown(SILENT, _NO_REPLY if why == _SKIPPED else why)
 
 
-def _lack(watched: _Watched) -> str:
+def _lack(watched: _WatchedDrive) -> str:
     """Return the page's text that says why a drive's state is unknown."""
     reader = watched.reader
     if not reader.has_state:
@@ -397,7 +397,7 @@ def _lack(watched: _Watched) -> str:
     return f"{reader.lacks} is {'not known' if reader.lacks in watched.cells else 'not polled'}"
 
 
-def _look_for_trip(watched: _Watched) -> None:
+def _look_for_trip(watched: _WatchedDrive) -> None:
     """Note a fault if the fault record has changed. Skip its first value: that fault may be an old one."""
     name = next((name for name in FAULT_RECORDS if name in watched.cells), "")
     cell = watched.cells.get(name)
@@ -410,13 +410,13 @@ def _look_for_trip(watched: _Watched) -> None:
         watched.trip = _Trip(words, at_ns) if value else None
 
 
-def _turns_since(watched: _Watched, since_ns: int) -> bool:
+def _turns_since(watched: _WatchedDrive, since_ns: int) -> bool:
     """Return True if all values that show a turning motor were requested after this time."""
     cells = [cell for name in ("status", *FREQUENCIES) if (cell := watched.cells.get(name)) and cell.good]
     return all(cell.good[1] > since_ns for cell in cells if cell.good)
 
 
-def _forget_trip(watched: _Watched) -> None:
+def _forget_trip(watched: _WatchedDrive) -> None:
     watched.trip = None
     # replaced, because the old reader remembers the fault record
     watched.reader = StateReader(watched.polled.drive)

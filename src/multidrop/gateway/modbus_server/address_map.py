@@ -53,7 +53,7 @@ class AddressRow(NamedTuple):
 
 
 # Returns a row of one drive. Arguments: the value's name, and the columns of the row from `access` on.
-Make = Callable[..., AddressRow]
+MakeRow = Callable[..., AddressRow]
 
 
 def address_map(
@@ -85,7 +85,7 @@ def _row(first: tuple[str, str, int, int, int], name: str, *others: Any, **more:
     return AddressRow(*first, name, name.replace("_", " "), *others, **more)
 
 
-def _rows_of(unit: Unit, make: Make, settings: ModbusSettings, may: May) -> Iterator[AddressRow]:
+def _rows_of(unit: Unit, make: MakeRow, settings: ModbusSettings, may: May) -> Iterator[AddressRow]:
     role = Right[settings.may.upper()]
     yield from _common_rows(unit, make, settings.common)
     if role >= Right.STOP:
@@ -102,7 +102,7 @@ def _rows_of(unit: Unit, make: Make, settings: ModbusSettings, may: May) -> Iter
         yield from (_text_row(make, text) for text in unit.drive.texts.values())
 
 
-def _common_rows(unit: Unit, make: Make, common: int) -> Iterator[AddressRow]:
+def _common_rows(unit: Unit, make: MakeRow, common: int) -> Iterator[AddressRow]:
     setpoint = unit.drive.registers.get(unit.drive.setpoint_name)
     for one in NUMBERS:
         yield make(
@@ -116,7 +116,7 @@ def _common_rows(unit: Unit, make: Make, common: int) -> Iterator[AddressRow]:
 
 
 def _register_row(
-    unit: Unit, make: Make, register: Register[Any], passing: str, may_write: Container[str]
+    unit: Unit, make: MakeRow, register: Register[Any], passing: str, may_write: Container[str]
 ) -> Iterator[AddressRow]:
     """Yield the row of a register, if clients can read or write it."""
     carrier, name = register.table.carrier, register.name
@@ -146,6 +146,6 @@ def _register_row(
     )
 
 
-def _text_row(make: Make, text: Text) -> AddressRow:
+def _text_row(make: MakeRow, text: Text) -> AddressRow:
     columns = ("read", reading_function(text.table), None, text.address, text.length, "text", text.order)
     return make(text.name, *columns, step=None, source="drive")

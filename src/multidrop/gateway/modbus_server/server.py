@@ -30,7 +30,7 @@ from multidrop.gateway.modbus_server.protocol import (
     reply_data,
 )
 from multidrop.gateway.modbus_server.settings import MAIN, ModbusSettings, Unit, Units
-from multidrop.gateway.modbus_server.words import Lack
+from multidrop.gateway.modbus_server.words import Unavailable
 from multidrop.gateway.parts import Ask, PartContext
 
 Settings = ModbusSettings
@@ -145,7 +145,7 @@ class ModbusServer:
                 monotonic_ns(),
                 max(self._commands.ended_ns(unit.drive.name), self._hub.woke_ns()),
             )
-            if isinstance(found, Lack):
+            if isinstance(found, Unavailable):
                 return self._pass(unit, request, addresses, found, client)
             words = found
         return request.reply(reply_data(function, words))
@@ -162,11 +162,11 @@ class ModbusServer:
         return None
 
     def _pass(
-        self, unit: Unit, request: MbapRequest, addresses: range, lack: Lack, client: ModbusClient
+        self, unit: Unit, request: MbapRequest, addresses: range, reason: Unavailable, client: ModbusClient
     ) -> Awaitable[bytes]:
         """Pass a read on to the drive itself, if the settings allow it."""
         passing = self.settings.passing
-        if passing == "off" and lack is Lack.UNPOLLED:
+        if passing == "off" and reason is Unavailable.UNPOLLED:
             raise Declined(ModbusCode.ILLEGAL_ADDRESS)
         if passing == "declared" and not unit.is_declared(request.function, addresses):
             raise Declined(ModbusCode.ILLEGAL_ADDRESS)

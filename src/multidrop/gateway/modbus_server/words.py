@@ -46,7 +46,7 @@ def reading_function(table: Table) -> int:
     return code if code in _FUNCTIONS.get(table.carrier, ()) else 0
 
 
-class Lack(Enum):
+class Unavailable(Enum):
     """The reason why a read of these addresses cannot be answered from polled rows."""
 
     UNPOLLED = "not polled, or the words are uncertain"
@@ -124,20 +124,20 @@ class _PolledRegister:
         self._value: float | None = None
         self._data: bytes | None = None
 
-    def word(self, row: Newest | None, at: int, now_ns: int, since_ns: int) -> int | Lack:
+    def word(self, row: Newest | None, at: int, now_ns: int, since_ns: int) -> int | Unavailable:
         """Return the word (of a coil: the bit) at this offset in the newest row, or the reason why it is
         unknown.
 
         Misses, stale rows and rows older than `since_ns` are not used.
         """
         if row is None or not is_fresh(row, now_ns, since_ns):
-            return Lack.STALE
+            return Unavailable.STALE
         value = row.value
         if value is not None and value != self._value:
             self._value, self._data = value, exact_data(self._register, value)
         data = self._data
         if data is None:
-            return Lack.UNPOLLED
+            return Unavailable.UNPOLLED
         return data[0] if len(data) == 1 else data[2 * at] << 8 | data[2 * at + 1]
 
 
@@ -166,44 +166,44 @@ class DriveWords:
         newest: Callable[[str], Newest | None],
         now_ns: int,
         since_ns: int = 0,
-    ) -> list[int] | Lack:
+    ) -> list[int] | Unavailable:
         """Return the words or bits at these addresses from fresh rows, or why that is impossible.
 
         `newest` returns the newest row of a register by name. Rows older than `since_ns` are not used.
         """
         words: list[int] = []
-        lacks: list[Lack] = []
+        reasons: list[Unavailable] = []
         for address in addresses:
             found = self._at.get((function, address))
             if found is None:
-                return Lack.UNPOLLED
+                return Unavailable.UNPOLLED
             if len(found) == 1:
                 polled, at = found[0]
                 word = polled.word(newest(polled.name), at, now_ns, since_ns)
             else:
                 rows = [(newest(polled.name), polled, at) for polled, at in found]
                 word = _newest_word(rows, now_ns, since_ns)
-            if isinstance(word, Lack):
-                lacks.append(word)
+            if isinstance(word, Unavailable):
+                reasons.append(word)
             else:
                 words.append(word)
-        if lacks:
-            return Lack.UNPOLLED if Lack.UNPOLLED in lacks else Lack.STALE
+        if reasons:
+            return Unavailable.UNPOLLED if Unavailable.UNPOLLED in reasons else Unavailable.STALE
         return words
 
 
 def _newest_word(
     found: list[tuple[Newest | None, _PolledRegister, int]], now_ns: int, since_ns: int
-) -> int | Lack:
+) -> int | Unavailable:
     """Return the word at an address that several registers share, from the newest of their rows."""
-    lack = Lack.STALE
+    reason = Unavailable.STALE
     for row, polled, at in sorted(found, key=lambda one: -one[0].monotonic_ns if one[0] else 0):
         word = polled.word(row, at, now_ns, since_ns)
-        if not isinstance(word, Lack):
+        if not isinstance(word, Unavailable):
             return word
-        if word is Lack.UNPOLLED:
-            lack = word
-    return lack
+        if word is Unavailable.UNPOLLED:
+            reason = word
+    return reason
 
 
 class CommonNumber(NamedTuple):

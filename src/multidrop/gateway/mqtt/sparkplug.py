@@ -51,7 +51,7 @@ class Metric(NamedTuple):
     is_historical: bool = False  # not the present value
 
 
-class Given(NamedTuple):
+class ReceivedMetric(NamedTuple):
     """A metric in a received command."""
 
     name: str  # "" if the metric has only an alias
@@ -114,7 +114,7 @@ def _varint(value: int) -> bytes:
     return bytes(out)
 
 
-def read_command(data: bytes) -> tuple[int, list[Given]]:
+def read_command(data: bytes) -> tuple[int, list[ReceivedMetric]]:
     """Return time (UTC in ms; 0 if missing) and metrics of an NCMD or a DCMD.
 
     Raises ValueError for an invalid payload.
@@ -130,7 +130,7 @@ def read_command(data: bytes) -> tuple[int, list[Given]]:
     return time_ms, given
 
 
-def _given(data: bytes) -> Given:
+def _given(data: bytes) -> ReceivedMetric:
     name, alias, value = "", None, None
     for field, found in _fields(data):
         if field == _NAME and isinstance(found, bytes):
@@ -139,7 +139,7 @@ def _given(data: bytes) -> Given:
             alias = found
         else:
             value = _found_value(field, found, value)
-    return Given(name, alias, value)
+    return ReceivedMetric(name, alias, value)
 
 
 def _found_value(field: int, found: int | bytes, before: float | str | None) -> float | str | None:

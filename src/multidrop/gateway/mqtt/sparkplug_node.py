@@ -19,8 +19,8 @@ from multidrop.gateway.mqtt.sparkplug import (
     REBIRTH,
     SEQUENCES,
     DataType,
-    Given,
     Metric,
+    ReceivedMetric,
     payload,
     read_command,
 )
@@ -260,7 +260,7 @@ class SparkplugNode:
 
     # ---- commands ----
 
-    def _command(self, drive: str, given: Given, sent_ms: int, *, is_retained: bool) -> None:
+    def _command(self, drive: str, given: ReceivedMetric, sent_ms: int, *, is_retained: bool) -> None:
         name = given.name or self._name_of(drive, given.alias)
         register = name.removeprefix(REGISTERS)
         is_writable = name not in OWN and register in self._writable(drive)
