@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,7 +20,7 @@ from lines import HOST_LATE, PATIENCE, until
 import multidrop
 from multidrop import Batch, Bus, InvtCHE, LineError, Plant
 from multidrop.gateway.clock import boottime_ns
-from multidrop.gateway.gateway import Gateway
+from multidrop.gateway.gateway import Gateway, Notifier
 from multidrop.gateway.http.rights import Right, new_token
 from multidrop.gateway.live import drive_reads
 from multidrop.gateway.settings import ServeSettings, read_settings
@@ -533,3 +534,9 @@ def test_a_reload_survives_unexpected_failures(tmp_path: Path, monkeypatch: pyte
         told = reload(gateway)
         assert (told["done"], told["mistakes"]) == (False, ["integer division or modulo by zero"])
         assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
+
+
+def test_reload_is_announced_on_systems_without_posix_clocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows has neither CLOCK_MONOTONIC nor a service manager's socket."""
+    monkeypatch.setattr("multidrop.gateway.gateway.time", SimpleNamespace())
+    Notifier("").send_reloading()

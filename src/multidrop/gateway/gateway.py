@@ -20,7 +20,7 @@ import uvicorn
 import multidrop
 from multidrop import Bus, LineError, Plant, Poller
 from multidrop.control import Ledger
-from multidrop.gateway.clock import boottime_ns, now_and_slept_ns, utc_ms
+from multidrop.gateway.clock import boottime_ns, monotonic_ns, now_and_slept_ns, utc_ms
 from multidrop.gateway.commands import Commands, FleetStops
 from multidrop.gateway.http.connections import BACKLOG, Connections, WatchedApp, WatchedProtocol, listen
 from multidrop.gateway.http.guard import MOST_HEAD
@@ -49,34 +49,6 @@ ASKED_S = 30.0  # time limit of one request for a register that is not declared
 END_S = 4.0  # time limit of shutdown, stops included
 GRACE_S = 1  # part of END_S for finishing HTTP requests in flight
 _log = logging.getLogger("multidrop.gateway")
-
-
-class Notifier:
-    """Sends messages to the service manager's socket; without a socket, all calls are ignored."""
-
-    def __init__(self, address: str | None = None) -> None:
-        self._address = os.environ.get("NOTIFY_SOCKET", "") if address is None else address
-
-    @property
-    def watchdog_s(self) -> float | None:
-        """The service manager's limit of the time between WATCHDOG=1 messages, in s; None: no limit."""
-        asked = os.environ.get("WATCHDOG_USEC", "")
-        mine = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
-        return int(asked) / 1e6 if asked.isdigit() and int(asked) > 0 and mine else None
-
-    def send_reloading(self) -> None:
-        """Report the start of a reload, with its time. A later READY=1 reports the end of the reload."""
-        self.send("RELOADING=1", f"MONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
-
-    def send(self, *lines: str) -> None:
-        """Send lines such as READY=1, without waiting; they are lost if the manager's queue is full."""
-        if not self._address:
-            return
-        abstract = self._address.startswith("@")
-        address = "\0" + self._address[1:] if abstract else self._address
-        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
-            manager.setblocking(False)
-            manager.sendto("\n".join(lines).encode(), address)
 
 
 class Gateway:
@@ -455,3 +427,34 @@ class _Server(uvicorn.Server):
     @contextmanager
     def capture_signals(self) -> Any:
         yield
+
+
+# ---- messages to the service manager by sd_notify(3): ready, alive, reloading, stopping ----
+
+
+class Notifier:
+    """Sends messages to the service manager's socket; without a socket, all calls are ignored."""
+
+    def __init__(self, address: str | None = None) -> None:
+        self._address = os.environ.get("NOTIFY_SOCKET", "") if address is None else address
+
+    @property
+    def watchdog_s(self) -> float | None:
+        """The service manager's limit of the time between WATCHDOG=1 messages, in s; None: no limit."""
+        asked = os.environ.get("WATCHDOG_USEC", "")
+        mine = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        return int(asked) / 1e6 if asked.isdigit() and int(asked) > 0 and mine else None
+
+    def send_reloading(self) -> None:
+        """Report the start of a reload, with its time. A later READY=1 reports the end of the reload."""
+        self.send("RELOADING=1", f"MONOTONIC_USEC={monotonic_ns() // 1000}")
+
+    def send(self, *lines: str) -> None:
+        """Send lines such as READY=1, without waiting; they are lost if the manager's queue is full."""
+        if not self._address:
+            return
+        abstract = self._address.startswith("@")
+        address = "\0" + self._address[1:] if abstract else self._address
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+            manager.setblocking(False)
+            manager.sendto("\n".join(lines).encode(), address)

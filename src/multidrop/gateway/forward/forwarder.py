@@ -77,6 +77,9 @@ def row_objects(rows: Any) -> list[dict[str, Any]]:
     ]
 
 
+# ---- messages, and the thread that sends them ----
+
+
 class SpoolPosition(NamedTuple):
     """The messages that a receiver has: all up to `newest`, except the ranges (first, last) in `gaps`."""
 
@@ -265,6 +268,9 @@ class RowForwarder(RetryingSender):
         self._refusals.pop(stored.sequence, None)
         self.refused += stored.rows
         _log.error("%s does not get %d rows: %s", self.name, stored.rows, printable(why)[:200])
+
+
+# ---- the part of the gateway ----
 
 
 class Forwarding:

@@ -35,7 +35,8 @@ TYPES = {  # media types by suffix; files with other suffixes are plain text
     ".svg": "image/svg+xml",
     ".json": "application/json",
 }
-MOST_EXPORTS = 8  # limit of concurrent exports
+# limit of concurrent exports: each uses a thread, and a Parquet file needs space on the history's disk
+MOST_EXPORTS = 8
 PIECE_S = 600.0  # time limit for making one piece of a file; a whole Parquet file counts as one piece
 R = TypeVar("R")
 MOST_NAME = 80  # a series' name is cut to this many characters in a file name
@@ -47,6 +48,9 @@ PARAMETER_KINDS = {
 }
 
 
+# ---- the page's files ----
+
+
 class PageFile(NamedTuple):
     """One file of the page."""
 
@@ -56,7 +60,10 @@ class PageFile(NamedTuple):
 
 
 class PageFiles:
-    """The files of a folder and of the folders in it, by relative path."""
+    """The files of a folder and of the folders in it, by relative path.
+
+    They are read into memory at the first request, so later requests do not wait for a disk.
+    """
 
     def __init__(self, folder: Path = PAGE) -> None:
         self._folder = folder
@@ -111,6 +118,9 @@ def _texts_by_language(catalogue: str) -> dict[str, PageFile]:
 
 def _page_file(body: bytes, media_type: str) -> PageFile:
     return PageFile(body, media_type, f'"{hashlib.sha256(body).hexdigest()[:32]}"')
+
+
+# ---- exports of the history, and parameters ----
 
 
 class Exports:

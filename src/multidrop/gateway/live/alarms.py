@@ -287,6 +287,9 @@ def _parts(text: str) -> set[str]:
     return {*text.split(SEPARATOR)}
 
 
+# ---- limits of values (`[[serve.limit]]` of a plant file) ----
+
+
 class Limit(NamedTuple):
     """A bound of a polled value. It is exceeded once the value has been beyond it for `lasting_s` seconds.
 

@@ -19,19 +19,19 @@ SHARE = 20  # the pause is at least this many times the duration of the last rea
 LOOKED_S = 3.0  # a drive is read until this many seconds after its last view
 MOST_DRIVES = 4  # limit of drives that are read concurrently
 READ_S = 30.0  # time limit of one read
-
 UNANSWERED = "no reply"
 
-ReadValues = dict[str, list[Any]]  # by register: value or None, time (UTC, ms), "ok" or the failure
 ROUND_S = 2.0  # pause between two rounds of identity checks
 ASKED_S = 30.0  # time limit of one identity check
 REST_S = 0.1  # pause before each read of an identity check, which leaves time for polling
-_log = logging.getLogger("multidrop.gateway")
+
 MOST_READS = 2  # limit of drives whose parameters are read concurrently
-PARAMETERS_S = 3600.0  # time limit of one read
-MOST_PAUSE_S = 1.0
-# pause after a block of parameters, which leaves time for polling: this many times the duration of the block
-PARAMETER_SHARE = 3
+PARAMETERS_S = 3600.0  # time limit of reading a drive's parameters
+# pause after a block of parameters: this many times the block's duration, and its limit in s
+PARAMETER_SHARE, MOST_PAUSE_S = 3, 1.0
+
+ReadValues = dict[str, list[Any]]  # by register: value or None, time (UTC, ms), "ok" or the failure
+_log = logging.getLogger("multidrop.gateway")
 
 
 class SideReads:
@@ -174,6 +174,9 @@ class Identities:
             self._refused[drive.name] = str(refusal)
         except (BusError, ValueError):  # checked again in a later round, unless the drive was removed
             pass
+
+
+# ---- reads of all parameters of a drive; no parameter is written ----
 
 
 @dataclass

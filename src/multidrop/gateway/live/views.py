@@ -27,6 +27,9 @@ CURRENTS = ("output_current",)
 LEDGER_S = 6.0  # time limit for the EEPROM ledger, which waits 5 s for a lock
 
 
+# ---- the description of a plant: lines, drives, registers and the caller's rights ----
+
+
 def describe(gateway: Gateway, right: Right | None, language: str) -> dict[str, Any]:
     """Return the answer to GET /api/plant for a caller with this right, with titles in this language."""
     is_writer = right is Right.WRITE
@@ -129,6 +132,9 @@ def _span(register: Register[Any]) -> tuple[float | None, float | None]:
     ends = (register.coding.value_of(float(raw)) for raw in register.coding.raw_span)
     least, most = sorted(ends)
     return least, most
+
+
+# ---- one drive, all lines, and health ----
 
 
 async def drive_view(gateway: Gateway, name: str) -> dict[str, Any]:

@@ -159,6 +159,9 @@ class LineShare:
             self._running.cancel()
 
 
+# ---- writes and stops ----
+
+
 class Standstill:
     """Detects that the gateway did not run for more than MOST_AGE_S; then refuses writes for SETTLE_S.
 

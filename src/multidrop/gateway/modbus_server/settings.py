@@ -166,6 +166,9 @@ def _is_network(text: object) -> bool:
         return False
 
 
+# ---- units ----
+
+
 class StopWrite(NamedTuple):
     """A register, and a raw value that stops the motor if it is written to the register."""
 

@@ -158,8 +158,15 @@ class Connection:
         self._peer.close()
 
 
+# ---- requests ----
+
+
 class RequestCutter:
-    """Collects a tool's bytes and returns whole requests."""
+    """Collects a tool's bytes and returns whole requests.
+
+    Source: MODBUS over Serial Line V1.02, section 2.5.1. On a serial line, silence separates frames. A
+    pseudo-terminal and TCP do not keep the silence, so a frame is recognised by its length and checksum.
+    """
 
     def __init__(self) -> None:
         self._came = bytearray()

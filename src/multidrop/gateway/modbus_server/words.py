@@ -206,6 +206,9 @@ def _newest_word(
     return reason
 
 
+# ---- the common block, and the computed channels ----
+
+
 class CommonNumber(NamedTuple):
     """A number of the common block, as the address map describes it."""
 
