@@ -24,7 +24,7 @@ from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
 from multidrop.gateway.mqtt.broker import Outbox, Publication
 from multidrop.gateway.mqtt.part import build
 from multidrop.gateway.mqtt.settings import MqttSettings
-from multidrop.gateway.mqtt.sparkplug import DataType, Given, Metric, payload, read_command
+from multidrop.gateway.mqtt.sparkplug import DataType, Metric, ReceivedMetric, payload, read_command
 from multidrop.gateway.mqtt.sparkplug_node import STOP, SparkplugNode
 from multidrop.polling.batch import Batch
 
@@ -325,7 +325,7 @@ def test_command_of_a_sparkplug_host_is_decoded(field: str, value: object) -> No
     sent.metrics.add(name="nothing", is_null=True)
     assert read_command(sent.SerializeToString()) == (
         1234,
-        [Given("setpoint", 9, value), Given("nothing", None, None)],  # type: ignore[arg-type]
+        [ReceivedMetric("setpoint", 9, value), ReceivedMetric("nothing", None, None)],  # type: ignore[arg-type]
     )
 
 
