@@ -16,6 +16,7 @@ from multidrop.cli.support.arguments import (
     add_json_argument,
     add_target_arguments,
     add_writing_arguments,
+    check_words,
     is_plant,
     mistaken,
     target_of,
@@ -108,7 +109,7 @@ def _diff(arguments: argparse.Namespace) -> int:
     words = list(arguments.words)
     if arguments.defaults:
         target, words = _drive_of(arguments, words)
-        _check_no_more(arguments, words)
+        check_words(arguments, words, ())
         family: Any = type(target.drive)
         first = params.defaults(family)
         second = _read(target, [*first.values])
@@ -118,7 +119,7 @@ def _diff(arguments: argparse.Namespace) -> int:
             # the second side is one word: the name of a drive in the first side's plant file
             words = [one.words[0], *words]
         other, words = _side(arguments, words)
-        _check_no_more(arguments, words)
+        check_words(arguments, words, ())
         first, second = _both(one, other)
         family = _family_of(one, other, first)
     different = params.compare(first, second, family)
@@ -188,7 +189,7 @@ def _apply(arguments: argparse.Namespace) -> int:
         )
     given = params.load(arguments.words[0])
     target, words = _drive_of(arguments, arguments.words[1:])
-    _check_no_more(arguments, words)
+    check_words(arguments, words, ())
     drive = target.drive
     with reporting_interruption(drive, "apply") as known, target.open_bus(arguments.audit):
         known.clear()
@@ -245,7 +246,7 @@ def _list(arguments: argparse.Namespace) -> int:
         family: Any = find_model(words[0])
     else:
         target, rest = _drive_of(arguments, words)
-        _check_no_more(arguments, rest)
+        check_words(arguments, rest, ())
         family = type(target.drive)
         held = _read(target)
     rows = params.rows(family, held)
@@ -267,11 +268,6 @@ def _list(arguments: argparse.Namespace) -> int:
 def _drive_of(arguments: argparse.Namespace, words: Sequence[str]) -> tuple[Target, list[str]]:
     """Return the drive that the first words name, and the remaining words."""
     return target_of(argparse.Namespace(**vars(arguments) | {"words": [*words]}))
-
-
-def _check_no_more(arguments: argparse.Namespace, words: Sequence[str]) -> None:
-    if words:
-        raise mistaken(arguments, f"unrecognized arguments: {' '.join(words)}")
 
 
 @contextmanager

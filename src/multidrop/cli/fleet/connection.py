@@ -96,9 +96,9 @@ def state_folder() -> Path:
     return default_path().parent / "fleet"
 
 
-def require_fleet() -> None:
+def require_fleet(command: str = "fleet") -> None:
     for library in ("nats", "pyarrow"):
-        require_extra(library, "fleet", "fleet")
+        require_extra(library, "fleet", command)
 
 
 def run_action(work: Callable[[], Coroutine[Any, Any, int]]) -> int:

@@ -162,8 +162,7 @@ def _add_hub(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_hub(arguments: argparse.Namespace) -> int:
-    for library in ("nats", "pyarrow"):
-        require_extra(library, "fleet", "hub")
+    require_fleet("hub")
     if arguments.postgres:
         require_extra("psycopg", "postgres", "hub")
     arguments.servers = nats_urls(",".join(arguments.servers))

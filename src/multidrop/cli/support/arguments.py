@@ -179,18 +179,14 @@ def plant_at(arguments: argparse.Namespace) -> Plant | None:
     Raises ValueError for a mistake in the plant file, and for a plant file's option given with a port.
     """
     if arguments.port is None:
-        raise ValueError(
-            f"the following arguments are required: PORT; see `multidrop {arguments.command} --help`"
-        )
+        raise mistaken(arguments, "the following arguments are required: PORT")
     if is_plant(arguments.port):
         return plant_of(arguments.port, arguments)
     check_port(arguments.port)
     if arguments.ports:
         raise ValueError("--port is for the lines of a plant file: write the port in place of PORT")
     if arguments.name is not None:
-        raise ValueError(
-            f"unrecognized arguments: {arguments.name}; see `multidrop {arguments.command} --help`"
-        )
+        raise mistaken(arguments, f"unrecognized arguments: {arguments.name}")
     return None
 
 
