@@ -158,7 +158,7 @@ def test_the_demo_of_serve_ends_when_its_terminal_is_closed() -> None:
 
 
 @pytest.mark.slow
-def test_a_fleets_gateway_ends_when_its_terminal_is_closed(tmp_path: Path) -> None:
+def test_a_gateway_ends_when_its_terminal_is_closed(tmp_path: Path) -> None:
     require_module("uvicorn")
     path = plant_file(tmp_path)
     with path.open("a") as file:
