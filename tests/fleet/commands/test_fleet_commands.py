@@ -14,7 +14,7 @@ import pytest
 from tables import table
 
 from multidrop.control import CommandOutcome, read_audit
-from multidrop.fleet.commands import fleet_commands as asker_module
+from multidrop.fleet.commands import fleet_commands
 from multidrop.fleet.commands.fleet_commands import FleetCommands
 from multidrop.fleet.commands.messages import CommandAnswer
 from multidrop.fleet.errors import FleetError, MayNotSend, NobodyThere, NotDelivered, OutcomeUnknown
@@ -90,22 +90,22 @@ def asked(
     """Return the result of a command from a client that has only this path."""
 
     async def main() -> CommandAnswer:
-        asker = FleetCommands(["nats://nobody"], by="anna", log=folder / "asked.jsonl")
-        asker._paths = [path]
-        asker._plant = plant or Plant()
+        client = FleetCommands(["nats://nobody"], by="anna", log=folder / "asked.jsonl")
+        client._paths = [path]
+        client._plant = plant or Plant()
         try:
-            return await what(asker)
+            return await what(client)
         finally:
-            await asker.close()
+            await client.close()
 
     with ExitStack() as stack:
         for name, seconds in (("LOST_S", 0.01), ("NO_MASTER_S", nobody_s), ("AGAIN_S", 0.0)):
-            stack.enter_context(patch.object(asker_module, name, seconds))
+            stack.enter_context(patch.object(fleet_commands, name, seconds))
         return asyncio.run(main())
 
 
-def write(asker: FleetCommands) -> Awaitable[CommandAnswer]:
-    return asker.write("pump-1", "frequency", 20.0)
+def write(client: FleetCommands) -> Awaitable[CommandAnswer]:
+    return client.write("pump-1", "frequency", 20.0)
 
 
 NOBODY, LOST, CUT = NobodyThere("nobody"), OutcomeUnknown("no answer"), NotDelivered("no connection")
@@ -121,26 +121,30 @@ WRITES: dict[
     "no connection": (ScriptedPath(cmd=[CUT]), NOT_SENT, 0),
     "a silent master": (ScriptedPath(cmd=[LOST]), NOT_SENT, 0),
     "a refusal": (ScriptedPath(cmd=[answer("refused")]), CommandOutcome.REFUSED, 0),
-    "words of nobody's": (ScriptedPath(cmd=[b"\xff"]), NOT_SENT, 0),
+    "an invalid offer": (ScriptedPath(cmd=[b"\xff"]), NOT_SENT, 0),
     "the master is gone": (ScriptedPath(cmd=[OFFER], do=[NOBODY]), NOT_SENT, 1),
-    "cut before it left": (ScriptedPath(cmd=[OFFER], do=[CUT]), NOT_SENT, 1),
+    "connection lost before sending": (ScriptedPath(cmd=[OFFER], do=[CUT]), NOT_SENT, 1),
     "the answer is lost, and then found": (
         ScriptedPath(cmd=[OFFER], do=[LOST], ask=[LOST, IT_IS_DONE]),
         DONE,
         1,
     ),
-    "the do is lost": (ScriptedPath(cmd=[OFFER], do=[LOST], ask=[TAKEN_BACK]), NOT_SENT, 1),
-    "it takes long": (
+    "the confirmation is lost": (ScriptedPath(cmd=[OFFER], do=[LOST], ask=[TAKEN_BACK]), NOT_SENT, 1),
+    "a long command": (
         ScriptedPath(cmd=[OFFER], do=[UNDER_WAY], ask=[UNDER_WAY, UNDER_WAY, IT_IS_DONE]),
         DONE,
         1,
     ),
-    "the master dies at it": (ScriptedPath(cmd=[OFFER], do=[UNDER_WAY], ask=[NOBODY]), UNKNOWN, 1),
-    "any other failure": (ScriptedPath(cmd=[OFFER], do=[ANY], ask=[ANY, IT_IS_DONE]), DONE, 1),
-    "any other failure of all": (ScriptedPath(cmd=[OFFER], do=[ANY], ask=[ANY]), UNKNOWN, 1),
+    "the master dies during the command": (
+        ScriptedPath(cmd=[OFFER], do=[UNDER_WAY], ask=[NOBODY]),
+        UNKNOWN,
+        1,
+    ),
+    "another error": (ScriptedPath(cmd=[OFFER], do=[ANY], ask=[ANY, IT_IS_DONE]), DONE, 1),
+    "another error each time": (ScriptedPath(cmd=[OFFER], do=[ANY], ask=[ANY]), UNKNOWN, 1),
     "no right to ask": (ScriptedPath(cmd=[ANY]), NOT_SENT, 0),
     "all is lost": (ScriptedPath(cmd=[OFFER], do=[LOST], ask=[LOST]), UNKNOWN, 1),
-    "an answer of nobody's": (ScriptedPath(cmd=[OFFER], do=[b"[]"], ask=[IT_IS_DONE]), DONE, 1),
+    "an invalid result": (ScriptedPath(cmd=[OFFER], do=[b"[]"], ask=[IT_IS_DONE]), DONE, 1),
 }
 
 
@@ -156,13 +160,13 @@ def test_a_command_is_sent_once_and_its_outcome_is_true(tmp_path: Path, case: st
     assert (last["step"], last["outcome"]) == ("over", outcome.value)
 
 
-def stop(asker: FleetCommands) -> Awaitable[CommandAnswer]:
-    return asker.stop(["pump-1"])
+def stop(client: FleetCommands) -> Awaitable[CommandAnswer]:
+    return client.stop(["pump-1"])
 
 
 STOPS: dict[str, tuple[ScriptedPath, CommandOutcome, str]] = {
     "stopped": (ScriptedPath(stop=[IT_IS_DONE]), DONE, "as it is"),
-    "at length": (ScriptedPath(stop=[UNDER_WAY, UNDER_WAY, IT_IS_DONE]), DONE, "as it is"),
+    "after a while": (ScriptedPath(stop=[UNDER_WAY, UNDER_WAY, IT_IS_DONE]), DONE, "as it is"),
     "no master": (
         ScriptedPath(stop=[NOBODY]),
         NOT_SENT,
@@ -190,8 +194,8 @@ STOPS: dict[str, tuple[ScriptedPath, CommandOutcome, str]] = {
         "the result of the stop of pump-1 is unknown: its gateway no longer answers; "
         "use the hard-wired stop (no answer)",
     ),
-    "any failure": (ScriptedPath(stop=[ANY]), UNKNOWN, "the result of the stop"),
-    "silence, then nobody": (ScriptedPath(stop=[LOST, NOBODY]), UNKNOWN, "the result of"),
+    "another error": (ScriptedPath(stop=[ANY]), UNKNOWN, "the result of the stop"),
+    "silence, then no master": (ScriptedPath(stop=[LOST, NOBODY]), UNKNOWN, "the result of"),
 }
 
 
@@ -207,7 +211,7 @@ def test_progress_of_a_stop_is_reported_once_per_change(tmp_path: Path) -> None:
     sent, turning = answer("under way", "sent"), answer("under way", "still turning")
     path = ScriptedPath(stop=[sent, sent, LOST, turning, sent, IT_IS_DONE])
     told: list[CommandAnswer] = []
-    last = asked(tmp_path, path, lambda asker: asker.stop(["pump-1"], on_news=told.append))
+    last = asked(tmp_path, path, lambda client: client.stop(["pump-1"], on_news=told.append))
     assert [(news.outcome, news.text) for news in told] == [
         (CommandOutcome.UNDER_WAY, "sent"),
         (CommandOutcome.UNDER_WAY, "still turning"),
@@ -218,7 +222,7 @@ def test_progress_of_a_stop_is_reported_once_per_change(tmp_path: Path) -> None:
 def test_a_missing_master_is_reported_once_and_immediately(tmp_path: Path) -> None:
     told: list[CommandAnswer] = []
     path = ScriptedPath(stop=[NOBODY, NOBODY, CUT, IT_IS_DONE])
-    last = asked(tmp_path, path, lambda asker: asker.stop(["pump-1"], on_news=told.append), nobody_s=60.0)
+    last = asked(tmp_path, path, lambda client: client.stop(["pump-1"], on_news=told.append), nobody_s=60.0)
     assert last.outcome is DONE
     yet = "the stop of pump-1 was NOT sent yet: {}; use the hard-wired stop"
     assert [news.text for news in told] == [
@@ -239,7 +243,7 @@ def test_a_stop_whose_gateway_falls_silent_reports_its_last_answer(tmp_path: Pat
 def test_a_stop_without_answers_is_reported_before_the_client_gives_up(tmp_path: Path) -> None:
     told: list[CommandAnswer] = []
     path = ScriptedPath(stop=[LOST])
-    last = asked(tmp_path, path, lambda asker: asker.stop(["pump-1"], on_news=told.append))
+    last = asked(tmp_path, path, lambda client: client.stop(["pump-1"], on_news=told.append))
     assert last.outcome is UNKNOWN
     [news] = told
     assert news.text == "the stop of pump-1: no gateway has answered yet; use the hard-wired stop"
@@ -257,9 +261,9 @@ class HangingPath(ScriptedPath):
 def test_a_stop_does_not_wait_for_a_hanging_path(tmp_path: Path) -> None:
     hanging, path = HangingPath(), ScriptedPath(stop=[IT_IS_DONE])
 
-    async def stop_on_both(asker: FleetCommands) -> CommandAnswer:
-        asker._paths = [hanging, path]
-        return await asyncio.wait_for(asker.stop(["pump-1"]), 60)
+    async def stop_on_both(client: FleetCommands) -> CommandAnswer:
+        client._paths = [hanging, path]
+        return await asyncio.wait_for(client.stop(["pump-1"]), 60)
 
     assert asked(tmp_path, path, stop_on_both).outcome is DONE
     assert hanging.asked == ["stop.hall-1"]
@@ -269,9 +273,9 @@ def test_a_stop_does_not_wait_for_a_hanging_path(tmp_path: Path) -> None:
 def test_a_stop_is_unsent_only_if_every_path_reports_it(tmp_path: Path, others: list[Given]) -> None:
     paths = [ScriptedPath(stop=[given]) for given in (NOBODY, *others)]
 
-    async def stop_on_all(asker: FleetCommands) -> CommandAnswer:
-        asker._paths = paths
-        return await asker.stop(["pump-1"])
+    async def stop_on_all(client: FleetCommands) -> CommandAnswer:
+        client._paths = paths
+        return await client.stop(["pump-1"])
 
     told = asked(tmp_path, paths[0], stop_on_all)
     assert told.outcome is (UNKNOWN if LOST in others else NOT_SENT)
@@ -304,9 +308,9 @@ def test_an_unopened_log_blocks_commands_but_not_stops(tmp_path: Path) -> None:
 def test_only_the_confirmed_text_is_carried_out(tmp_path: Path) -> None:
     path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE])
 
-    async def agreed(asker: FleetCommands) -> CommandAnswer:
-        request = asker.request("pump-1", register="frequency", value=20.0)
-        return await asker.carry_out(request, "pump-1: frequency = 2.00 Hz")
+    async def agreed(client: FleetCommands) -> CommandAnswer:
+        request = client.request("pump-1", register="frequency", value=20.0)
+        return await client.carry_out(request, "pump-1: frequency = 2.00 Hz")
 
     told = asked(tmp_path, path, agreed)
     assert told.outcome is NOT_SENT
@@ -316,7 +320,7 @@ def test_only_the_confirmed_text_is_carried_out(tmp_path: Path) -> None:
 
 def test_all_lines_are_stopped_and_the_worst_outcome_is_returned(tmp_path: Path) -> None:
     path = ScriptedPath(stop=[{**IT_IS_DONE, "drives": {"pump-1": IT_IS_DONE}}, NOBODY])
-    told = asked(tmp_path, path, lambda asker: asker.stop())
+    told = asked(tmp_path, path, lambda client: client.stop())
     assert told.outcome is NOT_SENT
     assert "the stop of all drives of line hall-2 was NOT sent" in told.text
     assert told.drives["pump-1"].outcome is DONE
@@ -324,7 +328,7 @@ def test_all_lines_are_stopped_and_the_worst_outcome_is_returned(tmp_path: Path)
 
 def test_the_drives_of_one_line_are_stopped_by_one_message(tmp_path: Path) -> None:
     path = ScriptedPath(stop=[IT_IS_DONE])
-    asked(tmp_path, path, lambda asker: asker.stop(["pump-1", "fan-1", "pump-2"]))
+    asked(tmp_path, path, lambda client: client.stop(["pump-1", "fan-1", "pump-2"]))
     assert path.asked == ["stop", "stop"]
 
 
@@ -334,10 +338,10 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_p
     plant = Plant()
     plant.records["hall-3"] = Record("hall-3", 1, {"line": {"drive": [{"name": fan}]}})
     path = ScriptedPath(stop=[IT_IS_DONE])
-    asked(tmp_path, path, lambda asker: asker.stop([spelt]), plant)
+    asked(tmp_path, path, lambda client: client.stop([spelt]), plant)
     assert f"the stop of {fan}" in {note["what"] for note in read_audit(tmp_path / "asked.jsonl")}
     with pytest.raises(ValueError, match="has no drive"):
-        asked(tmp_path, path, lambda asker: asker.write(spelt, "frequency", 20.0), plant)
+        asked(tmp_path, path, lambda client: client.write(spelt, "frequency", 20.0), plant)
     assert path.asked == ["stop"]
 
 
@@ -347,16 +351,16 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_p
 def test_a_stop_is_sent_whatever_the_senders_name(tmp_path: Path, by: Any, noted: str) -> None:
     path = ScriptedPath(stop=[IT_IS_DONE])
 
-    async def stopped(asker: FleetCommands) -> CommandAnswer:
-        asker.by = by
-        return await asker.stop("pump-1")  # a single name, which must not be read as a sequence of letters
+    async def stopped(client: FleetCommands) -> CommandAnswer:
+        client.by = by
+        return await client.stop("pump-1")  # a single name, which must not be read as a sequence of letters
 
     assert asked(tmp_path, path, stopped).outcome is DONE
     assert path.asked == ["stop"]
     assert {note["by"] for note in read_audit(tmp_path / "asked.jsonl")} == {noted}
 
 
-@pytest.mark.parametrize("what", [write, lambda asker: asker.stop(["pump-1"])])
+@pytest.mark.parametrize("what", [write, lambda client: client.stop(["pump-1"])])
 def test_without_a_readable_plant_nothing_is_sent(tmp_path: Path, what: Any) -> None:
     with pytest.raises(FleetError, match="no server"):
         asked(tmp_path, ScriptedPath(), what, Plant(FleetError("no server")))
@@ -373,7 +377,7 @@ def test_an_older_copy_of_the_plant_is_enough_for_commands(tmp_path: Path) -> No
 def test_a_stop_of_a_named_line_needs_no_plant(tmp_path: Path) -> None:
     path = ScriptedPath(stop=[IT_IS_DONE])
     plant = Plant(FleetError("no server"))
-    told = asked(tmp_path, path, lambda asker: asker.stop(["pump-1"], line="hall-1"), plant)
+    told = asked(tmp_path, path, lambda client: client.stop(["pump-1"], line="hall-1"), plant)
     assert told.outcome is DONE
     with pytest.raises(
         FleetError, match="the stop was NOT sent; use the hard-wired stop: the fleet's plant cannot"
@@ -383,7 +387,7 @@ def test_a_stop_of_a_named_line_needs_no_plant(tmp_path: Path) -> None:
 
 def test_an_unknown_drive_does_not_block_other_stops(tmp_path: Path) -> None:
     path = ScriptedPath(stop=[{**IT_IS_DONE, "drives": {"pump-1": IT_IS_DONE}}])
-    told = asked(tmp_path, path, lambda asker: asker.stop(["pmp-2", "pump-1"]))
+    told = asked(tmp_path, path, lambda client: client.stop(["pmp-2", "pump-1"]))
     assert path.asked == ["stop"]
     assert told.outcome is CommandOutcome.REFUSED
     assert "no stop was sent: the fleet's plant has no drive 'pmp-2'; did you mean pump-2" in told.text
@@ -397,8 +401,8 @@ def test_an_unknown_drive_does_not_block_other_stops(tmp_path: Path) -> None:
 def test_an_unknown_drive_is_rejected_with_suggestions(tmp_path: Path, what: str) -> None:
     path = ScriptedPath()
     calls: dict[str, Callable[[FleetCommands], Awaitable[CommandAnswer]]] = {
-        "write": lambda asker: asker.write("pump1", "frequency", 20.0),
-        "stop": lambda asker: asker.stop(["pump1"]),
+        "write": lambda client: client.write("pump1", "frequency", 20.0),
+        "stop": lambda client: client.stop(["pump1"]),
     }
     with pytest.raises(ValueError, match=r"has no drive 'pump1'; did you mean pump-\d or pump-\d\?"):
         asked(tmp_path, path, calls[what])

@@ -69,32 +69,38 @@ def claims(first: dict[str, int], spare: dict[str, int], turn: int = 6, votes: i
 NOTHING, GOES = Step({}, set()), Step({}, {"x"})
 ALL_FREE = claims({"first": 11, "second": 12}, {"third": 13})
 CASES = {
-    "mine stays": (one_step(ME, ME, DEAD), NOTHING),
-    "mine that is another's goes": (one_step(ME, ME, DEAD, wanted="b"), GOES),
-    "mine goes when I drain": (one_step(ME, ME, DEAD, drains=True), GOES),
-    "mine by its first record alone stays": (one_step(ME, NEVER, NEVER, alone=True), NOTHING),
-    "mine by its first record alone goes": (one_step(ME, NEVER, NEVER, alone=True, wanted="b"), GOES),
-    "another's stays its": (one_step(LIVING, LIVING, DEAD, wanted="b"), NOTHING),
-    "a living one's is waited for": (one_step(LIVING, LIVING, DEAD), NOTHING),
-    "a living one's by its first record alone": (one_step(LIVING, NEVER, NEVER, alone=True), NOTHING),
-    "a dead one's is claimed": (one_step(DEAD, DEAD, GIVEN, settled=False), ALL_FREE),
-    "a dead one's by its first record alone": (
+    "own line is kept": (one_step(ME, ME, DEAD), NOTHING),
+    "own line assigned to another is released": (one_step(ME, ME, DEAD, wanted="b"), GOES),
+    "own line is released while draining": (one_step(ME, ME, DEAD, drains=True), GOES),
+    "own line with a two-vote record is kept": (one_step(ME, NEVER, NEVER, alone=True), NOTHING),
+    "own line with a two-vote record is released": (one_step(ME, NEVER, NEVER, alone=True, wanted="b"), GOES),
+    "another gateway's line is not claimed": (one_step(LIVING, LIVING, DEAD, wanted="b"), NOTHING),
+    "line of a living session is not claimed": (one_step(LIVING, LIVING, DEAD), NOTHING),
+    "line of a living session with a two-vote record is not claimed": (
+        one_step(LIVING, NEVER, NEVER, alone=True),
+        NOTHING,
+    ),
+    "line of a dead session is claimed": (one_step(DEAD, DEAD, GIVEN, settled=False), ALL_FREE),
+    "line of a dead session with a two-vote record is claimed": (
         one_step(DEAD, NEVER, NEVER, alone=True),
         claims({"first": 11, "second": 0}, {"third": 0}),
     ),
-    "a dead one's is not mine by the balance": (one_step(DEAD, DEAD, DEAD, wanted="b"), NOTHING),
-    "my session's before is claimed": (one_step(BEFORE, BEFORE, DEAD), ALL_FREE),
-    "one that was given away": (one_step(GIVEN, GIVEN, DEAD, settled=False), ALL_FREE),
-    "one that was given away in two buckets": (
+    "line of a dead session is left to its gateway": (one_step(DEAD, DEAD, DEAD, wanted="b"), NOTHING),
+    "line of our earlier session is claimed": (one_step(BEFORE, BEFORE, DEAD), ALL_FREE),
+    "released line is claimed": (one_step(GIVEN, GIVEN, DEAD, settled=False), ALL_FREE),
+    "line released in two buckets is claimed there": (
         one_step(LIVING, GIVEN, GIVEN),
         claims({"second": 12, "third": 13}, {}),
     ),
-    "one that I have half": (one_step(LIVING, ME, DEAD), claims({"third": 13}, {})),
-    "one that I have half, and another": (one_step(LIVING, ME, LIVING), NOTHING),
-    "one that I have half goes": (one_step(DEAD, ME, DEAD, wanted="b"), GOES),
-    "one that nobody had": (one_step(NEVER, NEVER, NEVER), claims({"first": 0}, {}, 1, NEEDED)),
-    "one that nobody had, too early": (one_step(NEVER, NEVER, NEVER, settled=False), NOTHING),
-    "none while I drain": (one_step(NEVER, NEVER, NEVER, drains=True), NOTHING),
+    "half-claimed line is claimed completely": (one_step(LIVING, ME, DEAD), claims({"third": 13}, {})),
+    "half-claimed line with a living rival is not claimed": (one_step(LIVING, ME, LIVING), NOTHING),
+    "half-claimed line assigned to another is released": (one_step(DEAD, ME, DEAD, wanted="b"), GOES),
+    "new line is claimed with a two-vote record": (
+        one_step(NEVER, NEVER, NEVER),
+        claims({"first": 0}, {}, 1, NEEDED),
+    ),
+    "new line is not claimed too early": (one_step(NEVER, NEVER, NEVER, settled=False), NOTHING),
+    "no line is claimed while draining": (one_step(NEVER, NEVER, NEVER, drains=True), NOTHING),
 }
 
 
