@@ -100,10 +100,7 @@ class Latches:
                 latch.hold(stop, STOPPED)
 
     def over(self, stop: object) -> None:
-        """End a stop, and accept calls of its drives again.
-
-        Repeated calls, and calls without `begin`, are harmless.
-        """
+        """End a stop, and accept calls of its drives again. It may be called twice, or without `begin`."""
         for latch in [*self._latches.values()]:
             latch.let_go(stop)
         self._stops.pop(stop, None)

@@ -252,10 +252,7 @@ class ExitHook:
         return self._held is not None
 
     def await_effect(self) -> None:
-        """Wait until a delayed signal has its effect, such as KeyboardInterrupt.
-
-        Does nothing outside the main thread.
-        """
+        """Wait until a delayed signal has its effect, such as KeyboardInterrupt (main thread only)."""
         if threading.current_thread() is not threading.main_thread():
             return
         while self._held is not None:

@@ -32,10 +32,7 @@ class _Over(Exception):
 
 
 class Performer:
-    """Carries out scripts on one bus.
-
-    A write expires if it cannot be sent within `expiry` seconds of its call.
-    """
+    """Carries out scripts on one bus. A write expires unless it is sent within `expiry` s of its call."""
 
     def __init__(
         self, exchanges: Exchanges, writer: Writer, stopper: Stopper, latches: Latches, expiry: float

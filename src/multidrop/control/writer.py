@@ -167,10 +167,7 @@ class Writer:
         timeout: float,
         log: Callable[..., None],
     ) -> Outcome:
-        """Send a write once, and return its outcome.
-
-        Without a call, the write is a stop, sent with `insists`.
-        """
+        """Send a write once; return its outcome. Without a call, the write is a stop, sent with `insists`."""
         request, asked = write_request(drive, register, raw), register.decode(raw)
         what = _in_words(register, asked)
         is_setpoint = register.name == drive.setpoint_name

@@ -173,10 +173,7 @@ class Columns:
 
     @classmethod
     def lent(cls, made: Any, give_back: Callable[[Any], object]) -> Columns:
-        """Return columns over the core's memory `made`.
-
-        Once the last view is freed, `give_back(made)` is called.
-        """
+        """Return columns over memory `made`. When its last view is freed, call `give_back(made)`."""
         columns = cls.__new__(cls)
         columns._own(made, give_back)
         return columns
@@ -291,10 +288,7 @@ class CodeTable:
         self.used = ()
 
     def know(self, names: Sequence[str]) -> None:
-        """Replace the known names by `names`, if `names` has more.
-
-        `names` starts with the known names, in the same order.
-        """
+        """Replace the known names by `names`, which starts with the known names, if `names` has more."""
         if len(names) > len(self._names):
             known = [self._numbers[at] for at in range(len(self._names))]
             self._numbers = ffi.new("int16_t[]", [*known, *[-1] * (len(names) - len(known))])

@@ -309,10 +309,7 @@ class Peer:
 
     @property
     def next_timeout_ns(self) -> int:
-        """The timeout of the next read in ns.
-
-        While the drive is silent, this timeout is sometimes longer than `timeout`.
-        """
+        """The timeout of the next read in ns, sometimes longer than `timeout` while the drive is silent."""
         return int(lib.md_next_timeout_ns(self.c))
 
     @property

@@ -131,9 +131,7 @@ class AddedRows:
             self.mark(OUTAGE, text)
 
     def mark(self, kind: str, text: str, ago_s: float = 0.0) -> None:
-        """Add an event with a time `ago_s` s before now. Raises ValueError for a text that is empty or too
-        long.
-        """
+        """Add an event `ago_s` s before now. Raises ValueError for a text that is empty or too long."""
         text = " ".join(text.split())
         if not text or len(text) > LONGEST_TEXT or not text.isprintable():
             raise ValueError(f"an event has a text of 1 to {LONGEST_TEXT} printable characters, not {text!r}")
@@ -277,8 +275,6 @@ class TotalsFile:
             self._failure = str(failure)
 
     def flush(self) -> None:
-        """Wait up to CLOSE_S until all queued writes are done. Return immediately if an earlier wait timed
-        out.
-        """
+        """Wait up to CLOSE_S until all queued writes are done, unless an earlier wait timed out."""
         if not self._thread.hangs(CLOSE_S) and not self._thread.flush(CLOSE_S):
             _log.error("totals are not kept: %s has not been written for %g s", self.path, CLOSE_S)

@@ -219,9 +219,7 @@ class Adoption:
     # ---- carrying out the change ----
 
     def carry_out(self, *, start: bool) -> dict[str, LineError]:
-        """Change the lines; with `start`, start polling the new ones. Return the errors of ports, by line
-        name.
-        """
+        """Change the lines; with `start`, start polling the new ones. Return ports' errors, by line name."""
         self._let_go()
         failures = self._change() | self._open(start)
         self._lines.put_in_order([line.name for line in self._plant.lines])

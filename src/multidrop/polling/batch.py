@@ -255,9 +255,7 @@ class BatchColumns(NamedTuple):
 
 
 def slot_rows(columns: BatchColumns, slots: Mapping[tuple[int, int], int]) -> Iterator[SlotRow]:
-    """Yield the rows of the series in `slots`, which maps each series' codes (drive, register) to its
-    slot.
-    """
+    """Yield the rows of the series in `slots`, which maps codes (drive, register) to slots."""
     for at in find_codes(columns.drive, columns.register, slots):
         yield SlotRow(
             slots[columns.drive[at], columns.register[at]],

@@ -254,9 +254,7 @@ class PolledLine:
         self._row_queue.call(self.number)
 
     def forget(self, drive: Drive) -> None:
-        """Forget the jobs of a drive that was removed for good. Its peer, which knows of late replies, is
-        kept.
-        """
+        """Forget the jobs of a drive that was removed for good; its peer, which knows late replies, stays."""
         with self._lock:
             self._planned = {each: jobs for each, jobs in self._planned.items() if each.drive is not drive}
             self._maker.forget_drive(drive)
@@ -418,9 +416,7 @@ class PolledLine:
             self._miss_unasked(now_ns)
 
     def _observe(self, now_ns: int) -> None:
-        """Report changes in the drives' failures and late replies to the schedule, which polls silent drives
-        less.
-        """
+        """Report changed failures and late replies to the schedule, which polls silent drives less."""
         seen = [(peer.failures, peer.late_until_ns, peer.has_answered) for _, peer in self._polled]
         if seen == self._observed:
             return
@@ -511,9 +507,7 @@ class PolledLine:
         return self.bus.line.end()
 
     def close(self, why: str) -> None:
-        """Add miss rows for slots that ended without a request; close the bus. Later calls fail with text
-        `why`.
-        """
+        """Add miss rows for slots that ended unsent; close the bus. Later calls fail with text `why`."""
         self.bus.line.why_closing = why
         with self._lock:
             try:

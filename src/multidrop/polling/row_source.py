@@ -77,9 +77,7 @@ class BatchCaller:
             _log.error("on_batch: the function failed and is no longer called", exc_info=failure)
 
     def join(self) -> None:
-        """Wait until the call with the last batch has returned. Does nothing if called by the function
-        itself.
-        """
+        """Wait until the call with the last batch has returned, unless the function itself calls this."""
         if threading.current_thread() is not self._thread:
             self._thread.join()
 

@@ -225,10 +225,7 @@ class Exchanges:
     def _parts(
         self, drive: Drive, prepared: PreparedReads, read: PreparedRead, failure: Exception
     ) -> tuple[Block, ...]:
-        """Return smaller blocks to read instead of a failed block.
-
-        If smaller blocks cannot help, raise the failure.
-        """
+        """Return smaller blocks to read instead of a failed block; raise the failure if they cannot help."""
         block = read.block
         if isinstance(failure, DriveException):
             helps = failure.code != ILLEGAL_FUNCTION and not drive.is_temporary(failure.code)

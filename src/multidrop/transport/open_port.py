@@ -51,10 +51,7 @@ _OVERRUN, _BUF_OVERRUN = 7, 10
 
 
 def overruns(fd: int) -> int:
-    """Return the number of overruns since the driver was loaded.
-
-    Raises OSError if the driver does not count overruns.
-    """
+    """Return the number of overruns since the driver was loaded. Raises OSError if it is not counted."""
     if sys.platform != "linux":
         raise OSError("only Linux counts overruns")
     import fcntl  # Windows lacks this module
@@ -411,10 +408,7 @@ class OpenPort:
         )
 
     def overruns(self) -> int | None:
-        """Return how many characters the port has lost to overruns since its driver was loaded.
-
-        Return None while the port is closed, or if the driver does not count overruns.
-        """
+        """Return the number of overruns since the driver was loaded; None if unknown or while closed."""
         try:
             return None if self.bridge or not self._serial else overruns(self._serial.fileno())
         except (*PORT_FAILURES, TypeError, AttributeError):  # another thread may close the port meanwhile

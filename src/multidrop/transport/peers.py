@@ -140,10 +140,7 @@ class Peers:
     def carry_out(
         self, drive: Drive, made: Exchange, *, expires_ns: int = 0, into: Completion | None = None
     ) -> Completion:
-        """Carry out an exchange on the line.
-
-        Raises NotAttached if the drive was removed after the exchange was made.
-        """
+        """Carry out an exchange on the line. Raises NotAttached if the drive was removed meanwhile."""
         asking = object()
         # a signal must never leave an entry in `_asked`, because `add` would wait for that entry forever
         try:

@@ -75,10 +75,7 @@ NO_ROWS = core.RowLayout(0, [])
 def make_exchange(
     drive: Drive, request: Message, peer: Peer, rows: core.RowLayout | None = None, **details: Any
 ) -> Exchange:
-    """Return an exchange that sends this request to this drive.
-
-    `details` are further arguments of Exchange.
-    """
+    """Return an exchange that sends this request to this drive. `details` are arguments of Exchange."""
     settings = drive.settings
     return Exchange(
         drive.framing,
