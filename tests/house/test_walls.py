@@ -327,7 +327,7 @@ def test_no_function_of_the_core_is_long() -> None:
 
 
 ARCHITECTURE = ROOT / "docs" / "reference" / "architecture.md"
-WALKS = sorted((ROOT / "docs" / "reference").glob("walk-*.md"))
+WALKS = sorted((ROOT / "docs" / "reference" / "walks").glob("*.md"))
 STEP = re.compile(r"`(?:(?:src/multidrop/)?([\w/]+\.py):([\w.]+)|(?:csrc/)?(\w+\.c))`")
 
 

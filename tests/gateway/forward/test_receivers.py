@@ -159,7 +159,7 @@ def test_database_has_the_values_units_and_positions(tmp_path: Path) -> None:
         polled = rows_of(unpack(stored.read_bytes()))
         assert found == sorted((row[0], row[3], row[4], row[5], row[6]) for row in polled)
         assert database.ask("select newest, gaps from multidrop.spools") == [(1, [])]
-        page = (DOCS / "howto" / "database.md").read_text("utf-8")
+        page = (DOCS / "gateway" / "database.md").read_text("utf-8")
         queries = re.findall(r"```text\n((?:select|delete)[^`]*)```", page)
         assert len(queries) == 3
         for query in queries:

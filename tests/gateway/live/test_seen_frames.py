@@ -266,7 +266,7 @@ def test_stops_need_no_frame(gateway: Served) -> None:
 def test_documented_start_from_a_shell_works(tmp_path: Path) -> None:
     for program in ("curl", "jq"):
         require_program(program)
-    page = (Path(__file__).parents[3] / "docs/howto/serve.md").read_text("utf-8")
+    page = (Path(__file__).parents[3] / "docs/gateway/serve.md").read_text("utf-8")
     block = next(text for text in re.findall(r"```sh\n(.*?)```", page, re.DOTALL) if "jq" in text)
     with served(tmp_path, MAY) as gateway:
         assert gateway.command("/api/write", WRITE, authorization=gateway.bearer(Right.WRITE)).json["done"]

@@ -178,9 +178,9 @@ def test_only_listed_clients_may_connect_or_local_ones_without_a_list() -> None:
 
 
 DOCS = Path(__file__).parents[3] / "docs"
-HOWTO = (DOCS / "howto" / "modbus-server.md").read_text("utf-8")
+PAGE = (DOCS / "gateway" / "modbus-server.md").read_text("utf-8")
 REFERENCE = (DOCS / "reference" / "modbus-server.md").read_text("utf-8")
-PLANTS = re.findall(r"```toml\n# ([\w-]+\.toml)\n(.*?)```", HOWTO, re.DOTALL)
+PLANTS = re.findall(r"```toml\n# ([\w-]+\.toml)\n(.*?)```", PAGE, re.DOTALL)
 
 
 @table(("name", "text"), PLANTS, ids=[name for name, _ in PLANTS])

@@ -228,8 +228,8 @@ def test_start_delayed_by_a_broker_until_after_a_stop_is_refused(tmp_path: Path)
 # ---- the Node-RED flow in the documentation uses only topics of the gateway ----
 
 
-HOWTO = Path(__file__).parents[3] / "docs" / "howto"
-FLOW: list[dict[str, Any]] = json.loads((HOWTO / "node-red-flow.json").read_text("utf-8"))
+PAGES = Path(__file__).parents[3] / "docs" / "gateway"
+FLOW: list[dict[str, Any]] = json.loads((PAGES / "node-red-flow.json").read_text("utf-8"))
 
 
 class Noted:
@@ -274,5 +274,5 @@ def test_flow_is_complete_and_the_page_lists_its_topics() -> None:
     assert {
         node[key] for node in FLOW for key in ("z", "broker") if node["type"] != "mqtt-broker" and key in node
     } <= ids
-    page = (HOWTO / "node-red.md").read_text("utf-8")
+    page = (PAGES / "node-red.md").read_text("utf-8")
     assert all(f"| `{topic}` |" in page for topic in topics_of("mqtt in") + topics_of("mqtt out"))
