@@ -68,13 +68,16 @@ class Adapter(USBDevice):
         if self.is_stalled or not self.outs or self._room_at > monotonic():
             return
         sequence, data = self.outs.popleft()
+        self.taken.add(sequence)
         self._send(data)
         self._room_at = max(monotonic(), self._free_at - self.fifo * self.character)
         self.timers.at(self._room_at, self._taken, sequence, len(data))
 
     def _taken(self, sequence: int, length: int) -> None:
         self._room_at = 0.0
-        self.complete(sequence, 0, length=length)
+        if sequence in self.taken:  # otherwise the guest has called the transfer off
+            self.taken.remove(sequence)
+            self.complete(sequence, 0, length=length)
         self.take()
 
     def _send(self, data: bytes) -> None:

@@ -66,7 +66,10 @@ class USBDevice:
         self.sock, self.serial, self.timers = connection
         self.ins: deque[tuple[int, int]] = deque()  # waiting transfers to the guest
         self.outs: deque[tuple[int, bytes]] = deque()  # transfers that the device has not taken yet
+        self.taken: set[int] = set()  # transfers that the device has taken, but not completed yet
         self._interrupts: deque[tuple[int, int]] = deque()
+        self._newest = 0  # sequence number of the newest submitted transfer
+        self._called_off: set[int] = set()  # transfers that were called off before they came
         self._buffer = b""
 
     # ---- a subclass implements these ----
@@ -114,7 +117,11 @@ class USBDevice:
                 self._unlink(sequence, *struct.unpack_from(">I", message, 20))
 
     def _unlink(self, sequence: int, victim: int) -> None:
-        status = 0
+        """Call off the transfer `victim`; vhci_hcd may send this request before the transfer itself."""
+        if victim > self._newest:
+            self._called_off.add(victim)
+        status = ECONNRESET if victim in self.taken | self._called_off else 0
+        self.taken.discard(victim)
         for queue in (self.ins, self.outs, self._interrupts):
             for transfer in [transfer for transfer in queue if transfer[0] == victim]:
                 queue.remove(transfer)  # type: ignore[arg-type]
@@ -122,7 +129,10 @@ class USBDevice:
         self._put(struct.pack(">5Ii24x", RET_UNLINK, sequence, 0, 0, 0, status))
 
     def _submit(self, sequence: int, is_in: bool, end: int, length: int, setup: bytes, data: bytes) -> None:
-        if end == 0:
+        self._newest = max(self._newest, sequence)
+        if sequence in self._called_off:
+            self._called_off.remove(sequence)
+        elif end == 0:
             answer = self._control(setup, data)
             if answer is None:
                 self.complete(sequence, EPIPE)
