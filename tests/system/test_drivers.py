@@ -112,8 +112,10 @@ def test_a_16550_switches_rts_and_has_no_mode_of_its_own(guest: Guest) -> None:
 @pytest.mark.slow
 @pytest.mark.long
 def test_a_16550_refuses_a_speed_without_a_divisor(guest: Guest) -> None:
-    (fact,) = guest.run("uart", wanted=[(76800, "8N1")])
-    assert "its UART would run at 57600" in fact["read"]
+    for fact, true in zip(
+        guest.run("uart", wanted=[(76800, "8N1"), (12345, "8N1")]), (57600, 12800), strict=True
+    ):
+        assert f"its UART would run at {true}" in fact["read"]
 
 
 # ---- RTS ----
@@ -136,7 +138,7 @@ def test_rts_lets_the_transceiver_send_at_each_request(guest: Guest, kind: str, 
 def test_rts_never_changes_before_the_last_bit_has_left(
     guest: Guest, kind: str, baudrate: int, mode: str
 ) -> None:
-    found = guest.run("rts", kind=kind, mode=mode, baudrate=baudrate, count=100)
+    found = guest.run("rts", kind=kind, mode=mode, baudrate=baudrate, count=300)
     assert found["sent"] > 0
     assert found["missing"] == found["early"] == 0
 
@@ -208,30 +210,37 @@ def test_no_family_reads_a_wrong_value_from_a_stalled_adapter(guest: Guest, kind
 
 
 START, STOP = "01050000ff00", "01050001ff00"  # start of the frames that set these coils of drive 1
-LONG_S = 20.0  # the kernel's own limit is 30 s
+SIGNALS = [
+    *((kind, signal.SIGINT) for kind in KINDS),
+    *((kind, signal.SIGTERM) for kind in ("ftdi", "acm")),
+]
 
 
 @pytest.mark.slow
 @pytest.mark.long
-@pytest.mark.parametrize("kind", ["ftdi", "cp210x", "ch341", "pl2303", "acm"])
+@USB
 def test_a_start_that_a_stalled_adapter_holds_is_discarded(guest: Guest, kind: str) -> None:
+    """The driver would wait for ever. `close` waits once, for less than a second."""
     found = guest.run("start_in_stall", kind=kind)
-    assert found["close"] < LONG_S
-    assert not any(frame.startswith(START) for frame in found["left after the close"])
+    assert len(found["waits"]) <= 1
+    assert sum(found["waits"]) < 1
+    assert found["left after the close"] == []
 
 
 @pytest.mark.slow
 @pytest.mark.long
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("kind", ["ftdi", "acm"])
-def test_signal_ends_a_poll_of_a_stalled_adapter_in_time(guest: Guest, kind: str, number: int) -> None:
+@pytest.mark.parametrize(("kind", "number"), SIGNALS)
+def test_a_signal_ends_a_poll_although_its_adapter_is_stalled(guest: Guest, kind: str, number: int) -> None:
+    """The driver would wait for ever. The poll says what it waits for, and waits once."""
     found = guest.run("end_of_stalled_poll", kind=kind, signals=[number])
-    assert found["seconds"] < LONG_S
+    assert found["status"] == 0
+    assert found["output"].count("waiting 0.75 s for its adapter") <= 1
+    assert found["left after the end"] == []
 
 
 @pytest.mark.slow
 @pytest.mark.long
-@pytest.mark.parametrize("kind", ["ftdi", "cp210x", "ch341", "pl2303", "acm"])
+@USB
 def test_a_stop_in_a_stall_follows_one_read_at_most(guest: Guest, kind: str) -> None:
     found = guest.run("stop_in_stall", kind=kind, seconds=6.0)
     places = [at for at, frame in enumerate(found["frames"]) if frame.startswith(STOP)]

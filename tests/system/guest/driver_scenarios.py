@@ -6,6 +6,7 @@ import fcntl
 import json
 import os
 import random
+import statistics
 import subprocess
 import threading
 import time
@@ -68,9 +69,31 @@ def rts(kind: str, mode: str, baudrate: int, count: int) -> dict[str, Any]:
         "results": results,
         "missing": state["rts_missing"],
         "early": sum(lateness < 0 for lateness in state["rts_lateness"]),
+        "given up": state["rts_given_up"],
         "lateness": [round(1000 * lateness, 2) for lateness in sorted(state["rts_lateness"])],
         "sent": sum(event["what"] == "sent" for event in state["log"]),
         "levels": [event["rts"] for event in state["log"] if event["what"] == "set"],
+    }
+
+
+def rts_price(kind: str, baudrates: list[int], seconds: float, rounds: int) -> dict[int, dict[str, float]]:
+    """Read with and without RTS that switches a transceiver, in turn; return the median reads per second."""
+    adapter = plug.Adapter(kind, f"price-{kind}", sends_with=1)
+    rates: dict[int, dict[str, list[float]]] = {
+        baudrate: {mode: [] for mode in ("off", "rts-up", "rts-down")} for baudrate in baudrates
+    }
+    for baudrate, of_modes in [*rates.items()] * rounds:
+        for mode, of_mode in of_modes.items():
+            with insist(Bus, adapter.path, baudrate=baudrate, format="8N1", rs485=mode) as bus:
+                meter = bus.attach(Meter, address=2)
+                insist(meter.read, meter.a)
+                good, end = 0, time.monotonic() + seconds
+                while time.monotonic() < end:
+                    good += not isinstance(attempt(meter.read, meter.b), str)
+                of_mode.append(good / seconds)
+    return {
+        baudrate: {mode: statistics.median(of_mode) for mode, of_mode in of_modes.items()}
+        for baudrate, of_modes in rates.items()
     }
 
 

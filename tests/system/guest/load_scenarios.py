@@ -12,7 +12,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,9 @@ from common import FAMILY, write_plant
 from multidrop import Poller
 
 WARM_UP_S = 1.0
+# Kernel threads between a port and its program: of works, softirqs and USB/IP.
+PASSING_ON = re.compile(r"kworker/|ksoftirqd/|vhci_[rt]x")
+PRIORITY = 2  # above the core's thread, as a kernel with threaded interrupts would have it
 TRACING = Path("/sys/kernel/tracing")
 EVENTS = ("workqueue_queue_work", "workqueue_execute_start")
 QUEUED = re.compile(r" (\d+\.\d+): workqueue_queue_work: work struct=(\w+) function=flush_to_ldisc ")
@@ -44,6 +47,29 @@ def _busy_processes(count: int) -> Iterator[None]:
         for child in children:
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
+
+
+def _schedule_kernel(policy: int, priority: int) -> int:
+    """Set how the kernel's threads of PASSING_ON are scheduled; return their number."""
+    count = 0
+    for comm in Path("/proc").glob("[0-9]*/comm"):
+        with suppress(OSError):  # the thread has ended
+            if PASSING_ON.match(comm.read_text("ascii")):
+                os.sched_setscheduler(int(comm.parent.name), policy, os.sched_param(priority))
+                count += 1
+    return count
+
+
+@contextmanager
+def _kernel_first(is_wanted: bool) -> Iterator[None]:
+    """Let the kernel's threads that pass bytes on run before all normal processes."""
+    if is_wanted:
+        _schedule_kernel(os.SCHED_FIFO, PRIORITY)
+    try:
+        yield
+    finally:
+        if is_wanted:
+            _schedule_kernel(os.SCHED_OTHER, 0)
 
 
 @contextmanager
@@ -91,7 +117,8 @@ def _polled(plant: str, seconds: float, *, realtime: bool) -> dict[str, Any]:
 def cadence(kind: str, loops: int, seconds: float, rounds: int) -> dict[str, list[dict[str, Any]]]:
     """Poll two drives in turn: alone, then beside `loops` busy processes, without and with realtime.
 
-    `kind` is that of a USB adapter, or "8250" for QEMU's UART.
+    In the last case, the kernel's threads that pass bytes on have realtime scheduling too. `kind` is that of
+    a USB adapter, or "8250" for QEMU's UART.
     """
     far_end: dict[str, Any] = {"serial": "uart", "family": FAMILY, "addresses": [1, 2]}
     if kind == "8250":
@@ -100,10 +127,15 @@ def cadence(kind: str, loops: int, seconds: float, rounds: int) -> dict[str, lis
     else:
         path = plug.Adapter(kind, f"load-{kind}", family=FAMILY, addresses=[1, 2]).path
     plant = write_plant({"a": (path, [1, 2])}, every="")
-    cases = {"alone": (0, False), "busy": (loops, False), "busy, realtime": (loops, True)}
+    cases = {
+        "alone": (0, False, False),
+        "busy": (loops, False, False),
+        "busy, realtime": (loops, True, False),
+        "busy, realtime, kernel first": (loops, True, True),
+    }
     found: dict[str, list[dict[str, Any]]] = {name: [] for name in cases}
     for _ in range(rounds):
-        for name, (count, realtime) in cases.items():
-            with _busy_processes(count):
+        for name, (count, realtime, is_kernel_first) in cases.items():
+            with _busy_processes(count), _kernel_first(is_kernel_first):
                 found[name].append(_polled(plant, seconds, realtime=realtime))
     return found

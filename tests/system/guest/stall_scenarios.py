@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
+import struct
 import threading
 import time
 from typing import Any
@@ -10,13 +13,30 @@ import plug
 from common import FAMILY, Poll, attempt, insist, write_plant
 
 from multidrop import Bus, ErmanERG220, Poller
+from multidrop.transport import open_port
 
 FRAME = 8  # length in bytes of each of these drives' requests
+TIOCGSERIAL, TIOCSSERIAL = 0x541E, 0x541F
+SERIAL_STRUCT, CLOSING_WAIT = 72, 40  # length of Linux's struct serial_struct, and place of its closing_wait
+
+
+def close_only_if_sent(path: str) -> None:
+    """Let the driver close this port only when all bytes are sent, instead of after 30 s.
+
+    A process that does not end this wait by itself then never ends.
+    """
+    fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    settings = bytearray(SERIAL_STRUCT)
+    fcntl.ioctl(fd, TIOCGSERIAL, settings)
+    struct.pack_into("H", settings, CLOSING_WAIT, 0)
+    fcntl.ioctl(fd, TIOCSSERIAL, settings)
+    os.close(fd)
 
 
 def end_of_stalled_poll(kind: str, signals: list[int]) -> dict[str, Any]:
     """End a poll by signals, 2 s apart, while its adapter stalls; then let the adapter continue."""
     adapter = plug.Adapter(kind, f"stall-{kind}", family=FAMILY, addresses=[1, 2], encoded=True)
+    close_only_if_sent(adapter.path)
     poll = Poll({"a": (adapter.path, [1, 2])})
     poll.wait_for("ok", "a")
     adapter.do("stall", True)
@@ -36,16 +56,28 @@ def end_of_stalled_poll(kind: str, signals: list[int]) -> dict[str, Any]:
 
 
 def start_in_stall(kind: str) -> dict[str, Any]:
-    """Call start and stop during a stall, then close; let the adapter continue; return the late frames."""
+    """Call start and stop during a stall, then close; let the adapter continue; return the late frames.
+
+    `waits` has the limit in s of each wait of `close` for the adapter.
+    """
     adapter = plug.Adapter(kind, f"held-{kind}", family=FAMILY, addresses=[1])
+    close_only_if_sent(adapter.path)
     bus = Bus(adapter.path)
     pump = bus.attach(ErmanERG220, address=1, name="pump")
     insist(pump.set_frequency, 30.0)
     adapter.do("stall", True)
     facts: dict[str, Any] = {"start": str(attempt(pump.start)), "stop": str(attempt(pump.stop, seconds=5))}
+    waits: list[float] = []
+    close_behind = open_port.close_behind
+
+    def close(fd: int, other: int, seconds: float) -> None:
+        waits.append(seconds)
+        close_behind(fd, other, seconds)
+
+    open_port.close_behind = close
     begun = time.monotonic()
     bus.close()
-    facts["close"] = time.monotonic() - begun
+    facts |= {"close": time.monotonic() - begun, "waits": waits}
     count = len(adapter.state["requests"])
     adapter.do("stall", False)
     time.sleep(2)
