@@ -72,6 +72,15 @@ def test_doctor_advises_only_settings_that_the_driver_has(guest: Guest) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
+def test_scan_and_doctor_name_an_adapter_by_its_serial_number(guest: Guest) -> None:
+    found = guest.run("lasting_names")
+    assert found["scan"][0] == 0, found["scan"][1]
+    assert f'port = "{found["by-id"]}"' in found["plant"]
+    assert found["by-id"] in found["advice"]
+
+
+@pytest.mark.slow
 def test_a_port_that_cannot_be_opened_gives_the_reason(guest: Guest) -> None:
     found = guest.run("refused_ports") | guest.run("absent_uart")
     for name, reason in {

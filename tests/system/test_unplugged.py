@@ -33,6 +33,7 @@ def test_unplugged_adapters_are_polled_again_when_they_are_back(guest: Guest, ki
     found = guest.run("poll_through_unplug", kinds=kinds, names="path")
     check_recovered(found)
     assert found["statuses"].keys() == set(kinds)
+    assert "lost (unplugged)" in found["output"]
     assert found["same names"]
 
 

@@ -11,11 +11,14 @@ import subprocess
 import threading
 import time
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import plug
 from common import (
+    FAMILY,
     KINDS,
+    MODEL,
     Command,
     Meter,
     attempt,
@@ -142,6 +145,19 @@ def doctor() -> dict[str, dict[str, list[str]]]:
         findings = json.loads(text)["findings"]
         found[kind] = {finding["topic"]: [finding["what"], finding["advice"]] for finding in findings}
     return found
+
+
+def lasting_names() -> dict[str, Any]:
+    """Return an adapter's link in by-id, and what `scan --out` and `doctor` make of its device path."""
+    adapter = plug.Adapter("ftdi", "scanned", family=FAMILY, addresses=[1])
+    out = Path("/tmp/scanned.toml")
+    out.unlink(missing_ok=True)
+    words = ("--model", MODEL, "--addresses", "1", "--quick", "--out", str(out))
+    scan = run("scan", adapter.path, *words)
+    _, text = run("doctor", adapter.path, "--json")
+    findings = {finding["topic"]: finding["advice"] for finding in json.loads(text)["findings"]}
+    plant = out.read_text("utf-8") if out.exists() else ""
+    return {"by-id": adapter.by_id, "scan": scan, "plant": plant, "advice": findings["adapter"]}
 
 
 def refused_ports() -> dict[str, tuple[int, str]]:
