@@ -1,4 +1,4 @@
-"""Channels computed from rows: totals, outages, statuses, and totals that continue after a restart."""
+"""Channels that are computed from polled rows: totals, outages, statuses, and totals after a restart."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HOLD_S = 1.0
 
 
 def channels(*declared: Channel, **units: str) -> ChannelSet:
-    """Return the channels of a drive "pump"; `units` has the units of its polled registers."""
+    """Return the channels of a drive "pump"; `units` are the units of its polled registers."""
     polled = {name: (unit, HOLD_S) for name, unit in units.items()}
     made = ChannelSet([DriveSeries("pump", polled, polled, declared)])
     assert made.mistakes == []
@@ -44,7 +44,7 @@ ENERGY = Channel("energy", "integral(power)", "kWh")
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(1, 10))])
-def test_energy_agrees_with_the_analytic_integral_at_5_percent_misses(seed: int) -> None:
+def test_energy_total_equals_the_analytic_integral_although_5_percent_are_missing(seed: int) -> None:
     """The power is 2 + sin(t / 7 s) kW for 10 minutes, read about every 100 ms."""
     random_, made = missing(0.05, seed), channels(ENERGY, power="kW")
     rows, missed = [], 0
@@ -60,7 +60,7 @@ def test_energy_agrees_with_the_analytic_integral_at_5_percent_misses(seed: int)
     assert made.outages == []
 
 
-def test_outage_is_reported_and_adds_nothing_to_a_total() -> None:
+def test_outage_is_reported_and_adds_nothing_to_a_computed_total() -> None:
     made = channels(ENERGY, power="kW")
     assert last_value(made, [row(0, at, 3600.0) for at in (0.0, 1.0)]) == 1.0
     silent = made.compute([row(0, at, None) for at in (2.0, 3.0, 4.0)])
@@ -72,7 +72,7 @@ def test_outage_is_reported_and_adds_nothing_to_a_total() -> None:
     assert str(weekend) == "pump.energy: 216000 s without values are not counted"
 
 
-def test_misses_within_the_holding_time_are_bridged() -> None:
+def test_total_continues_across_missing_values_within_the_holding_time() -> None:
     made = channels(ENERGY, power="kW")
     rows = [row(0, 0.0, 3600.0), row(0, 0.5, None), row(0, 1.0, 7200.0)]
     assert last_value(made, rows) == 1.5
@@ -85,10 +85,10 @@ def test_misses_within_the_holding_time_are_bridged() -> None:
     ids=["without rows", "with a miss"],
 )
 @table("value", ["integral(power + pump-2.power)", "integral(both)"])
-def test_time_with_an_old_value_of_another_line_is_an_outage(
+def test_total_has_an_outage_while_the_value_of_another_line_is_too_old(
     value: str, misses: list[SlotRow], status: int, known_until_s: int
 ) -> None:
-    """Each drive's power is 1800 kW. The second drive is silent for 40 s; its value is current for 30 s."""
+    """Each of two drives has a power of 1800 kW, and values are valid for 30 s. One is silent for 40 s."""
     declared = Channel("both", "power + pump-2.power", "kW"), Channel("energy", value, "kWh")
     first = DriveSeries("pump", {"power": ("kW", HOLD_S)}, ["power"], declared)
     made = ChannelSet([first, DriveSeries("pump-2", {"power": ("kW", 30.0)}, ["power"], [])])
@@ -101,23 +101,24 @@ def test_time_with_an_old_value_of_another_line_is_an_outage(
     assert outage.seconds == 40 - known_until_s
 
 
-def test_run_hours_and_starts_are_counted() -> None:
+def test_run_hours_and_number_of_starts_are_computed() -> None:
     declared = Channel("hours", "integral(frequency > 0)", "h"), Channel("starts", "count(frequency > 0)")
     made = channels(*declared, frequency="Hz")
-    speeds = [50, 50, 0, 0, 50, 0, 50, 50]  # the motor runs at first, which does not count as a start
+    # the motor turns from the beginning, which does not count as a start
+    speeds = [50, 50, 0, 0, 50, 0, 50, 50]
     found = made.compute([row(0, at, float(hz)) for at, hz in enumerate(speeds)])
     assert [one.value for one in found if one.slot == 2] == [0, 0, 0, 0, 1, 1, 2, 2]
     assert found[-2].value == pytest.approx((1 + 0.5 + 0.5 + 0.5 + 0.5 + 1) / 3600)
 
 
-def test_derivative_needs_two_values_without_an_outage() -> None:
+def test_derivative_needs_two_values_without_an_outage_between_them() -> None:
     made = channels(Channel("slope", "derivative(frequency)", "Hz/s"), frequency="Hz")
     found = made.compute([row(0, 0.0, 10.0), row(0, 0.5, 15.0), row(0, 5.0, 0.0), row(0, 5.5, 1.0)])
     shown = [(one.value, one.status) for one in found]
     assert shown == [(0.0, Status.NO_VALUE), (10.0, 0), (0.0, Status.NO_VALUE), (2.0, 0)]
 
 
-def test_a_channel_s_row_has_the_status_of_the_newest_miss_and_the_time_of_its_request() -> None:
+def test_computed_row_has_the_status_and_time_of_the_newest_missing_value() -> None:
     made = channels(Channel("power", "voltage * current", "W"), voltage="V", current="A")
     assert made.compute([row(0, 1.0, 400.0)]) == []  # the current is not known yet
     (first,) = made.compute([row(0, 2.0, 400.0), row(1, 2.0, 2.0)])  # one request
@@ -128,13 +129,13 @@ def test_a_channel_s_row_has_the_status_of_the_newest_miss_and_the_time_of_its_r
     assert [one.status for one in found] == [Status.NO_REPLY, Status.NO_REPLY]
 
 
-def test_each_of_several_rows_of_a_register_at_one_time_gives_a_row_of_its_channel() -> None:
+def test_each_of_several_rows_with_the_same_time_gives_a_computed_row() -> None:
     made = channels(Channel("double", "2 * current", "A"), current="A")
     found = made.compute([row(0, 1.0, None), row(0, 1.0, None), row(0, 1.0, 3.0)])
     assert [one.status for one in found] == [Status.NO_REPLY, Status.NO_REPLY, Status.OK]
 
 
-def test_expression_may_use_a_channel_that_is_declared_earlier() -> None:
+def test_expression_may_use_a_channel_that_was_declared_earlier() -> None:
     made = channels(
         Channel("power", "u * i", "kW"), Channel("energy", "integral(power)", "kWh"), u="V", i="A"
     )
@@ -143,7 +144,7 @@ def test_expression_may_use_a_channel_that_is_declared_earlier() -> None:
     assert [(one.slot, one.value) for one in found] == [(2, 3600.0), (3, 0.0), (2, 3600.0), (3, 1.0)]
 
 
-def test_totals_are_exact_after_a_restart() -> None:
+def test_computed_totals_are_exact_after_a_restart() -> None:
     declared = ENERGY, Channel("starts", "count(power > 1)")
     values = [row(0, at / 7, 3 * random.Random(at).random()) for at in range(1000)]
     whole, first = channels(*declared, power="kW"), channels(*declared, power="kW")
@@ -152,13 +153,14 @@ def test_totals_are_exact_after_a_restart() -> None:
     second = channels(*declared, power="kW")
     assert second.restore(json.loads(json.dumps(first.totals()))) == []
     assert second.totals() == first.totals()
-    later = [one._replace(monotonic_ns=one.monotonic_ns - 100 * S) for one in values[499:]]  # as after a boot
+    # the monotonic clock starts again, as after a reboot
+    later = [one._replace(monotonic_ns=one.monotonic_ns - 100 * S) for one in values[499:]]
     second.compute(later[1:])
     assert second.totals()["pump.starts"]["totals"][0] == whole.totals()["pump.starts"]["totals"][0]
     assert str(second.outages[0]) == "pump.energy: 0.143 s without values are not counted"
 
 
-def test_reload_continues_totals_without_an_outage() -> None:
+def test_reload_of_the_plant_continues_totals_without_an_outage() -> None:
     values = [row(0, at / 7, 3 * random.Random(at).random()) for at in range(100)]
     whole, first, second = (channels(ENERGY, power="kW") for _ in range(3))
     whole.compute(values)
@@ -170,7 +172,7 @@ def test_reload_continues_totals_without_an_outage() -> None:
     assert second.outages == []
 
 
-def test_total_continues_with_an_outage_if_another_drive_has_the_name() -> None:
+def test_total_has_an_outage_if_another_drive_takes_over_the_name() -> None:
     ratio = Channel("ratio", "power / 2", "kW")
     energy, change = (
         Channel("energy", "integral(ratio)", "kW*s"),
@@ -186,7 +188,7 @@ def test_total_continues_with_an_outage_if_another_drive_has_the_name() -> None:
     assert list(map(str, second.outages)) == ["pump.energy: 0.5 s without values are not counted"]
 
 
-def test_changed_expression_and_damaged_totals_start_at_0() -> None:
+def test_total_with_a_changed_expression_or_damaged_file_starts_at_0() -> None:
     before = channels(ENERGY, power="kW")
     before.compute([row(0, at, 3600.0) for at in (0.0, 1.0)])
     good = before.totals()["pump.energy"]
@@ -204,14 +206,14 @@ def test_changed_expression_and_damaged_totals_start_at_0() -> None:
 
 
 @table("time_ns", [1 << 63, 10**400, None, "1"], ids=["late", "huge", "none", "text"])
-def test_total_saved_with_an_invalid_time_is_restored(time_ns: object) -> None:
+def test_saved_total_with_an_invalid_time_is_restored(time_ns: object) -> None:
     made = channels(ENERGY, power="kW")
     kept = {"value": ENERGY.value, "units": ["kW*s"], "totals": [[7200.0]], "time_ns": time_ns}
     assert made.restore({"pump.energy": kept}) == []
     assert last_value(made, [row(0, 0.0, 1.0)]) == 2.0
 
 
-def test_total_declared_as_not_kept_starts_at_0_after_a_restart() -> None:
+def test_total_that_is_declared_as_not_kept_starts_at_0_after_a_restart() -> None:
     kept, other = channels(ENERGY, power="kW"), channels(replace(ENERGY, is_kept=False), power="kW")
     for made in (kept, other):
         made.compute([row(0, at, 3600.0) for at in (0.0, 1.0)])
@@ -220,14 +222,14 @@ def test_total_declared_as_not_kept_starts_at_0_after_a_restart() -> None:
     assert last_value(other, [row(0, 2.0, 0.0)]) == 1.5
 
 
-def test_several_outages_before_a_value_are_reported_together() -> None:
+def test_several_outages_before_the_next_value_are_reported_together() -> None:
     made = channels(Channel("both", "integral(a) + b", "A*s"), a="A", b="A*s")
     made.compute([row(0, 0.0, 1.0), row(1, 0.5, 1.0), row(1, 1.0, None), row(0, 5.0, 1.0)])
     made.compute([row(0, 10.0, 1.0), row(1, 10.5, 1.0), row(0, 10.6, 1.0)])
     assert list(map(str, made.outages)) == ["pump.both: 10 s without values are not counted"]
 
 
-def test_infinite_value_does_not_destroy_a_total() -> None:
+def test_infinite_value_does_not_destroy_a_computed_total() -> None:
     made = channels(ENERGY, power="kW")
     rows = [row(0, 0.0, 3600.0), row(0, 1.0, 3600.0), row(0, 1.5, math.inf), row(0, 2.0, 3600.0)]
     assert last_value(made, rows) == pytest.approx(2)
@@ -241,7 +243,7 @@ def test_infinite_value_does_not_destroy_a_total() -> None:
         ("x" * 101, "a channel's name and its unit have at most 100 characters each"),
     ],
 )
-def test_invalid_name_of_a_channel_is_reported(name: str, sentence: str) -> None:
+def test_invalid_name_of_a_computed_channel_is_reported(name: str, sentence: str) -> None:
     made = ChannelSet(
         [DriveSeries("pump", {"power": ("kW", 1.0)}, {"power"}, [Channel(name, "power", "kW")])]
     )

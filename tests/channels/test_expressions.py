@@ -1,4 +1,4 @@
-"""Expressions of computed channels: values, units, and sentences about mistakes."""
+"""Expressions of computed channels: their values and units, and one sentence for each mistake."""
 
 from __future__ import annotations
 
@@ -39,7 +39,10 @@ PUMPS = [
 
 
 def value_of(text: str, unit: str = "") -> float | None:
-    """Return the value, in this unit, of an expression of pump-1. The power of pump 2 is 700 W."""
+    """Return the value, in this unit, of an expression of the drive pump-1.
+
+    The drive pump-2 has a power of 700 W.
+    """
     series = SeriesTable(PUMPS)
     values: list[float | None] = [
         NOW.get(name) if drive == "pump-1" else 700.0 for drive, name in series.slots
@@ -77,12 +80,12 @@ def value_of(text: str, unit: str = "") -> float | None:
         ("status * .5e1", "", 15.0),
     ],
 )
-def test_expression_has_the_expected_value(expression: str, unit: str, value: float) -> None:
+def test_channel_expression_has_the_expected_value(expression: str, unit: str, value: float) -> None:
     assert value_of(expression, unit) == pytest.approx(value, rel=1e-12)
 
 
 @table("expression", ["current / (status - 3)", "sqrt(status - 4)", "1e300 * 1e300 * status"])
-def test_expression_without_a_finite_result_has_no_value(expression: str) -> None:
+def test_channel_expression_without_a_finite_result_has_no_value(expression: str) -> None:
     assert value_of(expression, "A" if "current" in expression else "") is None
 
 
@@ -124,7 +127,7 @@ MISTAKES = {
 
 
 @table("expression", MISTAKES)
-def test_error_in_an_expression_is_one_sentence_that_names_the_column(expression: str) -> None:
+def test_mistake_in_a_channel_expression_is_reported_with_its_column(expression: str) -> None:
     with pytest.raises(ExpressionError) as mistake:
         value_of(expression)
     assert str(mistake.value).startswith(MISTAKES[expression])
@@ -140,7 +143,7 @@ def test_error_in_an_expression_is_one_sentence_that_names_the_column(expression
         ("sqrt(1 / (current * current))", "1/A", 0.25),
     ],
 )
-def test_suggested_unit_is_accepted(expression: str, unit: str, value: float) -> None:
+def test_unit_suggested_by_the_error_is_accepted(expression: str, unit: str, value: float) -> None:
     with pytest.raises(ExpressionError, match=f'add unit = "{re.escape(unit)}"$'):
         value_of(expression)
     assert value_of(expression, unit) == pytest.approx(value)

@@ -222,7 +222,7 @@ def valid_plants() -> list[str]:
 def invalid_plants() -> list[str]:
     """Return the invalid plant files of the loader's tests."""
     good = PLANTS.HEAD + PLANTS.TOY
-    rows = PLANTS.test_each_mistake_is_reported_in_one_sentence_with_place_and_remedy.rows
+    rows = PLANTS.test_each_mistake_in_a_plant_file_gives_one_sentence_with_remedy.rows
     ports = (*PLANTS.UNDOCUMENTED, "tcp://bob:S3C@ET@10.0.0.7")
     texts = [
         *(text for text, _ in rows),

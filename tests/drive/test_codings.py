@@ -1,4 +1,4 @@
-"""Every number format, order, part, offset and scale: declared, on the wire, simulated and recorded."""
+"""Decode and encode every number format, byte order, bit range, offset and scale."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ PACKED = {
 DIGITS = {NumberFormat.BCD16: 4, NumberFormat.BCD32: 8}
 FLOATS = (NumberFormat.F16, NumberFormat.F32, NumberFormat.F64)
 WRITTEN = [*PACKED, *DIGITS]
-SPELT = {  # the letters of the bytes on the wire, A the most significant
+SPELT = {  # names of byte orders in documents; A is the most significant byte
     2: {"ABCD": "AB", "CDAB": "AB", "BADC": "BA", "DCBA": "BA", "AB": "AB", "BA": "BA"},
     4: {"ABCD": "ABCD", "CDAB": "CDAB", "BADC": "BADC", "DCBA": "DCBA", "AB": "ABCD"},
     8: {"ABCD": "ABCDEFGH", "CDAB": "GHEFCDAB", "BADC": "BADCFEHG", "DCBA": "HGFEDCBA", "AB": "ABCDEFGH"},
@@ -58,7 +58,7 @@ def most_significant_first(number_format: NumberFormat, raw: float) -> bytes:
     if number_format in DIGITS:
         return bytes.fromhex(f"{raw:0{DIGITS[number_format]}d}")
     if number_format is NumberFormat.I8:
-        return bytes([0x5A, int(raw) % 256])  # the high byte does not belong to the value
+        return bytes([0x5A, int(raw) % 256])  # the high byte of the word does not belong to the value
     return struct.pack(PACKED[number_format], raw)
 
 
@@ -72,7 +72,7 @@ def words_of(data: bytes) -> tuple[int, ...]:
 
 
 def counts(number_format: NumberFormat) -> st.SearchStrategy[Any]:
-    """Return a strategy for raw counts of a format, which draws the limits more often."""
+    """Return a strategy for raw counts of a format. It draws the smallest and largest counts more often."""
     if number_format is NumberFormat.F64:
         return st.floats(allow_nan=False, allow_infinity=False)
     if number_format in (NumberFormat.F16, NumberFormat.F32):
@@ -106,11 +106,11 @@ def row_of(family: type[Drive], name: str, data: bytes, at: int = 0) -> Row:
 
 
 def is_near(found: float, exact: Fraction, parts: list[Fraction]) -> bool:
-    """Return True if `found` is `exact` within the rounding errors of float64 arithmetic with `parts`."""
+    """Return True if `found` is `exact`, apart from rounding errors of float64 arithmetic with `parts`."""
     try:
         least = Fraction(2) ** -1074  # the smallest float64; below 2^-1022 a float64 has fewer digits
         return abs(Fraction(found) - exact) <= 4 * Fraction(2) ** -52 * max(map(abs, [exact, *parts])) + least
-    except OverflowError:  # `found` is infinite
+    except OverflowError:  # the expected value is beyond the largest float, so `found` is infinite
         return max(map(abs, [exact, *parts])) > Fraction(2) ** 1020
 
 
@@ -133,7 +133,7 @@ def numbers(draw: st.DrawFn) -> tuple[NumberFormat, str, float, float, float]:
 @example((NumberFormat.I64, "DCBA", 0.001, 0, -(2**63)))
 @example((NumberFormat.I16, "ABCD", -0.1, 0, 0))
 @example((NumberFormat.F64, "AB", 0.01, 0, 2.225073858507203e-309))
-def test_every_format_order_step_and_offset_is_decoded_and_encoded(
+def test_every_number_format_byte_order_step_and_offset_is_decoded_and_encoded(
     case: tuple[NumberFormat, str, float, float, float],
 ) -> None:
     number_format, order, step, offset, raw = case
@@ -202,7 +202,7 @@ def test_floats_survive_write_and_read_back(
         line = SimulatedBus(monkeypatch, sim)
         drive = line.attach(family(1))
         assert drive.write(register, raw) == raw == sim["level"]
-        held = on_the_wire(number_format, order, raw or 0.0)  # a zero has no sign
+        held = on_the_wire(number_format, order, raw or 0.0)  # -0.0 is stored as 0
         assert sim.read(3, 7, len(held) // 2) == list(words_of(held))
         assert register.encode(register.parse(register.format(raw).removesuffix(" m"))) == raw
 
@@ -231,12 +231,12 @@ def bit_fields(draw: st.DrawFn) -> Bits:
 @given(bit_fields())
 @example(Bits(NumberFormat.U64, "CDAB", (0, 63), 2**64 - 1))
 @example(Bits(NumberFormat.I16, "BA", (15, 15), 0x8000))
-def test_a_part_of_a_word_is_decoded_and_encoded(case: Bits) -> None:
+def test_a_range_of_bits_in_a_register_is_decoded_and_encoded(case: Bits) -> None:
     low, high = case.part
     size = struct.calcsize(PACKED[case.number_format])
     digits = f"{case.whole:0{8 * size}b}"[::-1][low : high + 1][
         ::-1
-    ]  # the part's bits, most significant first
+    ]  # the bits of the register's range, most significant first
     exact = int(digits, 2)
     if case.number_format.name[0] == "I" and digits[0] == "1":
         exact -= 2 ** len(digits)
@@ -252,7 +252,7 @@ def test_a_part_of_a_word_is_decoded_and_encoded(case: Bits) -> None:
         sim.memory._cell(INPUT, 7 + at).raw = word
     assert sim["field"] == exact
     sim["field"] = 0
-    sim["field"] = exact  # setting the part must not change the other bits
+    sim["field"] = exact  # this must not change the word's other bits
     assert sim.read(4, 7, size // 2) == list(words_of(data))
 
 
@@ -266,7 +266,7 @@ class Alarm(IntFlag):
     SENSOR = 2
 
 
-def test_a_part_of_a_word_can_be_an_enumeration() -> None:
+def test_a_range_of_bits_in_a_register_can_be_an_enumeration() -> None:
     family = declared(
         phase=reading(7, Phase, part=(4, 7), table=INPUT), alarms=reading(7, Alarm, part=(8, 9), table=INPUT)
     )
@@ -286,7 +286,7 @@ def test_a_part_of_a_word_can_be_an_enumeration() -> None:
 @settings(max_examples=examples(300))
 @given(numbers().filter(lambda case: case[0] not in DIGITS), st.data())
 @example((NumberFormat.U64, "CDAB", 1, 0, 2**64 - 2), None)
-def test_a_number_declared_invalid_has_no_value(
+def test_a_raw_count_declared_invalid_is_read_as_no_value(
     case: tuple[NumberFormat, str, float, float, float], data: st.DataObject | None
 ) -> None:
     number_format, order, step, offset, raw = case
@@ -306,7 +306,8 @@ def test_a_number_declared_invalid_has_no_value(
 @table(
     ("number_format", "part", "invalid", "wire"),
     [
-        (NumberFormat.I16, None, 0x8000, "80 00"),  # compared as bits
+        # a count outside the format's span is compared as a bit pattern
+        (NumberFormat.I16, None, 0x8000, "80 00"),
         (NumberFormat.I16, None, -32768, "80 00"),
         (NumberFormat.I32, None, 0x80000000, "80 00 00 00"),
         (NumberFormat.U64, None, 0xFFFFFFFFFFFFFFFF, "FF FF FF FF FF FF FF FF"),
@@ -321,17 +322,19 @@ def test_a_number_declared_invalid_has_no_value(
         (NumberFormat.F64, None, (), "7F F8 00 00 00 00 00 00"),
         (NumberFormat.F32, None, math.inf, "7F 80 00 00"),
         (NumberFormat.F32, None, -9999.9, "C6 1C 3F 9A"),
-        (NumberFormat.F32, None, 0, "80 00 00 00"),  # a zero has no sign
+        (NumberFormat.F32, None, 0, "80 00 00 00"),  # -0.0 is the same count as 0
         (NumberFormat.BCD16, None, (), "12 3A"),
         (NumberFormat.BCD32, None, (), "F0 00 00 00"),
         (NumberFormat.BCD16, None, 9999, "99 99"),
-        (NumberFormat.U16, (0, 0), 0xFFFF, "FF FF"),  # compared with the whole word
-        (NumberFormat.U16, (0, 7), 0xFF, "12 FF"),  # compared with the part
+        # the invalid count does not fit into bit 0, so it is compared with the whole word
+        (NumberFormat.U16, (0, 0), 0xFFFF, "FF FF"),
+        # the invalid count fits into bits 0 to 7, so it is compared with these bits
+        (NumberFormat.U16, (0, 7), 0xFF, "12 FF"),
         (NumberFormat.U16, (8, 15), 0xFF, "FF 12"),
         (NumberFormat.I16, (0, 3), -8, "00 08"),
     ],
 )
-def test_a_number_declared_invalid_gives_no_value_in_every_format(
+def test_an_invalid_raw_count_gives_no_value_in_every_number_format(
     number_format: NumberFormat, part: Any, invalid: Any, wire: str
 ) -> None:
     data = bytes.fromhex(wire)
@@ -344,7 +347,9 @@ def test_a_number_declared_invalid_gives_no_value_in_every_format(
     assert register.value_in(other, 0) is not None
 
 
-def test_the_bus_raises_the_error_no_value_for_an_invalid_count(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bus_raises_no_value_when_a_drive_returns_an_invalid_raw_count(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     family = declared(
         level=reading(0, "m", invalid=0x7FFF),
         speed=reading(1, "rpm"),
@@ -358,7 +363,8 @@ def test_the_bus_raises_the_error_no_value_for_an_invalid_count(monkeypatch: pyt
     with pytest.raises(NoValue, match=r"^tank: level holds no valid value at present$") as lack:
         drive.read(drive.level, drive.speed)
     assert (lack.value.register, dict(lack.value.values)) == ("level", {"speed": 20})
-    assert drive.write(drive.limit, 7) == 7  # allowed although the register held no valid value
+    # the write is allowed although the register held an invalid count before
+    assert drive.write(drive.limit, 7) == 7
     with pytest.raises(ValueError, match=r"limit = 65535 is the raw count that stands for a missing value$"):
         drive.write(drive.limit, 0xFFFF)
     assert sim["limit"] == 7
@@ -375,7 +381,7 @@ def test_the_bus_raises_the_error_no_value_for_an_invalid_count(monkeypatch: pyt
     st.sampled_from([-3, -1, 1, 4]),
     st.data(),
 )
-def test_a_value_is_multiplied_by_the_power_of_ten_in_its_scale_register(
+def test_value_is_multiplied_by_the_power_of_ten_in_its_scale_register(
     number_format: NumberFormat, step: float, power: int, distance: int, data: st.DataObject
 ) -> None:
     raw = data.draw(counts(number_format))
@@ -426,7 +432,7 @@ def test_a_value_is_multiplied_by_the_power_of_ten_in_its_scale_register(
 @pytest.mark.parametrize("suffix", [".arrows", ".csv", ".parquet"])
 @settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cases=st.lists(numbers(), min_size=1, max_size=20))
-def test_a_recording_has_the_same_values_as_the_core(
+def test_recorded_values_equal_the_values_decoded_by_the_c_core(
     tmp_path: Path, suffix: str, cases: list[tuple[NumberFormat, str, float, float, float]]
 ) -> None:
     columns = Columns(len(cases))

@@ -1,4 +1,4 @@
-"""Every mistake in a drive's class is reported when the class is made."""
+"""Every mistake in a drive class is reported when the class is defined."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def declare(**registers: Any) -> type[Drive]:
 
 
 def mistakes_in(**registers: Any) -> tuple[str, ...]:
-    """Return the mistakes in a class with these registers and facts."""
+    """Return the mistakes in a drive class with these attributes and registers."""
     with pytest.raises(DeclarationError) as refusal:
         declare(**registers)
     assert str(refusal.value) == "\n".join(f"Fan.{mistake}" for mistake in refusal.value.mistakes)
@@ -97,7 +97,7 @@ WRONG: dict[str, dict[str, Any]] = {
 
 
 @table("mistake", WRONG)
-def test_mistake_is_reported_with_the_register_name(mistake: str) -> None:
+def test_mistake_in_a_register_is_reported_with_the_registers_name(mistake: str) -> None:
     (sentence,) = mistakes_in(speed=setting(5, "rpm", **WRONG[mistake]))
     assert sentence.startswith(f"speed: {mistake}")
 
@@ -130,7 +130,7 @@ PARTS: dict[str, dict[str, Any]] = {
 
 
 @table("mistake", PARTS)
-def test_mistake_in_a_reading_is_reported(mistake: str) -> None:
+def test_mistake_in_a_read_only_register_is_reported(mistake: str) -> None:
     details = dict(PARTS[mistake])
     (sentence,) = mistakes_in(level=reading(5, details.pop("what", ""), **details))
     assert sentence.startswith(f"level: {mistake}")
@@ -154,13 +154,13 @@ WRITTEN: dict[str, dict[str, Any]] = {
 
 
 @table("mistake", WRITTEN)
-def test_a_declared_number_that_no_write_can_send_is_reported(mistake: str) -> None:
+def test_declared_raw_count_that_no_write_can_send_is_reported(mistake: str) -> None:
     details = dict(WRITTEN[mistake])
     (sentence,) = mistakes_in(level=setting(5, details.pop("what", ""), **details))
     assert sentence.startswith(f"level: {mistake}")
 
 
-def test_declared_numbers_that_a_write_can_send_are_accepted() -> None:
+def test_declared_raw_counts_that_a_write_can_send_are_accepted() -> None:
     assert declare(
         level=setting(5, harmless=(-1, 0), number_format=NumberFormat.I16, default=-3),
         control=command(6, BITS, harmless=(0, 0x8000), never_together=(9,), broadcast=(0,)),
@@ -185,12 +185,12 @@ SCALED: dict[str, dict[str, Register[Any]]] = {
 
 
 @table("mistake", SCALED)
-def test_scale_register_outside_the_request_is_reported(mistake: str) -> None:
+def test_scale_register_too_far_away_for_one_request_is_reported(mistake: str) -> None:
     (sentence,) = mistakes_in(level=reading(10, scale_register="power"), **SCALED[mistake])
     assert sentence.startswith(f"level: {mistake}")
 
 
-def test_a_register_with_a_scale_register_must_be_a_plain_reading() -> None:
+def test_register_with_a_scale_register_must_be_a_read_only_number() -> None:
     power = reading(6, number_format=NumberFormat.I16)
     (sentence,) = mistakes_in(level=setting(5, scale_register="power"), power=power)
     assert sentence.startswith("level: a register with a scale register is never written")
@@ -200,7 +200,7 @@ def test_a_register_with_a_scale_register_must_be_a_plain_reading() -> None:
     assert sentence == "level: a register with a scale register has neither names nor an offset"
 
 
-def test_read_limit_includes_the_scale_register() -> None:
+def test_limit_of_registers_in_one_read_includes_the_scale_register() -> None:
     registers = {
         "most_registers": {HOLDING: 2},
         "level": reading(5, scale_register="power"),
@@ -211,7 +211,7 @@ def test_read_limit_includes_the_scale_register() -> None:
         type("Fan", (Drive,), registers)
 
 
-def test_scale_register_replaced_by_a_subclass_is_reported() -> None:
+def test_subclass_that_replaces_a_scale_register_is_reported() -> None:
     first = declare(
         level=reading(5, scale_register="power"), power=reading(6, number_format=NumberFormat.I16)
     )
@@ -220,14 +220,14 @@ def test_scale_register_replaced_by_a_subclass_is_reported() -> None:
     assert first.registers["level"].reach == range(5, 7)
 
 
-def test_parts_and_their_whole_word_may_share_an_address() -> None:
+def test_word_and_ranges_of_its_bits_may_be_declared_at_one_address() -> None:
     fan = declare(
         status=setting(5), fault=reading(5, part=(0, 7)), runs=reading(5, part=(8, 8)), speed=reading(6)
     )
     assert [len(register.reach) for register in fan.registers.values()] == [1, 1, 1, 1]
 
 
-def test_all_mistakes_are_reported_together() -> None:
+def test_all_mistakes_in_a_drive_class_are_reported_together() -> None:
     mistakes = mistakes_in(
         speed=reading(1, "rpm", step=0),
         level=reading(0xFFFF, "m", number_format=NumberFormat.F32),
@@ -250,7 +250,7 @@ def test_all_mistakes_are_reported_together() -> None:
     "step": "0.1", "span": (2, 1), "number_format": "f32", "kept": "RAM", "table": "coil", "default": "x",
     "harmless": (1.5,), "broadcast": 3, "never": 1, "ram_address": -1, "at_least": "none", "moves": 7,
 }.items()}))  # fmt: skip
-def test_any_combination_of_mistakes_gives_one_line_sentences(wrong: dict[str, Any]) -> None:
+def test_every_combination_of_mistakes_in_a_drive_class_gives_one_line_errors(wrong: dict[str, Any]) -> None:
     register = setting(1, "V", **wrong)
     if wrong:
         assert mistakes_in(v=register)
@@ -259,7 +259,7 @@ def test_any_combination_of_mistakes_gives_one_line_sentences(wrong: dict[str, A
         declare(v=register)
 
 
-def test_two_settings_with_different_meanings_at_one_address_are_reported() -> None:
+def test_two_writable_registers_that_differ_at_one_address_are_reported() -> None:
     for other in (
         setting(8, "V", number_format=NumberFormat.I16),
         setting(8, "V", step=0.1),
@@ -272,7 +272,7 @@ def test_two_settings_with_different_meanings_at_one_address_are_reported() -> N
     assert mistakes_in(volts=setting(8), other=setting(8, table=several, number_format=NumberFormat.U32))
 
 
-def test_a_register_that_would_write_to_a_motor_command_s_address_is_reported() -> None:
+def test_register_that_writes_to_the_address_of_a_motor_command_is_reported() -> None:
     run = command(0x20, Run, harmless=(0,))
     assert mistakes_in(run=run, speed=setting(9, "rpm", ram_address=0x20)) == (
         "speed: its ram_address is that of run, which commands the motor",
@@ -287,7 +287,7 @@ def test_a_register_that_would_write_to_a_motor_command_s_address_is_reported() 
     assert declare(run=run, speed=setting(9, "rpm", ram_address=0x21)).registers
 
 
-def test_registers_of_the_same_meaning_may_share_an_address() -> None:
+def test_registers_that_write_the_same_value_may_share_an_address() -> None:
     family = declare(
         volts=setting(8, "V"),
         volts_again=setting(8, "V", span=(0, 5)),
@@ -299,10 +299,10 @@ def test_registers_of_the_same_meaning_may_share_an_address() -> None:
         alias=setting(9, ram_address=8),
     )
     assert len(family.registers) == 8
-    assert DelixiNative.registers  # declares parameters with two function codes at one address
+    assert DelixiNative.registers  # its parameters are declared for two function codes at the same address
 
 
-def test_a_register_object_with_two_names_is_reported() -> None:
+def test_one_register_object_with_two_names_is_reported() -> None:
     speed = reading(1, "rpm")
     assert mistakes_in(speed=speed, rpm=speed) == (
         "rpm: this is the register speed already; declare one of its own",
@@ -323,7 +323,7 @@ def test_a_register_object_with_two_names_is_reported() -> None:
     assert list(Base.registers) == ["speed", "torque"]
 
 
-def test_an_access_that_the_table_does_not_allow_is_reported() -> None:
+def test_register_access_that_its_table_does_not_allow_is_reported() -> None:
     blind = Table("output", None, 0x06)
     assert mistakes_in(v=reading(1, table=blind)) == ("v: an output cannot be read, and so holds no reading",)
     assert mistakes_in(v=reading(1, harmless=(0,)))
@@ -375,12 +375,12 @@ WRONG_FACTS: list[tuple[str, Any, str]] = [
 
 
 @table(("name", "value", "expected"), WRONG_FACTS)
-def test_invalid_fact_of_a_family_is_reported(name: str, value: Any, expected: str) -> None:
+def test_invalid_attribute_of_a_drive_class_is_reported(name: str, value: Any, expected: str) -> None:
     (mistake,) = mistakes_in(speed=reading(1), **{name: value})
     assert mistake.startswith(expected)
 
 
-def test_facts_and_registers_are_reported_together() -> None:
+def test_mistakes_in_class_attributes_and_in_registers_are_reported_together() -> None:
     mistakes = mistakes_in(
         speed=reading(1, "rpm", step=0),
         volts=setting(8, "V"),
@@ -395,7 +395,7 @@ def test_facts_and_registers_are_reported_together() -> None:
 
 
 @table("name", [*VERBS, "identify"])
-def test_method_without_verb_decorator_is_reported(name: str) -> None:
+def test_verb_method_without_the_verb_decorator_is_reported(name: str) -> None:
     """Without the decorator, a call would only create a generator and send no request."""
 
     def script(self: Any) -> Script[None]:
@@ -408,6 +408,6 @@ def test_method_without_verb_decorator_is_reported(name: str) -> None:
     declare(control=control, **{name: verb(script)})
 
 
-def test_mistake_in_a_subclass_of_a_family_is_reported() -> None:
+def test_mistake_in_a_subclass_of_a_built_in_family_is_reported() -> None:
     with pytest.raises(DeclarationError, match=r"^Ours\.stop: without the decorator @verb"):
         type("Ours", (InnovertIBD,), {"stop": lambda self: None})

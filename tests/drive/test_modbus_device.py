@@ -1,4 +1,4 @@
-"""A Modbus device without a family: reads and writes by address, on simulated devices."""
+"""ModbusDevice: read and write a device by address, without declaring its registers."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def meter(monkeypatch: pytest.MonkeyPatch) -> tuple[SimulatedBus, ModbusDevice]:
     return line, line.attach(ModbusDevice(7, name="meter"))
 
 
-def test_numbers_of_any_format_are_read(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+def test_modbus_device_reads_numbers_of_any_format(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
     line, device = meter
     sim = line.sims[0]
     sim["first"], sim["second"] = 12, 65535
@@ -57,7 +57,9 @@ def test_coils_and_discrete_inputs_are_returned_as_bool(meter: tuple[SimulatedBu
     assert line.sims[0]["lamp"] == 1
 
 
-def test_writes_without_confirm_are_refused_and_not_sent(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+def test_modbus_device_refuses_writes_without_the_argument_confirm(
+    meter: tuple[SimulatedBus, ModbusDevice],
+) -> None:
     line, device = meter
     for write in (
         lambda: device.write_holding(5, [1, 2]),
@@ -69,7 +71,9 @@ def test_writes_without_confirm_are_refused_and_not_sent(meter: tuple[SimulatedB
     assert line.frames == []
 
 
-def test_written_registers_are_read_back(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+def test_modbus_device_reads_back_the_registers_that_it_wrote(
+    meter: tuple[SimulatedBus, ModbusDevice],
+) -> None:
     line, device = meter
     assert device.write_holding(5, [7], confirm=True) == [7]
     assert device.write_holding(5, [1, 2], confirm=True) == [1, 2]
@@ -77,7 +81,7 @@ def test_written_registers_are_read_back(meter: tuple[SimulatedBus, ModbusDevice
     assert [request.function for request, _ in line.frames] == [6, 3, 16, 3]
 
 
-def test_with_multiple_one_number_is_written_by_the_function_for_several(
+def test_argument_multiple_writes_one_number_with_function_10h(
     meter: tuple[SimulatedBus, ModbusDevice],
 ) -> None:
     line, device = meter
@@ -86,7 +90,9 @@ def test_with_multiple_one_number_is_written_by_the_function_for_several(
     assert [request.function for request, _ in line.frames] == [16, 3, 15, 1]
 
 
-def test_a_mask_sets_the_bits_that_it_does_not_keep(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+def test_masked_write_changes_only_the_bits_outside_the_mask(
+    meter: tuple[SimulatedBus, ModbusDevice],
+) -> None:
     line, device = meter
     held = ["12 34"]
     answers = {0x16: "07 16 00 05 FF F0 00 04", 3: "07 03 02 "}
@@ -103,7 +109,7 @@ def test_a_mask_sets_the_bits_that_it_does_not_keep(meter: tuple[SimulatedBus, M
         device.mask_holding(5, 65536, 0, confirm=True)
 
 
-def test_a_mask_is_unconfirmed_if_the_register_cannot_be_read(
+def test_masked_write_is_unconfirmed_if_the_register_cannot_be_read(
     meter: tuple[SimulatedBus, ModbusDevice],
 ) -> None:
     line, device = meter
@@ -115,7 +121,9 @@ def test_a_mask_is_unconfirmed_if_the_register_cannot_be_read(
         device.mask_holding(5, 0xFFF0, 0x0004, confirm=True)
 
 
-def test_an_identification_in_two_replies_is_returned_whole(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+def test_device_identification_in_two_replies_is_returned_whole(
+    meter: tuple[SimulatedBus, ModbusDevice],
+) -> None:
     line, device = meter
     parts = {0: "07 2B 0E 01 01 FF 01 01 00 04 41 63 6D 65", 1: "07 2B 0E 01 01 00 00 01 01 04 50 43 2D 31"}
     line.answers = lambda request: rtu(parts[request.data[2]])
@@ -124,7 +132,7 @@ def test_an_identification_in_two_replies_is_returned_whole(meter: tuple[Simulat
 
 
 def test_a_write_that_cannot_be_read_back_is_unconfirmed(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
-    """The reply to a write is a copy of the request, so it may be an adapter's echo."""
+    """The reply to a write is a copy of the request, so it may be an RS-485 adapter's echo."""
     line, device = meter
     line.loses = lambda request: request.function == 3
     with pytest.raises(Unconfirmed, match="could not be read back"):
@@ -151,7 +159,7 @@ def test_a_write_that_reads_back_another_number_raises_not_verified(
         ([1], "U17", "format = 'U17' is not one of U16"),
     ],
 )
-def test_numbers_that_do_not_fit_the_format_are_refused(
+def test_written_number_that_does_not_fit_its_format_is_refused(
     meter: tuple[SimulatedBus, ModbusDevice], values: list[float], format: str, sentence: str
 ) -> None:
     line, device = meter
@@ -160,12 +168,16 @@ def test_numbers_that_do_not_fit_the_format_are_refused(
     assert line.frames == []
 
 
-def test_a_refused_address_raises_drive_exception(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+def test_modbus_device_raises_drive_exception_for_a_refused_address(
+    meter: tuple[SimulatedBus, ModbusDevice],
+) -> None:
     with pytest.raises(DriveException, match="illegal address"):
         meter[1].read_holding(5000)
 
 
-def test_many_registers_need_several_requests(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+def test_modbus_device_reads_many_registers_in_several_requests(
+    meter: tuple[SimulatedBus, ModbusDevice],
+) -> None:
     line, device = meter
     line.answers = lambda request: rtu(f"07 03 {2 * request.count:02X}" + " 00" * (2 * request.count))
     assert device.read_holding(0, 300) == [0] * 300
@@ -179,7 +191,7 @@ def test_many_registers_need_several_requests(meter: tuple[SimulatedBus, ModbusD
 
 
 class Tank(Drive):
-    """A device with two neighbouring readings, a setting, and a text."""
+    """A drive with two readings at neighbouring addresses, a setting, and a text register."""
 
     level = reading(0, "m", step=0.1)
     flow = reading(1, "l/s")
@@ -197,7 +209,7 @@ def metered(monkeypatch: pytest.MonkeyPatch) -> tuple[SimulatedBus, Tank]:
     return line, line.attach(Tank(1, name="tank"))
 
 
-def test_reading_one_register_returns_its_value_and_several_a_dict(
+def test_read_of_one_register_returns_its_value_and_of_several_a_dict(
     metered: tuple[SimulatedBus, Tank],
 ) -> None:
     line, tank = metered
@@ -211,7 +223,7 @@ def test_reading_one_register_returns_its_value_and_several_a_dict(
     assert tank.read_all() == {"level": 2.5, "flow": 7, "door": False}
 
 
-def test_reads_of_the_same_names_are_planned_once(
+def test_requests_for_the_same_registers_are_planned_only_once(
     metered: tuple[SimulatedBus, Tank], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, tank = metered
@@ -220,13 +232,13 @@ def test_reads_of_the_same_names_are_planned_once(
     assert tank.read("level", "flow") == {"level": 2.5, "flow": 7}
 
 
-def test_texts_are_read_like_registers(metered: tuple[SimulatedBus, Tank]) -> None:
+def test_text_registers_are_read_by_name_like_other_registers(metered: tuple[SimulatedBus, Tank]) -> None:
     _, tank = metered
     assert tank.read(tank.serial) == tank.read("serial") == "AB12"
     assert tank.read("serial", tank.level) == {"serial": "AB12", "level": 2.5}
 
 
-def test_coils_and_discrete_inputs_are_bool(metered: tuple[SimulatedBus, Tank]) -> None:
+def test_declared_coils_and_discrete_inputs_are_returned_as_bool(metered: tuple[SimulatedBus, Tank]) -> None:
     line, tank = metered
     line.sims[0]["door"] = 1
     assert tank.read("door") is True
@@ -236,14 +248,14 @@ def test_coils_and_discrete_inputs_are_bool(metered: tuple[SimulatedBus, Tank]) 
     assert line.sims[0]["lamp"] == 1
 
 
-def test_a_setting_is_written_by_its_name(metered: tuple[SimulatedBus, Tank]) -> None:
+def test_setting_is_written_by_its_name(metered: tuple[SimulatedBus, Tank]) -> None:
     line, tank = metered
     assert tank.write("limit", 6.5) == tank.read(tank.limit) == line.sims[0]["limit"] == 6.5
     with pytest.raises(ValueError, match="has no register 'limits'; did you mean limit"):
         tank.write("limits", 6.5)
 
 
-def test_calls_of_a_drive_that_is_not_attached_raise_not_attached(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drive_without_a_bus_raises_not_attached(monkeypatch: pytest.MonkeyPatch) -> None:
     pump = InnovertIBD(1, name="pump-1")
     sentence = r"^pump-1 is not attached to a bus: use bus\.attach\(\.\.\.\)$"
     for call in (

@@ -1,4 +1,4 @@
-"""Numbers of every format, from a program to the wire, into a drive and back."""
+"""Numbers of every format are written to a simulated drive and read back."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from multidrop.sim import SimulatedDrive
 
 SEVERAL = Table("holding register, several at once", 0x03, 0x10)
 RELAYS = Table("coil, several at once", 0x01, 0x0F, Carrier.BIT)
-PACKED = {  # names in documents
+PACKED = {  # names of number formats in documents
     NumberFormat.U16: ">H",
     NumberFormat.I16: ">h",
     NumberFormat.U32: ">I",
@@ -65,7 +65,7 @@ formats = pytest.mark.parametrize("register", FORMATS, ids=lambda each: each.nam
 
 
 def numbers(register: Register[Any]) -> st.SearchStrategy[float]:
-    """Return a strategy for the numbers that the register can hold."""
+    """Return a strategy for numbers that the register can hold."""
     if register.is_float:
         width = 16 if register.number_format is NumberFormat.F16 else 32
         return st.floats(width=width, allow_nan=False, allow_infinity=False)
@@ -83,10 +83,13 @@ def on_the_wire(register: Register[Any], number: float) -> bytes:
 @formats
 @settings(max_examples=examples(30))
 @given(data=st.data())
-def test_a_written_number_has_the_bytes_of_its_format(register: Register[float], data: st.DataObject) -> None:
+def test_written_number_has_the_bytes_of_its_number_format(
+    register: Register[float], data: st.DataObject
+) -> None:
     number = data.draw(numbers(register))
     request = write_request(Meter(1), register, register.encode(number))
-    assert request.data == on_the_wire(register, number or 0)  # a zero has no sign
+    # 0 replaces -0.0, which is sent without its sign
+    assert request.data == on_the_wire(register, number or 0)
     function, count = (0x10, 2) if register.words == 2 else (0x06, 0)
     assert (request.function, request.start, request.count) == (function, register.address, count)
 
@@ -103,7 +106,7 @@ def attached() -> Any:
 @given(st.floats(-3e38, 3e38))
 @example(12.1)
 @example(16_777_217)
-def test_a_written_float_is_taken_as_the_nearest_float32(attached: Any, value: float) -> None:
+def test_written_float_is_rounded_to_the_nearest_float32(attached: Any, value: float) -> None:
     _, meter, sim = attached
     (nearest,) = struct.unpack(">f", struct.pack(">f", value))
     assert meter.write(Meter.f32, value) == nearest == sim["f32"]
@@ -112,7 +115,7 @@ def test_a_written_float_is_taken_as_the_nearest_float32(attached: Any, value: f
 
 @table("name", ["f32", "f32_swapped", "scaled", "unscaled", "u16"])
 @table("value", [math.nan, math.inf, -math.inf, 3.5e38, -1e300, 10**400, -(10**5000)], ids=range(7))
-def test_value_outside_the_number_format_is_refused(attached: Any, name: str, value: float) -> None:
+def test_value_beyond_its_number_format_is_refused(attached: Any, name: str, value: float) -> None:
     line, meter, _ = attached
     before = len(line.written)
     with pytest.raises(WriteForbidden, match=rf"{name} (takes a finite number, not|= .* does not fit:)"):
@@ -123,7 +126,7 @@ def test_value_outside_the_number_format_is_refused(attached: Any, name: str, va
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
 @example(struct.unpack(">f", struct.pack(">f", 1e-45))[0])
 @pytest.mark.parametrize("register", [Meter.f32, Meter.scaled, Meter.unscaled], ids=lambda each: each.name)
-def test_a_float_is_shown_with_enough_digits_to_read_it_back(register: Register[float], raw: float) -> None:
+def test_formatted_float_has_enough_digits_to_be_parsed_back(register: Register[float], raw: float) -> None:
     shown = register.format(register.decode(raw)).partition(" ")[0]
     assert register.encode(register.parse(shown)) == raw
     assert len(shown.lstrip("-").replace(".", "").partition("e")[0].strip("0")) <= 9
@@ -135,13 +138,15 @@ def test_a_float_is_shown_with_enough_digits_to_read_it_back(register: Register[
      (1 / 3, "0.33333334 V"), (1e20, "1e+20 V"), (math.nan, "nan V"), (math.inf, "inf V"),
      (16_777_217, "16777216 V")],
 )  # fmt: skip
-def test_floats_are_shown_as_their_shortest_decimals(value: float, text: str) -> None:
+def test_floats_are_formatted_as_their_shortest_decimals(value: float, text: str) -> None:
     assert Meter.f32.format(value) == text
     if math.isfinite(value):
         assert Meter.f32.format(Meter.f32.decode(Meter.f32.encode(value))) == text
 
 
-def test_a_half_precision_float_is_shown_as_its_shortest_decimal(capsys: pytest.CaptureFixture[str]) -> None:
+def test_half_precision_float_is_formatted_as_its_shortest_decimal(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert Meter.f16.format(nearest_value(Meter.f16, 12.1)) == "12.1 V"
     assert capsys.readouterr().err == ""
     assert nearest_value(Meter.f16, 2049.0) == 2048
@@ -150,14 +155,14 @@ def test_a_half_precision_float_is_shown_as_its_shortest_decimal(capsys: pytest.
         Meter.f16.encode(65520)
 
 
-def test_span_end_between_two_float32_values_can_be_written(attached: Any) -> None:
+def test_limit_between_two_float32_values_can_be_written(attached: Any) -> None:
     _, meter, _ = attached
     assert meter.write(Meter.narrow, 0.1) == pytest.approx(0.1)
     with pytest.raises(WriteForbidden, match=r"narrow = 0\.10001 is outside 0 to 0\.1 V"):
         meter.write(Meter.narrow, 0.10001)
 
 
-def test_a_simulated_drive_refuses_floats_outside_the_span() -> None:
+def test_simulated_drive_refuses_floats_outside_the_limits() -> None:
     sim = SimulatedDrive(Meter(1))
 
     def answer(value: float) -> Message:
@@ -173,12 +178,13 @@ def test_a_simulated_drive_refuses_floats_outside_the_span() -> None:
     assert sim["f32"] == math.inf
 
 
-def test_the_command_line_warns_if_a_float_register_changes_a_number(
+def test_command_line_warns_if_a_float_register_rounds_the_number(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     (single,) = struct.unpack(">f", struct.pack(">f", 12.1))
     assert nearest_value(Meter.f32, Meter.f32.parse("12.1")) == single
-    assert capsys.readouterr().err == ""  # no warning, because the number is shown as typed
+    # no warning, because the rounded number is shown with the digits that the user typed
+    assert capsys.readouterr().err == ""
     assert nearest_value(Meter.f32, 16_777_217.0) == 16_777_216
     assert capsys.readouterr().err == (
         "multidrop: f32 holds single-precision numbers: 16777217.0 becomes 16777216 V\n"
@@ -190,21 +196,21 @@ def test_the_command_line_warns_if_a_float_register_changes_a_number(
 
 
 @pytest.mark.parametrize(("value", "text"), [(12.345678, "12.345678 raw"), (1_234_567, "1234567 raw")])
-def test_a_number_without_a_scale_is_shown_with_all_its_digits(value: float, text: str) -> None:
+def test_number_without_a_known_scale_is_formatted_with_all_its_digits(value: float, text: str) -> None:
     assert value_text(Meter.unscaled, value) == text
 
 
 # ---- common in devices ----
 
 
-def test_long_register_is_read_without_a_stated_limit(attached: Any) -> None:
+def test_register_of_several_words_is_read_without_a_stated_read_limit(attached: Any) -> None:
     _, meter, sim = attached
     sim["total"] = 0x12345
     assert meter.read(Meter.total) == 0x12345
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_a_reading_and_a_command_share_an_address(monkeypatch: pytest.MonkeyPatch, order: int) -> None:
+def test_a_reading_and_a_command_may_share_an_address(monkeypatch: pytest.MonkeyPatch, order: int) -> None:
     declared = [("status", reading(5)), ("control", command(5, span=(0, 7), moves=False))][::order]
     both = type("Both", (Drive,), dict(declared))
     line = SimulatedBus(monkeypatch, SimulatedDrive(both(1)))
@@ -213,10 +219,10 @@ def test_a_reading_and_a_command_share_an_address(monkeypatch: pytest.MonkeyPatc
     assert drive.read(drive.status) == 3
     reply = line.sims[0].answer(Message(1, 6, 5, data=bytes([0, 8])), line.seconds)
     assert reply is not None
-    assert reply.exception == 3  # 3: the value is outside the command's span
+    assert reply.exception == 3  # exception 3: the value is outside the command's limits
 
 
-def test_a_single_register_is_written_by_its_table_s_function_16(attached: Any) -> None:
+def test_single_register_is_written_by_function_16_if_its_table_requires_it(attached: Any) -> None:
     line, meter, sim = attached
     assert write_request(meter, Meter.alone, 7) == Message(1, 0x10, 22, 1, bytes([0, 7]))
     assert meter.write(Meter.alone, 7) == 7
@@ -225,7 +231,7 @@ def test_a_single_register_is_written_by_its_table_s_function_16(attached: Any) 
     assert line.frames[-2][0].function == 0x0F
 
 
-def test_a_step_may_be_negative(attached: Any) -> None:
+def test_step_of_a_register_may_be_negative(attached: Any) -> None:
     _, meter, sim = attached
     assert meter.write(Meter.downwards, -5.0) == -5.0 == sim["downwards"]
     assert Meter.downwards.format(Meter.downwards.decode(0.0)) == "0.0 V"
@@ -238,5 +244,5 @@ def test_a_step_may_be_negative(attached: Any) -> None:
 @table(
     ("step", "decimals"), [(1, 0), (0.1, 1), (0.01, 2), (100, 0), (1e-7, 7), (-0.05, 2), (2.5, 1), (1e6, 0)]
 )
-def test_decimals_follows_from_the_step(step: float, decimals: int) -> None:
+def test_number_of_decimals_follows_from_the_registers_step(step: float, decimals: int) -> None:
     assert reading(1, "V", step=step).decimals == decimals

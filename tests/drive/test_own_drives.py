@@ -1,4 +1,4 @@
-"""A user's own drive: motor commands are never written by mistake, and its stop is always sent."""
+"""Drive classes that a user declares: no command is written by mistake, and a stop is always sent."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class Word(IntEnum):
 
 
 class Fan(Drive):
-    """The drive that README declares."""
+    """The drive class that is declared in README."""
 
     speed = reading(0x10, "rpm")
     frequency = setting(0x20, "Hz", step=0.1, span=(0, 60))
 
 
 class Pump(Fan):
-    """A drive with verbs, and a control word without declared harmless raw counts."""
+    """A drive with verbs. Its control word has no raw counts that are declared harmless."""
 
     control = command(0x30, Word)
     target = command(0x31, "Hz", step=0.1, span=(0, 60), moves=False)
@@ -45,7 +45,7 @@ class Pump(Fan):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop the motor with a plain write instead of `insist`."""
+        """Stop the motor with a plain `write` instead of `insist`."""
         yield from write(self.control, Word.STOP)
 
     @verb
@@ -85,7 +85,7 @@ def written(line: SimulatedBus) -> list[str]:
     return [frame[:17] for frame in line.written]
 
 
-def test_plain_setting_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_write_to_a_setting_of_a_users_drive_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
     line = SimulatedBus(monkeypatch, simulated(Fan(1)))
     fan = line.attach(Fan(1))
     assert fan.write(fan.frequency, 25.0) == 25.0
@@ -94,7 +94,7 @@ def test_plain_setting_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) ->
 
 @table("confirmed", [0, 1])
 @table("word", Word)
-def test_a_plain_write_to_a_command_is_refused_by_default(
+def test_plain_write_to_a_command_register_is_refused_by_default(
     monkeypatch: pytest.MonkeyPatch, confirmed: int, word: Word
 ) -> None:
     line = SimulatedBus(monkeypatch, simulated(Pump(1)))
@@ -108,7 +108,7 @@ def test_a_plain_write_to_a_command_is_refused_by_default(
     assert line.frames == []
 
 
-def test_missing_verb_names_the_declaration_that_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_for_a_missing_verb_names_the_method_to_declare(monkeypatch: pytest.MonkeyPatch) -> None:
     class Bare(Drive):
         """A drive with a command, but without verbs."""
 
@@ -124,7 +124,9 @@ def test_missing_verb_names_the_declaration_that_is_needed(monkeypatch: pytest.M
     assert line.frames == []
 
 
-def test_writing_a_number_declared_harmless_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_write_of_a_raw_count_declared_harmless_needs_no_confirmation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     class Stoppable(Pump):
         """A drive whose stop is declared harmless."""
 
@@ -139,7 +141,7 @@ def test_writing_a_number_declared_harmless_needs_no_confirmation(monkeypatch: p
 
 
 @pytest.mark.parametrize("name", ["start", "set_frequency", "target"])
-def test_starting_the_motor_of_a_drive_without_identify_needs_confirmation(
+def test_start_of_a_drive_without_identify_needs_confirmation(
     monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     def command_it(line: SimulatedBus, pump: Pump) -> None:
@@ -165,7 +167,7 @@ def test_starting_the_motor_of_a_drive_without_identify_needs_confirmation(
 
 
 @pytest.mark.parametrize("name", ["start_staggered", "ramp", "run_at"])
-def test_ramps_and_sequences_need_confirmation_too(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_ramps_and_combined_verbs_need_confirmation_too(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     class Combined(Pump):
         """A drive with a verb that combines two others."""
 
@@ -197,14 +199,16 @@ def test_ramps_and_sequences_need_confirmation_too(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("name", ["stop", "coast", "stop_all"])
-def test_a_stop_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_stop_of_a_drive_without_identify_needs_no_confirmation(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
     line = SimulatedBus(monkeypatch, simulated(Pump(1)))
     pump = line.attach(Pump(1))
     getattr(line.bus if name == "stop_all" else pump, name)()
     assert written(line) == [STOP]
 
 
-def test_class_with_identify_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_start_of_a_drive_with_identify_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "confirmed" in Pump.options
     line = SimulatedBus(monkeypatch, simulated(Known(1)))
     line.attach(Known(1)).start()
@@ -213,10 +217,10 @@ def test_class_with_identify_needs_no_confirmation(monkeypatch: pytest.MonkeyPat
 
 def acknowledged(request: Message) -> bytes | None:
     """Return exception 05 as the reply to a write, and None for a read."""
-    return bytes.fromhex("01 86 05 82 63") if request.function == 6 else None  # CRC from pymodbus
+    return bytes.fromhex("01 86 05 82 63") if request.function == 6 else None  # checksum computed by pymodbus
 
 
-def test_exception_05_to_a_write_is_unconfirmed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_write_that_is_answered_with_exception_05_is_unconfirmed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Exception 05 means: accepted and being processed (application protocol V1.1b3, section 7)."""
     line = SimulatedBus(monkeypatch, simulated(Known(1)))
     drive = line.attach(Known(1))
@@ -226,7 +230,7 @@ def test_exception_05_to_a_write_is_unconfirmed(monkeypatch: pytest.MonkeyPatch)
     assert written(line) == [RUN]
 
 
-def test_exception_05_with_another_meaning_in_the_family_is_a_refusal(
+def test_exception_05_is_a_refusal_if_the_family_gives_it_another_meaning(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     class Locked(Known):
@@ -241,7 +245,7 @@ def test_exception_05_with_another_meaning_in_the_family_is_a_refusal(
         drive.start()
 
 
-def test_setting_may_be_declared_to_move_the_motor(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_setting_can_be_declared_to_move_the_motor(monkeypatch: pytest.MonkeyPatch) -> None:
     class Readable(Drive):
         """A drive whose control word can be read."""
 
@@ -257,7 +261,7 @@ def test_setting_may_be_declared_to_move_the_motor(monkeypatch: pytest.MonkeyPat
     assert len(line.written) == 1
 
 
-def test_a_plant_file_or_a_command_line_option_can_confirm_a_drive(tmp_path: Path) -> None:
+def test_plant_file_or_command_line_option_can_confirm_a_drive(tmp_path: Path) -> None:
     (tmp_path / "pump.py").write_text(
         "from multidrop import Drive, command, reading\n"
         "class Pump(Drive):\n    speed = reading(1)\n    run = command(2)\n"

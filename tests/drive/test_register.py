@@ -1,4 +1,4 @@
-"""Registers: exact scaling, enforced spans, readable names."""
+"""Registers: exact scaling, limits of written values, and readable names."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Bits(IntFlag):
 
 
 class Example(Drive):
-    """A drive for these tests."""
+    """A drive with registers for these tests."""
 
     current = reading(3, "A", step=0.1)
     unknown = reading(4, "V", step=None)
@@ -69,16 +69,16 @@ class Example(Drive):
 
 
 @table(("raw", "value"), [(3, 0.3), (7, 0.7), (285, 28.5), (65535, 6553.5)])
-def test_a_decoded_value_is_the_float_nearest_to_raw_times_step(raw: int, value: float) -> None:
+def test_decoded_value_is_the_float_nearest_to_raw_count_times_step(raw: int, value: float) -> None:
     assert Example.current.decode(raw) == value
 
 
-def test_a_register_is_named_like_its_class_attribute() -> None:
+def test_register_has_the_name_of_its_class_attribute() -> None:
     assert Example.current.name == "current"
     assert list(Example.registers)[:2] == ["current", "unknown"]
 
 
-def test_a_number_without_a_name_in_the_enumeration_decodes_to_itself() -> None:
+def test_raw_count_without_a_name_in_the_enumeration_decodes_to_an_int() -> None:
     assert Example.run.decode(2) is Run.GO
     assert Example.run.decode(9) == 9
     assert Example.bits.decode(9) == Bits.RUN | Bits.FAULT
@@ -94,11 +94,11 @@ def test_a_number_without_a_name_in_the_enumeration_decodes_to_itself() -> None:
         (Example.frequency, "50", TypeError),
         (Example.frequency, True, TypeError),
         (Example.run, 2, TypeError),
-        (Example.word, Bits(2), ValueError),  # a reserved bit
+        (Example.word, Bits(2), ValueError),  # bit 1 is reserved
         (Example.temperature, 40000, ValueError),
         (Example.coil, 2, ValueError),
         (Example.coarse, 5 * 65536, ValueError),
-        (Example.unknown, 2.5, ValueError),  # a raw count
+        (Example.unknown, 2.5, ValueError),  # the scale is unknown, so only raw counts can be written
         (Example.choice, 1.5, ValueError),
     ],
 )
@@ -110,12 +110,12 @@ def test_encoding_an_invalid_value_raises_an_error_that_names_the_register(
 
 
 @given(st.integers(0, 40000))
-def test_every_register_number_survives_decoding_and_encoding(raw: int) -> None:
+def test_every_raw_count_survives_decoding_and_encoding(raw: int) -> None:
     assert Example.frequency.encode(Example.frequency.decode(raw)) == raw
 
 
 @given(st.floats(0, 400))
-def test_encoding_rounds_to_the_nearest_number_that_a_register_can_hold(value: float) -> None:
+def test_encoding_rounds_to_the_nearest_value_that_a_register_can_hold(value: float) -> None:
     assert abs(Example.frequency.decode(Example.frequency.encode(value)) - value) <= 0.00501
 
 
@@ -133,11 +133,11 @@ def test_encoding_rounds_to_the_nearest_number_that_a_register_can_hold(value: f
         (Example.coarse, 15.0, "15 V"),
     ],
 )
-def test_format_returns_values_with_their_unit(register: Register[Any], value: object, text: str) -> None:
+def test_formatted_values_have_their_unit(register: Register[Any], value: object, text: str) -> None:
     assert register.format(value) == text
 
 
-def test_text_typed_by_a_user_is_parsed_to_a_value() -> None:
+def test_typed_text_is_parsed_to_a_value() -> None:
     assert Example.frequency.parse("25.5") == 25.5
     assert Example.run.parse("go") is Run.GO
     assert Example.word.parse("run|fault") == Bits.RUN | Bits.FAULT
@@ -149,23 +149,23 @@ def test_text_typed_by_a_user_is_parsed_to_a_value() -> None:
         Example.run.parse("go|stop")
 
 
-def test_words_is_the_number_of_addresses_of_a_register() -> None:
+def test_words_is_the_number_of_addresses_that_a_register_occupies() -> None:
     assert (Example.energy.words, Example.current.words, Example.coil.words) == (2, 1, 1)
 
 
-def test_the_error_for_an_unknown_register_names_similar_registers() -> None:
+def test_error_for_an_unknown_register_suggests_similar_names() -> None:
     with pytest.raises(ValueError, match="did you mean current"):
         Example.register("curent")
 
 
-def test_an_address_outside_the_protocol_is_refused() -> None:
+def test_register_address_above_ffffh_is_refused() -> None:
     with pytest.raises(ValueError, match=r"^Far\.frequency: address = 65536 is not an address"):
         type("Far", (Drive,), {"frequency": reading(0x10000, "Hz")})
 
 
 @table("number", [10**400, -(10**400), 1 << 64])
 @table("name", ["current", "energy", "frequency", "choice", "unknown"])
-def test_number_too_large_for_a_float_is_refused(name: str, number: int) -> None:
+def test_integer_too_large_for_a_float_is_refused(name: str, number: int) -> None:
     with pytest.raises(ValueError, match=rf"^{name} "):
         Example.register(name).encode(number)
 
@@ -184,7 +184,7 @@ def test_number_too_large_for_a_float_is_refused(name: str, number: int) -> None
         (9600, "8O2", 12),
     ],
 )
-def test_the_duration_of_a_character_includes_start_parity_and_stop_bits(
+def test_duration_of_a_character_includes_start_parity_and_stop_bits(
     baudrate: int, format: str, bits: int
 ) -> None:
     assert Settings(baudrate, format).character == pytest.approx(bits / baudrate)
@@ -193,18 +193,18 @@ def test_the_duration_of_a_character_includes_start_parity_and_stop_bits(
 @table(
     ("baudrate", "format", "seconds"),
     [
-        (9600, "8E1", 4.0104e-3),  # 3.5 characters of 11 bits
+        (9600, "8E1", 4.0104e-3),  # 3.5 characters of 11 bits each
         (19200, "8E1", 2.0052e-3),
-        (38400, "8N1", 1.75e-3),  # fixed above 19200
+        (38400, "8N1", 1.75e-3),  # a fixed time above 19200 baud
         (115200, "8N1", 1.75e-3),
     ],
 )
-def test_t3_5_is_the_standards_silence_in_seconds(baudrate: int, format: str, seconds: float) -> None:
+def test_t3_5_is_the_modbus_silence_in_seconds(baudrate: int, format: str, seconds: float) -> None:
     assert Settings(baudrate, format).t3_5 == pytest.approx(seconds, rel=1e-4)
 
 
 @table("format", ["8X1", "9N1", "8N3", "8n1", "", "8N1 "])
-def test_invalid_format_is_refused(format: str) -> None:
+def test_invalid_character_format_is_refused(format: str) -> None:
     with pytest.raises(ValueError, match="format"):
         Settings(9600, format)
 
@@ -222,7 +222,7 @@ RUNS, STANDS = State(Condition.RUNNING), State(Condition.STOPPED)
 
 
 class Counting(Drive):
-    """A drive that records each computation of its state, in all copies."""
+    """A drive class that records each computation of its state, by any copy of the drive."""
 
     looks: list[float] = []
     speed = reading(0x10)
@@ -237,7 +237,7 @@ class Counting(Drive):
 
 
 class Noting(Drive):
-    """A drive that stores an attribute while its state is computed, so each call must compute the state."""
+    """A drive class whose `state` sets an attribute, so each call must compute the state again."""
 
     speed = reading(0x10)
 
@@ -247,13 +247,13 @@ class Noting(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Return the state `stopped` after two successive readings of output frequency 0."""
+        """Return `stopped` after two readings of 0 Hz in a row."""
         speed = yield from read(self.speed)
         self.zeros = 0 if speed else self.zeros + 1
         return STANDS if self.zeros > 1 else RUNS
 
 
-def test_the_state_of_equal_values_is_computed_once() -> None:
+def test_state_is_computed_only_once_for_equal_register_values() -> None:
     Counting.looks.clear()
     reader = StateReader(Counting(1))
     for temperature in range(5):
@@ -266,20 +266,21 @@ def test_the_state_of_equal_values_is_computed_once() -> None:
     assert Counting.looks[-1] == 25.0
 
 
-def test_the_state_of_nan_is_computed_again() -> None:
+def test_state_is_computed_again_for_a_register_value_of_nan() -> None:
     Counting.looks.clear()
     reader = StateReader(Counting(1))
     assert [reader.state({"speed": math.nan}) for _ in range(2)] == [RUNS, RUNS]
     assert len(Counting.looks) == 2
 
 
-def test_the_state_of_a_family_with_attributes_is_computed_each_time() -> None:
+def test_state_that_sets_attributes_of_the_drive_is_computed_each_time() -> None:
     reader = StateReader(Noting(1))
     shown = [reader.state({"speed": speed}) for speed in (25.0, 0.0, 0.0, 0.0, 25.0, 0.0, 0.0)]
     assert shown == [RUNS, RUNS, STANDS, STANDS, RUNS, RUNS, STANDS]
 
 
-# Status words from the manuals. A Delixi with Modbus has none: only its fault code shows a fault.
+# Status words from the manuals. A Delixi with standard Modbus has no status word: only its fault code shows a
+# fault.
 @table(
     ("model", "values", "condition"),
     [
@@ -289,7 +290,7 @@ def test_the_state_of_a_family_with_attributes_is_computed_each_time() -> None:
         ("delixi-modbus", {"output_frequency": 25.0}, None),
     ],
 )
-def test_a_fault_is_detected_from_the_status_alone(
+def test_fault_is_detected_from_the_status_word_alone(
     model: str, values: dict[str, float], condition: Condition | None
 ) -> None:
     found = StateReader(MODELS[model](1)).state(values)
@@ -297,7 +298,7 @@ def test_a_fault_is_detected_from_the_status_alone(
     assert found is None or found.fault is None
 
 
-def test_a_fault_gets_its_name_when_its_code_arrives() -> None:
+def test_fault_gets_its_name_once_the_fault_code_is_read() -> None:
     reader = StateReader(MODELS["invt-che"](1))
     assert reader.state({"status": 4.0}) == State(Condition.FAULT)
     assert reader.state({"status": 4.0}) == State(Condition.FAULT)
@@ -323,7 +324,7 @@ class Meter(Drive):
 
 
 class Meter(Drive):
-    """A drive with a text that is longer than its limit for one request."""
+    """A drive with a text register that is longer than one request may read."""
 
     most_registers = {INPUT: 5}
     level = reading(0, table=INPUT)
@@ -331,7 +332,7 @@ class Meter(Drive):
     maker = text(40, 3, order="BA")
 
 
-def test_a_text_register_is_read_as_the_document_prints_it() -> None:
+def test_text_register_is_decoded_in_the_documented_character_order() -> None:
     assert Meter.serial.decode(b"EM3-0042\0\0\0\0 rubbish") == "EM3-0042"
     assert Meter.maker.decode(b"BAB ") == "AB B"
     assert Meter.maker.decode(bytes.fromhex("42 41 00 42 00 00")) == "ABB"
@@ -339,7 +340,7 @@ def test_a_text_register_is_read_as_the_document_prints_it() -> None:
 
 
 @given(st.binary(max_size=24))
-def test_strings_read_from_text_registers_have_no_control_characters(data: bytes) -> None:
+def test_strings_from_text_registers_have_no_control_characters(data: bytes) -> None:
     found = Meter.serial.decode(data)
     assert found.isprintable()
     assert Meter.serial.decode(b"\x1b[2J\x07") == "?[2J?"
@@ -348,7 +349,7 @@ def test_strings_read_from_text_registers_have_no_control_characters(data: bytes
 @settings(max_examples=examples(20))
 @given(st.text(st.characters(min_codepoint=33, max_codepoint=126), max_size=6))
 @pytest.mark.parametrize("declared", [Meter.serial, Meter.maker], ids=str)
-def test_a_text_register_of_a_simulated_drive_is_read_over_the_line(declared: Text, value: str) -> None:
+def test_text_register_of_a_simulated_drive_is_read_over_the_line(declared: Text, value: str) -> None:
     with pytest.MonkeyPatch.context() as monkeypatch:
         sim = SimulatedDrive(Meter(1))
         line = SimulatedBus(monkeypatch, sim)
@@ -360,13 +361,13 @@ def test_a_text_register_of_a_simulated_drive_is_read_over_the_line(declared: Te
 
 
 class Known(Meter):
-    """A drive that is identified by the text `maker`."""
+    """A drive that is identified by its text register `maker`."""
 
     limit = setting(1, "m", span=(0, 10), kept=Kept.RAM)
 
     @verb
     def identify(self) -> Script[None]:
-        """Check that the text `maker` is ABB."""
+        """Check that the text register `maker` has the text ABB."""
         if (found := (yield from read(self.maker))) != "ABB":
             raise WriteForbidden(f"{self.name} is of {found}")
 
@@ -397,11 +398,11 @@ def test_scan_reads_text_registers_to_identify_families() -> None:
     assert _read(Known(1), Known.maker, ask) == "ABB"
 
 
-def test_polling_a_text_register_or_reading_one_of_another_family_raises(
+def test_polling_a_text_or_reading_another_familys_text_raises_an_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     class Other(Drive):
-        """Another family, with a text at the same address."""
+        """Another family with a text register at the same address."""
 
         serial = text(20, 12)
 
@@ -426,7 +427,7 @@ def test_polling_a_text_register_or_reading_one_of_another_family_raises(
         ((-1, 2), "its registers must be within 0 to FFFFH"),
     ],
 )
-def test_text_longer_than_a_request_is_refused(details: tuple[int, int], sentence: str) -> None:
+def test_text_register_longer_than_one_request_is_refused(details: tuple[int, int], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         text(*details)
 
@@ -444,7 +445,7 @@ def test_invalid_declarations_of_text_registers_are_refused() -> None:
         type("Wrong", (Drive,), {"second": Meter.serial})
 
 
-def test_command_line_prints_text_registers_and_missing_values(run: RunCommand, tmp_path: Path) -> None:
+def test_command_line_prints_text_registers_and_marks_missing_values(run: RunCommand, tmp_path: Path) -> None:
     path = tmp_path / "meter.py"
     path.write_text(METER)
     model = f"{path}:Meter"
@@ -478,7 +479,7 @@ UNTRANSLATED = {  # the documents do not explain these registers
 
 
 @pytest.mark.parametrize("language", LANGUAGES)
-def test_catalogue_has_each_register_of_the_built_in_families(language: str) -> None:
+def test_title_catalogue_has_each_register_of_the_built_in_families(language: str) -> None:
     families = [*MODELS.values(), *map(shipped_family, SHIPPED)]
     names = {name for family in families for name in family.registers}
     titles = catalogue(language)
@@ -489,7 +490,7 @@ def test_catalogue_has_each_register_of_the_built_in_families(language: str) -> 
     )
 
 
-def test_declared_title_precedes_the_catalogue_and_english() -> None:
+def test_declared_title_takes_precedence_over_catalogue_and_english_titles() -> None:
     registers = {
         "output_current": reading(1, "A", titles={"ru": "ток"}),
         "outdoor_temperature": reading(2, titles={"zh": "室外温度"}),
@@ -519,5 +520,5 @@ def test_declared_title_precedes_the_catalogue_and_english() -> None:
         ([], "en"),
     ],
 )
-def test_first_known_language_is_chosen(tags: list[str], language: str) -> None:
+def test_first_language_that_has_titles_is_chosen(tags: list[str], language: str) -> None:
     assert chosen_language(tags) == language

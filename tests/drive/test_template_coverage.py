@@ -1,4 +1,4 @@
-"""The script that reports which share of a folder of register templates the register model can describe."""
+"""The script that counts which entries of other programs' register templates can be described here."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_every_supported_key_of_a_template_is_converted(bench: Any, tmp_path: Pa
     }
 
 
-def test_missing_facts_are_counted_with_their_reasons(bench: Any, tmp_path: Path) -> None:
+def test_template_entries_without_required_keys_are_counted_with_reasons(bench: Any, tmp_path: Path) -> None:
     (tmp_path / "some.json").write_text(wb([*HELD, *READ_ONLY, *LACKING, *LACKING]))
     (tmp_path / "more.json").write_text(wb(LACKING[:1]))
     whole = len(HELD) + 1 + 2 * len(LACKING) + 1
@@ -112,7 +112,7 @@ def test_missing_facts_are_counted_with_their_reasons(bench: Any, tmp_path: Path
     }
 
 
-def test_parameters_nested_devices_and_comments_are_read(bench: Any, tmp_path: Path) -> None:
+def test_template_parameters_nested_devices_and_comments_are_read(bench: Any, tmp_path: Path) -> None:
     parameters = {"p": {"title": "p", "address": 5, "condition": "q==1"}}
     within = [{"device_type": "y", "device": {"channels": [HELD[0]], "parameters": [{"address": 6}]}}]
     used = {"name": "inner", "device_type": "y", "shift": 100}
@@ -129,14 +129,14 @@ def test_parameters_nested_devices_and_comments_are_read(bench: Any, tmp_path: P
     }
 
 
-def test_entries_that_do_not_fit_into_one_class_are_reported(bench: Any, tmp_path: Path) -> None:
+def test_template_entries_that_do_not_fit_into_one_class_are_reported(bench: Any, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(wb([{"address": 5, "scale": 0.1}, {"address": 5, "scale": 1}]))
     coverage = covered(bench, tmp_path)
     assert (coverage.whole, coverage.refused.total()) == (0, 1)
     assert "is written at the same address" in next(iter(coverage.refused))
 
 
-def test_other_protocols_and_invalid_files_are_left_out(bench: Any, tmp_path: Path) -> None:
+def test_templates_of_other_protocols_and_invalid_files_are_skipped(bench: Any, tmp_path: Path) -> None:
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub" / "modbus.json").write_text(wb(HELD[:1]))
     (tmp_path / "other.json").write_text(wb(HELD[:1], protocol="uniel"))
@@ -182,7 +182,7 @@ OTHERS = {
 }
 
 
-def test_modpoll_s_tables_are_read(bench: Any, tmp_path: Path) -> None:
+def test_template_tables_of_modpoll_are_read(bench: Any, tmp_path: Path) -> None:
     (tmp_path / "meter.csv").write_text(MODPOLL)
     coverage = covered(bench, tmp_path)
     assert shares(coverage) == {"templates": (2, 1), "entries": (9, 8), "read": (9, 8)}
@@ -191,7 +191,7 @@ def test_modpoll_s_tables_are_read(bench: Any, tmp_path: Path) -> None:
     assert (needed["order of bytes or words"], needed["bits of a word"], needed["text"]) == (3, 1, 1)
 
 
-def test_every_layout_of_the_importers_is_read(bench: Any, tmp_path: Path) -> None:
+def test_template_files_of_every_importer_layout_are_read(bench: Any, tmp_path: Path) -> None:
     pytest.importorskip("yaml")
     for name, contents in OTHERS.items():
         (tmp_path / name).write_text(contents)
@@ -205,7 +205,7 @@ def test_every_layout_of_the_importers_is_read(bench: Any, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_the_script_prints_its_tables(tmp_path: Path) -> None:
+def test_template_coverage_script_prints_its_tables(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(wb([*HELD, *LACKING]))
     (tmp_path / "b.json").write_text("{")
     done = subprocess.run([*SCRIPT, str(tmp_path)], capture_output=True, text=True, cwd=ROOT, check=True)
@@ -219,7 +219,7 @@ def test_the_script_prints_its_tables(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("folder", "sentence"), [("none", "is no folder"), (".", "has no template")])
-def test_folder_without_templates_is_reported(tmp_path: Path, folder: str, sentence: str) -> None:
+def test_folder_without_register_templates_is_reported(tmp_path: Path, folder: str, sentence: str) -> None:
     command = [*SCRIPT, str(tmp_path / folder)]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
     assert (done.returncode, done.stdout) == (2, "")
@@ -229,7 +229,7 @@ def test_folder_without_templates_is_reported(tmp_path: Path, folder: str, sente
 # ---- texts of one character a register ----
 
 
-def test_a_text_with_one_character_per_register_uses_the_low_bytes() -> None:
+def test_template_text_with_one_character_per_register_uses_the_low_bytes() -> None:
     version = text(250, 5, order="B")
     assert version.decode(bytes.fromhex("0034 002E 0031 0000 0041")) == "4.1"
     assert version.decode(bytes.fromhex("FF34 FF2E FF31 FF38 FF20")) == "4.18"

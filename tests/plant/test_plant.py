@@ -1,4 +1,4 @@
-"""Plant files: their contents, and one sentence for every mistake."""
+"""Plant files: valid contents are loaded, and every mistake gives one sentence."""
 
 from __future__ import annotations
 
@@ -126,14 +126,14 @@ def mistakes(load: Load, tmp_path: Path) -> Mistakes:
 @pytest.mark.parametrize(
     "text", ["a." * 300 + "b = 1", "a = " + "[" * 300 + "]" * 300, "a." * 100_000 + "b=1"]
 )
-def test_a_plant_file_with_too_deep_nesting_is_refused(tmp_path: Path, text: str) -> None:
+def test_plant_file_with_too_deep_nesting_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(text)
     with pytest.raises(PlantError):
         load_plant(path)
 
 
-def test_lines_drives_and_polls_are_read(load: Load) -> None:
+def test_lines_drives_and_polls_are_read_from_a_plant_file(load: Load) -> None:
     plant = load(GOOD)
     hall_1, hall_2 = plant.lines
     assert (hall_1.name, hall_1.port, hall_1.baudrate, hall_1.format) == (
@@ -181,7 +181,7 @@ address = 3
 """
 
 
-def test_the_silence_of_a_line_replaces_the_standards_silence_but_not_a_familys(load: Load) -> None:
+def test_silence_of_a_line_replaces_t3_5_but_no_longer_silence_of_a_family(load: Load) -> None:
     (line,) = load(SILENT).lines
     assert [polled.drive.needed_silence() for polled in line.drives] == pytest.approx([500e-6, 10e-3, 0])
     assert line.switching == 0
@@ -192,18 +192,18 @@ def test_the_silence_of_a_line_replaces_the_standards_silence_but_not_a_familys(
     assert [polled.drive.needed_silence() for polled in line.drives] == pytest.approx([1.75e-3, 10e-3, 0])
 
 
-def test_a_line_s_echo_is_detected_unless_it_is_declared(load: Load) -> None:
+def test_echo_of_a_line_is_detected_unless_the_plant_file_declares_it(load: Load) -> None:
     assert load(SILENT).lines[0].echo is Echo.AUTO
     assert load(SILENT.replace('silence = "500 us"', 'echo = "off"')).lines[0].echo is Echo.OFF
 
 
-def test_realtime_is_a_key_of_the_whole_plant(load: Load, mistakes: Mistakes) -> None:
+def test_realtime_is_a_key_of_the_whole_plant_file(load: Load, mistakes: Mistakes) -> None:
     assert load(GOOD).realtime is False
     assert load("realtime = true\n" + GOOD).realtime is True
     assert mistakes("realtime = 1\n" + GOOD) == ["realtime = 1 is not right; write realtime = true"]
 
 
-def test_without_poll_all_readings_are_polled_as_fast_as_the_line_allows(load: Load) -> None:
+def test_drive_without_poll_polls_all_readings_as_fast_as_possible(load: Load) -> None:
     (pump,) = load(GOOD).lines[1].drives
     assert [(poll.register.name, poll.every) for poll in pump.polls] == [
         ("output_frequency", None),
@@ -211,18 +211,18 @@ def test_without_poll_all_readings_are_polled_as_fast_as_the_line_allows(load: L
     ]
 
 
-def test_a_byte_order_mark_is_skipped(load: Load) -> None:
+def test_byte_order_mark_of_a_plant_file_is_skipped(load: Load) -> None:
     assert load("\ufeff" + SILENT).metadata() == load(SILENT).metadata()
 
 
-def test_framing_and_options_reach_the_drive(load: Load) -> None:
+def test_framing_and_options_in_a_plant_file_reach_the_drive(load: Load) -> None:
     (pump,) = load(GOOD).lines[1].drives
     assert pump.drive.framing is Framing.ASCII
     assert pump.drive.settings == Settings(9600, "7E1")
     assert pump.drive.option == {"rated_frequency": 60}
 
 
-def test_a_mistake_names_the_line_of_its_key_or_table(load: Load) -> None:
+def test_error_names_the_line_number_of_the_wrong_key_or_table(load: Load) -> None:
     text = (
         GOOD.replace('port = "/dev/ttyUSB0"', 'prot = "/dev/ttyUSB0"')
         .replace('"output_current",', '"output_curent",')
@@ -236,7 +236,7 @@ def test_a_mistake_names_the_line_of_its_key_or_table(load: Load) -> None:
     assert all(rows[number - 1].startswith(start) for number, start in zip(numbers, starts, strict=True))
 
 
-def test_the_same_mistake_in_many_drives_is_reported_once_with_a_count(load: Load) -> None:
+def test_same_mistake_in_many_drives_is_reported_once_with_a_count(load: Load) -> None:
     drives = (
         TOY.replace('"D"', f'"D{address}"').replace("address = 1", f"address = {address}")
         + 'poll = ["output_curent"]\n'
@@ -249,7 +249,7 @@ def test_the_same_mistake_in_many_drives_is_reported_once_with_a_count(load: Loa
     assert sentence.endswith("; the same in 30 more places")
 
 
-def test_five_mistakes_in_one_file_are_all_reported_together(mistakes: Mistakes) -> None:
+def test_five_mistakes_in_one_plant_file_are_reported_together(mistakes: Mistakes) -> None:
     text = (
         GOOD.replace('port = "/dev/ttyUSB0"', 'prot = "/dev/ttyUSB0"')
         .replace('"output_current",', '"output_curent",')
@@ -445,13 +445,13 @@ def test_five_mistakes_in_one_file_are_all_reported_together(mistakes: Mistakes)
         ),
     ],
 )
-def test_each_mistake_is_reported_in_one_sentence_with_place_and_remedy(
+def test_each_mistake_in_a_plant_file_gives_one_sentence_with_remedy(
     mistakes: Mistakes, text: str, sentence: str
 ) -> None:
     assert mistakes(text) == [sentence]
 
 
-def test_arguments_that_the_family_refuses_are_each_reported(mistakes: Mistakes) -> None:
+def test_each_drive_key_that_the_family_refuses_is_reported(mistakes: Mistakes) -> None:
     text = (
         HEAD + TOY.replace("= 1", "= 99") + 'baudrate = 1\nformat = "8N2"\nframing = "x"\nrated_frequency = 1'
     )
@@ -464,12 +464,12 @@ def test_arguments_that_the_family_refuses_are_each_reported(mistakes: Mistakes)
     ]
 
 
-def test_a_path_that_is_too_long_is_reported_as_a_mistake() -> None:
+def test_plant_file_path_that_is_too_long_is_reported() -> None:
     with pytest.raises(PlantError, match="the plant file cannot be read: File name too long"):
         load_plant("x" * 5000)
 
 
-def test_an_unreadable_plant_file_is_reported_as_a_sentence(tmp_path: Path) -> None:
+def test_unreadable_plant_file_is_reported_in_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(
         PlantError, match=r"none.toml: the plant file cannot be read: No such file or directory"
     ):
@@ -494,15 +494,15 @@ SCANNED = "is a port, not a plant file; `multidrop scan {} --out plant.toml` wri
         ("/dev/ttyUSB0", SCANNED.format("/dev/ttyUSB0")),
     ],
 )
-def test_a_url_or_port_given_as_a_plant_file_is_reported_as_such(name: str, expected: str) -> None:
-    for given in (name, Path(name)):  # Path reduces two slashes to one
+def test_url_or_port_name_instead_of_a_plant_file_is_reported(name: str, expected: str) -> None:
+    for given in (name, Path(name)):  # Path reduces two slashes to one, so both types are tried
         with pytest.raises(PlantError) as raised:
             load_plant(given)
         assert str(raised.value).lower().startswith(name.lower().rstrip("/"))
         assert expected in str(raised.value)
 
 
-def test_a_device_given_as_a_plant_file_is_not_read() -> None:
+def test_device_path_given_as_plant_file_is_not_read() -> None:
     """Reading a serial port would block, and take bytes from its line."""
     with pytest.raises(PlantError, match=r": is a device, not a plant file$"):
         load_plant(os.devnull)
@@ -517,7 +517,7 @@ def test_a_device_given_as_a_plant_file_is_not_read() -> None:
     ],
     ids=["nested", "decimal", "hexadecimal"],
 )
-def test_a_file_that_makes_tomllib_fail_is_reported_as_a_sentence(
+def test_plant_file_on_which_tomllib_fails_is_reported_in_one_sentence(
     tmp_path: Path, text: str, sentence: str
 ) -> None:
     (tmp_path / "a.toml").write_text(text)
@@ -537,7 +537,7 @@ UNDOCUMENTED = ("spy:///dev/null?file={}", "SPY://x?file={}", "alt://x?class={}"
 
 
 @pytest.mark.parametrize("port", UNDOCUMENTED)
-def test_urls_with_undocumented_schemes_are_refused(mistakes: Mistakes, port: str) -> None:
+def test_port_urls_with_undocumented_schemes_are_refused(mistakes: Mistakes, port: str) -> None:
     """For example, pyserial's spy:// would overwrite the file that the URL names."""
     (sentence,) = mistakes((HEAD + TOY).replace('port = "/dev/a"', f'port = "{port}"'))
     scheme = port.partition(":")[0]
@@ -547,7 +547,7 @@ def test_urls_with_undocumented_schemes_are_refused(mistakes: Mistakes, port: st
     )
 
 
-def test_a_port_url_with_a_user_is_refused_without_showing_the_password(mistakes: Mistakes) -> None:
+def test_port_url_with_a_user_is_refused_without_showing_the_password(mistakes: Mistakes) -> None:
     (sentence,) = mistakes((HEAD + TOY).replace('port = "/dev/a"', 'port = "tcp://bob:S3C@ET@10.0.0.7"'))
     assert "tcp://10.0.0.7: it has a user or a password" in sentence
     assert "S3C" not in sentence
@@ -559,15 +559,16 @@ def test_reserved_names_of_lines_and_drives_are_refused(mistakes: Mistakes) -> N
     assert drive.startswith('line "..", drive "stop": name "stop" is reserved for the MQTT topic PREFIX/stop')
 
 
-def test_a_model_file_name_that_is_too_long_is_reported_as_a_sentence(mistakes: Mistakes) -> None:
+def test_family_file_name_that_is_too_long_is_reported(mistakes: Mistakes) -> None:
     (sentence,) = mistakes(HEAD + TOY.replace("family.py:Toy", "a" * 300 + ".py"))
-    assert sentence.endswith((".py: File name too long", ".py to take a model from"))  # the second on Windows
+    # Windows has the second text
+    assert sentence.endswith((".py: File name too long", ".py to take a model from"))
 
 
 @table(
     ("text", "expected"), [("500 us", 500e-6), ("50ms", 0.05), ("2 s", 2), ("1.5 min", 90), (" 1 h ", 3600)]
 )
-def test_parse_duration_returns_seconds(text: str, expected: float) -> None:
+def test_parse_duration_returns_the_seconds_of_a_text_such_as_100ms(text: str, expected: float) -> None:
     assert parse_duration(text) == pytest.approx(expected)
 
 
@@ -591,12 +592,12 @@ def test_parse_duration_returns_seconds(text: str, expected: float) -> None:
         b"5 s",
     ],
 )
-def test_invalid_durations_are_refused(text: str) -> None:
+def test_invalid_durations_in_a_plant_file_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"is not a duration from 100 us to 24 h, such as"):
         parse_duration(text)
 
 
-def test_ram_and_confirmed_of_a_plant_file_reach_the_drive(tmp_path: Path) -> None:
+def test_keys_ram_and_confirmed_of_a_plant_file_reach_the_drive(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(
         """
@@ -649,7 +650,7 @@ def test_with_ports_refuses_unknown_lines_and_duplicate_ports(tmp_path: Path) ->
         plant.with_ports({"roof": "/dev/hall"})
 
 
-def test_lines_and_drives_are_found_by_name(tmp_path: Path) -> None:
+def test_plant_finds_lines_and_drives_by_name(tmp_path: Path) -> None:
     plant = load_plant(two_lines(tmp_path))
     assert plant.find_line("roof") is plant.lines[1]
     line, drive = plant.find_drive("pump-2")
@@ -659,8 +660,8 @@ def test_lines_and_drives_are_found_by_name(tmp_path: Path) -> None:
 
 
 @table("every", [0, 0.0, -1.0, 0.00009, 86401.0, float("nan"), float("inf"), True, "1 s"])
-def test_a_period_outside_the_limits_is_refused(every: Any) -> None:
-    """A period of 0 s would make the polling of its line fail."""
+def test_polling_period_outside_the_limits_is_refused(every: Any) -> None:
+    """A period of 0 s would make the polling of the whole line fail."""
 
     register = YD1000.register("status")
     with pytest.raises(ValueError, match=rf"^every = {every!r} is not a number of seconds from 0\.0001 to "):
@@ -668,7 +669,7 @@ def test_a_period_outside_the_limits_is_refused(every: Any) -> None:
     assert Polled(register, None).every is None
 
 
-def test_a_star_polls_all_readings_and_respects_their_own_rates(load: Load) -> None:
+def test_star_polls_all_readings_and_keeps_rates_given_for_single_ones(load: Load) -> None:
     def polls(entries: str) -> dict[str, float | None]:
         (line,) = load(HEAD + TOY + f'every = "1 s"\npoll = {entries}').lines
         return {poll.register.name: poll.every for poll in line.drives[0].polls}
@@ -694,7 +695,7 @@ def test_polling_a_text_register_is_reported_as_a_mistake(mistakes: Mistakes, tm
     assert sentence.endswith("'mark' of Meter is a text: texts are read, but neither polled nor written")
 
 
-def test_a_second_star_in_a_poll_list_is_reported(mistakes: Mistakes) -> None:
+def test_second_star_in_a_poll_list_is_reported(mistakes: Mistakes) -> None:
     (sentence,) = mistakes(HEAD + TOY + 'poll = ["*", "*"]')
     assert sentence.endswith('poll number 2: "*" is there twice; keep it once')
 
@@ -702,7 +703,7 @@ def test_a_second_star_in_a_poll_list_is_reported(mistakes: Mistakes) -> None:
 # ---- names of drives: Unicode normal forms, which differ between keyboards; reserved names ----
 
 
-# Letters with two encodings, from the code charts: U+00FC = U+0075 U+0308; U+0439 = U+0438 U+0306.
+# Letters with a composed and a decomposed Unicode encoding, from the code charts.
 COMPOSED, APART = "L\u00fcfter", "Lu\u0308fter"
 SHORT, LONG = "\u0439", "\u0438\u0306"
 
@@ -716,29 +717,30 @@ SHORT, LONG = "\u0439", "\u0438\u0306"
         (APART, [COMPOSED, APART], APART),  # an exact match takes precedence
         ("pump", ["pump", "pump-1"], "pump"),
         ("Pump", ["pump"], "Pump"),  # case is significant
-        ("\u212b", ["A\u030a", "\u00c5"], "\u212b"),  # ambiguous: both names have this normal form
+        # ambiguous: both names have the same Unicode normal form
+        ("\u212b", ["A\u030a", "\u00c5"], "\u212b"),
         ("Lufter", [COMPOSED], "Lufter"),
-        ("\ufb01", ["fi"], "\ufb01"),  # a ligature is not its two letters
+        ("\ufb01", ["fi"], "\ufb01"),  # the ligature of f and i does not match the two letters
         ("\ud800", [COMPOSED], "\ud800"),
         ("", [], ""),
     ],
 )
-def test_a_name_is_found_by_its_unicode_normal_form(given: str, names: list[str], meant: str) -> None:
+def test_drive_name_is_found_by_its_unicode_normal_form(given: str, names: list[str], meant: str) -> None:
     assert drive_meant(given, names) == meant
 
 
 @table("name", [*RESERVED_NAMES, "--all", "-"])
-def test_reserved_names_are_refused(name: str) -> None:
+def test_reserved_drive_names_are_refused(name: str) -> None:
     with pytest.raises(ValueError, match="give it another name"):
         check_drive_name(name)
 
 
 @table("name", ["stop-1", "Stop", "gateways", "...", "a-", "__proto"])
-def test_names_similar_to_reserved_ones_are_allowed(name: str) -> None:
+def test_drive_names_similar_to_reserved_ones_are_allowed(name: str) -> None:
     assert check_drive_name(name)
 
 
-def test_no_option_of_a_family_file_has_the_name_of_a_plant_files_key() -> None:
+def test_no_option_of_a_family_file_has_the_name_of_a_plant_file_key() -> None:
     assert set(DRIVE_KEYS) <= NOT_OPTIONS
 
 
@@ -779,7 +781,7 @@ def loaded(folder: Path, text: str = FILE) -> tuple[tuple[Channel, ...], ...]:
     return tuple(polled.channels for polled in plant.lines[0].drives)
 
 
-def test_channels_belong_to_their_drive(tmp_path: Path) -> None:
+def test_computed_channels_in_a_plant_file_belong_to_their_drive(tmp_path: Path) -> None:
     first, second = loaded(tmp_path)
     assert first == (Channel("energy", "integral(output_power)", "kWh"),)
     assert second == (Channel("both", "pump-1.output_power + output_power", "W"),)
@@ -807,7 +809,7 @@ WRONG_CHANNELS = (
 
 
 @pytest.mark.parametrize(("right", "wrong", "line", "sentence"), WRONG_CHANNELS)
-def test_a_mistake_in_a_channel_is_reported_with_its_file_and_line(
+def test_mistake_in_a_computed_channel_is_reported_with_file_and_line(
     tmp_path: Path, right: str, wrong: str, line: int, sentence: str
 ) -> None:
     assert right in FILE
@@ -818,7 +820,7 @@ def test_a_mistake_in_a_channel_is_reported_with_its_file_and_line(
     assert sentence in first
 
 
-def test_drive_with_a_wrong_channel_can_still_be_stopped(tmp_path: Path) -> None:
+def test_drive_with_a_mistake_in_its_channel_can_still_be_stopped(tmp_path: Path) -> None:
     with pytest.raises(PlantError) as mistake:
         loaded(tmp_path, FILE.replace("integral(", "integrall("))
     assert mistake.value.right is not None

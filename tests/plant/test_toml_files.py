@@ -1,6 +1,6 @@
-"""Files that are not TOML: one sentence says what is wrong, in which line, and what would be right.
+"""Invalid TOML files give one sentence with the mistake, its line and a correction.
 
-Also the line numbers of keys in TOML files, of any layout.
+TOML keys in any layout have the right line numbers.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def mistake(data: str | bytes) -> tuple[int, str]:
         ),
         ("a\u00a0= 1", 1, "the line has an invisible character; write the line again"),
         ('a = "\x01"', 1, "a text has an invisible character; remove it"),
-        # mistakes without a sentence of their own have that of tomllib
+        # tomllib's own error is shown for other mistakes
         ("a = 1\nb = 2026-02-30", 2, "Invalid date or datetime"),
         # headers
         ("[[line]\na = 1", 1, "a header lacks a bracket; write [serve] or [[line]]"),
@@ -117,11 +117,13 @@ def mistake(data: str | bytes) -> tuple[int, str]:
         (b"a = 1\nb = '\xe4'", 2, "is not text in UTF-8, from byte 11 on (0xE4); save it as UTF-8"),
     ],
 )
-def test_text_that_is_not_toml_is_explained(text: str | bytes, line: int, sentence: str) -> None:
+def test_text_that_is_not_toml_is_reported_with_a_correction(
+    text: str | bytes, line: int, sentence: str
+) -> None:
     assert mistake(text) == (line, sentence)
 
 
-def test_a_long_wrong_line_is_explained_at_once_and_shown_in_part() -> None:
+def test_long_line_with_a_toml_mistake_is_reported_quickly_and_shortened() -> None:
     line, sentence = mistake("name = " + "x" * 500_000 + "é" * 500_000)
     assert (line, len(sentence) < 200) == (1, True)
 
@@ -170,7 +172,8 @@ b = 1
         (["line", "drive", ("poll", 2)], "", 9),
         (["line", "drive", ("poll", 2)], "every", 9),
         (["line", "drive", ("poll", 3)], "", 10),
-        (["line", "drive", ("poll", 4)], "", 6),  # there is none, so its list is named
+        # the drive has no key `poll`, so the line number of the list is used
+        (["line", "drive", ("poll", 4)], "", 6),
         (["line", "drive"], "address", 16),
         ([("line", 2)], "name", 18),
         ([("line", 2), "drive"], "address", 20),
@@ -185,7 +188,7 @@ b = 1
         (["absent"], "absent", 0),
     ],
 )
-def test_a_mistake_names_the_line_of_its_key_in_any_layout(
+def test_error_names_the_line_number_of_its_toml_key_in_any_layout(
     tmp_path: Path, steps: list[str | tuple[str, int]], key: str, line: int
 ) -> None:
     (tmp_path / "a.toml").write_text(LAYOUT)
@@ -198,12 +201,12 @@ def test_a_mistake_names_the_line_of_its_key_in_any_layout(
     assert error.startswith(f"{tmp_path}/a.toml:{line}: " if line else f"{tmp_path}/a.toml: ")
 
 
-def test_a_file_that_is_gone_has_no_line_numbers(tmp_path: Path) -> None:
+def test_toml_file_that_no_longer_exists_has_no_line_numbers(tmp_path: Path) -> None:
     assert line_numbers(tmp_path / "none.toml") == {}
     assert line_numbers(tmp_path) == {}
 
 
-def test_a_sentence_that_starts_with_a_key_names_the_line_of_the_key(tmp_path: Path) -> None:
+def test_error_that_starts_with_a_toml_key_names_the_keys_line(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text("[a]\nb = 1\nc = 2\n")
     place = TomlPlace.in_file(tmp_path / "a.toml").within("[a]", "a")
     place.wrong("c = 2 is too much")
@@ -211,7 +214,7 @@ def test_a_sentence_that_starts_with_a_key_names_the_line_of_the_key(tmp_path: P
     assert [error.split(": ")[0].rpartition(":")[2] for error in place.config_errors] == ["3", "1"]
 
 
-def test_a_long_table_in_an_error_is_cut(tmp_path: Path) -> None:
+def test_long_toml_table_in_an_error_is_shortened(tmp_path: Path) -> None:
     place = TomlPlace(tmp_path / "a.toml")
     place.check({"line": {"name": "x" * 100}}, {"line": Key(list, "[[line]], in two brackets")})
     (error,) = place.config_errors
@@ -219,7 +222,7 @@ def test_a_long_table_in_an_error_is_cut(tmp_path: Path) -> None:
     assert len(error) < len(str(tmp_path)) + 150
 
 
-def test_a_table_outside_its_line_is_reported_with_the_right_header(tmp_path: Path) -> None:
+def test_toml_table_in_the_wrong_place_is_reported_with_the_right_header(tmp_path: Path) -> None:
     from multidrop.plant.loader import PlantError, load_plant
 
     path = tmp_path / "plant.toml"

@@ -1,4 +1,4 @@
-"""Drives as their manuals describe them: registers, line settings and timing, verbs. No I/O."""
+"""Drive classes as their manuals describe them: registers, line settings, timing and commands. No I/O."""
 
 from multidrop.core import Framing
 from multidrop.drive.declaration_check import DeclarationError as DeclarationError

@@ -1,4 +1,4 @@
-"""Check a drive's class when it is defined, with tables of rules for its facts (attributes) and registers."""
+"""Check the attributes and registers of a drive class when the class is defined, with tables of rules."""
 
 from __future__ import annotations
 
@@ -19,20 +19,21 @@ from multidrop.drive.text import Text
 from multidrop.printable import is_whole
 
 LAST_ADDRESS = 0xFFFF
-LONGEST_TIME = 60.0  # s; larger numbers are probably ms
+LONGEST_TIME = 60.0  # s; a larger number was probably meant in ms
 MOST_CHARACTERS = 1000
-UNIT_IDS = range(256)  # addresses on Modbus TCP; a serial line has fewer addresses
+UNIT_IDS = range(256)  # unit ids on Modbus TCP; a serial line has fewer addresses
 EXCEPTION_CODES = range(1, 256)
-# Function codes that write the same items: the code for one item, and the code for several.
+# Maps the function code that writes one coil or register to the code that writes several.
 _SAME_SPACE = {0x05: 0x0F, 0x06: 0x10}
 _TAKEN = "reserved name; every drive has it for something else"
 
-# A fact's name, the test of its value, and the end of the error "FACT = VALUE …" for a failed test.
+# An attribute's name, a function that checks its value, and the end of the error sentence, which begins with
+# "NAME = VALUE".
 Rules = tuple[tuple[str, Callable[[Any], Any], str], ...]
 
 
 class DeclarationError(ValueError):
-    """All errors in a drive's class; `mistakes` has each as a sentence with the register's name."""
+    """Raised for a drive class with errors; `mistakes` has a sentence for each, with the register's name."""
 
     def __init__(self, owner: str, mistakes: Collection[str]) -> None:
         super().__init__("\n".join(f"{owner}.{mistake}" for mistake in mistakes))
@@ -87,7 +88,7 @@ def _is_settings(baudrate: Any, format: Any) -> bool:
 
 
 def _wrong_facts(owner: Any, rules: Rules) -> dict[str, str]:
-    """Return a sentence for each wrong fact, by the fact's name."""
+    """Return an error sentence for each attribute with a wrong value, by the attribute's name."""
     facts = ((name, getattr(owner, name), is_right, rest) for name, is_right, rest in rules)
     return {
         name: f"{name} = {value!r} {rest}" for name, value, is_right, rest in facts if not is_right(value)
@@ -168,7 +169,7 @@ _CLASS_RULES: Rules = (
 
 
 def fact_errors(family: Any) -> list[str]:
-    """Return a sentence for each error in a class's facts, besides its registers."""
+    """Return an error sentence for each wrong attribute of a drive class, not including its registers."""
     wrong = _wrong_facts(family, _CLASS_RULES)
     is_known = not wrong.keys() & {"formats", "framings"}
     if is_known and family.formats and (first := family.framings[0]) not in family.formats:
@@ -183,12 +184,12 @@ def fact_errors(family: Any) -> list[str]:
                 wrong["options"] = (
                     f"options[{name!r}]: span = {option.span!r} is not the smallest and the largest value"
                 )
-    registers = {*family.registers, *family.texts}  # errors in their names are reported elsewhere
+    registers = {*family.registers, *family.texts}
     return [sentence for name, sentence in wrong.items() if name not in registers]
 
 
 def text_errors(texts: Mapping[str, Text], taken: Collection[str]) -> list[str]:
-    """Return a sentence for each error in a class's texts; `taken` are the reserved names."""
+    """Return an error sentence for each wrong text register of a class; `taken` are the reserved names."""
     found = [f"{name}: {_TAKEN}; rename the text" for name in texts if name in taken]
     return found + [
         f"{name}: this is the text {text.name} already; declare one of its own"
@@ -276,13 +277,13 @@ def _errors_together(
             yield f"its bound {name} is neither an option nor a number that can be read"
 
 
-# By carrier (bit or word): the function codes that read or write it (application protocol V1.1b3, 6).
+# Function codes that read bits or 16-bit words, and codes that write them (application protocol V1.1b3, 6).
 _READS = {Carrier.BIT: (0x01, 0x02), Carrier.WORD: (0x03, 0x04)}
 _WRITES = {Carrier.BIT: (0x05, 0x0F), Carrier.WORD: (0x06, 0x10)}
 
 
 def _table_errors(register: Register[Any]) -> Iterator[str]:
-    """Yield a sentence for each number format, function code and access that does not fit the table."""
+    """Yield an error sentence if the number format, a function code or the access does not fit the table."""
     table, access = register.table, register.access
     if not _fits_table(register):
         yield f"number_format = NumberFormat.{register.number_format.name} does not fit a {table.name}"
@@ -306,19 +307,22 @@ def _fits_table(register: Register[Any]) -> bool:
     return register.number_format is wanted
 
 
-# Formats of whole numbers. A register may be only a part (a range of bits) of such a number.
+# Number formats of which a register may be only a range of bits, its `part`.
 _PARTED = frozenset(
     {
         *(NumberFormat.U16, NumberFormat.U32, NumberFormat.U64),
         *(NumberFormat.I16, NumberFormat.I32, NumberFormat.I64),
     }
 )
-# Facts that only registers of 16-bit words may have, not bits, each with its default.
+# Attributes that only registers of 16-bit words may set, not coils or discrete inputs, with their defaults.
 _OF_WORDS = {"part": None, "invalid": (), "order": "ABCD", "scale_register": ""}
 
 
 def _number_errors(register: Register[Any]) -> Iterator[str]:
-    """Yield a sentence for each fact that does not fit the number format. The format must fit the table."""
+    """Yield an error sentence for each attribute that does not fit the register's number format.
+
+    The number format must already be known to fit the register's table.
+    """
     number_format, is_reading = register.number_format, register.access is Access.READING
     for name, at in (("address", register.address), ("ram_address", register.ram_address)):
         if at is not None and at + register.words - 1 > LAST_ADDRESS:
@@ -358,14 +362,15 @@ def _is_flags(register: Register[Any]) -> bool:
 
 
 def _counts(register: Register[Any]) -> tuple[Fraction, Fraction]:
-    """Return the least and the greatest raw count; flags are never negative."""
-    if _is_flags(register):  # even in a signed format, because the highest bit may be a named flag
+    """Return the smallest and the largest raw count of the register. Flags are never negative."""
+    # flags are unsigned, even in a signed format, because the highest bit may be a named flag
+    if _is_flags(register):
         return Fraction(0), Fraction((1 << register.coding.mask.bit_count()) - 1)
     return register.coding.raw_span
 
 
 def _written_errors(register: Register[Any]) -> Iterator[str]:
-    """Yield a sentence for each declared raw count that no write can send."""
+    """Yield an error sentence for each declared raw count, default or limit that cannot be written."""
     least, most = _counts(register)
     for key in ("harmless", "broadcast"):
         for count in getattr(register, key) or ():
@@ -408,7 +413,7 @@ def _invalid_errors(register: Register[Any]) -> Iterator[str]:
 
 
 def _name_errors(register: Register[Any]) -> Iterator[str]:
-    """Yield a sentence for each named count that the register can never hold."""
+    """Yield an error sentence for each enumeration member whose number the register cannot hold."""
     if register.values is None or (register.part is not None and register.number_format not in _PARTED):
         return
     least, most = _counts(register)
@@ -428,9 +433,9 @@ def _name_errors(register: Register[Any]) -> Iterator[str]:
 def declaration_errors(
     registers: Mapping[str, Register[Any]], taken: Collection[str], bounds: Collection[str]
 ) -> list[str]:
-    """Return a sentence for each error in a class's registers.
+    """Return an error sentence for each mistake in a class's registers.
 
-    `taken` are the reserved names; `bounds` are the names of the class's options.
+    `taken` are the reserved names. `bounds` are the class's options, which may limit a register's values.
     """
     found, sound = [], []
     for name, register in registers.items():
@@ -448,11 +453,11 @@ def declaration_errors(
 
 
 def _sharing_errors(registers: list[Register[Any]]) -> Iterator[str]:
-    """Yield a sentence for each pair of registers that are written at one address with different meanings.
+    """Yield an error sentence for each pair of registers that write different things to the same address.
 
     A reading may share its address with any register, and different tables may use the same addresses. A
-    register that commands the motor must not share its address with a RAM alias, or with a register that has
-    other harmless counts. Otherwise a plain write could send a count that only verbs may send.
+    register that commands the motor must not share its address with the RAM address of a setting, or with a
+    register that allows other values in plain writes. Otherwise a plain write could start the motor.
     """
     written = [one for one in registers if one.access is not Access.READING and one.table.write is not None]
     at: dict[tuple[object, int], list[Register[Any]]] = {}
@@ -476,7 +481,7 @@ def _sharing_errors(registers: list[Register[Any]]) -> Iterator[str]:
 
 
 def written_places(register: Register[Any]) -> list[tuple[object, int]]:
-    """Return the table and address of each item that a write of this register changes."""
+    """Return the table and address of each coil or word that a write to this register changes."""
     if register.access is Access.READING:
         return []
     starts = [register.address, *([] if register.ram_address is None else [register.ram_address])]
@@ -502,7 +507,7 @@ def _meaning(register: Register[Any]) -> object:
 
 
 def request_errors(family: Any) -> list[str]:
-    """Connect scale registers; return a sentence for each wrong scale, limit or group of registers."""
+    """Link registers to their scale registers; return a sentence for each wrong scale, limit or group."""
     wrong = list(_scale_errors(family)) or list(_limit_errors(family))
     if wrong:
         return wrong

@@ -38,7 +38,7 @@ from multidrop.drive.verbs import (
 from multidrop.errors import Advice, NotVerified, Unconfirmed, Unsupported, WriteForbidden
 from multidrop.printable import did_you_mean
 
-START_TIME = 5.0  # s within which a started motor must be seen to run
+START_TIME = 5.0  # s within which a started motor must be seen to turn
 REVERSAL_TIME = 60.0  # s for the ramps of a reversal if the option `stop_time` is not given
 _SETPOINT_FIRST = Advice("call set_frequency before start", "add --frequency HZ")
 _TURNING = (Condition.RUNNING, Condition.ACCELERATING, Condition.DECELERATING)
@@ -47,51 +47,58 @@ A = TypeVar("A")
 
 
 class Drive(RegisterAccess):
-    """One drive on a line; its class is the family, with the manual's tables in the manual's order.
+    """A drive on a line. Each family of drives is a subclass, with the registers in the manual's order.
 
     `address` is 1 to 247, or less in some families. On a tcp:// port it is a unit id, in some families 0 to
-    255. Baud rate, format and framing default to the family's. On a tcp:// port the framing is TCP, and baud
-    rate and format are those of the wire behind the gateway. `silence`, in s, replaces the standard's t3.5;
-    use it only if all drives on the line tolerate it. A longer silence in the family's document still
-    applies. Options are facts that only the owner knows (see `options`). `ram` names registers that the owner
-    knows to be kept in RAM although the document does not say so. Raises ValueError for values that the
-    family's document does not allow.
+    255. Baud rate, format and framing have the family's defaults. On a tcp:// port the framing is TCP, and
+    baud rate and format are those of the wire behind the gateway. `silence`, in s, replaces the standard's
+    t3.5; use it only if all drives on the line tolerate it. If the family's document requires a longer
+    silence, that applies. `options` are properties that only the drive's owner knows, such as its maximum
+    frequency. `ram` names registers that the drive keeps in RAM according to its owner, although the document
+    does not say so. Raises ValueError for values that the family's document does not allow.
     """
 
     title: ClassVar[str] = ""
     model: ClassVar[str] = ""
-    declared_in: ClassVar[str] = ""  # name of the family file; such a family is untested
+    # name of the TOML file that declares the family; such families are untested
+    declared_in: ClassVar[str] = ""
     manual: ClassVar[str] = ""
 
     # ---- the line ----
 
     framings: ClassVar[tuple[Framing, ...]] = (Framing.RTU,)
-    formats: ClassVar[Mapping[Framing, tuple[str, ...]]] = {}  # the first format is the default
+    # character formats by framing, the default format first
+    formats: ClassVar[Mapping[Framing, tuple[str, ...]]] = {}
     baudrates: ClassVar[tuple[int, ...]] = (9600, 1200, 2400, 4800, 19200, 38400, 57600, 115200)
     addresses: ClassVar[range] = range(1, 248)
-    line_terminals: ClassVar[str] = ""  # the drive's two terminals for the line
-    most_devices: ClassVar[int] = 0  # limit of devices on a line with such a drive; 0: not stated
+    line_terminals: ClassVar[str] = ""  # the manual's names of the drive's two RS-485 terminals
+    most_devices: ClassVar[int] = 0  # limit of devices on an RS-485 line with such a drive; 0: not stated
 
-    silence: ClassVar[float] = 0.0  # s of silence before and after a frame; with RTU, at least t3.5 is kept
-    # `silence` in characters; the longer of the two applies
+    silence: ClassVar[float] = 0.0  # s of silence before and after a frame; RTU needs at least 3.5 characters
+    # `silence` as a number of characters; the longer silence applies
     silence_characters: ClassVar[float] = 0.0
-    response_delay: float = 0.005  # s from the request's end to the reply's start, typically
-    # `response_delay` in characters; the longer of the two applies
+    response_delay: float = 0.005  # typical time in s from the end of a request to the start of the reply
+    # `response_delay` as a number of characters; the longer delay applies
     response_delay_characters: ClassVar[float] = 0.0
-    response_timeout: ClassVar[float] = 0.3  # s without a reply after which an exchange fails
-    answering_time: ClassVar[float] = 0.0  # s within which the drive replies, by its document; 0: not stated
+    response_timeout: ClassVar[float] = 0.3  # s without a reply after which a request has failed
+    # s within which the drive replies, according to its document; 0: not stated
+    answering_time: ClassVar[float] = 0.0
     turnaround_delay: ClassVar[float] = 0.1  # s without requests after a broadcast
-    least_interval: ClassVar[float] = 0.0  # s, from the end of an exchange to the next request to the drive
-    # True if the drive answers every read in its tables with a value or an exception. A late reply could then
-    # be taken for another register's. So a register of known value is read before the first reply counts.
+    # least time in s from the end of a reply to the next request to the same drive
+    least_interval: ClassVar[float] = 0.0
+    # True if the drive answers every read in its tables with a value or an exception. Then a late reply could
+    # be mistaken for the reply to the next read. So the first reply counts only after a read of a register
+    # whose value is known.
     answers_every_read: ClassVar[bool] = False
 
     # ---- registers, exceptions and commands ----
 
-    # limit of registers in one read; default: the standard's limit
+    # limit of registers in one read, by table; default: the Modbus limit
     most_registers: ClassVar[Mapping[Table, int]] = {}
-    readable_gaps: ClassVar[Mapping[Table, range]] = {}  # reserved addresses that one read may include
-    read_together: ClassVar[tuple[tuple[str, ...], ...]] = ()  # registers that share a request, in this order
+    # addresses without a register that one read may include, by table
+    readable_gaps: ClassVar[Mapping[Table, range]] = {}
+    # groups of registers that one request must read, in this order
+    read_together: ClassVar[tuple[tuple[str, ...], ...]] = ()
     exceptions: ClassVar[Mapping[int, str]] = {
         1: "illegal function",
         2: "illegal address",
@@ -100,17 +107,22 @@ class Drive(RegisterAccess):
         5: "acknowledged, still working",
         6: "busy",
     }
-    damaged: ClassVar[frozenset[int]] = frozenset()  # exception codes for a damaged request
-    later: ClassVar[frozenset[int]] = frozenset({5, 6})  # exception codes of a drive that is busy for now
-    broadcasts: ClassVar[bool] = False  # whether the document defines broadcasts
-    identify_recognises: ClassVar[bool] = False  # True if a drive of another make never passes `identify`
-    identity_proofs: ClassVar[tuple[Any, ...]] = ()  # from a family file: registers with known values
+    # exception codes with which the drive refuses a damaged request
+    damaged: ClassVar[frozenset[int]] = frozenset()
+    # exception codes with which a busy drive refuses a request
+    later: ClassVar[frozenset[int]] = frozenset({5, 6})
+    broadcasts: ClassVar[bool] = False  # True if the document describes broadcasts
+    identify_recognises: ClassVar[bool] = False  # True if `identify` fails for every drive of another make
+    # registers in a family file whose known values identify the family
+    identity_proofs: ClassVar[tuple[Any, ...]] = ()
     options: ClassVar[Mapping[str, Option]] = {}
     setpoint_name: ClassVar[str] = "frequency"  # name of the register that set_frequency writes
-    remote: ClassVar[str] = "the drive must take its commands from the line"  # what must be set on the keypad
-    line_parameters: ClassVar[str] = ""  # names of the parameters for address, baud rate and format
-    parameter_space: ClassVar[ParameterSpace | None] = None  # None: no known rule for addresses
-    no_broadcasts: ClassVar[str] = "none documented"  # why there are no broadcasts
+    # what must be set on the keypad before the drive obeys the line
+    remote: ClassVar[str] = "the drive must take its commands from the line"
+    line_parameters: ClassVar[str] = ""  # names of the drive's parameters for address, baud rate and format
+    # None: the rule for parameter addresses is not known
+    parameter_space: ClassVar[ParameterSpace | None] = None
+    no_broadcasts: ClassVar[str] = "none documented"  # reason why the drive gets no broadcasts
     watchdog: ClassVar[str] = "The document names no watchdog: the motor runs on when the client dies."
 
     registers: ClassVar[Mapping[str, Register[Any]]] = {}
@@ -135,7 +147,7 @@ class Drive(RegisterAccess):
 
     @classmethod
     def _declared(cls, kind: type[A]) -> dict[str, A]:
-        """Return the attributes of this type by name, except those that a subclass has replaced."""
+        """Return the attributes of type `kind` by name, without those that a subclass has replaced."""
         found: dict[str, A] = {}
         for owner in reversed(cls.__mro__):
             for name, attribute in vars(owner).items():
@@ -147,7 +159,7 @@ class Drive(RegisterAccess):
 
     @classmethod
     def _all_options(cls) -> Mapping[str, Option]:
-        """Return the class's options, including `confirmed` if a command needs it: see `check_confirmed`."""
+        """Return the class's options, and `confirmed` if commands need it: see `check_confirmed`."""
         commands = any(
             register.commands or register.access is Access.COMMAND for register in cls.registers.values()
         )
@@ -183,7 +195,7 @@ class Drive(RegisterAccess):
 
     @classmethod
     def readings(cls) -> tuple[Register[Any], ...]:
-        """Return the registers that are polled by default."""
+        """Return the registers that are polled unless the plant file lists others."""
         return tuple(
             register
             for register in cls.registers.values()
@@ -192,14 +204,14 @@ class Drive(RegisterAccess):
 
     @classmethod
     def speaks(cls, framing: Framing) -> bool:
-        """Return True for a framing of the document, and for TCP if the document has any Modbus framing."""
+        """Return True if the family can use this framing; TCP needs any Modbus framing in the document."""
         return framing in cls.framings or (
             framing is Framing.TCP and any(one in MODBUS for one in cls.framings)
         )
 
     @classmethod
     def formats_in(cls, framing: Framing) -> tuple[str, ...]:
-        """Return the formats of a framing; with TCP those of the wire behind the gateway."""
+        """Return the character formats of a framing; for TCP, those of the serial line behind the gateway."""
         return cls.formats.get(framing) or cls.formats[cls.framings[0]]
 
     # ---- one drive ----
@@ -234,17 +246,19 @@ class Drive(RegisterAccess):
             self.response_delay, self.response_delay_characters * self.settings.character
         )
         self.name = name or f"{self.model or type(self).__name__}@{address}"
-        if not self.name.isprintable():  # a line break would look like a truncated line in a text recording
+        if not self.name.isprintable():  # a line break would make a text recording look truncated
             raise ValueError(f"the name {name!r} is not one line of printable characters")
         self.option = checked_options(self._kind(), self.options, options)
         self.ram = frozenset(self._in_ram(name) for name in ram)
         self._known_setpoint = KnownSetpoint()
         self.link: Link = NO_LINK
-        self.stops_called: Sequence[int] = (0,)  # the first item is the number of stops called so far
+        # one item: the number of stops called so far, which the bus changes
+        self.stops_called: Sequence[int] = (0,)
 
     @classmethod
     def _one_of(cls, what: str, value: Any, allowed: Any) -> Any:
-        if value in allowed and not isinstance(value, bool | float):  # in Python, True and 1.0 equal 1
+        # True and 1.0 equal 1 in Python, but are not valid here
+        if value in allowed and not isinstance(value, bool | float):
             return value
         choices = (
             f"{allowed[0]} to {allowed[-1]}"
@@ -277,7 +291,7 @@ class Drive(RegisterAccess):
         return register.name
 
     def take_framing_of(self, port: str) -> None:
-        """Use the framing of this port: TCP on tcp://, and the declared one on others.
+        """Use TCP framing if the port is a tcp:// port, otherwise the declared framing.
 
         Raises ValueError if the drive cannot be used on the port.
         """
@@ -316,26 +330,26 @@ class Drive(RegisterAccess):
 
     @property
     def ledger_name(self) -> str:
-        """Name under which EEPROM writes are counted; the name of a family from a file includes its title."""
+        """Name under which EEPROM writes are counted. For a family from a file, it includes the title."""
         if self.declared_in:
             return f"{self.model}: {self.title}"
         return self.model or type(self).__name__
 
     @property
     def identity_is_weak(self) -> bool:
-        """True if `identify` may accept a drive of another make, so that `families.makes` is checked too."""
+        """True if `identify` may accept a drive of another make. Then `families.makes` is checked too."""
         return False
 
     @property
     def echo_probe(self) -> Register[Any] | None:
-        """Register whose reply is never a copy of its request; None if the family has none.
+        """Register whose reply always differs from the request; None if the family has none.
 
-        The register is read first while it is unknown whether the adapter echoes.
+        It is read first, to find out whether the RS-485 adapter returns an echo of each request.
         """
         return None
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
-        """Return registers of known ranges, each with its least and greatest raw count.
+        """Return registers whose raw count lies in a known range, with the smallest and the largest count.
 
         The ranges must not overlap. If a family reads one register at a time, only the value in a reply shows
         which register the reply belongs to.
@@ -347,7 +361,7 @@ class Drive(RegisterAccess):
         return self.exceptions.get(code, "a code that the document does not explain")
 
     def is_temporary(self, code: int) -> bool:
-        """Return True for a temporary exception: the request arrived damaged, or the drive was busy."""
+        """Return True for an exception that may not occur again: a damaged request, or a busy drive."""
         return code in self.exceptions and code in self.damaged | self.later
 
     def check_confirmed(self, what: str) -> None:
@@ -381,19 +395,19 @@ class Drive(RegisterAccess):
     # ---- scripts, carried out by the bus ----
 
     def perform(self, script: Script[Any]) -> Any:
-        """Carry out a script on the bus; return its result."""
+        """Carry out a script's steps on the bus; return the script's result."""
         return self.link.perform(self, script)
 
     def begin_call(self, verb: str, seen: int) -> Any:
-        """Return a call of a verb; a stop cancels it if more than `seen` stops were called by then."""
+        """Register a call of a verb, so that a later stop can cancel it; `seen` stops were called before."""
         return self.link.begin_call(self, verb, seen)
 
     def carry_out_move(self, script: Script[Any], call: Any) -> Any:
-        """Carry out the script of a verb that may move the motor; `call` is from `begin_call`."""
+        """Carry out a verb that may move the motor. `call` is the result of `begin_call`."""
         return self.link.carry_out_move(self, script, call)
 
     def begin_stop(self, verb: str, make: Callable[[], Script[Any]], seconds: float | None) -> CalledStop:
-        """Call a stop without carrying it out; `make` returns the stop's script."""
+        """Register a stop without sending it; `make` returns the stop's script."""
         return self.link.begin_stop(self, verb, make, seconds)
 
     # ---- for verbs ----
@@ -437,7 +451,7 @@ class Drive(RegisterAccess):
         return WriteForbidden(why, advice=Advice.call("reset_fault"))
 
     def _started(self, direction: Direction | None = None) -> Script[None]:
-        """Wait until the drive shows that the motor runs, and in `direction` if that is given.
+        """Wait until the drive reports that the motor turns, in `direction` if that is given.
 
         The direction is ignored if the drive does not show one. A motor that turned in the other direction
         gets more time for its ramps. Raises NotVerified if the drive trips, and Unconfirmed if the motor is
@@ -459,7 +473,7 @@ class Drive(RegisterAccess):
         return state.condition in _TURNING
 
     def _turns_in(self, direction: Direction) -> Script[bool]:
-        """Return True if the motor turns in this direction, or turns and the drive shows no direction."""
+        """Return True if the motor turns in this direction, or turns and the drive reports no direction."""
         state = yield from self._without_trip()
         if state.direction is None:
             return (yield from self._runs())
@@ -475,7 +489,7 @@ class Drive(RegisterAccess):
 
     @verb
     def identify(self) -> Script[None]:
-        """Check by reading that this is a drive of the family. Raises WriteForbidden if not.
+        """Read registers to check that the drive is of this family. Raises WriteForbidden if it is not.
 
         A drive that passes may still be of another family, because few drives identify themselves.
         """
@@ -530,7 +544,7 @@ class Drive(RegisterAccess):
 
     @verb
     def release_control(self) -> Script[None]:
-        """Return control of the motor to the drive's panel or terminals; only while the motor is at rest."""
+        """Return control of the motor to the drive's panel or terminals; allowed only at rest."""
         raise self._unsupported("way to return control")
         yield
 
@@ -541,7 +555,7 @@ class Drive(RegisterAccess):
         yield
 
 
-# Names that a register cannot have.
+# Names that a register must not have.
 TAKEN_NAMES = frozenset(
     {*dir(Drive), *("address", "framing", "settings", "agreed_silence", "response_delay", "name")}
     | {"option", "ram", "link"}
@@ -563,9 +577,9 @@ def check_drive(drive: Drive) -> None:
 
 
 def check_own(drive: Drive, register: Register[Any]) -> None:
-    """Raise ValueError for another family's register, whose address means something else in this family.
+    """Raise ValueError for a register of another family: its address has another meaning in this family.
 
-    Raises TypeError if `register` is not a Register, but for example a name.
+    Raises TypeError if `register` is not a Register, for example if it is a name.
     """
     check_drive(drive)
     if not isinstance(register, Register):

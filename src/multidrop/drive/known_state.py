@@ -1,4 +1,4 @@
-"""StateReader: compute a drive's state from values that were read before."""
+"""StateReader: compute a drive's state from register values that were already read."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from multidrop.drive.verbs import Read
 from multidrop.errors import BusError
 
 MOST_STEPS = 20
-FAULT = "fault"  # name of the register with the fault's code, in every family that has one
-FAULT_RECORDS = ("last_fault", "fault_record_1")  # names of registers with the newest fault, active or not
+FAULT = "fault"  # name of the register with the fault code, in every family that has one
+# registers with the newest fault, whether or not it is still active
+FAULT_RECORDS = ("last_fault", "fault_record_1")
 
 
 class StateReader:
-    """Computes a drive's state by its family's rules, from values such as those of polled rows.
+    """Computes a drive's state from register values that were already read, by the rules of its family.
 
-    No request is sent. Attributes that the family's script sets are kept in this reader's copy of the drive.
+    It sends no request. Attributes that the family's `state` method sets are stored in a copy of the drive.
     """
 
     def __init__(self, drive: Drive) -> None:
@@ -34,11 +35,12 @@ class StateReader:
         """The register whose value was missing in the last call; "" if none was."""
 
     def state(self, values: Mapping[str, float]) -> State | None:
-        """Return the state according to these values, by register name; None if a value is missing.
+        """Return the state that these register values show; None if a value is missing.
 
-        Values are as in rows: in the register's unit, or the raw count of a named value. If the status shows
-        a fault and the fault's code is missing, the state has no fault name. The state is computed again only
-        if a value that it depends on has changed, or if the family's script set an attribute.
+        A value is in the register's unit, or is a raw count if the register has named values. If the status
+        shows a fault and the fault's code is missing, the state has no fault name. The state is computed
+        again only if a value that it depends on has changed, or if the family's `state` method set an
+        attribute.
         """
         if self._shown and all(values.get(name) == value for name, value in self._shown[0].items()):
             return self._shown[1]
@@ -50,7 +52,7 @@ class StateReader:
         return found
 
     def _look(self, values: Mapping[str, float], read: dict[str, float | None]) -> State | None:
-        """Return the state, or None if a value is missing. Store the used values in `read`."""
+        """Return the state, or None if a value is missing. Store the values that were used in `read`."""
         try:
             script = self._drive.state.script()
             step = next(script)
@@ -63,7 +65,7 @@ class StateReader:
                     if register.name != FAULT:
                         self.lacks = register.name
                         return None
-                    value = 0.0  # used instead of the fault's code, which families read only in a fault
+                    value = 0.0  # stands for a missing fault code, which families read only during a fault
                 step = script.send(value if register.values is None else register.decode(value))
         except StopIteration as end:
             return _known(end.value, read)
@@ -73,16 +75,16 @@ class StateReader:
 
 
 def _known(state: object, read: Mapping[str, float | None]) -> State | None:
-    """Return the state. Without the fault's code, return None unless the state is a fault."""
+    """Return the state. Without the fault code, return FAULT without a name, or None for other states."""
     if not isinstance(state, State) or read.get(FAULT, 0) is not None:
         return state if isinstance(state, State) else None
     return State(Condition.FAULT) if state.condition is Condition.FAULT else None
 
 
 def can_show_fault(drive: Drive, polled: Collection[str]) -> bool:
-    """Return True if a fault of the drive can be detected from the registers with these names.
+    """Return True if these registers are enough to detect a fault of the drive.
 
-    A register with a record of the newest fault is enough: a new fault changes the register's value.
+    The register with the newest fault is enough, because its value changes with each new fault.
     """
     if {FAULT, *FAULT_RECORDS} & {*polled}:
         return True
@@ -100,6 +102,6 @@ def can_show_fault(drive: Drive, polled: Collection[str]) -> bool:
 
 
 def _choices(register: Register[Any]) -> list[float]:
-    """Return the values to try for a register: 0, 1 and all of its named values."""
+    """Return the values to try for a register: 0, 1 and every named value."""
     members: list[Any] = [] if register.values is None else list(cast(Any, register.values))
     return [0.0, 1.0, *(float(member.value) for member in members)]

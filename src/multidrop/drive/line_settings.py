@@ -12,7 +12,7 @@ from multidrop.core import Framing
 from multidrop.errors import NoSuchPort
 from multidrop.printable import is_number, masked
 
-BAUDRATES = (50, 4_000_000)  # lowest and highest
+BAUDRATES = (50, 4_000_000)  # lowest and highest baud rate
 FORMAT = "[78][NEO][12]"
 
 
@@ -51,7 +51,7 @@ class Settings:
 
     @cached_property
     def t3_5(self) -> float:
-        """Silence between RTU frames in s: 3.5 characters, or above 19200 baud a fixed time.
+        """Least silence between RTU frames in s: 3.5 characters, or a fixed time above 19200 baud.
 
         See the serial-line guide V1.02, 2.5.1.1.
         """
@@ -66,12 +66,12 @@ class Settings:
 
 
 MODBUS_PORT = 502  # the default port number of tcp:// URLs
-SCHEMES = ("tcp", "socket", "rfc2217")  # not all of pyserial's schemes: spy:// writes to any file
+SCHEMES = ("tcp", "socket", "rfc2217")  # pyserial has more schemes, but spy:// would overwrite any file
 URLS = "tcp://10.0.0.7, socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001"
 
 
 def check_port(port: str) -> str:
-    """Return `port` unchanged if it is a valid name of a port.
+    """Return `port` unchanged if it is a valid port name.
 
     Raises NoSuchPort for a URL with an unknown scheme, with a user or a password, or without its host or port
     number.
@@ -107,11 +107,11 @@ def url_of(port: str) -> SplitResult:
     return url
 
 
-MOST_SETTLE = 10.0  # s; limit of `settle`, because an exiting process may have to wait this long
+MOST_SETTLE = 10.0  # limit of `settle` in s, because an exiting process may have to wait as long
 
 
 def check_settle(settle: float) -> None:
-    """Raise ValueError unless a line may wait this many seconds after its port is opened."""
+    """Raise ValueError unless `settle` is a valid wait in s after a port is opened."""
     if not (is_number(settle) and 0 <= settle <= MOST_SETTLE):
         raise ValueError(f"settle = {settle!r} is not a number of seconds from 0 to {MOST_SETTLE:g}")
 
@@ -125,7 +125,7 @@ SERIAL_ADDRESSES = range(1, 248)  # 0 is the broadcast address
 def framing_on(
     port: str, declared: Framing | None, default: Framing, address: int, *, family: str, speaks_modbus: bool
 ) -> Framing:
-    """Return the framing of a drive on this port: TCP on tcp://, otherwise `declared` or else `default`.
+    """Return the framing of a drive on this port: TCP on tcp:// ports, else `declared`, else `default`.
 
     Raises ValueError if the drive cannot be used on the port.
     """
@@ -153,10 +153,10 @@ def framing_on(
 
 
 def check_agreed_silence(agreed: float, settings: Settings, own: float | None) -> None:
-    """Raise ValueError unless `agreed` is a valid silence in s.
+    """Raise ValueError unless `agreed`, a line's silence in s, is valid.
 
-    `own` is the silence in s that an RTU drive's document requires; None for other framings. Also raises
-    ValueError if both silences are shorter than 1.5 characters, because a frame may contain such pauses.
+    `own` is the silence in s that an RTU drive's document requires; None for other framings. Unless `own`
+    is at least 1.5 characters, `agreed` must be at least 1.5 characters: a frame may contain shorter pauses.
     """
     if not (is_number(agreed) and 0 <= agreed <= LONGEST_SILENCE):
         raise ValueError(f"silence {agreed!r} is not a time from 0 to {LONGEST_SILENCE:g} s")

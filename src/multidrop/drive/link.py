@@ -1,4 +1,4 @@
-"""RegisterAccess: a drive's methods that read and write. Link: the bus's methods that a drive calls."""
+"""RegisterAccess: a drive's read and write methods. Link: the methods of a bus that a drive calls."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ T = TypeVar("T", bound=float)
 
 
 class TextWanted(Exception):
-    """Raised if one of the registers to read is a text, which needs separate requests."""
+    """Raised if a text register is among the registers to read, because it needs a request of its own."""
 
 
 class Link(Protocol):
-    """The bus's implementation of a drive's methods; see the methods of the same names in Drive.
+    """The methods of a bus that a drive calls; see the methods of the same names in Drive.
 
-    Each method takes the drive. If a drive kept functions that hold the drive itself, it would be in a
-    reference cycle, and a removed drive would stay in memory until a garbage collection.
+    Each method takes the drive as an argument. Bound methods would create a reference cycle, which keeps a
+    removed drive in memory until a garbage collection.
     """
 
     @property
     def values(self) -> Any:
-        """A function that takes a drive and registers or their names, and returns the values by name.
+        """A function that takes a drive and registers, or their names, and returns their values by name.
 
         The function raises TextWanted if one of the registers is a text.
         """
@@ -46,7 +46,7 @@ class Link(Protocol):
 
 
 class NoLink:
-    """The link of a drive that was never attached: nothing is sent, and each call raises NotAttached."""
+    """The link of a drive that is not attached to a bus: each call raises NotAttached."""
 
     def _refuse(self, drive: Any, *details: Any, **options: Any) -> NoReturn:
         raise NotAttached(f"{drive.name} is not attached to a bus: use bus.attach(...)")
@@ -94,9 +94,9 @@ class RegisterAccess:
     def read(self, *wanted: Register[Any] | Text | str) -> Any:
         """Return the value of a register or text in engineering units; for several, a dict by name.
 
-        Registers may be given by name. Several are read in as few requests as the family allows. Raises
+        Registers may be given by name. They are read in as few requests as the family allows. Raises
         NoReply, BadReply, NoValue, DriveException or LineError if the read fails, ValueError for an unknown
-        name, and NotAttached if the drive is on no bus.
+        name, and NotAttached if the drive is not attached to a bus.
         """
         if not wanted:
             raise TypeError(f"read of {self.name} takes registers or their names; read_all() reads all")
@@ -112,7 +112,7 @@ class RegisterAccess:
             return self._read_texts_too(asked)
 
     def read_all(self) -> dict[str, Any]:
-        """Return the values of all readings by name: the registers that a plant polls by default."""
+        """Return the values of all readings by name. These are the registers that are polled by default."""
         return self.read_many(self.readings())
 
     def _read_texts_too(self, wanted: Sequence[Register[Any] | Text | str]) -> dict[str, Any]:
@@ -128,7 +128,7 @@ class RegisterAccess:
     @overload
     def write(self, register: str, value: Any) -> Any: ...
     def write(self, register: Register[Any] | str, value: Any) -> Any:
-        """Write a value; return the value that the drive then holds, or `value` if that cannot be read.
+        """Write a value; return the value read back, or `value` if the register cannot be read.
 
         The write is sent once, or skipped if the register may be in EEPROM and already holds the value.
         The identity of the drive is checked before the first write to it.
@@ -141,7 +141,7 @@ class RegisterAccess:
         return self.try_write(register, value).value
 
     def try_write(self, register: Register[Any] | str, value: Any) -> Any:
-        """Write like `write`, but return the Outcome of a write that was sent, even if it failed."""
+        """Write like `write`, but if the write was sent, return its Outcome instead of raising an error."""
         known = self.register(register) if isinstance(register, str) else register
         return self.link.write(self, known, value)
 
@@ -155,15 +155,15 @@ class RegisterAccess:
         status), 17 (server id) and 43 (device identification) read no addresses: `count` is 0, and so is
         `start`, except with 43: there it is the device id code times 256 plus the id of the first object.
 
-        The request is sent once, before queued polling. A late reply to another request is never returned. If
-        there is no reply, the call waits for the timeout, and this counts as a failure of the drive. Raises
-        Expired if the request cannot be sent within `expiry` seconds. Raises NoReply, BadReply,
+        The request is sent once, before queued polling. The late reply to an earlier request is never
+        returned. If there is no reply, the call waits for the timeout, and this counts as a failure of the
+        drive. Raises Expired if the request cannot be sent within `expiry` seconds. Raises NoReply, BadReply,
         DriveException or LineError if it fails, and ValueError or TypeError if an argument is invalid.
         """
         return self.link.read_raw(self, function, start, count, expiry)
 
     def send_raw(self, function: int, start: int, data: bytes = b"", *, count: int = 0) -> bytes:
-        """Send any request except a Modbus read once, without checks; return the reply's data.
+        """Send any request once, without checks, and return the reply's data. Modbus reads are refused.
 
         This deliberately bypasses the rules: no identity check, no limits, no EEPROM budget. It may start a
         motor. Raises Unconfirmed if there is no reply, DriveException if the drive refuses, and

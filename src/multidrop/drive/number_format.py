@@ -1,6 +1,6 @@
-"""Number formats: how a device encodes a quantity in its words, and how to decode it.
+"""Number formats: encode and decode the numbers in 16-bit registers.
 
-The core decodes by the same rules.
+The C core decodes by the same rules.
 """
 
 from __future__ import annotations
@@ -30,9 +30,11 @@ WORDS = {  # number of 16-bit words of each format
     NumberFormat.F64: 4,
 }
 FLOATS = {NumberFormat.F16: ">e", NumberFormat.F32: ">f", NumberFormat.F64: ">d"}
-SHORT_FLOATS = frozenset({NumberFormat.F16, NumberFormat.F32})  # a float64 holds each value exactly
-WHOLE = frozenset({NumberFormat.U64, NumberFormat.I64})  # a float64 does not hold all values exactly
-# The order of the bytes on the wire, A the most significant; a single word has AB or BA.
+# a float64 holds each value of these formats exactly
+SHORT_FLOATS = frozenset({NumberFormat.F16, NumberFormat.F32})
+# a float64 cannot hold every value of these formats exactly
+WHOLE = frozenset({NumberFormat.U64, NumberFormat.I64})
+# The order of a number's bytes on the wire, for one, two and four words; A is the most significant byte.
 ORDERS = {
     "AB": 0,
     "BA": LOW_BYTE_FIRST,
@@ -41,7 +43,7 @@ ORDERS = {
     "BADC": LOW_BYTE_FIRST,
     "DCBA": LOW_WORD_FIRST | LOW_BYTE_FIRST,
 }
-MOST_DIGITS = 9  # decimal digits that are enough to distinguish any two float32 values
+MOST_DIGITS = 9  # number of decimal digits that distinguishes any two float32 values
 SIGNED = frozenset({NumberFormat.I8, NumberFormat.I16, NumberFormat.I32, NumberFormat.I64})
 DECIMAL = frozenset({NumberFormat.BCD16, NumberFormat.BCD32})
 _LARGEST = {
@@ -82,7 +84,7 @@ def arranged(data: bytes, order: str) -> bytes:
 
 
 def bits_in(data: bytes, at: int, number_format: NumberFormat, order: str) -> int | None:
-    """Return the bits of the number that starts at word `at` of a reply's data; None if data is missing.
+    """Return the bits of the number at word `at` of a reply's data; None if the data is too short.
 
     In the format BIT, `at` counts bits instead of words.
     """
@@ -94,7 +96,7 @@ def bits_in(data: bytes, at: int, number_format: NumberFormat, order: str) -> in
 
 
 def number_of(bits: int, number_format: NumberFormat) -> float | None:
-    """Return the number that these bits encode; None if they encode no number."""
+    """Return the number that these bits encode; None for NaN and invalid BCD digits."""
     if number_format in FLOATS:
         (number,) = struct.unpack(FLOATS[number_format], bits.to_bytes(2 * WORDS[number_format]))
         return None if math.isnan(number) else float(number)
@@ -115,7 +117,7 @@ def signed(bits: int, count: int) -> int:
 
 
 def bits_of(number: float, number_format: NumberFormat) -> int:
-    """Return the bits that encode this number, without the high bits or BCD digits that do not fit."""
+    """Return the bits that encode this number. Bits or BCD digits that do not fit are dropped."""
     if number_format in FLOATS:
         number = nearest_or_infinite(number, number_format)
         return int.from_bytes(struct.pack(FLOATS[number_format], number))
@@ -144,7 +146,7 @@ def nearest_or_infinite(value: float, number_format: NumberFormat) -> float:
 
 
 def shortest(value: float, scale: Fraction, number_format: NumberFormat) -> str:
-    """Return the shortest decimal text that a drive would store as the same F16 or F32 as `value`.
+    """Return the shortest decimal number that the drive stores as the same F16 or F32 as `value`.
 
     The stored number is the value divided by `scale`.
     """
@@ -167,7 +169,7 @@ MOST_POWER = 22  # 10 ** 22 is the largest power of ten that a float64 holds exa
 
 @dataclass(frozen=True)
 class Coding:
-    """The encoding of one quantity: number format, byte order, bit range, invalid raw counts, exact scale."""
+    """The encoding of a register: number format, byte order, bit range, invalid counts, exact scale."""
 
     number_format: NumberFormat
     order: str = "ABCD"
@@ -194,7 +196,7 @@ class Coding:
 
     @cached_property
     def raw_span(self) -> tuple[Fraction, Fraction]:
-        """The least and the greatest raw count."""
+        """The smallest and the largest raw count."""
         if self.part is None:
             return raw_span(self.number_format)
         bits = self._part_width
@@ -208,15 +210,15 @@ class Coding:
 
     @cached_property
     def mask(self) -> int:
-        """A mask of the number's bits that belong to the part (bit range); all bits if there is no part."""
+        """A mask of the number's bits that belong to the register's `part`; all bits if it has no `part`."""
         return ((1 << self._part_width) - 1) << (self.part[0] if self.part else 0)
 
     @cached_property
     def invalid_patterns(self) -> tuple[tuple[int, int], ...]:
-        """Mask and bit pattern of each invalid raw count, without NaN, which is always invalid.
+        """Mask and bit pattern of each raw count that means "no value". NaN is invalid without a pattern.
 
-        A raw count that fits into the part is compared with the part, a larger raw count with the whole
-        number. A raw count outside the format's span is itself the bit pattern, such as 8000H of an I16.
+        A raw count that fits into the bit range `part` is compared with these bits, a larger raw count with
+        the whole number. A raw count outside the format's span is a bit pattern, such as 8000H for an I16.
         """
         return tuple(self._pattern(count) for count in self.invalid if count == count)
 
@@ -234,7 +236,7 @@ class Coding:
     # ---- reading ----
 
     def raw_in(self, data: bytes, at: int) -> float | None:
-        """Return the raw count that starts at word `at` of a reply's data (at bit `at` for BIT).
+        """Return the raw count at word `at` of a reply's data, or at bit `at` in the format BIT.
 
         Return None if the count is invalid or missing.
         """
@@ -273,10 +275,10 @@ class Coding:
         return nearest(count, self.number_format) if self.number_format in FLOATS else round(count)
 
     def exact_count(self, value: float) -> Fraction:
-        """Return the raw count of a value, unrounded.
+        """Return the exact raw count of a value. A float counts as its shortest decimal: 0.3 is three tenths.
 
-        A float is read as its shortest decimal: 0.3 is three tenths. But if the float's exact value gives a
-        whole raw count, that count is returned: the shortest decimal may be inexact for 64-bit numbers.
+        But if the float's exact value gives a whole raw count, that count is returned: the shortest decimal
+        may be inexact for 64-bit numbers.
         """
         count = (Fraction(value) - self.offset) / self.step
         return count if count.denominator == 1 else (Fraction(str(value)) - self.offset) / self.step

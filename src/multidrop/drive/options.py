@@ -1,4 +1,4 @@
-"""Options: facts about one drive that only its owner knows. `confirmed` confirms the drive's make."""
+"""Options: properties of a drive that only its owner knows, such as `confirmed` for its make."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from multidrop.printable import is_number
 
 @dataclass(frozen=True)
 class Option:
-    """A fact about one drive that only its owner knows, such as its maximum frequency.
+    """A property of a drive that only its owner knows, such as its maximum frequency.
 
-    Without a unit the value is a whole number: a choice or a count.
+    An option without a unit is a whole number.
     """
 
     unit: str
@@ -27,7 +27,7 @@ _CHECKED = Option("", (0, 1), "1: its name plate says what it is, and `multidrop
 def checked_options(
     family: str, options: Mapping[str, Option], given: Mapping[str, float]
 ) -> Mapping[str, float]:
-    """Return the options `given`. Raises ValueError for an unknown option or a value outside its span."""
+    """Return `given`. Raises ValueError for an unknown option or a value outside the option's limits."""
     for name, value in given.items():
         if name not in options:
             known = ", ".join(options) or "none"
@@ -43,7 +43,7 @@ def checked_options(
 
 
 def confirmation(declared_in: str, *, identifies: bool) -> Mapping[str, Option]:
-    """Return {"confirmed": option} if the class is untested or cannot identify its drives, else {}."""
+    """Return the option `confirmed` if the class is untested or cannot identify its drives, else {}."""
     if declared_in:
         return {"confirmed": _CHECKED}
     return {} if identifies else {"confirmed": _CONFIRMED}

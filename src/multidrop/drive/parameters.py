@@ -1,7 +1,8 @@
-"""Parameter spaces: a family's rule that computes a parameter's address from its code.
+"""ParameterSpace: a family's rule that computes a parameter's address from its code, such as P05.31.
 
-The class has the rule as `parameter_space`. Most parameters are not declared as registers: the rule is enough
-to save and restore them as raw counts. A declared setting adds its name, unit, limits and factory value.
+A drive class has the rule as `parameter_space`. The rule is enough to save and restore parameters as raw
+counts, even if they are not declared as registers. A declared register adds name, unit, limits and factory
+value.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ PASSWORD = "it is a password"
 
 @dataclass(frozen=True)
 class ParameterGroup:
-    """Parameters with consecutive addresses. A code is `prefix` and an index of at least `digits` digits.
+    """Parameters with consecutive addresses. Each code is `prefix` and an index of at least `digits` digits.
 
     With `as_hex`, the index's decimal digits are sent as hex digits: F170 is at `start` + 0170H.
     """
@@ -47,11 +48,11 @@ class ParameterGroup:
 class ParameterSpace:
     """The parameters of a family. Codes in the fields below may be patterns, such as "P05.*".
 
-    `groups` is the rule. Without a rule, `named` is a regular expression: its first group is the code in a
-    declared setting's `place`. `monitors` are values that the drive changes itself: they are neither saved
-    nor compared. `line` has the drive's address, baud rate, format and protocol, in the order of writing.
-    `never` gives reasons for codes that are not written, besides the reasons of declared settings. `firmware`
-    is the name of the register with the firmware version.
+    `groups` is the address rule. A family without a rule has the regular expression `named`, which finds the
+    code in the `place` of a declared register. `monitors` are values that the drive changes itself: they are
+    neither saved nor compared. `line` has the drive's address, baud rate, format and protocol, in the order
+    of writing. `never` maps codes that are not written to the reason. `firmware` is the name of the register
+    with the firmware version.
     """
 
     groups: tuple[ParameterGroup, ...] = ()
@@ -64,7 +65,7 @@ class ParameterSpace:
     firmware: str = ""
 
     def codes(self, registers: Mapping[str, Register[Any]]) -> dict[str, tuple[int, Table]]:
-        """Return the address and table of each code, given the family's registers."""
+        """Return the address and table of each code; `registers` are those of the family."""
         found = {code: (at, self.table) for group in self.groups for code, at in group.codes().items()}
         if self.named:
             for register in registers.values():
@@ -74,11 +75,11 @@ class ParameterSpace:
         return {code: place for code, place in found.items() if not self.is_monitor(code)}
 
     def is_monitor(self, code: str) -> bool:
-        """Return True if the drive itself changes this value."""
+        """Return True if the drive itself changes this parameter's value."""
         return _matches(code, self.monitors)
 
     def reason(self, code: str) -> str:
-        """Return why this code is never written; "" if no field of the parameter space forbids the write."""
+        """Return why this parameter is never written; "" if the parameter space does not forbid it."""
         if _matches(code, self.line):
             return LINE_PARAMETER
         if _matches(code, self.passwords):
@@ -92,9 +93,9 @@ def _matches(code: str, patterns: tuple[str, ...]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Parameter(Register[Any]):
-    """A parameter as a register of its family: declared, or known only by the family's address rule.
+    """A parameter of a drive, as a register: declared by the family, or computed from its address rule.
 
-    A parameter is always written to its permanent memory, even if the setting has a RAM address.
+    A parameter is always written to permanent memory, even if the register also has a RAM address.
     """
 
     code: str = ""

@@ -1,7 +1,7 @@
-"""Registers: the manual's facts about one quantity, its titles, and its values in replies and requests.
+"""Register: one quantity of a drive, as its manual describes it, and its values in replies and requests.
 
-`Register[float]` has a unit and a step, `Register[E]` the names of an enumeration. Declare them with
-`reading`, `setting` and `command`.
+A `Register[float]` has a unit and a step. A `Register[E]` has the values of the enumeration E. Declare them
+with `reading`, `setting` and `command`.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ class Kept(Enum):
     EEPROM = "EEPROM"
     UNKNOWN = "not stated"
 
-    __hash__ = object.__hash__  # ten times as fast as Enum's hash of the name
+    __hash__ = object.__hash__  # ten times as fast as Enum's own hash, which hashes the name
 
 
 class Carrier(Enum):
-    """The part of a frame that carries a value of a table."""
+    """The item that a frame has for each address of a table, such as a bit or a 16-bit word."""
 
     BIT = "bit"
     WORD = "word"
     LONG = "four bytes"  # Delixi's D3..D0
     NUMBER = "parameter number"  # Delixi's P1P0
 
-    __hash__ = object.__hash__  # for speed, as in Kept
+    __hash__ = object.__hash__  # ten times as fast as Enum's own hash
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,11 @@ class Table:
     read: int | None
     write: int | None
     carrier: Carrier = Carrier.WORD
-    kept: Kept = Kept.UNKNOWN  # the memory, if the function code alone determines it
+    kept: Kept = Kept.UNKNOWN  # the memory of all registers, if the function code alone determines it
 
     @property
     def read_space(self) -> tuple[Carrier, int | None]:
-        """Key that is equal for tables with the same read function; their registers may share a request."""
+        """Key that is equal for tables with the same read function: one request can read both."""
         return self.carrier, self.read
 
 
@@ -78,11 +78,12 @@ COIL = Table("coil", 0x01, 0x05, Carrier.BIT)
 DISCRETE = Table("discrete input", 0x02, None, Carrier.BIT)
 
 T = TypeVar("T", bound=float)
-ACRONYMS = frozenset({"DC", "EEPROM", "PID", "PWM"})  # words that keep their capitals in the names of values
+# words that stay in capitals in the texts of named values
+ACRONYMS = frozenset({"DC", "EEPROM", "PID", "PWM"})
 
 
 class Worded(IntEnum):
-    """Named numbers. If a name is only a code of the manual, such as E07, `words` explains the code."""
+    """Named numbers. If a name is only the manual's code, such as E07, `words` says what it means."""
 
     words: str
 
@@ -102,7 +103,7 @@ class Access(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Register(Generic[T]):
-    """One quantity of a drive: its address, its meaning, its limits; see `Details` for each fact."""
+    """One quantity of a drive: its address, meaning and limits. See `Details` for each attribute."""
 
     address: int
     access: Access
@@ -133,11 +134,11 @@ class Register(Generic[T]):
     note: str = ""
     titles: Mapping[str, str] = field(default_factory=dict)
     name: str = field(default="", init=False)
-    # the register that holds the power of ten
+    # the register that holds this register's power of ten
     scaled_by: Register[float] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        carrier = getattr(self.table, "carrier", Carrier.WORD)  # a wrong type of table is reported later
+        carrier = getattr(self.table, "carrier", Carrier.WORD)  # a table of a wrong type is reported later
         if self.number_format == NumberFormat.U16 and carrier is not Carrier.WORD:
             object.__setattr__(
                 self, "number_format", NumberFormat.BIT if carrier is Carrier.BIT else NumberFormat.U32
@@ -150,7 +151,7 @@ class Register(Generic[T]):
             object.__setattr__(self, "kept", table_kept)
 
     def __set_name__(self, owner: type, name: str) -> None:
-        if not self.name:  # if two attributes share a register, the first one names it
+        if not self.name:  # the first attribute with this register gives it its name
             object.__setattr__(self, "name", name)
 
     def __str__(self) -> str:
@@ -175,7 +176,7 @@ class Register(Generic[T]):
 
     @cached_property
     def reach(self) -> range:
-        """Addresses that one request reads for the value; they include the scale register's."""
+        """Addresses that one request must read for the value, including that of the scale register."""
         own = range(self.address, self.address + self.words)
         if self.scaled_by is None:
             return own
@@ -221,7 +222,7 @@ class Register(Generic[T]):
 
     @cached_property
     def scale(self) -> Fraction:
-        """The step as an exact fraction (1 if unknown), because 3 * 0.1 as floats is not 0.3."""
+        """The step as an exact fraction, because 3 * 0.1 as floats is not 0.3; 1 if the step is unknown."""
         return Fraction(str(self.step)) if self.step is not None else Fraction(1)
 
     @property
@@ -231,12 +232,15 @@ class Register(Generic[T]):
 
     @property
     def decimals(self) -> int:
-        """Number of decimals that step and offset need."""
+        """Number of decimal places that the step and the offset need."""
         parts = (Decimal(f"{float(part):.6g}") for part in (self.scale, self.coding.offset))
         return max(0, *(-int(part.normalize().as_tuple().exponent) for part in parts))
 
     def number_in(self, data: bytes, at: int) -> float | None:
-        """Return the number, as in a row, at word (coils: bit) `at` of a reply's data; None for no value."""
+        """Return the number at word (coils: bit) `at` of a reply's data; None for no value.
+
+        The number is as in polled rows: in the register's unit, or the raw count of a named value.
+        """
         raw = self.coding.raw_in(data, at)
         if raw is None or self.scaled_by is None:
             return None if raw is None else self.coding.value_of(raw)
@@ -308,20 +312,20 @@ class Register(Generic[T]):
         return self.coding.count_of(value)
 
     def takes(self, value: T) -> bool:
-        """Return True if a drive may hold this value: it is a named value, or within the span."""
+        """Return True if `value` is one of the named values, or within the register's limits."""
         if self.values is not None:
             return isinstance(value, self.values)
         if self.span is None:
             return True
         low, high = self.span
-        # for a limit of the span, the drive holds the nearest float, which may lie outside the span
+        # the drive rounds a limit to a float, which may lie just outside the span
         if self.is_float:
             low, high = (self.coding.value_of(self.coding.count_of(end)) for end in self.span)
         return low <= value <= high
 
     @property
     def _counts(self) -> bool:
-        """True if the values are choices or raw counts, which must not be rounded."""
+        """True if the values are choices or raw counts, not quantities: these are not rounded."""
         return self.step is None or (self.step == 1 and not self.unit)
 
     def _encode_name(self, value: T) -> int:
@@ -343,7 +347,10 @@ class Register(Generic[T]):
         raise TypeError(f"{self.name} takes one of {choices}, not {value!r}")
 
     def parse(self, text: str) -> T:
-        """Return the value of a typed text: a number, or names joined by "|". Raises ValueError otherwise."""
+        """Return the value that a user typed: a number, or names joined by "|".
+
+        Raises ValueError for an invalid text.
+        """
         if self.values is None:
             try:
                 return cast(T, _number_in(text) if self.number_format in WHOLE else plain_number(text))
@@ -374,7 +381,7 @@ class Register(Generic[T]):
         return f"{self._number(value)} {unit}".rstrip()
 
     def in_words(self, value: T) -> str:
-        """Return a named value in plain words; other values as `format` does."""
+        """Return a named value in plain words, such as "motor overload"; other values as `format` does."""
         if isinstance(value, Flag):
             names = [_spaced(str(member.name)) for member in value]
             return ", ".join([*names, *unnamed_bits(value)]) or "none"
@@ -393,7 +400,7 @@ class Register(Generic[T]):
 
 
 def unnamed_bits(value: Flag) -> list[str]:
-    """Return a text such as "bit 8" for each set bit that has no name."""
+    """Return a text such as "bit 8" for each bit that is set and has no name."""
     rest = int(value.value)
     for member in value:
         rest &= ~int(member.value)
@@ -405,7 +412,7 @@ def _spaced(name: str) -> str:
 
 
 def _number_in(text: str) -> float:
-    """Return the number that a text spells, whole numbers exactly. Raises ValueError if it spells none."""
+    """Return the number that `text` spells; whole numbers are exact. Raises ValueError for other texts."""
     try:
         return plain_whole(text)
     except ValueError:
@@ -413,7 +420,7 @@ def _number_in(text: str) -> float:
 
 
 def _short(value: float) -> str:
-    """Return a number as text for a message; the number may be larger than any float."""
+    """Return a number as short text for an error message. It may be larger than any float."""
     return f"{value:g}" if abs(value) <= sys.float_info.max else "a number of this size"
 
 
@@ -421,27 +428,30 @@ E = TypeVar("E", bound=IntEnum | IntFlag)
 
 
 class Details(TypedDict, total=False):
-    """Facts of a declaration besides address and unit; each may be left out."""
+    """Optional attributes of a declared register, besides its address and unit."""
 
-    step: float | None  #: value of one raw count; None if the document does not state it
-    offset: float  #: value of the raw count 0: value = raw * step + offset
-    #: Raw counts that mean "no value". A count outside the format's span is a bit pattern: 0x8000 of an I16.
+    step: float | None  #: quantity that one raw count stands for; None if the document does not state it
+    offset: float  #: value of the raw count 0, so that value = raw count * step + offset
+    #: Raw counts that mean "no value". A count outside the format's span is a bit pattern, such as 0x8000 for
+    #: an I16.
     invalid: float | tuple[float, ...]
-    #: Lowest and highest bit of a reading that is only a part of the number in its words. `invalid` counts
-    #: that do not fit into the part are compared with the whole number.
+    #: Lowest and highest bit, for a reading that is only a range of bits of a number. An `invalid` count that
+    #: does not fit into these bits is compared with the whole number.
     part: tuple[int, int]
-    order: str  #: order of the bytes on the wire, A the most significant: ABCD, CDAB, BADC, DCBA; AB, BA
-    scale_register: str  #: reading whose signed count is this register's power of ten; one request reads both
+    #: order of the number's bytes on the wire, A the most significant: ABCD, CDAB, BADC, DCBA, AB or BA
+    order: str
+    #: name of the reading that holds this register's power of ten; one request reads both
+    scale_register: str
     span: tuple[float, float]  #: smallest and largest value that may be written
-    at_least: str  #: register or option whose present value is the lower limit of writes
-    at_most: str  #: register or option whose present value is the upper limit of writes
-    number_format: NumberFormat  #: width, sign and kind of the number in the frame
-    table: Table  #: address space and function codes
-    kept: Kept  #: RAM or EEPROM; by default the table's
+    at_least: str  #: register or option whose present value is the smallest value that may be written
+    at_most: str  #: register or option whose present value is the largest value that may be written
+    number_format: NumberFormat  #: width, sign and kind of the number, such as U16 or F32
+    table: Table  #: address space with its function codes, such as the holding registers
+    kept: Kept  #: memory that holds the value, RAM or EEPROM; by default that of the table
     ram_address: int  #: address at which the same quantity is written without wearing the EEPROM
-    default: float  #: value from the factory
+    default: float  #: factory value
     while_running: bool  #: whether the register may be changed while the motor turns; None if not stated
-    broadcast: tuple[int, ...]  #: raw counts that are documented and harmless as a broadcast
+    broadcast: tuple[int, ...]  #: raw counts that the document allows in a broadcast, and that are harmless
     #: True if a write may start, stop or reset something, so that only verbs write it. The default is True
     #: for commands, and for settings that have `harmless`.
     moves: bool
@@ -451,13 +461,13 @@ class Details(TypedDict, total=False):
     never: str  #: reason why the library never writes the register
     never_together: tuple[int, ...]  #: masks of bits that are never set in one write
     place: str  #: section of the manual
-    outside: str  #: the source of these facts, if it is not the family's own document
-    note: str  #: further facts for users
+    outside: str  #: source of these attributes, if it is not the family's own document
+    note: str  #: further information for users
     titles: Mapping[str, str]  #: titles in other languages, by the language: `{"ru": "выходной ток"}`
 
 
 class Declaration(Protocol):
-    """A function that declares registers, each with its unit or the enumeration of its values."""
+    """A function that declares a register: it takes the address, the unit or enumeration, and `Details`."""
 
     @overload
     def __call__(self, address: int, unit: str = "", /, **details: Unpack[Details]) -> Register[float]: ...
@@ -466,7 +476,7 @@ class Declaration(Protocol):
 
 
 def declaration(declare: Callable[..., Register[Any]]) -> Declaration:
-    """Decorator that gives a declaring function its type: address, unit or enumeration, and details."""
+    """Decorator that gives a function such as `reading` the type Declaration."""
     return cast(Declaration, declare)
 
 
@@ -524,12 +534,12 @@ def _extra(register: Register[Any], at: int) -> Extra | None:
 
 LANGUAGES = ("ru", "zh")  # languages of the catalogue, besides English
 ENGLISH = "en"
-_CODE = re.compile(r"[A-Za-z]{2}(?![A-Za-z])")  # the language in a tag such as ru-RU, or ru_RU.UTF-8
+_CODE = re.compile(r"[A-Za-z]{2}(?![A-Za-z])")  # finds the language in a tag such as ru-RU or ru_RU.UTF-8
 
 
 @cache
 def catalogue(language: str) -> Mapping[str, str]:
-    """Return the titles in a language, by the register's name; none for English or an unknown language."""
+    """Return the titles in a language, by register name. English has none, because the names are English."""
     if language not in LANGUAGES:
         return {}
     file = files("multidrop.drive") / "catalogue" / f"{language}.toml"
@@ -537,7 +547,7 @@ def catalogue(language: str) -> Mapping[str, str]:
 
 
 def chosen_language(tags: Iterable[str]) -> str:
-    """Return the first language of these tags in which titles are known; English if there is none.
+    """Return the first of these languages that has titles; English if none has.
 
     A tag is such as `ru`, `zh-CN` or `ru_RU.UTF-8`.
     """

@@ -1,6 +1,6 @@
-"""Requests that read and write registers, and the limits of one read.
+"""Build requests that read and write registers, within the family's limits.
 
-A `family` argument is a drive's class, or a drive object that may have limits of its own.
+In every function `family` is a drive's class, or a drive object that may have limits of its own.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from multidrop.core import Framing, Message
 from multidrop.drive.register import Carrier, Register, Table
 from multidrop.printable import is_whole
 
-# Limit of the registers in one read (application protocol V1.1b3, 6.1 to 6.4). A frame of Delixi's protocol
+# Limit of registers in one read (application protocol V1.1b3, 6.1 to 6.4). A frame of Delixi's own protocol
 # holds one.
 STANDARD_LIMITS = {Carrier.BIT: 2000, Carrier.WORD: 125, Carrier.LONG: 1, Carrier.NUMBER: 1}
 FUNCTIONS = {1: Carrier.BIT, 2: Carrier.BIT, 3: Carrier.WORD, 4: Carrier.WORD}  # function codes that read
 # functions that read no addresses (application protocol V1.1b3, 6.7, 6.13, 6.21)
 STATUS, SERVER_ID, DEVICE_ID = 0x07, 0x11, 0x2B
 READS = frozenset({*FUNCTIONS, STATUS, SERVER_ID, DEVICE_ID})
-MEI_DEVICE_ID = 0x0E  # the first data byte of a DEVICE_ID request
+MEI_DEVICE_ID = 0x0E  # first data byte of a request with function 2BH, "read device identification"
 LONGEST_INTERVAL = 10.0  # s
 
 
 def stated_limit(family: Any, table: Table) -> int | None:
-    """Return the family's limit of registers in one read of this table; None if the family states none."""
+    """Return the family's limit of registers in one read of this table; None if it states none."""
     stated = [most for other, most in family.most_registers.items() if other.read_space == table.read_space]
     return min(stated, default=None)
 
@@ -38,7 +38,7 @@ def read_limit(family: Any, table: Table) -> int:
 
 
 def function_limit(family: Any, function: int) -> int:
-    """Return how many addresses, declared or not, one read with this Modbus function code may span.
+    """Return how many addresses one read with this Modbus function code may have, declared or not.
 
     This is the smallest limit that the family states, but at least the length of its longest register.
     """
@@ -51,7 +51,7 @@ def function_limit(family: Any, function: int) -> int:
 
 
 def stated_gaps(family: Any, table: Table) -> list[range]:
-    """Return the ranges of addresses without registers that a read may include."""
+    """Return the ranges of undeclared addresses that a read may include."""
     return [gap for other, gap in family.readable_gaps.items() if other.read_space == table.read_space]
 
 
@@ -67,7 +67,7 @@ def readable_addresses(family: Any, table: Table) -> frozenset[int]:
 
 
 def may_be_crossed(family: Any, table: Table, addresses: Iterable[int]) -> bool:
-    """Return True if one read may include all these addresses."""
+    """Return True if one read may include all these addresses, wanted or not."""
     declared = family if isinstance(family, type) else type(family)
     readable, gaps = readable_addresses(declared, table), stated_gaps(family, table)
     return all(at in readable or any(at in gap for gap in gaps) for at in addresses)
@@ -119,7 +119,7 @@ def write_request(drive: Any, register: Register[Any], raw: float, address: int 
 
 
 def check_no_read(drive: Any, request: Message) -> None:
-    """Raise ValueError for a Modbus read, because a raw read could return another read's late reply."""
+    """Raise ValueError for a Modbus read, because a raw request could return an earlier read's late reply."""
     if drive.framing is not Framing.DELIXI and request.function in READS:
         asked = f"{request.function}, {request.start}, {request.count}"
         raise ValueError(
@@ -129,7 +129,7 @@ def check_no_read(drive: Any, request: Message) -> None:
 
 
 def any_read(drive: Any, function: int, start: int, count: int) -> Message:
-    """Return the request of a read by a Modbus function. The addresses need not be declared.
+    """Return a request that reads with any Modbus function. The addresses need not be declared.
 
     The functions 01 to 04 read addresses. The functions 07, 11H and 2BH do not, so `count` must be 0.
     With 07 and 11H `start` must be 0 too. With 2BH it is the device id code times 256 plus the id of the

@@ -1,4 +1,4 @@
-"""State: condition, direction and fault as a drive reports them; KnownSetpoint: the setpoint written last."""
+"""State: a drive's condition, direction and fault. KnownSetpoint: the setpoint that it holds."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Condition(Enum):
 
 @dataclass(frozen=True)
 class State:
-    """A drive's state, as far as its document defines it."""
+    """A drive's state. Attributes that the drive's document does not define have no value."""
 
     condition: Condition
     direction: Direction | None = None
@@ -42,14 +42,14 @@ class State:
 
 
 class _PendingWrite:
-    """A write of the setpoint whose result is not known."""
+    """A write of the setpoint that has not ended yet."""
 
     def __init__(self, before: float | _PendingWrite | None) -> None:
         self.before = before
 
 
 class KnownSetpoint:
-    """The setpoint of one drive: None unless the drive is known to hold the value written last."""
+    """The setpoint that was written last; None unless the drive is known to hold it."""
 
     def __init__(self) -> None:
         self._held: float | _PendingWrite | None = None

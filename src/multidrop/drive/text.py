@@ -1,4 +1,4 @@
-"""Texts: characters in neighbouring registers, read on demand and for identification, never polled."""
+"""Text: a text in neighbouring registers of a drive. It is read on demand, and never polled."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from multidrop.printable import is_whole
 
 _LAST_ADDRESS = 0xFFFF
 MOST_WORDS = 125  # limit of one request, in registers
-_ORDERS = ("AB", "BA", "B")  # orders of characters; B: one character in each register, in its low byte
+_ORDERS = ("AB", "BA", "B")  # order of a register's two characters; B: only one character, in the low byte
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,7 @@
-"""Verbs: methods of a drive that are scripts, and the steps that scripts yield to the drive's bus."""
+"""Verbs: a drive's commands, such as `start`.
+
+A verb is a generator; the drive's bus carries out its steps.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ from multidrop.printable import is_number
 if TYPE_CHECKING:
     from multidrop.drive.family import Drive
 
-MOST_UNANSWERED = 3  # number of checks in a row without a valid reply after which `until` raises the error
+MOST_UNANSWERED = 3  # limit of checks in a row without a valid reply; then `until` raises the error
 
 T = TypeVar("T", bound=float)
 R = TypeVar("R")
@@ -50,7 +53,7 @@ class Write:
 
 @dataclass(frozen=True)
 class Insist(Write):
-    """A write that is harmless at any time, even if repeated, such as a stop."""
+    """A write that is safe to repeat at any time, such as a stop."""
 
 
 @dataclass(frozen=True)
@@ -86,9 +89,9 @@ def wait(seconds: float) -> Script[None]:
 
 
 def carry_out(script: Script[R], do: Callable[[Step], Any]) -> R:
-    """Run a script, calling `do` for each step, and return the script's result.
+    """Carry out a script: call `do` for each step that it yields, and return the script's result.
 
-    A BusError or ValueError that `do` raises is raised in the script.
+    A BusError or ValueError that `do` raises is raised again inside the script.
     """
     try:
         step = next(script)
@@ -104,7 +107,7 @@ def carry_out(script: Script[R], do: Callable[[Step], Any]) -> R:
 
 
 def insist(register: Register[T], value: T, attempts: int = 3) -> Script[None]:
-    """Write a harmless value, such as a stop; repeat the write if the reply is lost or is an exception."""
+    """Write a harmless value, such as a stop. Repeat the write after a lost reply or an exception reply."""
     for attempt in range(1, attempts + 1):
         try:
             yield Insist(register, value)
@@ -116,7 +119,7 @@ def insist(register: Register[T], value: T, attempts: int = 3) -> Script[None]:
 
 
 def until(look: Callable[[], Script[bool]], *, limit: float, every: float = 0.1) -> Script[bool]:
-    """Repeat a check every `every` seconds until it is true; return False after `limit` seconds.
+    """Repeat the check `look` every `every` seconds until it is true; return False after `limit` seconds.
 
     A starting motor causes noise, so a check without a valid reply counts as false. The third such check in
     a row raises its NoReply or BadReply.
@@ -139,20 +142,20 @@ def until(look: Callable[[], Script[bool]], *, limit: float, every: float = 0.1)
 
 
 class CommandOutcome(StrEnum):
-    """The outcome of a command; UNKNOWN unless its effect is certain."""
+    """The outcome of a command. It is UNKNOWN unless the effect is certain."""
 
     DONE = "done"
-    FAILED = "failed"  # sent, but the drive refused it, or was seen not to do it
+    FAILED = "failed"  # sent, but the drive refused the command or did not obey it
     REFUSED = "refused"  # forbidden by the library's rules or the plant's lists; not sent
-    NOT_SENT = "not sent"  # it is certain that nothing was sent
+    NOT_SENT = "not sent"  # certainly not sent
     UNKNOWN = "unknown"  # the command may have been carried out
-    UNDER_WAY = "under way"  # not over yet: ask again later
+    UNDER_WAY = "under way"  # not finished yet: ask again later
 
 
 class CommandResult(NamedTuple):
     """The result of a command.
 
-    `text` is one sentence for a person. `error` is the library's error if a server's command failed; a verb
+    `text` is one sentence for a person. `error` is the error of a command that a server carried out; a verb
     raises its error instead. `held` is the value that the drive holds after a write, as text with its unit.
     """
 
@@ -167,10 +170,10 @@ class CommandResult(NamedTuple):
         return self.outcome is CommandOutcome.DONE
 
 
-# Verbs that are sent only to an identified drive, and not after a stop was called.
+# Verbs that are sent only to an identified drive, and that a later stop cancels.
 MOVING = ("start", "jog", "reset_fault", "set_frequency", "release_control")
 
-# Verbs that are sent repeatedly, even to a silent drive.
+# Verbs that stop the motor. They are sent repeatedly, even to a drive that does not reply.
 STOPPING = ("stop", "coast", "emergency_stop")
 
 VERBS = (
@@ -178,19 +181,19 @@ VERBS = (
     *("release_control", "state"),
 )
 
-# By verb: its argument, the argument's types, and a description. Without the check of types, the text
-# "reverse" would count as forward.
+# By verb: the name of its argument, the allowed types, and their description in errors. Without the check of
+# types, the text "reverse" would run the motor forward.
 _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
     "start": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
     "jog": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
     "set_frequency": ("hz", (Real,), "a number in Hz"),
 }
 
-TRIES = 150  # attempts of a stop while the system has no memory or file descriptors left
+TRIES = 150  # limit of attempts to send a stop while the system lacks memory or file descriptors
 
 
 class CalledStop(Protocol):
-    """A stop that was called. `carry_out` may be called again after it failed, and then resumes the stop."""
+    """A stop that was called. If `carry_out` failed, another call of it resumes the stop."""
 
     def carry_out(self) -> None: ...
     def interrupted(self, interruption: BaseException) -> None: ...
@@ -205,10 +208,10 @@ class UnattachedStop:
         self._make = make
 
     def carry_out(self) -> None:
-        """Do nothing, because without a bus no stop can be sent."""
+        """Do nothing: without a bus no stop can be sent."""
 
     def interrupted(self, interruption: BaseException) -> None:
-        """Do nothing, because no stop was in progress."""
+        """Do nothing: no stop was in progress."""
 
     def result(self) -> CommandResult:
         """Raise NotAttached, because the drive has no bus."""
@@ -218,7 +221,7 @@ class UnattachedStop:
 class _BoundVerb(Generic[P, R]):
     """A verb of one drive; calling it carries out the verb.
 
-    The call returns what the script returns, or if that is None, a CommandResult.
+    The call returns the script's result, or a CommandResult if that is None.
 
     A stop takes `seconds`: it is repeated for that long, or until the motor is seen to be at rest. Without a
     valid `seconds`, it is repeated for the duration of the motor's ramp, but for at least 30 s. A stop that
@@ -251,7 +254,10 @@ class _BoundVerb(Generic[P, R]):
         return returned
 
     def script(self, *args: P.args, **kwargs: P.kwargs) -> Script[R]:
-        """Return the verb's script, for another verb or a test. Raises TypeError for a wrong argument."""
+        """Return the verb's script, for use in another verb or a test.
+
+        Raises TypeError for a wrong argument.
+        """
         if self.name in _TAKES:
             keyword, types, right = _TAKES[self.name]
             for given in (*args[:1], *(value for key, value in kwargs.items() if key == keyword)):
@@ -261,11 +267,11 @@ class _BoundVerb(Generic[P, R]):
 
 
 class _BoundMove(_BoundVerb[P, R]):
-    """A verb that may move the motor. Any later stop of the drive cancels the call."""
+    """A verb that may move the motor. A later stop of the drive cancels it."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        # Read the number of stops first, without calling a Python function. Then a signal handler that stops
-        # the drive either runs before this line, or cancels the call.
+        # Read the number of stops first, without calling a Python function. If a signal handler stops the
+        # drive after this line, the stop is newer than the number, and cancels this call.
         seen = self.drive.stops_called[0]
         script = self.script(*args, **kwargs)
         self.drive.check_confirmed(self.name)
@@ -303,7 +309,7 @@ class _BoundStop(_BoundVerb[P, R]):
     def _mistake(
         self, args: tuple[Any, ...], seconds: float | None = None, **kwargs: Any
     ) -> TypeError | None:
-        """Return a TypeError if the stop does not take these arguments, else None."""
+        """Return a TypeError if the stop's script does not take these arguments, else None."""
         if not args and not kwargs:
             return None
         try:
@@ -320,7 +326,7 @@ _BOUND: Mapping[str, type[_BoundVerb[Any, Any]]] = {
 
 
 class Verb(Generic[P, R]):
-    """Decorator that makes a script a verb: a call of the verb carries out the script on the drive's bus."""
+    """Decorator that makes a script a verb: calling the verb carries out the script on the drive's bus."""
 
     def __init__(self, script: Callable[Concatenate[Any, P], Script[R]]) -> None:
         self._script = script
@@ -353,7 +359,7 @@ verb = Verb
 
 
 def verb_errors(family: Any) -> list[str]:
-    """Return a sentence for each method that has a verb's name and lacks the decorator.
+    """Return an error sentence for each method that has a verb's name but not the decorator `verb`.
 
     A call of such a method would only create a generator, and send no request. A register or text with such
     a name is reported elsewhere.
@@ -380,19 +386,19 @@ def _hertz(value: object) -> float:
     return float(value)
 
 
-# By verb that commands a drive: its options, and the functions that convert their JSON values.
+# By verb: its options, each with the function that converts a JSON value.
 VERB_OPTIONS: Mapping[str, Mapping[str, Callable[[object], Any]]] = {
     "start": {"direction": _direction},
     "jog": {"direction": _direction},
     "reset_fault": {},
     "set_frequency": {"hz": _hertz},
-    "coast": {},  # not part of "stop", because coasting lets a hoist drop its load
+    "coast": {},  # a separate verb, not a variant of "stop", because coasting lets a hoist drop its load
     "emergency_stop": {},
     "stop": {},
 }
 LISTED_VERBS = tuple(
     name for name in VERB_OPTIONS if name != "stop"
-)  # verbs that a plant's list `may` can allow
+)  # verbs that the key `may` of a plant file can allow
 
 
 def verb_arguments(verb: str, options: Mapping[str, object]) -> dict[str, Any]:
