@@ -69,6 +69,10 @@ def test_stop_all_does_not_broadcast_if_families_differ(monkeypatch: pytest.Monk
     """The stop of one family may run a motor of the other family. Drives are attached in either order."""
     models = deque(MAKE)
     models.rotate(-models.index(model))
+    check_stopped_without_broadcast(monkeypatch, *models)
+
+
+def check_stopped_without_broadcast(monkeypatch: pytest.MonkeyPatch, *models: str) -> None:
     line, drives, sims = line_of(monkeypatch, *models)
     for drive in drives:
         drive.set_frequency(20)
@@ -92,13 +96,7 @@ def test_stop_all_broadcasts_if_all_drives_are_of_one_family(
 def test_stop_all_sends_no_broadcast_if_the_family_defines_no_broadcast(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    line, drives, sims = line_of(monkeypatch, "erman-er-g-220", "erman-er-g-220")
-    for drive in drives:
-        drive.set_frequency(20)
-        drive.start()
-    assert {each.seen for each in line.bus.stop_all().values()} == {Seen.STOPPED}
-    assert broadcasts(line) == []
-    assert not any(sim.motor.energised for sim in sims)
+    check_stopped_without_broadcast(monkeypatch, "erman-er-g-220", "erman-er-g-220")
 
 
 @pytest.mark.parametrize("models", [("erman-er-g-220", "erman-er-g-220"), ("invt-che", "yd1000")])

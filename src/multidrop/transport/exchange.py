@@ -141,12 +141,8 @@ class Exchanges:
         except PortLost:
             if self.line.queue is not None and not self.has_answered(drive):
                 raise
-        return text.decode(
-            b"".join(
-                self._again(partial(self._read_block, drive, block)).data
-                for block in text_blocks(drive, text)
-            )
-        )
+        reads = (self._again(partial(self._read_block, drive, block)) for block in text_blocks(drive, text))
+        return text.decode(b"".join(reads))
 
     def _again(self, read: Callable[[], T]) -> T:
         """Reopen a lost port and call `read`; if the port is then lost again, repeat both steps once.
@@ -263,12 +259,14 @@ class Exchanges:
 
     def text(self, drive: Drive, text: Text, attempts: int = READ_ATTEMPTS, *, insists: bool = False) -> str:
         """Return a text, read in as many requests as the family's limit on their length requires."""
-        peer = self.peers.of(drive)
-        reads = [make_read(drive, block, peer, insists=insists) for block in text_blocks(drive, text)]
-        return text.decode(b"".join(self._ask(drive, read, attempts).data for read in reads))
+        reads = (self._read_block(drive, block, attempts, insists) for block in text_blocks(drive, text))
+        return text.decode(b"".join(reads))
 
-    def _read_block(self, drive: Drive, block: Block) -> Completion:
-        return self._ask(drive, make_read(drive, block, self.peers.of(drive)), READ_ATTEMPTS)
+    def _read_block(
+        self, drive: Drive, block: Block, attempts: int = READ_ATTEMPTS, insists: bool = False
+    ) -> bytes:
+        read = make_read(drive, block, self.peers.of(drive), insists=insists)
+        return self._ask(drive, read, attempts).data
 
     def _prepare(self, drive: Drive) -> PreparedReads:
         """Return the drive's cached reads; replace them if the port, the settings or the peer has changed."""
