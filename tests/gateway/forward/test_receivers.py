@@ -8,6 +8,7 @@ import random
 import re
 import subprocess
 import sys
+import threading
 import time
 import urllib.error
 import urllib.parse
@@ -128,6 +129,33 @@ def test_after_kills_at_any_moment_no_row_is_lost_or_doubled(tmp_path: Path, kin
     assert min(told) > 0
     assert least_rows - found == Counter()
     assert set(found.values()) == {1}
+
+
+@pytest.mark.long
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", first_in_ci(3, 20))
+def test_after_kills_of_the_database_no_row_is_lost_or_doubled(tmp_path: Path, kills: int) -> None:
+    """The server is killed while rows arrive, and started again. Each row must be stored once."""
+    dice = random.Random(kills)
+    with postgres() as database:
+        part = forwarding("postgres", database.where, tmp_path / "gateway")
+        thread = threading.Thread(target=part._forwarder.run)
+        thread.start()
+        try:
+            for number in range(kills):
+                store(part._spool, number * 500, 250)
+                time.sleep(dice.uniform(0, 0.1))
+                database.kill()
+                store(part._spool, number * 500 + 250, 250)
+                database.start()
+                database.wait()
+            until(lambda: not part._forwarder.behind)
+        finally:
+            part._forwarder.close()
+            thread.join()
+            part._spool.close()
+        found = Counter(database.ask("select time_ns, drive, register from multidrop.samples"))
+    assert found == wanted(range(kills * 500))
 
 
 @pytest.mark.slow

@@ -225,6 +225,35 @@ def test_start_delayed_by_a_broker_until_after_a_stop_is_refused(tmp_path: Path)
             listener.close()
 
 
+CHANNEL = """
+[[line.drive.channel]]
+name = "half"
+value = "output_frequency / 2 + 25"
+unit = "Hz"
+[serve.mqtt]
+broker = "{}"
+rows = true
+"""
+
+
+@pytest.mark.long
+def test_values_of_a_channel_reach_a_broker(tmp_path: Path) -> None:
+    require_module("paho.mqtt.client")
+    with mosquitto(tmp_path) as broker, served(tmp_path, CHANNEL.format(broker.address)):
+        listener = Listener(broker, "multidrop/pump-2/#")
+        try:
+            listener.wait_for(
+                lambda one: (
+                    one.topic == "multidrop/pump-2" and json.loads(one.payload)["values"].get("half") == 25.0
+                )
+            )
+            found = listener.wait_for(lambda one: one.topic.endswith("/rows") and b'"half"' in one.payload)
+            row = next(row for row in json.loads(found.payload)["rows"] if row["register"] == "half")
+            assert (row["drive"], row["value"], row["unit"], row["status"]) == ("pump-2", 25.0, "Hz", "ok")
+        finally:
+            listener.close()
+
+
 # ---- the Node-RED flow in the documentation uses only topics of the gateway ----
 
 

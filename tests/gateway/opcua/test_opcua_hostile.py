@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import random
 import socket
@@ -12,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -185,6 +187,30 @@ def test_interval_of_a_subscription_is_limited(gateway: Served, interval: float)
         parameters = ua.CreateSubscriptionParameters(RequestedPublishingInterval=interval)
         found = client.tloop.post(client.aio_obj.uaclient.create_subscription(parameters, callback=None))
         assert server.LEAST_INTERVAL_MS <= found.RevisedPublishingInterval <= server.MOST_INTERVAL_MS
+
+
+async def subscribe_and_vanish(url: str, timeout_ms: float) -> None:
+    """Subscribe to a value a thousand times; then abort the connection without closing the session."""
+    client = AsyncClient(url, timeout=PATIENCE)
+    client.session_timeout = timeout_ms
+    await client.connect()
+    subscription = await client.create_subscription(1000.0, SimpleNamespace())
+    await subscription.subscribe_data_change([client.get_node("ns=2;s=pump-1.State")] * 1000)
+    client.uaclient.protocol.transport.abort()
+    with suppress(Exception):
+        await client.disconnect()
+
+
+@pytest.mark.long
+def test_subscriptions_of_a_vanished_client_end_with_its_session(gateway: Served) -> None:
+    part: Any = gateway.gateway.feeds["opcua"]
+    there = part._opened[2]._session.subscription_service.subscriptions
+    before = set(there)
+    for _ in range(3):
+        asyncio.run(subscribe_and_vanish(f"opc.tcp://127.0.0.1:{port_of(gateway)}/", 2_000.0))
+    assert len(there) == len(before) + 3
+    stop_all(f"opc.tcp://127.0.0.1:{port_of(gateway)}/")
+    until(lambda: set(there) == before)
 
 
 def test_request_for_too_many_nodes_is_refused(gateway: Served) -> None:
