@@ -27,7 +27,7 @@ TOOLS = ROOT / "tools"
 
 
 @pytest.mark.long
-@table("tool", ["bare", "booted", "foreign", "kernel/build", "musl", "wheels", "wine"])
+@table("tool", ["bare", "booted", "containers", "foreign", "kernel/build", "musl", "wheels", "wine"])
 def test_help_is_the_header_of_the_tool(tool: str) -> None:
     ran = subprocess.run([TOOLS / tool, "--help"], capture_output=True, text=True, check=True, timeout=60)
     assert f"tools/{tool} " in ran.stdout
