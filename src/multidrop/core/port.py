@@ -401,8 +401,8 @@ class Port:
     is_stalled = flag_at("_progress.stalled")
     # whether the driver's count of unsent bytes is ignored: it stayed above 0 although replies came
     miscounts = flag_at("_progress.miscounts")
-    # whether the driver may still hold bytes of a command that has ended: they must be discarded
-    called_off = flag_at("_progress.called_off")
+    # 1 if the driver may still hold bytes of a command that has ended: they must be discarded
+    called_off = number_at("_progress.called_off")  # no bool: it is read at each exchange
     # number of another master's bytes, received while the port listened before its first request
     foreign = number_at("_progress.foreign")
 

@@ -246,7 +246,7 @@ class Line:
                 self._why_lost = f"the port was lost ({(why := why_lost(self.port, core.lost_error))})"
                 self._log.lost(why)
             core.stop()
-            self._opened.must_discard |= core.called_off
+            self._opened.must_discard |= bool(core.called_off)
 
     @undisturbed
     def close(self) -> None:
