@@ -267,17 +267,21 @@ def test_schema_refuses_mistakes_in_the_fleet_table() -> None:
 def invalid_families() -> list[str]:
     """Return the invalid family files of the loader's tests."""
     head, reading = FAMILIES.HEAD, "[reading]\na = { at = 1 }\n"
-    texts = [text for text, _ in FAMILIES.test_a_mistake_is_reported_with_its_file_and_line.rows]
+    texts = [text for text, _ in FAMILIES.test_mistake_in_a_family_file_is_reported_with_file_and_line.rows]
     texts += [
         f"{head}[text]\n{entry}\n"
-        for entry, _ in FAMILIES.test_mistakes_in_declarations_of_text_registers_are_reported.rows
+        for entry, _ in FAMILIES.test_mistakes_in_text_registers_of_a_family_file_are_reported.rows
     ]
-    for rule, _ in FAMILIES.test_mistakes_in_the_parameters_section_are_reported.rows:
+    for rule, _ in FAMILIES.test_mistakes_in_the_parameters_section_of_a_family_file_are_reported.rows:
         texts.append(f"{head}{reading}[parameters]\n{rule}\n")
-    for section, _ in FAMILIES.test_mistakes_in_the_sections_identify_and_verb_are_reported.rows:
+    for section, _ in FAMILIES.test_mistakes_in_the_family_file_sections_identify_and_verb_are_reported.rows:
         is_table = section.startswith("[")
         texts.append(FAMILIES.DEVICE + section if is_table else f"{section}\n{FAMILIES.DEVICE}")
-    for base, declared, _ in FAMILIES.test_file_that_extends_a_family_replaces_none_of_its_safeguards.rows:
+    for (
+        base,
+        declared,
+        _,
+    ) in FAMILIES.test_family_file_that_extends_a_family_cannot_replace_its_safeguards.rows:
         texts.append(f'{head}extends = "{base}"\n{declared}\n')
     lines = FAMILIES.TWENTY.splitlines()
     for number, line in enumerate(lines):

@@ -1,4 +1,4 @@
-"""Every family has consistent declarations, and no verb that its document forbids."""
+"""Every built-in family has consistent declarations, and no verb that its document does not describe."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ family = pytest.mark.parametrize("family", FAMILIES, ids=lambda each: each.model
 
 
 def registers(wanted: Callable[[Register[Any]], object]) -> list[tuple[type[Drive], Register[Any]]]:
-    """Return (family, register) pairs of all registers that `wanted` accepts."""
+    """Return (family, register) for each register that the function `wanted` accepts."""
     return [(family, each) for family in FAMILIES for each in family.registers.values() if wanted(each)]
 
 
@@ -52,7 +52,7 @@ def label(one: type[Drive] | Register[Any]) -> str:
     return one.name if isinstance(one, Register) else one.model
 
 
-def test_built_in_models_are_found_by_name() -> None:
+def test_built_in_families_are_found_by_name() -> None:
     assert list(MODELS) == [
         "erman-er-g-220",
         "invt-che",
@@ -77,12 +77,12 @@ def test_every_family_has_a_title_and_a_manual(family: type[Drive]) -> None:
 
 @family
 @table("given", [True, 1.0, None, "1", 0, 248, -1])
-def test_invalid_address_is_refused(family: type[Drive], given: object) -> None:
+def test_invalid_drive_address_is_refused(family: type[Drive], given: object) -> None:
     with pytest.raises(ValueError, match=rf"^address {given!r} is not supported by "):
         family(given)  # type: ignore[arg-type]
 
 
-TERMINALS = {  # names as in each manual; the CHE's manual has none
+TERMINALS = {  # names of the RS-485 terminals in each manual; the CHE's manual has none
     "erman-er-g-220": "485A and 485B",
     "innovert-ibd": "RS+ and RS-",
     "delixi-modbus": "SG+ and SG-",
@@ -93,11 +93,11 @@ TERMINALS = {  # names as in each manual; the CHE's manual has none
 
 
 @family
-def test_every_family_names_its_line_terminals(family: type[Drive]) -> None:
+def test_every_family_names_its_rs485_terminals(family: type[Drive]) -> None:
     assert family.line_terminals == TERMINALS[family.model]
 
 
-def test_unknown_framing_is_refused_and_the_error_names_a_valid_one() -> None:
+def test_error_for_an_unknown_framing_names_a_valid_one() -> None:
     with pytest.raises(
         ValueError, match=r"^framing 'ascii' is not supported by .*, which has delixi; write delixi, or leave"
     ):
@@ -112,12 +112,12 @@ def test_delixi_units_not_in_the_manual_are_marked_as_inferred(family: type[Driv
 
 
 @family
-def test_framing_can_be_given_by_its_number(family: type[Drive]) -> None:
+def test_framing_of_a_drive_can_be_given_by_its_number(family: type[Drive]) -> None:
     first = family.framings[0]
     assert family(1, framing=int(first)).framing is first  # type: ignore[arg-type]
 
 
-def test_drive_base_class_cannot_be_used_as_a_family() -> None:
+def test_base_class_drive_cannot_be_used_as_a_family() -> None:
     with pytest.raises(TypeError, match=r"^Drive is the base class: use a family, such as YD1000, or "):
         Drive(1)
 
@@ -125,10 +125,10 @@ def test_drive_base_class_cannot_be_used_as_a_family() -> None:
 @family
 @table("name", ["start", "jog"])
 @table("given", ["reverse", "forward", True, 25.0, CHEStatus.REVERSE])
-def test_value_that_is_not_a_direction_raises_type_error(
+def test_start_with_a_value_that_is_not_a_direction_raises_type_error(
     family: type[Drive], name: str, given: object
 ) -> None:
-    """A value other than a Direction must not turn the motor, so no frame is sent."""
+    """A wrong direction must not turn the motor, so no frame is sent."""
     drive = family(family.addresses[0], name="pump")
     drive.perform = pytest.fail
     sentence = rf"^{name} of pump takes Direction\.FORWARD or Direction\.REVERSE, not "
@@ -141,7 +141,7 @@ def test_value_that_is_not_a_direction_raises_type_error(
 
 @family
 @table("given", ["25", None, True, Direction.FORWARD])
-def test_frequency_that_is_not_a_number_raises_type_error(family: type[Drive], given: object) -> None:
+def test_setpoint_that_is_not_a_number_raises_type_error(family: type[Drive], given: object) -> None:
     drive = family(family.addresses[0], name="pump")
     drive.perform = pytest.fail
     with pytest.raises(TypeError, match=r"^set_frequency of pump takes a number in Hz, not "):
@@ -161,7 +161,7 @@ def test_every_verb_has_a_docstring(family: type[Drive]) -> None:
 
 @family
 def test_no_two_registers_have_the_same_address(family: type[Drive]) -> None:
-    """A command and the reading that shows it may share an address."""
+    """A command and a reading that shows its effect may share an address."""
     places = [
         (register.table, register.address + at, register.access is Access.COMMAND)
         for register in family.registers.values()
@@ -171,7 +171,7 @@ def test_no_two_registers_have_the_same_address(family: type[Drive]) -> None:
 
 
 @family
-def test_every_framing_has_character_formats(family: type[Drive]) -> None:
+def test_every_framing_of_a_family_has_character_formats(family: type[Drive]) -> None:
     assert set(family.formats) == set(family.framings)
     for framing in family.framings:
         for format in family.formats[framing]:
@@ -181,20 +181,20 @@ def test_every_framing_has_character_formats(family: type[Drive]) -> None:
 
 
 @family
-def test_read_limits_name_only_tables_of_the_family(family: type[Drive]) -> None:
+def test_read_limits_of_a_family_name_only_its_own_tables(family: type[Drive]) -> None:
     tables = {register.table for register in family.registers.values()}
     assert {*family.most_registers, *family.readable_gaps} <= tables
 
 
 @family
-def test_every_register_has_a_source(family: type[Drive]) -> None:
+def test_every_register_names_its_section_of_the_manual(family: type[Drive]) -> None:
     for name, register in family.registers.items():
         assert register.place or register.outside, name
         assert getattr(family, name) is register
 
 
 @table("family, register", registers(lambda each: each.span))
-def test_span_ends_can_be_encoded_and_values_beyond_cannot(
+def test_limits_of_a_register_can_be_encoded_and_values_beyond_cannot(
     family: type[Drive], register: Register[Any]
 ) -> None:
     assert register.span
@@ -208,7 +208,9 @@ def test_span_ends_can_be_encoded_and_values_beyond_cannot(
 
 
 @table("family, register", registers(lambda each: each.span and each.default is not None))
-def test_every_default_is_within_its_span(family: type[Drive], register: Register[Any]) -> None:
+def test_every_factory_value_is_within_the_registers_limits(
+    family: type[Drive], register: Register[Any]
+) -> None:
     assert register.decode(register.encode(register.default)) == register.default
 
 
@@ -231,7 +233,7 @@ def test_named_values_survive_encoding_and_decoding(family: type[Drive], registe
 
 
 @family
-def test_a_register_declared_with_never_is_not_writable(family: type[Drive]) -> None:
+def test_register_declared_with_never_is_not_writable(family: type[Drive]) -> None:
     assert not [register for register in family.registers.values() if register.never and register.writable]
 
 
@@ -255,7 +257,7 @@ def test_register_of_unknown_scale_is_never_writable(family: type[Drive]) -> Non
 
 @pytest.mark.slow
 @table("family, register", registers(lambda each: not each.values))
-def test_every_number_of_a_register_survives_decoding_and_encoding(
+def test_every_raw_count_of_a_register_survives_decoding_and_encoding(
     family: type[Drive], register: Register[Any]
 ) -> None:
     low, high = (0, 1) if register.number_format is NumberFormat.BIT else (0, 0xFFFF)
@@ -276,10 +278,10 @@ def test_every_number_of_a_register_survives_decoding_and_encoding(
 @pytest.mark.parametrize(("family", "register"), registers(lambda each: each.writable), ids=label)
 @settings(max_examples=examples(10))
 @given(data=st.data())
-def test_value_survives_a_write_and_a_read(
+def test_value_of_any_register_survives_a_write_and_a_read(
     family: type[Drive], register: Register[Any], data: st.DataObject
 ) -> None:
-    """In every framing, a written value is stored as sent and read back."""
+    """A written value is stored as sent, and read back, in every framing."""
     drive = family(family.addresses[0], framing=data.draw(st.sampled_from(family.framings)))
     value = data.draw(_values(register))
     asked = write_request(drive, register, register.encode(value))
@@ -304,7 +306,7 @@ def test_value_survives_a_write_and_a_read(
 
 
 def _values(register: Register[Any]) -> st.SearchStrategy[Any]:
-    """Return a strategy for values that may be written."""
+    """Return a strategy for values that may be written to the register."""
     if register.values is not None:
         members = [
             value
@@ -328,7 +330,7 @@ NUMBERS = registers(lambda each: each.values is None and each.writable)
 @pytest.mark.parametrize(("family", "register"), NUMBERS, ids=label)
 @settings(max_examples=examples(10))
 @given(data=st.data())
-def test_formatted_values_can_be_parsed(
+def test_formatted_register_values_can_be_parsed(
     family: type[Drive], register: Register[Any], data: st.DataObject
 ) -> None:
     value = data.draw(_values(register))
@@ -348,7 +350,7 @@ def scripts_of(tree: ast.AST) -> set[str]:
 
 
 def forgotten(tree: ast.AST, scripts: set[str]) -> list[int]:
-    """Return the lines that call one of these functions and discard the generator."""
+    """Return the line numbers of calls that ignore the generator which one of these functions returns."""
     calls = [node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)]
     found = []
     for call in calls:
@@ -359,8 +361,8 @@ def forgotten(tree: ast.AST, scripts: set[str]) -> list[int]:
     return found
 
 
-def test_every_script_call_uses_yield_from() -> None:
-    """Without `yield from` a script silently does not run."""
+def test_every_call_of_a_script_uses_yield_from() -> None:
+    """Without `yield from`, the script's steps are silently not run."""
     rooms = (Path(multidrop.families.__file__).parent, Path(multidrop.drive.__file__).parent)
     trees = {path: ast.parse(path.read_text("utf-8")) for room in rooms for path in room.rglob("*.py")}
     scripts = {"script"}.union(*map(scripts_of, trees.values()))
@@ -375,7 +377,7 @@ def test_every_script_call_uses_yield_from() -> None:
         and isinstance(node.value.value, ast.Call)
     ]
     assert len(carried_out) > 80
-    for node in carried_out:  # if a call had no `yield from`, `forgotten` would find it
+    for node in carried_out:  # check that `forgotten` finds each call once its `yield from` is removed
         call = node.value.value  # type: ignore[attr-defined]
         assert forgotten(ast.Module([ast.Expr(call)], []), scripts) == [call.lineno]
 
@@ -394,7 +396,7 @@ def test_verb_that_a_family_lacks_raises_unsupported() -> None:
             next(getattr(Mute(1), name).script(*given))
 
 
-UNDOCUMENTED = {  # by family: the verbs that its document does not have
+UNDOCUMENTED = {  # verbs that a family's document does not describe, by family
     "erman-er-g-220": {"coast", "jog", "release_control"},
     "invt-che": {"emergency_stop", "release_control"},
     "innovert-ibd": {"coast", "emergency_stop", "release_control"},
@@ -405,7 +407,7 @@ UNDOCUMENTED = {  # by family: the verbs that its document does not have
 
 
 @family
-def test_undocumented_verbs_are_unsupported_and_send_nothing(family: type[Drive]) -> None:
+def test_verbs_not_in_the_document_are_unsupported_and_send_nothing(family: type[Drive]) -> None:
     wire = Wire(family(1))
     missing = {name for name in VERBS if getattr(family, name) is getattr(Drive, name)}
     assert missing == UNDOCUMENTED[family.model]
@@ -422,7 +424,7 @@ def test_state_as_text_shows_condition_direction_fault_and_note() -> None:
 
 
 @family
-def test_assigning_to_a_register_is_refused(family: type[Drive]) -> None:
+def test_assigning_to_a_register_attribute_is_refused(family: type[Drive]) -> None:
     drive = family(1)
     name = next(iter(drive.registers))
     with pytest.raises(

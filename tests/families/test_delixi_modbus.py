@@ -49,12 +49,12 @@ TABLE = """
 """
 
 
-def test_registers_equal_the_table_typed_from_part_2() -> None:
+def test_delixi_registers_equal_the_table_typed_from_part_2() -> None:
     shared = "\n".join(f"03/06 {line}" for line in DELIXI_MONITORS.strip().splitlines())
     assert rows(DelixiModbus) == typed(TABLE + shared)
 
 
-def test_line_settings_and_limits_are_those_of_the_document() -> None:
+def test_delixi_line_settings_and_limits_are_those_of_the_document() -> None:
     assert str(DelixiModbus(31).settings) == "9600 8N2"
     assert str(DelixiModbus(1, framing="ascii").settings) == "9600 7N2"
     assert DelixiModbus.formats[Framing.RTU] == ("8N2", "8E1", "8O1")
@@ -66,17 +66,17 @@ def test_line_settings_and_limits_are_those_of_the_document() -> None:
         DelixiModbus(1, framing="ascii", format="8N2")
 
 
-def test_run_words_have_a_direction_bit_and_never_the_bit_that_toggles_the_direction() -> None:
+def test_delixi_run_words_have_a_direction_and_never_the_toggle_bit() -> None:
     assert {each.value for each in DelixiModbusControl} == {0x00, 0x01, 0x12, 0x22, 0x13, 0x23}
 
 
-def test_character_formats_have_the_codes_of_the_manual() -> None:
-    """P04.29: 0 to 2 are ASCII with seven bits, 3 to 5 RTU with eight."""
+def test_delixi_character_formats_have_the_codes_of_the_manual() -> None:
+    """P04.29: 0 to 2 are ASCII with 7 data bits, 3 to 5 RTU with 8."""
     names = ["ASCII_7N2", "ASCII_7E1", "ASCII_7O1", "RTU_8N2", "RTU_8E1", "RTU_8O1"]
     assert [DelixiModbus.format_setting.decode(raw).name for raw in range(6)] == names
 
 
-def test_start_after_a_jog_requires_a_stop() -> None:
+def test_delixi_start_after_a_jog_requires_a_stop() -> None:
     jog = frame(DelixiModbus(1), DelixiModbus.control, DelixiModbusControl.JOG_FORWARD)
     wire = Wire(DelixiModbus(1), STANDING, turns={jog: TURNING} | TURNS)
     wire.drive.jog()
@@ -88,13 +88,13 @@ def test_start_after_a_jog_requires_a_stop() -> None:
     assert wire.sent == [jog, STOP[Framing.RTU], FORWARD[Framing.RTU], REVERSE[Framing.RTU]]
 
 
-def test_fault_codes_decode_to_the_documented_names() -> None:
+def test_delixi_fault_codes_decode_to_the_documented_names() -> None:
     assert [each.value for each in DelixiFault] == list(range(15))
     assert DelixiModbus.fault.decode(14) is DelixiFault.FLT_MODULE
 
 
 @table("framing", DelixiModbus.framings)
-def test_each_verb_sends_the_documented_frame(framing: Framing) -> None:
+def test_each_delixi_verb_sends_the_documented_frame(framing: Framing) -> None:
     wire = Wire(DelixiModbus(1, framing=framing), STANDING, turns=TURNS)
     wire.drive.set_frequency(50)
     wire.drive.start()
@@ -105,7 +105,7 @@ def test_each_verb_sends_the_documented_frame(framing: Framing) -> None:
     assert wire.sent == [FIFTY[framing], forward, forward, REVERSE[framing], STOP[framing]]
 
 
-def test_jog_sends_the_control_word_of_its_direction() -> None:
+def test_delixi_jog_sends_the_control_word_of_its_direction() -> None:
     jogs = [
         frame(DelixiModbus(1), DelixiModbus.control, word)
         for word in (DelixiModbusControl.JOG_FORWARD, DelixiModbusControl.JOG_REVERSE)
@@ -123,14 +123,14 @@ def test_jog_sends_the_control_word_of_its_direction() -> None:
 
 
 @table("name", ["start", "jog"])
-def test_start_is_unconfirmed_if_the_motor_does_not_run(name: str) -> None:
+def test_delixi_start_is_unconfirmed_if_the_motor_does_not_run(name: str) -> None:
     wire = Wire(DelixiModbus(1), STANDING)
     with pytest.raises(Unconfirmed, match="it is not seen to run; stop it, or it may start later"):
         getattr(wire.drive, name)()
     assert len(wire.sent) == 1
 
 
-def test_start_of_a_turning_motor_without_a_direction_is_refused() -> None:
+def test_delixi_start_of_a_turning_motor_without_a_direction_is_refused() -> None:
     wire = Wire(DelixiModbus(1), {**STANDING, **TURNING})
     with pytest.raises(WriteForbidden, match="give the direction"):
         wire.drive.start()
@@ -139,7 +139,7 @@ def test_start_of_a_turning_motor_without_a_direction_is_refused() -> None:
     assert wire.sent == [FORWARD[Framing.RTU]]
 
 
-def test_stop_waits_for_0_hz_and_raises_if_it_does_not_come() -> None:
+def test_delixi_stop_waits_for_0_hz_and_raises_if_it_does_not_come() -> None:
     wire = Wire(DelixiModbus(1), {"output_frequency": [30.0, 10.0, 0.0]})
     wire.drive.stop()
     assert len(wire.reads) == 3
@@ -149,7 +149,7 @@ def test_stop_waits_for_0_hz_and_raises_if_it_does_not_come() -> None:
     assert wire.sent == [STOP[Framing.RTU]]
 
 
-def test_setpoint_write_wears_the_eeprom_and_a_mismatch_is_reported() -> None:
+def test_delixi_setpoint_write_wears_eeprom_and_a_wrong_value_is_reported() -> None:
     assert DelixiModbus.frequency.kept is Kept.EEPROM
     assert "EEPROM" in DelixiModbus.frequency.note
     wire = Wire(DelixiModbus(1), {"frequency": 40.0})
@@ -165,15 +165,15 @@ def test_setpoint_write_wears_the_eeprom_and_a_mismatch_is_reported() -> None:
         ({"fault": 99}, State(Condition.FAULT, fault="99")),
     ],
 )
-def test_state_shows_the_fault_or_that_the_motor_turns(says: dict[str, object], state: State) -> None:
+def test_delixi_state_shows_the_fault_or_that_the_motor_turns(says: dict[str, object], state: State) -> None:
     assert Wire(DelixiModbus(1), says).drive.state() == state
 
 
-def test_state_at_0_hz_is_unknown() -> None:
+def test_delixi_state_at_0_hz_is_unknown() -> None:
     assert Wire(DelixiModbus(1), STANDING).drive.state().condition is Condition.UNKNOWN
 
 
-def test_identify_checks_address_and_baud_rate() -> None:
+def test_delixi_identify_checks_address_and_baud_rate() -> None:
     Wire(DelixiModbus(1), STANDING).drive.identify()
     for name, other, sentence in (
         ("fault", 99, "0063H"),
@@ -193,7 +193,9 @@ def test_identify_checks_address_and_baud_rate() -> None:
         ("frequency", 0.0, "set_frequency"),
     ],
 )
-def test_start_is_refused_in_a_fault_or_without_line_control(name: str, held: float, sentence: str) -> None:
+def test_delixi_start_is_refused_in_a_fault_or_without_line_control(
+    name: str, held: float, sentence: str
+) -> None:
     wire = Wire(DelixiModbus(1), {**STANDING, name: held})
     with pytest.raises(WriteForbidden, match=sentence):
         wire.drive.start()

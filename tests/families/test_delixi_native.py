@@ -1,4 +1,6 @@
-"""Delixi's own protocol: the register tables, and the frames that verbs send, as printed in part 3."""
+"""Delixi's own protocol: the register tables, and the frames of verbs, as printed in part 3 of the
+document.
+"""
 
 from __future__ import annotations
 
@@ -62,13 +64,13 @@ TABLE = """
 """
 
 
-def test_registers_equal_the_tables_typed_from_part_3() -> None:
+def test_delixi_native_registers_equal_the_tables_typed_from_part_3() -> None:
     own = DELIXI_MONITORS.replace("DelixiModbusFormat", "DelixiNativeFormat")
     shared = "\n".join(f"07/06 {line}" for line in own.strip().splitlines())
     assert rows(DelixiNative) == typed(TABLE + shared)
 
 
-def test_registers_of_each_function_code_have_the_documented_size() -> None:
+def test_delixi_registers_of_each_function_code_have_the_documented_size() -> None:
     carriers = {
         register.table.write or register.table.read: register.table.carrier
         for register in DelixiNative.registers.values()
@@ -77,24 +79,24 @@ def test_registers_of_each_function_code_have_the_documented_size() -> None:
     assert (PARAMETER_RAM.read, PARAMETER_RAM.write) == (7, 5)
 
 
-def test_line_settings_and_limits_are_those_of_the_document() -> None:
+def test_delixi_native_line_settings_and_limits_are_those_of_the_document() -> None:
     assert DelixiNative(31).framing is Framing.DELIXI
     assert DelixiNative.formats == {Framing.DELIXI: ("8N1", "8E1", "8O1")}
     assert set(DelixiNative.exceptions) == {0xF0, 0xFC, 0xFD, 0xFE, 0xFF}
     assert DelixiNative(1).needed_silence() == 0
 
 
-def test_character_formats_have_the_codes_of_the_manual() -> None:
-    """The codes of P04.29 differ from those in standard Modbus."""
+def test_delixi_native_character_formats_have_the_codes_of_the_manual() -> None:
+    """The codes of P04.29 differ from those in firmware for standard Modbus."""
     assert [DelixiNative.format_setting.decode(raw).name for raw in range(3)] == ["N81", "E81", "O81"]
 
 
-def test_only_a_stop_with_k_02_is_broadcast() -> None:
+def test_delixi_native_broadcasts_only_a_stop_command() -> None:
     broadcast = {name: each.broadcast for name, each in DelixiNative.registers.items() if each.broadcast}
     assert broadcast == {"control": (1,)}
 
 
-def test_each_verb_sends_the_printed_frame() -> None:
+def test_each_delixi_native_verb_sends_the_printed_frame() -> None:
     wire = Wire(DelixiNative(1), STANDING, turns=TURNS)
     wire.drive.set_frequency(50)
     wire.drive.start()
@@ -104,7 +106,7 @@ def test_each_verb_sends_the_printed_frame() -> None:
     assert wire.sent == [FIFTY, FORWARD, REVERSE, STOP, RESET]
 
 
-def test_start_without_a_direction_keeps_a_running_motors_direction() -> None:
+def test_delixi_native_start_keeps_a_running_motors_direction_by_default() -> None:
     wire = Wire(DelixiNative(1), {**STANDING, **TURNS[REVERSE]}, turns=TURNS)
     wire.drive.set_frequency(50)
     wire.drive.start()
@@ -112,7 +114,7 @@ def test_start_without_a_direction_keeps_a_running_motors_direction() -> None:
     assert wire.sent == [FIFTY, REVERSE, FORWARD]
 
 
-def test_start_without_a_known_setpoint_is_refused() -> None:
+def test_delixi_native_start_without_a_known_setpoint_is_refused() -> None:
     wire = Wire(DelixiNative(1), STANDING)
     with pytest.raises(WriteForbidden, match="set_frequency"):
         wire.drive.start()
@@ -124,11 +126,11 @@ def test_start_without_a_known_setpoint_is_refused() -> None:
     [
         (DelixiNativeStatus.UNDERVOLTAGE, r"a fault, UNDERVOLTAGE: .*reset_fault\(\)"),
         (DelixiNativeStatus.FAULT, r"a fault, FAULT: .*reset_fault\(\)"),
-        (9, "says 0009H in reply to K = 03, a state that the manual does not explain"),
+        (9, "reports 0009H in reply to K = 03, a state that the manual does not explain"),
     ],
 )
-def test_start_is_refused_if_the_motor_could_start_later(status: int, sentence: str) -> None:
-    """P05.31 shows no fault here, but a run command without mains voltage may take effect later."""
+def test_delixi_native_start_is_refused_if_the_motor_could_start_later(status: int, sentence: str) -> None:
+    """P05.31 shows no fault here. A run command without mains voltage may take effect later."""
     wire = Wire(DelixiNative(1), {**STANDING, "status": status})
     wire.drive.set_frequency(50)
     for direction in (None, *Direction):
@@ -144,7 +146,9 @@ def test_start_is_refused_if_the_motor_could_start_later(status: int, sentence: 
         ({"fault": DelixiFault.OC_OVERCURRENT}, "has a fault, overcurrent .OC.: remove its cause"),
     ],
 )
-def test_start_is_refused_in_a_fault_or_without_line_control(says: dict[str, object], sentence: str) -> None:
+def test_delixi_native_start_is_refused_in_a_fault_or_without_line_control(
+    says: dict[str, object], sentence: str
+) -> None:
     wire = Wire(DelixiNative(1), STANDING | says, turns=TURNS)
     wire.drive.set_frequency(50)
     with pytest.raises(WriteForbidden, match=sentence):
@@ -152,7 +156,7 @@ def test_start_is_refused_in_a_fault_or_without_line_control(says: dict[str, obj
     assert wire.sent == [FIFTY]
 
 
-def test_start_is_unconfirmed_if_the_motor_is_not_seen_to_run() -> None:
+def test_delixi_native_start_is_unconfirmed_if_the_motor_is_not_seen_to_run() -> None:
     wire = Wire(DelixiNative(1), STANDING)
     wire.drive.set_frequency(50)
     with pytest.raises(Unconfirmed, match="it is not seen to run; stop it, or it may start later"):
@@ -160,14 +164,14 @@ def test_start_is_unconfirmed_if_the_motor_is_not_seen_to_run() -> None:
     assert wire.sent == [FIFTY, FORWARD]
 
 
-def test_stored_setpoint_is_written_with_k_06() -> None:
+def test_delixi_setpoint_in_eeprom_is_written_with_function_06() -> None:
     drive = DelixiNative(1)
     assert frame(drive, DelixiNative.stored_frequency, 50) == FIFTY_STORED
     assert DelixiNative.stored_frequency.kept is Kept.EEPROM
     assert DelixiNative.frequency.kept is Kept.RAM
 
 
-def test_stop_waits_for_state_and_frequency() -> None:
+def test_delixi_native_stop_waits_for_run_state_and_frequency() -> None:
     wire = Wire(
         DelixiNative(1),
         {"status": [DelixiNativeStatus.REVERSE, DelixiNativeStatus.STOPPED], "output_frequency": [3.0, 0.0]},
@@ -195,7 +199,7 @@ def test_stop_waits_for_state_and_frequency() -> None:
         (0x15, 0x15),
     ],
 )
-def test_faults_are_read_as_decimal_and_as_hex_digits(raw: int, fault: int) -> None:
+def test_delixi_fault_codes_may_be_decimal_or_hex_digits(raw: int, fault: int) -> None:
     decoded = DelixiNative.fault.decode(raw)
     assert decoded == fault
     assert isinstance(decoded, DelixiFault) == isinstance(fault, DelixiFault)
@@ -214,7 +218,8 @@ def test_faults_are_read_as_decimal_and_as_hex_digits(raw: int, fault: int) -> N
             State(Condition.RUNNING, Direction.REVERSE),
         ),
         (
-            {"status": DelixiNativeStatus.FORWARD, "output_frequency": 0.0},  # 0 Hz, but not stopped
+            # the motor runs at 0 Hz, so it is not stopped
+            {"status": DelixiNativeStatus.FORWARD, "output_frequency": 0.0},
             State(Condition.RUNNING, Direction.FORWARD, note="output frequency 0"),
         ),
         (
@@ -228,11 +233,13 @@ def test_faults_are_read_as_decimal_and_as_hex_digits(raw: int, fault: int) -> N
         ({"status": 9}, State(Condition.UNKNOWN, note="K = 03 says 0009H, which is not explained")),
     ],
 )
-def test_state_shows_run_state_direction_and_fault(says: dict[str, object], state: State) -> None:
+def test_delixi_native_state_shows_run_state_direction_and_fault(
+    says: dict[str, object], state: State
+) -> None:
     assert Wire(DelixiNative(1), says).drive.state() == state
 
 
-def test_identify_reads_address_and_baud_rate() -> None:
+def test_delixi_native_identify_reads_address_and_baud_rate() -> None:
     wire = Wire(DelixiNative(1), STANDING)
     wire.drive.identify()
     assert (wire.reads, wire.sent) == (["address_setting", "baudrate_setting"], [])
@@ -242,7 +249,7 @@ def test_identify_reads_address_and_baud_rate() -> None:
         Wire(DelixiNative(2), STANDING).drive.identify()
 
 
-def test_subclass_keeps_the_registers_and_adds_its_own() -> None:
+def test_delixi_subclass_keeps_the_registers_and_adds_its_own() -> None:
     class Mine(DelixiNative):
         """A user's family with a parameter from the drive's list."""
 
@@ -260,7 +267,7 @@ class Owned(DelixiNative):
     stored_ramp = setting(parameter(0, 18), "s", step=0.1, table=PARAMETER)
 
 
-def test_table_of_a_parameter_decides_whether_it_is_stored() -> None:
+def test_table_of_a_delixi_parameter_selects_ram_or_eeprom() -> None:
     assert (Owned.ramp.kept, Owned.stored_ramp.kept) == (Kept.RAM, Kept.EEPROM)
     kept = {name: each.kept for name, each in DelixiNative.registers.items() if each.writable}
     assert kept == {
@@ -273,7 +280,9 @@ def test_table_of_a_parameter_decides_whether_it_is_stored() -> None:
         setting(parameter(0, 17), "s", table=PARAMETER, kept=Kept.RAM)
 
 
-def test_only_stored_writes_are_counted_and_limited(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_only_delixi_writes_to_eeprom_are_counted_and_limited(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     ledger = Ledger(tmp_path / "wear", budget=1000)
     line, drive, sim = one(monkeypatch, Owned(1), ledger=ledger)
     for seconds in (1.0, 2.0, 3.0):
@@ -287,7 +296,7 @@ def test_only_stored_writes_are_counted_and_limited(monkeypatch: pytest.MonkeyPa
 
 
 @table("status", [DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE])
-def test_fault_that_remains_after_reset_is_reported(status: DelixiNativeStatus) -> None:
+def test_delixi_fault_that_remains_after_a_reset_is_reported(status: DelixiNativeStatus) -> None:
     wire = Wire(DelixiNative(1), {**STANDING, "status": status, "fault": DelixiFault.OC_OVERCURRENT})
     with pytest.raises(NotVerified, match=r"the fault reset.*the fault remains: overcurrent"):
         wire.drive.reset_fault()
@@ -302,7 +311,7 @@ def test_fault_that_remains_after_reset_is_reported(status: DelixiNativeStatus) 
         (DelixiNativeStatus.STOPPED, 0.01),
     ],
 )
-def test_reset_is_refused_while_the_motor_turns(status: DelixiNativeStatus, hz: float) -> None:
+def test_delixi_reset_is_refused_while_the_motor_turns(status: DelixiNativeStatus, hz: float) -> None:
     wire = Wire(DelixiNative(1), {**STANDING, "status": status, "output_frequency": hz})
     with pytest.raises(WriteForbidden, match="runs: it has no fault to reset"):
         wire.drive.reset_fault()

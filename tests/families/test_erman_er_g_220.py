@@ -29,7 +29,7 @@ STOP_OFF = "01 05 00 01 00 00 9C 0A"
 EMERGENCY_ON = "01 05 00 02 FF 00 2D FA"
 RESET_ON = "01 05 00 09 FF 00 5C 38"
 RESET_OFF = "01 05 00 09 00 00 1D C8"
-FREQUENCY_28_5 = "01 06 00 02 01 1D E9 93"  # the example of function 06, with the address corrected
+FREQUENCY_28_5 = "01 06 00 02 01 1D E9 93"  # the example of function 06, with the right address 0002H
 
 STOPPED = {
     "frequency": 25.0,
@@ -68,18 +68,19 @@ TABLE = """
 """
 
 
-def test_registers_equal_the_table_typed_from_section_10() -> None:
+def test_erman_registers_equal_the_table_typed_from_section_10() -> None:
     assert rows(ErmanERG220) == typed(TABLE)
 
 
-def test_line_settings_and_limits_are_those_of_the_document() -> None:
+def test_erman_line_settings_and_limits_are_those_of_the_document() -> None:
     drive = ErmanERG220(1)
     assert str(drive.settings) == "38400 8N1"
     assert ErmanERG220.addresses == range(1, 32)
     assert ErmanERG220.most_registers == {HOLDING: 88, INPUT: 17, COIL: 12}
     assert ErmanERG220.readable_gaps == {HOLDING: range(0x59), INPUT: range(0x1000)}
     assert set(ErmanERG220.exceptions) == {1, 2, 3, 4}
-    assert "read or write" in ErmanERG220.exceptions[3]  # the document's example: 01 86 03 02 61
+    # the document's example has this meaning: 01 86 03 02 61
+    assert "read or write" in ErmanERG220.exceptions[3]
     assert "write" in drive.exception(4)
     assert not ErmanERG220.broadcasts
     for wrong in ({"baudrate": 9600}, {"format": "8E1"}):
@@ -89,7 +90,7 @@ def test_line_settings_and_limits_are_those_of_the_document() -> None:
         ErmanERG220(32)
 
 
-def test_status_and_fault_bits_have_the_documented_names() -> None:
+def test_erman_status_and_fault_bits_have_the_documented_names() -> None:
     assert [bit.value for bit in ErmanFault] == [1 << at for at in (0, 1, 2, 3, 4, 5, 6, 7, 10, 11)]
     assert [bit.value for bit in Modes] == [1 << 0, 1 << 4, 1 << 8]
     assert ErmanERG220.status.number_format is ErmanERG220.last_fault.number_format is NumberFormat.U32_EITHER
@@ -98,18 +99,18 @@ def test_status_and_fault_bits_have_the_documented_names() -> None:
     assert all(register.kept is Kept.UNKNOWN for register in ErmanERG220.registers.values())
 
 
-def test_register_0001h_is_read_and_never_written() -> None:
+def test_erman_register_0001h_is_read_and_never_written() -> None:
     assert ErmanERG220.control_register.readable
     assert not ErmanERG220.control_register.writable
 
 
-def test_start_clears_both_stop_coils_and_writes_no_setpoint() -> None:
+def test_erman_start_clears_both_stop_coils_and_writes_no_setpoint() -> None:
     wire = Wire(ErmanERG220(1), STOPPED, turns=TURNS)
     wire.drive.start()
     assert wire.sent == [STOP_OFF, frame(wire.drive, ErmanERG220.emergency_stop_coil, Coil.OFF), START_ON]
 
 
-def test_reverse_is_unsupported() -> None:
+def test_erman_start_in_reverse_is_unsupported() -> None:
     wire = Wire(ErmanERG220(1), STOPPED, turns=TURNS)
     with pytest.raises(Unsupported, match="reverse"):
         wire.drive.start(Direction.REVERSE)
@@ -118,7 +119,7 @@ def test_reverse_is_unsupported() -> None:
     assert wire.sent[-1] == START_ON
 
 
-def test_start_is_refused_until_the_last_fault_is_reset() -> None:
+def test_erman_start_is_refused_until_the_last_fault_is_reset() -> None:
     wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": ErmanFault.OVERHEAT}, turns=TURNS)
     with pytest.raises(WriteForbidden, match=r"overheat.*reset_fault.*acknowledged_fault = 64"):
         wire.drive.start()
@@ -133,14 +134,14 @@ def test_start_is_refused_until_the_last_fault_is_reset() -> None:
 
 
 @table("fault", ErmanFault)
-def test_fault_must_be_acknowledged_explicitly(fault: ErmanFault) -> None:
+def test_erman_fault_must_be_acknowledged_with_the_option(fault: ErmanFault) -> None:
     wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": fault}, turns=TURNS)
     with pytest.raises(WriteForbidden, match=f"acknowledged_fault = {int(fault)}"):
         wire.drive.start()
     assert wire.sent == []
 
 
-def test_acknowledged_fault_option_allows_a_start() -> None:
+def test_erman_option_acknowledged_fault_allows_a_start() -> None:
     wire = Wire(
         ErmanERG220(1, acknowledged_fault=64), {**STOPPED, "last_fault": ErmanFault.OVERHEAT}, turns=TURNS
     )
@@ -148,7 +149,7 @@ def test_acknowledged_fault_option_allows_a_start() -> None:
     assert wire.sent[-1] == START_ON
 
 
-def test_stop_sets_stop_and_clears_start_and_waits() -> None:
+def test_erman_stop_sets_the_stop_coil_and_clears_start_and_waits() -> None:
     wire = Wire(
         ErmanERG220(1),
         {
@@ -159,19 +160,20 @@ def test_stop_sets_stop_and_clears_start_and_waits() -> None:
     )
     wire.drive.stop()
     assert wire.sent == [STOP_ON, START_OFF]
-    assert wire.reads.count("status") == 4  # the third read shows stopped, but the frequency is 0.4 Hz
+    # the third reading shows "stopped", but the frequency is still 0.4 Hz
+    assert wire.reads.count("status") == 4
 
 
-def test_stop_escalates_to_emergency_stop_and_then_raises() -> None:
+def test_erman_stop_without_effect_is_followed_by_emergency_stop_and_raises() -> None:
     wire = Wire(ErmanERG220(1), {**STOPPED, "status": ErmanStatus.RUNNING})
     with pytest.raises(Unconfirmed, match="not seen to have stopped"):
         wire.drive.stop()
     assert wire.sent == [STOP_ON, START_OFF, EMERGENCY_ON]
-    assert 30 <= wire.seconds <= 31  # two waits of 15 s: deceleration time and STOP_MARGIN
+    assert 30 <= wire.seconds <= 31  # two waits of 15 s each: the deceleration time and STOP_MARGIN
 
 
 @table("failure", [NoReply("drive"), BadReply("drive", "odd", b"\1"), DriveException("drive", 2, "")])
-def test_stop_escalates_to_emergency_stop_without_a_readable_ramp(failure: Exception) -> None:
+def test_erman_emergency_stop_follows_if_the_deceleration_time_is_unreadable(failure: Exception) -> None:
     says = {**STOPPED, "deceleration_time": failure, "status": ErmanStatus.RUNNING}
     stops = {EMERGENCY_ON: {"status": ErmanStatus.STOPPED}}
     wire = Wire(ErmanERG220(1), says, turns=stops)
@@ -183,7 +185,7 @@ def test_stop_escalates_to_emergency_stop_without_a_readable_ramp(failure: Excep
     assert wire.sent == [EMERGENCY_ON, START_OFF]
 
 
-def test_start_coil_is_written_off_after_an_unconfirmed_stop() -> None:
+def test_erman_start_coil_is_cleared_after_an_unconfirmed_stop() -> None:
     lost = [Unconfirmed("drive", "stop", "no reply")] * 3
     for stop in (STOP_ON, EMERGENCY_ON):
         wire = Wire(ErmanERG220(1), STOPPED, {stop: lost})
@@ -191,12 +193,13 @@ def test_start_coil_is_written_off_after_an_unconfirmed_stop() -> None:
             (wire.drive.stop if stop == STOP_ON else wire.drive.emergency_stop)()
         assert wire.sent == [*[stop] * 3, START_OFF]
         wire = Wire(ErmanERG220(1), STOPPED, {stop: lost, START_OFF: lost})
-        with pytest.raises(Unconfirmed, match="no reply"):  # START_OFF is sent only once
+        # START_OFF is sent only once, because the caller repeats the whole stop
+        with pytest.raises(Unconfirmed, match="no reply"):
             (wire.drive.stop if stop == STOP_ON else wire.drive.emergency_stop)()
         assert wire.sent == [*[stop] * 3, START_OFF]
 
 
-def test_refused_stop_is_followed_by_the_emergency_stop() -> None:
+def test_refused_erman_stop_is_followed_by_the_emergency_stop() -> None:
     refusal = DriveException("drive", 3, "")
     for refused, begun in ((STOP_ON, [STOP_ON] * 3), (START_OFF, [STOP_ON, *[START_OFF] * 3])):
         wire = Wire(ErmanERG220(1), STOPPED, {refused: [refusal] * 3})
@@ -205,7 +208,7 @@ def test_refused_stop_is_followed_by_the_emergency_stop() -> None:
         assert wire.reads == ["deceleration_time", "status", "output_frequency"]  # watched once
 
 
-def test_stop_is_sent_again_when_its_answer_is_lost() -> None:
+def test_erman_stop_is_sent_again_if_its_reply_is_lost() -> None:
     lost = Unconfirmed("drive", "stop", "no reply")
     wire = Wire(ErmanERG220(1), STOPPED, {STOP_ON: [lost, DriveException("drive", 3, "")]})
     wire.drive.stop()
@@ -215,14 +218,14 @@ def test_stop_is_sent_again_when_its_answer_is_lost() -> None:
         wire.drive.stop()
 
 
-def test_start_is_sent_only_once_if_its_reply_is_lost() -> None:
+def test_erman_start_is_sent_only_once_if_its_reply_is_lost() -> None:
     wire = Wire(ErmanERG220(1), STOPPED, {START_ON: [Unconfirmed("drive", "start", "no reply")]})
     with pytest.raises(Unconfirmed):
         wire.drive.start()
     assert wire.sent.count(START_ON) == 1
 
 
-def test_start_is_refused_if_the_setpoint_is_0_or_was_changed() -> None:
+def test_erman_start_is_refused_if_the_setpoint_is_0_or_was_changed() -> None:
     wire = Wire(
         ErmanERG220(1), {**STOPPED, "frequency": 0.0, "maximum_frequency": 50.0, "minimum_frequency": 0.0}
     )
@@ -237,14 +240,14 @@ def test_start_is_refused_if_the_setpoint_is_0_or_was_changed() -> None:
     assert wire.sent == sent
 
 
-def test_start_without_effect_is_unconfirmed_and_names_the_setting() -> None:
+def test_error_of_an_erman_start_without_effect_names_the_keypad_setting() -> None:
     wire = Wire(ErmanERG220(1), STOPPED)
     with pytest.raises(Unconfirmed, match=r"to run; stop it, or it may start later; b\.001 must be 2"):
         wire.drive.start()
     assert wire.sent.count(START_ON) == 1
 
 
-def test_emergency_stop_sets_its_coil_and_clears_the_start_coil() -> None:
+def test_erman_emergency_stop_sets_its_coil_and_clears_the_start_coil() -> None:
     wire = Wire(ErmanERG220(1), STOPPED)
     wire.drive.emergency_stop()
     assert wire.sent == [EMERGENCY_ON, START_OFF]
@@ -253,7 +256,7 @@ def test_emergency_stop_sets_its_coil_and_clears_the_start_coil() -> None:
         wire.drive.emergency_stop()
 
 
-def test_reset_clears_start_first_and_leaves_its_own_coil_off() -> None:
+def test_erman_reset_clears_start_first_and_its_own_coil_afterwards() -> None:
     wire = Wire(ErmanERG220(1), STOPPED)
     wire.drive.reset_fault()
     assert wire.sent == [START_OFF, RESET_ON, RESET_OFF]
@@ -267,7 +270,7 @@ def test_reset_clears_start_first_and_leaves_its_own_coil_off() -> None:
     assert wire.sent == []
 
 
-def test_setpoint_is_written_to_0002h_within_minimum_and_maximum() -> None:
+def test_erman_setpoint_is_written_to_0002h_within_its_limits() -> None:
     wire = Wire(ErmanERG220(1), {"maximum_frequency": 50.0, "minimum_frequency": 5.0})
     wire.drive.set_frequency(28.5)
     assert wire.sent == [FREQUENCY_28_5]
@@ -292,7 +295,7 @@ def test_setpoint_is_written_to_0002h_within_minimum_and_maximum() -> None:
         (2, 64, Condition.ACCELERATING, ""),
         (3, 0, Condition.DECELERATING, ""),
         (0x21, 0, Condition.RUNNING, "motor overloaded"),
-        (0x8001, 0, Condition.RUNNING, ""),  # reserved bits are ignored
+        (0x8001, 0, Condition.RUNNING, ""),  # reserved bits have no effect
         (
             0,
             0x0402,
@@ -301,7 +304,7 @@ def test_setpoint_is_written_to_0002h_within_minimum_and_maximum() -> None:
         ),
     ],
 )
-def test_state_shows_the_ramp_phase_and_the_last_fault(
+def test_erman_state_shows_the_ramp_phase_and_the_last_fault(
     status: int, fault: int, condition: Condition, note: str
 ) -> None:
     says = {"status": ErmanERG220.status.decode(status), "last_fault": ErmanERG220.last_fault.decode(fault)}
@@ -309,7 +312,7 @@ def test_state_shows_the_ramp_phase_and_the_last_fault(
     assert (state.condition, state.note, state.fault) == (condition, note, None)
 
 
-def test_last_fault_with_only_unnamed_bits_counts_as_a_fault() -> None:
+def test_erman_last_fault_with_only_unnamed_bits_counts_as_a_fault() -> None:
     """Bits 8, 9 and 12 to 31 of the last fault are reserved (section 10, state registers 1026-1027)."""
     wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": ErmanERG220.last_fault.decode(0x1100)}, turns=TURNS)
     assert "last fault bit 8, bit 12" in wire.drive.state().note
@@ -318,7 +321,7 @@ def test_last_fault_with_only_unnamed_bits_counts_as_a_fault() -> None:
     assert wire.sent == []
 
 
-def test_identify_refuses_the_models_03_and_04() -> None:
+def test_erman_identify_refuses_the_models_03_and_04() -> None:
     Wire(ErmanERG220(1), STOPPED).drive.identify()
     with pytest.raises(WriteForbidden, match="0400H"):
         Wire(ErmanERG220(1), {"status": DriveException("drive", 1, "")}).drive.identify()
@@ -326,7 +329,7 @@ def test_identify_refuses_the_models_03_and_04() -> None:
         Wire(ErmanERG220(1), {"status": NoReply("drive")}).drive.identify()
 
 
-def test_coils_are_read_within_one_byte_and_only_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_erman_coils_are_read_within_one_byte_and_only_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
     """The order of two bytes in a reply is doubtful (section 6, the example of function 01)."""
     line, drive, _ = one(monkeypatch, ErmanERG220(1))
     coils = [drive.start_held, drive.stop_held, drive.emergency_stop_held, drive.fault_reset_held]
@@ -348,13 +351,13 @@ def test_coils_are_read_within_one_byte_and_only_on_request(monkeypatch: pytest.
             drive.write(register, Coil.ON)
 
 
-def test_printed_diagnostics_can_be_sent_raw(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Function 08 with `send_raw` (section 8); the misprinted error reply counts as a refusal too."""
+def test_erman_diagnostics_request_can_be_sent_with_send_raw(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`send_raw` sends function 08 (section 8). The misprinted error reply counts as a refusal too."""
     line, drive, _ = one(monkeypatch, ErmanERG220(1))
     assert drive.send_raw(0x08, 0x0000, b"\xa5\x37") == b"\xa5\x37"
     asked, read = (frame for _, frame in line.frames)
     assert asked == "01 08 00 00 A5 37 DA 8D"
-    assert read.startswith("01 04")  # the reply was a copy, so a read checks for an adapter's echo
+    assert read.startswith("01 04")  # a reply that is a copy may be an echo, so the next request is a read
     for refusal in ("01 89 01 86 50", "01 88 01 87 C0"):
         line.answers = lambda request, refusal=refusal: bytes.fromhex(refusal)  # type: ignore[misc]
         with pytest.raises(DriveException, match="unknown command"):

@@ -1,4 +1,4 @@
-"""Hazards: frames that a naive client would send, and what this library sends or refuses instead.
+"""Hazards: dangerous frames that a naive client would send, and the frames that this library sends instead.
 
 There is a row for each address collision between families, and for each error or gap in a family's document
 that concerns a client. The frame `naive`, printed in the document if possible, must never be sent. `sends`
@@ -55,7 +55,7 @@ def yd() -> Drive:
 
 @dataclass(frozen=True)
 class Hazard:
-    """A hazard: `do(line, drive, sim)` is the user's action.
+    """A dangerous action of a user, `do(line, drive, sim)`.
 
     Before the action, the simulated drive gets the register values `shows`.
     """
@@ -64,10 +64,10 @@ class Hazard:
     do: Callable[[SimulatedBus, Any, Any], object]
     naive: str
     sends: tuple[str, ...] = ()
-    refuses: str = ""  # text of the error with which the action is refused
+    refuses: str = ""  # text of the error that refuses the action
     error: type[Exception] = WriteForbidden
     shows: Mapping[str, Any] = field(default_factory=dict)
-    turning: bool = False  # if True, the drive is started and runs for a second before the action
+    turning: bool = False  # if True, the motor is started and turns for a second before the action
 
 
 def start(line: SimulatedBus, drive: Any, sim: Any) -> None:
@@ -336,7 +336,7 @@ class Mine(InvtCHE):
 
 
 @pytest.mark.parametrize("hazard", HAZARDS.values(), ids=HAZARDS)
-def test_action_sends_only_the_safe_frames_or_is_refused(
+def test_dangerous_action_sends_only_the_safe_frames_or_is_refused(
     monkeypatch: pytest.MonkeyPatch, hazard: Hazard
 ) -> None:
     line, drive, sim = one(monkeypatch, hazard.drive())
@@ -360,7 +360,7 @@ def body(frame: str) -> str:
     return frame[:-2] if frame.startswith(":") else frame[:-6]
 
 
-def test_y2_low_byte_of_the_checksum_is_sent_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_low_byte_of_a_yd1000_checksum_is_sent_first_erratum_y2(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1))
     run(line, drive, sim)
     assert line.written[-1] == "01 06 10 00 C4 00 DF CA"
@@ -373,13 +373,15 @@ def reply_to(request: Message, frame: str) -> tuple[int, Message | None]:
     return parse_reply(Framing.RTU, bytes.fromhex(frame), request)
 
 
-def test_e1_checksum_is_computed_not_copied_from_the_example(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_erman_checksum_is_computed_not_copied_from_the_example_erratum_e1(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, drive, _ = one(monkeypatch, ErmanERG220(1))
     drive.read(drive.output_frequency, drive.output_current, drive.dc_bus_voltage)
     assert [frame for _, frame in line.frames] == ["01 04 00 01 00 05 61 C9"]
 
 
-def test_e2_reply_with_another_byte_count_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_erman_reply_with_another_byte_count_is_rejected_erratum_e2(monkeypatch: pytest.MonkeyPatch) -> None:
     printed = "01 04 10 01 F4 00 00 00 D6 00 00 02 32 0A 03"
     line, drive, _ = one(monkeypatch, ErmanERG220(1))
     line.answers = lambda request: bytes.fromhex(printed)
@@ -388,17 +390,17 @@ def test_e2_reply_with_another_byte_count_is_rejected(monkeypatch: pytest.Monkey
 
 
 @table("code", [2, 3, 4])
-def test_e12_an_exception_for_a_bad_address_is_not_reported_as_a_failure(code: int) -> None:
+def test_erman_exception_for_a_bad_address_is_no_device_failure_erratum_e12(code: int) -> None:
     assert "address" in ErmanERG220(1).exception(code)
     assert "fail" not in ErmanERG220(1).exception(code)
 
 
-def test_e9_e10_state_is_decoded_from_either_word() -> None:
+def test_erman_state_is_decoded_from_either_word_erratum_e9_e10() -> None:
     assert ErmanERG220.status.number_format is NumberFormat.U32_EITHER
     assert [ErmanERG220.status.decode(number) for number in range(4)] == list(ErmanStatus)[:4]
 
 
-def test_e13_e16_diagnostics_and_unknown_addresses_are_not_used() -> None:
+def test_erman_diagnostics_and_unknown_addresses_are_not_used_erratum_e13_e16() -> None:
     assert {register.table.read for register in ErmanERG220.registers.values()} <= {1, 3, 4}
     assert max(register.address for register in ErmanERG220.registers.values()) == 0x0402
     assert all(
@@ -406,7 +408,7 @@ def test_e13_e16_diagnostics_and_unknown_addresses_are_not_used() -> None:
     )
 
 
-def test_i4_a_request_that_the_drive_refused_as_damaged_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_request_refused_as_damaged_by_a_che_is_repeated_erratum_i4(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1))
     damaged = build_reply(Framing.RTU, Message(1, 3, exception=0x11))
     line.answers = lambda request: damaged if len(line.frames) == 1 else None
@@ -414,7 +416,7 @@ def test_i4_a_request_that_the_drive_refused_as_damaged_is_repeated(monkeypatch:
     assert len(line.frames) == 2
 
 
-def test_i2_e_identify_refuses_the_models_03_and_04(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_erman_identify_refuses_the_models_03_and_04_erratum_i2_e(monkeypatch: pytest.MonkeyPatch) -> None:
     """These models lack function 04; the exception makes `identify` refuse them."""
     line, drive, _ = one(monkeypatch, ErmanERG220(1))
     refusal = build_reply(Framing.RTU, Message(1, 4, exception=1))
@@ -424,45 +426,51 @@ def test_i2_e_identify_refuses_the_models_03_and_04(monkeypatch: pytest.MonkeyPa
     assert line.written == []
 
 
-def test_e7_byte_count_of_coils_is_rounded_up() -> None:
+def test_erman_byte_count_of_coils_is_rounded_up_erratum_e7() -> None:
     request = Message(1, 1, 0, 12)
-    assert reply_to(request, "01 01 02 00 01 78 3C")[0] > 0  # as printed: 12 coils in 2 bytes are accepted
-    assert reply_to(request, checksums.rtu("01 01 01 00").hex())[0] <= 0  # 12 / 8 rounded down
+    # the printed request for 12 coils has 2 data bytes, and so does the reply
+    assert reply_to(request, "01 01 02 00 01 78 3C")[0] > 0
+    # a reply with only 1 data byte, 12 / 8 rounded down, is rejected
+    assert reply_to(request, checksums.rtu("01 01 01 00").hex())[0] <= 0
 
 
-def test_e8_reserved_state_registers_are_not_readings() -> None:
+def test_erman_reserved_state_registers_are_not_declared_erratum_e8() -> None:
     state = {register.address for register in ErmanERG220.registers.values() if register.table.read == 4}
     assert not state & set(range(0x0007, 0x000C))
 
 
-def test_e14_function_08_has_a_subfunction_of_two_bytes() -> None:
+def test_erman_function_08_has_a_subfunction_of_two_bytes_erratum_e14() -> None:
     printed = "01 08 00 00 A5 37 DA 8D"
     assert build_request(Framing.RTU, Message(1, 8, 0x0000, data=b"\xa5\x37")).hex(" ").upper() == printed
 
 
-def test_i3_user_can_choose_parity_and_stop_bits() -> None:
+def test_user_can_choose_parity_and_stop_bits_of_a_che_erratum_i3() -> None:
     assert {"8N1", "8N2", "8E1", "8E2"} <= set(InvtCHE.formats[Framing.RTU])
     assert InvtCHE(1, format="8E2").settings.format == "8E2"
 
 
-def test_i6_unexplained_example_cannot_be_sent() -> None:
+def test_unexplained_example_of_the_che_manual_cannot_be_sent_erratum_i6() -> None:
     assert not [register for register in InvtCHE.registers.values() if register.address == 0x0008]
 
 
-def test_n3_n6_at_most_four_ibd_registers_are_read_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_at_most_four_innovert_ibd_registers_are_read_at_once_erratum_n3_n6(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, drive, _ = one(monkeypatch, InnovertIBD(1))
     drive.read_many([register for register in drive.registers.values() if register.readable])
     assert max(request.count for request, _ in line.frames) <= 4
     assert reply_to(Message(1, 3, 0x16, 1), "01 03 02 18 00 B2 44")[1] is not None
 
 
-def test_n9_ibd_without_programmed_outputs_is_never_reported_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_innovert_ibd_with_other_outputs_is_never_reported_stopped_erratum_n9(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     _, drive, sim = one(monkeypatch, InnovertIBD(1))
     sim["output_m01"] = 0
     assert drive.state().condition is Condition.UNKNOWN
 
 
-def test_d2_d15_states_2_and_3_are_running_and_a_changed_copy_is_rejected(
+def test_delixi_states_2_and_3_are_running_and_a_changed_copy_is_rejected_erratum_d2_d15(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     _, drive, sim = one(monkeypatch, DelixiNative(1))
@@ -470,11 +478,11 @@ def test_d2_d15_states_2_and_3_are_running_and_a_changed_copy_is_rejected(
     assert drive.state().condition is Condition.RUNNING
     request = Message(1, 4, 1, data=b"\0\0\x13\x88")
     swapped = build_reply(Framing.DELIXI, Message(1, 4, 1, data=b"\0\0\x88\x13"))
-    assert text(swapped)[-2:] == "A1"  # the checksum does not detect the swap
+    assert text(swapped)[-2:] == "A1"  # the checksum does not detect that two bytes were swapped
     assert parse_reply(Framing.DELIXI, swapped, request)[0] < 0
 
 
-def test_d1_d3_d6_d9_line_settings_correct_the_misprints() -> None:
+def test_delixi_line_settings_correct_the_misprints_erratum_d1_d3_d6_d9() -> None:
     assert 4800 in DelixiModbus.baudrates
     assert 3800 not in DelixiModbus.baudrates
     assert DelixiModbus.formats[Framing.ASCII][0] == "7N2"
@@ -483,13 +491,13 @@ def test_d1_d3_d6_d9_line_settings_correct_the_misprints() -> None:
     assert DelixiModbus.response_timeout >= 0.08
 
 
-def test_d8_fault_04_is_decoded_as_ou() -> None:
+def test_delixi_fault_04_is_decoded_as_ou_erratum_d8() -> None:
     (ou,) = {drive.fault.decode(4) for drive in (DelixiModbus, DelixiNative)}
     assert ou.name == "OU_OVERVOLTAGE"
 
 
 @pytest.mark.parametrize("code", [1, 2, 0x42])
-def test_d13_y15_any_exception_code_is_a_refusal(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+def test_any_exception_code_is_a_refusal_erratum_d13_y15(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
     for make in (delixi, yd):
         line, drive, _ = one(monkeypatch, make())
         refusal = build_reply(Framing.RTU, Message(1, 3, exception=code))
@@ -499,39 +507,39 @@ def test_d13_y15_any_exception_code_is_a_refusal(monkeypatch: pytest.MonkeyPatch
         assert raised.value.code == code
 
 
-def test_d7_faults_10_to_14_are_decoded_in_decimal_and_hex() -> None:
+def test_delixi_faults_10_to_14_are_decoded_in_decimal_and_hex_erratum_d7() -> None:
     assert [DelixiNative.fault.decode(0x0A + at) for at in range(5)] == [
         DelixiNative.fault.decode(0x10 + at) for at in range(5)
     ]
 
 
-def test_y5_y6_only_functions_03_and_06_and_no_address_0() -> None:
+def test_yd1000_uses_only_functions_03_and_06_and_never_address_0_erratum_y5_y6() -> None:
     assert {(register.table.read, register.table.write) for register in YD1000.registers.values()} == {(3, 6)}
     assert YD1000.most_registers == {HOLDING: 1}
     with pytest.raises(ValueError, match="1 to 63"):
         YD1000(0)
 
 
-def test_y3_y4_frame_lengths_follow_from_their_fields() -> None:
+def test_yd1000_frame_lengths_follow_from_their_fields_erratum_y3_y4() -> None:
     assert len(build_request(Framing.RTU, Message(1, 6, 0x1001, data=b"\x1f\x40"))) == 8
     request = Message(1, 3, 0x1100, 1)
     used, reply = reply_to(request, checksums.rtu("01 03 02 13 88").hex())
     assert (used, reply and reply.data) == (7, b"\x13\x88")
 
 
-def test_y8_frozen_state_is_not_reported_as_running(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frozen_yd1000_status_is_not_reported_as_running_erratum_y8(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1))
     run(line, drive, sim)
     line.sleep(2)
     drive.state()
     sim.pass_time(line.seconds)
     sim.trip(5)
-    assert drive.read(drive.status)  # the frozen register still shows a running motor
+    assert drive.read(drive.status)  # the frozen register still shows that the motor runs
     assert drive.state().condition is Condition.FAULT
     drive.stop()
 
 
-def test_y12_watchdog_setting_is_readable(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_yd1000_watchdog_setting_is_readable_erratum_y12(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1))
     assert "off" in line.bus.watchdog(drive)
     sim["communication_timeout"] = 7
@@ -540,7 +548,7 @@ def test_y12_watchdog_setting_is_readable(monkeypatch: pytest.MonkeyPatch) -> No
     assert drive.communication_timeout.default is None
 
 
-def test_0_8_registers_kept_in_eeprom_are_declared_as_eeprom() -> None:
+def test_registers_kept_in_eeprom_are_declared_as_eeprom_erratum_0_8() -> None:
     for register in YD1000.registers.values():
         in_ram = 0x1000 <= register.address <= 0x12FF
         assert (register.kept is Kept.EEPROM) == (not in_ram) or register.access.value == "reading"
@@ -549,8 +557,8 @@ def test_0_8_registers_kept_in_eeprom_are_declared_as_eeprom() -> None:
 # ---- adapters with an echo ----
 
 
-def test_0_3_adapter_echo_is_not_accepted_as_a_drive(monkeypatch: pytest.MonkeyPatch) -> None:
-    """If only copies of requests arrive, no write is sent, because no read gets a valid reply."""
+def test_echo_of_an_adapter_is_not_accepted_as_a_drive_erratum_0_3(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If only copies of the requests arrive, no read gets a valid reply, and no write is sent."""
     line = SimulatedBus(monkeypatch)
     drives = [line.attach(make) for make in (InvtCHE(1, maximum_frequency=50), ErmanERG220(2), YD1000(3))]
     for drive in drives:
@@ -574,7 +582,7 @@ OF_PRINT_ALONE = {
 }
 
 
-def test_every_erratum_has_a_test_or_a_reason_for_having_none() -> None:
+def test_every_erratum_of_a_document_has_a_test_or_a_reason_for_having_none() -> None:
     names = [*HAZARDS, *(name.upper() for name in globals() if name.startswith("test_"))]
     for family, last in FAMILIES.items():
         for number in range(1, last + 1):

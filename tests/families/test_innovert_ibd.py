@@ -69,7 +69,7 @@ TABLE = """
 """
 
 
-def test_registers_equal_the_table_typed_from_appendix_2() -> None:
+def test_innovert_ibd_registers_equal_the_table_typed_from_appendix_2() -> None:
     assert rows(InnovertIBD) == typed(TABLE)
 
 
@@ -77,11 +77,11 @@ def test_registers_equal_the_table_typed_from_appendix_2() -> None:
     ("name", "address"),
     [("PrA.03", 3), ("PrA.04", 4), ("Prb.00", 0x64), ("Prb.01", 0x65), ("Prb.07", 0x6B), ("Prb.08", 0x6C)],
 )
-def test_parameter_address_follows_from_its_letter_and_number(name: str, address: int) -> None:
+def test_innovert_ibd_parameter_address_follows_from_its_letter_and_number(name: str, address: int) -> None:
     assert parameter(name) == address
 
 
-def test_line_settings_and_limits_are_those_of_the_manual() -> None:
+def test_innovert_ibd_line_settings_and_limits_are_those_of_the_manual() -> None:
     assert str(InnovertIBD(240).settings) == "9600 8N1"
     assert sorted(InnovertIBD.baudrates) == [4800, 9600, 19200, 38400]
     assert InnovertIBD.formats == dict.fromkeys((Framing.RTU, Framing.ASCII), ("8N1", "8E1", "8O1"))
@@ -91,18 +91,19 @@ def test_line_settings_and_limits_are_those_of_the_manual() -> None:
     assert InnovertIBD(1).exception(2) == "a code that the document does not explain"
 
 
-def test_control_words_never_have_the_toggle_or_reserved_bits() -> None:
+def test_innovert_ibd_control_words_never_have_toggle_or_reserved_bits() -> None:
     assert {each.value for each in IBDControl} == {0, 1, 2, 3, 6, 7, 0x0A, 0x0B, 0x10}
 
 
-def test_terminal_bits_have_the_documented_names() -> None:
+def test_innovert_ibd_terminal_bits_have_the_documented_names() -> None:
     assert [bit.value for bit in Terminals] == [1 << at for at in (*range(11), 13)]
-    printed = InnovertIBD.terminals.decode(0x1800)  # from the manual's example; bits 11 and 12 have no name
+    # the value in the manual's example; bits 11 and 12 have no name
+    printed = InnovertIBD.terminals.decode(0x1800)
     assert InnovertIBD.terminals.format(printed) == "bit 11, bit 12"
 
 
 @table("framing", InnovertIBD.framings)
-def test_each_verb_sends_the_printed_frame(framing: Framing) -> None:
+def test_each_innovert_ibd_verb_sends_the_printed_frame(framing: Framing) -> None:
     wire = Wire(InnovertIBD(1, framing=framing), {**STANDING, "terminals": Terminals(0)}, turns=TURNS)
     wire.drive.set_frequency(50)
     wire.drive.start()
@@ -110,15 +111,15 @@ def test_each_verb_sends_the_printed_frame(framing: Framing) -> None:
     assert wire.sent == [FIFTY[framing], RUN[framing], STOP[framing]]
 
 
-def test_reset_and_a_setpoint_of_0_send_the_documented_frames() -> None:
+def test_innovert_ibd_reset_and_setpoint_0_send_the_documented_frames() -> None:
     wire = Wire(InnovertIBD(1), STANDING)
     wire.drive.reset_fault()
     wire.drive.set_frequency(0)
     assert wire.sent == [STOP[Framing.RTU], RESET, ZERO]
 
 
-def test_stop_is_sent_before_the_fault_reset() -> None:
-    """By table 3 the reset word leaves the run command unchanged, so an earlier run may still be active."""
+def test_innovert_ibd_gets_a_stop_before_the_fault_reset() -> None:
+    """By table 3, the reset word leaves the run command unchanged. So an earlier run may still be active."""
     stop = STOP[Framing.RTU]
     lost = [Unconfirmed("drive", "stop", "no reply")] * 3
     wire = Wire(InnovertIBD(1), STANDING, {stop: lost})
@@ -133,7 +134,7 @@ def test_stop_is_sent_before_the_fault_reset() -> None:
 
 
 @table("direction", Direction)
-def test_direction_without_forward_bit_is_refused(direction: Direction) -> None:
+def test_innovert_ibd_start_with_a_direction_needs_the_option_forward_bit(direction: Direction) -> None:
     wire = Wire(InnovertIBD(1))
     for verb in (wire.drive.start, wire.drive.jog):
         with pytest.raises(WriteForbidden, match="ambiguous"):
@@ -142,7 +143,9 @@ def test_direction_without_forward_bit_is_refused(direction: Direction) -> None:
 
 
 @table(("forward_bit", "forward", "reverse"), [(2, "06", "0A"), (3, "0A", "06")])
-def test_forward_bit_option_selects_the_direction_word(forward_bit: int, forward: str, reverse: str) -> None:
+def test_innovert_ibd_option_forward_bit_selects_the_direction_word(
+    forward_bit: int, forward: str, reverse: str
+) -> None:
     says = {**STANDING, "terminals": Terminals(0)}
     drive = InnovertIBD(1, forward_bit=forward_bit)
     words = [frame(drive, drive.control, IBDControl(int(each, 16))) for each in (forward, reverse, "02")]
@@ -154,10 +157,10 @@ def test_forward_bit_option_selects_the_direction_word(forward_bit: int, forward
     assert [each for each in wire.sent[1:] if each != STOP[Framing.RTU]] == words
 
 
-JOG = checksums.rtu("01 06 20 00 00 03").hex(" ").upper()  # table 3, bits 1 and 0
+JOG = checksums.rtu("01 06 20 00 00 03").hex(" ").upper()  # the value 3 in bits 1 and 0 means jog (table 3)
 
 
-def test_jog_sends_the_control_word_of_table_3() -> None:
+def test_innovert_ibd_jog_sends_the_control_word_of_table_3() -> None:
     wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0)}, turns={JOG: {"output_current": 0.4}})
     wire.drive.jog()
     assert wire.sent == [JOG]
@@ -168,8 +171,8 @@ def test_jog_sends_the_control_word_of_table_3() -> None:
     [{"motor_speed": 120.0}, {"output_current": 0.4}, {**PROGRAMMED, "terminals": Terminals.M01}],
     ids=["speed", "current", "outputs"],
 )
-def test_start_and_jog_of_a_turning_motor_are_refused(turning: dict[str, object]) -> None:
-    """A jog ends only with a stop; then the drive can be started (table 3)."""
+def test_innovert_ibd_start_and_jog_of_a_turning_motor_are_refused(turning: dict[str, object]) -> None:
+    """A jog ends only with a stop. After the stop, the drive can be started (table 3)."""
     wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0), **turning})
     wire.drive.set_frequency(50)
     for verb in (wire.drive.start, wire.drive.jog):
@@ -180,7 +183,7 @@ def test_start_and_jog_of_a_turning_motor_are_refused(turning: dict[str, object]
     assert wire.sent == [FIFTY[Framing.RTU]]
 
 
-def test_start_after_jog_and_stop_runs_at_the_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_innovert_ibd_start_after_jog_and_stop_runs_at_the_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, InnovertIBD(1))
     drive.jog()
     drive.set_frequency(50)
@@ -201,14 +204,16 @@ def test_start_after_jog_and_stop_runs_at_the_setpoint(monkeypatch: pytest.Monke
         ({}, "set_frequency"),
     ],
 )
-def test_start_is_refused_without_its_conditions(says: dict[str, object], sentence: str) -> None:
+def test_innovert_ibd_start_is_refused_in_a_fault_or_if_not_set_up(
+    says: dict[str, object], sentence: str
+) -> None:
     wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0), **says})
     with pytest.raises(WriteForbidden, match=sentence):
         wire.drive.start()
     assert wire.sent == []
 
 
-def test_identify_requires_its_own_address_or_the_confirmed_option() -> None:
+def test_innovert_ibd_identify_needs_its_address_or_the_option_confirmed() -> None:
     says = {"baudrate_setting": IBDBaudrate.B9600, "address_setting": 1}
     Wire(InnovertIBD(1), says).drive.identify()
     for other in (
@@ -221,7 +226,7 @@ def test_identify_requires_its_own_address_or_the_confirmed_option() -> None:
         Wire(InnovertIBD(1, confirmed=1), {**says, **other}).drive.identify()
 
 
-def test_start_is_unconfirmed_if_current_and_speed_stay_0() -> None:
+def test_innovert_ibd_start_is_unconfirmed_if_current_and_speed_stay_0() -> None:
     wire = Wire(InnovertIBD(1), STANDING | {"terminals": Terminals(0)})
     wire.drive.set_frequency(50)
     with pytest.raises(Unconfirmed, match="it is not seen to run; stop it, or it may start later"):
@@ -239,7 +244,7 @@ SEEN = {
 
 
 @table("name", SEEN)
-def test_a_drive_that_lacks_a_named_register_does_not_resemble_the_family(name: str) -> None:
+def test_drive_that_lacks_a_register_does_not_resemble_an_innovert_ibd(name: str) -> None:
     def resembles(says: dict[str, object]) -> bool:
         wire = Wire(InnovertIBD(1), says)
         found = wire.run(wire.drive.resembles())
@@ -250,7 +255,7 @@ def test_a_drive_that_lacks_a_named_register_does_not_resemble_the_family(name: 
     assert not resembles({**SEEN, name: DriveException("it", 2, "")})
 
 
-def test_stop_waits_until_neither_speed_nor_current_is_shown() -> None:
+def test_innovert_ibd_stop_waits_until_speed_and_current_are_0() -> None:
     wire = Wire(
         InnovertIBD(1), {**STANDING, "motor_speed": [900.0, 300.0, 0.0], "output_current": [1.2, 0.0]}
     )
@@ -261,7 +266,7 @@ def test_stop_waits_until_neither_speed_nor_current_is_shown() -> None:
         wire.drive.stop()
 
 
-def test_stop_is_confirmed_by_programmed_outputs() -> None:
+def test_innovert_ibd_stop_is_confirmed_by_programmed_outputs() -> None:
     says = {**STANDING, **PROGRAMMED, "terminals": [Terminals.M01 | Terminals.YABC, Terminals(0)]}
     wire = Wire(InnovertIBD(1), says)
     wire.drive.stop()
@@ -269,7 +274,7 @@ def test_stop_is_confirmed_by_programmed_outputs() -> None:
     assert "motor_speed" not in wire.reads
 
 
-def test_setpoint_is_limited_by_the_maximum_frequency_option() -> None:
+def test_innovert_ibd_setpoint_is_limited_by_the_option_maximum_frequency() -> None:
     wire = Wire(InnovertIBD(1, maximum_frequency=50))
     with pytest.raises(WriteForbidden, match=r"50\.50 Hz is above maximum_frequency, which is 50 Hz"):
         wire.drive.set_frequency(50.5)
@@ -278,7 +283,7 @@ def test_setpoint_is_limited_by_the_maximum_frequency_option() -> None:
     assert wire.sent == []
 
 
-def test_state_is_unknown_unless_the_outputs_are_programmed() -> None:
+def test_innovert_ibd_state_is_unknown_unless_its_outputs_are_programmed() -> None:
     refusal = DriveException("drive", 2, "")
     for says in (
         {**PROGRAMMED, "output_m01": 0},
@@ -293,7 +298,7 @@ def test_state_is_unknown_unless_the_outputs_are_programmed() -> None:
 @table(
     ("raw", "condition"),
     [
-        (0x1800, Condition.STOPPED),  # the printed reply, with reserved bits set
+        (0x1800, Condition.STOPPED),  # the value in the manual's example, with unnamed bits set
         (0x1900, Condition.RUNNING),
         (0x1B00, Condition.ACCELERATING),
         (0x1D00, Condition.DECELERATING),
@@ -301,12 +306,12 @@ def test_state_is_unknown_unless_the_outputs_are_programmed() -> None:
         (0x3900, Condition.FAULT),
     ],
 )
-def test_programmed_outputs_decode_to_the_state(raw: int, condition: Condition) -> None:
+def test_innovert_ibd_programmed_outputs_decode_to_the_state(raw: int, condition: Condition) -> None:
     says = {"terminals": InnovertIBD.terminals.decode(raw), **PROGRAMMED}
     assert Wire(InnovertIBD(1), says).drive.state().condition is condition
 
 
-def test_registers_never_written_are_inferred_or_select_the_source() -> None:
+def test_innovert_ibd_registers_with_inferred_addresses_are_never_written() -> None:
     never = {name for name, each in InnovertIBD.registers.items() if each.never}
     inferred = {name for name, each in InnovertIBD.registers.items() if 200 <= each.address < 0x2000}
     assert inferred <= never

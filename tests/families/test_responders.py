@@ -1,4 +1,4 @@
-"""Each of the 25 families commands two drives: a responder typed from its sources, and its simulation.
+"""Each of the 25 families commands two simulated drives: one typed from the manuals, and the library's.
 
 The responder shares no code and no table with the library: it splits, checks and builds frames itself.
 """
@@ -22,32 +22,34 @@ from multidrop.families import MODELS
 from multidrop.families.registry import SHIPPED, find_model
 
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, FAULT = 1, 2, 4
-INPUT, COIL, ON = 0x10000, 0x20000, 0xFF00  # INPUT and COIL are added to the addresses of these tables
-Word = tuple[int, int]  # address and value
+# the addresses of input registers and coils have these numbers added
+INPUT, COIL, ON = 0x10000, 0x20000, 0xFF00
+Word = tuple[int, int]  # address and value of a register that is written
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """Facts from a family's sources: register values at rest and while running, and what each verb writes."""
+    """A family's manual as tables: register values at rest and while running, and the words of each verb."""
 
-    rest: Mapping[int, int]  # all readable registers, with their values at rest
-    shown: Mapping[str, float]  # values on the keypad while the motor turns, by register
+    rest: Mapping[int, int]  # values at rest of all readable registers, by address
+    shown: Mapping[str, float]  # values on the keypad while the motor turns, by register name
     turning: Mapping[int, int] = field(default_factory=dict)
     tripped: Mapping[int, int] = field(default_factory=dict)
-    setpoint: Word = (0, 0)  # write of a setpoint of 20 Hz
-    starts: tuple[Word, ...] = ()  # words of a start; the last one runs the motor
+    setpoint: Word = (0, 0)  # the write that sets a setpoint of 20 Hz
+    starts: tuple[Word, ...] = ()  # the writes of a start; the last one runs the motor
     stops: tuple[Word, ...] = ()
-    reset: Word | None = None  # the word that resets a fault; None if the document has none
-    before_reset: tuple[Word, ...] | None = None  # words that precede the reset; None: those of a stop
-    after_reset: tuple[Word, ...] = ()  # words that follow the reset
+    reset: Word | None = None  # the write that resets a fault; None if the document has none
+    before_reset: tuple[Word, ...] | None = None  # writes before the reset; None: the writes of a stop
+    after_reset: tuple[Word, ...] = ()  # writes after the reset
     write: int = 6
-    shows_setpoint: int = 0  # address of a register that repeats the setpoint
-    passes: Mapping[Word, Mapping[int, int]] = field(default_factory=dict)  # by word: register values then
-    standing: Condition = Condition.STOPPED  # condition that the drive's state shows at rest
-    failed: Condition = Condition.FAULT  # condition that the state shows in a fault
+    shows_setpoint: int = 0  # address of a register that shows the setpoint; 0: there is none
+    # by write: the register values that it causes
+    passes: Mapping[Word, Mapping[int, int]] = field(default_factory=dict)
+    standing: Condition = Condition.STOPPED  # condition of the drive's state at rest
+    failed: Condition = Condition.FAULT  # condition of the drive's state in a fault
 
 
-# ER-G-220-01(02) protocol 1.4, section 10. Reads across reserved registers are answered with 0 (section 6).
+# ER-G-220-01(02) protocol 1.4, section 10. Reads of reserved registers are answered with 0 (section 6).
 ERMAN = Sheet(
     dict.fromkeys(range(0x59), 0)
     | dict.fromkeys(range(INPUT, INPUT + 0x1000), 0)
@@ -61,7 +63,8 @@ ERMAN = Sheet(
     (COIL + 9, ON),
     before_reset=((COIL + 0, 0),),
     after_reset=((COIL + 9, 0),),
-    failed=Condition.STOPPED,  # 0402H is the last fault, and may be past
+    # 0402H is the last fault, which may be over, so the state shows only that the motor is at rest
+    failed=Condition.STOPPED,
 )
 # CP2000 manual p. 12.1-09-8, MS300 p. 788 to 790, VFD-EL-W p. 4-83: bits 1 and 0 of 2101H are 00 at rest.
 DELTA = Sheet(
@@ -81,7 +84,7 @@ DELTA = Sheet(
 def with_registers(
     sheet: Sheet, rest: Mapping[int, int], turning: Mapping[int, int], **shown: float
 ) -> Sheet:
-    """Return a sheet with more registers, and with more values on the keypad."""
+    """Return a copy of the sheet with more registers, and with more values on the keypad."""
     return replace(
         sheet, rest={**sheet.rest, **rest}, turning={**sheet.turning, **turning}, shown=sheet.shown | shown
     )
@@ -315,7 +318,7 @@ COMMANDED = [name for name in SHEETS if name not in READ_ONLY]
 
 
 class Responder:
-    """A drive with registers and a motor, which replies to frames. It knows only its sheet."""
+    """A simulated drive with registers and a motor. It only knows its sheet, and no code of this library."""
 
     def __init__(self, sheet: Sheet) -> None:
         self.sheet = sheet
@@ -376,14 +379,14 @@ class Responder:
 
 
 def made(name: str) -> Drive:
-    """Return a drive of this family with the options that its owner must set."""
+    """Return a drive of this family, with the options that the family requires."""
     if name in COMMANDED and name in SHIPPED:
         return shipped(name, 1)
     return find_model(name)(1, **({"maximum_frequency": 50} if name == "invt-che" else {}))
 
 
 def connected(monkeypatch: pytest.MonkeyPatch, name: str) -> tuple[Any, Responder]:
-    """Return a drive on a bus whose frames the family's responder hears."""
+    """Return a drive on a bus, and the responder that receives its frames."""
     there = Responder(SHEETS[name])
     line = SimulatedBus(monkeypatch)
 
@@ -405,7 +408,7 @@ def test_each_of_the_25_families_has_a_responder() -> None:
 
 
 @table("name", COMMANDED)
-def test_start_stop_and_reset_send_the_documented_words_and_readings_match(name: str) -> None:
+def test_start_stop_and_reset_send_the_documented_words_and_values_match(name: str) -> None:
     sheet = SHEETS[name]
     with pytest.MonkeyPatch.context() as monkeypatch:
         driven, there = connected(monkeypatch, name)
@@ -431,7 +434,7 @@ def test_start_stop_and_reset_send_the_documented_words_and_readings_match(name:
 
 
 @table("name", READ_ONLY)
-def test_readings_of_a_family_without_commands_match(name: str) -> None:
+def test_values_read_from_a_responder_without_commands_match_its_manual(name: str) -> None:
     with pytest.MonkeyPatch.context() as monkeypatch:
         drive, there = connected(monkeypatch, name)
         drive.bus.check_identity(drive)

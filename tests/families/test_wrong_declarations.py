@@ -1,4 +1,6 @@
-"""Wrong declarations: every family that commands a motor, declared for every other simulated drive."""
+"""Wrong declarations: a drive is declared as a family that commands motors, but another family's drive
+is connected.
+"""
 
 from __future__ import annotations
 
@@ -33,18 +35,19 @@ BUILT_IN: dict[str, Callable[[int], Drive]] = {
 DECLARED = {**BUILT_IN, **{name: partial(shipped, name) for name in COMMANDED}}
 every_declaration = pytest.mark.parametrize("declared", [*BUILT_IN, *usually(*COMMANDED)])
 THERE: dict[str, Callable[[int], Any]] = {**DECLARED, **{name: shipped_family(name) for name in READ_ONLY}}
-# Families with the same registers and words: each can command the other's drives.
+# Families with the same registers and control words: each can command drives of the other.
 SAME_WORDS = (
     {"delta-vfd-el", "delta-ms300", "delta-cp2000"},
     {"erman-er-g-220", "erman-er-g-220-02"},
     {"innovert-ibd", "innovert-idd-mini-plus"},
     {"yaskawa-a1000", "yaskawa-v1000"},
 )
-# Families with INVT's words at the same addresses: a stop is sent, and a start is refused.
+# Families with INVT's control words at the same addresses: a stop is sent, and a start is refused.
 SAME_STOP = {"invt-che", "invt-chf100a", "fuling-dzb"}
 
 AT_2000 = ("invt-goodrive", "powtran-pi130")
-# Stops that would run another make's motor; withheld if that make is proven. See docs/reference/profiles.md.
+# Pairs of families in which one's stop word would run the other's motor. The stop is withheld if the drive
+# proves its make. See docs/reference/profiles.md.
 RUNS_AT_A_STOP = {
     **dict.fromkeys(("innovert-ibd", "innovert-idd-mini-plus", "delixi-modbus"), AT_2000),
     **dict.fromkeys(("delta-vfd-el", "delta-ms300", "delta-cp2000"), AT_2000),
@@ -53,7 +56,8 @@ RUNS_AT_A_STOP = {
         *("delta-vfd-el", "delta-ms300", "delta-cp2000"),
     ),
 }
-RECOGNISED = {"invt-che", "yd1000"}  # built-in makes: no frame of another family is sent to them
+# built-in makes that are always recognised: they get no frame of another family
+RECOGNISED = {"invt-che", "yd1000"}
 
 
 def same_words(declared: str, there: str) -> bool:
@@ -61,7 +65,7 @@ def same_words(declared: str, there: str) -> bool:
 
 
 class Pair:
-    """A declared drive, and the simulated drive of another make at its address, whose motor may turn."""
+    """A declared drive, and a simulated drive of another make at its address, whose motor may turn."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, declared: str, there: str, turns: bool) -> None:
         self.sim: Any = simulated(THERE[there](1))
@@ -81,7 +85,7 @@ class Pair:
 
 @every_declaration
 @table("there", THERE)
-def test_no_command_is_sent_to_another_make(
+def test_no_command_is_sent_to_a_drive_of_another_make(
     monkeypatch: pytest.MonkeyPatch, declared: str, there: str
 ) -> None:
     if declared == there or same_words(declared, there):
@@ -97,7 +101,7 @@ def test_no_command_is_sent_to_another_make(
 @pytest.mark.parametrize("turns", usually(True, False), ids=["turning", "at rest"])
 @every_declaration
 @table("there", THERE)
-def test_stop_never_runs_another_make_or_reports_done_while_it_turns(
+def test_stop_never_runs_another_makes_motor_or_succeeds_while_it_turns(
     monkeypatch: pytest.MonkeyPatch, declared: str, turns: bool, there: str
 ) -> None:
     if declared == there or same_words(declared, there):
@@ -124,21 +128,24 @@ def test_stop_never_runs_another_make_or_reports_done_while_it_turns(
     if {declared, there} <= SAME_STOP:
         assert pair.bus.written != []
         return
-    assert failure is not None  # registers that are 0 do not prove a standstill
+    assert failure is not None  # registers with the value 0 do not prove that the motor is at rest
 
 
 @table(("declared", "there"), [(one, other) for one, others in RUNS_AT_A_STOP.items() for other in others])
-def test_documentation_lists_the_withheld_stops(declared: str, there: str) -> None:
+def test_documentation_lists_the_stops_that_are_withheld(declared: str, there: str) -> None:
     page = (Path(__file__).parents[2] / "docs" / "reference" / "profiles.md").read_text("utf-8")
     rows = [row.split("|") for row in page.splitlines() if re.search(r"\| 000[16]H \|", row)]
     assert any(f"`{declared}`" in row[1] and f"`{there}`" in row[3] for row in rows)
 
 
 @pytest.mark.parametrize("declared", ["delta-vfd-el", "delta-cp2000"])
-def test_parameter_that_looks_like_the_address_does_not_hide_a_goodrive(
+def test_parameter_with_the_value_of_the_address_does_not_hide_a_goodrive(
     monkeypatch: pytest.MonkeyPatch, declared: str
 ) -> None:
-    """0900H of a Goodrive is P09.00, the PID reference's source; its value may equal the drive's address."""
+    """Register 0900H of a Goodrive is P09.00, the source of the PID reference.
+
+    Its value may equal the address.
+    """
     pair = Pair(monkeypatch, declared, "invt-goodrive", turns=False)
     show = pair.sim.answer
     pair.sim.answer = lambda request, now: (
@@ -155,8 +162,8 @@ def replace_data(request: Any, value: int) -> Any:
     return type(request)(request.address, request.function, data=value.to_bytes(2))
 
 
-def test_a_goodrive_declared_as_a_confirmed_ibd_is_not_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The owner has confirmed the drive as an IBD, and a Goodrive has replaced it since."""
+def test_goodrive_declared_as_a_confirmed_innovert_ibd_does_not_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The owner had confirmed the drive as an IBD before a Goodrive replaced it."""
     sim: Any = simulated(shipped("invt-goodrive", 1))
     bus = SimulatedBus(monkeypatch, sim)
     drive = bus.attach(InnovertIBD(1, confirmed=1))
@@ -168,8 +175,10 @@ def test_a_goodrive_declared_as_a_confirmed_ibd_is_not_run(monkeypatch: pytest.M
     assert not sim.motor.energised
 
 
-def test_a_delta_declared_as_a_goodrive_is_stopped_and_gets_no_coast(monkeypatch: pytest.MonkeyPatch) -> None:
-    """0005H stops both; 0006H, which coasts a Goodrive, would run a Delta."""
+def test_delta_drive_declared_as_a_goodrive_is_stopped_but_gets_no_coast(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The word 5 stops both drives. The word 6 coasts a Goodrive, but would run a Delta."""
     pair = Pair(monkeypatch, "invt-goodrive", "delta-vfd-el", turns=True)
     with pytest.raises(WriteForbidden, match="multidrop stop PORT delta-vfd-el 1"):
         pair.drive.coast(seconds=1)
@@ -179,7 +188,7 @@ def test_a_delta_declared_as_a_goodrive_is_stopped_and_gets_no_coast(monkeypatch
     assert pair.bus.written != []
 
 
-def test_chf100a_declared_as_a_che_is_stopped_and_its_model_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_for_a_chf100a_declared_as_a_che_names_the_right_model(monkeypatch: pytest.MonkeyPatch) -> None:
     pair = Pair(monkeypatch, "invt-che", "invt-chf100a", turns=True)
     with pytest.raises(WriteForbidden, match="declare model invt-chf100a"):
         pair.drive.start()
@@ -188,7 +197,7 @@ def test_chf100a_declared_as_a_che_is_stopped_and_its_model_is_named(monkeypatch
     assert not pair.turns
 
 
-def test_an_erman_declared_as_an_optidrive_has_an_unknown_state(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_erman_declared_as_an_optidrive_has_an_unknown_state(monkeypatch: pytest.MonkeyPatch) -> None:
     pair = Pair(monkeypatch, "optidrive-e3", "erman-er-g-220", turns=True)
     with pytest.raises(Unconfirmed, match=r"are all 0, and so may be unused registers .*: look at the motor"):
         pair.drive.stop()
@@ -196,7 +205,7 @@ def test_an_erman_declared_as_an_optidrive_has_an_unknown_state(monkeypatch: pyt
 
 
 @table("declared", COMMANDED)
-def test_a_stop_is_sent_although_a_gateway_answers_ffff_for_the_drive(
+def test_stop_is_sent_although_a_gateway_answers_ffff_for_the_drive(
     monkeypatch: pytest.MonkeyPatch, declared: str
 ) -> None:
     bus = SimulatedBus(monkeypatch)
@@ -226,7 +235,7 @@ def ask(sim: Any, drive: Drive, request: Message) -> Message:
 
 
 @table("there", [*RECOGNISABLE, "invt-che", "yd1000", "delixi-modbus"])
-def test_scan_finds_the_drives_that_identify_themselves(there: str) -> None:
+def test_scan_finds_only_drives_that_identify_themselves(there: str) -> None:
     drive = THERE[there](1)
     sweep = Sweep(drive.settings, drive.framing, (), ScanRequest(3, 0, 1), (1,), 0.0, 0.0)
     found, doubt = identify(sweep, 1, SCANNED, partial(ask, simulated(drive)))

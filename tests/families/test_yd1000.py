@@ -1,4 +1,4 @@
-"""YD1000: the register table, and the frames that verbs send; the document prints only command words."""
+"""YD1000: the register table, and the frames of verbs. The document prints only the control words."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ STANDING = {
 }
 AT_30_HZ = {**STANDING, "frequency": 30.0}
 
-# Address, name, step and unit; factory value; changeable while running.
+# Columns: address, name, step and unit; factory value; changeable while running.
 TURNS = {
     FORWARD: {"output_frequency": 12.0, "status": YD1000Status.RUN},
     REVERSE: {"output_frequency": 12.0, "status": YD1000Status.RUN | YD1000Status.REVERSE},
@@ -120,20 +120,20 @@ def parameters() -> list[tuple[str, ...]]:
     return [tuple(line.split()) for line in PARAMETERS.strip().splitlines()]
 
 
-def test_registers_equal_the_typed_tables_of_sections_6_and_7() -> None:
+def test_yd1000_registers_equal_the_typed_tables_of_sections_6_and_7() -> None:
     basic = "\n".join(f"03/06 {' '.join(row[:-2])}" for row in parameters())
     assert rows(YD1000) == typed(basic + OTHERS)
 
 
 @table("row", parameters())
-def test_factory_values_and_locks_while_running_are_those_of_the_notes(row: tuple[str, ...]) -> None:
+def test_yd1000_factory_values_and_locks_while_running_are_as_documented(row: tuple[str, ...]) -> None:
     register = YD1000.registers[row[1]]
     assert register.default == (None if row[-2] == "X" else float(row[-2]))
     assert register.while_running == (row[-1] == "Y")
     assert register.kept is Kept.EEPROM
 
 
-def test_spans_are_those_of_the_notes() -> None:
+def test_yd1000_limits_are_those_of_the_notes() -> None:
     spans = {name: each.span for name, each in YD1000.registers.items() if each.span}
     assert spans["acceleration_time"] == spans["deceleration_time"] == (0.1, 3600)
     assert spans["maximum_frequency"] == (30, 320)
@@ -144,12 +144,12 @@ def test_spans_are_those_of_the_notes() -> None:
     assert (spans["thermal_protection"], spans["automatic_environment"]) == ((0, 7), (0, 2))
 
 
-def test_registers_are_declared_as_ram_or_eeprom() -> None:
+def test_yd1000_registers_are_declared_as_ram_or_eeprom() -> None:
     ram = {name for name, each in YD1000.registers.items() if each.kept is Kept.RAM}
     assert ram == {"control", "frequency", "panel_frequency"}
 
 
-def test_registers_never_written_are_those_of_the_notes() -> None:
+def test_yd1000_registers_that_are_never_written_are_those_of_the_notes() -> None:
     never: dict[str, set[int]] = {}
     for register in YD1000.registers.values():
         never.setdefault(register.never, set()).add(register.address)
@@ -165,13 +165,13 @@ def test_registers_never_written_are_those_of_the_notes() -> None:
             0x0008,  # FR
             0x0103,  # F103, ST
             0x0104,  # F104, RST
-            0x0110,  # F110, always on
-            *range(0x0111, 0x0116),  # F111 to F115, the inputs
+            0x0110,  # F110, a function that is always on
+            *range(0x0111, 0x0116),  # F111 to F115, the functions of the inputs
         },
     }
 
 
-def test_line_parameters_are_read_only() -> None:
+def test_yd1000_line_parameters_are_read_only() -> None:
     """By section 7, 0800H and 0801H take effect after a reset or power-on, 0802H and 0803H immediately."""
     later = {register.address for register in YD1000.registers.values() if "after a reset" in register.note}
     at_once = {register.address for register in YD1000.registers.values() if "at once" in register.note}
@@ -181,7 +181,7 @@ def test_line_parameters_are_read_only() -> None:
     assert YD1000.communication_timeout.span == (0, 100)
 
 
-def test_extended_parameter_address_follows_from_its_name() -> None:
+def test_yd1000_extended_parameter_address_follows_from_its_name() -> None:
     """The letter F of the name becomes the digit 0 of the address (section 6.2)."""
 
     class Mine(YD1000):
@@ -198,13 +198,13 @@ def test_extended_parameter_address_follows_from_its_name() -> None:
             with pytest.raises(
                 ValueError, match=f"^{name} is already declared for every YD1000, as {register.name}$"
             ):
-                extended(name)  # a register with `never` cannot be redeclared as writable
+                extended(name)  # a register that is declared with `never` must not become writable
     for wrong in ("F1000", "F24A", "f240", "240", "F24"):
         with pytest.raises(ValueError, match="F and three digits"):
             extended(wrong)
 
 
-def test_control_and_status_bits_have_the_documented_names() -> None:
+def test_yd1000_control_and_status_bits_have_the_documented_names() -> None:
     assert {bit.name: bit.value.bit_length() - 1 for bit in YD1000Control} == {
         "COMMAND_VALID": 15,
         "FREQUENCY_VALID": 14,
@@ -223,11 +223,11 @@ def test_control_and_status_bits_have_the_documented_names() -> None:
     }
     assert {bit.value.bit_length() - 1 for bit in YD1000Status} == {10, 9, 8, 7, 6}
     assert [bit.name for bit in Inputs] == ["F", "R", "RST", "S1", "S2"]
-    assert Inputs.S1 | Inputs.F == 9  # the example of section 8.2
+    assert Inputs.S1 | Inputs.F == 9  # the example in section 8.2
     assert Outputs.OUT1 | Outputs.OUT2 == 3
 
 
-def test_no_control_word_has_both_reset_and_run() -> None:
+def test_no_yd1000_control_word_has_both_reset_and_run() -> None:
     for turning in (YD1000Control.RUN, YD1000Control.JOG):
         with pytest.raises(ValueError, match=r"RESET.* are never written together"):
             YD1000.control.encode(YD1000Control.COMMAND_VALID | YD1000Control.RESET | turning)
@@ -235,7 +235,7 @@ def test_no_control_word_has_both_reset_and_run() -> None:
         YD1000.control.encode(YD1000Control(0x8010))
 
 
-def test_line_settings_and_limits_are_those_of_the_notes() -> None:
+def test_yd1000_line_settings_and_limits_are_those_of_the_notes() -> None:
     drive = YD1000(63)
     assert str(drive.settings) == "9600 8E1"
     assert drive.needed_silence() == pytest.approx(24 * 11 / 9600)
@@ -260,11 +260,13 @@ def test_line_settings_and_limits_are_those_of_the_notes() -> None:
         (YD1000Control(0), "01 06 10 00 00 00 8D 0A"),
     ],
 )
-def test_control_words_without_bit_14_are_encoded_as_printed(word: YD1000Control, printed: str) -> None:
+def test_yd1000_control_words_without_bit_14_are_encoded_as_printed(
+    word: YD1000Control, printed: str
+) -> None:
     assert frame(YD1000(1), YD1000.control, word) == printed
 
 
-def test_start_sends_the_run_word() -> None:
+def test_yd1000_start_sends_the_run_word() -> None:
     wire = Wire(YD1000(1), AT_30_HZ, turns=TURNS)
     wire.drive.start()
     wire.drive.start(Direction.FORWARD)
@@ -272,7 +274,7 @@ def test_start_sends_the_run_word() -> None:
     assert wire.sent == [FORWARD, FORWARD, REVERSE]
 
 
-def test_start_without_a_direction_keeps_a_running_motors_direction() -> None:
+def test_yd1000_start_without_a_direction_keeps_a_running_motors_direction() -> None:
     wire = Wire(YD1000(1), {**AT_30_HZ, **TURNS[REVERSE]})
     wire.drive.start()
     assert wire.sent == [REVERSE]
@@ -292,7 +294,9 @@ def yd_word(word: int) -> str:
         ({"second_ramp": 0, "setpoint_by_fnod": 0}, 0xC400, 0xC600),
     ],
 )
-def test_start_options_select_the_control_bits(options: dict[str, float], forward: int, reverse: int) -> None:
+def test_yd1000_start_options_select_the_control_bits(
+    options: dict[str, float], forward: int, reverse: int
+) -> None:
     words = [yd_word(forward), yd_word(reverse)]
     turns = dict(zip(words, (TURNS[FORWARD], TURNS[REVERSE]), strict=True))
     wire = Wire(YD1000(1, **options), AT_30_HZ, turns=turns)
@@ -301,14 +305,14 @@ def test_start_options_select_the_control_bits(options: dict[str, float], forwar
     assert wire.sent == words
 
 
-def test_start_without_a_setpoint_is_refused() -> None:
+def test_yd1000_start_without_a_setpoint_is_refused() -> None:
     wire = Wire(YD1000(1), STANDING | {"frequency": 0.0}, turns=TURNS)
     with pytest.raises(WriteForbidden, match=r"the setpoint of .* is 0: call set_frequency before start"):
         wire.drive.start()
     assert wire.sent == []
 
 
-def test_start_ignores_1001h_with_setpoint_by_fnod() -> None:
+def test_yd1000_start_with_setpoint_by_fnod_ignores_the_setpoint_1001h() -> None:
     wire = Wire(YD1000(1, setpoint_by_fnod=1), STANDING, turns={yd_word(0x8400): TURNS[FORWARD]})
     wire.drive.start()
     assert wire.sent == [yd_word(0x8400)]
@@ -325,7 +329,7 @@ AT_PRESET = {
 
 
 @table(("number", "bits"), [(1, 0x8), (2, 0x4), (3, 0xC), (4, 0x2), (5, 0xA), (6, 0x6), (7, 0xE)])
-def test_start_waits_until_1202h_shows_the_preset_speed(number: int, bits: int) -> None:
+def test_yd1000_start_waits_until_1202h_shows_the_preset_speed(number: int, bits: int) -> None:
     select, run = yd_word(0xC000 | bits), yd_word(0xC600 | bits)
     wire = Wire(
         YD1000(1, preset_speed=number),
@@ -346,7 +350,7 @@ def test_start_waits_until_1202h_shows_the_preset_speed(number: int, bits: int) 
         ({"held_frequency": 30.0}, [], r"has a fault.*reset_fault\(\)"),
     ],
 )
-def test_start_is_refused_if_1202h_does_not_show_the_preset_speed(
+def test_yd1000_start_is_refused_if_1202h_does_not_show_the_preset_speed(
     says: dict[str, object], sent: list[str], sentence: str
 ) -> None:
     wire = Wire(YD1000(1, preset_speed=3), {**AT_PRESET, **says})
@@ -355,7 +359,7 @@ def test_start_is_refused_if_1202h_does_not_show_the_preset_speed(
     assert wire.sent == sent
 
 
-def test_jog_leaves_the_run_bit_off() -> None:
+def test_yd1000_jog_leaves_the_run_bit_off() -> None:
     jogs = [frame(YD1000(1), YD1000.control, YD1000Control(word)) for word in (0xC100, 0xC300)]
     turns = dict(zip(jogs, (TURNS[FORWARD], TURNS[REVERSE]), strict=True))
     wire = Wire(YD1000(1), STANDING, turns=turns)
@@ -364,7 +368,7 @@ def test_jog_leaves_the_run_bit_off() -> None:
     assert [each[:17] for each in wire.sent] == ["01 06 10 00 C1 00", "01 06 10 00 C3 00"]
 
 
-def test_stop_keeps_bit_15_until_two_readings_of_0_hz() -> None:
+def test_yd1000_stop_keeps_bit_15_and_waits_for_two_readings_of_0_hz() -> None:
     wire = Wire(YD1000(1), {**STANDING, "output_frequency": [20.0, 0.0, 3.0, 0.0, 0.0]})
     wire.drive.stop()
     assert wire.sent == [STOP]
@@ -378,7 +382,7 @@ def test_stop_keeps_bit_15_until_two_readings_of_0_hz() -> None:
     assert wire.sent == [STOP]
 
 
-def test_no_other_verb_releases_control() -> None:
+def test_no_yd1000_verb_except_release_control_clears_bits_15_and_14() -> None:
     wire = Wire(YD1000(1), AT_30_HZ, turns=TURNS)
     for verb in (
         wire.drive.start,
@@ -392,7 +396,7 @@ def test_no_other_verb_releases_control() -> None:
     assert all(word & 0xC000 == 0xC000 for word in words)
 
 
-def test_emergency_stop_bit_is_cleared_once_it_is_confirmed() -> None:
+def test_yd1000_emergency_stop_bit_is_cleared_once_it_is_confirmed() -> None:
     wire = Wire(YD1000(1), STANDING)
     wire.drive.emergency_stop()
     assert [wire.sent[0][:17], *wire.sent[1:]] == ["01 06 10 00 D0 00", STOP]
@@ -403,24 +407,24 @@ def test_emergency_stop_bit_is_cleared_once_it_is_confirmed() -> None:
 
 
 @table("failure", [Unconfirmed("drive", "stop", "no reply"), DriveException("drive", 4, "")])
-def test_emergency_stop_is_a_pulse_and_sent_once(failure: Exception) -> None:
+def test_yd1000_emergency_stop_is_sent_only_once(failure: Exception) -> None:
     pulse = frame(YD1000(1), YD1000.control, YD1000Control(0xD000))
     wire = Wire(YD1000(1), STANDING, {pulse: [failure]})
     wire.drive.emergency_stop()
     assert wire.sent == [pulse, STOP]
 
 
-def test_coast_sends_its_bit_and_waits_for_two_zero_readings() -> None:
+def test_yd1000_coast_sends_its_bit_and_waits_for_two_readings_of_0_hz() -> None:
     wire = Wire(YD1000(1), STANDING)
     wire.drive.coast()
     assert [each[:17] for each in wire.sent] == ["01 06 10 00 C8 00"]
-    assert wire.seconds == 0.1  # the pause between the two readings that must both be 0
+    assert wire.seconds == 0.1  # the pause between the two readings of 0 Hz
     wire = Wire(YD1000(1), {**STANDING, "output_frequency": 3.0})
     with pytest.raises(Unconfirmed, match="5 s"):
         wire.drive.coast()
 
 
-def test_reset_is_sent_once_and_followed_by_a_stop() -> None:
+def test_yd1000_reset_is_sent_once_and_followed_by_a_stop() -> None:
     reset = frame(YD1000(1), YD1000.control, YD1000Control(0xE000))
     wire = Wire(YD1000(1), STANDING, {reset: [Unconfirmed("drive", "reset", "no reply")]})
     wire.drive.reset_fault()
@@ -437,8 +441,8 @@ def test_reset_is_sent_once_and_followed_by_a_stop() -> None:
     assert turning.sent == []
 
 
-def test_start_after_a_reset_requires_a_new_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The restart loses the written setpoint; a start at the drive's own setpoint was not requested."""
+def test_yd1000_start_after_a_reset_requires_a_new_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The restart loses the written setpoint. A start at the drive's own setpoint was not requested."""
     wire = Wire(YD1000(1), AT_30_HZ, turns=TURNS)
     wire.drive.set_frequency(30)
     wire.drive.reset_fault()
@@ -474,8 +478,10 @@ FUNCTIONS = {f"input_{at}_function": factory for at, factory in enumerate((2.0, 
         ({"always_on_function": 3.0}, "F110"),
     ],
 )
-def test_reset_is_refused_while_a_terminal_says_run(says: dict[str, object], terminal: str) -> None:
-    """A restart may clear bit 15, as a power-on does (section 8.1); then the terminals are in control."""
+def test_yd1000_reset_is_refused_while_a_terminal_commands_a_run(
+    says: dict[str, object], terminal: str
+) -> None:
+    """A restart may clear bit 15, as power-on does (section 8.1). Then the terminals command the motor."""
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, **says})
     with pytest.raises(WriteForbidden, match=f"^{terminal}.* is set to run, and may start the motor"):
         wire.drive.reset_fault()
@@ -483,14 +489,14 @@ def test_reset_is_refused_while_a_terminal_says_run(says: dict[str, object], ter
 
 
 @table("closed", [Inputs.RST | Inputs.S1, Inputs(0)])
-def test_other_terminals_do_not_block_a_reset(closed: Inputs) -> None:
+def test_yd1000_terminals_without_a_run_function_do_not_block_a_reset(closed: Inputs) -> None:
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, "inputs": closed})
     wire.drive.reset_fault()
     assert wire.sent == [frame(YD1000(1), YD1000.control, YD1000Control(0xE000)), STOP]
 
 
-def test_a_limit_that_the_notes_do_not_state_names_its_source() -> None:
-    """The notes limit UL to FH, but not FH to UL. The library infers that FH must not be below UL."""
+def test_yd1000_limit_that_the_notes_do_not_state_names_its_source() -> None:
+    """The notes limit UL to at most FH, but not FH to at least UL. The library infers the second limit."""
     wire = Wire(YD1000(1), {**STANDING, "upper_limit_frequency": 60.0})
     with pytest.raises(
         WriteForbidden, match=r"50\.00 Hz is below upper_limit_frequency, which is 60 Hz"
@@ -499,14 +505,15 @@ def test_a_limit_that_the_notes_do_not_state_names_its_source() -> None:
     assert str(refusal.value).endswith("(in the manual, maximum_frequency is 6.1, FH)")
 
 
-RELEASE = checksums.rtu("01 06 10 00 00 00").hex(" ").upper()  # section 8.1: bits 15 and 14 off
+# the word 0: bits 15 and 14 are off (section 8.1)
+RELEASE = checksums.rtu("01 06 10 00 00 00").hex(" ").upper()
 
 
-def test_release_control_is_refused_unless_the_motor_is_at_rest() -> None:
+def test_yd1000_release_control_is_refused_unless_the_motor_is_at_rest() -> None:
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS})
     wire.drive.release_control()
     assert wire.sent == [RELEASE]
-    for frequencies in (12.0, [0.0, 12.0]):  # 1100H must be 0 in two readings
+    for frequencies in (12.0, [0.0, 12.0]):  # 1100H must be 0 in two successive readings
         wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, "output_frequency": frequencies})
         with pytest.raises(WriteForbidden, match=r"turns: call stop\(\) first"):
             wire.drive.release_control()
@@ -521,7 +528,9 @@ def test_release_control_is_refused_unless_the_motor_is_at_rest() -> None:
         ({"always_on_function": 3.0}, "F110"),
     ],
 )
-def test_release_control_is_refused_while_a_terminal_says_run(says: dict[str, object], terminal: str) -> None:
+def test_yd1000_release_control_is_refused_while_a_terminal_commands_a_run(
+    says: dict[str, object], terminal: str
+) -> None:
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, **says})
     with pytest.raises(
         WriteForbidden, match=f"^{terminal}.* is set to run, .* once the line no longer commands it"
@@ -530,7 +539,7 @@ def test_release_control_is_refused_while_a_terminal_says_run(says: dict[str, ob
     assert wire.sent == []
 
 
-def test_motor_that_turns_after_release_control_is_stopped_again() -> None:
+def test_yd1000_motor_that_turns_after_release_control_is_stopped_again() -> None:
     turns = {RELEASE: {"output_frequency": [0.0, 0.0, 1.5]}}
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS}, turns=TURNS | turns)
     with pytest.raises(
@@ -541,7 +550,7 @@ def test_motor_that_turns_after_release_control_is_stopped_again() -> None:
 
 
 @table("is_sent", [True, False])
-def test_stop_is_written_again_if_release_control_is_unconfirmed(is_sent: bool) -> None:
+def test_yd1000_stop_is_written_again_if_release_control_is_unconfirmed(is_sent: bool) -> None:
     lost = Unconfirmed("drive", "control", "no reply") if is_sent else Expired("drive", "control", 1.0)
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS}, loses={RELEASE: [lost]})
     with pytest.raises(type(lost)):
@@ -553,7 +562,7 @@ def test_stop_is_written_again_if_release_control_is_unconfirmed(is_sent: bool) 
     assert wire.sent == [RELEASE, STOP]
 
 
-def test_panel_can_run_the_motor_after_release_control(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_yd1000_panel_can_run_the_motor_after_release_control(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, sim = one(monkeypatch, YD1000(1))
     assert isinstance(sim, SimulatedYD1000)
     drive.write(drive.panel_frequency, 20.0)
@@ -572,7 +581,7 @@ def test_panel_can_run_the_motor_after_release_control(monkeypatch: pytest.Monke
         one(monkeypatch, DelixiModbus(1))[1].release_control()
 
 
-def test_setpoint_is_written_to_1001h_up_to_fh() -> None:
+def test_yd1000_setpoint_is_written_to_1001h_and_limited_by_fh() -> None:
     wire = Wire(YD1000(1), STANDING)
     wire.drive.set_frequency(80)
     assert wire.sent == [EIGHTY]
@@ -584,7 +593,7 @@ def test_setpoint_is_written_to_1001h_up_to_fh() -> None:
         wire.drive.set_frequency(80)
 
 
-def test_state_shows_whether_the_motor_turns_or_a_fault() -> None:
+def test_yd1000_state_shows_a_turning_motor_or_a_fault() -> None:
     turning = {"output_frequency": 20.0, "status": YD1000Status.RUN}
     assert Wire(YD1000(1), turning).drive.state() == State(Condition.RUNNING, Direction.FORWARD)
     wire = Wire(YD1000(1), STANDING)
@@ -596,7 +605,7 @@ def test_state_shows_whether_the_motor_turns_or_a_fault() -> None:
     assert wire.drive.state().condition is Condition.STOPPED
 
 
-def test_identify_checks_address_and_maximum_frequency() -> None:
+def test_yd1000_identify_checks_address_and_maximum_frequency() -> None:
     says = {"address_setting": 5.0, "maximum_frequency": 80.0}
     wire = Wire(YD1000(5), says)
     wire.drive.identify()
@@ -607,7 +616,7 @@ def test_identify_checks_address_and_maximum_frequency() -> None:
         Wire(YD1000(5), {**says, "maximum_frequency": 0.1}).drive.identify()
 
 
-def test_start_in_a_fault_is_refused() -> None:
+def test_yd1000_start_in_a_fault_is_refused() -> None:
     wire = Wire(YD1000(1), AT_30_HZ)
     wire.drive.state()
     wire.says["fault_record_1"] = [0x0A]  # a new entry in the fault record
@@ -619,16 +628,16 @@ def test_start_in_a_fault_is_refused() -> None:
     assert wire.sent == []
 
 
-def test_trip_is_detected_by_the_frozen_registers() -> None:
-    """By section 8.2, 1200H is frozen while the drive has tripped, and 1100H is not."""
+def test_yd1000_trip_is_detected_by_the_frozen_register_1200h() -> None:
+    """By section 8.2, 1200H keeps its value while the drive has tripped, and 1100H does not."""
     wire = Wire(YD1000(1), {**STANDING, "held_frequency": 30.0, "fault_record_1": 0x0A})
     assert wire.drive.state() == State(Condition.FAULT, fault="code 0AH")
     starting = {**STANDING, "held_frequency": 0.2, "output_frequency": [0.0, 0.0, 0.4]}
     assert Wire(YD1000(1), starting).drive.state().condition is Condition.STOPPED
 
 
-def test_start_after_emergency_stop_advises_reset_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    """This holds for a new drive object too, such as each call of the command line creates."""
+def test_yd1000_start_after_an_emergency_stop_advises_reset_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    """This also holds for a new drive object, as each call of the command line creates one."""
     line, drive, sim = one(monkeypatch, YD1000(1))
     drive.set_frequency(30)
     drive.start()
@@ -646,8 +655,13 @@ def test_start_after_emergency_stop_advises_reset_fault(monkeypatch: pytest.Monk
     assert sim.motor.energised
 
 
-def test_start_after_an_emergency_stop_at_rest_advises_reset_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No register is frozen then. Only an object that had read the fault record could see a new entry."""
+def test_yd1000_start_after_an_emergency_stop_at_rest_advises_reset_fault(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """No register is frozen in this case.
+
+    Only an object that had read the fault record could see a new entry.
+    """
     _, drive, _ = one(monkeypatch, YD1000(1))
     drive.emergency_stop()
     drive.set_frequency(30)
@@ -655,7 +669,7 @@ def test_start_after_an_emergency_stop_at_rest_advises_reset_fault(monkeypatch: 
         drive.start()
 
 
-def test_watchdog_write_is_refused_while_the_motor_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_yd1000_watchdog_write_is_refused_while_the_motor_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, sim = one(monkeypatch, YD1000(1))
     assert drive.write(drive.communication_timeout, 5) == 5
     assert sim["communication_timeout"] == 5
@@ -669,7 +683,7 @@ def test_watchdog_write_is_refused_while_the_motor_turns(monkeypatch: pytest.Mon
 
 
 @table("speed", range(1, 8))
-def test_simulated_drive_runs_at_the_preset_speed(monkeypatch: pytest.MonkeyPatch, speed: int) -> None:
+def test_simulated_yd1000_runs_at_the_preset_speed(monkeypatch: pytest.MonkeyPatch, speed: int) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1, preset_speed=speed))
     sim[f"preset_speed_{speed}"] = 12.5
     drive.start()

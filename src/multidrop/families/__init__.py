@@ -1,4 +1,4 @@
-"""The built-in families, by the model names used in plant files and on the command line."""
+"""The built-in families of drives, by the model names that plant files and the command line use."""
 
 from multidrop.drive import Drive
 from multidrop.families.delixi import DelixiModbus, DelixiNative

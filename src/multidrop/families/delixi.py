@@ -24,7 +24,8 @@ from multidrop.drive.register import (
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Script, insist, read, verb, write
 
-STOP_TIME = 60.0  # s; the parameter number of the deceleration time is not known
+# s; default time limit of a stop, because the parameter number of the deceleration time is not known
+STOP_TIME = 60.0
 
 KEYPAD = "it belongs to the line or to the command over the motor; set it on the keypad"
 
@@ -37,7 +38,7 @@ def parameter(group: int, index: int) -> int:
 
 
 class DelixiFault(Worded):
-    """P05.31, the fault. The codes 10 to 14 may be decimal or hex digits: both are accepted."""
+    """P05.31, the fault. The codes 10 to 14 may be decimal or hex digits, so both are accepted."""
 
     NONE = 0
     OC_OVERCURRENT = 1, "overcurrent (OC)"
@@ -70,14 +71,14 @@ class DelixiRunSource(IntEnum):
 class DelixiBaudrate(IntEnum):
     B1200 = 0
     B2400 = 1
-    B4800 = 2  # misprinted as 3800 in the document
+    B4800 = 2  # 4800 bit/s; the document prints 3800
     B9600 = 3
     B19200 = 4
     B38400 = 5
 
 
 class DelixiParameters(Drive):
-    """The parameters of Delixi's inverters; each protocol's subclass passes the table that holds them.
+    """The parameters of Delixi's inverters. Each subclass passes the table that its protocol uses.
 
     P04.29, the format, has different codes in each protocol, so subclasses declare it.
 
@@ -159,7 +160,7 @@ class DelixiParameters(Drive):
         super().__init_subclass__()
 
     def _check_line_settings(self) -> Script[None]:
-        """Raise WriteForbidden unless P04.30 and P04.28 are the declared address and baud rate."""
+        """Raise WriteForbidden unless P04.30 is the declared address and P04.28 the declared baud rate."""
         address = yield from read(self.address_setting)
         if address != self.address:
             raise WriteForbidden(
@@ -177,7 +178,7 @@ class DelixiParameters(Drive):
         )
 
     def _check_start(self) -> Script[None]:
-        """Raise WriteForbidden in a fault, without a setpoint, or if the line does not command the drive."""
+        """Raise WriteForbidden if the drive has a fault, has no setpoint, or does not obey the line."""
         fault = yield from read(self.fault)
         if fault:
             raise WriteForbidden(
@@ -194,7 +195,7 @@ class DelixiParameters(Drive):
 
 
 class DelixiModbusControl(IntEnum):
-    """The control words that this library sends: run and jog include a direction; the toggle is not used."""
+    """The control words that this library sends. Run and jog words include a direction."""
 
     NOTHING = 0x00
     STOP = 0x01
@@ -248,7 +249,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         Framing.RTU: ("8N2", "8E1", "8O1"),
         Framing.ASCII: ("7N2", "7E1", "7O1"),
     }
-    most_registers = {HOLDING: 1}  # no example reads more
+    most_registers = {HOLDING: 1}  # the document has no example that reads more registers at once
     exceptions = {}
     broadcasts = True
     identify_recognises = True
@@ -274,9 +275,9 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     _jogged = False  # True if this object has sent a jog since it last saw the motor at rest
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
-        """Return the known counts of P04.30 (address) and P04.28 (baud rate), and those of the bus voltage.
+        """Return the expected raw counts of P04.30 (address), P04.28 (baud rate) and the bus voltage.
 
-        Only a bus voltage of 32 or more counts as known: addresses end at 31, so the ranges do not overlap.
+        Addresses end at 31. The bus voltage is included only from 32 on, so that the ranges do not overlap.
         """
         known = {self.address_setting: (self.address, self.address), self.dc_bus_voltage: (32, 0xFFFF)}
         code = DelixiBaudrate.__members__.get(f"B{self.settings.baudrate}", self.address)
@@ -328,7 +329,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop. The motor counts as stopped when the output frequency is 0."""
+        """Stop the motor. It counts as stopped when the output frequency is 0."""
         yield from insist(self.control, DelixiModbusControl.STOP)
         yield from self._stopped(self._is_at_rest, self._stop_limit())
 
@@ -442,7 +443,10 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
 
     @property
     def echo_probe(self) -> Register[Any]:
-        """The run state. It is never 0, so its reply differs from an echo (document, part 3, section 5)."""
+        """The run state.
+
+        Its value is never 0, so its reply differs from an echo of the request (part 3, section 5).
+        """
         return self.status
 
     @verb
@@ -462,8 +466,8 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
             raise self._reset_first(status.name)
         if status not in CONDITIONS:
             raise WriteForbidden(
-                f"{self.name} says {int(status):04X}H in reply to K = 03, a state that the manual does not "
-                f"explain"
+                f"{self.name} reports {int(status):04X}H in reply to K = 03, "
+                "a state that the manual does not explain"
             )
         yield from self._setpoint_in_force()
         if direction is None and status == DelixiNativeStatus.REVERSE:
@@ -474,7 +478,10 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop. The motor counts as stopped when neither run state nor output frequency shows a run."""
+        """Stop the motor.
+
+        It counts as stopped when the run state shows no run and the output frequency is 0.
+        """
         yield from insist(self.control, DelixiNativeControl.STOP)
         yield from self._stopped(self._is_at_rest, self._stop_limit())
 

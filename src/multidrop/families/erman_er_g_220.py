@@ -23,8 +23,8 @@ from multidrop.drive.register import (
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Script, insist, read, verb, write
 
-STOP_MARGIN = 5.0  # s; a stop may take this much longer than the deceleration time
-UNKNOWN_RAMP = 30.0  # s; allowed time of a stop if the deceleration time cannot be read
+STOP_MARGIN = 5.0  # s; time that a stop may take in addition to the deceleration time
+UNKNOWN_RAMP = 30.0  # s; time allowed for a stop if the deceleration time cannot be read
 
 
 class Coil(IntEnum):
@@ -33,7 +33,7 @@ class Coil(IntEnum):
 
 
 class ErmanStatus(IntEnum):
-    """Bits 0 and 1 form one number; bit 5 means that the motor is overloaded."""
+    """Bits 0 and 1 form one number, the state; bit 5 means that the motor is overloaded."""
 
     STOPPED = 0
     RUNNING = 1
@@ -56,7 +56,7 @@ class ErmanFault(IntFlag):
     LOW_DC_VOLTAGE = 1 << 1
     HIGH_DC_VOLTAGE = 1 << 2
     LOW_MOTOR_CURRENT = 1 << 3
-    MOTOR_CURRENT_ABOVE_THRESHOLD = 1 << 4  # 120 or 150 %
+    MOTOR_CURRENT_ABOVE_THRESHOLD = 1 << 4  # 120 or 150 % of the rated current
     INVERTER_SHORT_CIRCUIT = 1 << 5
     OVERHEAT = 1 << 6
     PWM_MODULATOR = 1 << 7
@@ -65,7 +65,7 @@ class ErmanFault(IntFlag):
 
 
 class Modes(IntFlag):
-    """Bits of register 0001H; what their values 0 and 1 mean is not stated."""
+    """Bits of register 0001H. The document does not state what their values mean."""
 
     MODULATION_TYPE = 1 << 0
     CONTROL_TYPE = 1 << 4
@@ -157,7 +157,8 @@ class ErmanERG220(Drive):
         3: "bad addresses on read or write (the table has it for reads, the examples for writes too)",
         4: "bad addresses on write",
     }
-    parameter_space = ParameterSpace(named=r"^([bdE]\.\d+);")  # the menu's names
+    # parameter names in the drive's menu, such as b.001
+    parameter_space = ParameterSpace(named=r"^([bdE]\.\d+);")
     options = {
         "acknowledged_fault": Option(
             "", (0, 0xFFFF_FFFF), "the drive's last fault, as its number, once it has been dealt with"
@@ -210,14 +211,14 @@ class ErmanERG220(Drive):
     deceleration_time = _control(0x000D, "s", step=0.1, place="b.004")
     braking_threshold = _control(0x0015, "V", place="E.06", note="Of dynamic braking.")
 
-    # The command coils as read back: they show the last command (sections 6 and 10). One read
-    # includes only the wanted coils, so that all coils in its reply lie in one byte.
+    # The command coils, as the drive reports them: they show the last command (sections 6 and 10). A read
+    # includes only the wanted coils, so that its reply has all of them in one byte.
     start_held = _held(0x0000, Coil)
     stop_held = _held(0x0001, Coil)
     emergency_stop_held = _held(0x0002, Coil)
     fault_reset_held = _held(0x0009, Coil)
 
-    _reset_fault = ErmanFault(0)  # the last fault at the time when this object reset it
+    _reset_fault = ErmanFault(0)  # the fault that was the last one when this object reset it
 
     @classmethod
     def readings(cls) -> tuple[Register[Any], ...]:
@@ -226,7 +227,7 @@ class ErmanERG220(Drive):
 
     @verb
     def identify(self) -> Script[None]:
-        """Check that 0400H can be read: the models -03 and -04 do not have function 04."""
+        """Check that register 0400H can be read with function 04, which the models -03 and -04 lack."""
         try:
             yield from read(self.status)
         except DriveException as refusal:
@@ -260,7 +261,10 @@ class ErmanERG220(Drive):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop along the ramp; if that is refused, or the motor then still runs, use the emergency stop."""
+        """Stop along the ramp.
+
+        If that is refused, or the motor still turns afterwards, use the emergency stop.
+        """
         try:
             yield from self._stop_and_clear_start(self.stop_coil)
         except DriveException:
@@ -289,10 +293,10 @@ class ErmanERG220(Drive):
         yield from insist(self.start_coil, Coil.OFF)
 
     def _longest_ramp(self) -> Script[float]:
-        """Return for how many seconds after a stop the motor may still run."""
+        """Return the longest time in s that the motor may still turn after a stop."""
         try:
             return (yield from read(self.deceleration_time)) + STOP_MARGIN
-        except BusError:  # a drive that does not answer this read may not obey a stop either
+        except BusError:  # if this read gets no reply, the drive may not receive a stop either
             return UNKNOWN_RAMP
 
     def _is_at_rest(self) -> Script[bool]:
@@ -321,7 +325,10 @@ class ErmanERG220(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Return the phase of the ramp as the state, and the last fault as a note, because it may be over."""
+        """Return the phase of the ramp as the state.
+
+        The last fault is only a note, because it may be over.
+        """
         status = yield from read(self.status)
         fault = yield from read(self.last_fault)
         notes = ["motor overloaded"] if status & OVERLOAD else []

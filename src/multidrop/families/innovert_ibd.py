@@ -11,9 +11,10 @@ from multidrop.drive.register import HOLDING, command, reading, setting
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Script, insist, read, verb, write
 
-STOP_MARGIN = 5.0  # s; a stop may take this much longer than the deceleration time
+STOP_MARGIN = 5.0  # s; time that a stop may take in addition to the deceleration time
 
-UNNAMED, UNNAMED_AS_1 = 0xD800, 0x1800  # the unnamed bits of PrA.22, and those that are 1 in the example
+# bits of PrA.22 without a name; and those that are 1 in the manual's example
+UNNAMED, UNNAMED_AS_1 = 0xD800, 0x1800
 
 INFERRED = "the address is inferred: the table of letters is lost"
 OTHER_MAKE = "code: Delta VFD-B and DEMA D5M manuals; the document itself has 1 = 9600 bit/s"
@@ -22,14 +23,15 @@ OTHER_MAKE = "code: Delta VFD-B and DEMA D5M manuals; the document itself has 1 
 def parameter(name: str) -> int:
     """Return the address of a parameter: 3 for PrA.03, 107 for Prb.07 (appendix 2, table 2).
 
-    The digits for A and b are known from examples. The manual's table is missing; C to H are inferred.
+    The digits for A and b are known from examples. Those for C to H are inferred, because the manual's table
+    is missing.
     """
     letter, _, number = name.removeprefix("Pr").partition(".")
     return "ABCDEFGH".index(letter.upper()) * 100 + int(number)
 
 
 class IBDControl(IntEnum):
-    """The control words that this library sends: at most one direction bit, and never the reversing bit."""
+    """The control words that this library sends. None has both direction bits, or the reversing bit."""
 
     NOTHING = 0x00
     STOP = 0x01
@@ -58,7 +60,7 @@ class Terminals(IntFlag):
 
 
 class Output(IntEnum):
-    """Functions that an output can be programmed for; only these codes are named in the manual."""
+    """Functions of a programmable output. The manual names only these codes."""
 
     RUNNING = 1
     FAULT = 3
@@ -143,7 +145,7 @@ class InnovertIBD(Drive):
         "PrH.00 baud rate (1 is 9600), PrH.01 format (0 to 2: ASCII, 3 to 5: RTU; each 8N1, 8E1, 8O1), "
         "PrH.02 address"
     )
-    parameter_space = ParameterSpace(  # addresses of the letters from C on are inferred
+    parameter_space = ParameterSpace(  # the addresses of the groups PrC to PrH are inferred
         groups=tuple(
             ParameterGroup(f"Pr{letter}.", hundred * 100, range(100))
             for hundred, letter in enumerate("bCdEFGH", start=1)
@@ -264,7 +266,7 @@ class InnovertIBD(Drive):
         return baudrate == IBDBaudrate[f"B{self.settings.baudrate}"] and address == self.address
 
     def resembles(self) -> Script[bool]:
-        """Return True if the unnamed bits of PrA.22 are as in the example, and four other registers exist."""
+        """Return True if the unnamed bits of PrA.22 are as in the manual, and four other registers exist."""
         try:
             yield from read(self.output_current)
             yield from read(self.motor_speed)
@@ -321,7 +323,10 @@ class InnovertIBD(Drive):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop along the ramp; wait until the outputs, or else current and speed, show that it stopped."""
+        """Stop along the ramp.
+
+        Wait until the outputs, or else current and speed, show that the motor stopped.
+        """
         yield from insist(self.control, IBDControl.STOP)
         limit = (yield from read(self.deceleration_time)) + STOP_MARGIN
         look = self._is_at_rest
@@ -334,7 +339,7 @@ class InnovertIBD(Drive):
 
     @property
     def _has_state(self) -> bool:
-        """True if this is a sibling whose file declares run state, output frequency and fault."""
+        """True for a family file that extends this class with run state, output frequency and fault."""
         return {"run_state", "output_frequency", "fault"} <= self.registers.keys()
 
     def _code(self) -> Script[int]:
@@ -348,7 +353,7 @@ class InnovertIBD(Drive):
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Reset a fault, after a stop; never starts the motor. The reset is sent once."""
+        """Reset a fault after a stop. It never starts the motor, and the reset is sent once."""
         if not (yield from self._is_at_rest()):
             raise WriteForbidden(f"{self.name} turns: it has no fault to reset")
         yield from insist(self.control, IBDControl.STOP)
@@ -361,7 +366,7 @@ class InnovertIBD(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Return the state shown by `run_state`, or by suitably programmed outputs; else unknown."""
+        """Return the state that `run_state` or suitably programmed outputs show; otherwise it is unknown."""
         if self._has_state:
             return (yield from self._shown_state())
         terminals = yield from read(self.terminals)
@@ -385,7 +390,7 @@ class InnovertIBD(Drive):
         return SHOWN_STATES.get(shown, State(Condition.UNKNOWN, note=f"run_state {shown} is not explained"))
 
     def _programmed(self) -> Script[bool]:
-        """Return True if the outputs are programmed as in the example; their addresses are inferred."""
+        """Return True if the outputs are programmed as in the example. The addresses read are inferred."""
         try:
             for register, function in (
                 (self.output_m01, Output.RUNNING),
@@ -400,7 +405,7 @@ class InnovertIBD(Drive):
         return True
 
 
-OUTPUTS = {  # most serious condition first
+OUTPUTS = {  # the most serious condition is first
     Terminals.VIRTUAL: Condition.FAULT,
     Terminals.YABC: Condition.DECELERATING,
     Terminals.M02: Condition.ACCELERATING,

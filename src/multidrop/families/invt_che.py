@@ -1,4 +1,4 @@
-"""INVT CHE: its registers and verbs, and functions that declare the parameters of one's own model."""
+"""INVT CHE: its registers and verbs, and functions to declare the parameters of your own model."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ CHE100_NEXT = "CHE100 manual v1.4, p. 118"
 CHE100_CODES = "CHE100 manual v1.4, p. 119"
 SCALE = f"{CHE100}; scale: Goodrive300L manual, p. 130 (compatible with CHF100A and CHV100)"
 
-STOP_TIME = 60.0  # s; the address of the deceleration time is not known
+STOP_TIME = 60.0  # s; default time limit of a stop, because the address of the deceleration time is not known
 
 
 class CHEControl(IntEnum):
@@ -44,7 +44,7 @@ class CHEControl(IntEnum):
     REVERSE = 2
     JOG_FORWARD = 3
     JOG_REVERSE = 4
-    STOP = 5  # along the ramp; some other makes have 5 and 6 exchanged
+    STOP = 5  # stop along the ramp; some other makes use 6 for this and 5 to coast
     COAST = 6
     RESET_FAULT = 7
     STOP_JOG = 8
@@ -62,7 +62,8 @@ class Device(IntEnum):
     CHE_1500_HZ = 0x0102
 
 
-OTHER_SERIES = {0x010A: "Goodrive300L", 0x010C: "Goodrive200L"}  # values of 3016H in their manuals
+# device codes in register 3016H, from the manuals of these series
+OTHER_SERIES = {0x010A: "Goodrive300L", 0x010C: "Goodrive200L"}
 # high byte of 3016H in the CHF series, which has the same control words (CHE100 manual v1.4, p. 119)
 CHF = 0x02
 
@@ -108,7 +109,7 @@ class CommunicationFault(IntEnum):
 
 @declaration
 def parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
-    """Declare a parameter by its ordinal number in your model's manual (section 11.6.4).
+    """Declare a parameter by its position in the list of your model's manual (section 11.6.4).
 
     The parameter is in EEPROM, but writes go to its RAM alias, the address with bit 15 set, whose value is
     lost at power-off. Use `stored_parameter` for permanent writes. Before the first write, compare the value
@@ -178,10 +179,11 @@ class InvtCHE(Drive):
     formats = dict.fromkeys(Drive.framings, ("8N1", "8E1", "8O1", "8N2", "8E2", "8O2"))  # PC.02
     baudrates = (9600, 1200, 2400, 4800, 19200, 38400)  # PC.01
     addresses = range(1, 248)
-    response_timeout = 0.4  # s; PC.03 is the delay of a reply: 5 ms by default, at most 200 ms
+    response_timeout = 0.4  # s; PC.03 sets the delay of a reply: 5 ms by default, at most 200 ms
     answers_every_read = True
     most_registers = {HOLDING: 16}
-    readable_gaps = {HOLDING: range(0x3000, 0x3017)}  # reserved registers are documented as readable
+    # the document allows reads that include these reserved registers
+    readable_gaps = {HOLDING: range(0x3000, 0x3017)}
     exceptions = {
         0x01: "illegal command, or the drive has a fault",
         0x02: "illegal address",
@@ -274,11 +276,11 @@ class InvtCHE(Drive):
     )
     communication_fault = reading(0x5001, CommunicationFault, outside=CHE100_NEXT)
 
-    _jogged = False  # True if this object has sent a jog since it last saw the motor at rest
+    _jogged = False  # True if this object has sent a jog and has not seen the motor at rest since
 
     @verb
     def identify(self) -> Script[None]:
-        """Check that 3016H is 0101H or 0102H; a stop is withheld only if 3016H shows another INVT series."""
+        """Check that 3016H is 0101H or 0102H. A stop is withheld only if 3016H shows another INVT series."""
         device = yield from read(self.device)
         if isinstance(device, Device):
             return
@@ -330,14 +332,17 @@ class InvtCHE(Drive):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop along the ramp; if the motor still turns, also send STOP_JOG: no register shows a jog."""
+        """Stop along the ramp.
+
+        If the motor still turns, also send STOP_JOG, because no register shows a jog.
+        """
         refusals: list[DriveException] = []
         try:
             if (yield from self._stands_by(CHEControl.STOP, refusals)):
                 return
-        except WriteForbidden:  # the drive is of another family
+        except WriteForbidden:  # the drive is of another family, so STOP_JOG could run its motor
             raise
-        except BusError:  # a drive that does not reply may be jogging, and may still receive
+        except BusError:  # a drive whose replies are lost may be jogging, and may still receive STOP_JOG
             with suppress(BusError):
                 yield from insist(self.control, CHEControl.STOP_JOG, attempts=1)
             raise
@@ -351,7 +356,7 @@ class InvtCHE(Drive):
         """Write a stop word; return True if the motor is then at rest. A refusal is added to `refusals`."""
         try:
             yield from insist(self.control, word)
-        except DriveException as refusal:  # some drives refuse this word in a fault, or without a jog
+        except DriveException as refusal:  # some drives refuse this stop word during a fault or without a jog
             refusals.append(refusal)
         return (yield from self._is_at_rest())
 

@@ -1,9 +1,8 @@
-"""Makes (brands) of drives that their registers identify, and the control words that run their motors.
+"""Makes (brands) of drives that can be recognised by their registers, and the words that run their motors.
 
-Two families may have their control words at the same address with different meanings, so that one family's
-stop runs another make's motor. A stop is withheld only if the drive's registers show that it is of such a
-make. The table lists these registers for each make. A drive of the declared family answers a read of these
-registers with an exception, or with other values.
+Two families may use one address for control words with different meanings. Then one family's stop word may
+run the motor of another make. A stop is withheld only if registers of the drive show that it is of such a
+make. MAKES lists these registers. A drive of the declared family refuses to read them, or has other values.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from multidrop.families.innovert_ibd import IBDBaudrate
 
 
 class Evidence(Drive):
-    """The registers by which makes are recognised, each at the address that its make's manual states."""
+    """The registers by which makes are recognised, at the addresses in the manuals of these makes."""
 
     goodrive_state = reading(0x2100, place="Goodrive200A manual p. 140")
     goodrive_device = reading(0x2103, place="Goodrive200A manual p. 140 to 142")
@@ -42,18 +41,18 @@ Test = Callable[[int, Drive], bool]
 
 @dataclass(frozen=True)
 class Make:
-    """A make: the model to declare, its control register and run words, and how to recognise its drives."""
+    """A make of drives: its model name, its control words that run a motor, and how to recognise it."""
 
     model: str
     title: str
-    control: int  # address of the make's control word, a holding register
+    control: int  # address of the control word, a holding register
     runs: Callable[[float], bool]  # function that returns True for a control word that runs the motor
     evidence: tuple[tuple[Register[Any], Test], ...]
-    may_be_silent: bool = False  # True if such a drive may leave reads of missing registers unanswered
-    copies: tuple[str, ...] = ()  # models that these registers do not distinguish from this make
+    may_be_silent: bool = False  # True if such a drive may not reply to reads of missing registers
+    copies: tuple[str, ...] = ()  # models whose drives these registers do not distinguish from this make
 
     def shows(self, drive: Drive) -> Script[bool]:
-        """Return True if all the make's registers have the make's values in this drive. Only reads."""
+        """Return True if the drive's registers have the values that prove this make. It only reads."""
         for register, test in self.evidence:
             if not test(int((yield from read(register))), drive):
                 return False
@@ -146,17 +145,17 @@ MAKES = (
 
 
 def run_by(register: Register[Any], count: float) -> list[Make]:
-    """Return the makes whose motors would run if this count were written to this register."""
+    """Return the makes whose motors would run if this raw count were written to this register."""
     if register.table.read_space != HOLDING.read_space:
         return []
     return [make for make in MAKES if make.control == register.address and make.runs(count)]
 
 
 def easily_mistaken_for(drive: Drive) -> list[Make]:
-    """Return the makes to exclude before writing to a drive whose identity is weak.
+    """Return the makes that must be excluded before a write to a drive that cannot identify itself.
 
-    These are the makes whose motors one of the drive's harmless control words would run. Makes whose
-    registers do not distinguish them from the drive's model are included too.
+    These makes would run their motors on one of the drive's harmless control words. Makes that cannot be
+    distinguished from the drive's model are included too.
     """
     control = drive.registers.get("control")
     harmless = control.harmless or () if control is not None else ()

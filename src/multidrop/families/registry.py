@@ -1,4 +1,4 @@
-"""Find a family by name: built-in, shipped as a file, or in a user's file.
+"""Find a family by name: a built-in family, a file of this package, or a user's file.
 
 The shipped families are TOML files of this package, untested on hardware. A TOML file is data. A Python
 file is a program: it is run once per process, with all rights of the caller, after its name is logged to
@@ -28,16 +28,18 @@ from multidrop.printable import did_you_mean
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-GROUP = "multidrop.families"  # entry point group of other packages; built-in names take precedence
+# entry point group in which other packages offer families; built-in names take precedence
+GROUP = "multidrop.families"
 _SHIPPED = Path(__file__).parent / "shipped"
-SHIPPED = tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))  # names; each file is read on demand
+# names of the family files in this package; each file is read when it is needed
+SHIPPED = tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
 
-# Shipped families that a scan looks for: their drives are identified by more than a status register.
+# Families from files of this package for which a scan looks: more than a status register identifies them.
 RECOGNISABLE = ("delixi-e", "invt-chf100a", "invt-goodrive", "powtran-pi130", "yaskawa-a1000")
 
 
 def shipped_family(name: str) -> type[Drive]:
-    """Return the shipped family of this name, with this name as its `model`."""
+    """Return the family from a file of this package, with this name as its `model`."""
     family = _family_of(_SHIPPED / f"{name}.toml")
     family.model = family.declared_in = name
     return family
@@ -59,7 +61,8 @@ def find_model(text: str, relative_to: Path | None = None) -> type[Drive]:
     if not colon and text.endswith(".py"):
         path = text
     if not path.endswith(".py"):
-        if found := installed_family(text):  # not tried for paths, because it reads the list of all packages
+        # not tried for paths, because it reads the list of all installed packages
+        if found := installed_family(text):
             return found
         known = (*MODELS, *SHIPPED, *installed_models())
         hint = did_you_mean(text.lower(), known)
@@ -68,15 +71,15 @@ def find_model(text: str, relative_to: Path | None = None) -> type[Drive]:
 
 
 def installed_models() -> list[str]:
-    """Return the names of families in other installed packages, except names of built-in or shipped ones."""
+    """Return the families that other installed packages offer, without names that this package uses."""
     names = {point.name for point in _entry_points()}
     return sorted(names - {*MODELS, *SHIPPED})
 
 
 def installed_family(name: str) -> type[Drive] | None:
-    """Return the family with this entry point name in another installed package; None if there is none.
+    """Return the family that another installed package offers under this name; None if there is none.
 
-    Raises ValueError if two packages have the name, or if the family cannot be loaded.
+    Raises ValueError if two packages offer the name, or if the family cannot be loaded.
     """
     points = [point for point in _entry_points() if point.name == name]
     if not points:
@@ -88,7 +91,7 @@ def installed_family(name: str) -> type[Drive] | None:
         )
     try:
         found = points[0].load()
-    except Exception as failure:  # another package's code may raise anything
+    except Exception as failure:  # code of another package may raise any exception
         why = f"{type(failure).__name__}: {failure}"
         raise ValueError(f"model {name!r} of package {packages[0]} cannot be loaded: {why}") from failure
     if not (isinstance(found, type) and issubclass(found, Drive) and found.registers):
@@ -104,18 +107,18 @@ def installed_family(name: str) -> type[Drive] | None:
 
 
 def _entry_points() -> Iterable[EntryPoint]:
-    from importlib.metadata import entry_points  # imported here, because it takes 2 MB of memory
+    from importlib.metadata import entry_points  # imported only here, because it takes 2 MB of memory
 
     return entry_points(group=GROUP)
 
 
 def is_users_own(family: type[Drive]) -> bool:
-    """Return True if the family is from a user's code and derives from no family of this package."""
+    """Return True if the family is a user's own class that extends no family of this package."""
     return family.model not in SHIPPED and not any(base in MODELS.values() for base in family.__mro__)
 
 
 def _family_of(path: Path) -> type[Drive]:
-    from multidrop.families.files.loader import load_family  # slow to import
+    from multidrop.families.files.loader import load_family  # imported only here, because the import is slow
 
     return load_family(path)
 
@@ -147,14 +150,15 @@ def _load(path: Path) -> ModuleType:
     return load_model_file(path)
 
 
-_KEPT = {*sys.stdlib_module_names, "multidrop"}  # modules that are never imported from a model file's folder
+# modules that are never imported from the folder of a model file
+_KEPT = {*sys.stdlib_module_names, "multidrop"}
 _running = RLock()  # held while a model file runs
 
 _log = logging.getLogger("multidrop.families.registry")
 
 
 def load_model_file(path: Path) -> ModuleType:
-    """Return the module of a Python file, which runs once per process, so that its classes stay the same.
+    """Return the module of a Python file. It is run once per process, so that its classes stay the same.
 
     Raises ValueError with file and line for any error in the file.
     """
@@ -174,7 +178,8 @@ class _NotPython(Exception):
 def _module(path: Path) -> ModuleType:
     name = f"multidrop_models.{path.stem}_{abs(hash(path)):x}"
     with _running:
-        if name in sys.modules:  # loaded, or being loaded if two files import each other
+        # the module is loaded, or is being loaded because two files import each other
+        if name in sys.modules:
             return sys.modules[name]
         spec = importlib.util.spec_from_file_location(name, path)
         if spec is None or spec.loader is None:
@@ -182,7 +187,7 @@ def _module(path: Path) -> ModuleType:
         _log.info("%s is run as Python: a user's model is a program", path)
         module = importlib.util.module_from_spec(spec)
         vars(module)["__builtins__"] = {**vars(builtins), "__import__": _import_beside(path.parent)}
-        sys.modules[name] = module  # required by dataclasses, which look up their module
+        sys.modules[name] = module  # dataclasses look up the module by its name
         try:
             spec.loader.exec_module(module)
         except BaseException:
@@ -210,16 +215,16 @@ def _import_beside(directory: Path) -> Callable[..., object]:
 
 
 def _imported(name: str, path: Path) -> ModuleType | None:
-    """Return the module of this name if the program has already imported it from this file; else None."""
+    """Return the module if the program has already imported it from this file, else None."""
     module = sys.modules.get(name)
     file = getattr(module, "__file__", None)
     return module if file and Path(file).exists() and path.samefile(file) else None
 
 
 def _place(mistake: BaseException, path: Path) -> str:
-    """Return the path and, if known, the line at which an error was raised.
+    """Return the file and, if known, the line in which an error was raised.
 
-    The path is that of `path`, or of a file that it imports from its directory.
+    The file is `path`, or a file in its directory that it imports.
     """
     if isinstance(mistake, SyntaxError):
         return str(path)  # the message already has file and line

@@ -15,25 +15,25 @@ from multidrop.drive.register import HOLDING, Details, Kept, Register, command, 
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Pulse, Script, insist, read, until, verb, wait, write
 
-STOP_MARGIN = 5.0  # s; a stop may take this much longer than the deceleration time
-SELECTION_TIME = 1.0  # s within which 1202H shows a newly selected preset speed
-RELEASE_TIME = 2.0  # s within which a motor started by panel or terminals shows that it turns
-RESET_TIME = 3.0  # s; the restarting drive may be silent for this long
+STOP_MARGIN = 5.0  # s; time that a stop may take in addition to the deceleration time
+SELECTION_TIME = 1.0  # s within which register 1202H must show a newly selected preset speed
+RELEASE_TIME = 2.0  # s in which a motor that the panel or the terminals started is seen to turn
+RESET_TIME = 3.0  # s; the drive may not reply for this long while it restarts
 
 PANEL = "it is effective from the panel only"
 LINE = "it changes the drive's end of the line; set it on the panel"
 COMMAND = "it belongs to the command over the motor; set it on the panel"
 NO_SCALE = "its scale is not stated"
-RUN_FUNCTIONS = (2, 3)  # input functions that run the motor: those of F and R in the factory settings
+RUN_FUNCTIONS = (2, 3)  # input functions that run the motor; the factory settings of the terminals F and R
 AT_ONCE = "Takes effect at once."
 AFTER_RESET = "Takes effect after a reset or at the next power-on."
 
 
 class YD1000Control(IntFlag):
-    """The control word 1000H. Bits 15 and 14 latch until 0 is written to them or the power fails."""
+    """The control word 1000H. Bits 15 and 14 stay set until 0 is written to them or the power fails."""
 
-    COMMAND_VALID = 1 << 15  # this word, and not CNOD's source, commands the motor
-    FREQUENCY_VALID = 1 << 14  # the setpoint is 1001H, and not FNOD's source
+    COMMAND_VALID = 1 << 15  # this word commands the motor, and not the source that CNOD selects
+    FREQUENCY_VALID = 1 << 14  # register 1001H is the setpoint, and not the source that FNOD selects
     RESET = 1 << 13
     EMERGENCY_STOP = 1 << 12
     COAST = 1 << 11
@@ -48,7 +48,7 @@ class YD1000Control(IntFlag):
     PRESET_SPEED_4 = 1 << 0
 
 
-STOP = YD1000Control.COMMAND_VALID | YD1000Control.FREQUENCY_VALID  # bits 15 and 14 without the run bit
+STOP = YD1000Control.COMMAND_VALID | YD1000Control.FREQUENCY_VALID  # only bits 15 and 14, without the run bit
 
 PRESET_SPEEDS = (
     YD1000Control.PRESET_SPEED_1,
@@ -58,7 +58,7 @@ PRESET_SPEEDS = (
 
 
 class YD1000Status(IntFlag):
-    RUN = 1 << 10  # also set while braking with direct current
+    RUN = 1 << 10  # is also set while the motor is braked with direct current
     REVERSE = 1 << 9
     JOG = 1 << 8
     DC_BRAKE = 1 << 7
@@ -99,21 +99,21 @@ def choice(number: int, place: str, most: int | None = None, /, **more: Unpack[D
 
 
 def seconds(number: int, place: str, /, **more: Unpack[Details]) -> Register[float]:
-    """Declare a time in s; the document does not state the unit."""
+    """Declare a time. The document does not state its unit, which is assumed to be s."""
     more["step"], more["span"] = 0.1, (0.1, 3600)
     more["outside"] = "unit: Toshiba IPE002Z manual, p. 34"
     return setting(number, "s", **_parameter(place, more))
 
 
 def hertz(number: int, place: str, least: float = 0, /, **more: Unpack[Details]) -> Register[float]:
-    """Declare a frequency of up to 320 Hz, the limit of FH; the document does not state the unit."""
+    """Declare a frequency of up to 320 Hz, the limit of FH. The document does not state the unit."""
     more["step"], more["span"] = 0.01, (least, 320)
     more["outside"] = "unit: Toshiba IPE002Z manual, p. 35"
     return setting(number, "Hz", **_parameter(place, more))
 
 
 def preset(number: int, place: str, /) -> Register[float]:
-    """Declare a preset speed, whose limits are LL and UL."""
+    """Declare a preset speed. The parameters LL and UL are its limits."""
     return hertz(number, place, at_least="minimum_frequency", at_most="upper_limit_frequency", default=0.0)
 
 
@@ -199,9 +199,9 @@ class YD1000(Drive):
     addresses = range(1, 64)
     silence_characters = 24  # section 4.3
     response_delay_characters = 24
-    response_timeout = 0.5  # 24 characters are 220 ms at 1200 bit/s
+    response_timeout = 0.5  # s; 24 characters take 220 ms at 1200 bit/s
     answers_every_read = True
-    most_registers = {HOLDING: 1}  # the document has only reads of one register
+    most_registers = {HOLDING: 1}  # the document only has reads of one register
     exceptions = {
         1: "no such function (after VF-S15)",
         2: "no such register (after VF-S15)",
@@ -218,7 +218,7 @@ class YD1000(Drive):
         "F800 baud rate (0 to 3: 1200, 2400, 4800, 9600; it must be 3, and an S7e is fixed at 1200), F801 "
         "parity (0 none, 1 even, 2 odd; it must be 1), both in effect after a reset or power-on; F802 address"
     )
-    parameter_space = ParameterSpace(  # 6.1, 6.2 and 7
+    parameter_space = ParameterSpace(  # sections 6.1, 6.2 and 7
         groups=(
             ParameterGroup("", 0x0000, range(25), digits=4, as_hex=True),
             ParameterGroup("F", 0x0000, range(100, 900), digits=3, as_hex=True),
@@ -371,10 +371,10 @@ class YD1000(Drive):
         note=f"0 is off. {AT_ONCE}",
     )
 
-    _record: float | None = None  # the newest entry of the fault record when it was last read
+    _record: float | None = None  # the newest entry in the fault record at its last reading
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
-        """Return the ranges of 0802H (the drive's own address) and 0011H (FH, from 30 to 320 Hz)."""
+        """Return the expected raw counts of 0802H (the drive's own address) and 0011H (FH, 30 to 320 Hz)."""
         return {self.address_setting: (self.address, self.address), self.maximum_frequency: (3000, 32000)}
 
     @verb
@@ -395,10 +395,10 @@ class YD1000(Drive):
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start at the setpoint 1001H; without a direction, keep turning as before, or forward from rest.
+        """Start at the setpoint 1001H. Without a direction, a turning motor keeps its direction.
 
-        The options `preset_speed` and `setpoint_by_fnod` select another setpoint, `second_ramp` the second
-        ramp. A stop always uses the first ramp.
+        Without a direction, a motor at rest turns forward. The options `preset_speed` and `setpoint_by_fnod`
+        select another setpoint, and `second_ramp` selects the second ramp. A stop always uses the first ramp.
         """
         how = YD1000Control.RUN
         if self.option.get("second_ramp"):
@@ -413,7 +413,7 @@ class YD1000(Drive):
         return bool(self.option.get("setpoint_by_fnod"))
 
     def _preset(self) -> Script[YD1000Control]:
-        """Select the preset speed at rest; return its bits once 1202H shows that speed."""
+        """Select the preset speed while the motor is at rest; return its bits once 1202H shows that speed."""
         number = int(self.option["preset_speed"])
         hz = yield from read(self.registers[f"preset_speed_{number}"])
         if hz == 0:
@@ -446,7 +446,10 @@ class YD1000(Drive):
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
-        """Turn slowly until stopped; without a direction, keep turning as before, or forward from rest."""
+        """Turn slowly until stopped.
+
+        Without a direction, keep a turning motor's direction, or turn forward.
+        """
         yield from self._turn(YD1000Control.JOG, direction)
 
     def _turn(self, how: YD1000Control, direction: Direction | None) -> Script[None]:
@@ -458,7 +461,7 @@ class YD1000(Drive):
         yield from self._started(direction)
 
     def _valid(self) -> YD1000Control:
-        """Return bit 15, and also bit 14 unless FNOD selects the setpoint's source."""
+        """Return bit 15, and also bit 14 unless FNOD selects the source of the setpoint."""
         return YD1000Control.COMMAND_VALID if self._by_fnod() else STOP
 
     def _without_fault(self) -> Script[State]:
@@ -528,7 +531,7 @@ class YD1000(Drive):
         self._record = yield from read(self.fault_record_1)
 
     def _no_terminal_runs(self, when: str) -> Script[None]:
-        """Raise WriteForbidden if a terminal would start the motor once bit 15 is off, as after a restart."""
+        """Raise WriteForbidden if a terminal would start the motor once bit 15 is 0, as after a restart."""
         closed = yield from read(self.inputs)
         functions = {"F110, which is always on,": self.always_on_function}
         for number, terminal in enumerate(Inputs, 1):  # F111 has the function of F, F112 that of R, and so on
@@ -543,7 +546,7 @@ class YD1000(Drive):
 
     @verb
     def release_control(self) -> Script[None]:
-        """Return command and setpoint to panel and terminals by clearing bits 15 and 14; only at rest.
+        """Let panel and terminals command the motor again: clear bits 15 and 14. Allowed only at rest.
 
         If the motor is then seen to turn, or the drive does not answer, the stop is written again.
         """
@@ -580,7 +583,10 @@ class YD1000(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Return whether the motor turns. A frozen 1200H, or a change in the fault record, shows a fault."""
+        """Return whether the motor turns.
+
+        A frozen 1200H, or a new entry in the fault record, shows a fault.
+        """
         if not (yield from self._is_at_rest()):
             return State(Condition.RUNNING, (yield from self._direction()))
         record = yield from read(self.fault_record_1)

@@ -1,4 +1,4 @@
-"""Use families from files: simulate, scan for, poll, record, decode and command their drives."""
+"""Use families from files: simulate, find, poll, record, decode and command drives of such a family."""
 
 from __future__ import annotations
 
@@ -72,14 +72,14 @@ def pump(plant: Path) -> type[Drive]:
     return load_family(plant.parent / "families" / "pump.toml")
 
 
-def test_model_path_is_relative_to_the_plant_file(plant: Path, pump: type[Drive]) -> None:
+def test_model_path_in_a_plant_file_is_relative_to_the_plant_file(plant: Path, pump: type[Drive]) -> None:
     drives = [polled.drive for polled in Plant.load(plant).lines[0].drives]
     assert type(drives[1]) is pump
     assert find_model("families/pump.toml", plant.parent) is pump
     assert [drive.model for drive in drives] == ["meter.toml", "pump.toml"]
 
 
-def test_family_file_gives_the_same_poll_plan_as_the_class(plant: Path) -> None:
+def test_family_file_gives_the_same_poll_plan_as_the_equivalent_class(plant: Path) -> None:
     """A family from a file causes the same requests as the equivalent class."""
     loaded = load_family(plant.parent / "families" / "meter.toml")(3)
     written = Meter(3)
@@ -94,7 +94,7 @@ def test_family_file_gives_the_same_poll_plan_as_the_class(plant: Path) -> None:
     assert len(planned(loaded)) < len(written.readings())
 
 
-def test_family_file_gives_the_same_values_as_the_class(plant: Path) -> None:
+def test_family_file_gives_the_same_values_as_the_equivalent_class(plant: Path) -> None:
     loaded, written = load_family(plant.parent / "families" / "meter.toml"), Meter
     found = []
     for family in (loaded, written):
@@ -151,10 +151,10 @@ def test_plant_with_two_family_files_is_scanned_recorded_and_reported(
 
 
 @pytest.mark.parametrize(("name", "value"), [("light", "1"), ("ramp", "1"), ("run", "off")])
-def test_unconfirmed_file_with_commands_writes_only_harmless_counts(
+def test_unconfirmed_family_file_with_commands_writes_only_harmless_raw_counts(
     pump: type[Drive], name: str, value: str
 ) -> None:
-    """Without a stop verb not even its harmless counts are sent, because they are untested."""
+    """Without a stop verb, even the declared harmless raw counts are not sent, because they are untested."""
     wire = Wire([simulated(pump(2))], port=ANY_PORT, unpaced=True)
     with Simulator([wire]) as line, Bus(wire.path) as bus:
         drive = bus.attach(pump, address=2)
@@ -164,8 +164,10 @@ def test_unconfirmed_file_with_commands_writes_only_harmless_counts(
         assert simulated_writes(line) == []
 
 
-def test_unconfirmed_file_sends_no_broadcast(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """stop_all does not send its broadcast counts either, because they are untested."""
+def test_no_broadcast_is_sent_for_an_unconfirmed_family_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`stop_all` does not send the file's broadcasts, because they are untested."""
     path = tmp_path / "fan.toml"
     head = '[family]\ntitle = "Fan"\nmanual = "M"\ncounts_from = 0\n[reading]\nspeed = { at = 1 }\n'
     path.write_text(head + "[command]\ncontrol = { at = 0, broadcast = [0x047F] }\n")
@@ -206,7 +208,7 @@ def test_family_file_without_commands_needs_no_confirmation(plant: Path) -> None
         ("above = 5\nbelow = 7", 7, False),
     ],
 )
-def test_identify_section_recognises_drives_by_register_values(
+def test_identify_section_recognises_drives_by_their_register_values(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, proof: str, value: int, is_one: bool
 ) -> None:
     path = tmp_path / "meter.toml"
@@ -223,7 +225,7 @@ def test_identify_section_recognises_drives_by_register_values(
         drive.perform(drive.identify.script())
 
 
-def test_eeprom_writes_of_two_files_with_the_same_name_are_counted_separately(plant: Path) -> None:
+def test_eeprom_writes_of_two_family_files_with_one_name_are_counted_separately(plant: Path) -> None:
     """The ledger counts EEPROM writes separately for two devices whose family files have the same name."""
     other = plant.parent / "other"
     other.mkdir()

@@ -1,4 +1,6 @@
-"""Load families from files: the resulting class; every mistake is reported with place and correct example."""
+"""Load families from files: the resulting class, and a sentence with place and correction for every
+mistake.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,7 @@ def mistakes(folder: Path, text: str) -> list[str]:
 
 
 def facts(register: Register[Any]) -> dict[str, Any]:
-    """Return a register's declared facts, with the names of its enumeration."""
+    """Return a register's declared attributes, with the names of its enumeration."""
     found = {one.name: getattr(register, one.name) for one in dataclasses.fields(register)}
     values = register.values
     found["values"] = values and ({each.name: each.value for each in values}, values.__mro__[1])
@@ -59,7 +61,7 @@ def facts(register: Register[Any]) -> dict[str, Any]:
 # ---- the resulting class ----
 
 
-def test_family_file_equals_the_hand_written_class(tmp_path: Path) -> None:
+def test_class_from_a_family_file_equals_the_hand_written_class(tmp_path: Path) -> None:
     loaded = load_family(write_meter(tmp_path))
     assert {name: facts(one) for name, one in loaded.registers.items()} == {
         name: facts(one) for name, one in Meter.registers.items()
@@ -74,7 +76,7 @@ def test_family_file_equals_the_hand_written_class(tmp_path: Path) -> None:
     assert (loaded.__name__, loaded.model, loaded.declared_in) == ("Meter", "meter.toml", "meter.toml")
 
 
-def test_named_values_are_read_by_the_names_in_the_file(tmp_path: Path) -> None:
+def test_values_in_a_family_file_are_read_by_their_names(tmp_path: Path) -> None:
     loaded = load_family(write_meter(tmp_path))
     assert loaded.register("mode").format(loaded.register("mode").decode(1)) == "automatic"
     alarms = loaded.register("alarms").decode(9)
@@ -82,7 +84,7 @@ def test_named_values_are_read_by_the_names_in_the_file(tmp_path: Path) -> None:
     assert loaded.register("alarms").format(alarms) == "hot|open"
 
 
-def test_loading_the_same_file_twice_gives_the_same_class(tmp_path: Path) -> None:
+def test_loading_a_family_file_twice_gives_the_same_class(tmp_path: Path) -> None:
     path = write_meter(tmp_path)
     first = load_family(path)
     assert load_family(str(path)) is first
@@ -91,7 +93,7 @@ def test_loading_the_same_file_twice_gives_the_same_class(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", ["meter.toml", "meter.csv"])
-def test_loading_a_changed_file_gives_another_class(tmp_path: Path, name: str) -> None:
+def test_loading_a_changed_family_file_gives_another_class(tmp_path: Path, name: str) -> None:
     first = load_family(write_meter(tmp_path))
     before = (tmp_path / name).stat()
     text = {"meter.toml": METER.replace("table 2", "table 3"), "meter.csv": METER_CSV.replace("all", "two")}
@@ -102,14 +104,14 @@ def test_loading_a_changed_file_gives_another_class(tmp_path: Path, name: str) -
     assert list(again.registers) == list(first.registers)
 
 
-def test_byte_order_mark_is_skipped(tmp_path: Path) -> None:
+def test_byte_order_mark_of_a_family_file_is_skipped(tmp_path: Path) -> None:
     path = write_meter(tmp_path)
     for file in (path, tmp_path / "meter.csv"):
         file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
     assert load_family(path).title == "Meter M-1"
 
 
-def test_every_key_of_a_register_is_loaded(tmp_path: Path) -> None:
+def test_every_key_of_a_register_in_a_family_file_is_loaded(tmp_path: Path) -> None:
     text = (
         HEAD
         + """\
@@ -133,14 +135,14 @@ control = { at = 3, bits = { on = 0, reset = 1 }, harmless = [0], broadcast = [0
     assert loaded.broadcasts
 
 
-def test_registers_can_be_declared_as_written_by_function_10h(tmp_path: Path) -> None:
+def test_family_file_can_declare_registers_written_by_function_10h(tmp_path: Path) -> None:
     loaded = family(
         tmp_path, HEAD + 'write = "multiple"\n[setting]\na = { at = 1 }\nb = { at = 2, write = "single" }\n'
     )
     assert [loaded.register(name).table.write for name in "ab"] == [0x10, 0x06]
 
 
-def test_family_addresses_may_be_unit_ids_0_to_255(tmp_path: Path) -> None:
+def test_addresses_of_a_family_file_may_be_unit_ids_0_to_255(tmp_path: Path) -> None:
     head = HEAD + "addresses = [0, 255]\n[reading]\nlevel = { at = 1 }\n"
     loaded = family(tmp_path, head)
     assert loaded.addresses == range(256)
@@ -224,7 +226,7 @@ TWENTY_MISTAKES = [
 ]
 
 
-def test_more_than_twenty_mistakes_are_reported_together(tmp_path: Path) -> None:
+def test_more_than_twenty_mistakes_in_a_family_file_are_reported_together(tmp_path: Path) -> None:
     (tmp_path / "twenty.csv").write_text(TWENTY_CSV)
     path = tmp_path / "twenty.toml"
     path.write_text(TWENTY)
@@ -268,7 +270,7 @@ DEVICE = HEAD + "[reading]\ndevice = { at = 3 }\nspeed = { at = 4, unit = 'Hz', 
         ),
     ],
 )
-def test_mistakes_in_the_sections_identify_and_verb_are_reported(
+def test_mistakes_in_the_family_file_sections_identify_and_verb_are_reported(
     tmp_path: Path, section: str, mistakes: list[str]
 ) -> None:
     first, rest = ("", DEVICE + section) if section.startswith("[") else (section + "\n", DEVICE)
@@ -281,7 +283,7 @@ def test_mistakes_in_the_sections_identify_and_verb_are_reported(
     assert [mistake.partition("t.toml:")[2].partition(": ")[2] for mistake in found] == mistakes
 
 
-WRONG_KEYS = [  # a wrong key of a register
+WRONG_KEYS = [  # each text has one wrong key of a register
     ("harmless = [0]", "[reading] a: a reading is never written"),
     ("step = inf", "step = inf is not a finite number; write step = 0.1"),
     ("step = 0", "step = 0 makes every value 0; write step = 0.1"),
@@ -296,7 +298,7 @@ WRONG_KEYS = [  # a wrong key of a register
     ("bits = { real = 0 }", "'real' is a name that all enumerations"),
     ("bits = { On = 0, on = 1 }", "on and On differ in capitals alone"),
 ]
-WRONG_SECTIONS = [  # a wrong part before a valid [reading]
+WRONG_SECTIONS = [  # each text is a wrong section before a valid section [reading]
     ("[option]\nx = { span = [2, 1], meaning = 'm' }", "span = [2, 1]"),
     (
         "[option]\nconfirmed = { span = [1, 2], meaning = 'm' }",
@@ -309,7 +311,7 @@ WRONG_SECTIONS = [  # a wrong part before a valid [reading]
     ("framings = ['delixi']", "'delixi' is none of rtu, ascii"),
     ("exceptions = { 300 = 'x' }", "300 = 'x' is not a code from 1 to 255"),
 ]
-WRONG_TEXTS = [  # a wrong text after HEAD
+WRONG_TEXTS = [  # each text is wrong and stands after HEAD
     ("", "t.toml: declares no register; add [reading] and NAME = { at = 0x0010 }"),
     ("[readings]\na = { at = 1 }\n", "t.toml: unknown key 'readings'; did you mean reading?"),
     ("[reading]\na = 5\n", "t.toml: [reading] a: 5 is not a register; write { at = 0x0010"),
@@ -319,16 +321,28 @@ WRONG_TEXTS = [  # a wrong text after HEAD
     ('[setting]\na = { at = "30001" }\n', "an input register cannot be written"),
     ("[setting]\na = { at = 1 }\nb = { at = 1, step = 2 }\n", "b: a is written at the same address"),
     ("[reading]\nstart = { at = 1 }\n", "[reading] start: reserved name; every drive has it"),
-    ("registers = ['/etc/passwd']\n", "registers has '/etc/passwd', which is not a CSV file"),
-    ("registers = ['/etc/x.csv']\n", "a CSV file must be in the family file's folder, or below it"),
-    ("registers = ['../x.csv']\n", "a CSV file must be in the family file's folder, or below it"),
-    ("registers = ['C:\\x.csv']\n", "a CSV file must be in the family file's folder, or below it"),
-    ("registers = ['C:x.csv']\n", "a CSV file must be in the family file's folder, or below it"),
-    ("registers = ['..\\x.csv']\n", "a CSV file must be in the family file's folder, or below it"),
+    ("registers = ['/etc/passwd']\n", "registers = '/etc/passwd' is not a CSV file"),
+    (
+        "registers = ['/etc/x.csv']\n",
+        "is outside the family file's folder: put the CSV file there, or below it",
+    ),
+    (
+        "registers = ['../x.csv']\n",
+        "is outside the family file's folder: put the CSV file there, or below it",
+    ),
+    (
+        "registers = ['C:\\x.csv']\n",
+        "is outside the family file's folder: put the CSV file there, or below it",
+    ),
+    ("registers = ['C:x.csv']\n", "is outside the family file's folder: put the CSV file there, or below it"),
+    (
+        "registers = ['..\\x.csv']\n",
+        "is outside the family file's folder: put the CSV file there, or below it",
+    ),
     ("registers = ['x.csv']\n", 'registers = ["x.csv"]: there is no such file'),
     ("option = 3\n", "declares no register"),
 ]
-WRONG_FILES = [  # a whole wrong file
+WRONG_FILES = [  # each text is a whole family file with a mistake
     ("", "t.toml: has no [family]; add it, with the title and the manual"),
     ("[family", "t.toml: is not TOML: a header lacks a bracket"),
     (
@@ -349,7 +363,9 @@ WRONG_FILES = [  # a whole wrong file
         *WRONG_FILES,
     ],
 )
-def test_a_mistake_is_reported_with_its_file_and_line(tmp_path: Path, text: str, expected: str) -> None:
+def test_mistake_in_a_family_file_is_reported_with_file_and_line(
+    tmp_path: Path, text: str, expected: str
+) -> None:
     found = mistakes(tmp_path, text)
     assert any(expected in mistake for mistake in found), found
 
@@ -383,7 +399,9 @@ def test_a_mistake_is_reported_with_its_file_and_line(tmp_path: Path, text: str,
         (b"name,at\n\na b,1\n", "c.csv: line 3, a b: 'a b' cannot be a register's name"),
     ],
 )
-def test_mistake_in_a_csv_file_is_reported_with_its_line(tmp_path: Path, data: bytes, expected: str) -> None:
+def test_mistake_in_a_csv_register_table_is_reported_with_its_line(
+    tmp_path: Path, data: bytes, expected: str
+) -> None:
     (tmp_path / "c.csv").write_bytes(data)
     found = mistakes(tmp_path, HEAD + 'registers = ["c.csv"]\n')
     assert any(expected in mistake for mistake in found), found
@@ -392,20 +410,20 @@ def test_mistake_in_a_csv_file_is_reported_with_its_line(tmp_path: Path, data: b
 @pytest.mark.parametrize(
     "text", ["name;at;unit\na;0x10;V\n", "name\tat\tunit\na\t16\tV\n", 'Name,At,Unit\n"a","10H",V\n']
 )
-def test_csv_file_may_use_any_delimiter(tmp_path: Path, text: str) -> None:
+def test_csv_register_table_may_use_any_delimiter(tmp_path: Path, text: str) -> None:
     (tmp_path / "c.csv").write_text(text)
     loaded = family(tmp_path, HEAD + 'registers = ["c.csv"]\n')
     assert (loaded.register("a").address, loaded.register("a").unit) == (16, "V")
 
 
-def test_csv_file_may_use_numbered_registers_such_as_40001(tmp_path: Path) -> None:
+def test_csv_register_table_may_use_addresses_such_as_40001(tmp_path: Path) -> None:
     (tmp_path / "c.csv").write_text("name,at\na,40001\nb,300010\nc,00001\nd,10002\n")
     loaded = family(tmp_path, '[family]\ntitle = "T"\nmanual = "M"\nregisters = ["c.csv"]\n')
     found = [(one.table.name, one.address) for one in loaded.registers.values()]
     assert found == [("holding register", 0), ("input register", 9), ("coil", 0), ("discrete input", 1)]
 
 
-def test_every_column_of_a_csv_file_is_loaded(tmp_path: Path) -> None:
+def test_every_column_of_a_csv_register_table_is_loaded(tmp_path: Path) -> None:
     (tmp_path / "c.csv").write_text(
         "name,at,access,step,span,values,kept,while_running,harmless\n"
         "a,1,setting,0.5,0 | 50,,eeprom,no,\n"
@@ -419,7 +437,7 @@ def test_every_column_of_a_csv_file_is_loaded(tmp_path: Path) -> None:
     assert [(each.name, each.value) for each in b.values] == [("off", 0), ("on", 16)]
 
 
-def test_missing_or_invalid_file_is_refused(tmp_path: Path) -> None:
+def test_missing_or_invalid_family_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FamilyError, match="there is no such file"):
         load_family(tmp_path / "none.toml")
     for path in (tmp_path, Path("/dev/zero")):
@@ -427,20 +445,20 @@ def test_missing_or_invalid_file_is_refused(tmp_path: Path) -> None:
             load_family(path)
 
 
-def test_number_of_reported_mistakes_is_limited(tmp_path: Path) -> None:
+def test_number_of_reported_mistakes_in_a_family_file_is_limited(tmp_path: Path) -> None:
     text = HEAD + "[reading]\n" + "".join(f"a{number} = 5\n" for number in range(300))
     found = mistakes(tmp_path, text)
     assert (len(found), found[-1]) == (201, "t.toml: 100 more mistakes are not shown; correct these first")
 
 
-def test_every_key_is_documented_in_the_reference() -> None:
+def test_reference_page_documents_every_key_of_a_family_file() -> None:
     page = (Path(__file__).parents[3] / "docs" / "reference" / "family-file.md").read_text("utf-8")
     missing = [key for key in (*FAMILY_KEYS, *REGISTER_KEYS) if f"`{key}`" not in page]
     assert missing == []
     assert [section for section in SECTIONS if f"[{section}]" not in page] == []
 
 
-def test_text_registers_can_be_declared_and_read(tmp_path: Path) -> None:
+def test_family_file_can_declare_text_registers(tmp_path: Path) -> None:
     entries = 'serial = { at = 0xFC00, length = 8, order = "BA" }\nkind = { at = "30011", length = 2 }\n'
     loaded: Any = family(tmp_path, HEAD + "[text]\n" + entries)
     assert (loaded.serial.address, loaded.serial.length, loaded.serial.order) == (0xFC00, 8, "BA")
@@ -462,7 +480,7 @@ def test_text_registers_can_be_declared_and_read(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_mistakes_in_declarations_of_text_registers_are_reported(
+def test_mistakes_in_text_registers_of_a_family_file_are_reported(
     tmp_path: Path, entry: str, expected: str
 ) -> None:
     found = mistakes(tmp_path, HEAD + "[text]\n" + entry + "\n")
@@ -478,7 +496,7 @@ groups = [{ code = "P00.", at = "0000H", count = 3 }, { code = "P", at = "1000H"
 """
 
 
-def test_parameters_section_gives_the_address_rule(tmp_path: Path) -> None:
+def test_parameters_section_of_a_family_file_gives_the_address_rule(tmp_path: Path) -> None:
     more = 'line = ["P00.00"]\npasswords = ["P001"]\nnever = { "P00.02" = "it starts a test" }\n'
     found = parameters_of(family(tmp_path, HEAD + RULE + more))
     assert {code: (one.name, one.address) for code, one in found.items()} == {
@@ -503,7 +521,9 @@ def test_parameters_section_gives_the_address_rule(tmp_path: Path) -> None:
         ('groups = [{ code = "P", at = 0, count = 2 }]\nfirmware = "x"', "firmware = 'x' is not a register"),
     ],
 )
-def test_mistakes_in_the_parameters_section_are_reported(tmp_path: Path, rule: str, expected: str) -> None:
+def test_mistakes_in_the_parameters_section_of_a_family_file_are_reported(
+    tmp_path: Path, rule: str, expected: str
+) -> None:
     text = f"{HEAD}[reading]\na = {{ at = 1 }}\n[parameters]\n{rule}\n"
     assert any(expected in mistake for mistake in mistakes(tmp_path, text))
 
@@ -534,21 +554,21 @@ EXTENDING = {
     ("extended", "declared", "expected"),
     [(extended, *row) for extended, rows in EXTENDING.items() for row in rows],
 )
-def test_file_that_extends_a_family_replaces_none_of_its_safeguards(
+def test_family_file_that_extends_a_family_cannot_replace_its_safeguards(
     tmp_path: Path, extended: str, declared: str, expected: str
 ) -> None:
     (only,) = mistakes(tmp_path, f'{HEAD}extends = "{extended}"\n{declared}\n')
     assert expected in only
 
 
-def test_file_that_extends_a_family_may_read_its_addresses_and_add_settings(tmp_path: Path) -> None:
+def test_family_file_that_extends_a_family_may_add_readings_and_settings(tmp_path: Path) -> None:
     more = '[reading]\nheld = { at = "0009H" }\n[setting]\nfan = { at = "0900H" }\n'
     assert {"held", "fan", "control"} <= family(
         tmp_path, f'{HEAD}extends = "yd1000"\n{more}'
     ).registers.keys()
 
 
-def test_number_format_and_order_of_a_register_are_loaded(tmp_path: Path) -> None:
+def test_number_format_and_byte_order_in_a_family_file_are_loaded(tmp_path: Path) -> None:
     text = (
         HEAD
         + """\
@@ -596,7 +616,7 @@ WORDS = (
     *(b"at = ", b"values = ", b"bits = ", b"table = ", b"unit = ", b"span = ", b"steps = ", b"await = "),
 )
 
-ENOUGH = 20.0  # s, limit for one file
+ENOUGH = 20.0  # time limit in s for loading one file
 
 
 def mutated(data: bytes, chosen: random.Random) -> bytes:
@@ -608,7 +628,7 @@ def mutated(data: bytes, chosen: random.Random) -> bytes:
         piece = chosen.choice(
             (chosen.choice(WORDS), b"", data[other : other + 30], data[begin:end] * 2, chosen.randbytes(2))
         )
-        if chosen.random() < 0.4:  # replace a whole value, so that the file stays valid TOML
+        if chosen.random() < 0.4:  # replace a whole value, so that the file often stays valid TOML
             begin = data.find(b"= ", begin) + 2
             ends = [at for at in (data.find(mark, begin) for mark in (b",", b" }", b"\n")) if at > 0]
             end = min(ends, default=begin)
@@ -619,7 +639,7 @@ def mutated(data: bytes, chosen: random.Random) -> bytes:
 @pytest.mark.slow
 @settings(max_examples=examples(300))
 @given(st.sampled_from(SEEDS), st.integers(0, 2**32))
-def test_damaged_file_loads_or_is_refused_with_sentences(seed: bytes, number: int) -> None:
+def test_damaged_family_file_loads_or_is_refused_with_sentences(seed: bytes, number: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         read("family", mutated(seed, random.Random(number)), Path(folder))
 
@@ -641,8 +661,8 @@ LARGE = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", [*list(LARGE)[:4], *usually(*list(LARGE)[4:])])
-def test_large_file_loads_in_time(tmp_path: Path, name: str) -> None:
-    """The limit is generous; a loader that compares every register with every other would take minutes."""
+def test_large_family_file_loads_in_less_than_twenty_seconds(tmp_path: Path, name: str) -> None:
+    """A loader that compares every register with every other register would take minutes."""
     large = LARGE[name]()
     begun = time.process_time()
     read("family", large, tmp_path)

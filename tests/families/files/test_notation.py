@@ -1,4 +1,4 @@
-"""Addresses in a family file: every notation gives the right address as sent."""
+"""Addresses in a family file: each notation is converted to the right address on the wire."""
 
 from __future__ import annotations
 
@@ -30,12 +30,13 @@ from multidrop.families.files.notation import Counting, sent_as
         ("10017", None, None, (16, "discrete")),
         ("00001", None, None, (0, "coil")),
         ("000065", None, "coil", (64, "coil")),
-        (50200, 1, None, (50199, "holding")),  # Danfoss' status word; no table has the digit 5
-        (16130, 1, None, (16129, "holding")),  # Danfoss' output frequency; the digit 1 is another table's
+        (50200, 1, None, (50199, "holding")),  # Danfoss' status word; the first digit 5 names no table
+        # Danfoss' output frequency; the first digit 1 names another table
+        (16130, 1, None, (16129, "holding")),
         (40001, 0, "input", (40001, "input")),
     ],
 )
-def test_an_address_in_toml_is_converted_to_the_address_on_the_wire(
+def test_address_in_toml_is_converted_to_the_address_on_the_wire(
     given: Any, counts_from: int | None, table: str | None, sent: tuple[int, str]
 ) -> None:
     assert Counting(counts_from).address(given, table, "holding") == sent
@@ -54,7 +55,7 @@ def test_an_address_in_toml_is_converted_to_the_address_on_the_wire(
         ("0016", 0, (16, "holding")),
     ],
 )
-def test_an_address_in_csv_is_converted_to_the_address_on_the_wire(
+def test_address_in_csv_is_converted_to_the_address_on_the_wire(
     cell: str, counts_from: int | None, sent: tuple[int, str]
 ) -> None:
     assert Counting(counts_from).address_in_cell(cell, None, "holding") == sent
@@ -79,20 +80,20 @@ def test_an_address_in_csv_is_converted_to_the_address_on_the_wire(
         (400017, "400017 may be the number 400017, or register 17 of table holding; write a smaller number"),
     ],
 )
-def test_invalid_addresses_are_refused(given: Any, sentence: str) -> None:
+def test_invalid_addresses_in_a_family_file_are_refused(given: Any, sentence: str) -> None:
     with pytest.raises(ValueError) as refused:  # noqa: PT011 (the sentence is compared below)
         Counting(0).address(given, None, "holding")
     assert sentence in str(refused.value)
 
 
 @table("table", ["holding", "input", "coil", "discrete"])
-def test_with_counts_from_0_every_address_can_be_written(table: str) -> None:
+def test_every_address_can_be_written_if_counts_from_is_0(table: str) -> None:
     for address in (0, 9, 10_000, 10_001, 19_999, 30_001, 39_999, 40_000, 40_017, 49_999, 0xFFFF):
         written = tomllib.loads(f"at = {sent_as(address, table)}")["at"]
         assert Counting(0).address(written, table, "holding") == (address, table)
 
 
-def test_address_digit_that_contradicts_its_table_is_refused() -> None:
+def test_address_whose_first_digit_contradicts_its_table_is_refused() -> None:
     with pytest.raises(
         ValueError, match='"30001" begins with 3, which stands for table input, but table = "holding"; '
     ):
@@ -110,13 +111,13 @@ def test_address_digit_that_contradicts_its_table_is_refused() -> None:
         ("1" * 400, "is outside 0 to FFFFH"),
     ],
 )
-def test_invalid_csv_cells_are_refused_with_an_example(cell: str, sentence: str) -> None:
+def test_invalid_csv_cell_is_refused_with_a_valid_example(cell: str, sentence: str) -> None:
     with pytest.raises(ValueError) as refused:  # noqa: PT011
         Counting(0).address_in_cell(cell, None, "holding")
     assert sentence in str(refused.value)
 
 
-def test_missing_counts_from_is_reported() -> None:
+def test_family_file_without_the_key_counts_from_is_reported() -> None:
     counting = Counting(None)
     assert counting.address(16, None, "holding") == (16, "holding")
     assert counting.address("40001", None, "holding") == (0, "holding")

@@ -1,4 +1,4 @@
-"""Hazards of motor commands, tested on a simulated drive of every profile."""
+"""Dangerous situations with motor commands, tested on a simulated drive of every profile."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def line(monkeypatch: pytest.MonkeyPatch, model: str) -> Line:
 
 
 class Line:
-    """A simulated bus with one drive; `starts` has the requests sent so far that start its motor."""
+    """A simulated bus with one drive. `starts` has the sent requests that start the motor."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, model: str) -> None:
         self.is_start = STARTS[model]
@@ -94,7 +94,7 @@ def test_trip_during_a_start_is_reported(line: Line, monkeypatch: pytest.MonkeyP
 
 
 def test_reset_never_starts_the_motor(line: Line) -> None:
-    """This holds even if the run command was active at the trip, and the drive obeys the run bit's level."""
+    """The run command may still be set at the trip, and the drive may obey its level."""
     line.runs()
     line.sim.trip(FAULT)
     begun = len(line.writes)
@@ -104,7 +104,7 @@ def test_reset_never_starts_the_motor(line: Line) -> None:
     line.bus.sleep(5)
     assert line.drive.state().condition is Condition.STOPPED
     assert not line.sim.motor.energised
-    line.sim.trip(FAULT)  # a later fault stays: the reset bit was cleared
+    line.sim.trip(FAULT)  # the later fault stays, because the reset bit was cleared
     line.bus.sleep(1)
     assert line.drive.state().condition is Condition.FAULT
     line.drive.reset_fault()  # the later fault can be reset too
@@ -129,7 +129,7 @@ def test_reset_with_lost_replies_never_starts_the_motor(line: Line, lost: int) -
     line.sim.trip(FAULT)
     line.bus.sleep(1)
     line.drive.state()
-    assert line.sim.motor.fault == FAULT  # the reset bit was cleared, so the new fault stays
+    assert line.sim.motor.fault == FAULT  # the new fault stays, because the reset bit was cleared
 
 
 def test_reset_without_a_fault_sends_no_write(line: Line) -> None:
@@ -137,7 +137,7 @@ def test_reset_without_a_fault_sends_no_write(line: Line) -> None:
     assert line.writes == []
 
 
-def test_fault_that_remains_is_reported(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fault_that_remains_after_a_reset_is_reported(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
     line.sim.trip(FAULT)
     monkeypatch.setattr(line.sim.motor, "reset", lambda: None)
     with pytest.raises(NotVerified, match="the fault remains"):
@@ -156,14 +156,14 @@ def test_start_without_a_setpoint_is_refused(line: Line) -> None:
 
 
 def test_start_after_a_power_cycle_requires_a_new_setpoint(line: Line, model: str) -> None:
-    """The motor stays off; the next start is refused, unless the drive's setpoint cannot be read."""
+    """The motor stays off. The next start is refused, unless the drive's setpoint cannot be read."""
     line.runs()
     line.sim.power_cycle()
     line.bus.sleep(5)
     assert not line.sim.motor.energised
     assert line.drive.state().condition is Condition.STOPPED
     begun = len(line.writes)
-    if model == "danfoss-fc51":  # its reference cannot be read
+    if model == "danfoss-fc51":  # the setpoint of this drive cannot be read
         line.drive.start()
         return
     with pytest.raises(WriteForbidden, match="set_frequency"):
@@ -184,7 +184,7 @@ LOCAL = {
 
 
 @table("model", LOCAL)
-def test_start_in_local_control_is_refused(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_start_is_refused_while_the_keypad_is_in_control(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, model)
     line.drive.set_frequency(20)
     line.sim.is_local = True
@@ -197,7 +197,7 @@ def test_start_in_local_control_is_refused(model: str, monkeypatch: pytest.Monke
 NO_DIRECTION = ("abb-acs355", "siemens-v20", "optidrive-e3")
 
 
-def test_direction_is_sent_or_refused(line: Line, model: str) -> None:
+def test_direction_of_a_start_is_sent_or_refused(line: Line, model: str) -> None:
     line.drive.set_frequency(20)
     if model in NO_DIRECTION:
         with pytest.raises(WriteForbidden, match="direction"):
@@ -208,18 +208,18 @@ def test_direction_is_sent_or_refused(line: Line, model: str) -> None:
     line.bus.sleep(2)
     assert line.drive.state().condition is Condition.RUNNING
     assert line.sim.motor.frequency == pytest.approx(-20, abs=0.01)
-    if model in ("danfoss-fc51", "schneider-atv320"):  # their status shows no direction
+    if model in ("danfoss-fc51", "schneider-atv320"):  # the status of these drives shows no direction
         with pytest.raises(WriteForbidden, match="cannot report which way"):
             line.drive.start()
     else:
-        line.drive.start()  # without a direction: the present one is kept
+        line.drive.start()  # without a direction, the drive keeps its present direction
         line.bus.sleep(3)
         line.drive.state()
         assert line.sim.motor.frequency == pytest.approx(-20, abs=0.01)
     assert line.drive.state().condition is Condition.RUNNING
 
 
-def test_a_plain_write_of_a_start_word_is_refused(line: Line) -> None:
+def test_plain_write_of_a_start_word_is_refused(line: Line) -> None:
     control = line.drive.control
     requests = {count: Message(1, 6, control.address, data=count.to_bytes(2)) for count in range(0x900)}
     starts = [count for count, request in requests.items() if line.is_start(request)]
@@ -230,7 +230,7 @@ def test_a_plain_write_of_a_start_word_is_refused(line: Line) -> None:
     assert line.writes == []
 
 
-def test_writing_a_number_declared_harmless_never_starts_the_motor(line: Line) -> None:
+def test_write_of_a_raw_count_declared_harmless_never_starts_the_motor(line: Line) -> None:
     line.drive.set_frequency(20)
     control = line.drive.control
     for before in control.harmless:
@@ -241,7 +241,7 @@ def test_writing_a_number_declared_harmless_never_starts_the_motor(line: Line) -
             assert not line.sim.motor.energised
 
 
-def test_frequency_out_of_range_is_refused(line: Line) -> None:
+def test_setpoint_outside_the_frequency_limits_is_refused(line: Line) -> None:
     for hz in (-1, 5000):
         with pytest.raises(ValueError, match="Hz"):
             line.drive.set_frequency(hz)
@@ -249,7 +249,7 @@ def test_frequency_out_of_range_is_refused(line: Line) -> None:
 
 
 def test_ramp_continues_from_the_setpoint_in_force(line: Line) -> None:
-    """The ramp is in Hz, even if the reference is a percentage that cannot be read."""
+    """The ramp is computed in Hz, even if the setpoint register holds a percentage that cannot be read."""
     line.drive.set_frequency(20)
     begun = len(line.writes)
     ramp(line.drive, 22, rate=1, every=1)
@@ -257,7 +257,7 @@ def test_ramp_continues_from_the_setpoint_in_force(line: Line) -> None:
     assert line.sim.motor.target == pytest.approx(22, abs=0.01)
 
 
-def test_jog_that_continues_after_a_stop_gets_its_own_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jog_that_continues_after_a_stop_is_ended_by_stop_jog(monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, "invt-goodrive")
     line.sim.jog_needs_own_stop = True
     line.drive.option["stop_time"] = 3.0
@@ -271,8 +271,10 @@ def test_jog_that_continues_after_a_stop_gets_its_own_stop(monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("is_refused", [False, True], ids=["not heard", "refused"])
-def test_stop_jog_follows_an_unconfirmed_stop(monkeypatch: pytest.MonkeyPatch, is_refused: bool) -> None:
-    """The stop's replies are lost, as with one broken wire, or the drive refuses a stop during a jog."""
+def test_stop_jog_is_sent_after_an_unconfirmed_stop(
+    monkeypatch: pytest.MonkeyPatch, is_refused: bool
+) -> None:
+    """The replies to the stop are lost, as with a broken wire, or the drive refuses a stop during a jog."""
     line = Line(monkeypatch, "invt-goodrive")
     line.sim.jog_needs_own_stop = True
     line.drive.jog()
@@ -294,7 +296,7 @@ def test_stop_jog_follows_an_unconfirmed_stop(monkeypatch: pytest.MonkeyPatch, i
     assert not line.sim.motor.energised
 
 
-def test_stop_jog_is_not_sent_to_another_make(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_jog_is_not_sent_to_a_drive_of_another_make(monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, "invt-goodrive")
     checked: list[Drive] = []
 
@@ -309,7 +311,7 @@ def test_stop_jog_is_not_sent_to_another_make(monkeypatch: pytest.MonkeyPatch) -
     assert line.writes == []
 
 
-def test_start_of_a_cia402_drive_without_mains_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_start_of_a_cia402_drive_without_mains_voltage_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, "schneider-atv320")
     line.drive.set_frequency(20)
     line.sim.stays_off = True
@@ -333,7 +335,9 @@ def test_start_of_a_profidrive_during_off2_or_off3_is_refused(
     assert line.sim.motor.energised
 
 
-def test_off2_during_a_run_is_reported_and_not_overridden(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_off2_from_a_terminal_during_a_run_is_reported_and_not_overridden(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line = Line(monkeypatch, "siemens-v20")
     line.runs()
     line.drive.write(line.drive.control, line.drive.control.decode(0x047C))
@@ -341,7 +345,7 @@ def test_off2_during_a_run_is_reported_and_not_overridden(monkeypatch: pytest.Mo
     assert line.drive.state().condition is Condition.STOPPED
 
 
-def test_reset_of_a_locked_trip_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reset_of_a_trip_that_only_a_power_cycle_clears_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line(monkeypatch, "danfoss-fc51")
     line.sim.trip(FAULT)
     line.sim.is_locked = True
@@ -352,7 +356,9 @@ def test_reset_of_a_locked_trip_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
     line.runs()
 
 
-def test_start_of_an_optidrive_of_the_first_guide_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_start_of_an_optidrive_as_its_first_guide_describes_it_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line = Line(monkeypatch, "optidrive-e3")
     line.sim.is_first_reading = True
     line.drive.set_frequency(20)
@@ -366,8 +372,9 @@ def test_start_of_an_optidrive_of_the_first_guide_is_refused(monkeypatch: pytest
     assert line.starts == []
 
 
-OF_ANOTHER = {  # values of another make; a drive of the family may show one of them, as before a restart
-    "status": 0x0241,  # not a state of PROFIdrive
+# register values of another make; a drive of this family may show one of them, for example before a restart
+OF_ANOTHER = {
+    "status": 0x0241,  # this status does not exist in PROFIdrive
     "station": 7,
     "signature": 1,
 }
@@ -378,7 +385,7 @@ OF_ANOTHER = {  # values of another make; a drive of the family may show one of 
 def test_stop_is_withheld_only_if_status_and_a_second_value_show_another_make(
     monkeypatch: pytest.MonkeyPatch, first: str, second: str
 ) -> None:
-    """The stop word of one make may run another make's motor. One value, or two settings, prove nothing."""
+    """One make's stop word may run another make's motor. One value, or two settings, prove nothing."""
     line = Line(monkeypatch, "abb-acs355")
     shown = {line.drive.register(name).address: OF_ANOTHER[name] for name in (first, second)}
 

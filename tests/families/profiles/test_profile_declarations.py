@@ -1,4 +1,4 @@
-"""Families of a profile: required and forbidden declarations, and identification."""
+"""Families that use a profile: required and forbidden declarations, and identification of drives."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def test_every_profile_is_documented(profile: type[Drive]) -> None:
 
 
 @every_profile
-def test_no_number_declared_harmless_is_a_start_or_reset_word(profile: Any) -> None:
+def test_no_raw_count_declared_harmless_is_a_start_or_reset_word(profile: Any) -> None:
     harmless = profile.roles["control"].harmless
     assert profile.stop_word in harmless
     assert profile.coast_word is None or profile.coast_word in harmless
     assert profile.reset_role != "control" or profile.reset_word not in harmless
 
 
-def test_profile_completes_the_family_roles() -> None:
+def test_profile_completes_the_register_declarations_of_a_family() -> None:
     control = Acs355.control
     assert control.name == "control"
     assert control is Acs355.registers["control"]
@@ -46,7 +46,7 @@ def test_profile_completes_the_family_roles() -> None:
     assert not Acs355.reference.commands
 
 
-def test_family_may_add_the_reverse_bit() -> None:
+def test_family_may_add_a_reverse_bit_to_the_control_word() -> None:
     assert Atv320.control.values(0x0800).name == "REVERSE"
 
 
@@ -89,7 +89,7 @@ WRONG: list[tuple[type[Drive], dict[str, Any], str]] = [
 
 
 @table(("family", "registers", "mistake"), WRONG)
-def test_a_register_that_does_not_fit_its_role_is_refused(
+def test_register_that_does_not_fit_its_role_in_the_profile_is_refused(
     family: type[Drive], registers: dict[str, Any], mistake: str
 ) -> None:
     with pytest.raises(DeclarationError) as wrong:
@@ -98,7 +98,7 @@ def test_a_register_that_does_not_fit_its_role_is_refused(
     assert sentence.startswith(mistake)
 
 
-def test_all_mistakes_of_a_family_are_reported_together() -> None:
+def test_all_mistakes_in_a_family_with_a_profile_are_reported_together() -> None:
     class Words(IntEnum):
         RUN = 1
 
@@ -126,7 +126,7 @@ def test_all_mistakes_of_a_family_are_reported_together() -> None:
     }
 
 
-def test_percentage_reference_requires_maximum_frequency() -> None:
+def test_setpoint_in_percent_requires_the_option_maximum_frequency() -> None:
     drive = Fc51(1, confirmed=1)
     wire = Wire(drive)
     with pytest.raises(WriteForbidden, match="maximum_frequency = HZ") as refusal:
@@ -196,12 +196,14 @@ STRANGERS: list[tuple[str, dict[str, Any], str]] = [
 
 
 @table(("model", "says", "sentence"), STRANGERS)
-def test_identify_refuses_a_drive_with_other_values(model: str, says: dict[str, Any], sentence: str) -> None:
+def test_identify_refuses_a_drive_with_values_of_another_family(
+    model: str, says: dict[str, Any], sentence: str
+) -> None:
     with pytest.raises(WriteForbidden, match=sentence):
         identify(model, **says)
 
 
-def test_drive_that_refuses_a_role_is_not_identified() -> None:
+def test_drive_that_refuses_to_read_a_profile_register_is_not_identified() -> None:
     with pytest.raises(DriveException):
         identify("abb-acs355", signature=DriveException("abb", 2, "illegal address"))
 
@@ -209,9 +211,9 @@ def test_drive_that_refuses_a_role_is_not_identified() -> None:
 # ---- subclasses of a family ----
 
 
-def test_family_class_can_be_extended_by_a_subclass() -> None:
+def test_class_with_a_profile_can_be_extended_by_a_subclass() -> None:
     class Longer(Acs355):
-        """The same drive with more registers."""
+        """A family with more registers than its base class."""
 
         output_current = reading(103, "A", step=0.1)
 

@@ -1,4 +1,4 @@
-"""The frames of each profile's verbs have the words that were typed from the manuals."""
+"""Frames of each profile's verbs have the control words that are printed in the manuals."""
 
 from __future__ import annotations
 
@@ -30,23 +30,24 @@ from multidrop.sim import SimulatedDrive, Simulator, simulated
 from multidrop.sim import Wire as SimulatedWire
 
 # The first bytes of frames to drive 1, as printed in the manuals.
-ABB = "01 06 00 00 "  # 40001 (ACS355 manual p. 313)
-FC = "01 06 C3 4F "  # 50000, counted from 1 (FC 202 design guide p. 175)
+ABB = "01 06 00 00 "  # register 40001 is address 0 (ACS355 manual p. 313)
+FC = "01 06 C3 4F "  # register 50000, counted from 1 (FC 202 design guide p. 175)
 DELTA = "01 06 20 00 "
 RESET = "01 06 20 02 "
 E3 = "01 06 00 00 "
 ATV = "01 06 21 35 "  # 8501
 DELIXI = "01 06 A0 00 "
-A1000 = "01 10 00 01 00 01 02 "  # 0001H by function 10 (A1000 manual p. 559)
+A1000 = "01 10 00 01 00 01 02 "  # register 0001H by function 10H (A1000 manual p. 559)
 
-ABB_OFF, ABB_READY, ABB_ON, ABB_RUNS = 0x0270, 0x0231, 0x0233, 0x0237  # ACS355 manual p. 319
+ABB_OFF, ABB_READY, ABB_ON, ABB_RUNS = 0x0270, 0x0231, 0x0233, 0x0237  # status words (ACS355 manual p. 319)
 ABB_FAULT = 0x0238
 FC_READY, FC_RUNS, FC_TRIP, FC_LOCK = 0x0607, 0x0E07, 0x0604 | 8, 0x0604 | 0x48
 DELTA_STOP, DELTA_RUNS, DELTA_REVERSE = 0x0500, 0x0503, 0x051B
-DELTA_TO_REVERSE = 0x0513  # reverse was commanded, and the motor still turns forward
+DELTA_TO_REVERSE = 0x0513  # status while the motor still turns forward although reverse was commanded
 GD_STANDBY, GD_RUNS, GD_FAULT = 3, 1, 4
-MD_STOPPED, MD_RUNS = 3, 1  # PI130 p. 116: 3000H
-YK_OFF, YK_RUNS, YK_REVERSE, YK_FAULT = 0xC022, 0xC031, 0xC035, 0xC082  # A1000 27C p. 494
+MD_STOPPED, MD_RUNS = 3, 1  # values of register 3000H (PI130 manual p. 116)
+# status words (A1000 manual 27C p. 494)
+YK_OFF, YK_RUNS, YK_REVERSE, YK_FAULT = 0xC022, 0xC031, 0xC035, 0xC082
 E3_READY, E3_RUNS, E3_TRIP = 0x0040, 0x0041, 0x0302
 ATV_OFF, ATV_READY, ATV_ON, ATV_RUNS, ATV_FAULT = 0x0250, 0x0231, 0x0233, 0x0237, 0x0218
 
@@ -54,7 +55,7 @@ FREE = {"reference": 40.0, "output_frequency": 0.0, "fault": 0, "reference_in_fo
 
 
 def wire(model: str, status: Any, **says: Any) -> Wire:
-    """Return a test wire with the drive, whose status does not change when it is commanded."""
+    """Return a test wire with the drive. Its status does not change when it is commanded."""
     drive: Any = MAKE[model](1)
     drive.commanded = 40.0
     kind = drive.status.values
@@ -63,13 +64,13 @@ def wire(model: str, status: Any, **says: Any) -> Wire:
 
 
 def sent(found: Wire) -> list[str]:
-    """Check the checksums of the sent frames, and return the frames without checksums."""
+    """Return the sent frames without checksums, after checking the checksums."""
     assert all(checksums.rtu(frame[:-6]).hex(" ").upper() == frame for frame in found.sent)
     return [frame[:-6] for frame in found.sent]
 
 
 STARTS: dict[str, tuple[list[int], tuple[str, ...]]] = {
-    # ACS550-02/U2 manual p. 246: bits 0110, 100 ms later 0111, then operation enabled with all ramp bits.
+    # ACS550-02/U2 manual p. 246: bits 0110, 100 ms later 0111, then 047FH, which enables operation.
     "abb-acs355": ([ABB_OFF, ABB_READY, ABB_ON, ABB_RUNS], (ABB + "04 76", ABB + "04 77", ABB + "04 7F")),
     "siemens-v20": (
         [ABB_OFF, ABB_READY, ABB_ON, ABB_RUNS],
@@ -80,7 +81,8 @@ STARTS: dict[str, tuple[list[int], tuple[str, ...]]] = {
         (ATV + "00 06", ATV + "00 07", ATV + "00 0F"),
     ),
     "danfoss-fc51": ([FC_READY, FC_RUNS], (FC + "04 7C",)),
-    "delta-vfd-el": ([DELTA_STOP, DELTA_RUNS], (DELTA + "00 12",)),  # CP2000 p. 12.1-09-8: run and forward
+    # CP2000 manual p. 12.1-09-8: bits run and forward
+    "delta-vfd-el": ([DELTA_STOP, DELTA_RUNS], (DELTA + "00 12",)),
     "invt-goodrive": ([GD_STANDBY, GD_RUNS], (DELTA + "00 01",)),  # Goodrive100 p. 167
     "optidrive-e3": ([E3_READY, E3_RUNS], (E3 + "00 01",)),  # ODE-3 user guide p. 33
     "powtran-pi130": ([MD_STOPPED, MD_RUNS], (DELTA + "00 01",)),  # PI130 p. 116
@@ -97,7 +99,7 @@ def test_start_sends_the_control_words_printed_in_the_manual(model: str) -> None
     assert sent(found) == list(words)
 
 
-def test_abb_start_waits_between_its_words() -> None:
+def test_abb_start_waits_100_ms_between_its_control_words() -> None:
     found = wire("abb-acs355", [ABB_OFF, ABB_READY, ABB_ON, ABB_RUNS])
     found.drive.start()
     assert found.seconds >= 0.1
@@ -211,16 +213,16 @@ def test_jog_of_a_turning_motor_is_refused(model: str, status: Any) -> None:
     assert sent(found) == []
 
 
-# Frames for a setpoint of 25 Hz; as a percentage it is half of 50 Hz.
+# Frames for a setpoint of 25 Hz, which is 50 % if the maximum frequency is 50 Hz.
 SETPOINTS = {
-    "abb-acs355": "01 06 00 01 27 10",  # 10000 of 20000 (ACS355 manual p. 308)
-    "siemens-v20": "01 06 00 64 20 00",  # 2000H of 4000H
+    "abb-acs355": "01 06 00 01 27 10",  # 10000 is half of 20000 (ACS355 manual p. 308)
+    "siemens-v20": "01 06 00 64 20 00",  # 2000H is half of 4000H
     "schneider-atv320": "01 06 21 36 00 FA",
-    "danfoss-fc51": "01 06 C3 59 20 00",  # 50010, 2000H of 4000H
+    "danfoss-fc51": "01 06 C3 59 20 00",  # register 50010; 2000H is half of 4000H
     "delta-vfd-el": "01 06 20 01 09 C4",
     "invt-goodrive": "01 06 20 01 09 C4",
-    "optidrive-e3": "01 06 00 01 00 FA",  # "100 = 10.0 Hz" (ODE-3 user guide p. 33)
-    "powtran-pi130": "01 06 10 00 13 88",  # 5000 of 10000 (PI130 p. 116)
+    "optidrive-e3": "01 06 00 01 00 FA",  # the guide's example: "100 = 10.0 Hz" (ODE-3 user guide p. 33)
+    "powtran-pi130": "01 06 10 00 13 88",  # 5000 is half of 10000 (PI130 manual p. 116)
     "delixi-e": "01 06 A0 01 13 88",
     "yaskawa-a1000": "01 10 00 02 00 01 02 09 C4",
 }
@@ -242,7 +244,7 @@ HINDRANCES = [
     ("danfoss-fc51", 0x0600, "is not ready"),
     ("danfoss-fc51", 0x0403, "hand mode"),
     ("optidrive-e3", 0x0000, "is not ready to run"),
-    ("optidrive-e3", 0x0100, "is not ready to run"),  # "running", as the first guide prints it
+    ("optidrive-e3", 0x0100, "is not ready to run"),  # this status means "running" in the first guide
     ("invt-goodrive", 5, "has no mains"),
     ("yaskawa-a1000", 0x4022, "does not take its commands from the line"),
     ("yaskawa-a1000", 0x8002, "is not ready"),
@@ -250,15 +252,16 @@ HINDRANCES = [
 
 
 @table(("model", "status", "sentence"), HINDRANCES)
-def test_refused_start_names_the_reason(model: str, status: int, sentence: str) -> None:
+def test_error_of_a_refused_start_names_the_reason(model: str, status: int, sentence: str) -> None:
     found = wire(model, status)
     with pytest.raises(WriteForbidden, match=sentence):
         found.drive.start()
     assert all(frame[-5:] == "04 76" for frame in sent(found))
 
 
-def test_optidrive_of_the_first_guide_is_never_reported_as_stopped() -> None:
-    found = wire("optidrive-e3", 0x0100, output_frequency=20.0)  # "high byte 1: running"
+def test_optidrive_as_in_its_first_guide_is_never_reported_as_stopped() -> None:
+    # the first guide says: "high byte 1: running"
+    found = wire("optidrive-e3", 0x0100, output_frequency=20.0)
     assert found.drive.state().condition is Condition.DECELERATING
     found = wire("optidrive-e3", 0x0000)
     assert found.drive.state() == State(Condition.STOPPED, note="is not ready to run")
@@ -273,7 +276,8 @@ STATES = [
     ("danfoss-fc51", FC_LOCK, {}, Condition.FAULT),
     ("delta-vfd-el", 0x0501, {}, Condition.DECELERATING),
     ("delta-vfd-el", 0x0502, {}, Condition.RUNNING),  # standby: running at 0 Hz
-    ("delta-vfd-el", DELTA_STOP, {"fault": 0x0500}, Condition.STOPPED),  # the high byte is only a warning
+    # the high byte of the fault register is only a warning
+    ("delta-vfd-el", DELTA_STOP, {"fault": 0x0500}, Condition.STOPPED),
     ("delta-vfd-el", DELTA_STOP, {"fault": 0x0031}, Condition.FAULT),
     ("invt-goodrive", 2, {}, Condition.RUNNING),
     ("invt-goodrive", 5, {}, Condition.STOPPED),
@@ -289,7 +293,7 @@ STATES = [
 
 
 @table(("model", "status", "says", "condition"), STATES)
-def test_status_is_decoded_to_the_condition(
+def test_status_word_of_a_profile_is_decoded_to_the_condition(
     model: str, status: int, says: dict[str, Any], condition: Condition
 ) -> None:
     assert wire(model, status, **says).drive.state().condition is condition
@@ -307,7 +311,7 @@ def test_status_is_decoded_to_the_condition(
         ("optidrive-e3", E3_RUNS),
     ],
 )
-def test_run_at_0_hz_is_not_reported_as_stopped(model: str, running: int) -> None:
+def test_motor_that_runs_at_0_hz_is_not_reported_as_stopped(model: str, running: int) -> None:
     found = wire(model, running, output_frequency=0.0)
     found.drive.option["stop_time"] = 5.0
     with pytest.raises(Unconfirmed, match="5 s it is not seen to have stopped"):
@@ -318,15 +322,15 @@ def test_run_at_0_hz_is_not_reported_as_stopped(model: str, running: int) -> Non
     ("shown", "sentence"),
     [(0.0, "setpoint .* is 0"), (12.5, r"follows 12\.50 Hz, not the setpoint that was written")],
 )
-def test_start_of_a_delta_that_follows_another_setpoint_is_refused(shown: float, sentence: str) -> None:
+def test_start_of_a_delta_drive_is_refused_if_it_shows_another_setpoint(shown: float, sentence: str) -> None:
     found = wire("delta-vfd-el", DELTA_STOP, reference_in_force=shown)
     with pytest.raises(WriteForbidden, match=sentence):
         found.drive.start()
     assert found.sent == []
 
 
-def test_stop_of_an_invt_that_continues_to_jog_sends_stop_jog_immediately() -> None:
-    """STOP_JOG is sent immediately, not only after the stop's timeout."""
+def test_stop_jog_is_sent_at_once_if_an_invt_drive_still_jogs_after_a_stop() -> None:
+    """STOP_JOG is not delayed until the stop's time limit."""
     found = wire("invt-goodrive", GD_RUNS)
     found.drive.option["stop_time"] = 5.0
     with pytest.raises(Unconfirmed, match="5 s"):
@@ -335,7 +339,7 @@ def test_stop_of_an_invt_that_continues_to_jog_sends_stop_jog_immediately() -> N
     assert found.seconds < 5.5
 
 
-def test_start_of_an_invt_after_a_jog_requires_a_stop() -> None:
+def test_start_of_an_invt_drive_after_a_jog_requires_a_stop() -> None:
     found = wire("invt-goodrive", [GD_STANDBY, GD_RUNS])
     found.drive.jog()
     found.sent.clear()
@@ -343,7 +347,7 @@ def test_start_of_an_invt_after_a_jog_requires_a_stop() -> None:
         found.drive.start()
     assert found.sent == []
     found.say({"status": found.drive.status.values(GD_STANDBY)})
-    with pytest.raises(Unconfirmed):  # the start is sent, but this drive never shows a run
+    with pytest.raises(Unconfirmed):  # the start is sent, but the test drive never shows that it runs
         found.drive.start()
     assert sent(found) == [DELTA + "00 01"]
 
@@ -380,12 +384,12 @@ def numbered(words: Mapping[str, int], **facts: Any) -> Register[Any]:
 
 
 class Clone(Goodrive):
-    """A family whose words are INVT's with 5 and 6 exchanged, and without jogs."""
+    """A family with INVT's control words in which 5 and 6 are exchanged, and without jog words."""
 
     control = numbered(EXCHANGED)
 
 
-def test_renumbered_control_words_are_sent() -> None:
+def test_control_words_renumbered_by_a_family_are_sent() -> None:
     drive: Any = Clone(1, confirmed=1)
     drive.commanded = 40.0
     found = Wire(drive, {**FREE, "status": drive.status.values(GD_STANDBY)})
@@ -396,14 +400,14 @@ def test_renumbered_control_words_are_sent() -> None:
     assert Goodrive.control.harmless == (5, 6, 8)
 
 
-def test_renumbered_stop_is_the_only_stop_of_a_turning_motor_without_jogs() -> None:
+def test_family_without_jog_words_sends_only_its_renumbered_stop() -> None:
     drive: Any = Clone(1, confirmed=1)
     found = Wire(drive, {**FREE, "status": [drive.status.values(GD_RUNS), drive.status.values(GD_STANDBY)]})
     drive.stop()
     assert sent(found) == [DELTA + "00 06"]
 
 
-def test_verbs_without_a_control_word_in_the_family_are_unsupported() -> None:
+def test_verbs_whose_control_word_a_family_omits_are_unsupported() -> None:
     control = numbered({"forward": 1, "stop": 0, "reset_fault": 9})
     drive: Any = type("Short", (Goodrive,), {"control": control})(1, confirmed=1)
     drive.commanded = 40.0
@@ -424,13 +428,15 @@ def test_verbs_without_a_control_word_in_the_family_are_unsupported() -> None:
         ({**EXCHANGED, "stop": 0x10000}, "control: STOP = 65536 is not within 0 to 65535"),
     ],
 )
-def test_invalid_numbers_of_control_words_are_reported(words: Mapping[str, int], mistake: str) -> None:
+def test_invalid_control_word_numbers_of_a_family_are_reported(
+    words: Mapping[str, int], mistake: str
+) -> None:
     with pytest.raises(DeclarationError) as wrong:
         type("Wrong", (Goodrive,), {"control": numbered(words)})
     assert any(each.startswith(mistake) for each in wrong.value.mistakes)
 
 
-def test_renumbering_is_refused_for_a_profile_of_bits() -> None:
+def test_control_words_made_of_bits_cannot_be_renumbered() -> None:
     with pytest.raises(DeclarationError, match="its words are whole numbers"):
         type("Bits", (Goodrive,), {"control": command(0x2000, IntFlag("Bits", {"forward": 1, "stop": 2}))})
 
@@ -454,7 +460,7 @@ output_frequency = { at = 0x3000, unit = "Hz", step = 0.01 }
 """
 
 
-def test_family_file_with_renumbered_control_words_runs_and_stops_its_simulation(tmp_path: Path) -> None:
+def test_simulated_drive_of_a_family_file_runs_with_renumbered_control_words(tmp_path: Path) -> None:
     (tmp_path / "clone.toml").write_text(CLONE_FILE)
     family = load_family(tmp_path / "clone.toml")
     sim: SimulatedDrive = simulated(family(1))

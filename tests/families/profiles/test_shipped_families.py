@@ -1,4 +1,4 @@
-"""The families that ship as files: their register tables, typed from the manuals, and their use."""
+"""Families from files of this package: their register tables, typed from the manuals, and their use."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ every_family = table("name", SHIPPED)
 every_profile_family = table("name", OF_PROFILE)
 every_commanded_family = table("name", COMMANDED)
 
-# By family: short names in `place` keys for the manuals and public programs that [family].manual lists.
+# By family: short names that `place` uses for the manuals and public programs in the key `manual`.
 EDITIONS = {
     "abb-acs355": ("ACS355", "ACS550-02/U2", "ACS550-01", "ACS550 p. 209"),
     "danfoss-fc51": ("FC 51", "FC 101", "FC 202", "MG02A4", "MG02C6"),
@@ -55,7 +55,7 @@ PAGE_OR_FILE = re.compile(
     r"\bp\. (A-)?\d|sheet \d|\.(py|h|c|cpp|yaml)\b|wb-community|energy-management|H300|GD100-PV"
 )
 
-# Function codes, address as sent, name, step, unit.
+# Columns: function codes, address on the wire, name, step, unit.
 TABLES = {
     "abb-acs355": """
 03/06 0000 control           - ProfidriveControl
@@ -308,7 +308,7 @@ TABLES = {
 03/06 045A dry_run_time             1 s
 03/06 045B start_pressure_difference 0.01 kgf/cm²
 """,
-    # Registers in addition to those of the built-in family.
+    # Only the registers that the built-in family does not have.
     "erman-er-g-220-02": """
 03/06 0062 pressure_setpoint 0.01 bar
 04/00 001A water_pressure    0.01 bar
@@ -322,7 +322,7 @@ TABLES = {
 TABLES["yaskawa-v1000"] = TABLES["yaskawa-a1000"].replace("03/10 0034 signature          - Signature\n", "")
 
 
-def test_shipped_families_are_found_by_name() -> None:
+def test_family_files_of_the_package_are_found_by_name() -> None:
     assert list(SHIPPED) == sorted(TABLES)
     assert {*SHIPPED} == {*COMMANDED, *READ_ONLY}
     assert not set(SHIPPED) & set(MODELS)
@@ -332,7 +332,7 @@ def test_shipped_families_are_found_by_name() -> None:
 
 
 @every_family
-def test_registers_equal_the_table_typed_from_the_manual(name: str) -> None:
+def test_registers_of_a_family_file_equal_the_table_typed_from_the_manual(name: str) -> None:
     inherited = rows(MODELS[EXTENDED[name]]) if name in EXTENDED else set()
     assert rows(shipped_family(name)) - inherited == typed(TABLES[name])
 
@@ -344,7 +344,7 @@ def own_registers(name: str) -> list[Register[Any]]:
 
 
 @every_family
-def test_shipped_family_names_its_sources_and_is_marked_untested(name: str) -> None:
+def test_family_files_of_the_package_name_sources_and_are_marked_untested(name: str) -> None:
     family = shipped_family(name)
     assert issubclass(family, Profile) is (name in OF_PROFILE)
     assert "not tried on hardware" in family.title
@@ -356,7 +356,7 @@ def test_shipped_family_names_its_sources_and_is_marked_untested(name: str) -> N
 
 
 @every_family
-def test_every_register_names_a_page_of_a_listed_edition(name: str) -> None:
+def test_every_register_of_a_family_file_names_a_page_of_a_listed_manual(name: str) -> None:
     family = shipped_family(name)
     words = [edition.partition(" p. ")[0].partition(", sheet")[0] for edition in EDITIONS[name]]
     assert all(word in family.manual or word in "Schneider_ATV312.yaml" for word in words)
@@ -365,7 +365,7 @@ def test_every_register_names_a_page_of_a_listed_edition(name: str) -> None:
         assert any(edition in register.place for edition in EDITIONS[name]), (register.name, register.place)
 
 
-def test_pump_controller_family_has_no_commands(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_family_of_the_pump_controller_has_no_commands(monkeypatch: pytest.MonkeyPatch) -> None:
     family = shipped_family("erman-er-g-220-03")
     assert {register.access for register in family.registers.values()} == {Access.READING}
     assert "confirmed" not in family.options
@@ -384,7 +384,7 @@ def test_pump_controller_family_has_no_commands(monkeypatch: pytest.MonkeyPatch)
 
 
 @every_commanded_family
-def test_no_command_except_a_stop_is_sent_before_confirmation(
+def test_untested_family_sends_no_command_except_a_stop_before_confirmation(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     family = shipped_family(name)
@@ -398,13 +398,13 @@ def test_no_command_except_a_stop_is_sent_before_confirmation(
 
 
 @every_profile_family
-def test_identification_registers_are_not_polled(name: str) -> None:
+def test_registers_that_only_identify_a_drive_are_not_polled(name: str) -> None:
     polled = {register.name for register in shipped_family(name).readings()}
     assert "status" in polled
     assert not polled & {"station", "signature"}
 
 
-def test_plant_file_can_use_shipped_families_by_name(tmp_path: Path) -> None:
+def test_plant_file_can_use_families_of_the_package_by_name(tmp_path: Path) -> None:
     plant = tmp_path / "plant.toml"
     names = [name for name in SHIPPED if 9600 in shipped_family(name).baudrates]
     assert len(names) > len(SHIPPED) - 3
@@ -421,7 +421,7 @@ def test_plant_file_can_use_shipped_families_by_name(tmp_path: Path) -> None:
     assert [type(polled.drive).model for polled in line.drives] == names
 
 
-def test_command_line_lists_and_checks_shipped_families(capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_line_lists_and_checks_families_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["models"]) == 0
     listed = capsys.readouterr().out
     assert all(f"\n{name} " in listed for name in (*MODELS, *SHIPPED)[1:])
@@ -431,7 +431,7 @@ def test_command_line_lists_and_checks_shipped_families(capsys: pytest.CaptureFi
 
 
 @pytest.mark.long
-def test_shipped_files_are_loaded_on_demand() -> None:
+def test_family_files_of_the_package_are_loaded_on_demand() -> None:
     code = (
         "import sys, multidrop.families.registry as registry; "
         "from multidrop.families.files import loader; "
@@ -463,7 +463,7 @@ def test_family_file_can_use_every_profile(tmp_path: Path) -> None:
         assert issubclass(load(tmp_path, f'{HEAD}profile = "{name}"\n{roles}'), profile)
 
 
-def test_all_mistakes_of_a_file_with_a_profile_are_reported_together(tmp_path: Path) -> None:
+def test_all_mistakes_of_a_family_file_with_a_profile_are_reported_together(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"own\.toml") as wrong:
         load(
             tmp_path,
@@ -484,7 +484,7 @@ def test_all_mistakes_of_a_file_with_a_profile_are_reported_together(tmp_path: P
         assert sentence in message
 
 
-def test_unknown_profile_is_reported(tmp_path: Path) -> None:
+def test_unknown_profile_in_a_family_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"profile = 'profdrive' is not known; did you mean profidrive"):
         load(tmp_path, f'{HEAD}profile = "profdrive"\n[reading]\nspeed = {{ at = 1 }}\n')
 
@@ -498,7 +498,10 @@ def test_adjacent_registers_are_read_in_one_request_if_the_manual_allows_it() ->
 
 
 def installed(monkeypatch: pytest.MonkeyPatch, **values: str) -> None:
-    """Fake installed entry points, given as name="module:attribute"; "name__" repeats a name."""
+    """Fake installed entry points, given as name="module:attribute".
+
+    `acme__` is a second entry point `acme`.
+    """
     points = [EntryPoint(name.rstrip("_"), value, GROUP) for name, value in values.items()]
     monkeypatch.setattr(
         importlib.metadata, "entry_points", lambda **wanted: EntryPoints(points).select(**wanted)
@@ -515,7 +518,7 @@ def test_built_in_family_takes_precedence_over_an_installed_one(monkeypatch: pyt
     assert find_model("yd1000") is YD1000
 
 
-def test_models_lists_installed_families_and_warns_of_broken_ones(
+def test_models_command_lists_installed_families_and_warns_of_broken_ones(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     installed(monkeypatch, toy="toy:Toy", broken="no_such_module:Drive", yd1000="toy:Toy")
@@ -546,7 +549,7 @@ def test_models_lists_installed_families_and_warns_of_broken_ones(
         ({"acmes": "toy:Toy"}, r"there is no model 'acme'; did you mean acmes"),
     ],
 )
-def test_an_unusable_package_raises_a_one_sentence_error(
+def test_unusable_family_package_raises_a_one_sentence_error(
     monkeypatch: pytest.MonkeyPatch, values: dict[str, str], sentence: str
 ) -> None:
     installed(monkeypatch, **values)
@@ -556,7 +559,7 @@ def test_an_unusable_package_raises_a_one_sentence_error(
 
 # ---- evidence from users' logs ----
 
-# A row of pjbardolia/energy-management, gateway/vfd_log.csv, as the drive's keypad shows it.
+# A row of the log gateway/vfd_log.csv in pjbardolia/energy-management, with the values on the drive's keypad.
 CHF100A_LOG = {
     "output_frequency": (3137, 31.37),
     "dc_bus_voltage": (5564, 556.4),
@@ -568,7 +571,7 @@ CHF100A_LOG = {
 }
 
 
-def test_chf100a_registers_decode_to_the_keypads_values() -> None:
+def test_chf100a_registers_decode_to_the_values_on_the_keypad() -> None:
     family = shipped_family("invt-chf100a")
     registers = family.registers
     assert {name: registers[name].decode(raw) for name, (raw, _) in CHF100A_LOG.items()} == {

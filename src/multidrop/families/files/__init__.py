@@ -1,8 +1,8 @@
-"""Load families from files: a register table in TOML and CSV becomes a drive class. No code is run."""
+"""Load drive families from files. A register table in TOML and CSV becomes a drive class. No code is run."""
 
 
 class FamilyError(ValueError):
-    """All mistakes in a family file; `mistakes` has a sentence for each: place, error, correction."""
+    """Raised for a family file with mistakes; `mistakes` has a sentence with the correction for each."""
 
     def __init__(self, mistakes: tuple[str, ...]) -> None:
         super().__init__("\n".join(mistakes))

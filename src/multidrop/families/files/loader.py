@@ -51,7 +51,7 @@ MOST_CSV_FILES = 20
 
 @dataclass(frozen=True)
 class _Loaded:
-    """A loaded family, and the contents of its files, to detect changes."""
+    """A loaded family and the contents of its files, which show whether the files have changed."""
 
     files: Mapping[Path, bytes]
     family: type[Drive]
@@ -63,7 +63,7 @@ _loaded: dict[Path, _Loaded] = {}
 def load_family(path: Path | str) -> type[Drive]:
     """Return the family that a TOML file declares: a subclass of `Drive`.
 
-    Loading a file again returns the same class until its contents change. The `model` is the file's name.
+    Loading an unchanged file again returns the same class. The `model` is the file's name.
     Raises FamilyError that lists all mistakes in the file and in the CSV files that it names.
     """
     path = Path(path)
@@ -93,7 +93,7 @@ def _same(file: Path, data: bytes) -> bool:
 
 
 def _bytes(path: Path, what: str) -> bytes:
-    """Return a file's bytes. Raises ValueError if the file is missing or too long; the text has no path."""
+    """Return a file's bytes. Raises ValueError if the file is missing or too long; the error has no path."""
     try:
         if not path.is_file():
             other = "is not a file, but a directory or a device; name a file" if path.exists() else ""
@@ -168,7 +168,7 @@ def _family(
 
 
 def _base(given: Mapping[str, Any], place: TomlPlace) -> type[Drive]:
-    """Return the base class whose verbs the family inherits: a profile, a built-in family, or Drive."""
+    """Return the base class that the family extends: a profile, a built-in family, or Drive."""
     if "profile" in given and "extends" in given:
         place.wrong("has profile and extends; name one of them")
     for key in ("profile", "extends"):
@@ -183,9 +183,9 @@ def _base(given: Mapping[str, Any], place: TomlPlace) -> type[Drive]:
 def _check_inherited(
     base: type[Drive], document: Mapping[str, Any], declared: Declared, texts: Iterable[str], place: TomlPlace
 ) -> None:
-    """Report each declaration that would replace a part of the built-in family that this file extends.
+    """Report each declaration in the file that would replace a part of the built-in family that it extends.
 
-    Such a part may be a limit, or may prevent a motor from being started.
+    The replaced part might be a limit, or might prevent a start of the motor.
     """
     if base not in MODELS.values():
         return
@@ -207,7 +207,7 @@ def _check_inherited(
 def _inherited_errors(
     registers: Mapping[str, Register[Any]], inherited: Mapping[str, Register[Any]], title: str
 ) -> Iterator[str]:
-    """Yield a sentence for each register that would be written at an address of an inherited register.
+    """Yield an error sentence for each register that writes to the address of an inherited register.
 
     Writes of such a register would bypass the limits of the inherited one. `title` names the extended family.
     """
@@ -222,7 +222,7 @@ def _inherited_errors(
 
 
 def bases(key: str) -> Mapping[str, type[Drive]]:
-    """Return the classes that the key "profile" or "extends" can name."""
+    """Return the base classes, by name, that the key "profile" or "extends" can name."""
     if key == "extends":
         return MODELS
     from multidrop.families.profiles import PROFILES  # imported here, because few files use a profile
@@ -276,7 +276,7 @@ def _named_bytes(table: Path) -> bytes:
 def _made(
     base: type[Drive], namespace: dict[str, Any], declared: Declared, place: TomlPlace
 ) -> type[Drive] | None:
-    """Create the class with this namespace and return it; None if a declaration is wrong."""
+    """Create the class with this namespace; return None if the class has a mistake."""
     broken = declared.places.keys() - declared.registers.keys()
     if place.config_errors:
         bounds = {*namespace["options"], *broken}
@@ -293,7 +293,7 @@ def _made(
 
 
 def _report(mistakes: Any, declared: Declared, place: TomlPlace) -> None:
-    """Add mistakes in declarations to `place`, each at the place of its register in the file."""
+    """Report mistakes in declarations, each with the place of its register in the file."""
     for mistake in mistakes:
         name, _, sentence = mistake.partition(": ")
         if name in declared.places:

@@ -1,4 +1,4 @@
-"""Parse addresses and CSV cells as manuals write them: 0x2000, 8192, "2000H", "40001", 0.1, off=0 | on=1."""
+"""Parse addresses and CSV cells in the notations of manuals: 0x2000, 8192, "2000H", "40001", off=0 | on=1."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ LAST_ADDRESS = 0xFFFF
 _HEX = re.compile(r"0[xX]([0-9a-fA-F]{1,8})|([0-9a-fA-F]{1,8})[hH]")
 _NUMBERED = re.compile(
     r"[0134](\d{4}|\d{5})", re.ASCII
-)  # as 40001 or 400001: the table's digit, then a number from 1
+)  # addresses such as 40001 or 400001: a digit for the table, then a number from 1
 _EXPONENT = re.compile(r"\d+([.]\d+)?[eE][+-]?\d+", re.ASCII)
 
 
 @dataclass(frozen=True)
 class Counting:
-    """Converts a manual's addresses to addresses as sent.
+    """Converts the addresses that a manual prints to the addresses that requests contain.
 
-    `counts_from` is the manual's number for the address 0 on the wire; None if the file does not state it.
-    The number is then assumed to be 0, so that other mistakes can still be found. `assumed` lists the
-    addresses that were converted with this assumption.
+    `counts_from` is the number that the manual prints for the address 0 of a request; None if the file does
+    not state it. Then 0 is assumed, so that other mistakes can still be found. `assumed` lists the addresses
+    that were converted with this assumption.
     """
 
     counts_from: int | None
     assumed: list[int | str] = field(default_factory=list)
 
     def address(self, given: Any, table: str | None, default: str) -> tuple[int, str]:
-        """Return the address as sent, and the table's name, for a TOML value.
+        """Return the address in requests and the table's name for an address in a TOML file.
 
         `table` is the table that the register states, `default` the table if it states none. Raises
-        ValueError whose text has a valid example.
+        ValueError with a valid example for an invalid address.
         """
         if isinstance(given, bool) or not isinstance(given, (int, str)):
             raise ValueError(f'{given!r} is not an address; write 0x2000, 8192, "2000H" or "40001"')
@@ -53,9 +53,9 @@ class Counting:
         raise ValueError(f'"{text}" is not an address; write 0x2000, 8192, "2000H" or "40001"')
 
     def address_in_cell(self, text: str, table: str | None, default: str) -> tuple[int, str]:
-        """Return the same as `address` for a CSV cell, in which a number such as 40001 has no quotes.
+        """Do the same as `address` for a CSV cell, in which a number such as 40001 has no quotes.
 
-        If the file states `counts_from`, a number is an address, counted from `counts_from`. Raises
+        If the file states `counts_from`, every number in a cell is an address. Raises
         ValueError for a number such as 40001 whose first digit is that of the register's table: the number
         may be an address, or may mean the first register of the table.
         """
@@ -92,7 +92,7 @@ class Counting:
 
 
 def sent_as(address: int, table: str) -> str:
-    """Return the TOML text of an address as sent, for a file with `counts_from = 0`."""
+    """Return an address of a request as TOML text, for a file with `counts_from = 0`."""
     is_plain = not _NUMBERED.fullmatch(str(address)) or _TABLE_OF_DIGIT[str(address)[0]] != table
     return f"0x{address:04X}" if is_plain else f'"{address:X}H"'
 
@@ -130,7 +130,7 @@ def text(cell: str) -> str:
 
 
 def number(cell: str) -> int | float:
-    """Parse a decimal or hex number. Raises ValueError whose text has a valid example."""
+    """Parse a decimal or hex number. Raises ValueError with a valid example for other texts."""
     if match := _HEX_COUNT.fullmatch(cell):
         return int(match[1] or match[2], 16)
     if _WHOLE.fullmatch(cell) and len(cell) <= 20:
@@ -143,7 +143,7 @@ def number(cell: str) -> int | float:
 
 
 def number_or_word(cell: str) -> int | float | str:
-    """Parse a number; return a word such as unknown or NaN unchanged."""
+    """Parse a number; return a word such as "unknown" or "NaN" unchanged."""
     return cell if cell.isalpha() else number(cell)
 
 
@@ -153,7 +153,7 @@ def numbers(cell: str) -> list[int | float | str]:
 
 
 def whole(cell: str) -> int:
-    """Parse a whole number; refuse 1E10, which may be a hex number that a spreadsheet has converted."""
+    """Parse a whole number. Refuse 1E10: a spreadsheet may have converted a hex number to this."""
     if _NUMBER.fullmatch(cell) and not _WHOLE.fullmatch(cell):
         right = f"0x{cell}" if cell.isalnum() else "it as 10 or 0x7FFF"
         raise ValueError(f"{cell!r} is not a whole number; write {right}")
@@ -169,12 +169,12 @@ def counts(cell: str) -> list[int]:
 
 
 def named(cell: str) -> dict[str, Any]:
-    """Parse "off=0 | on=1" into numbers by name. Raises ValueError whose text has a valid example."""
+    """Parse "off=0 | on=1" into numbers by name. Raises ValueError with a valid example for other texts."""
     return {name: whole(given) for name, given in _pairs(cell, "no name with its number; write off=0 | on=1")}
 
 
 def titles(cell: str) -> dict[str, Any]:
-    """Parse "ru=ток | zh=电流" into texts by language. Raises ValueError whose text has a valid example."""
+    """Parse "ru=ток | zh=电流" into texts by language. Raises ValueError with a valid example otherwise."""
     return dict(_pairs(cell, "no language with its title; write ru=ток | zh=电流"))
 
 

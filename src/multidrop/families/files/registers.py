@@ -1,4 +1,4 @@
-"""Parse the registers of a family file, in TOML and CSV, and declare them."""
+"""Parse the registers of a family file, from its TOML and CSV parts, and declare them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ OF_ENUMERATIONS = frozenset({*dir(IntEnum), *dir(IntFlag), *dir(int), "mro", "na
 
 
 def unusable(name: str) -> str:
-    """Return why a name cannot be a Python attribute, with a valid suggestion; "" if it can."""
+    """Return why a name cannot be a Python attribute, with a better name; "" if it can."""
     if len(name) > LONGEST_NAME:
         return f"it has more than {LONGEST_NAME} characters; give it a shorter one"
     if keyword.iskeyword(name):
@@ -55,14 +55,17 @@ def unusable(name: str) -> str:
 
 
 def enumeration(owner: str, given: Mapping[str, Any]) -> type[IntEnum]:
-    """Return the enumeration of a register's values. Raises ValueError that lists all mistakes."""
+    """Return an enumeration of a register's named values. Raises ValueError that lists all mistakes."""
     _check("values", given, MOST_VALUES, range(-(1 << 63), 1 << 64), "a whole number")
     make: Any = IntEnum
     return cast(type[IntEnum], make(owner, given))
 
 
 def flags(owner: str, given: Mapping[str, Any]) -> type[IntFlag]:
-    """Return a register's flags, given as bit numbers by name. Raises ValueError that lists all mistakes."""
+    """Return an IntFlag of a register's named bits, given by bit number.
+
+    Raises ValueError with all mistakes.
+    """
     _check("bits", given, MOST_BITS, range(MOST_BITS), f"a bit's number, 0 to {MOST_BITS - 1}")
     make: Any = IntFlag
     return cast(type[IntFlag], make(owner, {name: 1 << bit for name, bit in given.items()}))
@@ -99,7 +102,7 @@ def _mistakes(key: str, given: Mapping[str, Any], most: int, allowed: range, rig
 
 LONGEST_TEXT = 1000
 LONGEST_TITLE = 100
-MOST_LISTED = 100  # limit of raw counts listed in one key
+MOST_LISTED = 100  # limit of raw counts in one list of a family file
 NOT_STATED = "unknown"
 ORDERS = ("ABCD", "CDAB", "BADC", "DCBA", "AB", "BA")
 WRITES = ("single", "multiple")
@@ -109,7 +112,10 @@ _KEPT = {"ram": Kept.RAM, "eeprom": Kept.EEPROM, NOT_STATED: Kept.UNKNOWN}
 
 @dataclass(frozen=True)
 class RegisterKey:
-    """One key of a register: `convert` raises ValueError for an invalid value; `example` is a valid one."""
+    """A key that a register in a family file may have. `convert` raises ValueError for an invalid value.
+
+    `example` is a valid value.
+    """
 
     convert: Callable[[Any], Any]
     example: str
@@ -208,7 +214,7 @@ def _named_one(known: Mapping[str, Any], spelling: Callable[[str], str], value: 
 
 
 def _spellings(known: Mapping[str, Any], spelling: Callable[[str], str]) -> list[str]:
-    """Return the names; if `spelling` ignores case, also in lower case and in capitals."""
+    """Return the valid names; if `spelling` ignores case, also in lower case and in capitals."""
     return [*known] if spelling is str else [*known, *map(str.lower, known), *map(str.upper, known)]
 
 
@@ -243,7 +249,8 @@ _FINITE = {"type": "number", "minimum": -sys.float_info.max, "maximum": sys.floa
 _NUMBER_OR_NAN = {"anyOf": [_FINITE, {"enum": ["NaN", "nan"]}]}
 _NUMBERS = {"type": "array", "items": _NUMBER_OR_NAN, "minItems": 1, "maxItems": MOST_COUNTS}
 _TEXT = {"type": "string", "maxLength": LONGEST_TEXT, "pattern": r"^[^\x00-\x1f\x7f]*$"}
-_SCHEMAS: Mapping[Callable[[Any], Any], Mapping[str, Any]] = {  # JSON Schemas, by conversion function
+# JSON Schema of a key's values, by the function that converts them
+_SCHEMAS: Mapping[Callable[[Any], Any], Mapping[str, Any]] = {
     _any: ADDRESS,
     _text: _TEXT,
     _number: _FINITE,
@@ -309,7 +316,7 @@ DEFAULT_KEYS = ("table", "unit", "step", "number_format", "order", "invalid", "w
 
 
 def converted(key: str, value: Any) -> Any:
-    """Convert the value of a key. Raises ValueError whose text has the mistake and a valid example."""
+    """Convert the value of a register's key. Raises ValueError with the mistake and a valid example."""
     try:
         return REGISTER_KEYS[key].convert(value)
     except ValueError as mistake:
@@ -317,7 +324,7 @@ def converted(key: str, value: Any) -> Any:
 
 
 def shown(value: Any) -> str:
-    """Return a value as text for an error sentence."""
+    """Return a value as short text for an error."""
     text = str(value).lower() if isinstance(value, bool) else repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
@@ -329,14 +336,15 @@ _DECLARE: Mapping[Access, Callable[..., Register[Any]]] = {
     Access.SETTING: setting,
     Access.COMMAND: command,
 }
-_WITHOUT_BITS = ("number_format", "order", "invalid", "step", "unit")  # keys of [default] that bits ignore
+# keys of the section [default] that do not apply to coils and discrete inputs
+_WITHOUT_BITS = ("number_format", "order", "invalid", "step", "unit")
 
 ReadAddress = Callable[[Any, str | None, str], tuple[int, str]]
 
 
 @dataclass
 class Declared:
-    """The registers declared so far, and each name's place in the file."""
+    """The registers that the file has declared so far, and the place of each name in the file."""
 
     counting: Counting
     defaults: Mapping[str, Any]
@@ -363,7 +371,7 @@ class Declared:
     def add(
         self, name: str, access: Access, given: Mapping[str, Any], place: TomlPlace, read: ReadAddress
     ) -> None:
-        """Declare one register; `read` is the function that parses its addresses."""
+        """Declare one register; the function `read` parses its addresses."""
         known = self._reserve(name, place)
         good = self._converted(given, place)
         address = self._addresses(given, good, place, read)
@@ -385,7 +393,7 @@ class Declared:
         if why := unusable(name):
             place.wrong(f"{shown(name)} cannot be a register's name: {why}")
             return False
-        if name in TAKEN_NAMES:  # a verb of the family would silently replace a register of this name
+        if name in TAKEN_NAMES:  # such a register would replace the verb or attribute of this name
             place.wrong("reserved name; every drive has it for something else; rename the register")
             return False
         if first := self.places.get(name):
@@ -412,7 +420,10 @@ class Declared:
     def _addresses(
         self, given: Mapping[str, Any], good: dict[str, Any], place: TomlPlace, read: ReadAddress
     ) -> tuple[int, str] | None:
-        """Return the address as sent and the table; None after a mistake. Store a `ram_address` in `good`."""
+        """Return the register's address in requests and its table; None after a mistake.
+
+        A `ram_address` is stored in `good`.
+        """
         if "at" not in given or ("table" in given and "table" not in good):
             good.pop("ram_address", None)
             return None
@@ -451,7 +462,7 @@ class Declared:
         space = TABLES[table]
         defaults = {key: value for key, value in self.defaults.items() if key not in NOT_DETAILS}
         if "number_format" in good:
-            # the counts in `invalid` are in the default number format, which this register does not use
+            # the default `invalid` is for the default number format, which this register does not use
             defaults.pop("invalid", None)
         if space.carrier is Carrier.BIT:
             defaults = {key: value for key, value in defaults.items() if key not in _WITHOUT_BITS}
@@ -482,13 +493,13 @@ def defaults_of(table: Any, place: TomlPlace) -> dict[str, Any]:
 
 MOST_BYTES = 2_000_000
 _DELIMITERS = (",", ";", "\t")
-_OWN_COLUMNS = ("name", "access")  # columns of a CSV file besides the keys of a register
+_OWN_COLUMNS = ("name", "access")  # columns of a CSV file that are not keys of a register
 COLUMNS = dict.fromkeys((*_OWN_COLUMNS, *REGISTER_KEYS))
 NEEDED = ("name", "at")
 
 
 def declare_rows(data: bytes, declared: Declared, place: TomlPlace) -> None:
-    """Declare the registers in a CSV file's contents; mistakes are reported with line and column."""
+    """Declare the registers of a CSV file. Mistakes are reported with line and column."""
     text = _decoded(data, place)
     if text is None:
         return
@@ -520,7 +531,7 @@ def _decoded(data: bytes, place: TomlPlace) -> str | None:
 
 
 def _rows(text: str, place: TomlPlace) -> Iterator[tuple[int, list[str]]]:
-    """Yield number and cells of each non-empty line."""
+    """Yield the line number and the cells of each line that is not empty."""
     first = text.lstrip("\r\n").splitlines()[:1]
     delimiter = max(_DELIMITERS, key=first[0].count) if first else ","
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
@@ -534,9 +545,9 @@ def _rows(text: str, place: TomlPlace) -> Iterator[tuple[int, list[str]]]:
 
 
 def _columns(header: list[str], place: TomlPlace) -> list[str] | None:
-    """Return the names of the columns; None if one is invalid."""
+    """Return the column names in the header; None if one is invalid."""
     columns = [name.lower().replace(" ", "_") for name in header]
-    while columns and not columns[-1]:  # spreadsheets write empty columns at the end
+    while columns and not columns[-1]:  # spreadsheets add empty columns at the end
         columns.pop()
     before = len(place.config_errors)
     meant = place.unknown(dict.fromkeys(columns), COLUMNS) if set(columns) - COLUMNS.keys() else set()
@@ -581,14 +592,13 @@ BESIDE: Mapping[str, Any] = {  # JSON Schema
 
 
 def beside(path: Path, name: Any) -> Path:
-    """Return the path of a CSV file in the family file's folder. Raises ValueError if it is elsewhere."""
+    """Return a CSV file's path. Raises ValueError unless it is in the family file's folder, or below it."""
     if not isinstance(name, str) or not name.lower().endswith((".csv", ".tsv")):
-        raise ValueError(
-            f'registers has {shown(name)}, which is not a CSV file; write registers = ["meter.csv"]'
-        )
-    place = PureWindowsPath(name)  # recognises drive letters, roots and both separators on every system
+        raise ValueError(f'registers = {shown(name)} is not a CSV file; write registers = ["meter.csv"]')
+    place = PureWindowsPath(name)  # on every system, this recognises drive letters, roots and both separators
     if place.anchor or ".." in place.parts or not name.isprintable():
         raise ValueError(
-            f"registers has {shown(name)}; a CSV file must be in the family file's folder, or below it"
+            f"registers = {shown(name)} is outside the family file's folder: "
+            "put the CSV file there, or below it"
         )
     return path.parent / name

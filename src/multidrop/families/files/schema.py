@@ -1,4 +1,4 @@
-"""The JSON Schema of a family file, made from the keys that the loader checks."""
+"""The JSON Schema of a family file, generated from the keys that the loader checks."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from multidrop.families.files.sections import (
 from multidrop.families.profiles import PROFILES, Profile, Role
 from multidrop.toml_check import DRAFT, ascending, distinct, json_schema
 
-_NEVER_WRITTEN = ("harmless", "broadcast")  # keys that a reading cannot have
+_NEVER_WRITTEN = ("harmless", "broadcast")  # keys that a register in the section [reading] cannot have
 _WRITTEN = [access.value for access in Access if access is not Access.READING]  # sections
 _FORBIDDEN: dict[str, Any] = {"not": {}}
 
@@ -44,7 +44,7 @@ _FORBIDDEN: dict[str, Any] = {"not": {}}
 def family_schema(tables: Sequence[str] = ()) -> dict[str, Any]:
     """Return the JSON Schema of a family file.
 
-    With `tables`, the names of CSV files, the key `registers` may name only these.
+    `tables` are the names of CSV files that the key `registers` may have; empty: any name.
     """
     proof = json_schema(PROOF_KEYS, anyOf=[{"required": [key]} for key in ("is", "above", "below")])
     proofs = {"type": "array", "minItems": 1, "maxItems": MOST_PROOFS, "items": proof}
@@ -89,29 +89,32 @@ def family_schema(tables: Sequence[str] = ()) -> dict[str, Any]:
 
 
 def _says(key: str, *values: object) -> dict[str, Any]:
-    """Return the condition that [family] has this key, with one of these values if there are any."""
+    """Return the condition that the section [family] has this key, with one of these values, if given."""
     value = {"properties": {key: {"enum": [*values]}}} if values else {}
     return {"properties": {"family": {"type": "object", "required": [key], **value}}, "required": ["family"]}
 
 
 def _each(entry: dict[str, Any], sections: Iterable[str] = ACCESSES) -> dict[str, Any]:
-    """Return a schema that applies `entry` to each register or text in these sections."""
+    """Return a schema that applies the schema `entry` to each register or text in these sections."""
     return {"properties": {name: {"additionalProperties": entry} for name in sections}}
 
 
 # ---- names of registers ----
 
 
-_MORE_NAMES = ("registers", "extends", "profile")  # keys of [family] that add registers or options
-_REFERENCES = "^(register|firmware|scale_register|at_least|at_most)$"  # keys with a register's name
+# keys of the section [family] that add registers or options
+_MORE_NAMES = ("registers", "extends", "profile")
+# keys whose value is the name of a register
+_REFERENCES = "^(register|firmware|scale_register|at_least|at_most)$"
 
 
 def _references() -> dict[str, Any]:
-    """Return the JSON Schema "references" and its parts: keys such as `at_most` have names of the same file.
+    """Return the JSON Schema "references" and its parts: keys such as `at_most` must name a register.
 
-    A JSON Schema cannot look up a name, but it can compare lengths and single characters of names. If all
-    names begin with other letters than a reference, the reference is misspelt. The schema compares the first
-    two and the last two characters. A correct reference is never refused; most misspelt ones are.
+    A JSON Schema cannot look up a name, but it can compare lengths and single characters of names. A name
+    that begins with another letter than every register is misspelt. The schema compares the length, and the
+    first two and the last two characters. So it never refuses an existing name, and refuses most misspelt
+    names.
     """
     letters = [f"[{small}{small.upper()}]" for small in ascii_lowercase]
     characters = [*letters, "_", *digits]
@@ -135,7 +138,7 @@ def _references() -> dict[str, Any]:
 
 
 def _counting() -> list[dict[str, Any]]:
-    """Return the parts of the schema for a file's addresses, which depend on `counts_from`."""
+    """Return the parts of the schema for the addresses of a file; they depend on the key `counts_from`."""
 
     def addresses(right: dict[str, Any]) -> dict[str, Any]:
         gaps = {"properties": {"gaps": {"additionalProperties": {"items": right}}}}
@@ -151,7 +154,7 @@ def _counting() -> list[dict[str, Any]]:
 
 
 def _addresses(numbers: Iterable[int]) -> dict[str, Any]:
-    """Return the schema of these numbers as addresses, whole or in hex."""
+    """Return the schema of these addresses, as numbers or as hex text."""
     numbers = [*numbers]
     digits = "|".join(re.sub("[A-F]", lambda one: f"[{one[0]}{one[0].lower()}]", f"{n:X}") for n in numbers)
     pattern = rf"^\s*(0[xX]0*({digits})|0*({digits})[hH])\s*$"
@@ -164,7 +167,7 @@ def _without_addresses(*invalid: dict[str, Any]) -> dict[str, Any]:
 
 
 def _ambiguous(table: str) -> dict[str, Any]:
-    """Return the schema of addresses such as 40002, which may also mean the table's second register."""
+    """Return the schema of addresses such as 40002, which may also mean the second register of a table."""
     first = int(DIGIT_OF_TABLE[table]) * 10_000
     return {"type": "integer", "minimum": first, "maximum": first + 9_999} if first else {"not": {}}
 
@@ -175,7 +178,7 @@ def _numbered(digits: str) -> dict[str, Any]:
 
 
 def _addresses_of(table: str) -> dict[str, Any]:
-    """Return the part of the schema for registers that state this table."""
+    """Return the part of the schema for the addresses of registers that state this table."""
     others = "".join(digit for name, digit in DIGIT_OF_TABLE.items() if name != table)
     return {
         "if": {"properties": {"table": {"enum": [table, table.upper()]}}, "required": ["table"]},
@@ -187,7 +190,7 @@ def _addresses_of(table: str) -> dict[str, Any]:
 
 
 def _extending(name: str, base: type[Drive]) -> dict[str, Any]:
-    """Return the schema's part for files that extend this family: they must not replace parts of it."""
+    """Return the part of the schema for files that extend this family: they must not change it."""
     taken = sorted({one for one in dir(base) if not one.startswith("_")} - {*TAKEN_NAMES})
     has_rule = {
         "parameters": base.parameter_space is not None,
@@ -208,9 +211,9 @@ def _extending(name: str, base: type[Drive]) -> dict[str, Any]:
 
 
 def _without_written(first: int, found: list[int]) -> dict[str, Any]:
-    """Return the part of the schema that forbids these addresses (as sent) in files that count from `first`.
+    """Return the part of the schema that forbids these addresses in files whose `counts_from` is `first`.
 
-    Registers of the extended family are written at these addresses, so a file may write no others there.
+    The extended family writes its own registers at these addresses.
     """
     numbered = "|".join(f"{at + 1:04}" if at < 9_999 else f"{at + 1}" for at in found)
     in_table = {"type": "string", "pattern": rf"^\s*40?({numbered})\s*$"}
@@ -222,7 +225,7 @@ def _without_written(first: int, found: list[int]) -> dict[str, Any]:
 
 
 def _with_profile(name: str, roles: Mapping[str, Role]) -> dict[str, Any]:
-    """Return the part of the schema for files with this profile, which gives roles to some registers."""
+    """Return the part of the schema for files with this profile, whose registers may have these roles."""
     reserved = {*dir(Profile), *Profile.__annotations__} - {*dir(Drive)}
     return {
         "if": _says("profile", name),
@@ -245,7 +248,10 @@ def _with_profile(name: str, roles: Mapping[str, Role]) -> dict[str, Any]:
 
 
 def _of_roles(roles: Mapping[str, Role]) -> dict[str, Any]:
-    """Return the schema of a section such as [reading], in a family file whose profile has these roles."""
+    """Return the schema of a section such as [reading] in a family file with a profile.
+
+    `roles` are the profile's registers in this section.
+    """
     return {
         "properties": {role: _of_role(role, roles[role]) for role in roles},
         "additionalProperties": {"properties": {"harmless": {"maxItems": 0}}},
@@ -257,7 +263,10 @@ def _has(section: str, name: str) -> dict[str, Any]:
 
 
 def _of_role(name: str, role: Role) -> dict[str, Any]:
-    """Return the schema of a register with this role, whose other facts the profile declares."""
+    """Return the schema of a register with this role.
+
+    The profile declares the register's other attributes.
+    """
     facts: dict[str, Any] = {
         "harmless": {"maxItems": 0},
         "never_together": {"maxItems": 0},
@@ -322,7 +331,7 @@ def _by_format() -> list[dict[str, Any]]:
 
 
 _IS_WRITTEN = {"not": {"required": ["never"]}}
-_HOLDING = {"properties": {"table": {"enum": ["holding", "HOLDING"]}}}  # stated, or left out
+_HOLDING = {"properties": {"table": {"enum": ["holding", "HOLDING"]}}}  # the table is stated, or is left out
 _HOLDING_BY_DEFAULT = {"properties": {"default": _HOLDING}}
 
 
@@ -351,13 +360,13 @@ def _table(properties: dict[str, Any]) -> dict[str, Any]:
 
 
 def _named(entry: dict[str, Any], reserved: Iterable[str], most: int = 1000) -> dict[str, Any]:
-    """Return the schema of a section whose keys are names; each value is an entry."""
+    """Return the schema of a section whose keys are names and whose values fit the schema `entry`."""
     names = {**NAME, "not": {"enum": sorted({*reserved, *keyword.kwlist})}}
     return {"type": "object", "propertyNames": names, "additionalProperties": entry, "maxProperties": most}
 
 
 def _facts(tables: Sequence[str]) -> dict[str, Any]:
-    """Return the schema of [family]."""
+    """Return the schema of the section [family]."""
     eight_bits = {"type": "array", "items": {"type": "string", "pattern": "^8"}}
     speaks_ascii = {
         "required": ["framings"],
@@ -392,7 +401,7 @@ def _register() -> dict[str, Any]:
 
 
 def _of_access(access: Access) -> dict[str, Any]:
-    """Return the schema of a register in the section of this access."""
+    """Return the schema of a register in the section for this access, such as [reading]."""
     if access is Access.READING:
         never_written = {key: {"maxItems": 0} for key in _NEVER_WRITTEN}
         only: dict[str, Any] = {"properties": {**never_written, "moves": {"const": False}}}

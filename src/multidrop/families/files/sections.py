@@ -117,12 +117,13 @@ FAMILY_KEYS = {
 _TEXTS = {"title": "title", "manual": "manual", "remote": "remote", "watchdog": "watchdog"}
 _TEXTS |= {"line_parameters": "line_parameters", "note": "__doc__"}
 _DURATIONS = ("silence", "least_interval", "response_delay", "response_timeout", "turnaround_delay")
-LONGEST_WAIT = 10.0  # s; limit of waits, because a stop of another drive may have to wait as long
+# s; limit of the drive's pauses, because a stop of another drive may have to wait as long
+LONGEST_WAIT = 10.0
 _LONGEST = {"silence": LONGEST_SILENCE, "least_interval": LONGEST_INTERVAL}  # s
 
 
 def facts_of(given: Mapping[str, Any], counting: Counting, place: TomlPlace) -> dict[str, Any]:
-    """Return class attributes from the [family] section; report each wrong value at `place`."""
+    """Return class attributes from the section [family]. Wrong values are reported at `place`."""
     facts: dict[str, Any] = {_TEXTS[key]: given[key] for key in _TEXTS if key in given}
     for key in _DURATIONS:
         seconds = duration_of(given, key, place)
@@ -234,7 +235,7 @@ _MAKERS: Mapping[str, Callable[[Any], Any]] = {
 
 
 def _by_table(given: Mapping[str, Any], counting: Counting, place: TomlPlace) -> dict[str, Any]:
-    """Return, by table, how many registers and which reserved addresses one read may include."""
+    """Return, by table, the limit of registers in one read and the reserved addresses that it may include."""
     most: dict[Table, int] = {}
     gaps: dict[Table, range] = {}
     for key in ("together", "gaps"):
@@ -270,7 +271,7 @@ OPTION_KEYS = {
     "span": Key(list, "span = [1, 600]", needed=True, keywords={"items": {"type": "number"}, **_PAIR}),
     "meaning": Key(str, 'meaning = "parameter 1105, of which 20000 is 100 %"', needed=True),
 }
-# Reserved names: keys of a drive in a plant file, and options of its class.
+# Names that an option must not have, because they are keys of a drive in a plant file.
 NOT_OPTIONS = frozenset(
     {"name", "model", "address", "framing", "baudrate", "format", "silence", "ram", "every", "poll"}
     | {"channel", "confirmed"}
@@ -278,7 +279,7 @@ NOT_OPTIONS = frozenset(
 
 
 def options_of(table: Any, registers: Collection[str], place: TomlPlace) -> dict[str, Option]:
-    """Return the options declared in the [option] section; report mistakes at `place`."""
+    """Return the options that the section [option] declares. Mistakes are reported at `place`."""
     if not isinstance(table, dict):
         place.wrong("[option] is not a table; write [option] and NAME = { unit, span, meaning }", "option")
         return {}
@@ -322,7 +323,10 @@ TEXT_KEYS = {
 def texts_of(
     section: Any, counting: Counting, registers: Mapping[str, TomlPlace], place: TomlPlace
 ) -> dict[str, Text]:
-    """Return the texts declared in the [text] section, by name; report mistakes at `place`."""
+    """Return the text registers that the section [text] declares, by name.
+
+    Mistakes are reported at `place`.
+    """
     if not isinstance(section, dict):
         place.wrong("[text] is not a table; write [text] and NAME = { at = 0xFC00, length = 8 }", "text")
         return {}
@@ -397,7 +401,7 @@ PARAMETER_KEYS = {
 def parameter_space_of(
     section: Any, counting: Counting, registers: Collection[str], place: TomlPlace
 ) -> ParameterSpace | None:
-    """Return the address rule declared in the [parameters] section; None if it has a mistake."""
+    """Return the address rule that the section [parameters] declares; None if it has a mistake."""
     at = place.within("[parameters]", "parameters")
     good = at.check(section, PARAMETER_KEYS)
     groups = [
@@ -449,10 +453,10 @@ PROOF_KEYS = {
 
 @dataclass(frozen=True)
 class Proof:
-    """A register whose value identifies the family: it has one of these values, or lies in this range."""
+    """A register that identifies the family: it has one of these values, or a value in this range."""
 
     register: str
-    values: tuple[float, ...]  # accepted values; empty: any value in the range
+    values: tuple[float, ...]  # accepted values; empty: every value in the range is accepted
     above: float
     below: float
 
@@ -491,18 +495,19 @@ def _proof(table: Any, registers: Mapping[str, Register[Any]], place: TomlPlace)
         place.wrong(f"is = {values!r} is not right; write {PROOF_KEYS['is'].example}")
         return None
     if not good.keys() & {"is", "above", "below"}:
-        if len(place.config_errors) == before:  # else the key is there, but misspelt or wrong
+        # otherwise the key exists, but is misspelt or has a wrong value
+        if len(place.config_errors) == before:
             place.wrong("says no value; add is = [0x010A], or above and below")
         return None
     return Proof(name, tuple(values), good.get("above", -inf), good.get("below", inf))
 
 
 def identify_by(proofs: Sequence[Proof]) -> Verb[[], None]:
-    """Return an `identify` method that compares registers with the values that prove the family."""
+    """Return a method `identify` that checks the registers in [[identify]]."""
 
     @verb
     def identify(self: Drive) -> Script[None]:
-        """Check the values of the registers in [[identify]]; raise WriteForbidden if one differs."""
+        """Read the registers in [[identify]]. Raises WriteForbidden if one has another value."""
         for proof in proofs:
             register = self.register(proof.register)
             value = yield from read(register)

@@ -1,4 +1,4 @@
-"""Profiles: state machines of drives that many makes share; a family adds its register addresses.
+"""Profiles: drive state machines that several makes share. A family adds its register addresses.
 
 A family is a class that derives from a profile and declares its registers, or a file with
 `profile = "…"`.

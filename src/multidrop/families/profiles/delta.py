@@ -15,7 +15,7 @@ FORWARD, TO_FORWARD, TO_REVERSE, REVERSE = range(4)  # values of bits 4 and 3 of
 
 
 class DeltaControl(IntEnum):
-    """Control words at 2000H (CP2000 manual p. 12.1-09-8, MS300 p. 788); the direction toggle is not used."""
+    """Control words at 2000H (CP2000 manual p. 12.1-09-8, MS300 p. 788), without the direction toggle."""
 
     NOTHING = 0x00
     STOP = 0x01
@@ -26,7 +26,10 @@ class DeltaControl(IntEnum):
 
 
 class DeltaReset(IntEnum):
-    """2002H: bit 1 resets a fault (MS300 manual p. 789). Bits 0 (fault) and 2 (base block) are never set."""
+    """Register 2002H: bit 1 resets a fault (MS300 manual p. 789).
+
+    Bits 0 (fault) and 2 (base block) are not set.
+    """
 
     NOTHING = 0
     RESET = 2
@@ -53,7 +56,7 @@ class DeltaStatus(IntFlag):
     BIT_15 = 1 << 15
 
 
-MODES = range(5)  # bits 15 to 13: reserved, or a C2000 Plus's HOA and LOC/REM mode (its manual, p. A-10)
+MODES = range(5)  # bits 15 to 13: reserved, or HOA and LOC/REM mode on a C2000 Plus (its manual, p. A-10)
 
 
 class Delta(Profile):
@@ -107,7 +110,7 @@ class Delta(Profile):
         return Direction.REVERSE if shown in (TO_REVERSE, REVERSE) else Direction.FORWARD
 
     def _turns_in(self, direction: Direction) -> Script[bool]:
-        """Return True if the motor turns in this direction, and is no longer reversing."""
+        """Return True if the motor turns in this direction, and a reversal has ended."""
         shown = (yield from self._status()) >> 3 & 3
         return shown in (FORWARD, REVERSE) and (yield from super()._turns_in(direction))
 

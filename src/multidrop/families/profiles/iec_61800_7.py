@@ -1,4 +1,4 @@
-"""Two profiles of IEC 61800-7: CiA 402 (Schneider's Altivar, Lenze's i500) and PROFIdrive (ABB, SINAMICS)."""
+"""Two profiles of IEC 61800-7: CiA 402 (Schneider's Altivar, Lenze's i500), PROFIdrive (ABB, SINAMICS)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from multidrop.drive.state import Condition, Direction
 from multidrop.drive.verbs import Script, insist, until, wait, write
 from multidrop.families.profiles.profile import COMMON, Profile, Role
 
-READY_TIME = 1.0  # s allowed for each step before the start word
+READY_TIME = 1.0  # s allowed for each state change before the start word is sent
 
 
 # ---- CiA 402 ----
@@ -49,10 +49,13 @@ class CiA402Status(IntFlag):
     BIT_15 = 1 << 15
 
 
-SHUTDOWN, SWITCH_ON, ENABLE = 0x0006, 0x0007, 0x000F  # control words before and for the start
+# control words that lead to "operation enabled", in this order
+SHUTDOWN, SWITCH_ON, ENABLE = 0x0006, 0x0007, 0x000F
 MASK, SHORT_MASK = 0x6F, 0x4F  # masks of the state bits: with and without the quick stop bit
-NOT_READY, SWITCH_ON_DISABLED, FAULT_REACTION, FAULT = 0x00, 0x40, 0x0F, 0x08  # states, with SHORT_MASK
-READY, SWITCHED_ON, ENABLED, QUICK_STOP = 0x21, 0x23, 0x27, 0x07  # states, with MASK
+# states of the status word, masked with SHORT_MASK
+NOT_READY, SWITCH_ON_DISABLED, FAULT_REACTION, FAULT = 0x00, 0x40, 0x0F, 0x08
+# states of the status word, masked with MASK
+READY, SWITCHED_ON, ENABLED, QUICK_STOP = 0x21, 0x23, 0x27, 0x07
 _UP = ((SHUTDOWN, READY, "ready to be switched on"), (SWITCH_ON, SWITCHED_ON, "switched on"))
 
 
@@ -125,7 +128,8 @@ class CiA402(Profile):
 
 # ---- PROFIdrive ----
 
-BETWEEN = 0.1  # s; least pause between "ready to switch on" and the next word (ACS550-02/U2 manual, p. 246)
+# s; shortest pause between "ready to switch on" and the next control word (ACS550-02/U2 manual, p. 246)
+BETWEEN = 0.1
 
 
 class ProfidriveControl(IntFlag):
@@ -211,7 +215,7 @@ class Profidrive(Profile):
 
     def _condition(self, status: int) -> Condition:
         if self._turns(status) and not status & ProfidriveStatus.READY_TO_OPERATE:
-            return Condition.DECELERATING  # OFF1 is in progress
+            return Condition.DECELERATING  # OFF1 is in progress, a stop along the ramp
         return super()._condition(status)
 
     def _not_ready(self, status: int) -> str:

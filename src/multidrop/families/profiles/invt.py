@@ -1,4 +1,4 @@
-"""INVT's control words 1 to 8, which several makes have copied, some with 5 and 6 exchanged."""
+"""INVT's control words 1 to 8. Several makes have copied them, some with 5 (stop) and 6 (coast) exchanged."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from multidrop.families.profiles.profile import COMMON, READING, Profile, Role
 
 
 class InvtControl(IntEnum):
-    """Control words at 2000H (Goodrive100 manual p. 167, Goodrive350 p. 326); a CHE has them at 1000H."""
+    """Control words at 2000H (Goodrive100 manual p. 167, Goodrive350 p. 326). A CHE has them at 1000H."""
 
     FORWARD = 1
     REVERSE = 2
@@ -67,7 +67,7 @@ class Invt(Profile):
         "status": Role((Access.READING,), values=InvtStatus),
     }
 
-    _jogged = False  # True if this object has sent a jog since it last saw the motor at rest
+    _jogged = False  # True if this object has sent a jog and has not seen the motor at rest since
 
     def _impossible(self, status: int) -> str:
         return "" if status in tuple(cast(Any, self.status.values)) else "the profile has no such number"
@@ -117,9 +117,9 @@ class Invt(Profile):
         try:
             yield from self._send_stop(word)
             may_jog = self._turns((yield from self._status()))
-        except WriteForbidden:  # the drive is of another family
+        except WriteForbidden:  # the drive is of another family, so STOP_JOG could run its motor
             raise
-        except BusError:  # a drive that does not reply may be jogging, and may still receive
+        except BusError:  # a drive whose replies are lost may be jogging, and may still receive STOP_JOG
             if self._has(InvtControl.STOP_JOG):
                 with suppress(BusError):
                     yield from insist(self.control, self._word(InvtControl.STOP_JOG), attempts=1)
@@ -130,12 +130,12 @@ class Invt(Profile):
         yield from self._watch_stop()
 
     def _take_reset_back(self) -> Script[None]:
-        """Do nothing: the drive acts on a control word once, so the reset may stay in the register."""
+        """Do nothing: the drive carries out a word only once, so the reset may stay in the register."""
         yield from ()
 
 
 class InovanceControl(IntEnum):
-    """Control words at 2000H (Powtran PI130 manual p. 122, Inovance MD500 p. 703): 5 coasts, 6 stops."""
+    """Control words at 2000H (Powtran PI130 manual p. 122, Inovance MD500 p. 703). 5 coasts and 6 stops."""
 
     FORWARD = 1
     REVERSE = 2
@@ -180,12 +180,12 @@ class Inovance(Invt):
         return bool((yield from read(self.register("fault"))) != 0)
 
     def _is_tripped(self, status: int) -> bool:
-        return False  # the status shows no fault
+        return False  # the status register has no value for a fault
 
     def _turns(self, status: int) -> bool:
         return status != InovanceStatus.STOPPED
 
     @property
     def identity_is_weak(self) -> bool:
-        """True, because a drive with Delta's words would run at a stop, and may not answer `identify`."""
+        """True, because the stop word would run a drive with Delta's words, which `identify` may accept."""
         return True

@@ -1,4 +1,4 @@
-"""Profile: a drive state machine that many makes share; a family declares the registers for its roles."""
+"""Profile: a drive state machine that several makes share. A family declares the registers that it uses."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _CODED = "what the profile itself says; leave it out"
 
 @dataclass(frozen=True)
 class Role:
-    """One register of a profile's state machine; the profile, not the family, sets `values` and `harmless`.
+    """A register that a profile uses, such as `control`; the profile sets its `values` and `harmless`.
 
     `needed` is False if a family may omit the register. `extra` names bits that a family may add to `values`,
     because makes differ in these bits.
@@ -41,20 +41,20 @@ class Role:
     never_together: tuple[int, ...] = ()
     moves: bool | None = None
     units: tuple[str, ...] = ()  # allowed units; empty: any
-    extra: tuple[str, ...] = ()  # names of bits that a family may add
-    renumbered: tuple[str, ...] = ()  # control words that a family must define if it has its own numbers
+    extra: tuple[str, ...] = ()  # names of bits that a family may add, because makes differ in these bits
+    renumbered: tuple[str, ...] = ()  # control words that a family with its own numbers must define
     needed: bool = True
 
     @property
     def is_word(self) -> bool:
-        """True if the register holds flags or named words, not a quantity."""
+        """True if the register holds named values or flags, not a quantity."""
         return self.values is not None
 
 
 READING = Role((Access.READING,))
 OPTIONAL = Role((Access.READING,), needed=False)
-PROOFS = ("station", "signature")  # roles that serve only to identify the family
-COMMON: Mapping[str, Role] = {  # roles of all profiles, besides `control` and `status`
+PROOFS = ("station", "signature")  # registers that only serve to identify the family
+COMMON: Mapping[str, Role] = {  # registers of all profiles, besides `control` and `status`
     "reference": Role((Access.SETTING, Access.COMMAND), moves=False, units=("Hz", "%")),
     "output_frequency": READING,
     "fault": OPTIONAL,
@@ -66,7 +66,7 @@ COMMON: Mapping[str, Role] = {  # roles of all profiles, besides `control` and `
 def own_errors(
     name: str, register: Register[Any], roles: Mapping[str, Role], taken: Collection[str]
 ) -> Iterator[str]:
-    """Yield the errors in one register of a family; `taken` are names that profiles reserve."""
+    """Yield the errors in one register of a family. `taken` are names that profiles reserve."""
     if name in roles:
         yield from role_errors(name, roles[name], register)
     elif name in taken:
@@ -95,7 +95,7 @@ def errors_together(roles: Mapping[str, Role], found: Mapping[str, Any]) -> Iter
 
 
 def role_errors(name: str, role: Role, register: Register[Any]) -> Iterator[str]:
-    """Yield an error for each fact of a role that the family must omit or declare differently."""
+    """Yield an error for each attribute of a profile's register that the family must omit or change."""
     if register.access not in role.access:
         wanted = " or a ".join(access.value for access in role.access)
         yield f"{name}: in this profile it is a {wanted}, not a {register.access.value}"
@@ -144,7 +144,7 @@ def _extra_errors(name: str, role: Role, extra: type[Any]) -> Iterator[str]:
 
 
 def _renumbering_errors(name: str, role: Role, values: type[Any]) -> Iterator[str]:
-    """Yield the errors in a family's own numbers for the profile's words."""
+    """Yield the errors in the numbers that a family gives to the profile's control words."""
     assert role.values is not None
     known = [str(member.name).lower() for member in role.values]
     names = [name.lower() for name in values.__members__]
@@ -161,7 +161,7 @@ def _renumbering_errors(name: str, role: Role, values: type[Any]) -> Iterator[st
 
 
 def completed(role: Role, register: Register[Any]) -> Register[Any]:
-    """Return the family's declaration of a role, completed with the profile's facts."""
+    """Return the family's register, completed with the attributes that the profile sets."""
     facts: dict[str, Any] = {"moves": role.moves}
     harmless = role.harmless
     if role.renumbered and register.values is not None:
@@ -188,9 +188,10 @@ def _enumeration(kind: Any, name: str, members: dict[str, int]) -> type[Any]:
     return cast(type[Any], kind(name, members))
 
 
-STOP_TIME = 60.0  # s; profiles have no role for the deceleration time
-UNUSED = (0, 0xFFFF)  # read from an unused register, or from a gateway if the drive is absent
-RESET_TIME = 2.0  # s within which a reset fault must disappear
+# s; default time limit of a stop, because profiles have no register for the deceleration time
+STOP_TIME = 60.0
+UNUSED = (0, 0xFFFF)  # values of an unused register, or of a gateway whose drive is absent
+RESET_TIME = 2.0  # s within which the status must no longer show a fault after its reset
 
 
 class Profile(Drive):
@@ -234,7 +235,7 @@ class Profile(Drive):
     output_frequency: ClassVar[Register[float]]
 
     def __init_subclass__(cls) -> None:
-        """Complete the roles with the profile's facts. Raises DeclarationError that lists all mistakes."""
+        """Complete the registers with the profile's attributes. Raises DeclarationError with all mistakes."""
         own = {name: register for name, register in vars(cls).items() if isinstance(register, Register)}
         if own and (wrong := cls.role_mistakes(own)):
             raise DeclarationError(cls.__name__, wrong)
@@ -248,7 +249,7 @@ class Profile(Drive):
 
     @classmethod
     def role_mistakes(cls, own: Mapping[str, Register[Any]]) -> list[str]:
-        """Return a sentence for each mistake in a family's registers, including those in profile roles."""
+        """Return a sentence for each mistake in a family's registers, also in those of the profile."""
         taken = {*dir(Profile), *Profile.__annotations__} - {*dir(Drive)}
         found = {name: own.get(name, getattr(cls, name, None)) for name in cls.roles}
         singly = (own_errors(name, one, cls.roles, taken) for name, one in own.items())
@@ -267,7 +268,7 @@ class Profile(Drive):
     # ---- overridden by profiles ----
 
     def _impossible(self, status: int) -> str:
-        """Return a reason why no drive of this profile can have this status; "" if the status is possible."""
+        """Return why a drive of this profile cannot have this status; "" if it can."""
         return ""
 
     def _is_tripped(self, status: int) -> bool:
@@ -282,7 +283,7 @@ class Profile(Drive):
         return ""
 
     def _cannot_reset(self, status: int) -> str:
-        """Return why a reset would be useless or harmful; "" if it may be sent."""
+        """Return why a reset would have no effect or do harm; "" if it may be sent."""
         return ""
 
     def _direction(self, status: int) -> Direction | None:
@@ -290,7 +291,10 @@ class Profile(Drive):
         return None
 
     def _reverses(self, direction: Direction | None, status: int) -> bool:
-        """Return True if a start or jog in this direction goes in reverse; None keeps a turning motor's."""
+        """Return True if a start or jog in this direction turns the motor in reverse.
+
+        None means: keep the direction of a turning motor.
+        """
         if direction is None:
             return self._turns(status) and self._direction(status) is Direction.REVERSE
         return direction is Direction.REVERSE
@@ -299,7 +303,7 @@ class Profile(Drive):
         raise NotImplementedError
 
     def _prepare(self, status: int) -> Script[None]:
-        """Prepare the drive for the start word, without moving the motor."""
+        """Bring the drive into the state in which it accepts the start word, without moving the motor."""
         yield from ()
 
     def _condition(self, status: int) -> Condition:
@@ -317,7 +321,7 @@ class Profile(Drive):
         return "" if register is None else register.format((yield from read(register)))
 
     def _tripped(self, status: int) -> Script[bool]:
-        """Return True if the drive has a fault; by default, if the status shows a fault."""
+        """Return True if the drive has a fault; by default, the status shows this."""
         return self._is_tripped(status)
         yield
 
@@ -398,12 +402,12 @@ class Profile(Drive):
         """Return the word of a jog. Raises WriteForbidden as `start` does, and if the motor turns."""
         status = yield from self._status()
         yield from self._check_start(status)
-        if self._turns(status):  # no manual defines a jog then
+        if self._turns(status):  # the manuals do not define a jog while the motor turns
             raise self._stop_first("turns, and may continue to turn during a jog:")
         return self._word(reverse if self._reverses(direction, status) else forward)
 
     def _word(self, count: int, role: str = "control") -> Any:
-        """Decode one of the profile's words to a value of the role's register."""
+        """Convert one of the profile's words to a value of this register."""
         values = self.register(role).values
         assert values is not None
         return values(count)
@@ -447,7 +451,7 @@ class Profile(Drive):
             return
         if why := self._cannot_reset(status):
             raise WriteForbidden(f"{self.name} {why}")
-        yield from insist(self.control, self._word(self.stop_word))  # ends an earlier run command
+        yield from insist(self.control, self._word(self.stop_word))  # ends a run that was commanded earlier
         yield from self._pulse()
         if not (yield from until(self._is_reset, limit=RESET_TIME)):
             fault = (yield from self._fault()) or "it shows a fault"

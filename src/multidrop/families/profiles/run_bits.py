@@ -1,4 +1,4 @@
-"""Profiles whose motor runs while a bit of the control word is 1: Danfoss FC, Optidrive E3, Yaskawa."""
+"""Profiles whose motor runs as long as a bit of the control word is 1: Danfoss FC, Optidrive E3, Yaskawa."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from multidrop.families.profiles.profile import COMMON, Profile, Role
 class DanfossControl(IntFlag):
     """The control word CTW (FC 300 design guide MG.33.B6, p. 277; FC 51 manual p. 29, coils 1 to 16)."""
 
-    RAMP = 1 << 2  # 0 means: brake with direct current
+    RAMP = 1 << 2  # if 0, the drive brakes with direct current
     NO_COAST = 1 << 3
     NO_QUICK_STOP = 1 << 4
     NO_FREEZE = 1 << 5
     START = 1 << 6
-    RESET = 1 << 7  # acts on a change from 0 to 1
+    RESET = 1 << 7  # takes effect when it changes from 0 to 1
     VALID = 1 << 10
     REVERSE = 1 << 15
 
@@ -30,14 +30,14 @@ class DanfossStatus(IntFlag):
 
     CONTROL_READY = 1 << 0
     DRIVE_READY = 1 << 1
-    NOT_COASTING = 1 << 2  # means "safety closed" on an FC 101
+    NOT_COASTING = 1 << 2  # on an FC 101 this bit means "safety closed"
     TRIPPED = 1 << 3
     ERROR = 1 << 4
     BIT_5 = 1 << 5
     TRIP_LOCKED = 1 << 6  # not used on an FC 101
     WARNING = 1 << 7
     AT_REFERENCE = 1 << 8
-    BY_LINE = 1 << 9  # 1 in auto mode, 0 in hand mode
+    BY_LINE = 1 << 9  # 1 in auto mode, in which the line commands the drive; 0 in hand mode
     IN_RANGE = 1 << 10
     RUNNING = 1 << 11
     BIT_12 = 1 << 12
@@ -186,7 +186,10 @@ class Optidrive(Profile):
 
 
 class YaskawaControl(IntFlag):
-    """The control word 0001H (A1000 manual SIEP C710616 27G, p. 559). Bit 2, external fault, is never set."""
+    """The control word at 0001H (A1000 manual SIEP C710616 27G, p. 559).
+
+    The bit "external fault" is not sent.
+    """
 
     FORWARD = 1 << 0
     REVERSE = 1 << 1
