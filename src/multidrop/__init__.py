@@ -9,10 +9,11 @@ from typing import Any
 def _refuse_sub_interpreters() -> None:
     """Raise ImportError in a sub-interpreter.
 
-    The compiled module keeps its engine, types and callbacks for the whole process. After a sub-interpreter
-    ended, its callbacks would still be called.
+    The compiled module keeps its engine, types and callbacks for the whole process. After
+    a sub-interpreter has ended, the engine would still call its callbacks.
     """
-    for name in ("_interpreters", "_xxsubinterpreters"):  # its names since Python 3.13, and before
+    # the module's name since Python 3.13, and its earlier name
+    for name in ("_interpreters", "_xxsubinterpreters"):
         try:
             interpreters: Any = import_module(name)
         except ImportError:
@@ -29,7 +30,7 @@ _refuse_sub_interpreters()
 
 
 def _homes(stub: str) -> dict[str, str]:
-    """Return the module name for each public name, from the import lines of the stub file `stub`.
+    """Return a map from each public name to the module that defines it, by the imports in the file `stub`.
 
     A module is imported when one of its names is first used, because importing all takes a fifth of a second.
     """

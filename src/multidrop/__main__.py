@@ -9,7 +9,7 @@ def main() -> int:
         from multidrop.cli import main
     except (KeyboardInterrupt, RuntimeError) as interruption:
         if not isinstance(interruption.__cause__ or interruption, KeyboardInterrupt):
-            raise  # a real error, not the RuntimeError of a class statement that Ctrl-C interrupted
+            raise  # not Ctrl-C: inside a class statement, Python turns Ctrl-C into a RuntimeError
         print("multidrop: interrupted", file=sys.stderr)
         return 130
     return main()

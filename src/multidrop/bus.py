@@ -33,7 +33,7 @@ EchoMode = Echo | Literal["auto", "on", "off"]
 TransactionMode = TransactionIds | Literal["match", "ignore"]
 RS485Mode = RS485 | Literal["off", "kernel", "rts-up", "rts-down"]
 
-EXPIRY = 1.0  # s; default of `expiry`
+EXPIRY = 1.0  # s; default time limit for sending a write
 
 
 def _facts(port: str, echo: str, transaction: str, rs485: str) -> tuple[Echo, TransactionIds, RS485]:
@@ -60,7 +60,7 @@ class Bus:
       writes.
     - `expiry`: seconds. A write that cannot be sent within this time of the call, not counting the verb's own
       waits, raises Expired.
-    - `stop_on_exit`: stop all drives when the bus or the program ends; see the method.
+    - `stop_on_exit`: stop all drives when the bus is closed or the program ends; see `Bus.stop_on_exit`.
     - `mastership`: for a line on which another process may be the Modbus master. While this process does not
       hold the mastership, the port is not opened, and all requests raise NotMaster, even stops.
 
@@ -252,18 +252,18 @@ class Bus:
             self._writer.identity_check.forget(drive)
 
     def remember(self, before: Bus) -> None:
-        """Take over the drives' timing and outstanding requests from a closed bus on the same line.
+        """Take over the drives' response delays and unanswered requests from a closed bus on the same line.
 
-        The new bus must know the outstanding requests, because late replies to them may still arrive.
+        The new bus must know the unanswered requests, because late replies to them may still arrive.
         """
         self._exchanges.peers.remember(before._exchanges.peers)
 
     def peer(self, drive: Drive) -> Peer:
-        """Return the Peer with the drive's learnt timing and late replies. Raises NotAttached."""
+        """Return the Peer of a drive: its learnt response delay and its late replies. Raises NotAttached."""
         return self._exchanges.peers.of(drive)
 
     def is_asking(self, peer: Peer) -> bool:
-        """Return True while an exchange with this peer is about to start, queued or in flight."""
+        """Return True while a request to the drive of this peer is about to start, queued or in flight."""
         return self._exchanges.peers.is_asking(peer)
 
     @property
@@ -274,18 +274,18 @@ class Bus:
     # ---- commands ----
 
     def check_identity(self, drive: Drive, *, rest_s: float = 0.0) -> None:
-        """Check that the drive at this address is of its declared family, as far as its registers show it.
+        """Check that the drive which answers is of the declared family, as far as its registers show.
 
-        The check only reads. It is made once, and again after the port is reopened. The first write to a
-        drive makes the same check. A pause of `rest_s` s before each read leaves the line to polling. The
-        first check also logs the drive's watchdog. Raises WriteForbidden for a drive of another family, and
-        NoReply for a silent drive.
+        The check only reads. It is made once each time the port is opened, at the latest before the first
+        write. `rest_s` is a pause in s before each read, which leaves the line to polling. The first check
+        also logs the drive's watchdog. Raises WriteForbidden for a drive of another family, and NoReply for a
+        silent drive.
         """
         check_drive(drive)
         self._performer.check_identity(drive, rest_s)
 
     def knows_identity(self, drive: Drive) -> bool:
-        """Return True if `check_identity` has already passed on this port."""
+        """Return True if the drive has passed `check_identity` since the port was opened."""
         check_drive(drive)
         return self._writer.identity_check.is_known(drive)
 
@@ -303,8 +303,8 @@ class Bus:
         """Broadcast a write to all drives of the line; return each drive's state, or its error, by name.
 
         Drives do not answer a broadcast, so each drive's state is read afterwards. All drives must be of one
-        family, because an address means different things to different families. They must share their
-        settings, and the family's document must have this broadcast. Otherwise raises WriteForbidden.
+        family, because an address means different things to different families. They must have the same line
+        settings, and the family's manual must document this broadcast. Otherwise raises WriteForbidden.
         """
         return self._broadcaster.write(self.drives, register, value)
 

@@ -171,7 +171,8 @@ class NotAttached(ValueError):
 
 
 class Advice(NamedTuple):
-    """What to do after a refusal: one text each for a program, the command line, and a plant file's drive.
+    """What the user can do after a refused write: one text each for a program, the command line, and a plant
+    file's drive.
 
     `plant` is empty if it is the same as `command`.
     """
@@ -195,7 +196,7 @@ class Advice(NamedTuple):
         )
 
 
-# the `rule` of a WriteForbidden that may refuse even a stop
+# a value of WriteForbidden.rule: this rule may refuse even a stop
 ANOTHER_FAMILY = "another family is at its address"
 
 
@@ -232,4 +233,4 @@ class WriteForbidden(BusError, ValueError):
 
 
 class CheckAgain(Exception):
-    """A drive answered as one of another family would. Check it again, after the stops of other drives."""
+    """Raised if a drive answers as another family would: check it again after the other drives' stops."""

@@ -10,12 +10,14 @@ from typing import NamedTuple
 OPEN_METRICS = "application/openmetrics-text"
 OPEN_METRICS_TYPE = f"{OPEN_METRICS}; version=1.0.0; charset=utf-8"
 PLAIN_TYPE = "text/plain; version=0.0.4; charset=utf-8"  # Prometheus' own form, which promtool reads
-PLAIN_KINDS = {"info": "gauge", "stateset": "gauge"}  # replacements for kinds that the plain format lacks
-NAMED_WITH_SUFFIX = {"info": "_info", "counter": "_total"}  # suffixes of family names in the plain format
+# replacements for kinds of metrics that the plain format lacks
+PLAIN_KINDS = {"info": "gauge", "stateset": "gauge"}
+# In the plain format, the names of these kinds of metrics end in a suffix.
+NAMED_WITH_SUFFIX = {"info": "_info", "counter": "_total"}
 MOST_LABELS = 16_384  # limit of label texts in the cache, about 5 MB
 
 Labels = Mapping[str, str]
-Sample = tuple[str, Labels, float]  # the name's suffix, labels, value
+Sample = tuple[str, Labels, float]  # suffix of the metric's name, labels, value
 
 
 class MetricFamily(NamedTuple):
@@ -35,12 +37,12 @@ def expose_metrics(families: Iterable[MetricFamily], accept: str) -> tuple[str, 
 
 
 def open_metrics(families: Iterable[MetricFamily]) -> str:
-    """Return the families as OpenMetrics 1.0, with its end mark."""
+    """Return the metrics in the format OpenMetrics 1.0."""
     return "".join(_written(one, one.name, one.kind) for one in families) + "# EOF\n"
 
 
 def plain_text(families: Iterable[MetricFamily]) -> str:
-    """Return the families in Prometheus' text format 0.0.4, which differs in the names of some families."""
+    """Return the metrics in Prometheus' text format 0.0.4, in which the name of a counter ends in _total."""
     return "".join(
         _written(one, one.name + NAMED_WITH_SUFFIX.get(one.kind, ""), PLAIN_KINDS.get(one.kind, one.kind))
         for one in families
@@ -57,7 +59,7 @@ def _written(family: MetricFamily, name: str, kind: str) -> str:
 
 @lru_cache(maxsize=MOST_LABELS)
 def _braced(*labels: tuple[str, str]) -> str:
-    """Return labels as text in braces. Cached, because the next scrape has the same labels."""
+    """Return a sample's labels as text in braces. Cached, because the next scrape has the same labels."""
     inside = ",".join(f'{label}="{_escaped(value)}"' for label, value in labels)
     return f"{{{inside}}}" if inside else ""
 

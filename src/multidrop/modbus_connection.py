@@ -37,7 +37,8 @@ except ImportError as missing:
         f"{install_command('modbus-connection')}"
     ) from missing
 
-MOST_WAIT = 1.0  # s; limit of the first timeout without transaction ids; late replies lengthen it
+# limit, in s, of the first timeout on a port without transaction ids; a late reply lengthens it
+MOST_WAIT = 1.0
 LOSS_CHECK = 1.0  # s between checks whether an idle connection is lost
 OTHER = "use the ModbusConnection of modbus_connection.pymodbus"
 COUNTERS = (2, *range(0x0B, 0x13))  # sub-functions of function 08 that only read; 4 would silence a device
@@ -61,11 +62,12 @@ def _port_of(params: Any) -> str:
 
 
 def _family_of(params: Any, timeout: float) -> type[ModbusDevice]:
-    """Return the class of this connection's devices, with its line settings and times."""
+    """Return a device class with the line settings in `params` and a response time-out from `timeout`."""
     baudrate, format, wait = 9600, "8N1", timeout / READ_ATTEMPTS
     if isinstance(params, neutral.ModbusSerialParams):
         baudrate, format = params.baudrate, f"{params.bytesize}{params.parity}{params.stopbits}"
-    if params.framer != "socket":  # without transaction ids, requests wait until no late reply can come
+    # without transaction ids, the next request waits until no late reply can come
+    if params.framer != "socket":
         wait = min(wait, MOST_WAIT)
     framing = Framing.ASCII if params.framer == "ascii" else Framing.RTU
     line = {"framings": (framing,), "formats": {framing: (format,)}, "baudrates": (baudrate,)}

@@ -34,7 +34,8 @@ from multidrop.transport.aside_log import log_aside, traceback_of, words_of
 from multidrop.transport.statistics import LineStatistics
 
 LOOK_NS = 50_000_000  # interval between checks of the lines, if a line has a problem or `fileno` is in use
-# interval between checks of the lines, if lines only need new exchanges: a third of AHEAD_NS
+# interval between checks of the lines, if lines only need new exchanges; shorter than AHEAD_NS, so that no
+# line runs out of queued exchanges
 BUSY_NS = 100_000_000
 REST_NS = 500_000_000  # interval between checks of the lines, if no line needs attention
 MOST_FAILURES = 8  # consecutive failures of the poller's thread before polling ends
@@ -93,7 +94,7 @@ class Poller(RowSource):
         super().__init__(row_queue, self._lines.names)
         self._path, self._totals = plant.path, plant.totals
         self._thread = threading.Thread(target=self._run, name="multidrop poller", daemon=True)
-        self._look_ns = 0  # time of the next check of lines that the core has not reported
+        self._look_ns = 0  # time of the next check of the lines about which the core has reported nothing
         self._is_failure_raised = False
         self._ending = threading.Lock()
         register_at_fork(self)
@@ -196,7 +197,7 @@ class Poller(RowSource):
         self._closing = True
         for line in self._lines:
             line.bus.leave()  # start the stops of all lines before waiting for any
-        with self._changing:  # acquiring the lock waits for an adoption in progress
+        with self._changing:  # waits until a call of `adopt` on another thread is complete
             if self._thread.is_alive():
                 self._call_thread()
                 self._thread.join()
@@ -233,7 +234,7 @@ class Poller(RowSource):
                 clock.sleep(FAILED_NS / 1e9)
 
     def _tend_lines(self) -> None:
-        """Wait until the core reports lines, or a check is due; call `tend` of lines that need attention."""
+        """Wait for the core's reports or the next check; then call `tend` of the lines that need it."""
         seconds = max(0, self._look_ns - clock.now_ns()) / 1e9
         called = self._lines.called(self._row_queue.await_calls(seconds))
         now = clock.now_ns()
@@ -272,10 +273,11 @@ class Poller(RowSource):
         A mistake in the plant raises ValueError and changes nothing: PlantError with all mistakes, NoSuchPort
         for an invalid port name, OSError for an audit log that cannot be opened.
 
-        An unchanged line keeps its slots, and an unchanged drive stays the same object, with its known
-        identity and late replies. Changed registers, rates and drives take effect on the open port, if the
-        line keeps its port. All other lines are closed and opened again. A port that cannot be opened is
-        tried again like a lost one. The plant overrides earlier calls of `add` and `set_rate`.
+        An unchanged line keeps its polling times. An unchanged drive stays the same object, and the library
+        still knows its identity and its unanswered requests. Changed registers, rates and drives take effect
+        on the open port, if the line keeps its port. All other lines are closed and opened again. A port that
+        cannot be opened is tried again like a lost one. The plant overrides earlier calls of `add` and
+        `set_rate`.
 
         When lines and drives are removed, their requests in flight are completed and give rows. Other calls
         on a removed line raise LineError; calls of a removed drive raise NotAttached, or CancelledByStop if
@@ -412,8 +414,8 @@ class Poller(RowSource):
     def set_rate(self, drive: Drive | str, register: Register[Any] | str | None, every: float | None) -> None:
         """Set the period of a polled register in s, or of all polled registers if `register` is None.
 
-        `every` None means as fast as the line allows. Requests in flight are finished. Registers whose rate
-        does not change keep their slots; each changed register has its first slot now. The drive and the
+        `every` None means as fast as the line allows. Requests in flight are finished. Other registers keep
+        their polling times; each changed register is polled now, and then at its new rate. The drive and the
         register may be given by name. The metadata of a recording keeps the rates of its start. Raises
         ValueError for a drive or register that is not polled, and for an invalid period.
         """

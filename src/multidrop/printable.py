@@ -1,4 +1,4 @@
-"""Texts: safe to show, parsed as numbers and times, and hints for a wrong name or a missing library."""
+"""Make texts safe to show, parse numbers and times, and make hints for wrong names or missing libraries."""
 
 from __future__ import annotations
 

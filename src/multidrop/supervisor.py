@@ -32,7 +32,7 @@ class Hung(OSError):
 
 
 class Ended(OSError):
-    """Permanent tasks or threads have ended. One sentence says which, and why."""
+    """Raised when a permanent task or thread has ended; the text says which one, and why."""
 
 
 class _Work(NamedTuple):
@@ -138,7 +138,8 @@ class Supervisor:
         """
         loop = asyncio.get_running_loop()
         future: asyncio.Future[R] = loop.create_future()
-        future.add_done_callback(lambda done: done.cancelled() or done.exception())  # maybe never awaited
+        # read the exception, because asyncio logs an error for one that is never read
+        future.add_done_callback(lambda done: done.cancelled() or done.exception())
 
         def finish(settle: Callable[[], None]) -> None:
             del self._works[future]

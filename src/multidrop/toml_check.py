@@ -225,7 +225,7 @@ _DURATION = r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|h)"
 _TOO_SHORT = r"0*\d{0,2}(\.\d+)?\s*us"
 _TOO_LONG = r"0*(2[5-9]|[3-9]\d|[1-9]\d{2,})(\.\d+)?\s*h"
 
-# JSON Schema keywords for `Key.keywords`. Several keys share each of these.
+# JSON Schema keywords for `Key.keywords`, each used by several keys.
 DURATION: Mapping[str, Any] = {
     "pattern": rf"^\s*(?=[^a-z]*[1-9])(?!{_TOO_SHORT})(?!{_TOO_LONG}){_DURATION}\s*$"
 }
@@ -234,7 +234,8 @@ ASCENDING: Mapping[str, Any] = {"allOf": [{"$ref": "#/definitions/ascending"}]} 
 DISTINCT: Mapping[str, Any] = {"allOf": [{"$ref": "#/definitions/distinct"}]}  # see `distinct`
 PORT_NUMBER = r"([0-9]{1,4}|[1-5][0-9]{4}|6[0-4][0-9]{3}|65[0-4][0-9]{2}|655[0-2][0-9]|6553[0-5])"
 _IPV6 = r"\[?[0-9A-Fa-f.]*:[0-9A-Fa-f:.]*(%[^\s\]]+)?\]?"
-_HOST_NAME = r"([A-Za-z0-9_-]+\.)*[0-9]*[A-Za-z_-][A-Za-z0-9_-]*\.?"  # its last label is not only digits
+# unlike an IPv4 address, a host name does not end in a number
+_HOST_NAME = r"([A-Za-z0-9_-]+\.)*[0-9]*[A-Za-z_-][A-Za-z0-9_-]*\.?"
 _IPV4 = r"[0-9]{1,3}(\.[0-9]{1,3}){3}"
 ADDRESS: Mapping[str, Any] = {"pattern": f"^({_IPV6}|{_HOST_NAME}|{_IPV4}):{PORT_NUMBER}$"}
 
@@ -242,8 +243,8 @@ ADDRESS: Mapping[str, Any] = {"pattern": f"^({_IPV6}|{_HOST_NAME}|{_IPV4}):{PORT
 def ascending() -> dict[str, Any]:
     """Return the JSON Schema of two numbers in ascending order.
 
-    A JSON Schema cannot compare two numbers. It can only compare both with some limits: if the first number
-    is at least a limit, so is the second.
+    A JSON Schema cannot compare two numbers. So this one compares both with a list of limits: if the first
+    number is at least a limit, the second must be too.
     """
     powers = [sign * digit * 10**power for power in range(7) for digit in (1, 2, 5) for sign in (-1, 1)]
     limits = sorted({0, *powers, *(power / 1000 for power in powers)})
@@ -272,7 +273,8 @@ def distinct() -> dict[str, Any]:
         for bit in range(len(characters).bit_length())
     ]
     groups = [[form.format(half) for half in each] for form in ("^[{}]", "[{}]$") for each in halves]
-    numbers = range(16)  # the bits of a word, and most values
+    # only these values are compared: all bit numbers of a word, and most raw values with names
+    numbers = range(16)
     parts: dict[str, Any] = {
         f"not-{number}": {"not": {"const": number, "description": f"another name has the number {number}"}}
         for number in numbers

@@ -19,19 +19,20 @@ def line_numbers(path: Path) -> Lines:
     The name "" stands for a table's header or an element of a list. A file that cannot be read has none.
     """
     try:
-        text = path.read_text("utf-8-sig", "replace") if path.is_file() else ""  # a port would block
+        # reading a serial port would block
+        text = path.read_text("utf-8-sig", "replace") if path.is_file() else ""
     except OSError:
         return {}
     return _LineScan(text).lines
 
 
 class _Unclosed(NamedTuple):
-    """A list or an inline table that is not closed yet."""
+    """A list or an inline table whose closing bracket is still to come."""
 
     is_list: bool
-    steps: Steps  # of an inline table; of a list: of the table that has the list
-    name: str = ""  # of a list
-    number: int = 0  # of a list's current element
+    steps: Steps  # path of the inline table, or of the table that has the list
+    name: str = ""  # name of the list; "" for an inline table
+    number: int = 0  # number of the list's current element
 
 
 _TOKEN = re.compile(
@@ -50,11 +51,11 @@ class _LineScan:
 
     def __init__(self, text: str) -> None:
         self.lines: dict[tuple[Steps, str], int] = {}
-        self._counts: Counter[tuple[Steps, str]] = Counter()  # of [[ARRAY]] headers
+        self._counts: Counter[tuple[Steps, str]] = Counter()  # number of [[ARRAY]] headers so far
         self._table: Steps = ()  # the table of the latest header
         self._open: list[_Unclosed] = []
         self._parts: list[str] = []  # parts of the latest key or header
-        self._brackets = 0  # of the header that is being read
+        self._brackets = 0  # number of open brackets in the header that is being read
         self._is_value = False  # inside the value of a key, not in a key
         self._number = 1
         for kind, token in self._tokens(text):
@@ -118,7 +119,7 @@ class _LineScan:
         self._is_value, self._parts = True, []
 
     def _place(self) -> Steps:
-        """Record the line of a list's element; return the path that a table has here."""
+        """Record the line of a list's element; return the path of a table that starts at this place."""
         if not (self._open and self._open[-1].is_list):
             steps, name = self._key
             return (*steps, (name, 1))

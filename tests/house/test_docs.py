@@ -86,10 +86,10 @@ NOT_RUN = {
     "multidrop read /dev/ttyUSB0 invt-goodrive": "needs that drive: tests/families/test_responders.py",
     "multidrop sniff /dev/ttyUSB1": "needs a line with another master: tests/cli/test_cli_sniff.py",
 }
-PROGRAMS = ("openssl", "chmod", "echo")  # programs other than multidrop that blocks may run
+PROGRAMS = ("openssl", "chmod", "echo")  # other programs that the code blocks of a page may run
 COMPUTED = "multidrop plan"  # its figures are computed, so they must be equal; other commands measure theirs
-STATUS = {"multidrop plan full.toml": 1}  # expected exit status, if not 0
-SHORTER = (  # replacements that shorten long runs
+STATUS = {"multidrop plan full.toml": 1}  # exit status of commands that must not exit with 0
+SHORTER = (  # replacements that make long runs shorter
     (r"--seconds \d+", "--seconds 1"),
     (r"seconds=\d+", "seconds=0.5"),
     (r'dwell = "\d+ s"', 'dwell = "1 s"'),
@@ -270,7 +270,7 @@ def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Session
         yield Session(stack)
 
 
-@pytest.mark.usefixtures("_turns_awaited")  # on a busy machine, a write would expire
+@pytest.mark.usefixtures("_turns_awaited")  # writes have no time limit, because a busy machine delays them
 @pytest.mark.parametrize("page", usually(*RUN), ids=named)
 def test_page_runs_as_printed(page: Path, session: Session) -> None:
     text = page.read_text("utf-8")

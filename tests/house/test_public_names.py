@@ -51,7 +51,7 @@ def test_unknown_name_raises_attribute_error() -> None:
         _ = multidrop.Buss  # type: ignore[attr-defined]
 
 
-def test_modules_load_on_first_use() -> None:
+def test_modules_are_imported_when_their_names_are_first_used() -> None:
     code = (
         "import sys, multidrop; print(sorted(name for name in sys.modules if name.startswith('multidrop')))"
     )
@@ -190,7 +190,7 @@ def test_scripts_of_users_are_strictly_typed(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_values_have_the_types_of_their_registers(tmp_path: Path) -> None:
+def test_mypy_infers_the_types_of_register_values(tmp_path: Path) -> None:
     pytest.importorskip("mypy")
     (tmp_path / "script.py").write_text(TYPES, "utf-8")
     found = mypy(tmp_path)

@@ -198,7 +198,9 @@ def mounts(service: dict[str, Any]) -> dict[str, str]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", OURS)
-def test_commands_parse_and_read_only_mounted_files(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_container_commands_are_valid_and_read_only_mounted_files(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     words: list[str] = OURS[name]["command"]
     module: Any = importlib.import_module(f"multidrop.cli.{COMMANDS[words[0]][0]}")
     if hasattr(module, "ACTIONS"):
@@ -214,7 +216,7 @@ def test_commands_parse_and_read_only_mounted_files(name: str, monkeypatch: pyte
 
 @pytest.mark.long
 @pytest.mark.parametrize("file", FILES)
-def test_volumes_are_files_of_the_sources_or_declared(file: str) -> None:
+def test_container_volumes_are_files_of_the_sources_or_declared(file: str) -> None:
     found = FILES[file]
     sources = [source for service in found["services"].values() for source in mounts(service).values()]
     files = [source for source in sources if source.startswith(".")]
@@ -227,7 +229,7 @@ def test_volumes_are_files_of_the_sources_or_declared(file: str) -> None:
 
 
 @pytest.mark.long
-def test_all_ports_are_on_this_computer_only_and_match() -> None:
+def test_containers_open_matching_ports_on_this_computer_only() -> None:
     services = FILES["compose.yaml"]["services"]
     page = PLANT["serve"]["listen"]
     (scraped,) = yaml.safe_load((FOLDER / "prometheus.yml").read_text())["scrape_configs"]
@@ -264,14 +266,14 @@ def test_each_container_has_no_rights_beyond_its_volumes(name: str) -> None:
     assert service["security_opt"] == ["no-new-privileges:true"]
 
 
-def test_the_plant_can_be_served_and_simulated(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_plant_of_the_containers_can_be_served_and_simulated(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["serve", "--check", str(FOLDER / "plant.toml")]) == 0
     assert "parts: history, mqtt" in capsys.readouterr().out
     assert {urlsplit(line["port"]).scheme for line in PLANT["line"]} == {"tcp"}
 
 
 @pytest.mark.long
-def test_the_image_has_the_sources_the_extras_and_an_init_process() -> None:
+def test_the_container_image_has_the_sources_the_extras_and_an_init_process() -> None:
     copied = re.findall(r"(?m)^COPY (?!--)(.+) \S+$", CONTAINERFILE)
     assert [path for paths in copied for path in paths.split() if not (ROOT / path).exists()] == []
     (extras,) = re.findall(r"'\.\[(.+)\]'", CONTAINERFILE)
@@ -280,7 +282,8 @@ def test_the_image_has_the_sources_the_extras_and_an_init_process() -> None:
     assert {*extras.split(",")} <= {*known}
     libraries = {library for extra in extras.split(",") for library in known[extra]}
     assert [name for name in (*PARTS, "serve") if not {*known.get(name, ())} <= libraries] == []
-    assert 'ENTRYPOINT ["tini", "--", "multidrop"]' in CONTAINERFILE  # process 1 ignores the kernel's timer
+    # without tini, multidrop would be process 1, which a kernel timer cannot kill
+    assert 'ENTRYPOINT ["tini", "--", "multidrop"]' in CONTAINERFILE
     assert re.search(r"(?m)^USER 10001$", CONTAINERFILE)
 
 

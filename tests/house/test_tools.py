@@ -28,7 +28,7 @@ TOOLS = ROOT / "tools"
 
 @pytest.mark.long
 @table("tool", ["bare", "booted", "containers", "foreign", "kernel/build", "musl", "wheels", "wine"])
-def test_help_is_the_header_of_the_tool(tool: str) -> None:
+def test_the_help_of_a_tool_is_the_comment_at_its_start(tool: str) -> None:
     ran = subprocess.run([TOOLS / tool, "--help"], capture_output=True, text=True, check=True, timeout=60)
     assert f"tools/{tool} " in ran.stdout
     assert ran.stdout.isascii()
@@ -66,7 +66,7 @@ CI = "".join((ROOT / ".ci" / name).read_text("utf-8") for name in ("run", "night
 
 @pytest.mark.long
 def test_paths_in_ci_scripts_exist() -> None:
-    """A rename must leave no pattern without a file, and no name of a brace expansion without a file."""
+    """After a rename, each pattern and each name in braces must still match a file."""
     code = re.sub(r"(?m)^ *#.*", "", CI)
     patterns = re.findall(r"(?<![\w/$])(?:bench|csrc|docs|tests)/[\w*.,{}/-]+", code)
     echo = subprocess.run(
@@ -105,7 +105,7 @@ HARNESSES = sorted(path.stem.removeprefix("fuzz_") for path in HERE.glob("fuzz_*
 
 
 @pytest.mark.long
-def test_every_parser_has_a_small_corpus() -> None:
+def test_every_parser_has_a_small_fuzz_corpus() -> None:
     assert len(HARNESSES) == 6
     owners = {line.split(" ")[0] for line in corpora.CORPUS.read_text("ascii").splitlines()}
     assert owners == {*HARNESSES, *READERS}
@@ -115,7 +115,9 @@ def test_every_parser_has_a_small_corpus() -> None:
 
 
 @pytest.mark.long
-def test_a_corpus_is_unpacked_and_saved_unchanged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fuzz_corpus_is_unpacked_and_saved_unchanged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     corpora.unpack("frame", tmp_path / "inputs")
     inputs = {path.name: path.read_bytes() for path in (tmp_path / "inputs").iterdir()}
     text = corpora.CORPUS.read_bytes()
@@ -131,7 +133,7 @@ def test_a_corpus_is_unpacked_and_saved_unchanged(tmp_path: Path, monkeypatch: p
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", HARNESSES)
-def test_the_core_survives_its_corpus(tmp_path: Path, name: str) -> None:
+def test_the_c_core_survives_the_inputs_of_its_fuzz_corpus(tmp_path: Path, name: str) -> None:
     if shutil.which(CC) is None:
         pytest.skip(f"no C compiler ({CC})")
     build = command(name, tmp_path / name, "replay.c", CC, *STRICT, *SANITIZERS)
@@ -169,7 +171,7 @@ OF_C = {
     "if (*at <= most)",
     "if (*at >= most)",
     "if (!(*at < most))",
-    ";",  # in place of each of the three statements
+    ";",  # this line replaces each of the three statements in turn
     "return 1;",
     "return 0;",
     "return -0;",
@@ -209,7 +211,9 @@ OF_PYTHON = {
 
 @pytest.mark.long
 @pytest.mark.parametrize(("path", "source", "made"), [("a.c", C, OF_C), ("a.py", PYTHON, OF_PYTHON)])
-def test_each_source_has_the_expected_mutants(path: str, source: str, made: set[str]) -> None:
+def test_the_mutation_tool_makes_the_expected_mutants_of_a_source(
+    path: str, source: str, made: set[str]
+) -> None:
     found = mutants(path, source)
     assert {each.after for each in found} == made
     assert len({each.text for each in found}) == len(found)
@@ -247,14 +251,14 @@ SLEEPS = [sys.executable, "-c", "import time; time.sleep(3600)"]
 
 
 @pytest.mark.long
-def test_failing_block_kills_its_process() -> None:
+def test_a_with_block_that_fails_kills_its_process() -> None:
     with pytest.raises(ZeroDivisionError), BoundProcess(SLEEPS) as process:
         raise ZeroDivisionError
     assert process.returncode
 
 
 @pytest.mark.long
-def test_no_test_starts_an_unbound_process() -> None:
+def test_no_test_starts_a_process_that_may_outlive_it() -> None:
     unbound = "with subprocess." + "Popen("
     assert [str(path) for path in TESTS.rglob("*.py") if unbound in path.read_text("utf-8")] == []
 
@@ -266,7 +270,7 @@ def notes(caught: pytest.ExceptionInfo[BaseExceptionGroup[BaseException]]) -> li
     return [failure.__notes__ for failure in caught.value.exceptions]
 
 
-def test_every_failing_row_is_reported() -> None:
+def test_every_failing_row_of_a_test_table_is_reported() -> None:
     tried = []
 
     @table("number", range(5))
@@ -280,7 +284,7 @@ def test_every_failing_row_is_reported() -> None:
     assert notes(caught) == [["in the row (1,)"], ["in the row (3,)"]]
 
 
-def test_row_fails_if_it_is_skipped_or_an_expected_error_is_missing() -> None:
+def test_a_table_row_fails_if_skipped_or_if_an_expected_error_is_missing() -> None:
     @table(("one", "other"), [(1, 2), (2, 2), (3, 3)], ids=["a", "b", "c"])
     def differ(one: int, other: int) -> None:
         if one == 3:
@@ -296,12 +300,14 @@ def test_row_fails_if_it_is_skipped_or_an_expected_error_is_missing() -> None:
 @table("left", [0, 1])
 @table("right", [0, 1])
 @pytest.mark.parametrize("sum_", [0, 1, 2])
-def test_tables_accept_nested_tables_and_fixtures(left: int, right: int, sum_: int, tmp_path: object) -> None:
+def test_test_tables_accept_nested_tables_and_fixtures(
+    left: int, right: int, sum_: int, tmp_path: object
+) -> None:
     assert (left + right == sum_) is (sum_ - left == right)
 
 
 @table("rows", [[], [(1, 2)]], ids=["none", "too wide"])
-def test_empty_or_ill_formed_table_is_rejected(rows: list[tuple[int, int]]) -> None:
+def test_an_empty_or_ill_formed_test_table_is_rejected(rows: list[tuple[int, int]]) -> None:
     with pytest.raises(AssertionError):
         table(["only"], rows)
 

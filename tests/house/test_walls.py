@@ -19,7 +19,7 @@ OUTSIDE = {
     *("os", "time", "select", "selectors", "socket", "serial", "termios", "fcntl", "pty", "tty"),
     *("signal", "subprocess"),
 }
-# floors, the lowest first: a room may import from itself and from rooms on lower floors
+# packages by floor, the lowest floor first: a package may import only from lower floors
 FLOORS = [
     {"errors", "exposition", "printable", "supervisor", "whole_file"},
     {"toml_lines", "toml_syntax"},
@@ -116,7 +116,7 @@ def rooms(modules: set[str]) -> set[str]:
 
 
 def floor(name: str) -> int:
-    """Return the floor of a room, or of a public name: public names are above all rooms."""
+    """Return the floor (layer) of a package. Public names are above all packages."""
     return next((number for number, names in enumerate(FLOORS) if name in names), len(FLOORS))
 
 
@@ -302,7 +302,7 @@ def test_pure_files_of_the_core_use_no_system() -> None:
 
 
 @pytest.mark.long
-def test_python_calls_each_function_of_its_headers() -> None:
+def test_python_calls_each_function_of_the_core_s_public_headers() -> None:
     headers = "".join((ROOT / "csrc" / f"{name}.h").read_text("utf-8") for name in HEADERS_OF_PYTHON)
     declared = set(CALLED.findall(re.sub(r"/\*.*?\*/", "", headers, flags=re.DOTALL)))
     called = {

@@ -60,7 +60,7 @@ def _state(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def made(family: type[Drive]) -> Drive:
-    """Return a drive of the family. If the drive has a run source, it is the line."""
+    """Return a drive of the family; for a family from a file, the user has confirmed the file."""
     return family(1, **({"confirmed": 1} if family.declared_in else {}))
 
 
@@ -124,7 +124,9 @@ def test_run_command_at_zero_speed_makes_apply_raise(monkeypatch: pytest.MonkeyP
     assert line.written == []
 
 
-def test_drive_of_unknown_state_is_sent_a_stop_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_is_sent_before_the_writes_if_the_motor_state_is_unknown(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, drive, _ = attached(monkeypatch, DelixiModbus(1), ["P01.00"])
     params.plan(drive, {"P01.00": 5})
     assert line.written == []
@@ -133,7 +135,7 @@ def test_drive_of_unknown_state_is_sent_a_stop_first(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("family", [DelixiModbus, DelixiNative])
-def test_drive_that_obeys_its_panel_makes_apply_raise(
+def test_apply_raises_if_the_panel_may_start_the_motor(
     monkeypatch: pytest.MonkeyPatch, family: type[Drive]
 ) -> None:
     line, drive, sim = attached(monkeypatch, family(1), ["P01.00"])
@@ -151,7 +153,7 @@ def test_drive_that_obeys_its_panel_makes_apply_raise(
         ({"0009": 0, "0010": 1}, "has values that may not be written: "),
     ],
 )
-def test_one_invalid_value_refuses_the_whole_set(
+def test_one_invalid_value_makes_apply_write_nothing(
     monkeypatch: pytest.MonkeyPatch, values: dict[str, int], sentence: str
 ) -> None:
     line, drive, _ = attached(monkeypatch, YD1000(1), [])
@@ -170,7 +172,9 @@ def test_parameters_of_another_model_are_refused(monkeypatch: pytest.MonkeyPatch
 # ---- parameters that are left out ----
 
 
-def test_communication_parameters_are_written_only_if_named_in_also(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_communication_parameters_are_written_only_with_the_option_also(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     _, drive, sim = attached(monkeypatch, YD1000(1), [])
     left = params.apply(drive, {"F803": 30, "F801": 0, "F111": 3}, also=["F801"])
     assert left.plan.left == {"F111": f"{COMMAND} (2 -> 3)"}
@@ -306,15 +310,17 @@ def test_stop_while_the_plan_is_read_cancels_all_writes(monkeypatch: pytest.Monk
     monkeypatch.setattr(drive.link, "read_raw", lambda *given: (drive.stop(), read(*given))[1])
     done = params.apply(drive, {"P00.03": 6000})
     assert isinstance(done.failure, CancelledByStop)
-    assert {frame[6:11] for frame in line.written} == {"20 00"}  # only the stop
+    assert {frame[6:11] for frame in line.written} == {"20 00"}  # the only write is the stop
 
 
-@table("room", [0, 100, 130, 160, 200, 230])  # free bytes on the disk; each record is cut once
+# free bytes on the disk: in each row, the disk becomes full at another record
+@table("room", [0, 100, 130, 160, 200, 230])
 def test_a_full_disk_ends_apply_and_the_next_apply_completes_the_writes(
     monkeypatch: pytest.MonkeyPatch, room: int
 ) -> None:
     line, drive, _ = attached(monkeypatch, ErmanERG220(1), [])
-    monkeypatch.setattr(Ledger, "enter", lambda *given: "")  # the ledger's disk has room
+    # the EEPROM ledger is not affected by the full disk
+    monkeypatch.setattr(Ledger, "enter", lambda *given: "")
     values = {"b.003": 150, "b.004": 160}
     with full_at(room):
         first = params.apply(drive, values)
@@ -330,7 +336,7 @@ def test_a_full_disk_ends_apply_and_the_next_apply_completes_the_writes(
     assert params.apply(drive, values).earlier == []
 
 
-def test_a_journal_that_cannot_be_removed_does_not_lose_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_apply_returns_its_result_if_the_journal_cannot_be_removed(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, _ = attached(monkeypatch, ErmanERG220(1), [])
 
     def refuse(*given: object, **options: object) -> None:

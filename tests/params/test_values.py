@@ -84,7 +84,7 @@ def test_read_with_codes_reads_only_these_parameters(monkeypatch: pytest.MonkeyP
         params.read(drive, ["P09.00"])
 
 
-def test_group_without_replies_is_abandoned(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_parameter_group_without_replies_is_abandoned(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, DelixiModbus(1))
     found = params.read(drive).values
     assert [*found] == ["P00.00", "P00.01", "P00.02", "P04.28", "P04.29", "P04.30"]
@@ -103,7 +103,7 @@ def test_a_silent_drive_raises_the_error_no_reply(monkeypatch: pytest.MonkeyPatc
 ADDRESSES = [
     ("delta-cp2000", "04-10", 0x040A),  # CP2000 manual p. 12.1-09-8
     ("powtran-pi130", "F0.01", 0xF001),  # PI130 manual p. 112
-    ("powtran-pi130", "F3.12", 0xF30C),  # PI500 manual p. 88, like the next ones
+    ("powtran-pi130", "F3.12", 0xF30C),  # PI500 manual p. 88, as the next entries
     ("powtran-pi130", "E3.21", 0xA315),
     ("powtran-pi130", "y1.30", 0xC11E),
     ("invt-goodrive", "P14.02", 0x0E02),  # Goodrive200A manual p. 138

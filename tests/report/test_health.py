@@ -35,7 +35,7 @@ def _imported() -> None:
 # ---- loading ----
 
 
-def test_series_have_every_value_and_every_miss(look: Recording) -> None:
+def test_a_loaded_recording_has_every_value_and_every_miss(look: Recording) -> None:
     assert [(each.drive, each.register, each.unit, len(each.time)) for each in look.series] == [
         ("pump", "output_frequency", "Hz", 1000),
         ("pump", "fault", "", 1000),
@@ -88,8 +88,8 @@ def test_faults_without_a_name_and_sets_of_fault_bits_are_shown(tmp_path: Path) 
     ]
 
 
-def test_an_unnamed_number_is_not_a_sum_of_names(tmp_path: Path) -> None:
-    """A fault number that is not in the enumeration is not shown as the sum of several faults."""
+def test_a_fault_number_without_a_name_is_not_shown_as_a_sum_of_faults(tmp_path: Path) -> None:
+    """The names of 8 and 16 must not be shown for 24."""
     series = load(record(tmp_path / "it.arrows", [row(0, "pump", "fault", 9 + 2)], ABOUT)).series[0]
     assert [series.name_of(count) for count in (8.0, 9.0, 24.0, 1e308, -1.0, 0.5)] == [
         "OVERHEAT",
@@ -120,7 +120,7 @@ def test_recording_too_large_to_draw_raises_value_error(
         load(path)
 
 
-def test_recording_of_events_alone_is_refused(tmp_path: Path) -> None:
+def test_a_recording_that_has_only_events_cannot_be_drawn(tmp_path: Path) -> None:
     path = record(tmp_path / "run.arrows", [row(1, "event", "comment", None, "nothing")])
     with pytest.raises(ValueError, match="only events"):
         load(path)
@@ -155,7 +155,8 @@ def test_misses_that_grow_with_speed_are_found(look: Recording) -> None:
     slow = shares[1][shares[0] < 28]
     fast = shares[1][shares[0] > 32]
     assert slow.max() == 0
-    assert fast == pytest.approx(np.full(len(fast), 0.25), abs=0.02)  # 0.25: half of `fault`
+    # half of the rows of `fault`, which is one of two registers
+    assert fast == pytest.approx(np.full(len(fast), 0.25), abs=0.02)
     assert miss_shares(look, "fan") is None
 
 
@@ -170,7 +171,7 @@ def test_misses_are_listed_by_reason(look: Recording) -> None:
     assert reasons_of(look, "fan") == {"no reply": 1}
 
 
-def test_reasons_beyond_the_limit_are_combined_as_other_reasons(tmp_path: Path) -> None:
+def test_reasons_for_misses_beyond_the_limit_are_combined(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", None, f"reason {at % 8}") for at in range(80)]
     rows += [row(at, "pump", "output_frequency", None, "no reply") for at in range(80)]
     (_, misses) = draw_rates(load(record(tmp_path / "it.arrows", rows))).axes
@@ -201,7 +202,7 @@ def test_utilisation_of_a_line_is_computed_from_its_recording(
     assert re.search(r"bus cycle, ms</td><td[^>]*>70\.0</td><td[^>]*>119\.\d</td>", page)
 
 
-def test_utilisation_of_a_port_without_a_wire_is_at_most_1(planned: dict[str, Any], tmp_path: Path) -> None:
+def test_utilisation_of_a_network_port_is_at_most_1(planned: dict[str, Any], tmp_path: Path) -> None:
     """The port is a network port with a request every 2 ms. On a wire, each exchange would need 32 ms."""
     rows = [row(tick / 500, "fan", "output_current", 1.0, ms=0.5) for tick in range(1000)]
     line_plan = {"hall-1": planned["hall-1"] | {"drives": {"fan": planned["hall-1"]["drives"]["fan"]}}}
@@ -226,12 +227,12 @@ def test_utilisation_counts_requests_that_differ_from_the_plan(
 
 
 @pytest.mark.parametrize("wrong", [None, [], "hall", {"hall-1": 7}, {"hall-1": {"drives": {"pump": {}}}}])
-def test_an_invalid_plan_is_ignored(turns: list[Row], tmp_path: Path, wrong: Any) -> None:
+def test_a_recordings_invalid_plan_is_ignored(turns: list[Row], tmp_path: Path, wrong: Any) -> None:
     look = load(record(tmp_path / "it.arrows", turns, ABOUT | {"planned": wrong}))
     assert line_uses(look) == []
 
 
-def test_the_plan_equals_the_polled_blocks(tmp_path: Path) -> None:
+def test_the_plan_in_a_recording_equals_the_polled_blocks(tmp_path: Path) -> None:
     path = tmp_path / "hall.toml"
     path.write_text(
         '[[line]]\nname = "hall-1"\nport = "x"\n[[line.drive]]\nname = "pump"\naddress = 1\nevery = "1 s"\n'
@@ -247,7 +248,7 @@ def test_the_plan_equals_the_polled_blocks(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_a_line_polled_at_rates_has_no_bus_cycle(
+def test_a_line_whose_registers_have_polling_rates_has_no_bus_cycle(
     planned: dict[str, Any], turns: list[Row], tmp_path: Path
 ) -> None:
     planned["hall-1"]["drives"]["fan"]["blocks"][0]["every_ms"] = 100

@@ -49,11 +49,12 @@ def test_the_report_is_one_self_contained_page(look: Recording) -> None:
     assert "http" not in re.sub(r'src="data:[^"]+"', "", page)
     for text in ("OVERHEAT", "bad checksum", "no reply", "invt-che", "9600 8N1 rtu", "Response delays"):
         assert text in page
-    assert re.search(r"<td[^>]*>pump</td><td[^>]*>1000</td><td[^>]*>10\.6</td>", page)  # least delay, ms
+    # number of values, and the least response delay in ms
+    assert re.search(r"<td[^>]*>pump</td><td[^>]*>1000</td><td[^>]*>10\.6</td>", page)
 
 
 @pytest.mark.usefixtures("_unpainted")
-def test_names_cannot_break_the_page(tmp_path: Path) -> None:
+def test_names_with_html_markup_are_escaped_in_the_report(tmp_path: Path) -> None:
     rows = [row(at, "<script>&", "output_frequency", at) for at in range(3)]
     look = load(record(tmp_path / "<b>.arrows", rows))
     for page in (report_page(look), plot_page(look, plot(look)[0])):
@@ -63,7 +64,7 @@ def test_names_cannot_break_the_page(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_names_of_any_script_are_drawn(tmp_path: Path) -> None:
+def test_names_in_any_alphabet_are_drawn(tmp_path: Path) -> None:
     with open_writer(tmp_path / "it.arrows", METADATA) as writer:
         writer.write(example())
     loaded = load(tmp_path / "it.arrows")
@@ -81,7 +82,7 @@ def test_a_recording_of_misses_only_has_a_report(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_single_row_has_a_report(tmp_path: Path) -> None:
+def test_a_recording_of_one_row_has_a_report(tmp_path: Path) -> None:
     look = load(record(tmp_path / "it.arrows", [row(1, "pump", "output_frequency", 50.0)], pieces=1))
     assert "Report on it.arrows" in report_page(look)
 

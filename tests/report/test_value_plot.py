@@ -47,7 +47,7 @@ def test_neighbouring_ticks_of_the_time_axis_have_different_labels(seconds: floa
     assert all(one != other for one, other in pairwise(labels))
 
 
-def test_thinning_keeps_every_extreme() -> None:
+def test_a_thinned_curve_keeps_every_minimum_and_maximum() -> None:
     time = np.arange(1_000_000)
     value = np.sin(time / 1e5)
     value[123_456], value[777_777] = 9.0, -9.0
@@ -143,14 +143,14 @@ def test_a_long_legend_takes_no_room_from_the_plot(tmp_path: Path, drives: int, 
     assert shown.x1 <= figure.bbox.width
 
 
-def test_a_constant_value_has_a_wide_axis(tmp_path: Path) -> None:
+def test_the_value_axis_around_a_constant_value_is_wide(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", 50.0) for at in range(3)]
     (axes,) = plot(load(record(tmp_path / "it.arrows", rows)))[0].axes
     low, high = axes.get_ylim()
     assert low <= 0 < 50 < high
 
 
-def test_the_y_axis_includes_a_zero_near_the_values(tmp_path: Path) -> None:
+def test_the_value_axis_includes_zero_if_the_values_are_near_it(tmp_path: Path) -> None:
     for least, bottom in ((10.0, 0.0), (45.0, None)):
         rows = [row(at, "pump", "output_frequency", value) for at, value in enumerate((least, 50.0))]
         (axes,) = plot(load(record(tmp_path / f"{least:g}.arrows", rows)))[0].axes
@@ -228,7 +228,7 @@ def test_no_state_has_the_colour_of_a_drive(tmp_path: Path) -> None:
     assert of_bit == of_drives[1]
 
 
-def test_a_state_of_one_row_is_drawn(tmp_path: Path) -> None:
+def test_a_state_that_lasts_one_row_is_drawn(tmp_path: Path) -> None:
     """The state's bar is pale and one pixel wide. Without a dark edge it would be invisible."""
     rows = [row(at, "che", "status", 3 if at == 500 else None) for at in range(1000)]
     (axes,) = plot(states(tmp_path, rows))[0].axes
@@ -237,7 +237,7 @@ def test_a_state_of_one_row_is_drawn(tmp_path: Path) -> None:
     assert sum(bars.get_edgecolor()[0][:3]) < 1.5  # darker than a medium grey
 
 
-def test_each_bit_has_a_lane_instead_of_one_sum(tmp_path: Path) -> None:
+def test_each_bit_of_a_status_register_has_a_lane_of_its_own(tmp_path: Path) -> None:
     rows = [row(at, "yd", "status", value) for at, value in enumerate((0, 16, 18, 2, 2 + 64, 1e308, 0.5, 0))]
     (axes,) = plot(states(tmp_path, rows))[0].axes
     assert drawn(axes) == {  # bars start at 1 s, when the first bit is set
@@ -250,7 +250,7 @@ def test_each_bit_has_a_lane_instead_of_one_sum(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_states_that_change_faster_than_can_be_drawn_hide_no_fault(tmp_path: Path) -> None:
+def test_states_that_change_too_fast_to_be_drawn_hide_no_fault(tmp_path: Path) -> None:
     rows = [row(at / 100, "che", "status", 1 + at % 2) for at in range(20_000)]
     rows[10_001] = row(100.01, "che", "status", 4)
     (axes,) = plot(states(tmp_path, rows))[0].axes
@@ -260,7 +260,7 @@ def test_states_that_change_faster_than_can_be_drawn_hide_no_fault(tmp_path: Pat
 
 
 @pytest.mark.long
-def test_lanes_that_do_not_fit_into_a_panel_are_counted(tmp_path: Path) -> None:
+def test_state_lanes_that_do_not_fit_into_a_panel_are_counted(tmp_path: Path) -> None:
     bits = {f"B{bit}": 1 << bit for bit in range(16)}
     drives = [f"yd{number}" for number in range(80)]
     meaning = {"unit": "", "values": bits, "bits": True}
@@ -305,7 +305,7 @@ def test_series_that_do_not_fit_into_the_picture_are_named(run: Run, tmp_path: P
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_a_register_of_two_panels_without_room_is_named_only_once(tmp_path: Path) -> None:
+def test_a_register_with_two_omitted_panels_is_named_only_once(tmp_path: Path) -> None:
     """A register whose values are numbers on one drive and states on another has two panels."""
     rows = [row(0, "pump", f"r{number}", 1) for number in range(MOST_PANELS)]
     rows += [row(0, drive, "status", 1) for drive in ("pump", "che")]

@@ -165,7 +165,7 @@ def test_drives_at_usual_settings_are_found_within_15_s() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("format", ["8N1", "8E1"])
-def test_sweep_of_a_silent_line_takes_no_longer_than_needed(format: str) -> None:
+def test_sweep_of_a_line_without_drives_takes_the_predicted_time(format: str) -> None:
     nobody = Pair([simulated(YD1000(9))])
     line = Line(nobody)
     plan = sweeps(FAMILIES, addresses=range(10, 248), baudrates=[9600], formats=[format])
@@ -264,7 +264,7 @@ class Shared(Pair):
         return bytes(one & two for one, two in itertools.zip_longest(reply, other, fillvalue=0xFF))
 
 
-def test_two_drives_at_one_address_are_reported_as_a_crowd() -> None:
+def test_two_drives_at_one_address_are_reported() -> None:
     one, twin = simulated(InnovertIBD(3)), simulated(InnovertIBD(3))
     one["output_current"], twin["output_current"] = 41.1, 77.7
     line = Line(Shared([simulated(InvtCHE(1)), one, simulated(InnovertIBD(4))], twin))
@@ -294,7 +294,7 @@ class Everything(Echo, Junk):
 
 @pytest.mark.story
 @pytest.mark.long
-def test_all_eight_drives_are_found_with_echo_noise_and_a_crowd() -> None:
+def test_all_eight_drives_are_found_despite_echo_noise_and_a_shared_address() -> None:
     one, twin = simulated(InnovertIBD(9)), simulated(InnovertIBD(9))
     one["output_current"], twin["output_current"] = 41.1, 77.7
     line = Everything(Shared([*map(simulated, ALL_EIGHT), one], twin))
@@ -313,7 +313,7 @@ class OneAfterTheOther(Shared):
         return reply if answer is None else reply + build_reply(self.twin.drive.framing, answer)
 
 
-def test_second_reply_after_the_first_raises_a_doubt_about_a_second_drive() -> None:
+def test_two_replies_to_one_request_are_reported_as_a_possible_second_drive() -> None:
     one, twin = simulated(InnovertIBD(3)), simulated(InnovertIBD(3))
     line = Line(OneAfterTheOther([one, simulated(InnovertIBD(4))], twin))
     findings = found(line, sweeps([InnovertIBD], baudrates=[9600], formats=["8N1"]), [InnovertIBD])
@@ -429,7 +429,7 @@ def test_identify_script_that_would_write_is_not_carried_out() -> None:
 
 
 class Commanded(Drive):
-    """A user's family without readable registers."""
+    """A user's family that has only registers for writing."""
 
     model = "commanded"
     speed = command(1, "rpm")
@@ -511,7 +511,7 @@ def questions(plan: Sequence[Sweep]) -> Iterator[bytes]:
 
 
 @pytest.mark.slow
-def test_every_sweep_request_is_a_read_of_its_families() -> None:
+def test_every_sweep_reads_a_register_of_its_families() -> None:
     for sweep in sweeps(FAMILIES):
         assert sweep.request.function in READS[sweep.framing]
         for family in sweep.families:
@@ -530,7 +530,7 @@ class Bare(SimulatedIBD):
 
 
 @pytest.mark.slow
-def test_ibd_without_line_registers_is_reported_with_a_doubt() -> None:
+def test_innovert_ibd_without_line_registers_is_reported_with_a_doubt() -> None:
     bare = InnovertIBD(3), InnovertIBD(4, framing="ascii")
     line = Line(Pair([Bare(each) for each in bare]))
     plan = sweeps(FAMILIES, baudrates=[9600], formats=["8N1", "8E1"])
@@ -543,7 +543,7 @@ def test_ibd_without_line_registers_is_reported_with_a_doubt() -> None:
 
 
 @pytest.mark.long
-def test_unusual_upper_bits_of_the_terminals_exclude_an_ibd() -> None:
+def test_unusual_upper_bits_of_the_terminal_register_exclude_an_innovert_ibd() -> None:
     for bits in (0x0000, 0x0800, 0x1000, 0x9800, 0xFFFF):
         drive = Bare(InnovertIBD(3))
         drive.read_handlers = {**Bare.read_handlers, "terminals": lambda self, bits=bits: bits}

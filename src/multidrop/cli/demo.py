@@ -76,7 +76,7 @@ def _text(summary: Mapping[str, Any], out: Path) -> Iterator[str]:
 
 
 class NextCommand(NamedTuple):
-    """A command for the user to try next, its effect, and the optional extra that it needs."""
+    """A command that the user could try next, its effect, and the optional library that it needs."""
 
     words: tuple[str, ...]
     effect: str

@@ -69,7 +69,7 @@ from multidrop.transport.port_identity import lasting_name
 from multidrop.transport.prepared import make_exchange
 
 WAKE_S = 5.0  # how long to measure this computer's wake-ups, in s
-NOBODY = 247  # an address without a drive: only an echo of the request may come back
+NOBODY = 247  # address at which no drive is expected: only an echo of the request may come back
 SETTING_UP_COM = "while the port is open, multidrop makes it raw and sets each drive's baud rate and format"
 SETTING_UP = (
     "while the port is open, multidrop locks it against programs that respect such locks, makes it raw, sets "
@@ -214,7 +214,8 @@ def _findings(target: _Target) -> Iterator[Finding]:
     block = first_block(target.drives[0]) if target.drives else None
     if block:
         yield other_way_finding(port, block.request, settings)
-    elif not speaks_tcp(port):  # without a drive to ask, silence in the other framing proves nothing
+    # if the user named no drive, a missing answer in the other framing proves nothing
+    elif not speaks_tcp(port):
         yield other_way_finding(port, nobody, settings)
 
 
@@ -307,7 +308,7 @@ def _text(findings: list[Finding]) -> Iterator[str]:
 
 UNANSWERED = 5  # a drive gets no further requests after this many without a single reply
 MOST_S = 5.0  # time limit, in s, for all requests to a slow or silent drive
-RETRY_S = 0.05  # pause, in s, before the retry of a request that the line held back
+RETRY_S = 0.05  # pause, in s, before a request is tried again because a late reply may still come
 OF_GATEWAYS = (0x0A, 0x0B)  # exception codes: no path; device does not respond (Modbus protocol, section 7)
 
 

@@ -18,9 +18,9 @@ from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import Settings
 from multidrop.transport.port_identity import of_name
 
-LATENCY_MS = 1  # ms; if the adapter's latency timer is longer, advise to lower it
+LATENCY_MS = 1  # in ms: advise the user to lower the adapter's latency timer if it is longer
 ROUNDS = 20
-SLOW_S = 0.005  # advise if a measured delay exceeds the family's usual delay by more than this many s
+SLOW_S = 0.005  # s; advise the user if replies are later than usual for the family by more than this
 
 
 _LEVELS = {RS485.RTS_UP: "on", RS485.RTS_DOWN: "off"}

@@ -50,7 +50,7 @@ from multidrop.polling.added_rows import TRIGGER
 from multidrop.recording.triggered import TriggeredWriter
 
 DRAW_S = 0.25
-SCROLL_S = 2.0  # s between two pictures on a terminal that scrolls
+SCROLL_S = 2.0  # s between two pictures on a terminal without cursor control
 PAGE = 10  # number of lines that a page key scrolls
 _STOP_KEYS = ("s", "S")
 STILL_STOPPING = "waiting for a stop in progress; press Ctrl-C repeatedly to leave, and watch the motors"
@@ -165,7 +165,8 @@ class Monitor:
 
         def draw() -> None:
             lines = trigger_picture(newest, how, width - 2, self._screen.blocks)
-            if newest == self._trigger:  # otherwise, the recording of a later trigger is complete already
+            # if a later trigger's recording is complete by now, that one is drawn instead
+            if newest == self._trigger:
                 self._at.trigger = lines
 
         with suppress(RuntimeError):  # no thread can start: the curves of the earlier trigger stay

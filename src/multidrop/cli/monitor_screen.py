@@ -21,7 +21,8 @@ WIDE, WIDEST = 100, 110  # columns needed to show delays (WIDE), and also models
 LEAST_DRIVES = 3  # minimum number of drives in the overview; curves of a trigger get only the room below
 OLD_NOTE, NOT_POLLED = "old", "not polled"  # notes beside a register's value
 NEVER = "never"
-LEAST_VALUE, AROUND = 12, 13  # minimum width of a value; width of its age and all blanks together
+# least width of a register's value; width of the value's age and of all blanks together
+LEAST_VALUE, AROUND = 12, 13
 OLD = "?"  # mark in front of an old value
 HISTORY = "LAST MINUTE"  # table heading
 STOPS = "s stop   S stop all   q quit"

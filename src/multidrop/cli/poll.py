@@ -387,7 +387,7 @@ class Keys:
             elif key == "t" and self._has_trigger:
                 self._poller.mark("key t", kind=TRIGGER)
         elif key == ENTER:
-            with suppress(ValueError):  # an empty text is no comment
+            with suppress(ValueError):  # raised for an empty comment, which is not recorded
                 self._poller.mark(self._text, ago=time.monotonic() - self._begun)
             self._text = None
         elif key == ESCAPE:

@@ -123,7 +123,8 @@ def _screen(test: TestRun, arguments: argparse.Namespace) -> Iterator[list[Calla
         def show(rows: Rows) -> None:
             nonlocal is_ending
             table.add(rows)
-            if not is_ending and signal_has_come():  # then another sentence is printed below the table
+            # after a signal, another message is printed below the table
+            if not is_ending and signal_has_come():
                 is_ending = True
                 table.keep_drawing(time.monotonic())
             table.draw_if_due(time.monotonic())

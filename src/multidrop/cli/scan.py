@@ -123,7 +123,7 @@ def _permission_advice(device: Path) -> str:
     try:
         owner, user = (pwd.getpwuid(number).pw_name for number in (about.st_uid, os.getuid()))
         group = grp.getgrgid(about.st_gid)
-    except KeyError:  # in a container, numbers may have no names
+    except KeyError:  # in a container, the number of a user or group may have no name
         return f"start this program, or its container, in group {about.st_gid}"
     if about.st_mode & 0o060 != 0o060 or not about.st_gid:
         return f"only {owner} may; a udev rule can give it to a group"

@@ -297,7 +297,7 @@ def replay(
     return sum((Counter(printer.pairing.counts()) for printer in printers), Counter())
 
 
-_COUNTED = {  # singular and plural
+_COUNTED = {  # the noun for each count, in singular and plural
     "exchanges": ("exchange", "exchanges"),
     "broadcasts": ("broadcast", "broadcasts"),
     "unanswered": ("request without a reply", "requests without a reply"),

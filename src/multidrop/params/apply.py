@@ -208,7 +208,7 @@ _STOP = Advice.call("stop")
 
 
 def _bounds(family: Any, known: Mapping[str, Parameter]) -> dict[str, str]:
-    """Return the codes, by register name, of the parameters whose values limit the `known` ones."""
+    """Return the parameters that are limits of the `known` ones, as a map from register name to code."""
     names = {name for one in known.values() for name in (one.at_least, one.at_most) if name}
     return {one.name: code for code, one in parameters_of(family).items() if one.name in names}
 

@@ -109,13 +109,13 @@ def read(
 
 @dataclass
 class _Reader:
-    """Reads parameters, and finds out which of them the drive lacks and how long a block it answers."""
+    """Reads a drive's parameters, and learns which of them it lacks and how long a block it answers."""
 
     drive: Drive
     total: int
     progress: Progress | None
     values: dict[str, int] = field(default_factory=dict)
-    most: int = 0  # longest accepted block, once a longer one was refused; 0: no such refusal
+    most: int = 0  # length of the longest block that the drive answers; 0 until it has refused a block
     done: int = 0
     silent: int = 0  # number of reads in a row that were not answered
     group: str = ""  # group of the last parameter read

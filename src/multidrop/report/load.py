@@ -186,7 +186,7 @@ class Recording:
 
         Raises ValueError for unknown names, and if there is no value to draw.
         """
-        from multidrop.report.value_plot import plot  # which imports this file
+        from multidrop.report.value_plot import plot  # imported here, because value_plot imports this module
 
         return plot(self, drives, registers)[0]
 

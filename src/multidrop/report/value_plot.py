@@ -50,7 +50,7 @@ MOST_POINTS = 4000  # limit of points per curve: more points could not be distin
 FEW_POINTS = 200  # a curve with at most this many points is drawn with a dot for each
 FAULTS = "fault"
 MOST_EVENTS = 50  # limit of events, and of steps of a test run, in a picture
-STEP = "step"  # kind of the events that mark the steps
+STEP = "step"  # kind of the events that mark the steps of a test run
 LONGEST_EVENT = 30  # limit of an event's text in a picture
 
 CURVES_INCHES = 1.9

@@ -44,7 +44,7 @@ MOST_READINGS = 3  # number of readings that a drive must answer if its family h
 NOISY = 1 / 3  # invalid bytes count as noise if more than this share of a sweep's addresses has them
 LEAST_NOISY = 4  # if fewer addresses than this have invalid bytes, the bytes never count as noise
 BEGUN = 2  # number of received characters after which a reply counts as started
-LATE = 8  # for this many later requests, a late reply is still matched to its request
+LATE = 8  # a reply may come this many requests late, and is still matched to its request
 MOST_TIMEOUT = 1.0  # limit of the timeout in s, used only for an address at which a drive has answered
 TRIES = 3
 LATE_NS = 500_000_000  # maximum wait for late replies
@@ -322,7 +322,7 @@ def identify(
 
 
 def _score(drive: Drive, ask: Ask) -> int:
-    """Return the number of checks that the drive passes. Raises BusError or ValueError on a misfit."""
+    """Return the number of identity checks that the drive passes. Raises BusError or ValueError if not."""
     score = 0
     if type(drive).identify is not Drive.identify:
         _run(drive, drive.identify.script(), ask)

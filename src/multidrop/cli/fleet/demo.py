@@ -42,7 +42,7 @@ Fleet = dict[str, Any]
 
 
 class Stage:
-    """The demo's output: its notes so far, and the newest view of the fleet."""
+    """The demo's output: its notes so far, and the newest state of the fleet."""
 
     def __init__(self) -> None:
         self.notes: list[str] = []
@@ -74,7 +74,7 @@ class Stage:
         return ", ".join(f"{name} {found.count(name)}" for name in GATEWAYS if name in found)
 
     async def until(self, condition: Callable[[], bool], what: str) -> None:
-        """Wait for a view of the fleet that meets the condition. Raises OSError after a minute."""
+        """Wait for a state of the fleet that meets the condition. Raises OSError after a minute."""
         try:
             async with asyncio.timeout(WAIT_S):
                 while not condition():
@@ -84,7 +84,7 @@ class Stage:
             raise OSError(f"the demo has failed: {what} not within {WAIT_S:.0f} s") from None
 
     async def calm(self, seconds: float) -> None:
-        """Wait until no line has changed its master for `seconds` s, because views may be out of date."""
+        """Wait until two reports of the fleet, `seconds` s apart, show the same master for each line."""
         before: dict[str, str | None] | None = None
         while (found := self.masters()) != before:
             before = found
@@ -105,7 +105,7 @@ def run(arguments: argparse.Namespace) -> int:
     program = server_program(OLDEST)
     stage = Stage()
     with temporary_folder() as folder, ExitStack() as stack:
-        # so that the demo does not use the credentials of the user's own fleet
+        # otherwise the demo would use the credentials of the user's own fleet
         none = dict.fromkeys((CREDENTIALS, CA), "")
         children = Children(folder, {"XDG_STATE_HOME": str(folder / "state"), **none})
         stack.callback(children.close)
@@ -209,7 +209,7 @@ class Demo:
 
 @contextmanager
 def _drawn(stage: Stage) -> Iterator[None]:
-    """Draw the stage on a terminal until the context ends. Print its notes in any case."""
+    """On a terminal, draw the fleet's state while the context lasts; afterwards, print the notes again."""
     if not sys.stdout.isatty():
         yield
         return

@@ -203,7 +203,7 @@ async def _read(arguments: argparse.Namespace, sink: SampleSink, options: dict[s
 
         async with samples_path(arguments.servers, options) as path:
             hub = SampleHub(path, sink, every=arguments.every)
-            if arguments.parquet:  # PostgreSQL needs no compaction
+            if arguments.parquet:  # only Parquet files need compaction, PostgreSQL does not
                 supervisor().keep("compaction", compact_for_ever(arguments.parquet))
             reading = asyncio.ensure_future(hub.run(once=arguments.once))
             failing = asyncio.ensure_future(supervisor().has_dead.wait())

@@ -123,13 +123,13 @@ async def _print_lines(arguments: argparse.Namespace, paths: list[ServerPath]) -
 # ---- the picture: everything important is shown by words, not only by colours ----
 
 
-OLD_S = 3.0  # an older view is dimmed
-NOTES = 4  # limit of the lines for notes, and for problems
-MOVES = 8  # limit of the rows for moves while the lines fill the rest of the screen
+OLD_S = 3.0  # s; a state of the fleet that is older is shown dimmed
+NOTES = 4  # limit of the rows for notes, and of the rows for problems
+MOVES = 8  # limit of the rows that show how lines moved between gateways, if the lines fill the screen
 
 
 def picture(fleet: FleetState, size: tuple[int, int], head: str) -> list[TextLine]:
-    """Draw a fleet's gateways, lines, moves and notes.
+    """Draw a fleet's gateways and lines, the lines' moves between gateways, and notes.
 
     `fleet` has the form that `fleet watch --json` prints, plus the key "notes": a list of sentences.
     """
@@ -179,7 +179,7 @@ def _first_lines(lines: list[str], room: int) -> list[str]:
     if len(lines) <= room:
         return lines
     kept = room - 1
-    if kept < 2:  # there is room only for the table's head
+    if kept < 2:  # there is room only for the table's heading
         return []
     return [*lines[:kept], f"and {len(lines) - kept} more lines"]
 
@@ -362,7 +362,7 @@ def count_sentence(fleet: FleetState) -> str:
 
 
 def move_table(moves: Iterable[FleetState], width: float = inf) -> list[str]:
-    """Return a line of text for each move: time, line, former master (if there is room) and new master."""
+    """Return a row of text for each move of a line: time, line, former master (if it fits), new master."""
     rows = [
         (
             moment(move["at_ms"]),

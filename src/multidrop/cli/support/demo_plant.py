@@ -64,7 +64,7 @@ TROUBLE = {  # faults that are simulated for some drives
 }
 DRIFT = 0.25  # each simulated load moves up and down by this fraction of the rated torque
 STEP_S = 0.8  # pause before the operator turns to the next drive of a line
-CALM = 3  # the operator changes the setpoint at one in CALM visits to a running motor, on average
+CALM = 3  # when the operator visits a running motor, one visit in CALM changes the setpoint, on average
 
 
 def demo_files(folder: Path) -> tuple[Path, Path]:

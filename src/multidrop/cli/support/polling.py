@@ -35,7 +35,7 @@ from multidrop.transport.statistics import LineStatistics, Statistics, line_stat
 class PollingSession(NamedTuple):
     poller: Poller  # not started yet
     interruption: Interruption
-    hand_out: Callable[[], None]  # passes new rows to the recording and to all consumers
+    hand_out: Callable[[], None]  # passes the newest rows to the recording and to all other consumers
     writer: RecordingWriter | None = None  # the recording
 
 
@@ -91,7 +91,7 @@ def polling_session(
                     try:
                         take(batch)
                     except BaseException:
-                        # this consumer lost the batch, so further rows would leave a hole in its recording
+                        # this consumer failed: without this batch, its recording would have a hole
                         takers.remove(take)
                         raise
 
