@@ -1,1 +1,3 @@
-"""The gateway: one process polls the lines, and browsers, brokers and Modbus clients use it."""
+"""The gateway: one process that polls the lines and serves the values to browsers, brokers and Modbus
+clients.
+"""

@@ -1,5 +1,5 @@
-"""Clocks: the monotonic clock, which gives polled rows their times; the boot-time clock, which also runs
-while the computer sleeps; and UTC.
+"""Clocks: the monotonic clock, which dates polled values; the boot-time clock, which also runs while the
+computer sleeps; and UTC.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from datetime import UTC, datetime
 if hasattr(time, "CLOCK_MONOTONIC"):
 
     def monotonic_ns() -> int:
-        """Return the time of CLOCK_MONOTONIC in ns. Polled rows have times of this clock."""
+        """Return the time of CLOCK_MONOTONIC in ns, the clock by which polled values are dated."""
         return time.clock_gettime_ns(time.CLOCK_MONOTONIC)
 
 else:
 
     def monotonic_ns() -> int:
-        """Return the monotonic time in ns. Polled rows have times of this clock."""
+        """Return the monotonic time in ns, the clock by which polled values are dated."""
         return time.monotonic_ns()
 
 

@@ -1,7 +1,8 @@
-"""Commands: check and carry out the writes and verbs that arrive over the gateway's interfaces.
+"""Commands: check and carry out register writes and verbs, such as start and stop, that arrive over the
+gateway's interfaces.
 
-The caller's role, the plant file's lists and the library's own rules must allow a command. A stop needs only
-the role, and does not wait for other commands.
+A command is allowed only if the caller's role, the plant file's lists and the library's own rules allow it. A
+stop needs only the role, and does not wait for other commands.
 """
 
 from __future__ import annotations
@@ -33,11 +34,12 @@ from multidrop.gateway.http.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTE
 from multidrop.plant import drive_meant
 from multidrop.supervisor import supervisor
 
-MOST_AGE_S = 5.0  # writes and verbs that arrive later than this are refused; late stops are sent
-LOOK_S = 0.02  # during a reload: interval between checks for replaced drives, which must be stopped again
+MOST_AGE_S = 5.0  # age limit, in s, of writes and verbs when they arrive; stops have none
+# interval, in s, of checking during a reload whether drives that must be stopped again are attached
+LOOK_S = 0.02
 MOST_WRITES = 8  # limit of concurrent writes on one line; stops are not counted
-MOST_STOPS = 8  # limit of concurrent stops of a drive from one interface
-# Values of WriteForbidden.rule.
+MOST_STOPS = 8  # limit of concurrent stops of one drive that arrive over one interface
+# Values of the field `rule` of WriteForbidden.
 BUSY = "too many writes are under way"
 STOOD_STILL = "the gateway stood still"
 UNAUDITED = "the audit log cannot be written"
@@ -52,7 +54,7 @@ Admit = Callable[[str], float]
 _CALL = re.compile(r"(?P<how>call |run `multidrop )?\b(?P<verb>[a-z_-]+)(?P<end>\(\)|`)?")
 _log = logging.getLogger("multidrop.gateway")
 NOT_STARTED = "the stop was NOT sent: the fleet's part has not started; use the hard-wired stop"
-WHOLE = "the fleet"  # key of the whole fleet's result in the answer to a stop
+WHOLE = "the fleet"  # in the answer to a stop: the key of the result for the whole fleet
 
 
 class UnknownDrive(ValueError):
@@ -82,7 +84,7 @@ STOPPING = frozenset(verb for verb, rule in VERBS.items() if rule.role is Right.
 
 
 class PolledLines(Protocol):
-    """The polled lines, which a reload may change at any moment."""
+    """The polled lines of the gateway. A reload may change them at any moment."""
 
     @property
     def plant(self) -> Plant: ...
@@ -107,32 +109,34 @@ class Commands:
         self.may = may
         self.withheld = ""  # why all commands except stops are refused now; "" if commands are accepted
         self._on_reset = on_reset
-        self._halts: Counter[str] = Counter()  # by drive: commands other than stops that can end a run
+        # by drive: number of commands, other than stops, that can end a motor's run
+        self._halts: Counter[str] = Counter()
         self._jogging: Counter[str] = Counter()  # by drive: jogs in progress
         self._lines = lines
-        self.called = 0  # number of admitted commands so far
+        self.called = 0  # number of commands accepted so far
         self._under_way: Counter[str] = Counter()  # by line: writes in progress
         self.stops: Counter[str] = Counter()  # by drive: number of stops called
-        self._stopped_ns: dict[str, int] = {}  # by drive: when its latest stop was called (CLOCK_BOOTTIME)
+        # by drive: when its latest stop was called (CLOCK_BOOTTIME, ns)
+        self._stopped_ns: dict[str, int] = {}
         self._repeated = {verb: RepeatedStops(partial(stop_drive_by, verb)) for verb in STOPPING}
         self._repeated["stop"] = RepeatedStops()
-        # by drive: when its latest command, including stops, ended (CLOCK_MONOTONIC)
+        # by drive: when its latest command, including stops, ended (CLOCK_MONOTONIC, ns)
         self._ended_ns: dict[str, int] = {}
-        self.plant_ns: int | None = None  # when the plant file was last reloaded (CLOCK_BOOTTIME)
+        self.plant_ns: int | None = None  # when the plant file was last reloaded (CLOCK_BOOTTIME, ns)
 
     def note_reload(self) -> None:
-        """Record the time of a reload: a drive's name in an older command may mean another drive now."""
+        """Record the time of a reload, after which a drive's name may mean another drive."""
         self.plant_ns = boottime_ns()
 
     def ended_ns(self, drive: str) -> int:
-        """Return when the latest command of a drive ended (CLOCK_MONOTONIC); 0 if there was none.
+        """Return when the latest command of a drive ended (CLOCK_MONOTONIC, ns); 0 if there was none.
 
-        Rows polled before that time may not show the command's effect.
+        Values polled before that time may not show the command's effect.
         """
         return self._ended_ns.get(drive, 0)
 
     def stopped_ns(self, drive: str) -> int | None:
-        """Return when the latest stop of a drive was called (CLOCK_BOOTTIME); None if there was none."""
+        """Return when the latest stop of a drive was called (CLOCK_BOOTTIME, ns); None if there was none."""
         return self._stopped_ns.get(drive)
 
     def halts(self, drive: str) -> int | None:
@@ -179,7 +183,10 @@ class Commands:
     async def _stop_by(
         self, verb: str, lines: Sequence[LineStop], wanted: Iterable[str], caller: Caller
     ) -> dict[str, CommandResult]:
-        """Stop the wanted drives of these lines by a verb; return a result for each wanted name."""
+        """Stop those of the wanted drives that are on these lines, with the verb `verb`.
+
+        Return a result for each wanted name, also for unknown drives.
+        """
         names = [drive.name for line in lines for drive in line.drives]
         self._note_stop(names)
         with _written_by(caller):
@@ -196,7 +203,7 @@ class Commands:
     async def write(
         self, drive: str, register: str, value: float, caller: Caller, admit: Admit = lambda what: inf
     ) -> CommandResult:
-        """Write a register once; the plant file must list the register."""
+        """Write a register once. The plant file must list the register as writable."""
         what = f"{drive}.{register}"
         if caller.role < Right.WRITE:
             return denied(caller, Right.WRITE, f"a write of {what}")
@@ -217,7 +224,7 @@ class Commands:
         caller: Caller,
         admit: Admit = lambda what: inf,
     ) -> CommandResult:
-        """Carry out a verb once; all verbs but "stop" must be listed in the plant file.
+        """Carry out a verb once. The plant file must list every verb except "stop".
 
         Callers over Modbus and tool ports are refused, because no person confirms their commands.
         """
@@ -268,7 +275,7 @@ class Commands:
         return found is not None and found.commands
 
     async def _carry_out_stop(self, drive: str, verb: str, caller: Caller) -> CommandResult:
-        """Carry out a verb that stops the motor, without waiting for writes in progress or other stops."""
+        """Carry out a stop verb, such as "coast", without waiting for writes in progress or other stops."""
         self.called += 1
         caller = caller.commanding()
         _log.warning("%s.%s, asked for by %s", drive, verb, caller.by)
@@ -284,7 +291,7 @@ class Commands:
     ) -> CommandResult:
         try:
             line, known = self._lines.plant.find_drive(drive)
-        except ValueError:  # the drive is only in the plant that a reload is about to put into use
+        except ValueError:  # the drive exists only in the new plant of a reload, which is not in effect yet
             return _refused(UnknownDrive(drive))
         if self.withheld:
             return _refused(WriteForbidden(f"{what} was not sent: {self.withheld}", rule=UNAUDITED))
@@ -299,9 +306,7 @@ class Commands:
         stops = self.stops[drive]
 
         def limit_ns() -> float:
-            """Return the deadline for sending the command (CLOCK_MONOTONIC, ns); 0 if a stop was called in
-            the meantime.
-            """
+            """Return the deadline for sending the command (CLOCK_MONOTONIC, ns); 0 after a later stop."""
             return until_ns - boottime_ns() + monotonic_ns() if self.stops[drive] == stops else 0
 
         def why_not() -> CommandResult | None:
@@ -325,7 +330,7 @@ class Commands:
 
 @contextmanager
 def _written_by(caller: Caller) -> Iterator[None]:
-    """Within the block, audit entries name the caller.
+    """Within the `with` block, put the caller's name into the audit log's entries.
 
     The first entry of each command, except a stop, is written before the command is sent.
     """
@@ -346,7 +351,7 @@ def drives_of(plant: Plant) -> dict[str, Drive]:
 
 
 def names_of(lines: PolledLines) -> set[str]:
-    """Return the names of all drives of the present plant. During a reload, add those of the new plant."""
+    """Return the names of all drives of the present plant and, during a reload, of the new plant."""
     return {*drives_of(lines.plant_now), *drives_of(lines.plant_coming or lines.plant_now)}
 
 
@@ -357,10 +362,10 @@ async def stop_meant(
 ) -> dict[str, CommandResult]:
     """Stop the drives with these names, or all if None; return the result of each drive's latest stop.
 
-    Names may have another spelling (see `drive_meant`). `stop` is called with the present plant and the
-    names. If a reload changes a drive before all stops have ended, that drive is stopped again as soon as
-    it is attached. If a drive's stop failed and the plant's lines have changed since the first stop, the
-    drive is stopped once more after the other stops.
+    A name may be spelled differently from the plant file (see `drive_meant`). `stop` is called with the
+    present plant and the names. If a reload changes a drive before all stops have ended, that drive is
+    stopped again as soon as it is attached. If the plant's lines have changed since the first stop, each
+    failed stop is repeated once, after the other stops.
     """
     known = names_of(lines)
     meant = {name: drive_meant(name, known) for name in drives or ()}
@@ -400,7 +405,7 @@ def denied(caller: Caller, role: Right, what: str) -> CommandResult:
 
 
 def not_listed(what: str, key: str) -> WriteForbidden:
-    """Return the error for a write or a verb that the plant file does not list."""
+    """Return the error for a write or a verb that is not in the plant file's lists of allowed commands."""
     return WriteForbidden(
         f'{what} is not in the plant file\'s list; add it to {key} = ["{what}"] of [serve.may]',
         rule=NOT_LISTED,
@@ -416,7 +421,7 @@ def _for_users(result: CommandResult) -> CommandResult:
 
 
 def in_words(text: str, error: BusError | ValueError | None) -> str:
-    """Return an error's text for users of the gateway: "call stop()" becomes 'use "stop"'."""
+    """Rephrase an error message for users of the gateway: "call stop()" becomes 'use "stop"'."""
     advice = error.advice if isinstance(error, WriteForbidden) else None
     if advice is not None and advice.plant:
         text = text.replace(advice.program, advice.plant)
@@ -434,9 +439,9 @@ def _used(call: re.Match[str]) -> str:
 
 
 class FleetStops(Commands):
-    """Stops the drives of a fleet through the gateway's part `fleet`; refuses all other commands.
+    """Stops the drives of a fleet of gateways; refuses all other commands.
 
-    `part` returns the part `fleet`, or None before that part has started.
+    `part` returns the gateway's part `fleet`, which sends the stops, or None before that part has started.
     """
 
     def __init__(self, lines: PolledLines, may: May, part: Callable[[], Any]) -> None:
@@ -451,7 +456,10 @@ class FleetStops(Commands):
         return None
 
     async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, CommandResult]:
-        """Stop these drives. If `drives` is None, stop the whole fleet, even drives unknown to the page."""
+        """Stop these drives.
+
+        If `drives` is None, stop the whole fleet, including drives that the page does not show.
+        """
         if drives is not None or caller.role < Right.STOP:
             return await super().stop(drives, caller)
         self.called += 1
@@ -466,7 +474,8 @@ class FleetStops(Commands):
         found = await self._stop_by_fleet(names, caller)
         self._note_end(names)
         missing = found.get(WHOLE)
-        if missing is None or missing.ok:  # the fleet's answer does not say whether this drive is stopped
+        # the whole fleet's result does not say whether this drive is stopped
+        if missing is None or missing.ok:
             missing = CommandResult(CommandOutcome.UNKNOWN, "the fleet gives no answer for it")
         return {name: found.get(name, missing) for name in names}
 

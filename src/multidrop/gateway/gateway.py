@@ -38,16 +38,16 @@ from multidrop.gateway.reload import ADOPTION_S, Read, Reload
 from multidrop.gateway.settings import AUDIT_S, ServeSettings, check_writable
 from multidrop.supervisor import Hung, in_time, supervisor
 
-TAKE_S = 0.1  # interval of taking rows from the poller: half of LOOK_S
+TAKE_S = 0.1  # interval, in s, of taking polled values from the poller: half of LOOK_S
 LOOK_S = 0.2  # interval of checks for alarms; after each check, the pages get a frame of values
-TICK_S = 1.0  # interval of reading statistics
-LOG_S = 60.0  # interval of log lines about a part that keeps failing
-RESTORE_S = 2.0  # how long to wait for the alarms of earlier runs
-FLEET_LATE_S = 2.0  # how long rows of a fleet may take to arrive
-MOST_ASKED = 16  # limit of concurrent requests for registers that are not declared in the drives' tables
-ASKED_S = 30.0  # time limit of one request for a register that is not declared
+TICK_S = 1.0  # interval, in s, of reading the poller's statistics
+LOG_S = 60.0  # shortest time, in s, between two log lines about failures of the same part
+RESTORE_S = 2.0  # how long to wait, in s, until the alarms of earlier runs are read from the disk
+FLEET_LATE_S = 2.0  # how long polled values of a fleet may take to arrive, in s
+MOST_ASKED = 16  # limit of concurrent reads of registers that the drives' tables do not declare
+ASKED_S = 30.0  # time limit, in s, of one read of an undeclared register
 END_S = 4.0  # time limit of shutdown, stops included
-GRACE_S = 1  # part of END_S for finishing HTTP requests in flight
+GRACE_S = 1  # s of END_S for finishing HTTP requests in flight
 _log = logging.getLogger("multidrop.gateway")
 
 
@@ -55,7 +55,7 @@ class Gateway:
     """A polled plant and its interfaces.
 
     Raises ValueError or OSError if an interface cannot be opened, after closing the other interfaces. A
-    missing port of a line raises no error: the line counts as lost, and its port is retried.
+    serial port that cannot be opened raises no error: its line counts as lost, and the port is retried.
     """
 
     clock = staticmethod(time.monotonic)
@@ -79,7 +79,7 @@ class Gateway:
         self._has_news = False  # True: something has changed since the newest frame
         self.ledger = ledger or Ledger()
         self.poller: Poller | None = None  # None before polling starts
-        self._made: Poller | None = None  # the same poller, set before it starts
+        self._made: Poller | None = None  # the same poller, already set while it starts
         self._end = asyncio.Event()
         self.listener = listen(settings.host, settings.port)
         self.connections = self.listener.connections = Connections(self.clock)
@@ -120,7 +120,7 @@ class Gateway:
         except BaseException:
             self.listener.close()
             if self._made is not None:
-                with suppress(Exception):  # any failure was logged before
+                with suppress(Exception):  # an exception of `close` must not replace the first one
                     in_time("polling", END_S, self._made.close)
             raise
 
@@ -134,7 +134,8 @@ class Gateway:
             await self.parts.build(self.settings.parts, self.plant)
             await self._find_audit()
             poller = self._made = self._source() or Poller(nothing, ledger=self.ledger, audit=self.audit)
-            self.poller = poller.__enter__()  # `_close` closes it in a thread, because closing may take long
+            # not a `with` block: `_close` closes the poller in a thread, because closing may take long
+            self.poller = poller.__enter__()
             adopting = supervisor().thread("adoption", ADOPTION_S, partial(poller.adopt, self.plant))
             either: set[asyncio.Future[Any]] = {end, adopting}
             await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
@@ -160,9 +161,10 @@ class Gateway:
             await self._close(server)
 
     def _source(self) -> Any:
-        """Return the source of the fleet's lines if the plant file has no lines, else None.
+        """Return the object that supplies a fleet's lines and values if the plant file has no lines, else
+        None.
 
-        Raises OSError if the part `fleet`, which has this source, is not built yet.
+        Raises OSError if the gateway's part `fleet`, which supplies them, is not built yet.
         """
         if self.plant.lines:
             return None
@@ -189,7 +191,8 @@ class Gateway:
             closing = supervisor().within("polling", END_S, self.poller.close)
             await self._end_of("polling", left_s(1.0), closing)
             await supervisor().release("polling", "statistics", "identities")
-            self.guarded("hub", self.hand_out, self.poller)  # rows received during shutdown
+            # hand out the values that were received during shutdown
+            self.guarded("hub", self.hand_out, self.poller)
         await self._end_of("parts", left_s(0.2), self.parts.close(left_s(0.4)))
         if self.alarm_file is not None:
             supervisor().let_go("alarms")
@@ -210,11 +213,11 @@ class Gateway:
             await asyncio.wait_for(work, seconds)
         except TimeoutError:
             _log.error("%s did not end in time", name)
-        except Exception:  # continue: the other parts must be closed too
+        except Exception:  # the other parts must be closed too
             _log.exception("ending %s failed", name)
 
     async def _find_audit(self) -> None:
-        """Use the audit log only if its disk answers now: a disk that hangs would block polling."""
+        """Use the audit log only if its disk answers now, because a disk that hangs would block polling."""
         self.audit, path = self.settings.audit, self.settings.audit
         if path is None:
             return
@@ -256,13 +259,15 @@ class Gateway:
                 if self.poller is not None:
                     self.hand_out(self.poller)
                 dead.pop("polling", None)
-            except Exception as failure:  # the poller has ended, or memory is short
+            except Exception as failure:  # for example, the poller has ended or memory is short
                 dead["polling"] = f"{type(failure).__name__}: {failure}"
                 self.note_failure("polling")
             await asyncio.sleep(TAKE_S)
 
     def hand_out(self, poller: Poller) -> None:
-        """Give each batch of rows to the hub and to all parts; if one fails, continue with the others."""
+        """Give each batch of polled values to the hub and to all parts of the gateway; if one fails,
+        continue.
+        """
         while batch := poller.take():
             self._has_news = True
             batch = self.reload.without_changed_drives(batch)
@@ -293,8 +298,12 @@ class Gateway:
                 self.hub.unopened.pop(line.name, None)  # the port works now: forget why it did not open
 
     def _restore_alarms(self) -> bool:
-        """Continue the alarms of earlier runs; return False while they are read, at most for RESTORE_S."""
-        if not self.plant.lines:  # the lines come from a fleet, and are not read yet
+        """Continue the alarms of earlier runs.
+
+        Return False until they are read, but not for longer than RESTORE_S.
+        """
+        # a plant whose lines come from a fleet has none until the fleet's files are read
+        if not self.plant.lines:
             return False
         past = self.alarm_file.past if self.alarm_file is not None else []
         if past is None and self.clock() - self.begun < RESTORE_S:
@@ -344,7 +353,7 @@ class Gateway:
             self.guarded("minute", self.hub.note_minute)
             self.guarded("connections", self.connections.sweep)
             supervisor().look()
-            # make a frame even without new rows: its time shows viewers that the gateway is alive
+            # make a frame even without new values: its time shows viewers that the gateway is alive
             self._has_news = True
             if notifier.watchdog_s:
                 notifier.send("WATCHDOG=1")
@@ -367,7 +376,7 @@ class Gateway:
 
     @property
     def status(self) -> str:
-        """The status line for the service manager."""
+        """The line about the gateway's state that the service manager shows."""
         lost = len(self.hub.unopened)
         return f"STATUS=polling {len(self.plant.lines) - lost} lines" + (f"; {lost} lost" if lost else "")
 
@@ -392,7 +401,7 @@ class Gateway:
         return self.poller.bus(line)
 
     async def ask(self, drive: str, function: int, start: int, count: int, expiry_s: float) -> list[int]:
-        """Read `count` 16-bit words or bits of a drive from address `start` on; see `Drive.read_raw`.
+        """Read `count` 16-bit words or bits of a drive, from the address `start` on; see `Drive.read_raw`.
 
         For a Modbus function without addresses, return the bytes of the reply's data.
         """
@@ -406,7 +415,7 @@ class Gateway:
         return list(struct.unpack(f">{count}H", data))
 
     def part_context(self, plant: Plant) -> PartContext:
-        """Return the gateway's objects for a part: those that the part may use with this plant."""
+        """Return the objects of the gateway that one of its parts may use with this plant."""
         folder, page = self.settings.folder, self.settings.page
         return PartContext(
             plant, self.hub, self.commands, self.ask, folder, self.version, self.alarms, self.tokens, page
@@ -422,7 +431,7 @@ class Gateway:
 
 
 class _Server(uvicorn.Server):
-    """A web server that installs no signal handlers, because the gateway's process has its own."""
+    """A web server that installs no signal handlers, because the gateway installs its own."""
 
     @contextmanager
     def capture_signals(self) -> Any:
@@ -440,13 +449,13 @@ class Notifier:
 
     @property
     def watchdog_s(self) -> float | None:
-        """The service manager's limit of the time between WATCHDOG=1 messages, in s; None: no limit."""
+        """The longest allowed time between two WATCHDOG=1 messages, in s; None if there is no limit."""
         asked = os.environ.get("WATCHDOG_USEC", "")
         mine = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         return int(asked) / 1e6 if asked.isdigit() and int(asked) > 0 and mine else None
 
     def send_reloading(self) -> None:
-        """Report the start of a reload, with its time. A later READY=1 reports the end of the reload."""
+        """Report that a reload starts, and when. A later READY=1 reports its end."""
         self.send("RELOADING=1", f"MONOTONIC_USEC={monotonic_ns() // 1000}")
 
     def send(self, *lines: str) -> None:

@@ -1,4 +1,4 @@
-"""Historian: the gateway's part `history`, which records all rows and answers queries about them."""
+"""Historian: the gateway's part `history`, which records all polled values and answers queries about them."""
 
 from __future__ import annotations
 
@@ -26,14 +26,15 @@ from multidrop.supervisor import supervisor
 from multidrop.toml_check import SIZE
 
 MS_NS = 1_000_000
-LOOK_S = 1.0  # interval of checking that the writing thread is alive
-CLOSING_S = 3.0  # time limit for writing the last rows
-QUERY_S = 30.0  # time limit of a query, and of its wait until other queries end
+LOOK_S = 1.0  # interval, in s, of checking that the writing thread still runs
+CLOSING_S = 3.0  # time limit, in s, for writing the last values at shutdown
+QUERY_S = 30.0  # time limit, in s, of a query, and of the wait until other queries have ended
 MOST_QUERIES = 2  # limit of concurrent queries
 PIECE = 1 << 16  # bytes of an export read at a time
 UNFINISHED = ".export-"  # prefix of temporary folders of exports
-AGE = r"^\s*\d+(\.\d+)?\s*(s|min|h|days?|weeks?)\s*$"  # what `parse_age` accepts, for the JSON Schema
-# limit of buckets in one answer (5 MB), enough for the page's 24 series on a screen of 8000 px
+# regular expression of the ages that `parse_age` accepts, for the JSON Schema
+AGE = r"^\s*\d+(\.\d+)?\s*(s|min|h|days?|weeks?)\s*$"
+# limit of points in one answer (5 MB), enough for the page's 24 series on a screen of 8000 px
 MOST_BUCKETS = 200_000
 
 
@@ -61,13 +62,14 @@ def build(settings: HistorySettings, context: PartContext) -> Historian:
     try:
         return Historian(context.plant, folder, settings)
     except OSError as failure:
-        if failure.filename is None:  # the message of such an OSError is already a sentence
+        # this OSError has a sentence as its message, instead of a file name and a reason
+        if failure.filename is None:
             raise
         raise OSError(f"folder {folder} cannot be written: {failure.strerror}") from failure
 
 
 class Historian:
-    """Records rows and answers queries.
+    """Records polled values and answers queries.
 
     Raises ValueError if another process records in the folder, OSError if the folder cannot be written.
     """
@@ -80,7 +82,7 @@ class Historian:
             keep=parse_age(settings.keep),
             most=parse_size(settings.most),
         )
-        # Exports that a killed process left: no other process uses this folder now.
+        # Delete exports that a killed process left; no other process uses this folder now.
         for left in folder.glob(f"{UNFINISHED}*"):
             rmtree(left, ignore_errors=True)
         self.history = History(folder)
@@ -89,7 +91,7 @@ class Historian:
     # ---- the methods of Part ----
 
     def take(self, batch: Batch) -> None:
-        """Copy the rows within microseconds; another thread writes them."""
+        """Copy the values of the batch within microseconds; another thread writes them."""
         self._writer.take(batch)
 
     async def run(self) -> None:
@@ -100,7 +102,7 @@ class Historian:
             raise RuntimeError("the writing thread has ended")
 
     async def close(self) -> None:
-        """Write the pending rows. Raises Hung if the disk does not answer."""
+        """Write the values that are still in memory. Raises Hung if the disk does not answer."""
         self._is_closed = True
         await supervisor().within("history", CLOSING_S, self._close)
 
@@ -109,7 +111,7 @@ class Historian:
         self.history.close()
 
     def adopt(self, plant: Plant) -> None:
-        """Use another plant: write its metadata into the next file of the history."""
+        """Use another plant; the next file of the history gets its metadata."""
         self._writer.begin(plant.metadata())
 
     def health(self) -> str:
@@ -128,13 +130,13 @@ class Historian:
 
     @property
     def state(self) -> HistoryState:
-        """The number of rows written and lost so far, and the present problem."""
+        """The number of values written and lost so far, and the present problem."""
         return self._writer.state()
 
     # ---- queries; times are UTC in ms ----
 
     async def series(self, names: Sequence[str], begin: int, end: int, points: int) -> bytes:
-        """Return each series between two times as JSON, reduced to `points` buckets.
+        """Return each register's values between two times (UTC, ms) as JSON, reduced to `points` buckets.
 
         A thread does the work, to keep the event loop free for stops. Raises ValueError for wrong arguments,
         OSError (Hung included) if files cannot be read, and ImportError without DuckDB.
@@ -154,9 +156,9 @@ class Historian:
         return f'{{"step_ms":{step / MS_NS},"series":{{{",".join(pieces)}}}}}'.encode()
 
     def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
-        """Return an iterator over the pieces of a file of these series (of all if `names` is empty).
+        """Return an iterator over the pieces of a file with the values of these registers.
 
-        `kind` is "csv" or "parquet".
+        If `names` is empty, the file has all registers. `kind` is "csv" or "parquet".
 
         This call and the iterator read files, so use both in threads. Both may raise OSError and ImportError;
         only this call raises ValueError.
@@ -166,7 +168,7 @@ class Historian:
             raise ValueError(f"format = {kind!r} is neither csv nor parquet")
         if kind == "csv":
             return self.history.csv(series, begin_ns, end_ns)
-        self.history.read(series, begin_ns, end_ns)  # raises ValueError now, not during the iteration
+        self.history.read(series, begin_ns, end_ns)  # raises ValueError here, before the first piece is sent
         return self._parquet(series, begin_ns, end_ns)
 
     def _parquet(self, names: Sequence[str] | None, begin: int, end: int) -> Iterator[bytes]:

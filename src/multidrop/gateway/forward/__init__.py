@@ -1,1 +1,1 @@
-"""Store and forward: rows are kept on disk until a database or another program has received them."""
+"""Store and forward: polled values are kept on disk until a database or another program has received them."""

@@ -1,10 +1,10 @@
-"""Forwarding: store all rows on disk, and send them to a receiver, such as a database.
+"""Forwarding: store all polled values on disk as rows, and send them to a receiver, such as a database.
 
-After an outage, the newest message is sent first.
+The stored rows are messages in a folder, the spool. After an outage, the newest message is sent first.
 
-The receiver's position says which messages the receiver has. A database stores the position together with the
-rows, so each row is stored once. `RepeatingReceiver` keeps the position in a file beside the spool: a message
-whose answer was lost is sent again, with the same id.
+The spool's position says which messages the receiver has. A database stores the position together with the
+rows, so each row is stored once. `RepeatingReceiver` keeps the position in a file in the spool's folder. If
+the answer to a message is lost, the message is sent again with the same id.
 """
 
 from __future__ import annotations
@@ -35,18 +35,19 @@ from multidrop.whole_file import whole_file
 MOST_ROWS = 2000  # limit of rows in one request or MQTT message, about 250 kB of JSON
 NOT_FINITE = "not a finite number"  # status of a row whose value JSON and InfluxDB cannot represent
 SLOW_S = 40.0  # a receiver that takes longer than this (in s) for one message is reported
-REMOVED_S = 0.01  # pause if the full spool has just removed the message that was to be sent
-# A gap is a range of messages that were skipped to send a newer one first. At this limit, none are skipped.
+REMOVED_S = 0.01  # pause in s after the full spool has removed the message that was about to be sent
+# limit of gaps. A gap is a range of messages that were skipped in order to send a newer message first.
 MOST_GAPS = 64
 SET_BACK = (
     "it has message {} of the spool {}, which ends at message {}: the folder was copied or set back; "
     "move it away to start a new spool"
 )
 _log = logging.getLogger("multidrop.gateway.forward")
-LOOK_S = 1.0  # interval of checking that the threads are alive
+LOOK_S = 1.0  # interval, in s, of checking that the threads still run
 CLOSING_S = 2.0  # time limit for writing the last rows to the disk
-SENDING_S = 0.5  # time limit for the message that is being sent
-SETTLED_NS = 60_000_000_000  # rows of the former plant arrive at most this long after a reload
+SENDING_S = 0.5  # time limit for sending the message in progress at shutdown
+# after a reload, rows requested under the previous plant may arrive for this long
+SETTLED_NS = 60_000_000_000
 
 
 def pieces(rows: Any) -> Iterator[Any]:
@@ -81,7 +82,9 @@ def row_objects(rows: Any) -> list[dict[str, Any]]:
 
 
 class SpoolPosition(NamedTuple):
-    """The messages that a receiver has: all up to `newest`, except the ranges (first, last) in `gaps`."""
+    """The messages that a receiver has: all up to number `newest`, except the ranges (first, last) in
+    `gaps`.
+    """
 
     newest: int = 0
     gaps: tuple[tuple[int, int], ...] = ()
@@ -110,9 +113,10 @@ class SpoolPosition(NamedTuple):
 class Outgoing(NamedTuple):
     """A message to send."""
 
-    id: str  # id that all attempts to send this message share, and no other message has
+    id: str  # the same in all attempts to send this message, and different from that of every other message
     rows: Any  # pyarrow.Table with the columns of `samples.ROWS`
-    is_historical: bool  # newer values were sent before, or the message is from an earlier run
+    # True: newer values were sent already, or the message is from an earlier run of the gateway
+    is_historical: bool
 
 
 class RowReceiver(Protocol):
@@ -122,14 +126,19 @@ class RowReceiver(Protocol):
         """Connect, and return which messages of this spool the receiver has. Raises OSError."""
 
     def write(self, message: Outgoing, after: SpoolPosition) -> None:
-        """Send a message, and store the position after it. Raises Refused or another OSError."""
+        """Send a message, and store `after`, the spool's position once the message has arrived.
+
+        Raises Refused or another OSError.
+        """
 
     def close(self) -> None:
         """Close the receiver's open files and connections."""
 
 
 class RepeatingReceiver:
-    """A receiver whose position is a file beside the spool. Such a receiver may get a message twice.
+    """A receiver whose position is kept in a file in the spool's folder.
+
+    Such a receiver may get a message twice.
 
     `deliver(message)` returns once the message's rows have arrived. It may raise the errors of `write`.
     """
@@ -172,15 +181,16 @@ class RowForwarder(RetryingSender):
     ) -> None:
         super().__init__(name, clock)
         state = spool.state()
-        self.rows = 0  # rows sent since the start
-        self.refused = 0  # rows that the receiver does not accept
+        self.rows = 0  # rows sent since the gateway's start
+        self.refused = 0  # number of rows that the receiver refused
         self._spool = spool
         self._receiver = receiver
         self._earlier = state.newest  # number of the newest message of earlier runs
-        self._position = SpoolPosition(max(0, state.oldest - 1))  # assumed before `_ask`
+        # assumed until `_ask` has asked the receiver
+        self._position = SpoolPosition(max(0, state.oldest - 1))
         self._is_asked = False
-        self._accepted = 0  # messages sent since the start
-        # by number of a refused message: the value of `_accepted` at the refusal
+        self._accepted = 0  # messages sent since the gateway's start
+        # by message number: the value of `_accepted` when the message was refused first
         self._refusals: dict[int, int] = {}
         spool.acknowledge(self._position.newest)
         spool.on_message = self.announce
@@ -197,7 +207,7 @@ class RowForwarder(RetryingSender):
         self._receiver.close()
 
     def _may_end(self, pause_s: float) -> bool:
-        return True  # the rows stay in the spool
+        return True  # unsent rows stay in the spool
 
     def _note_failure(self, failure: Exception) -> None:
         self._is_asked = False
@@ -234,7 +244,7 @@ class RowForwarder(RetryingSender):
     def _ask(self) -> None:
         """Ask the receiver which messages it has.
 
-        Raises SinkError if that position is beyond the spool's newest message.
+        Raises SinkError if the receiver claims a message that is newer than the spool's newest message.
         """
         position, newest = self._receiver.begin(self._spool.log), self._spool.state().newest
         if position.newest > newest:
@@ -257,9 +267,10 @@ class RowForwarder(RetryingSender):
         return None
 
     def _is_refused_alone(self, sequence: int) -> bool:
-        """Return True if this message was refused twice, and another message was accepted in between.
+        """Return True if this message was refused twice, and another message was accepted between the
+        refusals.
 
-        If no other message was accepted, a wrong setting may be the cause: skipping each refused message
+        If no other message was accepted, a wrong setting may be the cause. Skipping each refused message
         would then lose all messages.
         """
         return self._accepted > self._refusals.setdefault(sequence, self._accepted)
@@ -274,10 +285,10 @@ class RowForwarder(RetryingSender):
 
 
 class Forwarding:
-    """A spool and its forwarder.
+    """A spool of stored rows, and the forwarder that sends them.
 
-    `name` is the prefix of the metrics, and `receiver` the receiver's name in logs. `make_receiver`
-    is called with the spool's folder.
+    `name` is the prefix of the metrics, and `receiver` the receiver's name in logs. `make_receiver` is called
+    with the spool's folder.
 
     Raises ValueError if the folder is not a spool, is in use, or cannot be written.
     """
@@ -299,7 +310,7 @@ class Forwarding:
         self._forwarder = RowForwarder(receiver, self._spool, make_receiver(folder))
         self._changed: frozenset[str] = frozenset()  # drives that the newest plant changed
         self._adopted_ns = 0
-        self._lost_before = 0  # number of lost rows that /health no longer reports
+        self._lost_before = 0  # number of lost rows that the health report no longer mentions
         self._sending: asyncio.Future[None] | None = None
         self._is_closed = False
 
@@ -310,7 +321,7 @@ class Forwarding:
     # ---- the methods of Part ----
 
     def take(self, batch: Batch) -> None:
-        """Copy the rows within microseconds; other threads store and send them."""
+        """Copy the batch's rows within microseconds; other threads store and send them."""
         self._spool.append(self._without_former_drives(batch) if self._changed else batch)
 
     def adopt(self, plant: Plant) -> None:
@@ -321,7 +332,8 @@ class Forwarding:
         self._note_units(self._adopted_ns)
 
     def _without_former_drives(self, batch: Batch) -> Batch:
-        """Return the batch without rows of drives that the new plant changes, if the old plant polled them.
+        """Return the batch without rows that the previous plant polled from drives that the new plant
+        changes.
 
         Such rows were requested before the new plant was adopted, so their units are unknown.
         """
@@ -334,7 +346,11 @@ class Forwarding:
         return batch if len(kept) == len(columns.time) else batch.at(kept)
 
     async def run(self) -> None:
-        """Forward until cancelled. If a thread ends before `close`, raises its exception or RuntimeError."""
+        """Forward until cancelled.
+
+        If the storing or the sending thread ends before `close`, raises that thread's exception or
+        RuntimeError.
+        """
         sending = supervisor().thread(f"{self._name} rows", inf, self._forwarder.run)
         self._sending = sending
         while self._spool.is_alive() and not sending.done():
@@ -347,11 +363,14 @@ class Forwarding:
             raise RuntimeError("the thread that stores or sends rows has ended")
 
     def abandon(self) -> None:
-        """Close the spool of a part that does not start, so that the next reload can open it."""
+        """Close the spool of a part that will not start, so that the next reload can open it."""
         self._spool.close()
 
     async def close(self) -> None:
-        """Write the last rows to the disk; they are sent after the next start. Raises Hung."""
+        """Write the last rows to the disk; they are sent after the next start.
+
+        Raises Hung if the disk hangs.
+        """
         self._is_closed = True
         self._forwarder.close()
         await supervisor().within(f"{self._name} spool", CLOSING_S, self._spool.close)
@@ -370,7 +389,9 @@ class Forwarding:
         return "; ".join(filter(None, found))
 
     def figures(self) -> list[MetricFamily]:
-        """Return metrics: rows sent, lost and refused since the start, and the backlog."""
+        """Return metrics: numbers of rows sent, lost and refused since the start, and of messages not
+        sent yet.
+        """
         state, sent, name = self._spool.state(), self._forwarder, f"multidrop_{self._name}"
         gauges = {
             f"{name}_backlog_messages": ("Stored messages that are not sent yet.", sent.behind),

@@ -1,4 +1,6 @@
-"""The part `influx`: all rows as InfluxDB's line protocol, to a server over HTTP or to standard output."""
+"""The gateway's part `influx`: sends all polled values in InfluxDB's line protocol, to a server over
+HTTP or to standard output.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,7 @@ from multidrop.recording import parse_size
 from multidrop.toml_check import SIZE
 
 STDOUT = "stdout"
-NANOSECONDS = ("ns", "n", "nanosecond")  # what InfluxDB 1, 2 and 3 call the precision of nanoseconds
+NANOSECONDS = ("ns", "n", "nanosecond")  # names of nanosecond precision in the APIs of InfluxDB 1, 2 and 3
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ Settings = InfluxSettings
 
 
 def build(settings: InfluxSettings, context: PartContext) -> Forwarding:
-    """Return the part. Raises OSError if the token cannot be read."""
+    """Return the forwarder to InfluxDB. Raises OSError if the token cannot be read."""
     token = secret_in(settings.token, context.plant)
     headers = {"content-type": "text/plain; charset=utf-8", "content-encoding": "gzip"}
     if token:
@@ -67,7 +69,9 @@ def build(settings: InfluxSettings, context: PartContext) -> Forwarding:
             lines = line_protocol(rows, settings.measurement)
             if settings.url == STDOUT:
                 left = memoryview(lines)
-                while left:  # bypass Python's buffer, which stays locked while the reader hangs
+                # bypass Python's buffer, which stays locked while the program that reads standard output
+                # hangs
+                while left:
                     left = left[os.write(sys.stdout.fileno(), left) :]
             else:
                 post(settings.url, gzip.compress(lines, 1), headers)
@@ -82,11 +86,12 @@ def build(settings: InfluxSettings, context: PartContext) -> Forwarding:
 def line_protocol(rows: Any, measurement: str) -> bytes:
     """Return the rows in line protocol.
 
-    Drive, register and unit are tags; the value or the miss is the field. If a row is written twice,
-    InfluxDB replaces the point by the same point.
+    Drive, register and unit are tags. The field is the value, or for a failed read its status. If a row is
+    written twice, InfluxDB replaces the point by the same point.
     """
     name, lines = _escaped(measurement, ", "), []
-    heads: dict[tuple[str, str, str | None], str] = {}  # how a line starts, by drive, register and unit
+    # by drive, register and unit: the start of a line, without its value and time
+    heads: dict[tuple[str, str, str | None], str] = {}
     for time_ns, drive, register, value, status, unit in listed(rows):
         head = heads.get((drive, register, unit))
         if head is None:

@@ -1,7 +1,7 @@
-"""The part `postgres`: all rows into PostgreSQL, each once.
+"""The gateway's part `postgres`: stores all polled values in PostgreSQL, each once.
 
-The table `multidrop.spools` has a row for each spool: its position, which says which messages the
-database has. Rows and position are stored in one transaction.
+The table `multidrop.spools` has an entry for each spool, with its position: which messages the database has.
+A message's rows and the new position are stored in one transaction.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class PostgresSettings:
         try:
             if PASSWORDS & conninfo_to_dict(self.database).keys():
                 wrong.append('database has a password in it; write password = "FILE" instead')
-        except psycopg.Error:  # the library's own message may quote a password
+        except psycopg.Error:  # do not quote the library's message, which may contain a password
             wrong.append('database is not a connection string; write database = "host=db dbname=plant"')
         refuse(wrong)
 
@@ -55,7 +55,7 @@ Settings = PostgresSettings
 
 
 def build(settings: PostgresSettings, context: PartContext) -> Forwarding:
-    """Return the part. Raises OSError if the password cannot be read."""
+    """Return the forwarder to PostgreSQL. Raises OSError if the password cannot be read."""
     password = secret_in(settings.password, context.plant)
     login = {"password": password} if password else {}
     tables = SampleTables(settings.database, "multidrop serve", **login)
@@ -66,7 +66,7 @@ def build(settings: PostgresSettings, context: PartContext) -> Forwarding:
 
 
 class PostgresReceiver:
-    """Stores each message as one transaction."""
+    """Stores the rows of each message, and the spool's new position, in one transaction."""
 
     def __init__(self, tables: SampleTables) -> None:
         self._tables = tables
@@ -74,7 +74,7 @@ class PostgresReceiver:
         self._kept = SpoolPosition()  # the spool's position that is stored in the database
 
     def begin(self, log: str) -> SpoolPosition:
-        """Connect again, create missing tables, and return the spool's position."""
+        """Connect again, create missing tables, and return the position of this spool."""
         self._log = log
         with sentences(), self._tables.open().transaction():
             self._tables.prepare(SPOOLS, COLUMNS)

@@ -1,4 +1,4 @@
-"""The part `upload`: all rows as JSON, in batches by POST to a URL."""
+"""The gateway's part `upload`: sends all polled values to a URL by POST, as batches in JSON."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Settings = UploadSettings
 
 
 def build(settings: UploadSettings, context: PartContext) -> Forwarding:
-    """Return the part. Raises OSError if the token cannot be read."""
+    """Return the forwarder to the URL. Raises OSError if the token cannot be read."""
     token = secret_in(settings.token, context.plant)
     headers = {"content-type": "application/json"} | ({"authorization": f"Bearer {token}"} if token else {})
 

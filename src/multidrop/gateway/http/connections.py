@@ -1,8 +1,8 @@
-"""HTTP connections: their number, time limits, and the order of requests.
+"""HTTP connections: limit their number and duration, and order their requests.
 
 A slow, silent or greedy client does not delay the others. A new connection is always accepted, because its
-request may stop a motor. If MOST_OPEN connections are open already, an old one is closed for it, such as that
-of a greedy client. Requests start one by one, and those that may be stops start first.
+request may stop a motor. If MOST_OPEN connections are open already, an old one is closed for it, a greedy
+client's first. Requests start one by one, and those that may be stops start first.
 """
 
 from __future__ import annotations
@@ -21,24 +21,27 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from multidrop.gateway.http.messages import JsonResponse
 
-# limit of open connections: a process usually has 1024 file descriptors, and lines and files need some
+# limit of open connections; a process usually has 1024 file descriptors, and lines and files need some
 MOST_OPEN = 256
-FIRST_S = 10.0  # time limit for a TLS handshake and the first request
-# time limit, after an answer, for the next request to arrive completely. If the client sends nothing, uvicorn
-# closes the connection after 30 s already.
+# time limit, in s, from the opening of a connection to its first complete request, including a TLS handshake
+FIRST_S = 10.0
+# time limit, in s, from an answer to the next complete request. uvicorn closes a connection on which nothing
+# arrives after 30 s already.
 AGAIN_S = 40.0
-# a new connection counts as fresh until its first request, for at most this long (in s); idle and busy
-# connections are closed before fresh ones
+# in s: a new connection without a request counts as fresh for this long; idle and busy connections are closed
+# before fresh ones
 FRESH_S = 1.0
-MOST_FRESH = 64  # if more connections than this are fresh, the oldest of them is closed first
-STALLED_S = 10.0  # a client's connection is closed if the client reads none of its answers for this long
+MOST_FRESH = 64  # limit of fresh connections: above it, the oldest fresh connection is closed first
+STALLED_S = 10.0  # in s: a client that reads none of its answers for this long is disconnected
 
 ENDS = "the gateway is shutting down: the outcome of this request is unknown"
 
 BODY_HEADERS = (b"content-length", b"transfer-encoding")
-# paths of stop requests; a request to VERB_PATH may be a stop too
+# paths of stop requests; a request to VERB_PATH may be a stop too, depending on its body
 STOP_PATHS, VERB_PATH = ("/api/stop", "/api/fleet/stop"), "/api/act"
-BACKLOG = 64  # limit of connections that wait to be accepted; they are accepted even if MOST_OPEN are open
+# limit of connections that the operating system holds until the gateway accepts them; it accepts them even if
+# MOST_OPEN are open
+BACKLOG = 64
 _WHY = {
     errno.EADDRINUSE: "another program listens there",
     errno.EACCES: "this user has no permission",
@@ -47,9 +50,9 @@ _WHY = {
 
 
 class Rank(IntEnum):
-    """The order in which connections are closed if MOST_OPEN are open.
+    """Kinds of connections, in the order in which they are closed when more than MOST_OPEN are open.
 
-    Within a rank, the first in the order of `Connections` is closed first.
+    Among connections of one kind, the one that comes first in `Connections` is closed first.
     """
 
     GREEDY = 0  # the client sends requests without waiting for answers, or does not read its answers
@@ -82,13 +85,16 @@ class _Open:
         return Rank.FRESH if now < self.fresh_until else Rank.IDLE
 
     def end(self) -> None:
-        """Shut the socket down; the server then closes the connection."""
+        """Shut the socket down; the web server then closes the connection."""
         with suppress(OSError):  # the socket is closed already
             self.peer.shutdown(socket.SHUT_RDWR)
 
 
 class Connections:
-    """The open connections by client address, ordered by latest answer, or without one by opening."""
+    """The open connections by client address.
+
+    They are ordered by the time of the latest answer, or of the opening if there was no answer.
+    """
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
@@ -117,7 +123,7 @@ class Connections:
                 self._end(client)
 
     def begin(self, client: tuple[str, int] | None) -> None:
-        """Note that a request of this client has arrived completely."""
+        """Note that a complete request of this client has arrived."""
         if client in self._open:
             self._open[client].is_busy = True
 
@@ -139,14 +145,14 @@ class Connections:
             self._open[client].is_greedy = is_greedy
 
     def note_stall(self, client: tuple[str, int] | None, *, is_stalled: bool) -> None:
-        """Note whether answers are pending because the client does not read them."""
+        """Note whether answers are unsent because the client does not read."""
         if client in self._open:
             self._open[client].stalled_since = self._clock() if is_stalled else None
 
     def finish(self, client: tuple[str, int] | None) -> None:
         """Note that a request of this client was answered."""
         if client in self._open:
-            # inserted again, and so last in the order
+            # moved to the end of the order
             found = self._open[client] = self._open.pop(client)
             found.is_busy = found.is_stop = False
             found.fresh_until, found.ends = 0.0, self._clock() + AGAIN_S
@@ -176,10 +182,9 @@ class CountingSocket(socket.socket):
 
 
 class Turns:
-    """Starts one request in each round of the event loop: from the queue `stops` if that has a request,
-    else from `others`.
+    """Starts one request in each round of the event loop, requests in the queue `stops` first.
 
-    The loop reads all sockets in each round, so a stop waits for one request at most.
+    The loop reads all sockets in each round, so a stop waits for one other request at most.
     """
 
     def __init__(self) -> None:
@@ -202,15 +207,15 @@ class Turns:
         self._is_taken = False
         while not self._is_taken and (waiting := self.stops or self.others):
             turn = waiting.popleft()
-            if not turn.done():  # a turn that is done belongs to a cancelled request
+            if not turn.done():  # the waiting request was cancelled
                 turn.set_result(None)
                 self._is_taken = True
                 asyncio.get_running_loop().call_soon(self._give)
 
 
 class WatchedProtocol(H11Protocol):
-    """A connection that notes whether its client sends requests without waiting for answers, or does not
-    read answers.
+    """An HTTP connection that detects a client which sends requests without waiting for answers, or does
+    not read answers.
     """
 
     @property
@@ -243,9 +248,9 @@ class WatchedProtocol(H11Protocol):
 
 
 class WatchedApp:
-    """An ASGI application that notes the start and end of each request in `connections`.
+    """An ASGI application that reports the start and end of each request to `connections`.
 
-    Each request waits for its turn; requests that may be stops go first.
+    Requests wait for each other; those that may be stops go first.
     """
 
     def __init__(self, app: ASGIApp, connections: Connections) -> None:
@@ -290,7 +295,7 @@ def listen(host: str, port: int) -> CountingSocket:
         raise OSError(
             f"listen: this machine does not have the address {host}: {failure.strerror}"
         ) from failure
-    # With IPPROTO_TCP given, asyncio sets TCP_NODELAY. Without it, each answer would wait 40 ms.
+    # With IPPROTO_TCP, asyncio sets TCP_NODELAY. Without it, each answer would be delayed by 40 ms.
     listener = CountingSocket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -1,4 +1,4 @@
-"""Files that the web server sends: those of the page, exports of the history, and drives' parameters."""
+"""Files that the web server sends: the page, exports of the history, and drives' parameters."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ TYPES = {  # media types by suffix; files with other suffixes are plain text
 }
 # limit of concurrent exports: each uses a thread, and a Parquet file needs space on the history's disk
 MOST_EXPORTS = 8
-PIECE_S = 600.0  # time limit for making one piece of a file; a whole Parquet file counts as one piece
+PIECE_S = 600.0  # time limit, in s, for making one piece of a file; a whole Parquet file is one piece
 R = TypeVar("R")
-MOST_NAME = 80  # a series' name is cut to this many characters in a file name
+MOST_NAME = 80  # limit of the characters of a series' name in a file name; longer names are cut
 FORBIDDEN = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')  # characters that some systems forbid in file names
 KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
 PARAMETER_KINDS = {
@@ -60,7 +60,7 @@ class PageFile(NamedTuple):
 
 
 class PageFiles:
-    """The files of a folder and of the folders in it, by relative path.
+    """The page's files in a folder and its subfolders, by relative path.
 
     They are read into memory at the first request, so later requests do not wait for a disk.
     """
@@ -70,7 +70,7 @@ class PageFiles:
         self._files: dict[str, PageFile] = {}
 
     async def index(self, request: Request) -> Response:
-        """Return index.html. Raises Denied if this installation has no page, Hung if the disk hangs."""
+        """Return index.html. Raises Denied if the page is not installed, Hung if the disk hangs."""
         return await self._respond(request, INDEX)
 
     async def file(self, request: Request) -> Response:
@@ -93,7 +93,10 @@ class PageFiles:
 
 
 def read_files(folder: Path) -> dict[str, PageFile]:
-    """Return the files by relative path, which always has slashes. Raises OSError if one is unreadable."""
+    """Return the files of a folder by relative path, with slashes on all systems.
+
+    Raises OSError if a file is unreadable.
+    """
     found: dict[str, PageFile] = {}
     for path in sorted(folder.rglob("*")):
         if path.name == TEXTS:
@@ -105,7 +108,9 @@ def read_files(folder: Path) -> dict[str, PageFile]:
 
 
 def _texts_by_language(catalogue: str) -> dict[str, PageFile]:
-    """Return a JSON file for each language, such as texts.ru.json: the translations by English text."""
+    """Return a JSON file of translations for each language, such as texts.ru.json, with the English
+    texts as keys.
+    """
     texts: dict[str, dict[str, str]] = defaultdict(dict)
     for english, translations in tomllib.loads(catalogue).items():
         for language, text in translations.items():
@@ -124,7 +129,7 @@ def _page_file(body: bytes, media_type: str) -> PageFile:
 
 
 class Exports:
-    """The exports in progress."""
+    """The downloads of recorded values that are in progress."""
 
     def __init__(self) -> None:
         self.under_way = 0
@@ -132,9 +137,10 @@ class Exports:
     async def respond(
         self, part: Any, names: Sequence[str], begin: int, end: int, kind: str, *, is_gzipped: bool = False
     ) -> Response:
-        """Return a file of series from the historian `part`; with `is_gzipped`, compressed for transfer.
+        """Start a download of recorded values from the historian `part`, and return its response.
 
-        Raises Hung if the disk hangs, and Denied for wrong arguments or too many exports.
+        With `is_gzipped`, it is compressed for transfer. Raises Hung if the disk hangs, and Denied for wrong
+        arguments or too many exports.
         """
         if kind not in KINDS:
             raise Denied(400, f"format = {kind[:20]!r} is neither csv nor parquet")
@@ -157,7 +163,7 @@ class Exports:
 
 
 class _Export(StreamingResponse):
-    """One export. It ends when its client has received the whole file or has disconnected."""
+    """One download of recorded values. It ends when the client has the whole file or has disconnected."""
 
     def __init__(
         self, exports: Exports, pieces: Iterator[bytes], kind: str, headers: Mapping[str, str]
@@ -205,7 +211,7 @@ async def _through(pieces: Iterator[bytes]) -> AsyncIterator[bytes]:
     try:
         while (piece := await _in_thread(partial(next, pieces, None))) is not None:
             yield piece
-    finally:  # removes temporary files, also if the client has disconnected
+    finally:  # the iterator's end removes temporary files, also if the client has disconnected
         if isinstance(pieces, Generator):
             supervisor().thread("exports", PIECE_S, pieces.close)
 
@@ -215,7 +221,7 @@ async def _in_thread(work: Callable[[], R]) -> R:
 
 
 def _what(names: Sequence[str]) -> str:
-    """Return the names of the drives of these series, in a form that is allowed in file names."""
+    """Return the drives' names in these series, with characters that are allowed in file names."""
     drives = list(dict.fromkeys(name.rpartition(".")[0] for name in names))
     if not drives:
         return "all drives"
@@ -225,7 +231,7 @@ def _what(names: Sequence[str]) -> str:
 
 
 def _moment(ms: int) -> str:
-    """Return a UTC time for a file name: without colons, which some systems forbid there."""
+    """Return a UTC time for a file name, without colons, which some systems forbid."""
     try:
         return datetime.fromtimestamp(ms / 1000, UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
     except (ValueError, OverflowError, OSError):

@@ -1,4 +1,4 @@
-"""Guard: checks the origin and the token of each request before any route handles it."""
+"""Guard: checks the origin and the token of each HTTP request before a route handles it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from multidrop.gateway.http.rights import (
 
 COOKIE = "multidrop"
 CSP = "default-src 'self'; base-uri 'none'; form-action 'none'; object-src 'none'; frame-ancestors 'none'"
-HEADERS = {  # headers of API answers; few, because the very frequent frames have them too
+HEADERS = {  # headers of all API answers; few, because pages request several frames a second
     "content-security-policy": "default-src 'none'; frame-ancestors 'none'",
     "cross-origin-resource-policy": "same-origin",
     "x-content-type-options": "nosniff",
@@ -42,9 +42,10 @@ PAGE_HEADERS = HEADERS | {
 }
 WRONG = "the token is wrong"
 SHUT = "too many wrong tokens came from this address: try again in a minute"
-# key in the ASGI scope of a request with a wrong token; such a request may only be a stop
+# key in the ASGI scope: the request has a wrong token, so it is accepted only if it is a stop
 HAS_WRONG_TOKEN = "has_wrong_token"
-# limit of a request's headers in bytes; large, because a browser sends the cookies of all ports of a host
+# limit of a request's headers in bytes; large, because browsers send the cookies of all ports of a host
+# together
 MOST_HEAD = 64 * 1024
 
 
@@ -58,14 +59,16 @@ _log = logging.getLogger("multidrop.gateway")
 
 
 class RouteAccess(NamedTuple):
-    """The HTTP method and the right that a path needs; if the right is None, no token is checked."""
+    """The HTTP method and the right that a path needs. If the right is None, no token is checked."""
 
     method: str
     right: Right | None
 
 
 class Guard:
-    """Passes allowed requests to `app`, with the caller in the scope's key `caller`; refuses all others."""
+    """Passes allowed requests to `app`, with the caller in the scope's key `caller`; refuses all other
+    requests.
+    """
 
     def __init__(
         self,
@@ -88,7 +91,7 @@ class Guard:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
-            return  # not HTTP: uvicorn refuses the connection
+            return  # not an HTTP request: uvicorn refuses the connection
 
         is_page = scope["path"] == "/" or scope["path"].startswith("/page/")
         added = _RAW_PAGE_HEADERS if is_page else _RAW_HEADERS
@@ -108,7 +111,7 @@ class Guard:
                 response.headers["allow"] = self._find(scope["path"]).method
             if denied.status == 401:
                 response.headers["www-authenticate"] = "Bearer"
-                # remove the wrong token from the browser
+                # make the browser delete the cookie with the wrong token
                 if COOKIE in Headers(scope=scope).get("cookie", ""):
                     response.delete_cookie(COOKIE, httponly=True, samesite="strict")
             await response(scope, receive, send_with_headers)
@@ -135,7 +138,7 @@ class Guard:
         return self._admit(scope, headers, needed.right)
 
     def _find(self, path: str) -> RouteAccess:
-        """Return the method and the right for a path: the entry of its longest prefix in `needed`."""
+        """Return the method and the right that a path needs: the entry of its longest prefix in `needed`."""
         while path not in self._needed:
             head, slash, _ = path.rstrip("/").rpartition("/")
             if not slash:
@@ -144,7 +147,7 @@ class Guard:
         return self._needed[path]
 
     def _check_site(self, headers: Headers, host: str, needed: RouteAccess, schemes: Sequence[str]) -> None:
-        """Raise Denied if the browser's headers say that a page of another site sent the request."""
+        """Raise Denied if the browser's headers say that another site's page sent the request."""
         origin = headers.get("origin")
         if origin is not None and not self._names.has_origin(origin, host, schemes):
             raise Denied(403, f"the request comes from a page of {origin[:100]!r}, not of this gateway")
@@ -160,9 +163,9 @@ class Guard:
     def _admit(self, scope: Scope, headers: Headers, needed: Right) -> Caller:
         """Return the caller of a request that needs the right `needed`. Raises Denied if the caller lacks it.
 
-        A request with a wrong token is refused, even if it would need no token. Only a stop that needs no
-        token is still accepted. After several wrong tokens, requests from that address with a token are
-        refused for a while; the tokens of stops are always checked.
+        A request with a wrong token is refused even if it needs no token, except a stop. After several wrong
+        tokens, requests from that address with a token are refused for a while, except stops: their tokens
+        are always checked.
         """
         address = self.address(scope, headers)
         local = is_loopback(address) and not self._behind_proxy
@@ -193,7 +196,10 @@ class Guard:
         )
 
     def address(self, scope: Scope, headers: Headers) -> str:
-        """Return the client's address; behind a proxy, the last address in the X-Forwarded-For header."""
+        """Return the client's address.
+
+        Behind a proxy, it is the last address in the X-Forwarded-For header.
+        """
         client: Any = scope.get("client")
         peer = str(client[0]) if client else ""
         if not self._behind_proxy:

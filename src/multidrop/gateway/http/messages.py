@@ -45,7 +45,7 @@ class Denied(Exception):
 
 
 class JsonResponse(Response):
-    """JSON escaped to ASCII; tolerates lone surrogates, which names from requests and files may have."""
+    """A JSON response with only ASCII characters. Names from requests and files may have lone surrogates."""
 
     media_type = "application/json"
 

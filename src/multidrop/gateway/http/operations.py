@@ -12,9 +12,9 @@ from multidrop.gateway.http.rights import Right
 from multidrop.gateway.http.schemas import Schema
 
 ANY: Schema = {}
-WITH_BODY = (400, 408, 413)  # statuses with which a route refuses an invalid, late or long body
+WITH_BODY = (400, 408, 413)  # HTTP statuses for a body that is invalid, arrives too late or is too long
 FRAME = "/api/frame"
-HEADERS_TOO_LONG = 431  # HTTP status; the length of headers is not checked for stops
+HEADERS_TOO_LONG = 431  # HTTP status; not used for stops, because the length of their headers is not checked
 REASONS = {
     304: "The client has the newest version.",
     400: "A parameter or the body is invalid.",
@@ -33,20 +33,20 @@ REASONS = {
 
 
 class Operation(NamedTuple):
-    """One route: who may use it, the method of `Pages` that answers it, and its description for clients.
+    """One HTTP route: who may use it, the method of `Pages` that answers it, and its description for clients.
 
     `answer` has the schema of a successful answer, by media type. `refusals` has the HTTP statuses of other
-    answers, without the statuses that the guard may give on every route.
+    answers, except those with which the guard may refuse any request.
     """
 
-    path: str  # `{name}` matches the rest of the path
+    path: str  # `{name}` in the path stands for the rest of the path
     handler: str
     right: Right | None  # None: no token is checked
     summary: str
     answer: Mapping[str, Schema]
     refusals: tuple[int, ...] = ()
     query: Mapping[str, Schema] = {}
-    required: tuple[str, ...] = ()  # names in `query` that a request must have
+    required: tuple[str, ...] = ()  # names of the parameters in `query` that a request must have
     body: Schema | None = None  # the body of a POST; None: the route is a GET
 
     @property
@@ -228,7 +228,8 @@ OPERATIONS = (
     Operation(
         "/api/act",
         "act",
-        Right.STOP,  # enough for stops; the class Commands checks the right that the verb needs
+        # the right to stop is enough for stop verbs; `Commands` checks the right that each verb needs
+        Right.STOP,
         "Carry out a verb once.",
         json_of(schemas.COMMANDED),
         (404, *WITH_BODY),
@@ -265,7 +266,7 @@ OPERATIONS = (
 )
 
 NEEDED: Mapping[str, RouteAccess] = {
-    "/api/": RouteAccess("GET", Right.LOOK),  # for the paths under /api/ that are not in the table
+    "/api/": RouteAccess("GET", Right.LOOK),  # for paths under /api/ that have no route
     **{one.path.partition("{")[0]: RouteAccess(one.method, one.right) for one in OPERATIONS},
 }
 

@@ -14,13 +14,13 @@ from ipaddress import ip_address
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
-# values of WriteForbidden.rule
+# values of the field `rule` of WriteForbidden
 NOT_LISTED = "not on the list"
 NOT_ALLOWED = "the role does not allow it"
 NEVER_THIS_WAY = "never by this way"
 ANYONE = "anyone"  # the name of callers without a token
 
-# limit of wrong tokens from one address, and for how many s each wrong token counts
+# limit of wrong tokens from one address, and for how many seconds each of them counts
 MOST_WRONG, WINDOW_S = 5, 60.0
 MOST_ADDRESSES = 10_000  # limit of addresses whose wrong tokens are remembered
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
@@ -30,7 +30,7 @@ SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 class Right(IntEnum):
-    """Roles, in ascending order: each role includes the rights of the roles before it."""
+    """Roles, in ascending order; each role includes the rights of the roles before it."""
 
     LOOK = 0
     STOP = 1
@@ -44,7 +44,7 @@ class Caller(NamedTuple):
     way: str  # the interface: "page", "http", "mqtt", "modbus", "tool" or "opcua"
     address: str
     role: Right
-    command: str = ""  # the id of the command that the caller sends
+    command: str = ""  # the id of the command that this caller sends; "": none yet
 
     @property
     def by(self) -> str:
@@ -53,11 +53,10 @@ class Caller(NamedTuple):
         return f"{self.name} by {self.way} from {self.address}{command}"
 
     def commanding(self, given: object = None) -> Caller:
-        """Return this caller with `given` as the command's id.
+        """Return this caller with `given` as the id of the command.
 
-        If `given` is None, keep the present id or make a new id.
-
-        Raises ValueError for an invalid id.
+        If `given` is None, keep the caller's command id, or make a new one if there is none. Raises
+        ValueError for an invalid id.
         """
         if given is None:
             return self._replace(command=self.command or secrets.token_hex(8))
@@ -66,9 +65,8 @@ class Caller(NamedTuple):
         return self._replace(command=given)
 
     def stopping(self, given: object = None) -> Caller:
-        """Return the same as `commanding`, but replace an invalid id by a new id.
-
-        So no stop is refused because of its id.
+        """Return the same as `commanding`, but replace an invalid id by a new one, so that no stop is
+        refused.
         """
         try:
             return self.commanding(given)
@@ -107,7 +105,7 @@ def new_token(name: str, right: Right) -> tuple[str, Token]:
 
 
 def read_tokens(text: str) -> tuple[list[Token], list[str]]:
-    """Return the tokens in a file, and a sentence for each invalid line."""
+    """Return the tokens in a token file, and an error sentence for each invalid line."""
     found: list[Token] = []
     wrong: list[str] = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -141,7 +139,7 @@ class Tokens:
         self._tokens = tuple(tokens)
 
     def find(self, secret: str) -> Token | None:
-        """Return the token of this secret; None if it is wrong. Compares in constant time."""
+        """Return the token with this secret; None if there is none. Compares in constant time."""
         given, found = digest(secret), None
         for token in self._tokens:
             if hmac.compare_digest(token.sha256, given):
@@ -175,27 +173,28 @@ class Tokens:
 class May(NamedTuple):
     """The table [serve.may]: the rights of callers without a token, and the allowed writes and verbs."""
 
-    look: str = "anyone"  # who may look: "anyone", or "token" for callers with a token
-    on_loopback: Right = Right.LOOK  # right of callers on this computer without a token
+    look: str = "anyone"  # who may read values: "anyone", or "token" for callers with a token
+    on_loopback: Right = Right.LOOK  # right of callers without a token on this computer
     write: frozenset[str] = frozenset()
     verbs: frozenset[str] = frozenset()
 
     def bounded_by(self, other: May) -> May:
-        """Return this table, but give callers without a token only the rights that both tables give."""
+        """Return this table with the smaller of the two tables' rights for callers without a token."""
         look = "anyone" if self.look == other.look == "anyone" else "token"
         return self._replace(look=look, on_loopback=min(self.on_loopback, other.on_loopback))
 
     def without_token(self, *, is_loopback: bool) -> Right | None:
-        """Return the right of callers without a token; None: no access."""
+        """Return the right of callers without a token; None if they have no access."""
         if is_loopback and self.on_loopback > Right.LOOK:
             return self.on_loopback
         return Right.LOOK if self.look == "anyone" else None
 
 
 def caller_with(token: Token | None, free: Right | None, way: str, address: str) -> Caller | None:
-    """Return a caller with the larger of two rights: its token's, and that of callers without a token.
+    """Return a caller with the larger of two rights: that of its token, and `free`, the right without a
+    token.
 
-    Return None if both are missing: the caller has no access.
+    Return None if the caller has neither right.
     """
     if token is not None and (free is None or token.right >= free):
         return Caller(token.name, way, address, token.right)
@@ -204,7 +203,7 @@ def caller_with(token: Token | None, free: Right | None, way: str, address: str)
 
 @lru_cache(maxsize=256)
 def is_loopback(host: str) -> bool:
-    """Return True for addresses and names that only this computer can reach."""
+    """Return True for an address or a host name that only this computer can reach."""
     if host in ("localhost", ""):
         return host == "localhost"
     try:
@@ -214,7 +213,7 @@ def is_loopback(host: str) -> bool:
 
 
 class OwnNames:
-    """The host names of the gateway; requests to other hosts, or from pages of other hosts, are refused."""
+    """The gateway's own host names. Requests to other hosts, or from pages of other hosts, are refused."""
 
     def __init__(self, names: Iterable[str], listen: str, port: int) -> None:
         self._always = {"localhost", "127.0.0.1", "[::1]"}
@@ -232,9 +231,9 @@ class OwnNames:
         return split is not None and split[0] in self._hosts
 
     def has_origin(self, origin: str, host: str, schemes: Container[str]) -> bool:
-        """Return True for the Origin header of the gateway's page: it has the host and port in `host`.
+        """Return True if an Origin header is that of the gateway's page: it has the host and port in `host`.
 
-        `host` is the request's Host header, and `schemes` are the allowed URL schemes of the page.
+        `host` is the request's Host header, and `schemes` are the page's allowed URL schemes.
         """
         scheme, _, rest = origin.partition("://")
         if scheme not in schemes:
@@ -246,7 +245,7 @@ class OwnNames:
         return (theirs[0], theirs[1] or usual) == (ours[0], ours[1] or usual)
 
 
-@lru_cache(maxsize=64)  # cached, because all requests of a viewer have the same header
+@lru_cache(maxsize=64)  # cached, because all requests of a browser have the same Host header
 def _split(host: str) -> tuple[str, int | None] | None:
     """Return name and port of a Host header; None if it is invalid."""
     if not re.fullmatch(r"[A-Za-z0-9._-]+(:[0-9]{1,5})?|\[[0-9A-Fa-f:.]+\](:[0-9]{1,5})?", host):

@@ -1,4 +1,4 @@
-"""The routes of the web server, behind the guard."""
+"""The functions that answer the web server's routes. The guard has checked each request before."""
 
 from __future__ import annotations
 
@@ -58,15 +58,17 @@ if TYPE_CHECKING:
 MOST_QUERIES = 2  # limit of concurrent queries of the audit log
 AUDIT_S = 20.0  # time limit of a query of the audit log
 COOKIE_S = 30 * 24 * 3600
-MAP_S = 20.0  # time limit for making the address map
+MAP_S = 20.0  # time limit, in s, for making the Modbus address map
 MOST_RECORDS = 200  # limit of the audit log's entries in one answer
 MOST_NOTE = 500  # limit of an acknowledgement's note in characters
-# the head of a stop's answer is sent after this many seconds, to confirm that the stop was accepted
+# in s: if a stop takes longer than this, the head of its answer is sent before the stop ends
 HEAD_S = 0.5
-UNBUFFERED = {"x-accel-buffering": "no"}  # makes proxies forward the head immediately
+# header that makes proxies forward the head of an answer immediately
+UNBUFFERED = {"x-accel-buffering": "no"}
 RIGHTS_RULES = (NOT_ALLOWED, NOT_LISTED, NEVER_THIS_WAY)
 
-_UTC = re.compile(r"\d{4}-\d\d-\d\d(T\d\d:\d\d(:\d\d(\.\d+)?)?Z?)?", re.ASCII)  # the time of day is optional
+# a date, or a date and a time of day (ISO 8601, UTC)
+_UTC = re.compile(r"\d{4}-\d\d-\d\d(T\d\d:\d\d(:\d\d(\.\d+)?)?Z?)?", re.ASCII)
 R = TypeVar("R")
 _log = logging.getLogger("multidrop.gateway")
 _PLAIN = [(b"content-type", b"application/json"), (b"vary", b"accept-encoding")]
@@ -89,7 +91,9 @@ def make_app(gateway: Gateway) -> ASGIApp:
     others = Starlette(routes=routes, exception_handlers=handlers)
 
     async def app(scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer requests for frames without the router: they are by far the most frequent requests."""
+        """Answer requests for frames without the router, because they are by far the most frequent
+        requests.
+        """
         await (pages.frame if scope["path"] == FRAME else others)(scope, receive, send)
 
     return Guard(
@@ -104,7 +108,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
 
 
 def _endpoint(pages: Pages, operation: Operation) -> Any:
-    """Return the method of `pages` that answers a route; answers to GET are compressed."""
+    """Return the function that answers a route; it compresses answers to GET, except frames."""
     handler = getattr(pages, operation.handler)
     if operation.method == "POST" or operation.path == FRAME:
         return handler
@@ -128,7 +132,7 @@ def _fields(result: CommandResult, caller: Caller) -> dict[str, Any]:
 
 
 def _status(result: CommandResult) -> int:
-    """Return a 4xx status if the command was invalid or the caller lacks the right; else 200."""
+    """Return HTTP status 4xx if the command was invalid or the caller lacks the right; else 200."""
     error = result.error
     if isinstance(error, UnknownDrive):
         return 404
@@ -144,7 +148,9 @@ def _answer(caller: Caller, result: CommandResult) -> Response:
 
 
 def _answer_all(caller: Caller, results: Mapping[str, CommandResult]) -> Response:
-    """Return the HTTP answer with the outcome of each drive's stop; 404 if all drives are unknown."""
+    """Return the HTTP answer with the result of each drive's stop, with status 404 if all drives are
+    unknown.
+    """
     if results and all(isinstance(one.error, UnknownDrive) for one in results.values()):
         return _error(404, "; ".join(one.text for one in results.values()))
     return JsonResponse({name: _fields(one, caller) for name, one in results.items()})
@@ -162,10 +168,10 @@ def _time_asked(query: Mapping[str, str]) -> str:
 
 
 def newest_records(path: Path | None, before: str = "", count: int = MOST_RECORDS) -> dict[str, Any]:
-    """Return the newest `count` entries of an audit log before this time (ISO 8601, UTC; "": now).
+    """Return the newest `count` entries of an audit log from before a time (ISO 8601, UTC; "": now).
 
-    The newest entry is first. `more` in the answer is True if there are older entries. Raises OSError if
-    the log cannot be read.
+    The newest entry is first. In the answer, `more` is True if there are older entries. Raises OSError if the
+    log cannot be read.
     """
     count = max(1, min(count, MOST_RECORDS))
     found: deque[dict[str, Any]] = deque(maxlen=count + 1)
@@ -176,10 +182,10 @@ def newest_records(path: Path | None, before: str = "", count: int = MOST_RECORD
 
 
 async def _answer_stop(work: Coroutine[Any, Any, R], respond: Callable[[R], Response]) -> Response:
-    """Return the answer to a stop. The stop continues even if its client disconnects.
+    """Wait for a stop, and return its answer. The stop continues even if its client disconnects.
 
-    If the stop takes longer than HEAD_S, the head of the answer is sent before the stop ends. A client that
-    gets no head knows that its stop was not accepted.
+    If the stop takes longer than HEAD_S, the head of the answer is sent before the stop ends. So a client
+    that gets no head knows that its stop was not accepted.
     """
     task = supervisor().start("stop", work)
     await asyncio.wait({task}, timeout=HEAD_S)
@@ -193,7 +199,7 @@ async def _answer_stop(work: Coroutine[Any, Any, R], respond: Callable[[R], Resp
 
 
 class Pages(PageFiles):
-    """The functions that answer the routes; `OPERATIONS` names them."""
+    """The methods that answer the routes; the table `OPERATIONS` names the method of each route."""
 
     def __init__(self, gateway: Gateway) -> None:
         super().__init__()
@@ -217,8 +223,9 @@ class Pages(PageFiles):
             return _error(404, str(unknown))
 
     async def parameters(self, request: Request) -> Response:
-        """Return a drive's parameters as JSON, or with `format` as a file; with `read`, read them from the
-        drive first.
+        """Return a drive's parameters as JSON, or as a file if the query has `format`.
+
+        If the query has `read`, read them from the drive first.
         """
         reads, query, name = self._gateway.parameter_reads, request.query_params, request.path_params["name"]
         try:
@@ -350,7 +357,8 @@ class Pages(PageFiles):
         drive, verb = text_in(body, "drive"), text_in(body, "verb")
         if HAS_WRONG_TOKEN in request.scope and verb not in STOPPING:
             raise Denied(401, WRONG)
-        options = {} if verb in STOPPING else body.get("options", {})  # wrong options must not prevent a stop
+        # wrong options must not prevent a stop, so a stop ignores all options
+        options = {} if verb in STOPPING else body.get("options", {})
         if not isinstance(options, dict):
             raise Denied(400, "options is not a JSON object")
         sender = caller_of(request)
@@ -362,7 +370,11 @@ class Pages(PageFiles):
         return _answer(caller, await acting)
 
     def _admission(self, drive: str, command: object, body: Mapping[str, Any]) -> Admit:
-        """Return `SeenFrames.admit` for a command and the frame that its sender saw. Stops need no frame."""
+        """Return a function that admits a command only if its sender saw a recent frame; see
+        `SeenFrames.admit`.
+
+        Stops need no frame.
+        """
         frames = self._gateway.seen_frames
         return lambda what: frames.admit(drive, what, (drive, command), frame_in(body))
 
@@ -384,8 +396,8 @@ class Pages(PageFiles):
     async def token(self, request: Request) -> Response:
         """Log in: store the request's token in a cookie that scripts cannot read.
 
-        After several wrong tokens, an address must wait before its next attempt. The wait is skipped if
-        the body says that the token is for a stop.
+        After several wrong tokens, an address must wait before its next attempt. There is no wait if the body
+        says that the token is for a stop.
         """
         gateway, caller = self._gateway, caller_of(request)
         body = await body_of(request)
@@ -412,7 +424,7 @@ class Pages(PageFiles):
 
 
 class FrameRoute:
-    """Answers `/api/frame?after=N` as soon as there is a frame whose number is not N."""
+    """Answers `/api/frame?after=N` as soon as the newest frame's number differs from N."""
 
     def __init__(self, frames: Frames) -> None:
         self._frames = frames
