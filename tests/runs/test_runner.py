@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import random
 import signal
 import subprocess
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,29 +19,32 @@ import pytest
 from commands import MULTIDROP
 from examples import first_in_ci
 from kills import BoundProcess
-from lines import until
+from lines import patient, until
 from simulated_bus import is_write
 from simulated_pumps import CHE, STEPS, far_ends, simulated_test, turning, write_test
 from tables import table
 
 from multidrop.bus import Bus
 from multidrop.control import read_audit
-from multidrop.core import Message, Names
+from multidrop.core import Completion, Exchange, Message, Names
 from multidrop.drive import Drive
 from multidrop.errors import WriteForbidden
 from multidrop.families import MODELS, DelixiModbus, InvtCHE
 from multidrop.families.registry import SHIPPED, find_model
+from multidrop.planning.prediction import predict
 from multidrop.plant.model import Plant, PlantLine, PolledDrive, planned_on
 from multidrop.polling.added_rows import AddedRow, JoinedColumns
 from multidrop.polling.batch import Batch, Rows
 from multidrop.recording import open_recording
-from multidrop.runs import RunPlan, RunStep, TestRun, load_test, runner
+from multidrop.runs import RunPlan, RunResult, RunStep, TestRun, load_test, runner
 from multidrop.runs.runner import _Session
 from multidrop.runs.watch import LimitWatch
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
+from multidrop.sim.drive import Reason, Refusal
 from multidrop.sim.memory import MemoryCell
 from multidrop.sim.receiver import Frame
 from multidrop.transport import clock
+from multidrop.transport.line import Line
 
 SPEED = 5.0
 
@@ -330,16 +335,221 @@ def test_a_failed_command_aborts_before_any_later_step(tmp_path: Path) -> None:
         assert not [write for write in fan.counters.writes if write.raw == 6000]
 
 
+# ---- the first stop of an abort, counted in requests at the far ends ----
+
+WAIT = 'dwell = "2 min"'
 WAITING = """
 [abort]
-limits = ["a.%s >= 60"]
+{limits}
 [[phase]]
 name = "wait"
 [[phase.step]]
-dwell = "20 s"
+{step}
 [[phase.step]]
 start = ["a", "b", "c"]
 """  # the start is never reached, but before the first step the drives' identities are checked
+
+
+class FarEnds:
+    """The far ends of a run's lines. An event gives the run a reason to abort.
+
+    After the event, the far ends' clock advances by each pause of the main thread, and an exchange takes its
+    predicted time on this clock. Once stops have begun, a reply also waits for the thread that sends the
+    line's first stop. So a busy computer changes no count.
+    """
+
+    def __init__(self, test: TestRun, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.test = test
+        self.sims: dict[str, Any] = {}
+        self.requests: dict[str, list[Message]] = {}  # by line
+        self.cause: dict[str, int] | None = None  # by line: requests before the reason for the abort
+        self.event: Callable[[FarEnds], object] | None = None  # called after two bus cycles of the first step
+        self._left: dict[str, int] = {}  # by line: requests before the event
+        self._monkeypatch = monkeypatch
+        self._clock, self._ticked = 0.0, threading.Condition()
+        self._due: dict[str, float] = {}  # by line: time of the newest reply
+        self._is_stopping = False
+        self._is_stop_sent: set[str] = set()  # lines
+        sleep, begin_stops, carry_out = clock.sleep, _Session._begin_stops, Line.carry_out
+
+        def counted_sleep(seconds: float) -> None:
+            sleep(seconds)
+            if threading.current_thread() is threading.main_thread():
+                with self._ticked:
+                    self._clock += seconds
+                    self._ticked.notify_all()
+                    self._ticked.wait_for(self._is_caught_up, 2.0)
+
+        def noted_stops(session: _Session) -> None:
+            self._is_stopping = True
+            begin_stops(session)
+
+        def noted_exchange(line: Line, exchange: Exchange, **details: Any) -> Completion:
+            if self._is_stopping:
+                with self._ticked:
+                    self._is_stop_sent.add(line.port)
+                    self._ticked.notify_all()
+            return carry_out(line, exchange, **details)
+
+        monkeypatch.setattr(clock, "sleep", counted_sleep)
+        monkeypatch.setattr(_Session, "_begin_stops", noted_stops)
+        monkeypatch.setattr(Line, "carry_out", noted_exchange)
+
+    def run(self, event: Callable[[FarEnds], object]) -> RunResult:
+        self.event = event
+        with ExitStack() as stack:
+            for line in self.test.plan.plant.lines:  # a thread for each, because replies wait in it
+                sims = [simulated(polled.drive) for polled in line.drives]
+                for sim in sims:
+                    self._watch(sim, line)
+                stack.enter_context(Simulator([Wire(sims, port=line.port, unpaced=True)]))
+            return self.test.run()
+
+    def _watch(self, sim: Any, line: PlantLine) -> None:
+        """Note this drive's requests, and delay its replies."""
+        requests = self.requests.setdefault(line.name, [])
+        exchange_s = predict(planned_on(line)).cycle / len(planned_on(line))
+        receive, self.sims[sim.drive.name] = sim.receive, sim
+        self._left[line.name] = 2 * len(planned_on(line))
+        self._due[line.name] = math.inf  # until the event
+
+        def noting(frame: Frame) -> Message | None:
+            if frame.message is None or not frame.intact:
+                return receive(frame)
+            requests.append(frame.message)
+            if is_write(frame.message):
+                sim._held.clear()  # the values of `exceed`: the motor is at rest
+            if self.event:
+                self._left[line.name] -= bool(self.test.phase)
+                if max(self._left.values()) > 0:
+                    return receive(frame)
+                event, self.event = self.event, None
+                event(self)
+            self._await_reply(line, exchange_s)
+            return receive(frame)
+
+        vars(sim)["receive"] = noting
+
+    def _is_caught_up(self) -> bool:
+        """Return True if all requests before the present time have come."""
+        return self._is_stopping or min(self._due.values()) > self._clock
+
+    def _await_reply(self, line: PlantLine, exchange_s: float) -> None:
+        with self._ticked:
+            due = self._due[line.name] = exchange_s + min(self._due[line.name], self._clock)
+            self._ticked.notify_all()
+            self._ticked.wait_for(
+                lambda: line.port in self._is_stop_sent or (self._clock >= due and not self._is_stopping)
+            )
+
+    def happen(self) -> None:
+        """Note that the reason for the abort exists from now on."""
+        if self.cause is None:
+            self.cause = {line: len(requests) for line, requests in self.requests.items()}
+
+    def show(self, drive: str, register: str) -> None:
+        """The reason is the next value of this register that is read."""
+        sim = self.sims[drive]
+        refresh = sim.refresh
+
+        def noting(cell: MemoryCell) -> None:
+            refresh(cell)
+            if cell.name == register:
+                self.happen()
+
+        vars(sim)["refresh"] = noting
+
+    def pass_time(self, seconds: float) -> None:
+        """Let the run's steps be later by this time."""
+        self.test._begin_ns -= round(seconds * 1e9)
+        self.happen()
+
+    def silence(self, seconds: float) -> None:
+        """Let the newest values be older by this time."""
+        awake = clock.boottime_ns
+        self._monkeypatch.setattr(clock, "boottime_ns", lambda: awake() + round(seconds * 1e9))
+        self.happen()
+
+    def stops_after(self, line: str) -> int:
+        """Return how many requests of this line came after the reason, up to the first write: a stop."""
+        assert self.cause is not None
+        later = self.requests[line][self.cause[line] :]
+        return 1 + next(at for at, request in enumerate(later) if is_write(request))
+
+
+def exceed(ends: FarEnds, drive: str = "a") -> None:
+    ends.sims[drive]["output_current"] = 60.0
+    ends.show(drive, "output_current")
+
+
+def trip(ends: FarEnds) -> None:
+    ends.sims["a"].trip(4)
+    ends.show("a", "fault")
+
+
+def refuse(ends: FarEnds) -> None:
+    """Refuse the setpoint of the step that comes after the first one."""
+    accept = ends.sims["b"].accept
+
+    def refusing(cell: MemoryCell, raw: int) -> int:
+        if cell.name == "setpoint":
+            ends.happen()
+            raise Refusal(Reason.VALUE)
+        return int(accept(cell, raw))
+
+    vars(ends.sims["b"])["accept"] = refusing
+    ends.test._begin_ns -= 120 * 10**9  # the second step is due
+
+
+# for each kind of abort: limits, the first step, what happens, and the reason in the result
+CAUSES: dict[str, tuple[str, str, Callable[[FarEnds], object], str]] = {
+    "limit": ('limits = ["a.output_current >= 60"]', WAIT, exceed, "a.output_current >= 60"),
+    "limit on another line": (
+        'limits = ["far.output_current >= 60"]',
+        WAIT,
+        lambda ends: exceed(ends, "far"),
+        "far.output_current >= 60",
+    ),
+    "fault": ("", WAIT, trip, "a has a fault"),
+    "silence": ('silence = "3 s"', WAIT, lambda ends: ends.silence(4), "no value of "),
+    "duration": ('duration = "30 s"', WAIT, lambda ends: ends.pass_time(40), "the run took longer"),
+    "until": (
+        "",
+        'until = "a.output_frequency > 60"\nwithin = "30 s"',
+        lambda ends: ends.pass_time(40),
+        "wait 1: a.output_frequency > 60 did not hold",
+    ),
+    "failed command": (
+        "",
+        f"{WAIT}\n[[phase.step]]\nfrequency = {{ b = 20.0 }}\n{WAIT}",
+        refuse,
+        "b refuses: ",
+    ),
+}
+YARD = '[[line]]\nname = "yard"\nport = "{folder}/yard"\n' + "".join(
+    f'[[line.drive]]\nname = "{name}"\nmodel = "invt-che"\nmaximum_frequency = 50\naddress = {address}\n'
+    f"poll = {CHE['poll']}\n"
+    for address, name in enumerate(("far", "far-2", "far-3"), 1)
+)
+
+
+@patient
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", CAUSES)
+def test_the_first_stop_of_each_kind_of_abort_comes_within_two_bus_cycles(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limits, step, event, reason = CAUSES[kind]
+    path = write_test(tmp_path, WAITING.format(limits=limits, step=step), a=CHE, b=CHE, c=CHE)
+    with (tmp_path / "plant.toml").open("a") as plant:
+        plant.write(YARD.format(folder=tmp_path))
+    ends = FarEnds(TestRun(path), monkeypatch)
+    result = ends.run(event)
+    assert result.abort.startswith(reason)
+    for line in ends.test.plan.plant.lines:
+        assert ends.stops_after(line.name) <= 2 * len(planned_on(line))
+
+
 OPTIONS = {"maximum_frequency": 50, "confirmed": 1}
 FAMILIES = [model for model in (*MODELS, *SHIPPED) if find_model(model).stop is not Drive.stop]
 
@@ -353,7 +563,15 @@ def test_the_first_stop_frame_of_an_abort_comes_within_two_bus_cycles(model: str
     limited = "output_current" if "output_current" in numbers else "output_frequency"
     keys: dict[str, Any] = {name: value for name, value in OPTIONS.items() if name in family.options}
     keys |= {"model": model, "poll": [limited, *(name for name in numbers if name != limited)][:3]}
-    with simulated_test(write_test(tmp_path, WAITING % limited, a=keys, b=keys, c=keys)) as (plan, sims):
+    with simulated_test(
+        write_test(
+            tmp_path,
+            WAITING.format(limits=f'limits = ["a.{limited} >= 60"]', step=WAIT),
+            a=keys,
+            b=keys,
+            c=keys,
+        )
+    ) as (plan, sims):
         are_writes: list[bool] = []  # whether each request at the far end is a write
         reads: list[int] = []  # numbers of requests that have read the high value
         for sim in sims:
