@@ -1,1 +1,1 @@
-"""Masters: multidrop, its rivals, and bare programs in C."""
+"""The Modbus masters to compare: multidrop, other libraries, and minimal programs in C."""

@@ -164,7 +164,7 @@ def decoder(drives: int) -> Callable[[], Batch]:
 
     def decode() -> Batch:
         columns = Columns(BATCH_ROWS)
-        add, into = lib.md_columns_add, columns.c  # called directly, as by the core's thread
+        add, into = lib.md_columns_add, columns.c  # called directly from C, as the core's own thread does
         for block, found in turns[: BATCH_ROWS // REGISTERS]:
             add(into, block.c, found, 0)
         return Batch(columns, *names)

@@ -23,7 +23,7 @@ class Job:
 
     @property
     def wire(self) -> float:
-        """The time in s from the start of a request to the end of its reply on paced_line."""
+        """The time in s from the start of a request to the end of its reply on the simulated line."""
         return (8 + 5 + 2 * REGISTERS) * self.character + DELAY_S
 
     @property
@@ -37,5 +37,5 @@ class Job:
 
 
 def expected(address: int) -> list[int]:
-    """Return the register values of paced_line's drive with this address."""
+    """Return the register values that the simulated drive with this address has."""
     return [256 * address + register for register in range(REGISTERS)]

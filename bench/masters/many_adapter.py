@@ -84,13 +84,13 @@ def _name(port: str, address: int) -> str:
 
 
 def start_lateness_us(ports: Sequence[str], baudrate: int, every: float, seconds: float) -> list[float]:
-    """Return the delay of each request from the start of its slot, in us, for one drive per line."""
+    """Return by how many us each request was sent after it was due, for one drive per line."""
     with polling_lines(ports, baudrate, 1, every) as poller:
         batches = list(poller.batches(seconds))
         grids = {_name(line.name, 1): line.started_ns for line in poller._lines}
     period_ns = round(every * 1e9)
     sent_ns = {(row.drive, row.monotonic_ns - grids[row.drive]) for batch in batches for row in batch}
-    # Skip the first slots, which start when polling starts.
+    # skip each drive's first request, which is due when polling starts
     return [sent % period_ns / 1e3 for _, sent in sorted(sent_ns) if sent > period_ns / 2]
 
 
@@ -130,7 +130,8 @@ def mixed() -> Mixed:
             )
         )
         for drive in drives
-        for demanded in [drive.needed_silence() + drive.settings.bit]  # the silence is longer around ASCII
+        # the silences before and after ASCII frames are longer
+        for demanded in [drive.needed_silence() + drive.settings.bit]
     ]
     return Mixed(drives, words, len(exchanges), predict(exchanges, lateness=0).cycle)
 
@@ -154,7 +155,7 @@ class Judged:
     exchanges: int = 0  # requests that were sent
     samples: int = 0
     wrong: int = 0  # values that belong to another register
-    beyond: int = 0  # wrong values whose reply was later than three time-outs
+    beyond: int = 0  # wrong values from requests sent more than three time-outs earlier
     late: int = 0  # replies that were recognised after their time-out
     misses: Counter[str] = field(default_factory=Counter)
     asked_ns: dict[tuple[str, int], int] = field(default_factory=dict)  # unanswered requests

@@ -18,7 +18,7 @@ from bench.support.programs import paced_line
 
 
 def measured(threads: int, baudrate: int, seconds: float) -> dict[str, float]:
-    """Return exchanges per second of polling and of the threads, and the threads' longest call in s."""
+    """Return exchanges per second of polling and of `threads` reading threads, and the longest call in s."""
     with paced_line(baudrate=baudrate) as line, adapter.polling(Job(line.path, baudrate, seconds)) as poller:
         bus = poller.bus("line")
         stop, took = threading.Event(), []
@@ -29,7 +29,7 @@ def measured(threads: int, baudrate: int, seconds: float) -> dict[str, float]:
                 drive.read_many(drive.readings())
                 took.append(time.monotonic() - begun)
 
-        time.sleep(1.0)  # the poller learns the response delays
+        time.sleep(1.0)  # until the poller has learned the response delays
         readers = [threading.Thread(target=read, args=[bus.drives[at]]) for at in range(threads)]
         before, begun = adapter.counts(poller)[0], time.monotonic()
         for reader in readers:

@@ -118,7 +118,7 @@ def instructions(lines: int, seconds: float) -> tuple[int, dict[str, Any]]:
 
 @contextmanager
 def talkers(lines: int) -> Iterator[list[str]]:
-    """Play `lines` paced lines; yield their ports."""
+    """Simulate `lines` lines with paced_line.c; yield their ports."""
     from bench.players.responders import responders
 
     with responders("pty", lines, "--baudrate", BAUDRATE, "--delay-us", 2000) as (ports, _):

@@ -96,7 +96,7 @@ def make_day(folder: Path, hours: int) -> None:
             "-c",
             COMPACTED,
             str(folder),
-        ]  # a small intermediate process, to measure the child's memory
+        ]  # a small process in between, because it reports its child's greatest memory
         print(subprocess.run(words, check=True, capture_output=True, text=True).stdout.strip())
         segments = hours * 3600 // SEGMENT_S
         for number in range(2, segments + 1):
@@ -105,7 +105,8 @@ def make_day(folder: Path, hours: int) -> None:
             span = MIDNIGHT + begin * SECOND, MIDNIGHT + (begin + SEGMENT_S) * SECOND
             for kind, query in (("tens", TENS.format("told")), ("rows", ROWS)):
                 copy_out(database, query, folder / kind / file_name(number, number, *span), METADATA)
-        made(database, hours * 3600 - SEGMENT_S // 2, hours * 3600)  # the last segment, not closed
+        # the last segment, which is not closed yet
+        made(database, hours * 3600 - SEGMENT_S // 2, hours * 3600)
         recorded(database, folder, segments)
     compact(folder, 0)  # merges the summaries of each complete hour
 

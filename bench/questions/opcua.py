@@ -71,7 +71,10 @@ def last(log: Path) -> tuple[float, int]:
 
 
 async def measured(slices: int, clients: int | None) -> tuple[float, float]:
-    """Return the CPU time in percent, and the values per second of the first client; None: no server."""
+    """Return the CPU time in percent, and the first client's values per second.
+
+    With `clients` None, measure without the OPC UA server.
+    """
     with TemporaryDirectory() as folder, ExitStack() as stack:
         worker, rate = Worker(Path(folder), LINES), 0.0
         stack.callback(worker.gateway.listener.close)
@@ -114,7 +117,10 @@ def started(stack: ExitStack, words: list[str]) -> None:
 
 
 def stops(rounds: int, clients: int | None) -> Iterator[tuple[float, float]]:
-    """Yield the times in ms from each stop to its first frame and to its answer; None: no OPC UA server."""
+    """Yield the times in ms from each stop to its first frame and to its answer.
+
+    With `clients` None, the gateway runs without its OPC UA server.
+    """
     with TemporaryDirectory() as folder, ExitStack() as stack:
         web, opcua = free_ports(2)
         serve = f'[serve]\nlisten = "127.0.0.1:{web}"\n[serve.may]\nstop = "anyone"\n'

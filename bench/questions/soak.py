@@ -38,7 +38,7 @@ from multidrop.toml_check import parse_duration
 PLAYERS = Path(__file__).parents[1] / "players"
 MOST_GROWTH_KB = 2048  # limit for resident memory after the first period
 COMMAND_EVERY = 20.0  # s between the start and the stop of a motor
-IN_FLIGHT = 2  # number of a register's latest slots whose rows may still be in flight
+IN_FLIGHT = 2  # number of each register's newest reads that may have no row yet
 HELD_UP = 1.0  # s; a wrong value is excused if the line was delayed this soon before it
 HEAD: tuple[str, ...] = (
     "hours",
@@ -135,7 +135,8 @@ class Soak:
             for poll in drive.polls
             if poll.every
         }
-        self.slots: Counter[tuple[str, str]] = Counter()  # number of rows of each register with a rate
+        # number of rows of each register that has a polling rate
+        self.slots: Counter[tuple[str, str]] = Counter()
         self.total = Period()
         self.exchanges = 0
         self.faults: list[str] = []

@@ -50,16 +50,16 @@ def unhurried(request: Message) -> Exchange:
 
 
 @pytest.mark.parametrize("length", [8, 25, 256])
-def test_checksum(benchmark: Any, length: int) -> None:
+def test_time_of_a_checksum(benchmark: Any, length: int) -> None:
     frame = bytes(range(256))[:length]
     benchmark(crc16, frame, length)
 
 
-def test_build_request(benchmark: Any) -> None:
+def test_time_to_build_a_request(benchmark: Any) -> None:
     assert benchmark(build_request, Framing.RTU, READ_TEN) == bytes.fromhex("01030000000AC5CD")
 
 
-def test_check_reply(benchmark: Any) -> None:
+def test_time_to_check_a_reply(benchmark: Any) -> None:
     used, reply = benchmark(parse_reply, Framing.RTU, REPLY, Message(1, 3, 1, 4))
     assert used == len(REPLY)
     assert reply.data == REPLY[3:-2]
@@ -84,7 +84,7 @@ def carry_out(port: Port, exchanges: list[Exchange], row_queue: RowQueue) -> Col
     return columns
 
 
-def test_256_exchanges_and_their_2560_values(benchmark: Any, fd: int) -> None:
+def test_time_of_256_exchanges_with_2560_values(benchmark: Any, fd: int) -> None:
     with closing(Port(fd, -1, room=EXCHANGES)) as port:
         row_queue = RowQueue()
         port.report_to(row_queue, 0)
@@ -94,11 +94,11 @@ def test_256_exchanges_and_their_2560_values(benchmark: Any, fd: int) -> None:
     assert columns.array("value")[0] == 0x0304 / 10
 
 
-def test_256_exchanges_of_a_bare_c_loop(benchmark: Any, fd: int, bare: CDLL) -> None:
+def test_time_of_256_exchanges_in_a_minimal_c_loop(benchmark: Any, fd: int, bare: CDLL) -> None:
     assert benchmark(bare.bare_exchanges, fd, EXCHANGES) == EXCHANGES
 
 
-def test_decode_ten_values(benchmark: Any, fd: int) -> None:
+def test_time_to_decode_ten_values(benchmark: Any, fd: int) -> None:
     found = ffi.new("struct md_completion *")
     with closing(Port(fd, -1)) as port:
         reply = port.carry_out(unhurried(READ_TEN)).reply

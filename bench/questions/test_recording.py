@@ -29,12 +29,12 @@ def batch() -> Batch:
     return Batch(columns, Names(["pump-1"]), Names(REGISTERS))
 
 
-def test_4096_rows_as_arrow(benchmark: Any, batch: Batch) -> None:
+def test_time_to_convert_4096_rows_to_arrow(benchmark: Any, batch: Batch) -> None:
     assert benchmark(batch.arrow) is not None
 
 
 @pytest.mark.parametrize("suffix", [".arrows", ".csv", ".parquet"])
-def test_4096_rows_into_a_recording(benchmark: Any, batch: Batch, tmp_path: Path, suffix: str) -> None:
+def test_time_to_record_4096_rows(benchmark: Any, batch: Batch, tmp_path: Path, suffix: str) -> None:
     with open_writer(tmp_path / f"run{suffix}", {}) as writer:
         benchmark(writer.write, batch)
         assert writer.rows % ROWS == 0

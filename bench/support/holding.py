@@ -72,7 +72,7 @@ class Holding:
 def holdings(device: ImportedDevice) -> list[Holding]:
     """Return for each entry of an imported device whether a family can declare it.
 
-    A declaration must let the register be read and written as the program uses it from which it was imported.
+    The declared register must be readable and writable as in the program that the entry is from.
     """
     found = [_held(entry) for entry in device.registers]
     found += [Holding(entry, is_held=True, is_text=True) for entry in device.texts]
@@ -90,7 +90,8 @@ def family_of(entries: list[Holding]) -> str:
     }
     for name, register in members.items():
         object.__setattr__(register, "name", name)
-        object.__setattr__(register, "scale_register", "")  # its name differs here; the importer checked it
+        # the scale register is not checked again: its name differs here
+        object.__setattr__(register, "scale_register", "")
     return _refusal(members)
 
 

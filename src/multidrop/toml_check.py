@@ -161,9 +161,9 @@ class TomlPlace:
             steps = tuple(outer)
 
     def once(self, *what: object, sentence: str, key: str = "") -> None:
-        """Add the error `sentence` if `what` was seen before.
+        """Add the error `sentence` if an earlier call had the same `what`.
 
-        `{first}` in the sentence becomes the first place of `what`.
+        `{first}` in the sentence becomes the place of the first such call.
         """
         if what in self.seen:
             self.wrong(sentence.format(first=self.seen[what]), key)

@@ -38,7 +38,7 @@ def fan(tmp_path: Path) -> Path:
     return path
 
 
-def test_check_lists_contents_gaps_and_refusals(run: Run, fan: Path) -> None:
+def test_check_lists_registers_unknown_facts_and_forbidden_writes(run: Run, fan: Path) -> None:
     status, out, err = run("check", fan)
     shown = words(out)
     assert (status, err) == (0, "")
@@ -90,7 +90,7 @@ def test_check_hints_at_the_right_name_or_command(run: Run, tmp_path: Path) -> N
     ]
 
 
-def test_a_familys_sheet_has_the_notation_of_manuals(run: Run, tmp_path: Path) -> None:
+def test_models_prints_bits_and_addresses_in_the_notation_of_manuals(run: Run, tmp_path: Path) -> None:
     """Bits have numbers, and registers have hex addresses. Only a family with verbs has a watchdog."""
     _, out, _ = run("check", "abb-acs355")
     assert "bit 0 READY_TO_SWITCH_ON, bit 1 READY_TO_OPERATE" in words(out)
@@ -181,7 +181,7 @@ def test_mistakes_of_a_family_file_are_reported_once_for_all_drives(run: Run, tm
     assert all('plant.toml:6: line "L", drive "f1": ' in line for line in reported)
 
 
-def test_check_reports_no_missing_span_for_a_coil(run: Run, tmp_path: Path) -> None:
+def test_check_does_not_ask_for_the_value_range_of_a_coil(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "io.toml"
     path.write_text(
         '[family]\ntitle = "IO"\nmanual = "v1"\n[setting]\nlamp = { at = "00001", place = "1" }\n'

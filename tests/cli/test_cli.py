@@ -278,7 +278,9 @@ def test_a_forbidden_write_is_reported_in_one_sentence_with_status_1(
         ),
     ],
 )
-def test_a_forbidden_write_shows_the_command_to_type(run: Run, words: list[str], advice: str) -> None:
+def test_a_forbidden_write_shows_the_command_or_option_to_use_instead(
+    run: Run, words: list[str], advice: str
+) -> None:
     status, out, err = run(*words)
     assert (status, out) == (1, "")
     assert advice in err

@@ -107,7 +107,7 @@ def test_a_bit_without_a_name_is_shown_by_its_number(run: Run, port: str, toy: S
     }
 
 
-def test_a_refused_register_does_not_hide_the_others(run: Run, port: str) -> None:
+def test_read_prints_the_other_registers_if_the_drive_refuses_one(run: Run, port: str) -> None:
     status, out, err = run("read", port, TOY, 2, "status", "fault")
     assert (status, out) == (1, "status  none\nfault         refused: code 02H, illegal address\n")
     assert err == ""
@@ -132,7 +132,7 @@ class Mute(Drive):
 """
 
 
-def test_a_family_that_cannot_read_its_state_is_stopped(
+def test_a_drive_whose_state_cannot_be_read_is_stopped(
     run: Run, port: str, toy: SimulatedDrive, tmp_path: Path
 ) -> None:
     (tmp_path / "mute.py").write_text(MUTE)
@@ -143,7 +143,7 @@ def test_a_family_that_cannot_read_its_state_is_stopped(
     assert out.startswith("mute@1: stop done; state: the family cannot say")
     assert json.loads(run(*words, "--json")[1])["state"] is None
     writes = [(write.address, write.raw) for write in toy.counters.writes]
-    assert len(writes) >= 2  # the stop is repeated on a busy machine
+    assert len(writes) >= 2  # on a busy machine, the stop may be repeated
     assert set(writes) == {(0x14, 0)}
 
 
@@ -312,7 +312,7 @@ def test_every_write_is_recorded_in_the_audit_log(run: Run, port: str, tmp_path:
 
 
 @pytest.mark.parametrize("log", ["none/audit.jsonl", "."])
-def test_a_stop_is_sent_if_its_log_cannot_be_opened(
+def test_a_stop_is_sent_even_if_its_audit_log_cannot_be_opened(
     run: Run, port: str, toy: SimulatedDrive, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, log: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -341,7 +341,7 @@ def test_ctrl_c_at_a_question_sends_no_request(
     assert not toy.counters.writes
 
 
-def test_the_command_wear_shows_the_ledger(run: Run, port: str, toy: SimulatedDrive) -> None:
+def test_the_command_wear_shows_the_eeprom_ledger(run: Run, port: str, toy: SimulatedDrive) -> None:
     status, out, _ = run("wear")
     assert (status, out.endswith("no writes to EEPROM yet\n")) == (0, True)
     toy["status"] = Status(0)

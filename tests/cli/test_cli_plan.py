@@ -120,7 +120,7 @@ def test_a_plan_that_does_not_fit_returns_1_with_suggestions(run: Run, crowded: 
     assert run("plan", crowded)[0] == 0
 
 
-def test_a_drive_without_a_rate_keeps_its_share_of_a_full_line(run: Run, crowded: Path) -> None:
+def test_a_drive_without_a_rate_gets_time_on_an_overloaded_line(run: Run, crowded: Path) -> None:
     crowded.write_text(crowded.read_text() + DRIVE.format("eager", TOY, 9) + 'poll = ["fault"]\n')
     status, out, _ = run("plan", crowded)
     assert status == 1

@@ -326,7 +326,7 @@ def test_models_are_found_relative_to_the_plant_file(
     assert (status, out) == (0, "output_current  3.25  A\n")
 
 
-def test_a_drive_named_by_plant_file_has_the_same_guards_as_by_port(
+def test_writes_to_a_drive_named_by_plant_file_are_refused_as_if_named_by_port(
     run: Run, plant: Path, at: str, port: str
 ) -> None:
     """Each refused command prints the same error in both cases."""

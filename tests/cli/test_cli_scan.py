@@ -37,7 +37,8 @@ from multidrop.transport import port_identity
 from multidrop.transport.port_identity import USBAdapter
 
 USUAL = Settings(9600, "8N1")
-PATIENTLY = ("--baudrates", "9600", "--formats", "8N1", "--addresses", "1-3")  # for busy machines
+# few settings and addresses, because each request waits longer on a busy machine
+PATIENTLY = ("--baudrates", "9600", "--formats", "8N1", "--addresses", "1-3")
 TWO_MODELS = ("--model", "invt-che", "--model", "innovert-ibd")
 
 

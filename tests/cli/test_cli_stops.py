@@ -296,7 +296,7 @@ def test_a_stop_is_sent_even_if_no_warning_can_be_printed(
 
 @pytest.mark.parametrize("seconds", ["-1", "0", "nan", "inf", "ten", ""])
 @pytest.mark.parametrize("verb", ["stop", "coast"])
-def test_an_invalid_time_does_not_prevent_a_stop(run: Run, che: Che, verb: str, seconds: str) -> None:
+def test_an_invalid_time_limit_does_not_prevent_a_stop(run: Run, che: Che, verb: str, seconds: str) -> None:
     received, words = che
     status, _, err = run(verb, *words, "--seconds", seconds)
     assert status == 0

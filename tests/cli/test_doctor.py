@@ -48,7 +48,7 @@ def examined(run: Run, *words: object) -> tuple[int, str]:
     return status, " ".join(out.split())
 
 
-def test_doctor_measures_wake_ups(run: Run, port: str) -> None:
+def test_doctor_measures_how_late_the_computer_wakes(run: Run, port: str) -> None:
     told = examined(run, port)[1]
     assert re.search(r"wake-ups the core wakes \d+\.\d\d ms late \(p50\), .* for 9600 8N1: p99 must be", told)
 
@@ -67,7 +67,7 @@ def test_on_a_pty_doctor_reports_no_adapter(run: Run, port: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
-def test_on_a_socket_the_adapter_is_at_the_far_end(run: Run, port: str) -> None:
+def test_doctor_says_that_the_adapter_of_a_socket_is_at_the_far_end(run: Run, port: str) -> None:
     status, told = examined(run, port)
     assert status == 0
     assert "is a TCP connection" in told
@@ -89,7 +89,7 @@ def test_rs485_modes_are_accepted_only_for_devices(run: Run, port: str) -> None:
 @pytest.mark.slow
 @pyserials_own
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
-def test_on_a_pyserial_port_the_adapter_is_at_the_far_end(run: Run, port: str) -> None:
+def test_doctor_says_that_the_adapter_of_a_pyserial_port_is_at_the_far_end(run: Run, port: str) -> None:
     server = SerialServer(port)
     status, out, _ = run("doctor", server.url)
     server.close()
@@ -110,7 +110,7 @@ def test_a_port_lost_during_the_echo_test_is_part_of_the_finding(run: Run) -> No
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_patient")
-def test_the_round_trip_is_measured_with_a_drive(run: Run, port: str) -> None:
+def test_doctor_measures_the_round_trip_with_a_drive(run: Run, port: str) -> None:
     words = ("--model", "innovert-ibd", "--address", "2", "--framing", "ascii", "--json")
     status, out, _ = run("doctor", port, *words)
     assert status == 0
@@ -150,7 +150,7 @@ def test_doctor_sends_only_five_requests_to_a_silent_drive(run: Run, port: str) 
 
 @pytest.mark.usefixtures("_patient")
 @pytest.mark.parametrize("port", ["pty", "socket://127.0.0.1:0"], indirect=True)
-def test_no_delay_is_negative_on_ports_whose_bits_take_no_time(run: Run, port: str) -> None:
+def test_measured_delays_on_ptys_and_network_ports_are_never_negative(run: Run, port: str) -> None:
     """The simulated far end answers immediately, sooner than a wire could have delivered the request."""
     status, told = examined(run, port, *CHE_1)
     assert status == 0
@@ -226,11 +226,12 @@ def responder() -> Iterator[Callable[[Callable[[bytes], bytes]], Responder]]:
 
 
 @pytest.mark.slow
-def test_an_exception_in_the_echo_test_is_not_called_foreign_traffic(
+def test_an_exception_reply_in_the_echo_test_is_not_called_foreign_traffic(
     run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A server may answer for every address, even an unused one."""
-    monkeypatch.setattr("multidrop.cli.doctor.LEAST_TIMEOUT", 2.0)  # a busy machine may be slow
+    # on a busy machine, the reply may come late
+    monkeypatch.setattr("multidrop.cli.doctor.LEAST_TIMEOUT", 2.0)
     end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=4)))
     told = examined(run, end.path)[1]
     assert "answers with exception 04" in told

@@ -129,7 +129,7 @@ def test_a_driver_that_refuses_the_rs485_mode_counts_as_having_none(
     assert written == [bytes(32)] * settable
 
 
-def test_reading_driver_features_of_a_lost_port_raises_instead_of_returning_none() -> None:
+def test_reading_driver_features_of_a_lost_port_raises_an_error() -> None:
     master, slave = os.openpty()
     os.close(master)
     os.close(slave)
@@ -288,7 +288,7 @@ REFUSED = "the system refuses it; permit it so"
         (REFUSED, {}, "realtime: refused; too late", REFUSED),
     ],
 )
-def test_wake_ups_are_judged_by_the_lines_silence(
+def test_late_wake_ups_are_compared_with_the_silence_between_frames(
     realtime: WakeLateness | str, options: dict[str, Any], verdict: str, advice: str
 ) -> None:
     found = wake_finding(LATE, realtime, USUAL, **options)
@@ -297,7 +297,7 @@ def test_wake_ups_are_judged_by_the_lines_silence(
     assert found.advice.startswith(advice) if advice else not found.advice
 
 
-def test_a_computer_that_wakes_in_time_needs_no_permission_unless_the_plant_asks_for_realtime() -> None:
+def test_realtime_permission_is_advised_only_if_needed_or_requested() -> None:
     assert wake_finding(EARLY, REFUSED, USUAL).advice == ""
     assert wake_finding(EARLY, REFUSED, USUAL, is_realtime=True).advice == REFUSED
     switched = wake_finding(WakeLateness(0.0001, 0.0005, 0.004), EARLY, USUAL, RS485.RTS_DOWN)

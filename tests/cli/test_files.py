@@ -92,14 +92,14 @@ def fill(pipe: int) -> None:
     os.set_blocking(pipe, True)
 
 
-def test_lines_lost_by_a_slow_reader_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_log_lines_lost_because_of_a_slow_reader_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(log_thread, "MOST_WAITING", 3)
     unread, log = os.pipe()
     with os.fdopen(unread) as reader, os.fdopen(log, "w") as stream:
         fill(log)
         handler = LogThread(stream, FORMAT)
         handler.handle(record("first"))
-        until(lambda: handler._waiting.empty())  # the thread hangs in a write
+        until(lambda: handler._waiting.empty())  # the log's thread is blocked in its first write
         for number in range(8):
             handler.handle(record(f"line {number}"))
         told = [reader.readline().strip()]

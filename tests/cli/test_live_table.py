@@ -130,7 +130,8 @@ def size(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Return the terminal's columns and lines, in a list that a test may change."""
     found = [80, 24]
     terminal = SimpleNamespace(get_terminal_size=lambda: os.terminal_size(found))
-    monkeypatch.setattr("multidrop.cli.poll.shutil", terminal)  # pytest uses shutil's own function
+    # replaced in this module only, because pytest uses the original function
+    monkeypatch.setattr("multidrop.cli.poll.shutil", terminal)
     return found
 
 
@@ -164,7 +165,7 @@ def test_a_wrapped_table_is_redrawn_after_the_terminal_narrowed(tmp_path: Path, 
     assert again == ["\x1b[2F\x1b[J", "\x1b[3F\x1b[J"]
 
 
-def test_a_warning_is_above_the_table_and_rows_of_channels_are_not_counted(
+def test_the_live_table_shows_warnings_above_it_and_counts_no_channel_rows(
     tmp_path: Path, size: list[int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "plant.toml"
@@ -190,7 +191,7 @@ def test_a_name_that_cannot_be_encoded_moves_no_column(tmp_path: Path, size: lis
     assert text.endswith("\n??-1        1       0  output_frequency 42.50 Hz\n")
 
 
-def test_a_sentence_printed_at_a_signal_stays_above_the_next_table_of_a_run(
+def test_a_message_printed_at_a_signal_stays_above_the_redrawn_table(
     tmp_path: Path, size: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "plant.toml"

@@ -110,7 +110,7 @@ def texts(lines: list[Any]) -> list[str]:
 # ---- states and histories ----
 
 
-def test_states_come_from_polled_registers(watched: LivePlant) -> None:
+def test_the_monitor_derives_a_drives_state_from_polled_registers(watched: LivePlant) -> None:
     assert [(drive.state, drive.fault, drive.why_silent) for drive in watched.drives] == [
         ("running", "", ""),
         ("fault", "oc1_overcurrent_accelerating", ""),
@@ -120,7 +120,7 @@ def test_states_come_from_polled_registers(watched: LivePlant) -> None:
     assert [drive.so_far.misses.total() for drive in watched.drives] == [12, 0, 0]
 
 
-def test_a_silent_drive_that_is_no_longer_polled_keeps_its_first_reason(watched: LivePlant) -> None:
+def test_a_skipped_poll_of_a_silent_drive_does_not_hide_the_reason_no_reply(watched: LivePlant) -> None:
     watched.add(from_rows([row("drive-3", name, None, "not asked: drive is silent", ago=0) for name in CHE]))
     assert watched.drives[2].why_silent == "no reply"
 
@@ -133,7 +133,7 @@ def test_a_frequency_of_0_is_not_shown_as_stopped(tmp_path: Path) -> None:
     assert live.drives[0].state == "turns"
 
 
-def test_flags_of_which_no_bit_is_set_name_no_state(tmp_path: Path) -> None:
+def test_a_register_of_flags_in_which_no_bit_is_set_names_no_state(tmp_path: Path) -> None:
     path = tmp_path / "hall.toml"
     path.write_text(
         '[[line]]\nname = "hall-1"\nport = "/dev/nowhere"\n'
@@ -144,7 +144,7 @@ def test_flags_of_which_no_bit_is_set_name_no_state(tmp_path: Path) -> None:
     assert live.drives[0].state == ""
 
 
-def test_rates_are_measured_over_the_last_seconds(watched: LivePlant) -> None:
+def test_the_monitor_measures_rates_over_the_last_seconds(watched: LivePlant) -> None:
     recent = watched.recent["hall-1"]
     assert recent.exchanges_per_second == pytest.approx(50)
     assert recent.utilisation == pytest.approx(0.9)
@@ -156,7 +156,7 @@ def test_rates_are_measured_over_the_last_seconds(watched: LivePlant) -> None:
     assert watched.drives[0].recent.exchanges == 0
 
 
-def test_history_has_a_gap_for_a_miss(watched: LivePlant) -> None:
+def test_the_monitors_history_of_values_has_a_gap_for_a_miss(watched: LivePlant) -> None:
     assert [list(drive.history) for drive in watched.drives] == [[42.5, 42.5], [None, None], [None, None]]
     assert sparkline([0, 1, 2, None, 7], 10) == "▁▂▃ █"
     assert sparkline([50, 50, 50], 2) == "██"
@@ -232,7 +232,9 @@ def test_reads_of_unpolled_registers_take_at_most_5_percent_of_a_lines_time(tmp_
 @pytest.mark.long
 @table("size", [(60, 12), (80, 24), (200, 50), (500, 100)])
 @table("drives", [1, 31, 247])
-def test_a_picture_fills_every_size(tmp_path: Path, size: tuple[int, int], drives: int) -> None:
+def test_the_monitors_pictures_fit_every_terminal_size(
+    tmp_path: Path, size: tuple[int, int], drives: int
+) -> None:
     live = LivePlant(a_plant(tmp_path, min(drives, 247)))
     live.add(from_rows([row("drive-1", register, 4.0) for register in CHE]))
     live.tick(1.0, told(1, 1, 1.0, drives))
@@ -305,7 +307,7 @@ def test_a_drives_page_shows_every_register(watched: LivePlant) -> None:
     assert rows["device"].split()[1] == "..."
 
 
-def test_a_page_shows_full_reasons_if_values_are_short(watched: LivePlant) -> None:
+def test_the_page_of_a_drive_shows_whole_reasons_if_values_are_short(watched: LivePlant) -> None:
     why = "not asked: drive is silent"
     watched.add(from_rows([row("drive-1", name, None, why) for name in CHE]))
     lines = texts(page(watched.drives[0], {}, Position(page=True), (80, 24), NOW))
@@ -315,7 +317,7 @@ def test_a_page_shows_full_reasons_if_values_are_short(watched: LivePlant) -> No
 @pytest.mark.parametrize(
     ("seconds", "age"), [(9, "9.5 s"), (50, "50 s"), (600, "10 min"), (7199, "120 min"), (36000, "10 h")]
 )
-def test_ages_have_readable_units(watched: LivePlant, seconds: int, age: str) -> None:
+def test_the_monitor_shows_ages_in_readable_units(watched: LivePlant, seconds: int, age: str) -> None:
     lines = texts(overview(watched, Position(), (80, 24), NOW + seconds * SECOND, BLOCKS))
     assert " ".join(lines[3].split()[6:8]) == age
 
@@ -466,7 +468,8 @@ def test_a_stops_failure_is_shown_until_it_is_acknowledged(screened: Screened) -
     assert "a acknowledge FAILURES" in screened.text
     stopped = {"drive-2": Stopped("drive-2", Seen.STOPPED, 0.1)}
     poller.stop_all = lambda: stopped  # type: ignore[method-assign]
-    for key in ("x", DOWN, "S", "y", ENTER, "s", "n", ENTER):  # also on a page, and after a successful stop
+    # the message stays on a drive's page, and after a successful stop
+    for key in ("x", DOWN, "S", "y", ENTER, "s", "n", ENTER):
         screened.press([key])
         assert failure in screened.text
     assert monitor.await_stops() == monitor._at.failures
@@ -541,7 +544,8 @@ def test_quitting_during_a_stop_asks_and_then_waits_for_it(
         assert not monitor._has_left
     screened.press(("q", "y"))
     assert monitor._has_left
-    monitor._session = monitor._session._replace(hand_out=stands.set)  # rows are still recorded
+    # the motor stands still once rows are recorded during the wait
+    monitor._session = monitor._session._replace(hand_out=stands.set)
     assert monitor.await_stops() == []
     assert not any(thread.is_alive() for thread in monitor._stops)
     assert "waiting for a stop in progress" in capsys.readouterr().err

@@ -210,7 +210,9 @@ aborts: fan.output_current > 30; no value for 5 s; a failed command
     assert (status, [step["at_s"] for step in json.loads(out)["steps"]]) == (0, [0.0, 0.0, 2.0])
 
 
-def test_a_test_that_does_not_fit_is_refused_before_a_port_is_opened(run: Run, tmp_path: Path) -> None:
+def test_a_test_run_whose_steps_are_too_short_is_refused_before_a_port_opens(
+    run: Run, tmp_path: Path
+) -> None:
     path = write_test(tmp_path, STEPS.replace('"2 s"', '"50 ms"'))
     status, out, _ = run("run", path, "--dry-run")
     assert status == 1
@@ -220,7 +222,7 @@ def test_a_test_that_does_not_fit_is_refused_before_a_port_is_opened(run: Run, t
     assert "it would fit with" in errors
 
 
-def test_wrong_options_are_refused(run: Run, tmp_path: Path) -> None:
+def test_contradicting_options_of_run_are_refused(run: Run, tmp_path: Path) -> None:
     path = write_test(tmp_path)
     assert run("run", path, "--speed", 3)[::2] == (
         2,
@@ -234,7 +236,7 @@ def test_wrong_options_are_refused(run: Run, tmp_path: Path) -> None:
     assert "which commands fan at up to 30 Hz, and then stops all drives of the plant?" in errors
 
 
-def test_the_question_names_missing_setpoints_and_fault_registers(run: Run, tmp_path: Path) -> None:
+def test_the_question_before_a_run_names_missing_setpoints_and_faults(run: Run, tmp_path: Path) -> None:
     text = '[[phase]]\nname = "a"\n[[phase.step]]\nstart = ["fan"]\ndwell = "9 s"'
     status, _, errors = run("run", write_test(tmp_path, text, fan=HIDDEN))
     assert status == 1

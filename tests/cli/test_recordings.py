@@ -49,7 +49,7 @@ def test_plot_and_report_need_only_the_recording(run: Run, ramp: Path, tmp_path:
         (("--out", "picture.jpg"), "picture.jpg: a plot's name must end in .png or .html"),
     ],
 )
-def test_mistakes_are_reported_in_one_sentence(
+def test_mistaken_plot_options_are_reported_in_one_sentence(
     run: Run, ramp: Path, tmp_path: Path, words: tuple[str, ...], sentence: str
 ) -> None:
     out = () if "--out" in words else ("--out", tmp_path / "it.png")

@@ -395,7 +395,8 @@ def test_schema_refuses_two_names_with_one_number() -> None:
     [
         ("[reading]\nb = { at = 2, scale_register = 'power_of_ten' }", True),
         ("[reading]\nb = { at = 2, scale_register = 'power_of_tens' }", False),  # another length
-        ("[reading]\nb = { at = 2, scale_register = 'powwr_of_ten' }", True),  # the same length and ends
+        # accepted: the length, the first and the last letters are right
+        ("[reading]\nb = { at = 2, scale_register = 'powwr_of_ten' }", True),
         ("[setting]\nb = { at = 2, at_least = 'lowest' }", True),
         ("[setting]\nb = { at = 2, at_least = 'lowezt', at_most = 'highest' }", False),
         ("[setting]\nb = { at = 2, at_most = 'hihgest' }", True),
@@ -416,7 +417,7 @@ def test_schema_refuses_most_misspelt_names_of_registers(referring: str, is_acce
     assert accepts("family", csv)  # the CSV file may have registers with these names
 
 
-FIRST_SECTION = "[reading]\n"  # of the registers above, which more readings may follow
+FIRST_SECTION = "[reading]\n"  # `names` starts this table already
 
 
 def test_schema_refuses_csv_files_that_it_was_not_given(tmp_path: Path) -> None:

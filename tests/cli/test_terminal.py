@@ -27,7 +27,7 @@ from multidrop.cli.support.terminal import (
 from multidrop.cli.support.values import columns_of
 
 
-def test_a_long_history_is_drawn_as_means_that_keep_their_columns() -> None:
+def test_a_growing_history_keeps_its_points_in_the_same_sparkline_columns() -> None:
     assert sparkline([0, 7, 0, 7, 7, 7, None, None, 0, 0], 5) == "▅▅█ ▁"
     steps = [0.0] * 60 + [7.0] * 60 + [0.0] * 120
     pictures = [sparkline(steps[at : at + 120], 30, points=120 + at) for at in range(100)]

@@ -56,7 +56,7 @@ class MemoryBucket:
         self.name = name
         self.records: dict[str, Record] = {}
         self.last = 0
-        self.asked = 0  # number of calls of `newest`
+        self.asked = 0  # how often `newest` was called
         self.is_down = False
         self.loses_answers = False
         self.before_put: Callable[[str], object] = lambda key: None  # called before each put
@@ -234,9 +234,10 @@ class FailingLog(CommandLog):
 
 
 class Desks:
-    """The command desks of one gateway, which is master of its line while `is_master` is set.
+    """The objects with which one gateway answers requests for commands to its line's drives.
 
-    While `is_guarded` is set, frames of the former master may still arrive.
+    The gateway is master of the line while `is_master` is set. While `is_guarded` is set, frames of
+    the former master may still arrive.
     """
 
     def __init__(self, bus: Bus, sim: SimulatedDrive, folder: Path, may: Mapping[str, Any]) -> None:
