@@ -28,7 +28,7 @@ _ITEM = r"(\"[^\"]*\"|[\w.-]+)"
 _WORD = r"(?P<value>[A-Za-z][\w .:/-]*?)\s*"
 _TWICE = "twice|overwrite|mutate"
 _VALUE = "Invalid value|Expected newline"
-_HEADER = "write [serve] or [[line]]"
+_HEADER = "write [{key}] or [[{key}]]"
 _CAUSES = (
     _Cause("", r".*\r.*", "a line ends with CR alone; save the file with the line ends LF or CRLF"),
     _Cause(
@@ -63,8 +63,17 @@ _CAUSES = (
     _Cause("Invalid value", r".*,\s*,.*", "a comma is there twice; keep one"),
     _Cause("", rf"{_KEY}:\s*(?P<value>.+)", "{key} has a colon; write {key} = {value}"),
     _Cause("Invalid value", rf"{_KEY}={_END}", "{key} has no value; write one after the ="),
-    _Cause("", rf"\s*\[[^][]*{_END}|\s*\[\[[^]]*\]?{_END}", f"a header lacks a bracket; {_HEADER}"),
-    _Cause("", r"\s*\[[^]]*\]\]+.*|\s*\[{3}.*", f"a header has too many brackets; {_HEADER}"),
+    _Cause("", rf"\s*\[\[?\s*\]?{_END}", "a header has no name; write one in its brackets"),
+    _Cause(
+        "",
+        rf"\s*\[(\[)?\s*(?P<key>[^][#]*?)\s*(?(1)\]?){_END}",
+        f"a header lacks a bracket; {_HEADER}",
+    ),
+    _Cause(
+        "",
+        r"\s*(?=\[[^]]*\]\]|\[{3})\[+\s*(?P<key>[^][]*?)\s*(\].*)?",
+        f"a header has too many brackets; {_HEADER}",
+    ),
     _Cause(
         _VALUE,
         rf"{_KEY}=\s*(?P<value>True|False|TRUE|FALSE){_END}",

@@ -11,7 +11,7 @@ import threading
 from io import BytesIO, StringIO, TextIOWrapper
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from commands import TOY_IS_RUN
@@ -20,7 +20,7 @@ from recordings import recorded
 from terminals import on_terminal
 
 from multidrop.cli import run
-from multidrop.cli.poll import LiveTable
+from multidrop.cli.poll import Keys, LiveTable
 from multidrop.cli.support.polling import Triggering, trigger_picture
 from multidrop.control import exit_hook
 from multidrop.plant.loader import load_plant
@@ -79,6 +79,15 @@ def test_key_m_adds_a_comment_and_key_t_adds_a_trigger(plant: Path, tmp_path: Pa
     rows = recorded(tmp_path / "trip.00000001.csv")
     events = [(row.register, row.status) for row in rows if row.drive == "event"]
     assert events == [("comment", "key k, \u044f"), ("trigger", "key t")]
+
+
+def test_key_m_without_a_recording_says_that_the_comment_would_be_lost() -> None:
+    poller, table = SimpleNamespace(mark=pytest.fail), SimpleNamespace(note="")
+    keys = Keys(cast(Any, poller), cast(Any, table), lambda seconds: "", has_trigger=False, is_recorded=False)
+    assert table.note == "Ctrl-C: end"
+    keys.press("m")
+    assert table.note.startswith("no comment: nothing is recorded; start poll with --out FILE")
+    keys.press("\r")
 
 
 @pytest.mark.long

@@ -88,9 +88,11 @@ def mistake(data: str | bytes) -> tuple[int, str]:
         # tomllib's own error is shown for other mistakes
         ("a = 1\nb = 2026-02-30", 2, "Invalid date or datetime"),
         # headers
-        ("[[line]\na = 1", 1, "a header lacks a bracket; write [serve] or [[line]]"),
-        ("[serve\na = 1", 1, "a header lacks a bracket; write [serve] or [[line]]"),
-        ("[serve]]\na = 1", 1, "a header has too many brackets; write [serve] or [[line]]"),
+        ("[[line]\na = 1", 1, "a header lacks a bracket; write [line] or [[line]]"),
+        ("[[phase.step # cool\na = 1", 1, "a header lacks a bracket; write [phase.step] or [[phase.step]]"),
+        ("[serve\na = 1", 1, "a header lacks a bracket; write [serve] or [[serve]]"),
+        ("[serve]]\na = 1", 1, "a header has too many brackets; write [serve] or [[serve]]"),
+        ("[[\na = 1", 1, "a header has no name; write one in its brackets"),
         (
             "[serve]\na = 1\n[serve]\nb = 1",
             3,

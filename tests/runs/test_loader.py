@@ -127,6 +127,27 @@ def test_each_mistake_is_reported_in_one_sentence_that_names_its_line(
     assert sentence in first
 
 
+def test_mistakes_are_listed_by_line_and_none_follows_from_another(tmp_path: Path) -> None:
+    text = (
+        'abort.silence = "soon"\n[[phase]]\nname = "a"\n[[phase.step]]\ndwel = "1 s"\n'
+        'frequncy = { fan = 1 }\nrate = 1\n[[phase.step]]\nstart = ["fen"]\n[[phase.step]]\n[aborted]\n'
+    )
+    with pytest.raises(ValueError) as mistakes:  # noqa: PT011 (the sentences are compared below)
+        load_test(write_test(tmp_path, text, fan=CHE))
+    found = [sentence.split(":", 2)[1:] for sentence in str(mistakes.value).splitlines()]
+    assert [int(line) for line, _ in found] == [2, 6, 7, 10, 11, 12]
+    for (_, sentence), part in zip(
+        found, ["silence", "'dwel'", "'frequncy'", "'fen'", "does nothing", "'aborted'"], strict=True
+    ):
+        assert part in sentence
+
+
+def test_a_plant_file_instead_of_a_test_file_is_named_with_its_command(tmp_path: Path) -> None:
+    plant = write_test(tmp_path, "").with_name("plant.toml")
+    with pytest.raises(ValueError, match=r"plant\.toml: this is a plant file; poll .* `multidrop poll .*`"):
+        load_test(plant)
+
+
 def test_a_condition_compares_a_computed_channel(tmp_path: Path) -> None:
     path = write_test(tmp_path, STEP + 'until = "fan.double > 3"\nwithin = "1 s"')
     with (tmp_path / "plant.toml").open("a") as plant:

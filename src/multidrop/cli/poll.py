@@ -129,7 +129,11 @@ def follow(
         if table:
             stack.enter_context(table.showing_warnings())
         taps = _Taps(session.poller, arguments, stack)
-        keys = stack.enter_context(Keys.of_terminal(session.poller, table, how)) if table else None
+        keys = (
+            stack.enter_context(Keys.of_terminal(session.poller, table, how, arguments.out))
+            if table
+            else None
+        )
         wait = keys.wait if keys else time.sleep
         with session.poller, beside(session.poller):
             for _ in _ticks(arguments.seconds, session.interruption, wait):
@@ -345,12 +349,22 @@ class LiveTable:
 
 
 class Keys:
-    """The keys of `poll`: `m` starts a comment, which gets the time of this key press; `t` is a trigger."""
+    """The keys of `poll`: `m` starts a comment, which gets the time of this key press; `t` is a trigger.
+
+    A comment is a row of the recording, so without one the key `m` only shows NO_RECORDING.
+    """
 
     def __init__(
-        self, poller: Poller, table: LiveTable, wait_for_key: Callable[[float], str], *, has_trigger: bool
+        self,
+        poller: Poller,
+        table: LiveTable,
+        wait_for_key: Callable[[float], str],
+        *,
+        has_trigger: bool,
+        is_recorded: bool,
     ) -> None:
         self._has_trigger = has_trigger
+        self._is_recorded = is_recorded
         self._poller = poller
         self._table = table
         self._wait_for_key = wait_for_key
@@ -361,14 +375,15 @@ class Keys:
     @classmethod
     @contextmanager
     def of_terminal(
-        cls, poller: Poller, table: LiveTable, how: Rotation | Triggering | None
+        cls, poller: Poller, table: LiveTable, how: Rotation | Triggering | None, out: Path | None
     ) -> Iterator[Keys | None]:
         """Yield the keys of this terminal; None if its keys cannot be read, as in the background."""
         if not (keys_are_readable() and _is_in_foreground()):
             yield None
             return
         with terminal_keys() as wait_for_key:
-            yield cls(poller, table, wait_for_key, has_trigger=isinstance(how, Triggering))
+            has_trigger = isinstance(how, Triggering)
+            yield cls(poller, table, wait_for_key, has_trigger=has_trigger, is_recorded=out is not None)
         table.note = ""
 
     def wait(self, seconds: float) -> None:
@@ -382,6 +397,9 @@ class Keys:
 
     def press(self, key: str) -> None:
         if self._text is None:
+            if key == "m" and not self._is_recorded:
+                self._table.note = NO_RECORDING
+                return
             if key == "m":
                 self._text, self._begun = "", time.monotonic()
             elif key == "t" and self._has_trigger:
@@ -399,12 +417,14 @@ class Keys:
         self._show()
 
     def _show(self) -> None:
+        comment = "m: add a comment; " if self._is_recorded else ""
         trigger = "t: trigger; " if self._has_trigger else ""
-        keys = f"m: add a comment; {trigger}Ctrl-C: end"
+        keys = f"{comment}{trigger}Ctrl-C: end"
         self._table.note = keys if self._text is None else f"comment: {self._text}_"
 
 
 BACKSPACES = ("\x7f", "\b")
+NO_RECORDING = "no comment: nothing is recorded; start poll with --out FILE; Ctrl-C: end"
 
 
 def _is_in_foreground() -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,9 @@ _STEP = {
 }
 
 
+NEEDS = {"rate": "frequency", "direction": "start", "within": "until", "until": "within"}  # key: another key
+
+
 def load_test(path: Path | str) -> RunPlan:
     """Return the test that the file describes.
 
@@ -57,6 +61,11 @@ def load_test(path: Path | str) -> RunPlan:
     path = Path(path)
     place = TomlPlace.in_file(path)
     document = place.attempt(read_document, path, "test file")
+    if document and "line" in document and "phase" not in document:
+        raise ValueError(
+            f"{path}: this is a plant file; poll its drives with `multidrop poll {path}`, or write a test "
+            f'file with plant = "{path.name}"'
+        )
     given = {} if document is None else place.check(document, _TEST)
     if "plant" not in given:
         raise ValueError("\n".join(place.config_errors))
@@ -75,7 +84,7 @@ def load_test(path: Path | str) -> RunPlan:
             f"the phases have {len(steps)} steps, repetitions included; at most {MOST_STEPS} fit", "phase"
         )
     if place.config_errors:
-        raise ValueError("\n".join(grouped(place.config_errors)))
+        raise ValueError("\n".join(grouped(sorted(place.config_errors, key=attrgetter("line")))))
     return RunPlan(plant, tuple(steps), limits, path)
 
 
@@ -123,6 +132,7 @@ def _steps(table: Any, place: TomlPlace, plant: Plant) -> Iterator[RunStep]:
     """Yield the step that a table describes. If the table lists several frequencies, yield a step for
     each.
     """
+    errors = len(place.config_errors)
     given = place.check(table, _STEP)
     for key in ("frequency", "write"):
         given[key] = {name: one for name, one in given.get(key, {}).items() if _find(plant, name, place, key)}
@@ -145,7 +155,10 @@ def _steps(table: Any, place: TomlPlace, plant: Plant) -> Iterator[RunStep]:
         within=duration_of(given, "within", place) or 0.0,
         rate=_rate(given, place),
     )
-    _check_keys(given, step, place)
+    if len(place.config_errors) == errors:  # without misspelt keys and ignored values
+        _check_keys(given, step, place)
+    for key, sentence in contradictions(step, given["frequency"]):
+        place.wrong(sentence, key)
     _check_commands(step, place, plant)
     if step.rate:
         for name in given["frequency"]:
@@ -179,19 +192,12 @@ def _rate(given: Mapping[str, Any], place: TomlPlace) -> float | None:
 
 
 def _check_keys(given: Mapping[str, Any], step: RunStep, place: TomlPlace) -> None:
-    """Add an error for each invalid combination of a step's keys."""
-    for key, needs in (
-        ("rate", "frequency"),
-        ("direction", "start"),
-        ("within", "until"),
-        ("until", "within"),
-    ):
-        if given.get(key) and not given.get(needs):
-            place.wrong(f"{key} needs {needs}; add {_STEP[needs].example}", key)
-    if not (step.drives or given["frequency"] or step.dwell or step.until):
+    """Add an error for each key that needs another one, or else for a step that does nothing."""
+    lacking = [(key, needs) for key, needs in NEEDS.items() if given.get(key) and not given.get(needs)]
+    for key, needs in lacking:
+        place.wrong(f"{key} needs {needs}; add {_STEP[needs].example}", key)
+    if not (lacking or step.drives or given["frequency"] or step.dwell or step.until):
         place.wrong(f"the step does nothing; add a command, or {_STEP['dwell'].example}")
-    for key, sentence in contradictions(step, given["frequency"]):
-        place.wrong(sentence, key)
 
 
 def _each(frequency: Mapping[str, Any], place: TomlPlace) -> Iterator[dict[str, float]]:
