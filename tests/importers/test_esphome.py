@@ -175,7 +175,7 @@ def test_package_without_its_controller_has_an_unknown_address(run: Run, tmp_pat
 @table(
     ("text", "reason"),
     [
-        (CONTROLLER, "`modbus_controller:` has no entity: none of sensor, binary_sensor"),
+        (CONTROLLER, "has no entity with `platform: modbus_controller` in sensor, binary_sensor"),
         ("modbus_controller: {address: 300}\n", "modbus_controller: address = '300' is not a unit id"),
         (node(FAST, VOLTS.replace("read", "custom")), "volts: its register_type custom is not known"),
         (node(FAST, VOLTS.replace("address: 3", "id: 3")), "volts: it has no address"),

@@ -134,7 +134,7 @@ def test_slave_ids_0_and_255_are_valid_addresses(tmp_path: Path, unit: int) -> N
     ("text", "reason"),
     [
         ("[agent]\n", "has no [[inputs.modbus]] (Telegraf): it has agent"),
-        (HEAD, "[[inputs.modbus]] has no field: none of holding_registers"),
+        (HEAD, "[[inputs.modbus]] has no field in holding_registers"),
         (HEAD + 'coils = [{ name = "a" }]\n', "a: it has no address"),
         (
             f'{HEAD}[[inputs.modbus.request]]\nfields = [{{ name = "a", address = 1, type = "STRING" }}]\n',

@@ -1,4 +1,4 @@
-"""Computed channels: values that are computed from polled registers. Pure: no I/O and no clock."""
+"""Computed channels: values that are computed from polled registers. No I/O and no clock."""
 
 from multidrop.channels.channel_set import MOST_NAME as MOST_NAME
 from multidrop.channels.channel_set import OLD as OLD

@@ -1,4 +1,4 @@
-"""ChannelSet: compute the rows of a plant's channels from the rows of its registers."""
+"""ChannelSet: compute the rows of a plant's channels from the polled rows of its registers."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from multidrop.channels.program import Channel, DriveSeries, Program, SeriesTabl
 from multidrop.channels.units import unit_of
 from multidrop.core import Status
 
-MOST_CHANNELS = 1000  # limit of a plant's channels
-MOST_NAME = 100  # limit of the characters in a channel's name, and in its unit
-UNSEEN = -1  # status of a series that has had no row yet
-OLD = -2  # status of a series whose newest value is too old, because no further row has come
+MOST_CHANNELS = 1000  # limit of channels in a plant
+MOST_NAME = 100  # limit of characters in a channel's name, and in its unit
+UNSEEN = -1  # status of a register or channel that has had no row yet
+OLD = -2  # status of a register or channel whose newest value is too old
 
 
 class Mistake(NamedTuple):
-    """A mistake in a channel, as a sentence."""
+    """A mistake in a channel, described in one sentence."""
 
     drive: str
     channel: str
@@ -30,10 +30,10 @@ class Mistake(NamedTuple):
 
 
 class SlotRow(NamedTuple):
-    """A row of a register or channel, which `slot` identifies.
+    """A row of a register or channel; `slot` is its index.
 
-    Status 0 means that the row has a value; any other status is a miss. A channel's row has the status OLD
-    if an input has had no row for too long.
+    With the status 0 the row has a value, with any other status it has none. A channel's row has the status
+    OLD if a register that it uses has had no row for too long.
     """
 
     slot: int
@@ -45,9 +45,12 @@ class SlotRow(NamedTuple):
 
 
 class Outage(NamedTuple):
-    """A period that the totals of a channel leave out, because no value was known. It ends at `end_ns`."""
+    """A period that is not included in a channel's totals, because a value was unknown.
 
-    channel: str  # written as DRIVE.CHANNEL
+    It ends at `end_ns`.
+    """
+
+    channel: str  # DRIVE.CHANNEL, such as "pump-1.energy"
     end_ns: int  # UTC
     seconds: float
 
@@ -68,9 +71,9 @@ class _Computed(NamedTuple):
 
 
 class ChannelSet:
-    """The valid channels of these drives; `mistakes` lists the mistakes of the invalid channels.
+    """The valid channels of drives. `mistakes` lists the mistakes in invalid channels.
 
-    A series is a register or a channel. `slots` maps the drive and name of each series to its slot, an index.
+    A series is a register or a channel. `slots` maps the drive and the name of each series to its index.
     Registers have the first slots.
     """
 
@@ -78,7 +81,7 @@ class ChannelSet:
         self.mistakes: list[Mistake] = []
         series = SeriesTable(drives)
         self.slots: Mapping[tuple[str, str], int] = series.slots
-        self.inputs = dict(series.slots)  # the slots of registers only
+        self.inputs = dict(series.slots)  # indexes of the registers only
         self._computed: list[_Computed] = []
         self._drive_of = [drive for drive, _ in series.slots]
         for drive in drives:
@@ -88,14 +91,15 @@ class ChannelSet:
         self._values: list[Value] = [None] * size
         self._statuses = [UNSEEN] * size
         self._sent_ns = [0] * size
-        self._known_ns: dict[int, int] = {}  # monotonic time of each slot's newest known value
-        self._gaps: set[int] = set()  # slots of channels with an input whose value is too old
+        self._known_ns: dict[int, int] = {}  # by index: the monotonic time of the newest known value
+        self._gaps: set[int] = set()  # indexes of channels that use a value which is too old
         self._holds_ns = [round(hold_s * 1e9) for hold_s in series.holds_s]
-        # by slot of a channel whose totals were restored: UTC in ns of the newest value in these totals
+        # by index of a channel with restored totals: the UTC time in ns of the newest value in these totals
         self._left_off: dict[int, int] = {}
-        # by slot of a channel with totals: UTC in ns of the channel's newest value
+        # by index of a channel with totals: the UTC time in ns of its newest value
         self._newest_ns: dict[int, int] = {}
-        self.outages: list[Outage] = []  # the caller empties this list
+        # periods without values that have ended; the caller empties this list
+        self.outages: list[Outage] = []
 
     def _add(self, drive: DriveSeries, channel: Channel, series: SeriesTable) -> None:
         try:
@@ -109,7 +113,7 @@ class ChannelSet:
             self._computed.append(_Computed(drive.name, channel, program, slot))
 
     def _checked(self, drive: DriveSeries, channel: Channel, series: SeriesTable) -> Program:
-        """Check a channel and return its program. Raises ValueError for a mistake."""
+        """Check a channel and compile its expression to a program. Raises ValueError for a mistake."""
         if not channel.name.isidentifier():
             raise ValueError(f"{channel.name!r} is not a valid channel name; use letters, digits and _")
         if max(len(channel.name), len(channel.unit)) > MOST_NAME:
@@ -128,23 +132,23 @@ class ChannelSet:
 
     @property
     def holds_s(self) -> Mapping[tuple[str, str], float]:
-        """The seconds for which each channel's value stays current, by drive and channel name.
+        """The seconds for which a value of each channel is valid, by drive and channel name.
 
-        A channel's value stays current for as long as that of its slowest input.
+        It is valid for as long as that of its slowest register.
         """
         return {(one.drive, one.channel.name): one.program.hold_s for one in self._computed}
 
     # ---- rows ----
 
     def compute(self, rows: Iterable[SlotRow]) -> list[SlotRow]:
-        """Compute and return the rows of channels that follow from these rows of registers.
+        """Return the rows of channels that are computed from these rows of registers.
 
         A channel gets a row for each request that read one of its registers, with the time of that request.
-        If the newest row of a register is a miss, the channel's row is a miss with the same status. A
-        register that has had no row for too long makes the channel's row a miss with the status OLD.
+        If the newest row of a register has no value, the channel's row has none either, and the same status.
+        If a register has had no row for too long, the channel's row has no value and the status OLD.
         """
         found: list[SlotRow] = []
-        group: dict[int, SlotRow] = {}  # the rows of one request, by slot
+        group: dict[int, SlotRow] = {}  # rows of one request, by index of the register
         key: tuple[int, str] | None = None
         for row in rows:
             before, key = key, (row.monotonic_ns, self._drive_of[row.slot])
@@ -187,10 +191,10 @@ class ChannelSet:
             yield row
 
     def _expire(self, computed: _Computed, now_ns: int) -> None:
-        """Note an outage for each input of a channel whose newest value is too old at `now_ns` (monotonic).
+        """Start an outage of each value that a channel uses and that is too old at `now_ns` (monotonic).
 
-        Functions with a memory, such as integrals, leave out the time of an outage. The value of an input in
-        an outage is unknown. Its status is OLD, unless its newest row is a miss with another status.
+        During an outage the value is unknown, and functions with a memory, such as integrals, do not count
+        the time. The status is OLD, unless the newest row already has no value for another reason.
         """
         gone = set()
         for slot in computed.program.slots:
@@ -215,9 +219,9 @@ class ChannelSet:
         fresh.add(row.slot)
 
     def _status(self, slots: Iterable[int]) -> int:
-        """Return the status of the newest miss among these series.
+        """Return the status of the newest row without a value among these series.
 
-        Without a miss, return UNSEEN if a series has no row, else OK.
+        If each row has a value, return UNSEEN if a series has no row yet, else OK.
         """
         misses = [slot for slot in slots if self._statuses[slot] not in (Status.OK, UNSEEN)]
         if misses:
@@ -225,7 +229,10 @@ class ChannelSet:
         return min(self._statuses[slot] for slot in slots)
 
     def _note_outages(self, computed: _Computed, row: SlotRow) -> None:
-        """If an outage ended with this row, add it to `outages`. A restart is an outage too."""
+        """If an outage of this channel ended with this row, add it to `outages`.
+
+        A restart counts as an outage.
+        """
         totals = computed.program.totals
         if not totals or any(self._values[slot] is None for slot in computed.program.slots):
             return
@@ -241,9 +248,9 @@ class ChannelSet:
     # ---- totals ----
 
     def take_over(self, before: ChannelSet, replaced: Collection[str] = ()) -> None:
-        """Continue the totals of channels that `before` also has, with the same expression and units.
+        """Continue the totals of channels that `before`, an earlier set, has with equal expression and units.
 
-        `replaced` has the names that other drives have taken over. For functions with a memory, an outage
+        `replaced` are names that now belong to other drives. For functions with a memory, an outage
         lies between the last value of the old drive and the first value of the new drive.
         """
         known = {(one.name, one.channel, *one.program.units): one for one in before._computed}
@@ -259,11 +266,11 @@ class ChannelSet:
         changed = {slot for (drive, _), slot in self.inputs.items() if drive in replaced}
         for one in self._computed:
             if not one.program.slots.isdisjoint(changed):
-                changed.add(one.slot)  # later channels may use this channel
+                changed.add(one.slot)  # a channel that was declared later may use this one
                 one.program.interrupt(changed)
 
     def totals(self) -> dict[str, Any]:
-        """Return the integrals and counts of all kept channels, for `restore`."""
+        """Return the integrals and counts of all channels that are kept over restarts, for `restore`."""
         return {
             one.name: {
                 "value": one.channel.value,
@@ -276,10 +283,9 @@ class ChannelSet:
         }
 
     def restore(self, kept: Mapping[str, Any]) -> list[str]:
-        """Continue with these stored totals. Return the channels that start at 0, because their expression
-        was changed.
+        """Continue with totals that were stored before a restart. Return the channels that start at 0.
 
-        `kept` may come from a damaged file: a channel whose totals are damaged starts at 0, too.
+        These are the channels whose expression was changed, or whose totals are damaged in the file.
         """
         changed = []
         for one in self._computed:
@@ -300,7 +306,7 @@ class ChannelSet:
 
 
 def _numbers(about: Any, computed: _Computed) -> list[list[float]] | None:
-    """Return the stored numbers of a channel's totals; None if they are damaged or of another expression."""
+    """Return a channel's stored totals as numbers; None if damaged, or of another expression."""
     program = computed.program
     if not isinstance(about, dict) or about.get("value") != computed.channel.value:
         return None

@@ -1,4 +1,4 @@
-"""The operators and functions of expressions: their units, and their values.
+"""The operators and functions of channel expressions, with the units and values of their results.
 
 A value that is not known is None. Pure functions then return None. Functions with a memory, such as
 `integral`, get each value with the time of its request, and note outages: times without a known value.
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from multidrop.channels.units import NUMBER, SECOND, ValueUnit, unit_of
 
 Value = float | None
-# the operands' units; None for a plain number, which fits any unit
+# units of the operands; None for a plain number, which fits every unit
 Units = Sequence[ValueUnit | None]
 
 
@@ -31,7 +31,7 @@ class Typed(NamedTuple):
 
 
 def _alike(units: Units, what: str) -> Typed:
-    """Convert all operands to the unit of the first operand that has a unit.
+    """Return a result in the unit of the first operand that has a unit; the others are converted to it.
 
     Raises ValueError if one cannot be converted.
     """
@@ -88,7 +88,7 @@ def _root(units: Units) -> Typed:
     for base, exponent in unit.dimensions:
         for _ in range(abs(exponent) // 2):
             root = root.times(unit_of(base)) if exponent > 0 else root.per(unit_of(base))
-    # the factor converts the operand to base units before the root is taken
+    # the operand is converted to base units before its root is computed
     return Typed(root, (unit.factor,))
 
 
@@ -184,19 +184,20 @@ class Curve:
 
 
 class StatefulFunction:
-    """A function with a memory: call `take` once for each known value, in the order of time. `kept` has the
-    numbers to store in a state file. If two values are further apart than `hold_ns`, or if `is_interrupted`
-    was set, an outage lies between them.
+    """A function with a memory. Call `take` once for each known value, in the order of time.
+
+    `kept` has the numbers to store in a state file. If two values are further apart than `hold_ns`, or if
+    `is_interrupted` was set, an outage lies between them.
     """
 
-    is_total = True  # True if the value is kept over restarts
+    is_total = True  # True if the memory is kept over restarts
     typed: Callable[[Units], Typed]
 
     def __init__(self) -> None:
         self.hold_ns = 0
-        self.is_interrupted = False  # True if an outage, however short, precedes the next value
+        self.is_interrupted = False  # True if an outage of any length precedes the next value
         self.result: Value = None
-        self.outage_s = 0.0  # total length in s of the outages since the caller last set this to 0
+        self.outage_s = 0.0  # total s of the outages since the caller last set this to 0
         self._last_ns: int | None = None
         self._last = 0.0
 
@@ -204,7 +205,7 @@ class StatefulFunction:
         """Process a value whose request was sent at `now_ns` (monotonic)."""
         if self._last_ns is None:
             self._first(value)
-        # ignore an older row, because rows of several lines may be out of order
+        # rows of several lines may be out of order, so ignore older ones
         elif now_ns <= self._last_ns:
             return
         else:
@@ -217,7 +218,7 @@ class StatefulFunction:
         self._last_ns, self._last, self.is_interrupted = now_ns, value, False
 
     def take_over(self, before: StatefulFunction) -> None:
-        """Continue with the memory of the same function in an earlier program."""
+        """Continue with the memory of the same function in an earlier program of the channel."""
         vars(self).update(vars(before) | {"hold_ns": self.hold_ns})
 
     def _first(self, value: float) -> None: ...
@@ -246,7 +247,7 @@ class Integral(StatefulFunction):
 
     def _step(self, value: float, seconds: float) -> None:
         total = (self.result or 0.0) + (self._last + value) / 2 * seconds
-        if isfinite(total):  # otherwise one absurdly large value would destroy the total
+        if isfinite(total):  # one absurdly large value must not destroy the total
             self.result = total
 
     @property
@@ -266,7 +267,7 @@ class EdgeCount(StatefulFunction):
     def __init__(self) -> None:
         super().__init__()
         self.result = 0.0
-        # the previous value; None before the first value, which is never counted
+        # the previous value; None before the first value, which is not counted
         self._was: float | None = None
 
     def _first(self, value: float) -> None:
@@ -323,5 +324,5 @@ MEMORIES: dict[str, type[StatefulFunction]] = {
     "count": EdgeCount,
     "changed": Changed,
 }
-TABLE, AS = "table", "as"  # functions whose arguments include a unit
+TABLE, AS = "table", "as"  # functions with a unit among their arguments
 NAMES = (*(name for name in FUNCTIONS if name.isalpha()), *MEMORIES, TABLE, AS)

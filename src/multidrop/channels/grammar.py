@@ -47,7 +47,7 @@ class ReferenceStep(NamedTuple):
 
 
 class CallStep(NamedTuple):
-    """A function or an operator, applied to the last `arity` operands. A minus sign is named "-1"."""
+    """A call of a function or operator with the last `arity` operands. A minus sign is named "-1"."""
 
     column: int
     name: str
@@ -79,7 +79,7 @@ _TOKEN = re.compile(
 )
 
 
-# operators of other languages, and what to write in place of them
+# operators of other languages, each with the advice that completes the error
 _INSTEAD = {sign: f"; write {word}" for sign, word in (("=", "=="), ("&", "and"), ("|", "or"), ("!", "not"))}
 
 
@@ -106,7 +106,7 @@ def _tokens(text: str) -> Iterator[_Token]:
 
 
 def parse(text: str) -> list[Step]:
-    """Return the steps of an expression. Raises ExpressionError."""
+    """Return the steps of an expression. Raises ExpressionError for a mistake."""
     if len(text) > MOST_CHARACTERS:
         raise ExpressionError(MOST_CHARACTERS, f"the expression has more than {MOST_CHARACTERS} characters")
     return _ExpressionParser(text).steps
@@ -138,7 +138,7 @@ class _ExpressionParser:
         self._next()
 
     def _expression(self, least: int) -> None:
-        """Parse an expression whose operators have a precedence of at least `least`."""
+        """Parse an expression that has only operators with a precedence of at least `least`."""
         self._depth += 1
         if self._depth > MOST_DEPTH:
             raise ExpressionError(self._token.column, f"more than {MOST_DEPTH} levels are nested; split it")
@@ -191,7 +191,10 @@ class _ExpressionParser:
             self.steps.append(CallStep(sign.column, SIGN, 1))
 
     def _name(self, token: _Token) -> None:
-        """Parse a call if "(" follows the name; else the name is a register of the channel's drive."""
+        """Parse a function call if "(" follows the name.
+
+        Otherwise it names a register of the channel's drive.
+        """
         if self._token.text != "(":
             self.steps.append(ReferenceStep(token.column, "", token.text))
             return

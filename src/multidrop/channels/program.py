@@ -1,4 +1,4 @@
-"""Programs: expressions that are checked against the series of a plant, and that compute values."""
+"""Programs: expressions that were checked against a plant's registers and channels, and compute values."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ from multidrop.drive.register import Access, Register
 from multidrop.drive.register import Table as AddressTable
 from multidrop.printable import did_you_mean
 
-COMPUTED = AddressTable("computed channel", None, None)  # for channels, which have no addresses
+# placeholder for the address table of a channel, which has no address
+COMPUTED = AddressTable("computed channel", None, None)
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Channel:
 
     @cached_property
     def register(self) -> Register[float]:
-        """The channel as a register for tables of names and units; it has no address and is never read."""
+        """The channel as a register, which gives its name and unit. It has no address and is never read."""
         register = Register[float](
             0,
             Access.READING,
@@ -57,28 +58,31 @@ class Channel:
 
 
 class DriveSeries(NamedTuple):
-    """A drive's registers and channels; each register with its unit, and the s for which it stays current."""
+    """A drive's registers and channels.
+
+    Each register has its unit, and the s for which its value is valid.
+    """
 
     name: str
     polled: Mapping[str, tuple[str, float]]
-    known: Collection[str]  # names of all registers of the family, polled or not
+    known: Collection[str]  # names of all registers of the drive's family, polled or not
     channels: Sequence[Channel]
 
 
 class _Operand(NamedTuple):
-    """An operand on the stack while an expression is checked: its unit, and the series that it needs."""
+    """An operand of an expression that is being checked: its unit, and the registers and channels in it."""
 
     column: int
     unit: ValueUnit | None
     slots: frozenset[int]
-    text: str | None = None  # the text, if the operand is a quoted text
-    number: float | None = None  # the number, if the operand is a number of the expression
+    text: str | None = None  # the text, if the operand is a text in quotes
+    number: float | None = None  # the number, if the operand is a number
 
 
 class _Memorised(NamedTuple):
-    """An instruction: call a function with a memory, such as an integral.
+    """An instruction to call a function with a memory, such as an integral.
 
-    `slots` are the slots of the series in the function's operand.
+    `slots` are the indexes of the registers and channels in its operand.
     """
 
     memory: StatefulFunction
@@ -86,9 +90,9 @@ class _Memorised(NamedTuple):
 
 
 class _Applied(NamedTuple):
-    """An instruction: call a pure function.
+    """An instruction to call a function without a memory. Each factor is multiplied with its operand.
 
-    `factors` multiply the operands; it is empty if all factors are 1.
+    `factors` is empty if all factors are 1.
     """
 
     value: Any
@@ -97,7 +101,7 @@ class _Applied(NamedTuple):
 
 
 class _Load(NamedTuple):
-    """An instruction: load the newest value of a series."""
+    """An instruction to load the newest value of a register or channel."""
 
     slot: int
 
@@ -106,9 +110,9 @@ _Instruction = float | _Load | _Applied | _Memorised
 
 
 class SeriesTable:
-    """The series of a plant, by drive and name.
+    """The registers and channels of a plant, by drive and name.
 
-    Each series has a slot (an index), a unit, and a time in s for which its values stay current.
+    Each has an index, a unit, and a time in s for which its values are valid.
     """
 
     def __init__(self, drives: Iterable[DriveSeries]) -> None:
@@ -127,7 +131,10 @@ class SeriesTable:
         return slot
 
     def find(self, reference: ReferenceStep, own: str) -> int:
-        """Return the slot of a reference in an expression of the drive `own`. Raises ExpressionError."""
+        """Return the index of the register or channel that an expression of the drive `own` names.
+
+        Raises ExpressionError if there is none.
+        """
         drive = reference.drive or own
         if (drive, reference.name) in self.slots:
             return self.slots[drive, reference.name]
@@ -147,11 +154,11 @@ class SeriesTable:
 
 
 class Program:
-    """An expression that was checked and compiled. Raises ExpressionError for a mistake."""
+    """A checked and compiled expression. Raises ExpressionError for a mistake in the expression."""
 
     def __init__(self, text: str, own: str, series: SeriesTable, unit: str = "") -> None:
         self.memories: list[StatefulFunction] = []
-        self.units: list[str] = []  # the unit of each function's result, in the order of `memories`
+        self.units: list[str] = []  # unit of the result of each function in `memories`
         self._instructions: list[_Instruction] = []
         self._own, self._series = own, series
         stack: list[_Operand] = []
@@ -203,7 +210,7 @@ class Program:
             stack.append(_Operand(step.column, unit, frozenset().union(*(one.slots for one in operands))))
 
     def _call(self, call: CallStep, operands: list[_Operand]) -> ValueUnit | None:
-        """Append the instruction of a call; return the unit of the call's result."""
+        """Append the instruction for a call. Return the unit of the result, or None for a plain number."""
         if call.name == TABLE:
             return self._table(operands)
         if call.name == AS:
@@ -232,7 +239,10 @@ class Program:
         return typed.unit
 
     def _table(self, operands: list[_Operand]) -> ValueUnit:
-        """Replace the instructions for a table's points by one for the table; return its result's unit."""
+        """Replace the instructions for the points of a table by one instruction.
+
+        Return the unit of its result.
+        """
         if len(operands) < 2 or operands[0].text is not None or operands[1].text is None:
             raise ValueError('table takes a position, a unit and points: table(x, "m3/h", x1, y1, x2, y2)')
         points = operands[2:]
@@ -252,11 +262,11 @@ class Program:
 
     @property
     def totals(self) -> list[StatefulFunction]:
-        """The functions in `memories` whose values are kept over restarts."""
+        """The functions in `memories` that are kept over restarts."""
         return [memory for memory in self.memories if memory.is_total]
 
     def interrupt(self, slots: Collection[int]) -> None:
-        """Note an outage in each function with a memory whose operand needs one of these series."""
+        """Start an outage in each function with a memory that uses one of these registers or channels."""
         for step in self._instructions:
             if isinstance(step, _Memorised) and not step.slots.isdisjoint(slots):
                 step.memory.is_interrupted = True

@@ -1,4 +1,4 @@
-"""Units of expressions: their dimensions, and the factors between units of the same dimension.
+"""Units in expressions: their dimensions, and the factors that convert between units of one dimension.
 
 A unit that is not listed here, such as "pulses", has its own dimension. A revolution has one too: 1 rpm is
 not 1/60 Hz, and torque times speed in rpm is a power only with the factor 2 pi.
@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from functools import lru_cache
 from typing import NamedTuple
 
-Dimensions = tuple[tuple[str, int], ...]  # exponents by base unit, sorted; no exponent is 0
+Dimensions = tuple[tuple[str, int], ...]  # exponent of each base unit, sorted by unit; none is 0
 
 
 class ValueUnit(NamedTuple):
-    """A unit: `factor` times the product of the base units with these exponents."""
+    """A unit: the product of `factor` and of base units with exponents."""
 
     text: str
     factor: float = 1.0
@@ -53,8 +53,8 @@ class ValueUnit(NamedTuple):
         return self.dimensions == other.dimensions
 
 
-_INVERTED = str.maketrans("*·/", "//*")  # to divide by a/b, divide by a and multiply by b
-_LEAST_FACTOR = 1e-150  # least allowed factor; it keeps products and quotients of factors finite
+_INVERTED = str.maketrans("*·/", "//*")  # for a division by a/b: divides by a and multiplies by b
+_LEAST_FACTOR = 1e-150  # smallest factor of a unit, so that products and quotients of units stay finite
 NUMBER = ValueUnit("")
 SECOND = ValueUnit("s", 1.0, (("s", 1),))
 

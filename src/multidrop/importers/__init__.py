@@ -1,6 +1,6 @@
 """Convert register tables of other programs into family files.
 
-In the family file, a comment "gap: ..." marks each fact that the register table lacks.
+In the family file, a comment "gap: ..." marks each property of a register that the table does not state.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from multidrop.toml_document import DocumentError, parse_document, read_bounded
 __all__ = ["SUFFIXES", "ImportedDevice", "all_devices", "family_text", "plant_text", "read_devices"]
 
 MOST_BYTES = 5_000_000
-MOST_REASONS = 3  # limit of reasons listed in an error
+MOST_REASONS = 3  # limit of reasons in one error
 
 
 def read_devices(path: Path) -> list[ImportedDevice]:
-    """Return the devices in another program's file; its format follows from its suffix and contents.
+    """Return the devices in another program's file. Suffix and contents of the file show its format.
 
     The family file of each device is loadable. Raises ValueError if the format is unknown or no register can
     be imported, and ImportError for YAML if PyYAML is missing.
@@ -47,7 +47,7 @@ def read_devices(path: Path) -> list[ImportedDevice]:
 
 
 def _make_titles_unique(devices: list[ImportedDevice], stem: str) -> None:
-    """Change titles until no two devices have the same title and address."""
+    """Change titles until no two devices with the same address have the same title."""
     for device in devices:
         device.title = device.title or stem
     addresses = Counter(device.address for device in devices)
@@ -61,7 +61,10 @@ def _make_titles_unique(devices: list[ImportedDevice], stem: str) -> None:
 
 
 def all_devices(path: Path) -> list[ImportedDevice]:
-    """Return all devices, even those without importable registers. Raises the errors of `read_devices`."""
+    """Return all devices, including those without a register that can be imported.
+
+    Errors as in `read_devices`.
+    """
     read = _READERS.get(path.suffix.lower())
     if read is None:
         raise ValueError(f"{path}: its suffix is not one of {', '.join(_READERS)}")

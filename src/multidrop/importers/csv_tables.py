@@ -1,6 +1,7 @@
-"""CSV and TSV tables: layouts of ioBroker, modpoll and Neuron, and any table whose column names are known.
+"""Import CSV and TSV tables of ioBroker, modpoll and Neuron, and other tables with known column names.
 
-If programs use a column name with different meanings, the most frequent one is assumed and noted in `gaps`.
+If programs use a column name with different meanings, the most frequent meaning is assumed and noted in
+`gaps`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from multidrop.importers.numbers import (
     words_of,
 )
 
-COLUMNS = {  # by key: its column names in lower case and without _, the most specific first
+# by key of a register: the names of its column in lower case and without _, the most specific name first
+COLUMNS = {
     "name": (
         *("name", "register name", "signal name", "parameter name", "register", "description", "parameter"),
         *("tag", "signal", "variable", "point", "title"),
@@ -76,11 +78,12 @@ GAPS = frozenset(
     }
 )
 _SPARE = frozenset(alias for key in ("name", "note", "at") for alias in COLUMNS[key])
-# Columns that may affect a value. They include further columns for an imported key, which may contradict it.
+# Columns that may affect a register's value. They include second columns for one key, which may contradict
+# the first.
 _VALUE_COLUMNS = GAPS | frozenset(alias for aliases in COLUMNS.values() for alias in aliases) - _SPARE
 _KNOWN = IRRELEVANT | _VALUE_COLUMNS | _SPARE
 _NUMBER = re.compile(r"[0-9]{1,9}")
-_ORDERED = re.compile(r"(u?int(?:16|32|64)|float|double)(be|le|sw|sb)")  # ioBroker's type names
+_ORDERED = re.compile(r"(u?int(?:16|32|64)|float|double)(be|le|sw|sb)")  # type names of ioBroker
 _BYTES = {"uint8be": "0-7", "uint8le": "8-15", "int8be": "0-7", "int8le": "8-15"}
 _TEXT_ORDERS = {"string": "", "stringle": "BA", "string16": "B"}
 _SUFFIXES = {"be": "", "le": "DCBA", "sw": "CDAB", "sb": "BADC"}
@@ -91,7 +94,7 @@ _ORDERS = {
 _STEP_COLUMNS = ("factor", "scale", "divisor", "gain", "decimal")
 _WHOLE = re.compile(r"(?:(u|unsigned)|signed)?int(?:eger)?(\d*)(?:t|bits?)?")
 _BIT_TYPES = frozenset({"bit", "bool", "boolean", "binary", "coil", "flag"})
-_NAMED_TABLES = (  # prefix of a cell, and the table it means; the first matching prefix decides
+_NAMED_TABLES = (  # prefix of a cell and the table that it means; the first prefix that matches applies
     *(("holding", "holding"), ("hr", "holding"), ("4x", "holding")),
     *(("discrete", "discrete"), ("input status", "discrete"), ("input contact", "discrete")),
     *(("input coil", "discrete"), ("di", "discrete"), ("1x", "discrete"), ("contact", "discrete")),
@@ -101,8 +104,9 @@ _NAMED_TABLES = (  # prefix of a cell, and the table it means; the first matchin
 _FUNCTIONS = {1: "coil", 2: "discrete", 3: "holding", 4: "input"}
 _WRITES = {5: "coil", 6: "holding", 15: "coil", 16: "holding"}
 _BARE_HEX = re.compile(r"(?=[0-9]*[a-fA-F])[0-9a-fA-F]{1,8}")
-_REFERENCE = re.compile(r"[0134][0-9]{4,5}")  # 40001 or 400001: the table's digit, then a number from 1
-_ACCESS = {  # for each cell: whether the register can be read, and whether it can be written
+# addresses such as 40001 or 400001: a digit for the table, then a number from 1
+_REFERENCE = re.compile(r"[0134][0-9]{4,5}")
+_ACCESS = {  # by cell: whether the register can be read, and whether it can be written
     **dict.fromkeys(("r", "ro", "read", "readonly", "rd"), (True, False)),
     **dict.fromkeys(("w", "wo", "write", "writeonly"), (False, True)),
     **dict.fromkeys(
@@ -112,8 +116,8 @@ _ACCESS = {  # for each cell: whether the register can be read, and whether it c
 _SIGNED = {"signed": True, "yes": True, "y": True, "true": True, "s": True}
 _SIGNED |= {"unsigned": False, "no": False, "n": False, "false": False, "u": False}
 
-MOST_TITLES = 20  # limit of title lines before the column header
-MOST_UNKNOWN = 20  # limit of unknown columns named in a message
+MOST_TITLES = 20  # limit of lines above the line with the column names
+MOST_UNKNOWN = 20  # limit of unknown columns in one message
 
 Cells = Mapping[str, str]
 
@@ -144,7 +148,7 @@ def read_table(text: str, stem: str) -> list[ImportedDevice]:
 def _columns(rows: list[list[str]], stem: str) -> list[ImportedDevice]:
     layout = _Layout(rows)
     devices: dict[int | None, ImportedDevice] = {}
-    table = ImportedDevice(stem)  # used only to count the entries against their limit
+    table = ImportedDevice(stem)  # counts the entries, whose number is limited
     unknown: set[str] = set()
     for row in rows[1:]:
         cells, further = layout.cells(row), layout.further(row)
@@ -164,7 +168,7 @@ def _columns(rows: list[list[str]], stem: str) -> list[ImportedDevice]:
 
 
 class _Layout:
-    """The columns of a table, from its header line. Raises ValueError if no column is an address."""
+    """The columns of a table, as its header line names them. Raises ValueError without an address column."""
 
     def __init__(self, rows: list[list[str]]) -> None:
         header = [_plain_name(cell) for cell in rows[0]]
@@ -184,21 +188,23 @@ class _Layout:
         }
 
     def cells(self, row: list[str]) -> dict[str, str]:
-        """Return a row's imported cells, by key."""
+        """Return the cells of a row in imported columns, by key."""
         found = {key: row[place].strip() for key, place in self._at.items() if place < len(row)}
         if self._is_hex and re.fullmatch(r"[0-9a-fA-F]{1,8}", found.get("at", "")):
             found["at"] = f"0x{found['at']}"
         return found
 
     def further(self, row: list[str]) -> set[str]:
-        """Return the names of the columns that have a value in this row and are not imported."""
+        """Return the names of the columns that are not imported and have a value in this row."""
         return {name for place, name in self._others.items() if place < len(row) and row[place].strip()}
 
     def gaps(self, cells: Cells, further: set[str]) -> list[str]:
-        """Return sentences about a row's unknown facts, such as columns that may affect the value."""
+        """Return a sentence for each unknown property of a row, such as a column that may affect its
+        value.
+        """
         columns = further & _VALUE_COLUMNS
         if _parse_tag(cells["at"]):
-            columns -= {"precision"}  # a tag's precision is only the number of digits shown
+            columns -= {"precision"}  # the precision of a Neuron tag is only the number of digits shown
         found = [f"the column {name} was not carried over" for name in sorted(columns)]
         is_text = cells.get("type", "").lower().startswith("str")
         if cells.get("length") and is_text and self._length in ("length", "size"):
@@ -216,7 +222,7 @@ def _plain_name(cell: str) -> tuple[str, str]:
 
 
 def _places(header: list[str]) -> dict[str, int]:
-    """Return the indexes of the imported columns, by key; a column that fits two keys has the first."""
+    """Return the index of the column for each key. A column that fits two keys is used for the first."""
     found: dict[str, int] = {}
     for key, aliases in COLUMNS.items():
         for alias in aliases:
@@ -244,7 +250,7 @@ def _row(devices: dict[int | None, ImportedDevice], cells: Cells, gaps: list[str
 
 
 def _placed(name: str, cells: Cells, tag: _Tag | None) -> ImportedRegister:
-    """Return a register at the row's address; note in `gaps` if the table or the numbering is ambiguous."""
+    """Return a register at the row's address. An ambiguous table or numbering is noted in `gaps`."""
     register = ImportedRegister(name, 0)
     stated = _table(register, cells)
     given = tag.address if tag else cells["at"]
@@ -266,7 +272,10 @@ def _assume_number(register: ImportedRegister, stated: str | None) -> None:
 
 
 def _referred(register: ImportedRegister, given: str, stated: str | None, cells: Cells) -> tuple[int, str]:
-    """Return the address and table that 40001 means; a plain address if the table contradicts other cells."""
+    """Return the address and the table that a reference such as 40001 means.
+
+    If other cells contradict this table, the number is a plain address.
+    """
     address, table = Counting(None).address_in_cell(given, None, "holding")
     is_bit = table in ("coil", "discrete")
     if (stated not in (None, table)) or (is_bit and stated is None and _is_number(cells)):
@@ -283,7 +292,7 @@ def _referred(register: ImportedRegister, given: str, stated: str | None, cells:
 
 
 def _is_number(cells: Cells) -> bool:
-    """Return True if a row describes a number, not a bit."""
+    """Return True if the register of a row is a number and not a bit."""
     kind = cells.get("type", "").lower()
     if kind:
         return kind not in _BIT_TYPES
@@ -291,13 +300,13 @@ def _is_number(cells: Cells) -> bool:
 
 
 def _steps(cells: Cells) -> list[tuple[str, str]]:
-    """Return the row's scale columns with their cells, except scales of 1."""
+    """Return the row's cells in scale columns, except scales of 1, with the names of the columns."""
     stated = [(key, cells.get(key, "")) for key in _STEP_COLUMNS]
     return [(key, cell) for key, cell in stated if cell and (cell != "1" or key == "decimal")]
 
 
 def _table(register: ImportedRegister, cells: Cells) -> str | None:
-    """Return the table that a row states, or None; note in `gaps` if the cell is ambiguous or unknown."""
+    """Return the table that a row states, else None. An ambiguous or unknown cell is noted in `gaps`."""
     if function := cells.get("function"):
         codes = {int(code, 0) for code in re.findall(r"0x[0-9a-f]{1,4}|(?!0\d)\d{1,5}", function.lower())}
         tables = {(_FUNCTIONS | _WRITES).get(code) for code in codes}
@@ -329,7 +338,7 @@ def _named_table(given: str) -> str | None:
 
 
 def _fill(device: ImportedDevice, register: ImportedRegister, cells: Cells, tag: _Tag | None) -> None:
-    """Add the register as a text or a number, depending on its cells."""
+    """Add the register to the device, as a text or as a number."""
     kind = cells.get("type", "").lower()
     if note := cells.get("note"):
         register.details["note"] = note
@@ -351,7 +360,7 @@ def _fill(device: ImportedDevice, register: ImportedRegister, cells: Cells, tag:
 
 
 def _access(register: ImportedRegister, given: str) -> None:
-    """Set whether the register can be read and written; note an unknown word in `gaps`."""
+    """Set whether the register can be read and written. An unknown word is noted in `gaps`."""
     words = re.sub(r"subscribe|static|only|[^a-z]", "", given.lower())
     if not given:
         return
@@ -412,7 +421,10 @@ def _number(device: ImportedDevice, register: ImportedRegister, cells: Cells, ta
 
 
 def _part(register: ImportedRegister, kind: str, cells: Cells, tag: _Tag | None) -> str:
-    """Return the bits of the word that the register uses, or "" for all; note a missing bit in `gaps`."""
+    """Return the bits of the word that the register uses; "" for all.
+
+    A missing bit number is noted in `gaps`.
+    """
     if tag and tag.part:
         return tag.part
     stated = re.fullmatch(r"([0-9]{1,2})(?:\s*(?:-|\.\.|:|to)\s*([0-9]{1,2}))?", cells.get("bit", ""))
@@ -428,7 +440,7 @@ def _part(register: ImportedRegister, kind: str, cells: Cells, tag: _Tag | None)
 
 
 def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
-    """Return the number format of a row; note a missing type or width in `gaps`."""
+    """Return the number format of a row. A missing type or width is noted in `gaps`."""
     length = cells.get("length", "")
     words = int(length) if _NUMBER.fullmatch(length) else 0
     signed = _SIGNED.get(cells.get("signed", "").lower())
@@ -458,7 +470,7 @@ def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
 
 
 def _order(register: ImportedRegister, given: str) -> str:
-    """Return the byte order that a cell states; note a missing one in `gaps`."""
+    """Return the byte order that a cell states. A missing byte order is noted in `gaps`."""
     word = re.sub(r"[^a-z]|endian|first", "", given.lower())
     if not given:
         register.gaps.append("the order of its words is not stated")
@@ -468,7 +480,10 @@ def _order(register: ImportedRegister, given: str) -> str:
 
 
 def _scale(register: ImportedRegister, cells: Cells, *, is_neuron: bool) -> None:
-    """Set step and offset; note the assumption in `gaps` if programs differ about a column."""
+    """Set the step and the offset.
+
+    If programs use a column differently, the assumption is noted in `gaps`.
+    """
     found = _steps(cells)
     key, given = found[0] if found else ("scale", "")
     offset = cells.get("offset", "")
@@ -491,7 +506,7 @@ def _scale(register: ImportedRegister, cells: Cells, *, is_neuron: bool) -> None
 
 
 def _step(register: ImportedRegister, key: str, given: str, *, is_neuron: bool) -> float:
-    """Return the value of one raw count. Raises ValueError unless the cell is a number."""
+    """Return the value that one raw count stands for. Raises ValueError unless the cell is a number."""
     amount = number(given, 1)
     exact = Fraction(str(amount))
     if amount == 0 and key != "decimal":
@@ -515,17 +530,17 @@ def _step(register: ImportedRegister, key: str, given: str, *, is_neuron: bool) 
 # ---- tags of EMQX Neuron's Modbus plugins: SLAVE!ADDRESS[.BIT][#ENDIAN][.LEN[H][L][D][E]] ----
 
 _TAG = re.compile(r"([0-9]{1,6})!([0-9]{1,9})(?:[.](\d{1,6})([HLDE]?))?(?:#([A-Z]{1,2}))?")
-_TAG_ORDERS = {  # Neuron's Modbus TCP page, section #ENDIAN: LL means the byte order 1,2,3,4
+_TAG_ORDERS = {  # The orders in Neuron's Modbus TCP page, section #ENDIAN. LL means the byte order 1,2,3,4.
     **{"L": "", "LL": "", "LB": "BADC", "BL": "CDAB", "BB": "DCBA", "B": "DCBA"}
 }
-# Byte orders of texts, by the letter at the end of the tag. Texts with the letter E (one character per
+# Byte orders of texts, by the last letter of the Neuron tag. Texts with the letter E (one character per
 # register, in the high byte) are not imported.
 _TAG_TEXT_ORDERS = {"": "", "H": "", "L": "BA", "D": "B"}
 
 
 @dataclass(frozen=True)
 class _Tag:
-    """The parts of a tag's address; `part` is the bit number, or the length of a text."""
+    """The parts of a Neuron tag's address. `part` is the bit number, or the length of a text."""
 
     slave: int
     address: str
@@ -535,7 +550,7 @@ class _Tag:
 
 
 def _parse_tag(cell: str) -> _Tag | None:
-    """Return the parts of a tag's address; None for any other cell."""
+    """Return the parts of a Neuron tag's address; None if the cell is no such address."""
     match = _TAG.fullmatch(cell)
     if match is None:
         return None
@@ -543,7 +558,7 @@ def _parse_tag(cell: str) -> _Tag | None:
 
 
 def _tag_order(register: ImportedRegister, tag: _Tag, number: str) -> str:
-    """Return a number's byte order; note in `gaps` if the tag does not state it."""
+    """Return a number's byte order. If the Neuron tag does not state it, that is noted in `gaps`."""
     if tag.order in _TAG_ORDERS:
         return _TAG_ORDERS[tag.order]
     if tag.order:

@@ -1,4 +1,4 @@
-"""An imported device: its registers, line settings, gaps, and the entries that could not be imported."""
+"""An imported device: its registers, its line settings, and the entries that could not be imported."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from multidrop.printable import is_whole
 
 UNKNOWN_HOST = "HOST"
 _HOST = re.compile(r"[A-Za-z0-9_.:-]{1,200}|\[[0-9A-Fa-f:.]{1,100}\]")
-_PORT = re.compile(r"[^!${}\s][^${}]*")  # a port's name that is neither a YAML tag nor a variable
+_PORT = re.compile(r"[^!${}\s][^${}]*")  # a port name that is neither a YAML tag nor a variable
 _PARITIES = {"n": "N", "none": "N", "e": "E", "even": "E", "o": "O", "odd": "O"}
-# Serial formats of a family that states none, by framing; ASCII frames may have 7 data bits.
+# Serial formats that are possible if the source states none, by framing. ASCII frames may have 7 data bits.
 _FORMATS = {"rtu": ("8N1", "8E1", "8O1", "8N2"), "ascii": ("7E1", "7O1", "7N2", "8N1", "8E1", "8O1", "8N2")}
 
 
 @dataclass(frozen=True)
 class LineSettings:
-    """A line's settings. An unknown port or format is "", an unknown baud rate 0."""
+    """The settings of a line. "" means an unknown port or format, 0 an unknown baud rate."""
 
     port: str = ""
     baudrate: int = 0
@@ -33,7 +33,10 @@ class LineSettings:
     framing: str = "rtu"
 
     def drive_keys(self) -> dict[str, Any]:
-        """Return a drive's line settings as keys of a plant file; on a network line, only the framing."""
+        """Return the line settings as keys of a drive in a plant file.
+
+        On a network line, this is only the framing.
+        """
         found: dict[str, Any] = {"framing": self.framing} if self.framing != "rtu" else {}
         if self.is_network:
             return found
@@ -62,7 +65,10 @@ def serial_settings(
     framing: Any = "rtu",
     keys: Sequence[str] = ("baud_rate", "data_bits", "parity", "stop_bits"),
 ) -> LineSettings:
-    """Return a serial line's settings. `keys` are the source's names for baud rate, bits, parity and stop."""
+    """Return the settings of a serial line.
+
+    `keys` are the source's names of baud rate, bits, parity and stop.
+    """
     baudrate, bits, parity, stop = (given.get(key, "") for key in keys)
     parity = _PARITIES.get(str(parity).lower(), "")
     bits, stop = _whole(bits) or 8, _whole(stop) or 1
@@ -79,7 +85,7 @@ def network_settings(
 ) -> LineSettings:
     """Return the settings of a network line: Modbus TCP, or serial frames over a socket.
 
-    If the host is unknown, it becomes the placeholder HOST; an invalid port number becomes 502.
+    An unknown host becomes the placeholder HOST, and an invalid port number becomes 502.
     """
     number = _whole(port)
     known = host if isinstance(host, str) and _HOST.fullmatch(host) else UNKNOWN_HOST
@@ -89,7 +95,7 @@ def network_settings(
 
 
 def _whole(given: Any) -> int:
-    """Return a whole number, which may be given as text; 0 for any other value."""
+    """Return a whole number, which may be given as text. Return 0 for other values."""
     if isinstance(given, str) and re.fullmatch(r"[0-9]{1,9}", given.strip()):
         given = int(given)
     return given if is_whole(given) and 0 < given < 10**9 else 0
@@ -97,14 +103,14 @@ def _whole(given: Any) -> int:
 
 WRITTEN = "it is written there; what a write does is not known here"
 ONLY_WRITTEN = "is only written: a command is never imported"
-MOST_ENTRIES = 20_000  # limit of entries per file
+MOST_ENTRIES = 20_000  # limit of entries in one file
 _LONGEST_NAME = 50
 _DECIMAL = re.compile(r"-?[0-9]{1,19}")
 _ANY_BASE = re.compile(r"0[xX][0-9a-fA-F]{1,8}|0|[1-9][0-9]{0,5}")
 
 
 class Treatment(Enum):
-    """How an importer treats a key of the source's schema."""
+    """What an importer does with a key of the source's schema."""
 
     IMPORTED = "the importer reads it"
     IRRELEVANT = "it changes no value"
@@ -115,7 +121,10 @@ KeyTable = Mapping[str, Treatment]
 
 
 def key_table(*, imported: str = "", irrelevant: str = "", gap: str = "") -> KeyTable:
-    """Return the treatment of each key. An argument lists the keys of one treatment, separated by spaces."""
+    """Return the treatment of each key.
+
+    Each argument has the keys with one treatment, separated by spaces.
+    """
     return {
         **dict.fromkeys(imported.split(), Treatment.IMPORTED),
         **dict.fromkeys(irrelevant.split(), Treatment.IRRELEVANT),
@@ -124,7 +133,7 @@ def key_table(*, imported: str = "", irrelevant: str = "", gap: str = "") -> Key
 
 
 def unimported_keys(entry: Mapping[Any, Any], table: KeyTable) -> list[str]:
-    """Return a sentence for each key of an entry that may affect the value but is not imported.
+    """Return a sentence for each key of an entry that is not imported and may affect the register's value.
 
     Keys that the table lacks are included. Keys with empty or false values are ignored.
     """
@@ -140,32 +149,32 @@ def is_empty(value: Any) -> bool:
 
 @dataclass
 class ImportedRegister:
-    """One register, with its address as sent in a request. `gaps` are sentences about unknown facts.
+    """A register with its address in requests. `gaps` are sentences about unknown properties.
 
-    `lacks` names a fact that the value depends on and that a register cannot declare; if set, only the
-    raw count is imported. In a family file, each register is only read; `is_written` and `of_writes` are for
+    `lacks` names a property that affects the value, but that a family file cannot declare. Then only the raw
+    count is imported. In a family file, each register is only read; `is_written` and `of_writes` are for
     coverage reports.
     """
 
     name: str
     address: int
     table: str = "holding"
-    details: dict[str, Any] = field(default_factory=dict)  # its keys in the family file, in this order
+    # keys of the register in the family file, in this order
+    details: dict[str, Any] = field(default_factory=dict)
     gaps: list[str] = field(default_factory=list)
     lacks: str = ""
     is_read: bool = True
     is_written: bool = False
-    of_writes: dict[str, Any] = field(default_factory=dict)  # further details if the register is written
+    of_writes: dict[str, Any] = field(default_factory=dict)  # further keys, if the register is written
 
     def note_write(self, *, is_written: bool = True) -> None:
-        """Record whether the source program writes the register; a write is noted in `gaps`."""
+        """Record whether the source program writes the register. If it does, that is noted in `gaps`."""
         self.is_written = is_written
         if is_written:
             self.gaps.append(WRITTEN)
 
     def put_names(self, key: str, pairs: Mapping[Any, Any]) -> None:
-        """Add names of the register's values or bits; add a sentence to `gaps` if a register cannot have
-        these names.
+        """Add names of the register's values or bits. Names that a register cannot have are noted in `gaps`.
 
         If a value or bit has several names, the first is used.
         """
@@ -184,7 +193,7 @@ class ImportedRegister:
 
 @dataclass(frozen=True)
 class Lost:
-    """An entry that was not imported, and why. `is_entry` is False if only a key or a fact was lost."""
+    """An entry that was not imported, with the reason. `is_entry` is False if only a key was not imported."""
 
     name: str
     reason: str
@@ -204,13 +213,13 @@ class ImportedDevice:
     texts: list[ImportedRegister] = field(default_factory=list)
     commands: list[ImportedRegister] = field(default_factory=list)
     lost: list[Lost] = field(default_factory=list)
-    readable: range = range(0)  # holding registers that a read may span, including unnamed registers
-    together: int = 0  # limit of registers in one read request; 0: not stated
+    readable: range = range(0)  # addresses of holding registers that one read may include, declared or not
+    together: int = 0  # limit of registers in one read; 0: not stated
     line: LineSettings = UNKNOWN_LINE
     names: UniqueNames = field(default_factory=lambda: UniqueNames())
 
     def add(self, found: ImportedRegister, *, is_text: bool = False) -> None:
-        """Add a register under a unique name; record an invalid register as lost."""
+        """Add a register under a unique name. An invalid register is recorded in `lost`."""
         if not is_whole(found.address):
             self.lose(found.name, f"its address {str(found.address)[:40]!r} is not a whole number")
             return
@@ -227,12 +236,15 @@ class ImportedDevice:
         (self.texts if is_text else self.registers).append(found)
 
     def lose(self, name: str, reason: str, *, is_entry: bool = True) -> None:
-        """Record an entry or fact that could not be imported, with the reason."""
+        """Record in `lost` an entry or a key that was not imported, with the reason."""
         self.lost.append(Lost(name, reason, is_entry))
 
     @contextmanager
     def entry(self, name: str) -> Iterator[None]:
-        """Record the entry as lost if the block raises an error. Raises ValueError after too many entries."""
+        """Record the entry in `lost` if the block raises an error.
+
+        Raises ValueError if there are too many entries.
+        """
         if len(self.registers) + len(self.texts) + len(self.lost) >= MOST_ENTRIES:
             raise ValueError(f"has more than {MOST_ENTRIES} entries, which no device has")
         try:
@@ -245,13 +257,13 @@ class ImportedDevice:
             self.lose(name, f"it is not laid out as an entry: {type(failure).__name__} {str(failure)[:100]}")
 
     def lose_keys(self, place: str, given: Mapping[Any, Any], table: KeyTable) -> None:
-        """Record as lost the keys of a device or line that are not imported."""
+        """Record in `lost` the keys of a device or a line that are not imported."""
         for sentence in unimported_keys(given, table):
             self.lose(place, sentence, is_entry=False)
 
 
 class UniqueNames:
-    """Makes unique Python names, as close as possible to the given spelling."""
+    """Makes unique Python names that are close to the given spelling."""
 
     def __init__(self, taken: Collection[str] = TAKEN_NAMES) -> None:
         self._taken = taken

@@ -1,4 +1,4 @@
-"""Import ESPHome's `modbus_controller`: its entities in a node's YAML, or in one of the node's packages.
+"""Import ESPHome's `modbus_controller` entities from the YAML file of a node, or from one of its packages.
 
 The key tables follow ESPHome's documentation and its components' schemas.
 """
@@ -37,9 +37,9 @@ _SHOWN = (
     "response_size "
     "on_value on_state qos retain discovery availability state_topic command_topic"
 )
-_TIMES = "skip_updates custom_command"  # an entry with custom_command (raw bytes) is not imported
+_TIMES = "skip_updates custom_command"  # entries with custom_command, which sends raw bytes, are not imported
 _WRITES = "write_lambda"
-KEYS = {  # treatment of keys, by kind of entity
+KEYS = {  # treatment of keys, by kind of entity, such as sensor
     "sensor": key_table(
         imported=f"{_ITEM} value_type unit_of_measurement filters",
         irrelevant=f"{_SHOWN} register_count accuracy_decimals state_class force_update expire_after "
@@ -88,12 +88,12 @@ _WRITTEN = ("switch", "number", "select", "output")
 
 
 def is_esphome(document: Any) -> bool:
-    """Return True if the document has a `modbus_controller`, or an entity of that platform."""
+    """Return True if the document has a `modbus_controller`, or an entity with this platform."""
     return any(PLATFORM in part or any(_entries(part)) for part in _parts(document))
 
 
 def read_esphome(document: Any) -> list[ImportedDevice]:
-    """Return a device for each address on each bus. Raises ValueError if the document has no such entity."""
+    """Return a device for each address on each bus. Raises ValueError if the document has no entity."""
     parts = [_substituted(part, _substitutions(document), 0) for part in _parts(document)]
     nodes = [part["esphome"] for part in parts if isinstance(part.get("esphome"), dict)]
     devices = _Devices(str(nodes[0].get("name") or "") if nodes else "", parts)
@@ -101,12 +101,12 @@ def read_esphome(document: Any) -> list[ImportedDevice]:
         for kind, entry in _entries(part):
             devices.add(kind, entry)
     if not (found := devices.found):
-        raise ValueError(f"`{PLATFORM}:` has no entity: none of {', '.join(KEYS)} has that platform")
+        raise ValueError(f"has no entity with `platform: {PLATFORM}` in {', '.join(KEYS)}")
     return found
 
 
 def _parts(document: Any) -> Iterator[dict[str, Any]]:
-    """Yield the document and its packages; a package that is a list contains only entities."""
+    """Yield the document and its packages. A package that is a list only has entities."""
     if isinstance(document, list):
         entities = [each for each in document if isinstance(each, dict) and each.get("platform") == PLATFORM]
         yield from ({_kind_of(entity): entity} for entity in entities)
@@ -119,7 +119,7 @@ def _parts(document: Any) -> Iterator[dict[str, Any]]:
 
 
 def _kind_of(entity: Mapping[str, Any]) -> str:
-    """Return the kind of an entity whose list states none: the first kind that allows all of its keys."""
+    """Return the kind of an entity in a list without kinds: the first kind that allows all of its keys."""
     return next((kind for kind, table in KEYS.items() if entity.keys() <= table.keys()), "sensor")
 
 
@@ -134,7 +134,7 @@ def _substitutions(document: Any) -> dict[str, str]:
 
 
 def _substituted(value: Any, known: Mapping[str, str], depth: int) -> Any:
-    """Return the value with $name and ${name} replaced by their text in `known`, if they are in it."""
+    """Replace $name and ${name} in the value by the text in `known`, if it has this name."""
     if isinstance(value, str) and "$" in value and not isinstance(value, YamlTag):
         return re.sub(r"\$(?:\{(\w+)\}|(\w+))", lambda name: known.get(name[1] or name[2], name[0]), value)
     if depth < 5 and known:
@@ -157,7 +157,7 @@ def _entries(part: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]
 
 
 class _Devices:
-    """The devices of a node. Controllers with the same address on the same bus are one device."""
+    """The devices of an ESPHome node. Controllers with the same address on the same bus are one device."""
 
     def __init__(self, title: str, parts: list[dict[str, Any]]) -> None:
         self._title = title
@@ -198,7 +198,10 @@ class _Devices:
             _add(device, kind, name, entry)
 
     def _device_of(self, given: Any) -> ImportedDevice:
-        """Return the device of this controller; its address is unknown if another file declares it."""
+        """Return the device of this controller.
+
+        Its address is unknown if another file declares the controller.
+        """
         if given is None and self._by_controller:
             return next(iter(self._by_controller.values()))
         return self._by_controller.setdefault(
@@ -207,7 +210,7 @@ class _Devices:
 
 
 def _line(parts: list[dict[str, Any]], bus: str) -> LineSettings:
-    """Return the settings of the UART that a bus names, or of the only UART."""
+    """Return the settings of the UART that the bus names, or of the only UART."""
     uarts = [each for part in parts for each in _listed(part.get("uart")) if isinstance(each, dict)]
     buses = [each for part in parts for each in _listed(part.get("modbus")) if isinstance(each, dict)]
     named = [each.get("uart_id") for each in buses if len(buses) == 1 or str(each.get("id")) == bus]
@@ -256,7 +259,10 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
 
 
 def _filters(register: ImportedRegister, filters: Any) -> None:
-    """Combine factors and offsets, in order, into a step and an offset; note other filters in `gaps`."""
+    """Combine factors and offsets into a step and an offset, in their order.
+
+    Other filters are noted in `gaps`.
+    """
     step, offset = Fraction(1), Fraction(0)
     others: list[str] = []
     for each in _listed(filters):
@@ -309,7 +315,7 @@ def _number(device: ImportedDevice, register: ImportedRegister, kind: str, entry
         return False
     every = (1 << 16 * words_of(found)) - 1
     mask = whole(entry, "bitmask", every) & every
-    if words_of(found) < 4 and mask != every:  # ESPHome ignores the mask of 64-bit numbers
+    if words_of(found) < 4 and mask != every:  # ESPHome ignores the bit mask of 64-bit numbers
         found = found.replace("I", "U")  # in ESPHome a masked number is unsigned
         _part(register, found, mask)
     elif is_flag:

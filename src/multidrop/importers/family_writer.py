@@ -1,4 +1,4 @@
-"""Write a family file for an imported device, after dropping registers that a family cannot declare."""
+"""Write a family file for an imported device, without the registers that a family cannot declare."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from multidrop.printable import printable
 from multidrop.toml_check import TomlPlace
 from multidrop.toml_document import parse_document
 
-MOST_LOST = 500  # limit of lost entries listed in the family file
+MOST_LOST = 500  # limit of entries listed in the family file as not imported
 UNKNOWN_PORT = f"the port, which the file does not state; tcp://{UNKNOWN_HOST}:502 if it is Modbus TCP"
-_LONGEST = 200  # limit of a text, in characters
-_MOST_POINTS = 20  # limit of dots in a text; the TOML parser is slow on a line with very many dots
+_LONGEST = 200  # limit of characters in a text
+_MOST_POINTS = 20  # limit of dots in a text, because the TOML parser is slow on lines with many dots
 
 _ORDER = (
     *("unit", "values", "bits", "step", "offset", "number_format", "order", "part", "invalid"),
@@ -116,7 +116,7 @@ def _line_gap(device: ImportedDevice) -> str:
 
 
 def entry_line(register: ImportedRegister) -> str:
-    """Return the register's TOML line for its section of the family file."""
+    """Return the TOML line that declares the register in its section of the family file."""
     parts = [f"at = {sent_as(register.address, register.table)}"]
     if register.table != "holding":
         parts.append(f"table = {_value(register.table)}")
@@ -125,7 +125,7 @@ def entry_line(register: ImportedRegister) -> str:
 
 
 def _value(value: Any) -> str:
-    """Return a value in TOML's notation, on one line."""
+    """Return a value in TOML notation, on one line."""
     if isinstance(value, dict):
         pairs = (f"{name} = {_value(given)}" for name, given in value.items())
         return f"{{ {', '.join(pairs)} }}"
@@ -162,7 +162,7 @@ def _keep(
     most: int,
     kind: str,
 ) -> dict[str, Any]:
-    """Drop the entries of `listed` that no family can declare; return the other declarations by name."""
+    """Remove the entries from `listed` that no family can declare. Return the declarations by name."""
     held: dict[str, Any] = {}
     kept: list[ImportedRegister] = []
     for found in listed:
@@ -180,7 +180,7 @@ def _keep(
 
 
 def declare(found: ImportedRegister, access: Access = Access.READING) -> Register[Any]:
-    """Return the register that a family file would declare. Raises ValueError that lists all errors."""
+    """Return the register that the family file declares. Raises ValueError with all errors."""
     place = TomlPlace(_PLACE)
     declared = Declared(Counting(0), {}, "single")
     ((name, given),) = parse_document(entry_line(found).encode()).items()
@@ -197,7 +197,7 @@ def declare(found: ImportedRegister, access: Access = Access.READING) -> Registe
 
 
 def declare_text(found: ImportedRegister) -> Text:
-    """Return the text that a family file would declare. Raises ValueError that lists all errors."""
+    """Return the text register that the family file declares. Raises ValueError with all errors."""
     place = TomlPlace(_PLACE)
     texts = texts_of(parse_document(entry_line(found).encode()), Counting(0), {}, place)
     if place.config_errors:
@@ -207,7 +207,7 @@ def declare_text(found: ImportedRegister) -> Text:
 
 
 def _drop_conflicts(device: ImportedDevice, held: dict[str, Register[Any]]) -> None:
-    """Make the registers fit into one class: drop first references to scale registers, then registers."""
+    """Remove references to scale registers, and then registers, until the class is valid."""
     by_name = {found.name: found for found in device.registers}
     gaps = {HOLDING: device.readable} if device.readable else {}
     while wrong := _conflicts({**held, "readable_gaps": gaps}):
@@ -226,7 +226,7 @@ def _drop_conflicts(device: ImportedDevice, held: dict[str, Register[Any]]) -> N
 
 
 def _conflicts(members: dict[str, Any]) -> dict[str, str]:
-    """Return the errors, by register name, of a class with these members; {} if it is valid."""
+    """Return the errors of a class with these members, by register name; {} if the class is valid."""
     try:
         type("Imported", (Drive,), {"__doc__": "Of an importer.", **members})
     except DeclarationError as refusal:

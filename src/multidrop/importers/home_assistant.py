@@ -33,20 +33,20 @@ _TYPES = {
     **{"int16": "I16", "int32": "I32", "int64": "I64", "uint16": "U16", "uint32": "U32", "uint64": "U64"},
     **{"float16": "F16", "float32": "F32", "float64": "F64"},
 }
-_LEGACY_TYPES = {  # types used before 2022, when `count` stated the number of registers
+_LEGACY_TYPES = {  # types before 2022; `count` stated the number of registers then
     "int": {1: "I16", 2: "I32", 4: "I64"},
     "uint": {1: "U16", 2: "U32", 4: "U64"},
     "float": {1: "F16", 2: "F32", 4: "F64"},
 }
 _STRUCTURES = {"h": "I16", "H": "U16", "i": "I32", "I": "U32", "l": "I32", "L": "U32", "q": "I64", "Q": "U64"}
 _STRUCTURES |= {"e": "F16", "f": "F32", "d": "F64"}
-# keys that the code for each kind of entity reads
+# keys that are read for every kind of entity
 _ENTITY = "name slave device_address address scan_interval"
 _SHOWN = "unique_id device_class lazy_error_count entity_category icon friendly_name hub"
 _SWITCH = key_table(
     imported=f"{_ENTITY} write_type command_on command_off verify", irrelevant=f"{_SHOWN} optimistic"
 )
-KEYS = {  # treatment of keys, by kind of entity
+KEYS = {  # treatment of keys, by kind of entity, such as sensor
     "sensors": key_table(
         imported=f"{_ENTITY} unit_of_measurement input_type data_type count structure scale offset swap "
         "reverse_order nan_value slave_count virtual_count",
@@ -69,9 +69,9 @@ VERIFY_KEYS = key_table(imported="address input_type state_on state_off", irrele
 _DEFAULT_TABLES = {"sensors": "holding", "binary_sensors": "coil"}
 _NOT_READ = ("climates", "covers")
 _LEGACY_KINDS = {"sensor": "sensors", "binary_sensor": "binary_sensors", "switch": "switches"}
-_LEGACY_LISTS = {"registers": "", "inputs": "", "coils": "coil"}  # the table of a list's entries, by key
-MOST_REPEATED = 1000  # limit of virtual_count
-_DEEPEST = 4  # limit of nested packages
+_LEGACY_LISTS = {"registers": "", "inputs": "", "coils": "coil"}  # by key of a list: the table of its entries
+MOST_REPEATED = 1000  # limit of the key virtual_count
+_DEEPEST = 4  # limit of packages within packages
 
 
 def read_home_assistant(document: Any) -> list[ImportedDevice]:
@@ -122,7 +122,7 @@ def _lack(document: Any, hubs: list[Mapping[str, Any]]) -> str:
 
 
 def _hubs(found: Any, place: str, depth: int) -> Iterator[Mapping[str, Any]]:
-    """Yield the hubs of a document: below `modbus:`, in packages, or the document itself."""
+    """Yield the hubs of a document: below `modbus:`, in packages, or in the document itself."""
     if isinstance(found, dict):
         if (place == "modbus" and "type" in found) or any(kind in found for kind in (*KEYS, *_NOT_READ)):
             yield found
@@ -151,7 +151,7 @@ def _kind_of(entry: Mapping[str, Any]) -> str:
 
 
 def _legacy_hubs(kind: str, listed: Any, hubs: Any) -> Iterator[Mapping[str, Any]]:
-    """Yield a hub for each `platform: modbus` (before 2021), with its entries' keys renamed to today's."""
+    """Yield a hub for each `platform: modbus`, the layout before 2021, with the present names of its keys."""
     known = {
         str(hub.get("name", "modbus_hub")): hub
         for hub in (hubs if isinstance(hubs, list) else [hubs])
@@ -235,7 +235,7 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
 
 
 def _verify(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
-    """Take the switch's state from its state register, if it has one.
+    """Read the state of a switch from its state register, if it has one.
 
     Values for on and off other than 1 and 0 are noted in `gaps`.
     """
@@ -295,10 +295,10 @@ def _swap(register: ImportedRegister, entry: Mapping[str, Any]) -> str:
 
 
 def _format(register: ImportedRegister, kind: str, entry: Mapping[str, Any]) -> str | None:
-    """Return a data type's number format, or None; note a doubtful width in `gaps`."""
+    """Return the number format of a data type, or None. A doubtful width is noted in `gaps`."""
     registers = whole(entry, "count", 1)
     if kind in _LEGACY_TYPES:
-        # only for floats, because an int has 16 bits in every version
+        # applies only to floats, because an int has 16 bits in every version
         if kind == "float" and "count" not in entry:
             width = "one register was assumed, as Home Assistant did"
             register.gaps.append(f"the width of its type {kind} is not stated; {width}")
@@ -314,7 +314,7 @@ def _format(register: ImportedRegister, kind: str, entry: Mapping[str, Any]) -> 
 
 
 def _nan(given: Any) -> int | str:
-    """Return the raw count of a `nan_value`, which may be hex text without 0x."""
+    """Return the raw count in `nan_value`, which may be hex text without 0x."""
     text = str(given).strip()
     return int(text, 16) if re.fullmatch(r"[0-9]*[a-fA-F][0-9a-fA-F]*", text) else count(given, "nan_value")
 
@@ -328,7 +328,7 @@ def _more(entry: Mapping[str, Any]) -> int:
 
 
 def _repeat(device: ImportedDevice, register: ImportedRegister, entry: Mapping[str, Any], words: int) -> None:
-    """Add the register, and `slave_count` or `virtual_count` further registers at the addresses after it."""
+    """Add the register, and `slave_count` or `virtual_count` further registers after it."""
     first = replace(register, details=dict(register.details), gaps=list(register.gaps))
     for at in range(_more(entry) + 1):
         name = f"{first.name}_{at}" if at else first.name

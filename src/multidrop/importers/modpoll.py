@@ -1,4 +1,4 @@
-"""Import modpoll's tables of lines `device`, `poll` and `ref` (see "configuration" in its documentation)."""
+"""Import modpoll's tables with lines `device`, `poll` and `ref`; see "configuration" in its documentation."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ _TABLES = {
     **{"coil": "coil", "discrete_input": "discrete"},
     **{"holding_register": "holding", "input_register": "input"},
 }
-_ORDERS = {"BE_BE": "", "BE_LE": "CDAB", "LE_BE": "BADC", "LE_LE": "DCBA"}  # by modpoll's names, BYTES_WORDS
-_CELLS = 7  # limit of a row's cells: keyword, name, address, type, access, unit, scale
+# byte orders by modpoll's names, such as BE_LE: first the order in a word, then that of the words
+_ORDERS = {"BE_BE": "", "BE_LE": "CDAB", "LE_BE": "BADC", "LE_LE": "DCBA"}
+_CELLS = 7  # limit of cells in a row: keyword, name, address, type, access, unit, scale
 _FLAGS = re.compile(r"bool(8|16)?")
 _STRING = re.compile(r"string([0-9]{1,4})")
 
 
 def read_modpoll(rows: list[list[str]]) -> list[ImportedDevice]:
-    """Return the devices of a modpoll table's rows. Raises ValueError for any other kind of row."""
+    """Return the devices of a modpoll table. Raises ValueError for a row of another kind."""
     devices: list[ImportedDevice] = []
     table = order = ""
     for number, row in enumerate(rows, 1):
@@ -57,7 +58,7 @@ def _reference(device: ImportedDevice, cells: list[str], table: str, order: str)
         device.lose(name, f"which bits {kind} means is not known")
         return
     if text := _STRING.fullmatch(kind):
-        # without a byte order, because that of the poll does not apply to texts
+        # the byte order of the poll does not apply to texts
         register.details = {"length": (int(text[1]) + 1) // 2}
         device.add(register, is_text=True)
         return

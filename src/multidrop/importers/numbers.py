@@ -1,4 +1,4 @@
-"""Parse numbers in other programs' tables: number types, steps, and byte and word orders."""
+"""Parse numbers, number types and byte orders in other programs' tables."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _KINDS: Mapping[str, Mapping[str, str]] = {
     "bcd": {"16": "BCD16", "32": "BCD32"},
 }
 _NAMED = {"word": "U16", "dword": "U32", "lword": "U64", "double": "F64", "lreal": "F64", "short": "I16"}
-# names of IEC 61131
+# type names of IEC 61131
 _NAMED |= {"ushort": "U16", "dint": "I32", "udint": "U32", "lint": "I64", "ulint": "U64"}
 _NAMED |= {"sunssf": "I16", "count": "U16", "pad": "U16", "raw16": "U16"}
 _ANY_WIDTH = {"int": "I", "signed": "I", "uint": "U", "unsigned": "U", "bcd": "BCD"}
@@ -29,7 +29,7 @@ _WHOLE = re.compile(r"0[xX][0-9a-fA-F]{1,16}|-?[0-9]{1,20}")
 
 
 def number_format(kind: str) -> str | None:
-    """Return the number format of a type such as uint16, s32 or float; None if it is not known."""
+    """Return the number format of a type such as uint16, s32 or float; None for unknown types."""
     kind = kind.strip().lower()
     if kind in _NAMED:
         return _NAMED[kind]
@@ -38,7 +38,10 @@ def number_format(kind: str) -> str | None:
 
 
 def format_of_width(kind: str, words: int) -> str | None:
-    """Return the number format of a type without a width, such as int, in `words` words; None for others."""
+    """Return the number format of a type without a width, such as int, for a width of `words` words.
+
+    Return None for unknown types.
+    """
     letter = _ANY_WIDTH.get(kind.strip().lower())
     return f"{letter}{16 * words}" if letter and words in (1, 2, *((4,) if letter != "BCD" else ())) else None
 
@@ -48,12 +51,12 @@ def words_of(number: str) -> int:
 
 
 def bits_text(low: int, high: int) -> str:
-    """Return a range of bits as a family file writes it: 3, or 0-7."""
+    """Return a range of bits in the notation of family files, such as 3 or 0-7."""
     return str(low) if low == high else f"{low}-{high}"
 
 
 def put_number(details: dict[str, Any], number: str, order: str = "") -> None:
-    """Set the number format in `details`, and the byte order of a four-byte number, such as "CDAB"."""
+    """Set the number format, and the byte order of a four-byte number, such as "CDAB", in `details`."""
     if number != "U16":
         details["number_format"] = number
     if words_of(number) == 1:
@@ -63,7 +66,7 @@ def put_number(details: dict[str, Any], number: str, order: str = "") -> None:
 
 
 def scaled(details: dict[str, Any], step: Any, offset: Any = 0) -> None:
-    """Put `step` and `offset` into `details`, except values without effect: step 0 or 1, offset 0.
+    """Set `step` and `offset` in `details`. Values without effect are not set: step 0 or 1, and offset 0.
 
     Raises ValueError if one of them is not a number.
     """
@@ -75,14 +78,14 @@ def scaled(details: dict[str, Any], step: Any, offset: Any = 0) -> None:
 
 
 def number(given: Any, default: float, key: str = "number") -> float:
-    """Return a number, which may be given as text; `default` if `given` is None or empty.
+    """Return a number, which may be given as text. Return `default` if `given` is None or empty.
 
     Raises ValueError for any other value.
     """
     if given in (None, ""):
         return default
     text = str(given).strip()
-    if re.fullmatch(r"-?[0-9]+,[0-9]+", text):  # a decimal comma
+    if re.fullmatch(r"-?[0-9]+,[0-9]+", text):  # a number with a decimal comma
         text = text.replace(",", ".")
     found = float(text) if _REAL.fullmatch(text) else math.nan
     if not math.isfinite(found):
@@ -91,7 +94,7 @@ def number(given: Any, default: float, key: str = "number") -> float:
 
 
 def whole(entry: Mapping[str, Any], key: str, default: int | None = None) -> int:
-    """Return the key's whole number, which may be text, also in hex.
+    """Return the whole number of a key, which may be decimal or hex text.
 
     Raises KeyError if the key is missing and there is no default, ValueError if it is not a whole number.
     """
@@ -107,7 +110,7 @@ def whole(entry: Mapping[str, Any], key: str, default: int | None = None) -> int
 
 
 def count(given: Any, key: str = "count") -> int | str:
-    """Return a raw count, or "NaN"; text may be decimal or hex. Raises ValueError for other values."""
+    """Return a raw count, or "NaN". A text may be decimal or hex. Raises ValueError for other values."""
     return "NaN" if str(given).strip().lower() in ("nan", ".nan") else whole({key: given}, key)
 
 

@@ -1,4 +1,4 @@
-"""Import SunSpec models from JSON: a model is a block of registers, whose address depends on the device."""
+"""Import SunSpec models from JSON. A model is a block of registers; its address depends on the device."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ GROUP_KEYS = key_table(
     imported="name label points groups", irrelevant="type count desc detail notes comments standards"
 )
 MODEL_KEYS = key_table(imported="id group", irrelevant="label desc detail notes comments standards")
-MOST_REPEATED = 1000  # limit of the repetitions of a point
-FIRST = 40000  # assumed start address, because a model's file does not state it
-# Raw counts that mean "not implemented" (SunSpec information model specification, data types).
+MOST_REPEATED = 1000  # limit of repetitions of a point
+FIRST = 40000  # assumed start address of a model, which its file does not state
+# Raw counts that mean "not implemented", by type (SunSpec information model specification, data types).
 _INVALID = {
     **{"int16": 0x8000, "uint16": 0xFFFF, "acc16": 0, "enum16": 0xFFFF, "bitfield16": 0xFFFF},
     **{"int32": 0x80000000, "uint32": 0xFFFFFFFF, "acc32": 0, "enum32": 0xFFFFFFFF, "bitfield32": 0xFFFFFFFF},
-    # 64-bit counts are signed here, because TOML has no unsigned 64-bit numbers.
+    # 64-bit counts are signed here, because TOML has no unsigned 64-bit numbers
     **{"int64": -(1 << 63), "uint64": -1, "acc64": 0, "bitfield64": -1},
     **{"float32": math.nan, "float64": math.nan, "sunssf": 0x8000},
 }
@@ -44,7 +44,7 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
     device = ImportedDevice(title)
     reason = f"its place in the device is not in its file: {FIRST} is assumed, so mend every `at`"
     device.lose("the model", reason, is_entry=False)
-    names: dict[str, str] = {}  # for points that are scale factors: the names of their registers
+    names: dict[str, str] = {}  # by point that is a scale factor: the name of its register
     address = FIRST
     for point in group["points"]:
         size, count = _size(point), whole(point, "count", 1)
@@ -54,7 +54,7 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
                 _add(device, point, name, address + at * size, names)
         address += size * count
     if FIRST < address <= 0x10000:
-        # one read may span any registers of a model, because a model is one block without holes
+        # one read may include any register of a model, because a model has no holes
         device.readable = range(FIRST, address)
     for register in device.registers:
         _tie(register, names)
@@ -66,7 +66,7 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
 
 
 def _size(point: Mapping[str, Any]) -> int:
-    """Return a point's number of registers, which later addresses need. Raises ValueError without it."""
+    """Return how many registers a point has. Raises ValueError if its size is missing."""
     try:
         return whole(point, "size")
     except KeyError:
@@ -74,7 +74,7 @@ def _size(point: Mapping[str, Any]) -> int:
 
 
 def _lose_group(device: ImportedDevice, group: Mapping[str, Any]) -> None:
-    """Record the points of a group, and of the groups in it, as not imported."""
+    """Record in `lost` the points of a group and of the groups in it."""
     for point in group.get("points", []):
         with device.entry(str(group.get("name"))):
             device.lose(
@@ -125,7 +125,7 @@ def _add(
 
 
 def _tie(register: ImportedRegister, names: Mapping[str, str]) -> None:
-    """Set the register's step if the point states its scale factor, else the name of its scale register."""
+    """Set the register's step if the point states it as a number, else the name of its scale register."""
     scale = register.details.pop("scale_register", None)
     if isinstance(scale, int):
         register.details["step"] = 10**scale if 0 <= scale <= 10 else float(f"1e{scale}")

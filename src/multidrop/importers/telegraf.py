@@ -27,13 +27,13 @@ _REGISTER_STYLE = {
     "coils": "coil",
     "discrete_inputs": "discrete",
 }
-_ORDERS = {  # by the plugin's names; an order of four bytes also applies to numbers of 16 and 64 bits
+_ORDERS = {  # byte orders by the plugin's names; they also apply to 16-bit and 64-bit numbers
     **dict.fromkeys(("ABCD", "AB", "ABCDEFGH", "MSW", "MSW-BE"), ""),
     **dict.fromkeys(("BADC", "BADCFEHG", "MSW-LE"), "BADC"),
     **dict.fromkeys(("CDAB", "GHEFCDAB", "LSW-BE"), "CDAB"),
     **dict.fromkeys(("DCBA", "BA", "HGFEDCBA", "LSW", "LSW-LE"), "DCBA"),
 }
-FIELD_KEYS = {  # treatment of keys, by style
+FIELD_KEYS = {  # treatment of keys, by configuration style
     "register": key_table(imported="name byte_order data_type scale address bit", irrelevant="measurement"),
     "request": key_table(
         imported="address name type length scale omit bit", irrelevant="measurement", gap="output"
@@ -67,7 +67,7 @@ PLUGIN_KEYS = key_table(
 
 
 class _Field(NamedTuple):
-    """A field of the plugin, with the facts that the enclosing tables state."""
+    """A field of the plugin, with the settings of the tables that contain it."""
 
     given: Mapping[str, Any]
     style: str
@@ -78,7 +78,7 @@ class _Field(NamedTuple):
 
 
 def read_telegraf(document: Mapping[str, Any]) -> list[ImportedDevice]:
-    """Return a device for each slave id of each line. Raises ValueError if the file has no fields."""
+    """Return a device for each slave id on each line. Raises ValueError if the file has no fields."""
     inputs = document.get("inputs")
     plugins = inputs.get("modbus") if isinstance(inputs, dict) else None
     if plugins is None:
@@ -98,7 +98,7 @@ def read_telegraf(document: Mapping[str, Any]) -> list[ImportedDevice]:
             _lose_settings(here, plugin)
     if not found:
         lists = ", ".join((*_REGISTER_STYLE, *BLOCK_KEYS))
-        raise ValueError(f"[[inputs.modbus]] has no field: none of {lists} has one")
+        raise ValueError(f"[[inputs.modbus]] has no field in {lists}")
     return list(found.values())
 
 
@@ -121,7 +121,7 @@ def _line(plugin: Mapping[str, Any]) -> LineSettings:
             parts = urlsplit(controller)
             host, port = parts.hostname, parts.port or 502
         except ValueError as mistake:
-            if "$" in controller:  # an environment variable
+            if "$" in controller:  # the host is in an environment variable
                 return network_settings(None, 502)
             raise ValueError(f"controller = {controller[:200]!r} is not an address: {mistake}") from mistake
         framing = mode.lower().removesuffix("overtcp")
@@ -133,7 +133,7 @@ def _line(plugin: Mapping[str, Any]) -> LineSettings:
 
 
 def _fields(plugin: Mapping[str, Any]) -> Iterator[_Field]:
-    """Yield the fields of the plugin's stated style, or of all styles if it states none."""
+    """Yield the fields in the style that the plugin states; if it states none, in all styles."""
     style, slave = str(plugin.get("configuration_type", "")), plugin.get("slave_id")
     text = str((plugin.get("workarounds") or {}).get("string_register_location") or "both")
     if style in ("", "register"):
@@ -144,7 +144,7 @@ def _fields(plugin: Mapping[str, Any]) -> Iterator[_Field]:
         for block in plugin.get(kind) or () if style in ("", kind) else ():
             for field in block.get("fields") or ():
                 table = block.get("register", "holding") if kind == "request" else field.get("register")
-                order = str(block.get("byte_order") or "ABCD")  # the plugin's default in these styles
+                order = str(block.get("byte_order") or "ABCD")  # default of the plugin in these styles
                 yield _Field(field, kind, block.get("slave_id", slave), table or "holding", order, text)
 
 
@@ -209,10 +209,10 @@ def _number(
 
 
 def _plain_type(style: str, kind: str, words: int) -> str:
-    """Return the style-independent name of a type.
+    """Return a type name that means the same in all styles.
 
-    In the register style, FLOAT32 is a whole number whose width is the number of addresses; IEEE floats have
-    names that end in -IEEE.
+    In the register style, FLOAT32 is a whole number with a word for each address, and IEEE floats have names
+    that end in -IEEE.
     """
     if style != "register":
         return kind.removesuffix("-IEEE")
@@ -222,7 +222,7 @@ def _plain_type(style: str, kind: str, words: int) -> str:
 
 
 def _part(kind: str, field: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the bits of the word that a type below 16 bits uses ("" for all), and the number's type."""
+    """Return the bits that a type below 16 bits uses ("" for all), and the type of the number."""
     if kind == "BIT":
         return str(whole(field, "bit", 0)), "UINT16"
     if kind in ("INT8L", "UINT8L", "INT8H", "UINT8H"):

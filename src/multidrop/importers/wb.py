@@ -26,12 +26,12 @@ from multidrop.importers.device import (
 )
 from multidrop.importers.numbers import bits_text, count, float_of_bits, put_number, scaled, whole, words_of
 
-# Matches comments and trailing commas, which JSON forbids, and strings, which are kept. An unclosed
-# string or comment extends to the end, so that each character is scanned once.
+# Matches strings, which are kept, and comments and trailing commas, which JSON forbids. A string or comment
+# without an end extends to the end of the text, so that each character is scanned only once.
 _NOT_JSON = re.compile(r'("(?:\\.|[^"\\])*+(?:"|\\?\Z))|//[^\n]*|/\*.*?(?:\*/|\Z)|,(?=\s*[\]}])', re.DOTALL)
 MOST_READ = 125
-_DEEPEST = 8  # limit of nested subdevices
-PART = "its place in a larger channel"  # extra key that marks a part of a composite channel
+_DEEPEST = 8  # limit of subdevices within subdevices
+PART = "its place in a larger channel"  # extra key for a part of a channel that consists of several parts
 _TABLES = {
     **{"holding": "holding", "holding_single": "holding", "holding_multi": "holding"},
     **{"input": "input", "coil": "coil", "discrete": "discrete"},
@@ -42,9 +42,10 @@ _FORMATS = {
     **{"float": "F32", "double": "F64"},
     **{"bcd8": "BCD16", "bcd16": "BCD16", "bcd24": "BCD32", "bcd32": "BCD32"},
 }
-# width in bits of each format that is narrower than its words
+# width in bits of formats that do not use all bits of their words
 _WIDTHS = {"u8": 8, "s8": 8, "u24": 24, "s24": 24}
-_TEXTS = {"string": "B", "char8": "B", "string8": ""}  # B: one character per register, in the low byte
+# order of characters; B: one character in each register, in its low byte
+_TEXTS = {"string": "B", "char8": "B", "string8": ""}
 _ORDERS = {"big_endian": False, "little_endian": True}
 _ORDER_OF = {(False, False): "", (True, False): "CDAB", (False, True): "BADC", (True, True): "DCBA"}
 _ENTRY = "name id title address write_address reg_type format units scale offset word_order byte_order"
@@ -81,12 +82,12 @@ PORT_KEYS = key_table(
 
 
 def json_without_comments(text: str) -> str:
-    """Return valid JSON: remove comments and trailing commas, which such templates may have."""
+    """Return valid JSON: remove the comments and trailing commas that the program's templates may have."""
     return _NOT_JSON.sub(lambda found: found[1] or "", text)
 
 
 def read_wb(document: Any) -> list[ImportedDevice]:
-    """Return a template's device, or a configuration's devices. Raises ValueError for other documents."""
+    """Return the devices of a template or of a configuration. Raises ValueError for other documents."""
     if not isinstance(document, dict):
         kind = type(document).__name__
         raise ValueError(f"is neither a wb-mqtt-serial template nor a SunSpec model: it is a {kind}")
@@ -118,7 +119,7 @@ def _of_port(port: Mapping[str, Any]) -> Iterator[ImportedDevice]:
     for template in port.get("devices") or ():
         title = str(template.get("name") or template.get("device_type") or "device")
         try:
-            # The device's other keys are values for parameters of its template.
+            # the other keys are values for parameters of the device's template
             known = {key: value for key, value in template.items() if key in DEVICE_KEYS}
             device = _device(known, title, unit_address(template.get("slave_id"), "slave_id"), line)
         except ValueError as mistake:
@@ -147,7 +148,7 @@ def _device(
 
 
 class _Walk:
-    """Walks through a template's entries, and through the entries of the subdevices that its channels use."""
+    """Goes through the entries of a template, and of the subdevices that its channels use."""
 
     def __init__(self, device: ImportedDevice, template: Mapping[str, Any], is_shifted: bool) -> None:
         self._device = device
@@ -173,7 +174,7 @@ class _Walk:
     def add(
         self, template: Mapping[str, Any], outer: tuple[str, ...], shift: int, stride: int, depth: int
     ) -> None:
-        """Add a template's entries; `outer` names the channels that contain it, the outermost first."""
+        """Add entries of a template; `outer` names the channels that contain them, the outermost first."""
         for key in ("channels", "parameters"):
             for name, entry in _flat(_listed(template.get(key))):
                 with self._device.entry(" ".join((*outer, name))):
@@ -185,7 +186,7 @@ class _Walk:
             self._device.lose(f"subdevice {kind}", "no channel uses it, so its address is not known")
 
     def _titles(self, path: tuple[str, ...], entry: Mapping[str, Any]) -> dict[str, str]:
-        """Return the translated titles of an entry by language; `path` ends with its name."""
+        """Return the titles of an entry by language; the last name in `path` is that of the entry."""
         *outer, name = path
         found = {}
         for language, words in self._words.items():
@@ -226,7 +227,7 @@ def _listed(found: Any) -> list[tuple[str, Any]]:
 
 
 def _flat(listed: list[tuple[str, Any]]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield the entries; replace a composite entry by its parts."""
+    """Yield the entries. An entry that consists of several parts is replaced by its parts."""
     for key, entry in listed:
         if isinstance(entry, dict):
             name = str(entry.get("name") or key or entry.get("id") or entry.get("title") or "channel")
@@ -308,18 +309,18 @@ def _number(
 
 
 def _number_of_bits(register: ImportedRegister, format: str, bits: tuple[int, int] | None) -> tuple[str, str]:
-    """Return the number format, and the bits that the format or the address selects ("" for all)."""
+    """Return the number format, and the bits that the format or the address selects; "" for all bits."""
     number = _FORMATS[format]
     own = _WIDTHS.get(format, 16 * words_of(number))
     if bits is None and (own == 16 * words_of(number) or number == "I8"):
         return number, ""
     shift, width = bits or (0, own)
     width = width or own
-    words = -(-max(own, shift + width) // 16)  # number of registers that the bits span
+    words = -(-max(own, shift + width) // 16)  # number of registers over which the bits extend
     if number[0] not in "UI" or words not in (1, 2, 4):
         register.lacks = f"its bits {shift} to {shift + width - 1} of the format {format}"
         return number, ""
-    sign = number[0] if width == own else "U"  # a number that is made of only some bits is unsigned
+    sign = number[0] if width == own else "U"  # a number that uses only some bits is unsigned
     part = "" if (shift, width) == (0, 16 * words) else bits_text(shift, shift + width - 1)
     return f"{sign}{16 * words}", part
 
@@ -344,7 +345,7 @@ def _invalid(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
 
 
 def _is_plain(register: ImportedRegister) -> bool:
-    """Return True if the register's raw counts may be named: it has no step, offset or the like."""
+    """Return True if the register's raw counts can be named, because it has no step, offset or the like."""
     is_float = str(register.details.get("number_format", "")).startswith("F")
     return not is_float and not {"step", "offset"} & register.details.keys()
 
@@ -367,7 +368,10 @@ def _text(device: ImportedDevice, register: ImportedRegister, format: str, entry
 
 
 def _place(address: Any) -> tuple[int, tuple[int, int] | None]:
-    """Split "register:shift:width" into address and (shift, width); None without them, 0 without a width."""
+    """Split "register:shift:width" into the address and (shift, width).
+
+    Without a shift, (shift, width) is None. Without a width, the width is 0.
+    """
     register, *bits = str(address).split(":")
     at = whole({"address": register}, "address")
     if not bits:

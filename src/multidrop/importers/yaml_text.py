@@ -1,4 +1,4 @@
-"""Read untrusted YAML: only safe types, with limits of size, time and memory. Needs PyYAML."""
+"""Read YAML from unknown sources: only safe types, with limits of size, time and memory. Needs PyYAML."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Any
 from multidrop.printable import install_command
 
 MOST_CHARACTERS = 1_000_000
-MOST_NODES = 50_000  # node limit; an alias counts as all nodes of its expansion
+MOST_NODES = 50_000  # limit of nodes; an alias counts as many nodes as it stands for
 
 
 class YamlTag(str):
-    """A tagged value as spelt in the file, such as `!secret host`; its value is not in the file."""
+    """A value with a tag such as `!secret host`, as text. The real value is not in the file."""
 
 
 def parse_yaml(text: str) -> Any:
-    """Return the document; a value with a tag such as !secret is a `YamlTag`.
+    """Return the document. A value with a tag such as !secret becomes a `YamlTag`.
 
     Raises ImportError if PyYAML is missing, ValueError if the text is invalid or too long, or expands to too
     many nodes.
@@ -46,7 +46,7 @@ def parse_yaml(text: str) -> Any:
             return node
 
         def count_again(self, node: Any) -> None:
-            """Count the nodes of an alias's expansion again, up to the limit."""
+            """Count the nodes that an alias stands for, up to the limit."""
             pending = [node]
             while pending and self.left >= 0:
                 self.left -= 1

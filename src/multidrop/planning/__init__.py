@@ -1,1 +1,1 @@
-"""Planning: requests, their order and rates, and a line's predicted performance. No I/O, no clock."""
+"""Planning: requests, their order and rates, and the predicted performance of a line. No I/O, no clock."""

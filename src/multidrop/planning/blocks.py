@@ -1,4 +1,4 @@
-"""Combine registers into requests, so that reading them takes the least time on the wire."""
+"""Combine registers into requests so that reading them takes the least time on the wire."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from multidrop.planning.bus_time import characters, silence
 
 @dataclass(frozen=True)
 class Block:
-    """Registers of one read space, and the request that reads them from a drive together."""
+    """Registers that one request reads from a drive, and this request."""
 
     table: Table
     start: int
-    count: int  # number of addresses, including the addresses between the registers
+    count: int  # number of addresses that the request reads, including those between the registers
     registers: tuple[Register[Any], ...]
     request: Message
 
     @classmethod
     def of(cls, drive: Drive, registers: Sequence[Register[Any]]) -> Block:
-        """Return the block that reads these registers of one read space, with the addresses between them."""
+        """Return the block that reads these registers, which one function code must read."""
         spans = [register.reach for register in registers]
         table, start = registers[0].table, min(span.start for span in spans)
         count = max(span.stop for span in spans) - start
@@ -42,7 +42,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Planned:
-    """A drive's block, to be read every `every` seconds (None: as fast as the line allows)."""
+    """A block of a drive that is read every `every` seconds; None: as fast as the line allows."""
 
     drive: Drive
     block: Block
@@ -51,11 +51,11 @@ class Planned:
 
 @dataclass(frozen=True)
 class Plan:
-    """The blocks that read a drive's registers fastest, for response delays from `least` to `most` s."""
+    """The quickest blocks for reading a drive's registers, if its response delay is `least` to `most` s."""
 
     planned: tuple[Planned, ...]
-    least: float  # below this response delay, more but shorter requests would be quicker
-    most: float  # above this response delay, fewer but longer requests would be quicker
+    least: float  # s; if the response delay is shorter, more and shorter requests would be quicker
+    most: float  # s; if the response delay is longer, fewer and longer requests would be quicker
 
     def suits(self, delay: float, margin: float = 0.0) -> bool:
         """Return True if no other plan is quicker at this response delay, within a relative `margin`."""
@@ -78,7 +78,7 @@ def plan(
     rates: dict[float | None, list[Register[Any]]] = {}
     for register, every in wanted:
         rates.setdefault(every, []).append(register)
-    # time in s that each request adds to its characters
+    # s that a request takes in addition to its characters
     overhead = silence(drive) + (drive.response_delay if delay is None else delay)
     character = drive.settings.character
     found: list[Planned] = []
@@ -119,7 +119,7 @@ def blocks(drive: Drive, registers: Iterable[Register[Any]]) -> tuple[Block, ...
 
 
 def first_block(drive: Drive) -> Block | None:
-    """Return a block with the drive's first reading, or else its first readable register, or else None."""
+    """Return a block with the drive's first reading, else its first readable register; None without any."""
     readable = [*drive.readings(), *(each for each in drive.registers.values() if each.readable)]
     return blocks(drive, readable[:1])[0] if readable else None
 
@@ -127,7 +127,7 @@ def first_block(drive: Drive) -> Block | None:
 def all_requests(
     drive: Drive, registers: Iterable[Register[Any]]
 ) -> Iterator[tuple[int, tuple[Register[Any], ...], int, int]]:
-    """Yield every request that may read some of these registers.
+    """Yield every allowed request that reads some of these registers.
 
     Each request is a tuple (count, registers, begin, end): `count` is its number of addresses, `registers`
     are all registers of the read space in order of address, and the request reads `registers[begin:end]`.
@@ -139,7 +139,7 @@ def all_requests(
 
 
 def text_blocks(drive: Drive, text: Text) -> tuple[Block, ...]:
-    """Return the blocks that read a text, in order, each within the family's limit."""
+    """Return the blocks that read a text register, in order. Each is within the family's limit."""
     limit, end = read_limit(drive, text.table), text.address + text.length
     counts = ((start, min(limit, end - start)) for start in range(text.address, end, limit))
     return tuple(
@@ -149,7 +149,7 @@ def text_blocks(drive: Drive, text: Text) -> tuple[Block, ...]:
 
 
 def sending(drive: Drive, block: Block) -> float:
-    """Return the seconds that the characters of the block's request and reply take on the wire."""
+    """Return the seconds that the characters of a block's request and reply take on the wire."""
     return characters(drive.framing, block.table.carrier, block.count) * drive.settings.character
 
 
@@ -158,17 +158,17 @@ def sending(drive: Drive, block: Block) -> float:
 
 @dataclass(frozen=True)
 class _Neighbours:
-    """Registers of one read space in order of address, with the rules for requests that read them.
+    """Registers that are read by the same function, by address, with the rules for requests that read them.
 
-    Registers may overlap: several may be parts of one 16-bit word.
+    Registers may overlap: several may be bits of one 16-bit word.
     """
 
     carrier: Carrier
     registers: tuple[Register[Any], ...]
-    spans: tuple[tuple[int, int], ...]  # for each register: its first address, and the address after its last
-    joined: tuple[bool, ...]  # for each register: whether a request may read on to the next register
-    tied: tuple[bool, ...]  # for each register: whether it must be read together with the next register
-    limit: int  # most addresses in a request; a register with more addresses is still read whole
+    spans: tuple[tuple[int, int], ...]  # by register: its first address, and the address after its last one
+    joined: tuple[bool, ...]  # by register: True if one request may read it together with the next register
+    tied: tuple[bool, ...]  # by register: True if one request must read it together with the next register
+    limit: int  # limit of addresses in a request; a register with more addresses is still read whole
 
     def ending_at(self, end: int) -> Iterator[tuple[int, int]]:
         """Yield (begin, count) of each allowed request for registers[begin:end]; `count` is in addresses."""
@@ -187,7 +187,7 @@ class _Neighbours:
 
 
 def _neighbours(drive: Drive, registers: Iterable[Register[Any]]) -> list[_Neighbours]:
-    """Return these registers as one _Neighbours for each read space."""
+    """Group these registers by read function, each group sorted by address."""
     spaces: dict[object, list[tuple[range, Register[Any]]]] = {}
     for register in dict.fromkeys(registers):
         check_readable(drive, register)
@@ -224,10 +224,10 @@ def _side_by_side(drive: Drive, wanted: list[tuple[range, Register[Any]]]) -> _N
 
 @dataclass(frozen=True)
 class _Way:
-    """The division of registers into a given number of requests that has the fewest characters."""
+    """The way to divide registers into a given number of requests that needs the fewest characters."""
 
-    characters: int  # total characters of the requests and their replies
-    spans: tuple[tuple[int, int], ...]  # (begin, end) of each request: it reads registers[begin:end]
+    characters: int  # characters of all requests and their replies
+    spans: tuple[tuple[int, int], ...]  # begin and end of each request, which reads registers[begin:end]
 
     @property
     def requests(self) -> int:
@@ -236,14 +236,14 @@ class _Way:
 
 @lru_cache(maxsize=256)
 def _ways(framing: Framing, neighbours: _Neighbours) -> tuple[_Way, ...]:
-    """Return all divisions that are the quickest for some response delay, sorted by number of requests.
+    """Return the divisions that are the quickest at some response delay, sorted by number of requests.
 
     With a long delay, few requests are quicker; with a short delay, few characters. The algorithm is dynamic
     programming over the first register of the last request.
     """
-    fronts: list[list[_Way]] = [[_Way(0, ())]]  # index n: divisions of the first n registers
+    fronts: list[list[_Way]] = [[_Way(0, ())]]  # the item n has the ways to divide the first n registers
     for end in range(1, len(neighbours.registers) + 1):
-        fewest: dict[int, _Way] = {}  # number of requests: division with the fewest characters
+        fewest: dict[int, _Way] = {}  # by number of requests: the way with the fewest characters
         for begin, count in neighbours.ending_at(end):
             own = characters(framing, neighbours.carrier, count)
             for before in fronts[begin]:
@@ -256,7 +256,7 @@ def _ways(framing: Framing, neighbours: _Neighbours) -> tuple[_Way, ...]:
 
 
 def _worthwhile(ways: dict[int, _Way]) -> list[_Way]:
-    """Drop each division with more requests than another division, but without fewer characters."""
+    """Drop each way that has more requests than another, but not fewer characters."""
     kept: list[_Way] = []
     for requests in sorted(ways):
         if not kept or ways[requests].characters < kept[-1].characters:
@@ -271,7 +271,7 @@ def _even(drive: Drive, few: _Way, many: _Way) -> float:
 
 
 def halves(drive: Drive, block: Block) -> tuple[Block, ...]:
-    """Return two blocks that together read the block's registers, or () if it cannot be split.
+    """Return two smaller blocks that together read the block's registers; () if it cannot be split.
 
     Registers at the same address stay in one block, and so do those of a group in `read_together`. Splitting
     a block of n registers repeatedly gives at most 2 n - 1 blocks, including the block itself.
@@ -285,7 +285,7 @@ def halves(drive: Drive, block: Block) -> tuple[Block, ...]:
 
 
 def _units(drive: Drive, block: Block) -> list[list[Register[Any]]]:
-    """Return the block's groups of registers that are always read together, in order of address."""
+    """Group the block's registers so that each group must be read by one request; sorted by address."""
     groups = {name: place for place, group in enumerate(drive.read_together) for name in group}
     found: dict[object, list[Register[Any]]] = {}
     for register in block.registers:
@@ -295,10 +295,10 @@ def _units(drive: Drive, block: Block) -> list[list[Register[Any]]]:
 
 
 def may_be_too_long(drive: Drive, block: Block) -> bool:
-    """Return True if the drive's class states no limit, so that this block may be too long for the drive."""
+    """Return True if the drive may not answer so long a read, because its class states no limit."""
     return stated_limit(drive, block.table) is None and len(_units(drive, block)) > 1
 
 
 def least(drive: Drive, block: Block) -> Block:
-    """Return a block with only the first group of registers that are always read together."""
+    """Return the smallest block: the first registers that one request must read together."""
     return Block.of(drive, _units(drive, block)[0])

@@ -9,17 +9,17 @@ from multidrop.core import Framing
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Carrier
 
-# By framing: characters of a read (request plus reply) without its data; characters per data byte.
+# By framing: number of characters in a read request and its reply without data; characters per data byte.
 _FRAMES = {
     Framing.RTU: (8 + 5, 1),
     Framing.ASCII: (17 + 11, 2),
     Framing.DELIXI: (21 + 21, 0),
-    Framing.TCP: (8 + 5, 1),  # the gateway sends RTU on the wire
+    Framing.TCP: (8 + 5, 1),  # the gateway sends RTU frames on the wire
 }
 
 
 def silence(drive: Drive) -> float:
-    """Return the silence around a drive's exchanges, in s: the silence that the drive needs, plus one bit.
+    """Return the silence in s before a request to a drive and after its reply: its own silence plus one bit.
 
     Text frames need no silence, but get 1.5 characters, so that bytes that follow a reply are noticed.
     Otherwise a second copy of the reply could be mistaken for the next reply. Modbus TCP has no silence.
@@ -38,7 +38,7 @@ def characters(framing: Framing, carrier: Carrier, count: int) -> int:
 
 
 def gap(before: Drive, after: Drive, switching: float = 0.0) -> float:
-    """Return the seconds from the reply of `before` to the request to `after`, on a line that is never idle.
+    """Return the seconds from the reply of the drive `before` to the next request, to the drive `after`.
 
     `switching` is the time in s that the port takes to change baud rate or format after the silence.
     """
@@ -47,12 +47,18 @@ def gap(before: Drive, after: Drive, switching: float = 0.0) -> float:
 
 
 def switches(before: Drive, after: Drive) -> bool:
-    """Return True if the port changes baud rate or format between the drives; network ports never do."""
+    """Return True if the port must change its baud rate or format between these drives.
+
+    Network ports never do.
+    """
     return before.settings != after.settings and Framing.TCP not in (before.framing, after.framing)
 
 
 def kind(drive: Drive) -> tuple[float, str]:
-    """Return the drive's silence and line settings. Drives that agree in both are polled in a row."""
+    """Return the drive's silence and line settings.
+
+    Drives with the same kind are polled one after another.
+    """
     return silence(drive), str(drive.settings)
 
 
@@ -67,7 +73,7 @@ def in_order(drives: Iterable[Drive], switching: float = 0.0) -> list[Drive]:
     kinds: dict[tuple[float, str], list[Drive]] = {}
     for drive in drives:
         kinds.setdefault(kind(drive), []).append(drive)
-    cycle: list[Drive] = []  # one drive of each kind
+    cycle: list[Drive] = []  # one drive for each kind, in the order of polling
     for each in sorted(kinds):
         drive = kinds[each][0]
         costs = [_detour(cycle[at - 1], drive, cycle[at], switching) for at in range(len(cycle))]
@@ -76,7 +82,7 @@ def in_order(drives: Iterable[Drive], switching: float = 0.0) -> list[Drive]:
 
 
 def _detour(before: Drive, drive: Drive, after: Drive, switching: float) -> tuple[int, int]:
-    """Return the cost of inserting `drive` between two drives: time in ns, and number of settings changes."""
+    """Return the cost of polling `drive` between two drives: time in ns, and number of settings changes."""
     seconds = gap(before, drive, switching) + gap(drive, after, switching) - gap(before, after, switching)
     more = sum(switches(one, other) for one, other in pairwise((before, drive, after)))
     return round(seconds * 1e9), more - switches(before, after)

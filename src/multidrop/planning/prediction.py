@@ -23,22 +23,22 @@ from multidrop.planning.blocks import Planned, planned, sending
 from multidrop.planning.bus_time import gap, in_order, kind, silence, switches
 from multidrop.planning.schedule import TURN_SHARE, Job, Schedule
 
-LATENESS = 100e-6  # s that a typical computer adds to each exchange to wake up and write
-ENOUGH = 0.97  # a rate counts as reached if it is at least this fraction of the wanted rate
-LEAST_EXCHANGES = 1000  # minimum number of simulated exchanges
-LEAST_ROUNDS = 3  # minimum number of simulated exchanges per job
+LATENESS = 100e-6  # s by which a typical computer delays each exchange, because it wakes up late
+ENOUGH = 0.97  # a rate counts as reached from this fraction of the wanted rate on
+LEAST_EXCHANGES = 1000  # least number of simulated exchanges
+LEAST_ROUNDS = 3  # least number of simulated exchanges of each job
 FAR_NS = 1 << 62
 
 
 @dataclass(frozen=True)
 class Rate:
-    """Registers of a drive that are polled every `every` s; None means as fast as the line allows."""
+    """Registers of a drive that are polled every `every` s. None means as fast as the line allows."""
 
     drive: Drive
     every: float | None
     registers: tuple[Register[Any], ...]
     requests: int
-    reached: float  # reads per second
+    reached: float  # predicted reads per second
 
     @property
     def fits(self) -> bool:
@@ -49,9 +49,9 @@ class Rate:
 class Prediction:
     """The predicted bus cycle, utilisation and rates of one line."""
 
-    cycle: float  # s for one exchange of each block
-    switches: int  # number of changes of baud rate or format in a cycle
-    utilisation: float  # share of the line's time that the rates need; above 1, they do not fit
+    cycle: float  # s in which each block is read once
+    switches: int  # number of changes of baud rate or format in a bus cycle
+    utilisation: float  # fraction of the line's time that the rates need; above 1, they cannot all be reached
     rates: tuple[Rate, ...]
 
     @property
@@ -67,13 +67,13 @@ class Prediction:
 
 
 class _Done(NamedTuple):
-    """The results of a job's exchanges on the simulated clock."""
+    """The simulated exchanges of one job."""
 
     exchanges: int = 0
     skipped: int = 0
     first_ns: int = 0
     last_ns: int = 0
-    taken: float = 0.0  # s of line time, including the silences before the exchanges
+    taken: float = 0.0  # s of line time, including the silence before each exchange
 
 
 NOT_RUN = _Done()
@@ -81,10 +81,10 @@ NOT_RUN = _Done()
 
 @dataclass(eq=False)
 class _PredictedJob:
-    """A job, and the results of its simulation."""
+    """A job, and the results of its simulated exchanges."""
 
     planned: Planned
-    own: float  # s from the end of the silence to the end of the reply
+    own: float  # s from the start of the request to the end of the reply, without silence
     done: _Done = NOT_RUN
 
     @property
@@ -119,7 +119,7 @@ def predict(
     turn = [job for job in jobs if job.planned.every is None]
     load = sum(job.cost / job.planned.every for job in jobs if job.planned.every)
     turns = max(TURN_SHARE, 1 - load) / sum(job.cost for job in turn) if turn else 0.0
-    # if a drive needs intervals between its requests, the line may be idle in these intervals
+    # if a drive needs pauses between its requests, the line may be idle during these pauses
     has_rests = any(job.planned.drive.least_interval for job in jobs)
     if has_rests:
         load += sum(job.cost * job.reached for job in turn)
@@ -148,7 +148,7 @@ def predict(
 
 
 def _rests(jobs: Iterable[_PredictedJob]) -> dict[Drive, float]:
-    """Return, by drive, the time in s of one exchange of each of its jobs, with silences and intervals."""
+    """Return, by drive, the time in s to carry out each of its jobs once, with silences and pauses."""
     found: dict[Drive, float] = {}
     for job in jobs:
         drive = job.planned.drive
@@ -172,7 +172,7 @@ def _jobs(
 
 
 class _Slots(NamedTuple):
-    """The properties of a job that determine its schedule; used as cache key."""
+    """The properties of a job that determine its schedule. They are a cache key."""
 
     drive: int
     kind: int
@@ -183,8 +183,8 @@ class _Slots(NamedTuple):
 
 
 def _run(jobs: Sequence[_PredictedJob], switching: float) -> None:
-    """Run the jobs on a simulated clock, and store the results in them."""
-    # one drive represents each kind: the pause between two drives depends only on their kinds
+    """Simulate the jobs' exchanges on a clock, and store the results in the jobs."""
+    # one drive stands for all drives of its kind, because the pause between two drives depends only on kinds
     ends = {kind(job.planned.drive): job.planned.drive for job in jobs}
     numbers = {kind: number for number, kind in enumerate(ends)}
     gaps = tuple(tuple(gap(before, after, switching) for after in ends.values()) for before in ends.values())
@@ -205,11 +205,11 @@ def _run(jobs: Sequence[_PredictedJob], switching: float) -> None:
         job.done = done
 
 
-@lru_cache(64)  # a plant often has several equal lines, and may be predicted several times
+@lru_cache(64)  # a plant often has several equal lines, and is often predicted more than once
 def _carried_out(
     slots: tuple[_Slots, ...], owns: tuple[float, ...], gaps: tuple[tuple[float, ...], ...]
 ) -> tuple[_Done, ...]:
-    """Simulate the jobs in the schedule's order; return the results of each job.
+    """Simulate the exchanges of jobs in the schedule's order; return the results of each job.
 
     `owns` are the jobs' times in s, without silence. `gaps[a][b]` is the pause in s from a drive of kind a to
     a following drive of kind b.
@@ -276,20 +276,20 @@ def _block_metadata(planned: Planned) -> dict[str, Any]:
 # ---- suggestions ----
 
 
-WORTH_SAYING = 0.02  # minimum fraction of the reading time that a suggestion must save
+WORTH_SAYING = 0.02  # least fraction of the reading time that a suggestion must save
 _NAMES = {HOLDING: "HOLDING", HOLDING_MULTIPLE: "HOLDING", INPUT: "INPUT", COIL: "COIL", DISCRETE: "DISCRETE"}
 
-SLOWER = 1.05  # factor from one attempted period to the next
+SLOWER = 1.05  # factor between one period that is tried and the next
 
 
 @dataclass(frozen=True)
 class Suggestions:
-    """Three changes, each of which lets the line reach its rates. A change is None if it is not enough."""
+    """Three changes to a line. Each one alone lets the line reach its rates; None if it cannot."""
 
-    every: tuple[tuple[float, float], ...]  # pairs: wanted period, reachable period (s)
-    # lowest sufficient baud rate, and the drives that now use a lower one
+    every: tuple[tuple[float, float], ...]  # pairs of a wanted period and a period that can be reached, in s
+    # lowest baud rate that is enough, and the drives that now have a lower one
     baudrate: tuple[int, tuple[Drive, ...]] | None
-    registers: int | None  # most registers per drive, for drives whose rates do not fit
+    registers: int | None  # largest number of registers per drive, for drives whose rates do not fit
 
     def __str__(self) -> str:
         pairs = (f'every = "{duration_text(new)}" instead of {duration_text(old)}' for old, new in self.every)
@@ -304,7 +304,7 @@ class Suggestions:
 
 
 def duration_text(seconds: float) -> str:
-    """Return a duration as it is written in a plant file, such as "50 ms"."""
+    """Return a duration in the notation of plant files, such as "50 ms"."""
     return f"{seconds:g} s" if seconds >= 1 else f"{seconds * 1e3:g} ms"
 
 
@@ -325,7 +325,7 @@ def suggest(exchanges: Sequence[Planned], prediction: Prediction, switching: flo
 def _every(
     exchanges: Sequence[Planned], tight: Sequence[Rate], least: float, switching: float
 ) -> tuple[tuple[float, float], ...]:
-    """Lengthen the periods of the rates `tight`, which are not reached, until all rates are reached.
+    """Lengthen the periods of the rates `tight`, which the line does not reach, until all rates are reached.
 
     Return pairs in s: the wanted period, and the longer period. All wanted periods are multiplied by the
     same factor, at least `least`. The search always ends: the other exchanges reach their rates already, and
@@ -347,13 +347,13 @@ def _every(
 
 
 def _rounded_up(seconds: float) -> float:
-    """Round up to two significant digits."""
+    """Round a duration up to two significant digits."""
     digit = 10.0 ** (math.floor(math.log10(seconds)) - 1)
     return round(math.ceil(seconds / digit - 1e-9) * digit, 9)
 
 
 def _baudrate(exchanges: Sequence[Planned], switching: float) -> tuple[int, tuple[Drive, ...]] | None:
-    """Return the lowest baud rate at which all rates are reached, and the drives that now use a lower one."""
+    """Return the lowest baud rate that reaches all rates, and the drives that now have a lower one."""
     wanted: dict[Drive, list[tuple[Register[Any], float | None]]] = {}
     for each in exchanges:
         wanted.setdefault(each.drive, []).extend((register, each.every) for register in each.block.registers)
@@ -380,7 +380,7 @@ def _at(drive: Drive, baudrate: int) -> Drive:
 
 
 def _registers(exchanges: Sequence[Planned], tight: Sequence[Rate], switching: float) -> int | None:
-    """Return the most registers per drive with which each rate is reached; None if even one is too many."""
+    """Return how many registers per drive the line can read at the wanted rates; None if not even one."""
     crowded = {(rate.drive, rate.every) for rate in tight}
     others = [each for each in exchanges if (each.drive, each.every) not in crowded]
 
@@ -398,9 +398,9 @@ def _registers(exchanges: Sequence[Planned], tight: Sequence[Rate], switching: f
 
 @dataclass(frozen=True)
 class ReadingGain:
-    """The cost of a drive's reads if its class declared these readable gaps, and their cost now.
+    """The bus time of a drive's reads now, and the time if its class declared readable gaps.
 
-    A readable gap is a range of addresses without declared registers that a request may read across.
+    A readable gap is a range of undeclared addresses that a request may include.
     """
 
     drive: Drive
@@ -419,7 +419,7 @@ class ReadingGain:
         )
 
     def _declaration(self) -> str:
-        """Return the text that would declare the gaps in the family's file or class."""
+        """Return the text that declares the gaps in a family file or a class."""
         named = [(_NAMES.get(table, table.name), gap) for table, gap in self.gaps]
         if self.drive.declared_in:
             in_file = (f"{name.lower()} = [0x{gap[0]:X}, 0x{gap[-1]:X}]" for name, gap in named)
@@ -452,7 +452,7 @@ def reading_gain(drive: Drive, wanted: Iterable[tuple[Register[Any], float | Non
 
 
 def _crossed(drive: Drive, table: Table, found: Sequence[Planned]) -> range:
-    """Return the range from the first to the last undeclared address in these blocks of `table`."""
+    """Return the range from the first to the last undeclared address that these blocks of `table` include."""
     family: Any = type(drive)
     readable = readable_addresses(family, table)
     blocks = [one.block for one in found if one.block.table.read_space == table.read_space]

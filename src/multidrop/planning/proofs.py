@@ -1,4 +1,4 @@
-"""Choose proofs: reads whose replies show that no earlier reply of the drive can still come.
+"""Choose proofs: reads whose reply proves that no late reply of the drive can still come.
 
 After a timeout a reply may still come, at any time and to any outstanding request. But a late reply can never
 be mistaken for the reply to a proof. Once the reply to a proof has come, no earlier reply can still come,
@@ -20,20 +20,20 @@ from multidrop.drive.register import COIL, DISCRETE, HOLDING, INPUT, Access, Car
 from multidrop.drive.request import read_request
 from multidrop.planning.blocks import Block, all_requests
 
-MOST_PROOFS = 4  # limit of proofs per drive, because each proof uses memory
+MOST_PROOFS = 4  # limit of proofs per drive, because each one uses memory
 
-# Tables to read as proofs if a device's replies all look alike: each reply, even an exception, has the
+# Tables to read as proofs if a device's other replies all look alike. Even an exception reply has the
 # function code of its table.
 OTHER_TABLES = (INPUT, COIL, HOLDING, DISCRETE)
-# Number of proofs that a drive needs. A late reply to the first may still come, so another one is needed. The
-# last is sent only once a silent drive answers again.
+# Number of proofs that a drive needs. A late reply to the first proof may still come, so the second is
+# needed. The third is only sent when a silent drive answers again.
 ENOUGH = 3
 
-RawRange = tuple[int, int]  # lowest and highest raw value of the only register in a reply
+RawRange = tuple[int, int]  # lowest and highest raw count that the only register of a reply can have
 
 
 def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
-    """Return the blocks to read from this drive as proofs.
+    """Return blocks of this drive that can be read as proofs.
 
     Each block comes with the range of raw values that its reply is known to hold, or with None. The last
     block is the least likely to be polled. If a Modbus device has fewer than ENOUGH blocks, blocks of its
@@ -46,7 +46,7 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
     ]
     if known:
         found = [*known, *found[1:]]
-    if probe := drive.echo_probe:  # a read whose reply cannot be mistaken for an echo
+    if probe := drive.echo_probe:  # a read whose reply always differs from an echo of the request
         found = [(Block.of(drive, [probe]), None), *found]
     if len(found) < ENOUGH and not known and drive.framing is not Framing.DELIXI:
         found += [(block, None) for block in _of_other_tables(drive, [block for block, _ in found])]
@@ -57,7 +57,7 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
 
 @lru_cache(maxsize=256)
 def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
-    """Return groups of registers whose reads have replies of different shape (see `_shape`), as proofs.
+    """Return groups of registers whose replies can be distinguished from each other (see `_shape`).
 
     Groups of readings come first, because readings are polled anyway; shorter requests come before longer
     ones. If there are many groups, only the first MOST_PROOFS and the last one are returned.
@@ -75,7 +75,7 @@ def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
 
 
 def _of_other_tables(drive: Drive, found: Sequence[Block]) -> list[Block]:
-    """Return blocks of one register, each with a function code that no block in `found` has."""
+    """Return blocks of one register each. No two of them, or of `found`, have the same function code."""
     start = found[0].start if found else 0
     functions = {block.table.read for block in found}
     return [
@@ -86,7 +86,7 @@ def _of_other_tables(drive: Drive, found: Sequence[Block]) -> list[Block]:
 
 
 def _shape(first: Register[Any], count: int) -> Hashable:
-    """Return the properties of a request that can be recognised in its reply."""
+    """Return the properties of a read request that its reply shows, such as its function code."""
     if first.table.carrier is Carrier.LONG:
         return first.table.read, first.address
     if first.table.carrier is Carrier.BIT:

@@ -1,12 +1,12 @@
 """Decide which exchange of a line is carried out next. Callers pass the time, in ns.
 
 The exchanges are planned in advance, up to a horizon, so that the line never waits for Python. A job with a
-period has one slot in each period; slots start at multiples of the period and never drift. Among the started
-slots, the slot that ends first goes first. If there is time for all of them, jobs of one kind are sent one
-after another. A slot that ends before its turn is counted and skipped for good. Then, until the line has
-caught up, the job that has waited longest goes first, so that each job gets a share. Jobs without a period
-form the round: they take turns in the remaining time, and have a minimum share of the line. Silent drives get
-few requests: see `BackOff`.
+period has one slot (a time interval in which it is carried out) in each period. Slots start at multiples of
+the period and never drift. Among the started slots, the slot that ends first goes first. If there is time for
+all of them, jobs of one kind are sent one after another. A slot that ends before its turn is counted and
+skipped for good. Then, until the line has caught up, the job that has waited longest goes first, so that each
+job gets a share. Jobs without a period take turns, one round after another, in the remaining time. They have
+a minimum share of the line. Silent drives get few requests: see `BackOff`.
 """
 
 from __future__ import annotations
@@ -16,19 +16,21 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, NamedTuple, TypeVar
 
-TURN_SHARE = 0.05  # minimum share of the line for jobs without a period
-CREDIT_NS = 50_000_000  # limit of the line time that these jobs can use in advance of their share
+TURN_SHARE = 0.05  # least fraction of the line's time for jobs without a period
+# limit of the line time that jobs without a period can use before they are entitled to it
+CREDIT_NS = 50_000_000
 NEVER_NS = 1 << 63
-SILENT_AFTER = 2  # number of consecutive failures after which a drive rests
+SILENT_AFTER = 2  # number of successive failures after which a drive gets no requests for a while
 FIRST_REST_NS = 500_000_000
 LONGEST_REST_NS = 2_000_000_000
-SILENT_SHARE = 0.015  # share of the line's time for requests to silent drives
-SECOND_COST_NS = 400_000_000  # limit of the line time for second requests to all silent new drives
+SILENT_SHARE = 0.015  # fraction of the line's time for requests to silent drives
+# limit of the line time for second requests to all new drives that did not reply
+SECOND_COST_NS = 400_000_000
 
 
 @dataclass(eq=False, kw_only=True)
 class Job:
-    """One exchange that is carried out repeatedly with the drive at this address.
+    """An exchange that is repeated with the drive at this address.
 
     Jobs of one `kind` have the same line settings and silence. They take the least time if they follow each
     other.
@@ -37,13 +39,14 @@ class Job:
     drive: int
     period_ns: int | None
     duration_ns: int
-    silence_ns: int = 0  # silence before the request, included in `duration_ns`; may pass on an idle line
-    interval_ns: int = 0  # minimum time from the end of an exchange to the drive's next request
+    # silence before the request; part of `duration_ns`, but may pass while the line is idle
+    silence_ns: int = 0
+    interval_ns: int = 0  # least time from the end of an exchange to the next request to the drive
     kind: Hashable = None
     due_ns: int = 0
     taken_ns: int = 0
-    skipped: int = 0  # number of slots skipped because the line was busy
-    number: int = 0  # place in the bus cycle
+    skipped: int = 0  # number of slots that passed without a request because the line was busy
+    number: int = 0  # position in the bus cycle
 
     @property
     def end_ns(self) -> int:
@@ -54,11 +57,11 @@ J = TypeVar("J", bound=Job)
 
 
 class Turn(NamedTuple, Generic[J]):
-    """One execution of a job."""
+    """One exchange of a job, as planned."""
 
     job: J
     not_before_ns: int
-    due_ns: int | None  # start of the job's slot; None for a job without slots
+    due_ns: int | None  # start of the slot; None for a job without a period
 
 
 # ---- silent drives ----
@@ -66,15 +69,15 @@ class Turn(NamedTuple, Generic[J]):
 
 @dataclass
 class Health:
-    """A drive's failures, and its rest (the time in which it gets no request)."""
+    """A drive's failures, and the time in which it gets no request."""
 
-    is_new: bool = False  # the drive has never answered
-    is_pending: bool = False  # the drive is new, and the outcome of its request is not known yet
+    is_new: bool = False  # True if the drive has never answered
+    is_pending: bool = False  # True if the drive is new and its first request has no result yet
     failures: int = 0
     late_until_ns: int = 0
     rest_ns: int = 0
     asleep_until_ns: int = 0
-    cost_ns: int = 0  # line time of a request without a reply
+    cost_ns: int = 0  # line time of a request that gets no reply
 
 
 @dataclass
@@ -92,13 +95,13 @@ class BackOff:
     request if they are few. Drives are given by address.
     """
 
-    begin_rest: Callable[[int, int], None]  # its arguments: the drive's address, and the time
+    begin_rest: Callable[[int, int], None]  # called with the drive's address and the time
     health: dict[int, Health] = field(default_factory=dict)
-    has_silent: bool = False  # True if any drive is new, or did not answer its last request
-    _late_until_ns: int = 0  # the latest `late_until_ns` of all drives
+    has_silent: bool = False  # True if any drive is new or did not answer its last request
+    _late_until_ns: int = 0  # latest `late_until_ns` of all drives
 
     def meet(self, drive: int) -> None:
-        """Treat a drive as new: it may be absent, so it gets only one request until the outcome is known."""
+        """Treat a drive as new. It may be absent, so it gets only one request until the result is known."""
         self.health[drive].is_new = self.has_silent = True
 
     def forget(self, drive: int) -> None:
@@ -110,7 +113,7 @@ class BackOff:
             self.health[drive].is_pending = False
 
     def may_sleep(self, at_ns: int) -> bool:
-        """Return True if any drive may be asleep (gets no request now)."""
+        """Return True if a drive on the line may get no request now."""
         return self.has_silent or at_ns < self._late_until_ns
 
     def is_asleep(self, drive: int, at_ns: int) -> bool:
@@ -118,7 +121,7 @@ class BackOff:
         return health.rest_ns > 0 or at_ns < max(health.asleep_until_ns, health.late_until_ns)
 
     def wake(self, at_ns: int) -> int | None:
-        """Return a drive whose rest is over, and start its next rest; None if there is no such drive."""
+        """Return a drive that may get a request again, and start its next pause; None if there is none."""
         for drive, health in self.health.items():
             if health.rest_ns and at_ns >= health.asleep_until_ns and not health.is_pending:
                 health.asleep_until_ns = at_ns + health.rest_ns
@@ -135,7 +138,7 @@ class BackOff:
         cost_ns: int,
         has_answered: bool = True,
     ) -> None:
-        """Record a drive's number of consecutive failures.
+        """Record how many requests to a drive have failed in a row.
 
         `cost_ns` is the line time of its next request if no reply comes. Until `late_until_ns` a reply to an
         earlier request may come. Until then the drive gets no request, even if it has answered another one.
@@ -170,18 +173,18 @@ class BackOff:
         health.asleep_until_ns = max(health.late_until_ns, now_ns + rest_ns)
 
     def _fair_rest_ns(self) -> int:
-        """Return the pause, in ns, that keeps requests to all silent drives within SILENT_SHARE."""
+        """Return the pause in ns that keeps requests to all silent drives within SILENT_SHARE."""
         return round(sum(health.cost_ns for health in self.health.values() if health.rest_ns) / SILENT_SHARE)
 
     def _wake_next(self, drive: int, now_ns: int) -> None:
-        """Retry the silent drive that is due next immediately, because this drive answers again."""
+        """Let the silent drive whose pause ends next be tried now, because this drive answers again."""
         resting = [health for number, health in self.health.items() if health.rest_ns and number != drive]
         if resting:
             first = min(resting, key=lambda health: health.asleep_until_ns)
             first.asleep_until_ns = min(first.asleep_until_ns, max(now_ns, first.late_until_ns))
 
     def _try_new_again(self, now_ns: int) -> None:
-        """If all new drives have had a request and few of them were silent, retry the silent ones now."""
+        """Let silent new drives be tried again now, if all new drives had a request and few were silent."""
         new = [health for health in self.health.values() if health.is_new]
         silent = [health for health in new if health.failures == 1]
         if all(health.failures for health in new) and sum(each.cost_ns for each in silent) <= SECOND_COST_NS:
@@ -201,18 +204,20 @@ class Schedule(Generic[J]):
     def clear(self) -> None:
         """Forget all jobs and the health of their drives."""
         self.jobs: list[J] = []
-        self.unasked: list[tuple[J, int]] = []  # slots skipped because the drive is silent: job and due time
+        # slots without a request because the drive is silent: job and start of the slot
+        self.unasked: list[tuple[J, int]] = []
         self.back_off = BackOff(self._begin_rest)
         self._health: dict[int, Health] = self.back_off.health
-        self._waiting: list[tuple[int, int, J]] = []  # a heap of (due, number, job)
-        self._begun: list[J] = []  # jobs whose slot has started
-        self._ready: dict[int, int] = {}  # drive that needs intervals: its next request's earliest time
-        self._held: list[J] = []  # jobs without a period whose turn came before their drive was ready
-        self._round: list[J] = []  # jobs without a period
-        self._next = 0  # index of the next job in the round
-        self._owed_ns = -CREDIT_NS  # line time owed to jobs without a period; negative: used in advance
-        self._is_late = False  # True after a skipped slot, until the line has no due job
-        self._kind: Hashable = None  # kind of the job that was taken last
+        self._waiting: list[tuple[int, int, J]] = []  # heap of (start of the slot, number, job)
+        self._begun: list[J] = []  # jobs whose slot has started but is not carried out yet
+        self._ready: dict[int, int] = {}  # by drive that needs pauses: the earliest time of its next request
+        self._held: list[J] = []  # jobs without a period that must wait until their drive's pause has ended
+        self._round: list[J] = []  # jobs without a period, in the order of their turns
+        self._next = 0  # index in `_round` of the next job
+        # line time that jobs without a period are entitled to; negative: used in advance
+        self._owed_ns = -CREDIT_NS
+        self._is_late = False  # True from a skipped slot until no job is due
+        self._kind: Hashable = None  # line settings and silence of the job that was taken last
         self._number = 0
 
     def add(self, job: J, now_ns: int) -> None:
@@ -228,7 +233,7 @@ class Schedule(Generic[J]):
             self._await(job)
 
     def remove(self, job: J) -> None:
-        """Remove a job; its queued exchanges are still carried out."""
+        """Remove a job. Exchanges of the job that are already queued are still carried out."""
         self.jobs.remove(job)
         self._held = [held for held in self._held if held is not job]
         if job.interval_ns and all(other.drive != job.drive for other in self.jobs):
@@ -242,7 +247,7 @@ class Schedule(Generic[J]):
             self._round.pop(at)
 
     def replace(self, jobs: Sequence[J], others: Sequence[J], due_ns: int) -> None:
-        """Put `others` in the place of `jobs` in the round. The first slots of `others` start at `due_ns`."""
+        """Replace `jobs` by `others` in the order of turns. The first slots of `others` start at `due_ns`."""
         rest = self._round[self._next :] + self._round[: self._next]
         at = next((at for at, job in enumerate(rest) if job in jobs), len(rest))
         for job in others:
@@ -253,7 +258,7 @@ class Schedule(Generic[J]):
             self.remove(job)
 
     def put_in_order(self, drives: Sequence[int]) -> None:
-        """Sort the round in the order of these drives, and restart it."""
+        """Sort the jobs without a period by the order of these drives, and start a new round."""
         places = {drive: place for place, drive in enumerate(drives)}
         self._round.sort(key=lambda job: places[job.drive])
         self._next = 0
@@ -264,7 +269,7 @@ class Schedule(Generic[J]):
     # ---- the next jobs ----
 
     def cycle(self, now_ns: int) -> list[J]:
-        """Return the jobs of the round, starting with the next job.
+        """Return the jobs without a period, starting with the next one.
 
         Return [] if any job has slots or an interval, or if any drive is silent.
         """
@@ -273,12 +278,12 @@ class Schedule(Generic[J]):
         return self._round[self._next :] + self._round[: self._next]
 
     def go_on(self, job: J) -> None:
-        """Make this job the next job of the round."""
+        """Make this job the next one among the jobs without a period."""
         if job in self._round:
             self._next = self._round.index(job)
 
     def take(self, now_ns: int, start_ns: int, horizon_ns: int, most: int) -> list[Turn[J]]:
-        """Return at most `most` turns, in order, that keep the line busy until `horizon_ns`.
+        """Return the next exchanges in order, at most `most`, that keep the line busy until `horizon_ns`.
 
         `start_ns` is the time at which the line will have carried out all earlier turns.
         """
@@ -302,13 +307,13 @@ class Schedule(Generic[J]):
         return not self._ready or at_ns >= self._ready.get(job.drive, 0)
 
     def _next_ns(self, at_ns: int) -> int:
-        """Return the earliest future time at which a slot starts or a drive's interval ends."""
+        """Return the earliest future time at which a slot starts or a drive's pause ends."""
         times = [max(at_ns, self._waiting[0][0])] if self._waiting else []
         times += [ready_ns for ready_ns in self._ready.values() if ready_ns > at_ns]
         return min(times, default=NEVER_NS)
 
     def _begin_slots(self, by_ns: int) -> None:
-        """Start all slots that are due, but skip slots of drives that get no request now."""
+        """Start all slots that are due. Skip slots of drives that get no request now."""
         while self._waiting and self._waiting[0][0] <= by_ns:
             job = heapq.heappop(self._waiting)[2]
             if self.back_off.is_asleep(job.drive, by_ns):
@@ -350,7 +355,7 @@ class Schedule(Generic[J]):
         return min(begun, key=lambda job: (job.kind != self._kind, job.end_ns, job.number))
 
     def _in_turn(self, at_ns: int) -> J | None:
-        """Return the shortest job of a drive whose rest is over, or the next job of the round, or None."""
+        """Return the shortest job of a silent drive to try, else the next job without a period, else None."""
         if self.back_off.has_silent and (drive := self.back_off.wake(at_ns)) is not None:
             own = [job for job in self.jobs if job.drive == drive]
             if own:
@@ -376,11 +381,11 @@ class Schedule(Generic[J]):
         return not self.back_off.is_asleep(job.drive, at_ns) and not self._health[job.drive].is_pending
 
     def _take(self, job: J, at_ns: int) -> Turn[J]:
-        """Return a job's turn for its present slot; count and skip its slots that are over."""
+        """Return the next exchange of a job. Count and skip its slots that are over."""
         health = self._health[job.drive]
         health.is_pending = health.is_new
         ready_ns = self._ready.get(job.drive, 0)
-        if job.period_ns is None or health.rest_ns:  # a request to a resting drive does not use a slot
+        if job.period_ns is None or health.rest_ns:  # a request that tries a silent drive does not use a slot
             self._owed_ns = max(self._owed_ns - self._duration_ns(job), -CREDIT_NS)
             return Turn(job, max(health.late_until_ns, ready_ns), None)
         self._begun.remove(job)
@@ -398,13 +403,13 @@ class Schedule(Generic[J]):
         return max(job.duration_ns, health.cost_ns) if health.rest_ns else job.duration_ns
 
     def _put_off(self) -> None:
-        """Delay the started slots of new drives whose first request has no result yet."""
+        """Postpone the started slots of new drives whose first request has no result yet."""
         for job in [job for job in self._begun if self._health[job.drive].is_pending]:
             self._begun.remove(job)
             self._await(job)
 
     def put_back(self, turns: Sequence[Turn[J]]) -> None:
-        """Schedule these turns again, in the same order, because they were not carried out."""
+        """Schedule these exchanges again in the same order, because they were not carried out."""
         for turn in reversed(turns):
             job = turn.job
             self.back_off.conclude(job.drive)
@@ -422,11 +427,11 @@ class Schedule(Generic[J]):
     # ---- slots without a request ----
 
     def _begin_rest(self, drive: int, now_ns: int) -> None:
-        """Add the drive's jobs without slots to `unasked`, so that each gets a row without a value."""
+        """Add the drive's jobs without a period to `unasked`, so that each gets one row without a value."""
         self.unasked += [(job, now_ns) for job in self._round if job.drive == drive]
 
     def pass_slots(self, now_ns: int) -> list[tuple[J, int]]:
-        """Skip every slot that starts by `now_ns`; return pairs of a job and the due time of its slot."""
+        """Skip every slot that starts by `now_ns`. Return each with its job and its start time."""
         while self._begun:
             self._await(self._begun.pop())
         passed = []
@@ -438,5 +443,5 @@ class Schedule(Generic[J]):
         return passed
 
     def pass_all(self, now_ns: int) -> list[tuple[J, int]]:
-        """Skip all due slots and one turn of each job without a period; return pairs like `pass_slots`."""
+        """Skip all due slots, and one turn of each job without a period. Return pairs like `pass_slots`."""
         return [*((job, now_ns) for job in self._round), *self.pass_slots(now_ns)]

@@ -1,4 +1,4 @@
-"""The plant file."""
+"""The plant file, which describes the lines and drives of a plant."""
 
 from multidrop.plant.loader import check_channels as check_channels
 from multidrop.plant.model import FLEET_KEYS as FLEET_KEYS

@@ -1,4 +1,4 @@
-"""Load a plant file, and find all errors in the file. Opens no port."""
+"""Load a plant file and find all mistakes in it. Opens no port."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ from multidrop.toml_document import read_document
 
 
 class PlantError(ValueError):
-    """All errors of a plant file; `mistakes` has a sentence for each, with its place and what would be right.
+    """Raised for a plant file with mistakes; `mistakes` has a sentence for each, with place and correction.
 
-    `right` is the plant with those drives that can be stopped: their own entries have no mistakes, except in
+    `right` is a plant with only those drives that can be stopped: their entries have no mistakes, except in
     `every`, `poll` and channels. It is None if the file is not valid TOML.
     """
 
@@ -54,12 +54,15 @@ class PlantError(ValueError):
 
 
 def load_plant(path: Path | str) -> Plant:
-    """Return the plant that the file describes. Raises PlantError if there is any error in the file."""
+    """Return the plant that a file describes. Raises PlantError with all mistakes in the file."""
     return _load(path, lambda document: PLANT_KEYS)
 
 
 def load_served_plant(path: Path | str) -> Plant:
-    """Load a plant file as `load_plant` does; a file with only [serve.fleet] gives a plant without lines."""
+    """Load a plant file like `load_plant`.
+
+    A file that only has the table [serve.fleet] gives an empty plant.
+    """
     return _load(path, _served_keys)
 
 
@@ -87,7 +90,7 @@ def _load(path: Path | str, keys_of: Callable[[Mapping[str, Any]], Mapping[str, 
 
 
 def _tables(document: dict[str, Any], keys: Mapping[str, Key], place: TomlPlace) -> dict[str, Any]:
-    """Return the valid tables of a document; add an error for every other one."""
+    """Return the valid tables of a document. Each other table adds an error to `place`."""
     for name, inside in _INNER.items():
         if name in document:
             place.wrong(f"[[{name}]] is not inside a line; write {inside}, in two brackets", name)
@@ -98,13 +101,13 @@ _INNER = {"drive": "[[line.drive]]", "channel": "[[line.drive.channel]]"}
 
 
 def check_channels(plant: Plant) -> None:
-    """Raise PlantError with all mistakes of the channels of a plant, which a program may have built."""
+    """Raise PlantError with all mistakes in the channels of a plant, which a program may have built."""
     if mistakes := ChannelSet(series_of(plant)).mistakes:
         raise PlantError(tuple(map(str, mistakes)))
 
 
 def port_or_address(name: Path | str) -> str:
-    """Return an error sentence if a URL or a device was given instead of a plant file, else ""."""
+    """Return an error sentence if `name` is a URL or a device instead of a plant file, else ""."""
     url = _URL.match(str(name))
     if url is None and not str(name).startswith("/dev/tty"):
         return ""
@@ -116,7 +119,8 @@ def port_or_address(name: Path | str) -> str:
     return f"{shown} is a port, not a plant file; `multidrop scan {shown} --out plant.toml` writes one"
 
 
-_URL = re.compile(r"([a-z][a-z0-9+.-]+):/{1,2}(.*)", re.IGNORECASE)  # Path leaves only one slash of two
+# one or two slashes, because Path reduces two slashes to one
+_URL = re.compile(r"([a-z][a-z0-9+.-]+):/{1,2}(.*)", re.IGNORECASE)
 _PORTS = ("tcp", "socket", "rfc2217")
 
 # Keywords of JSON Schema.
@@ -129,7 +133,7 @@ PORT = {"pattern": rf"^((?!.*://).*|({_BY_TCP}|{_BY_SOCKET})([/?#].*)?)$"}
 FORMATS = {"pattern": f"^{FORMAT}$"}
 BAUDRATE = {"minimum": BAUDRATES[0], "maximum": BAUDRATES[1]}
 TEXTS = {"items": {"type": "string", "minLength": 1}}
-_KNOWN = "|".join((*FUNCTION_NAMES, "and", "or", "not"))  # words that may precede a parenthesis
+_KNOWN = "|".join((*FUNCTION_NAMES, "and", "or", "not"))  # words that may stand before a parenthesis
 _UNKNOWN_FUNCTION = rf"^[^\"']*(?<![\w.-])(?!({_KNOWN})\s*\()[^\W\d]\w*\s*\("
 
 PLANT_KEYS = {
@@ -201,7 +205,7 @@ _NOT_ARGUMENTS = ("name", "model", "every", "poll", "channel")
 
 
 def _line(table: Any, place: TomlPlace) -> PlantLine | None:
-    """Return the line with the drives that can be stopped; None if the line itself has a mistake."""
+    """Return the line with its drives that can be stopped; None if the line itself has a mistake."""
     before = len(place.config_errors)
     given = place.check(table, LINE_KEYS)
     name, port = given.get("name", ""), given.get("port", "")
@@ -251,7 +255,7 @@ def _line(table: Any, place: TomlPlace) -> PlantLine | None:
 
 
 def _drive(table: Any, line: Mapping[str, Any], place: TomlPlace) -> PolledDrive | None:
-    """Return the drive; None if a key that its stop needs has a mistake."""
+    """Return the drive; None if its entry has a mistake that prevents a stop."""
     before = len(place.config_errors)
     model = _model(table, place)
     given = place.check(table, DRIVE_KEYS | _option_keys(model))
@@ -294,7 +298,7 @@ def _channel(table: Any, place: TomlPlace) -> Channel | None:
 
 
 def _check_channels(plant: Plant, given: Mapping[str, Any], place: TomlPlace) -> None:
-    """Add the mistakes of channels, which may name registers of any drive."""
+    """Add the mistakes in all channels, which may use registers of any drive."""
     places = {
         (drive["name"], channel["name"]): at
         for line, at_line in place.inside("line", given.get("line", []))
@@ -328,7 +332,10 @@ def _model(table: Any, place: TomlPlace) -> type[Drive] | None:
 
 
 def _option_keys(model: type[Drive] | None) -> dict[str, Key]:
-    """Return the keys of the family's options; for an unknown family, the keys of all families' options."""
+    """Return the keys for the options of a family.
+
+    If the family is unknown, include all families' options.
+    """
     families = [model] if model else list(MODELS.values())
     return {
         name: Key((int, float), f"{name} = {option.span[1]:g}")
@@ -340,7 +347,7 @@ def _option_keys(model: type[Drive] | None) -> dict[str, Key]:
 def _try_each(
     model: type[Drive], arguments: Mapping[str, Any], inherited: Mapping[str, Any], place: TomlPlace
 ) -> None:
-    """Try each argument alone, so that each argument that the family refuses gets its own error."""
+    """Pass each argument to the drive's class separately: each refused argument gets its own error."""
     least: dict[str, Any] = {"address": model.addresses[0]}
     if "framing" in arguments:
         framing = {"framing": arguments["framing"]}
@@ -352,7 +359,7 @@ def _try_each(
     settings = model(**least).settings
     right = {"baudrate": str(settings.baudrate), "format": f'"{settings.format}"'}
     for key, value in inherited.items():
-        if key not in right:  # other keys cannot be tried alone
+        if key not in right:  # the other keys need this one, so they cannot be tried
             continue
         hint = f" (the line's); add {key} = {right[key]} to this drive"
         place.attempt(partial(model, **(least | {key: value})), hint=hint)
@@ -378,7 +385,7 @@ def _polls(
 def _polled(
     entry: Any, model: type[Drive], every: float | None, place: TomlPlace
 ) -> Polled | tuple[Polled, ...] | None:
-    """Return the poll of an entry; for "*", the polls of all readings; None if the entry is invalid."""
+    """Return the polls of an entry in the list `poll`: all readings for "*"; None if the entry is invalid."""
     if not isinstance(entry, (str, dict)):
         place.wrong(f'{entry!r} is not right; write "output_current" or {{ register = "output_current" }}')
         return None

@@ -1,4 +1,4 @@
-"""Plant: lines, their drives and the polled registers, as plain data."""
+"""Plant: its lines, their drives and the polled registers, as plain data."""
 
 from __future__ import annotations
 
@@ -67,9 +67,9 @@ class Polled:
 
 @dataclass(frozen=True, init=False)
 class PolledDrive:
-    """A drive and its polled registers, each with its rate.
+    """A drive and its polled registers, each with its period.
 
-    `polls` lists registers of the drive or their names, or Polled for a register with a period of its own.
+    `polls` lists registers of the drive, their names, or Polled objects for registers with their own period.
     Without `polls`, all readings of the drive are polled. `every` is the period in s of registers without
     their own; None means as fast as the line allows. `channels` are computed from registers of this drive and
     of others.
@@ -92,16 +92,16 @@ class PolledDrive:
         object.__setattr__(self, "polls", tuple(_polled(drive, one, every) for one in wanted))
         object.__setattr__(self, "channels", tuple(channels))
 
-    def __hash__(self) -> int:  # leaves out the polls, because the hash is computed often
+    def __hash__(self) -> int:  # the polls are not hashed, because the hash is computed often
         return hash(self.drive)
 
     @property
     def wanted(self) -> list[tuple[Register[Any], float | None]]:
-        """The polled registers with their periods in s, as `plan` takes them."""
+        """The polled registers with their periods in s, in the form that `plan` needs."""
         return [(poll.register, poll.every) for poll in self.polls]
 
     def at_rate(self, register: Register[Any] | None, every: float | None) -> PolledDrive:
-        """Return a copy in which `register` (None: every register) is polled with another period in s.
+        """Return a copy that polls `register` (None: every register) with another period in s.
 
         Raises ValueError for a register that is not polled.
         """
@@ -115,7 +115,7 @@ class PolledDrive:
 
     @property
     def series(self) -> tuple[Polled, ...]:
-        """The polled registers, followed by a register for each channel, which is never read."""
+        """The polled registers, and a placeholder register for each channel, which is never read."""
         slowest = max((poll.every or 0.0 for poll in self.polls), default=0.0) or None
         return (*self.polls, *(Polled(channel.register, slowest) for channel in self.channels))
 
@@ -133,13 +133,13 @@ def _polled(drive: Drive, wanted: Polled | Register[Any] | str, every: float | N
 
 @dataclass(frozen=True)
 class PlantLine:
-    """A port with its drives, whose settings already contain the line's baud rate and format."""
+    """A port with its drives. The drives' settings already include the line's baud rate and format."""
 
     name: str
     port: str
     baudrate: int | None = None
     format: str | None = None
-    drives: Sequence[PolledDrive] = ()  # kept as a tuple
+    drives: Sequence[PolledDrive] = ()  # converted to a tuple
     switching: float = 0.0  # s that the port takes to change baud rate or format
     echo: Echo = Echo.AUTO
     ids: TransactionIds = TransactionIds.MATCH
@@ -150,22 +150,22 @@ class PlantLine:
         object.__setattr__(self, "drives", tuple(self.drives))
 
     def at(self, port: str) -> PlantLine:
-        """Return a copy of the line at another port; without `rs485` if the new port is a network port."""
+        """Return a copy of the line at another port. The key `rs485` is dropped if that is a network port."""
         return replace(self, port=port, rs485=RS485.OFF if "://" in port else self.rs485)
 
 
 @dataclass(frozen=True)
 class Plant:
-    """All lines of a plant file, and its unchecked table `serve`, which only the gateway reads.
+    """All lines of a plant file, and its table `serve`, which is unchecked and only for the gateway.
 
-    With `realtime`, the core's thread is scheduled before all normal threads; see Poller.
+    With `realtime`, the thread of the C core runs before all normal threads; see Poller.
     """
 
-    lines: Sequence[PlantLine]  # kept as a tuple
-    path: Path = Path("plant")  # the plant file
+    lines: Sequence[PlantLine]  # converted to a tuple
+    path: Path = Path("plant")  # path of the plant file
     serve: Mapping[str, Any] = field(default_factory=dict, hash=False)
     realtime: bool = False
-    totals: Path | None = None  # file of the channels' totals; None: the default, see `totals_path`
+    totals: Path | None = None  # file with the totals of channels; None: the default file, see `totals_path`
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lines", tuple(self.lines))
@@ -173,7 +173,8 @@ class Plant:
     @classmethod
     def load(cls, path: Path | str) -> Plant:
         """Return the plant that a file describes; no port is opened. Raises PlantError with all mistakes."""
-        plant: Plant = import_module("multidrop.plant.loader").load_plant(path)  # avoids an import cycle
+        # imported here to avoid an import cycle
+        plant: Plant = import_module("multidrop.plant.loader").load_plant(path)
         return plant
 
     @property
@@ -211,7 +212,7 @@ class Plant:
         return replace(self, lines=lines)
 
     def metadata(self) -> dict[str, Any]:
-        """Return the metadata of a recording: versions, drives, registers, predictions."""
+        """Return the metadata of a recording: versions, drives, registers and predictions."""
         return {
             "multidrop": multidrop.__version__,
             "plant": str(self.path),
@@ -225,7 +226,7 @@ class Plant:
 
 
 def current_for(period: float) -> float:
-    """Return for how many seconds a polled value counts as current.
+    """Return how many seconds a polled value is valid.
 
     `period` in s is the register's own period or the line's bus cycle, whichever is longer.
     """
@@ -233,7 +234,7 @@ def current_for(period: float) -> float:
 
 
 def planned_on(line: PlantLine, delays: Mapping[Drive, float] | None = None) -> list[Planned]:
-    """Return the planned blocks of a line; `delays` are measured response delays in s."""
+    """Return the blocks to read on a line; `delays` are measured response delays in s, by drive."""
     known = delays or {}
     return [
         each
@@ -243,10 +244,10 @@ def planned_on(line: PlantLine, delays: Mapping[Drive, float] | None = None) -> 
 
 
 def series_of(plant: Plant, planned: Mapping[str, Any] | None = None) -> list[DriveSeries]:
-    """Return the series from which channels are computed; [] if the plant has no channels.
+    """Return the registers and channels from which channels are computed; [] if the plant has no channels.
 
-    How long a value stays current: see `current_for`. Pass `plant.metadata()["planned"]` as `planned`
-    if it is known.
+    Each value is valid for the time that `current_for` returns. Pass `plant.metadata()["planned"]` as
+    `planned` if it is known.
     """
     if not any(polled.channels for polled in plant.drives):
         return []
@@ -298,7 +299,7 @@ def _of_register(register: Register[Any]) -> dict[str, Any]:
 
 
 def allowed(plant: Plant, table: Mapping[str, Any], place: TomlPlace) -> dict[str, frozenset[str]]:
-    """Return the registers ("write") and verbs ("verbs"), as "drive.name", that a table `may` allows.
+    """Return the registers ("write") and verbs ("verbs") that a table `may` allows, as "drive.name".
 
     `table` has checked values of MAY_KEYS. Errors are added to `place`. `stop` is never listed: it is always
     allowed.
@@ -320,11 +321,10 @@ def allowed(plant: Plant, table: Mapping[str, Any], place: TomlPlace) -> dict[st
 
 
 def _listed(plant: Plant, key: str, entry: object) -> list[str]:
-    """Return what an entry such as "pump-1.start" or "pump-*.start" allows. Raises ValueError for a wrong
-    entry.
+    """Return the registers or verbs, as "drive.name", that an entry such as "pump-*.start" allows.
 
-    `*` stands for any characters of a drive's name. Drives without the register or verb are left out, unless
-    no drive has it.
+    `*` stands for any characters of a drive's name. Drives without the register or verb are skipped. Raises
+    ValueError for a wrong entry.
     """
     name, dot, rest = entry.rpartition(".") if isinstance(entry, str) else ("", "", "")
     if not dot:
@@ -350,7 +350,7 @@ def _listed(plant: Plant, key: str, entry: object) -> list[str]:
 
 
 def _entry(key: str, drive: Drive, name: object) -> str:
-    """Return "drive.name" if a list may allow this register or verb. Raises ValueError if not."""
+    """Return "drive.name" if the table `may` can allow this register or verb, else raise ValueError."""
     entry = f"{drive.name}.{name}"
     if key == "write":
         try:
@@ -372,7 +372,7 @@ def _entry(key: str, drive: Drive, name: object) -> str:
 # ---- names of drives and lines ----
 
 
-# Reserved names, each with its use: a topic, path, file or key has this name already.
+# Reserved names and their use: a topic, path, file or key already has this name.
 RESERVED_NAMES: Final[Mapping[str, str]] = {
     "gateway": "the MQTT topic PREFIX/gateway",
     "stop": "the MQTT topic PREFIX/stop, which stops all drives",
@@ -389,7 +389,7 @@ RESERVED_NAMES: Final[Mapping[str, str]] = {
 
 
 def check_drive_name(name: str) -> bool:
-    """Return True for a valid name of a drive or a line. Raises ValueError for a reserved or invalid one."""
+    """Return True if a drive or a line may have this name. Raises ValueError if not."""
     if name in RESERVED_NAMES:
         raise ValueError(f'name "{name}" is reserved for {RESERVED_NAMES[name]}; give it another name')
     if name.startswith("-"):
@@ -398,10 +398,11 @@ def check_drive_name(name: str) -> bool:
 
 
 def drive_meant(name: str, names: Iterable[str]) -> str:
-    """Return the listed name that `name` means.
+    """Return the name in `names` that `name` means.
 
-    That is `name` itself if it is listed, else the only listed name with the same Unicode normal form; else
-    return `name`. Use this only for stops and reads: a command that moves a motor must name it exactly.
+    This is `name` itself if it is in `names`, else the only one with the same Unicode normal form. If there
+    is none, `name` is returned. Use this only for stops and reads: a command that moves a motor must name it
+    exactly.
     """
     names = [*names]
     if name in names:

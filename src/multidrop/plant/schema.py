@@ -1,4 +1,4 @@
-"""The JSON Schema of a plant file, made from the keys that the loader checks."""
+"""The JSON Schema of a plant file, generated from the keys that the loader checks."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _Families = Mapping[str, type[Drive]]
 def plant_schema(serve: Mapping[str, Any], own: _Families) -> dict[str, Any]:
     """Return the JSON Schema of a plant file; `serve` is the schema of its table [serve].
 
-    The schema also has the registers, addresses and options of the built-in families, the shipped families,
-    and of `own`: further families by model, as written in the plant file.
+    The schema also has the registers, addresses and options of all families: the built-in families, the
+    family files of this package, and `own`, which are further families by model name.
     """
     families = {**MODELS, **{name: shipped_family(name) for name in SHIPPED}, **own}
     follows = {"required": ["serve"], "properties": {"serve": {"required": ["fleet"]}}}
@@ -39,7 +39,7 @@ def plant_schema(serve: Mapping[str, Any], own: _Families) -> dict[str, Any]:
             for number, model in enumerate(models)
             for table in ("serve", "fleet")
         ],
-        definitions={  # numbered, because a model's name or a unit may have any characters
+        definitions={  # keys are numbers, because a model's name or a unit may have any characters
             **{f"lists-{number}": _lists_of(model, families) for number, model in enumerate(models)},
             **_units_of_integrals(families),
         },
@@ -56,7 +56,7 @@ def _allowed(model: str, table: str, number: int) -> dict[str, Any]:
 
 
 def _lists_of(model: str, families: _Families) -> dict[str, Any]:
-    """Return the schema of a plant file whose tables `may.family` name this model."""
+    """Return the schema for plant files whose table `may.family` names this model."""
     names = [name for name, family in families.items() if family.model == model]
     family = families[names[0]]
     writable = [register.name for register in family.registers.values() if register.writable]
@@ -71,7 +71,7 @@ def _lists_of(model: str, families: _Families) -> dict[str, Any]:
 
 
 def _inside(keys: Sequence[str], condition: dict[str, Any]) -> dict[str, Any]:
-    """Return a schema that applies this condition to the table at this path of keys."""
+    """Return a schema that applies a condition to the table at this path of keys."""
     for key in reversed(keys):
         condition = {"properties": {key: condition}, "required": [key]}
     return condition
@@ -109,7 +109,7 @@ def _drives(schema: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _inherited(families: _Families) -> Iterator[dict[str, Any]]:
-    """Yield the parts of the schema for a line's baud rate and format, which some drives do not support.
+    """Yield the parts of the schema for drives that do not support their line's baud rate or format.
 
     Such a drive needs a baud rate or a format of its own.
     """
@@ -125,7 +125,7 @@ def _inherited(families: _Families) -> Iterator[dict[str, Any]]:
 
 
 def _facts(**values: list[str]) -> dict[str, Any]:
-    """Return the condition that each of these keys is stated, with one of its values."""
+    """Return the condition that each of these keys is present and has one of its values."""
     return {"properties": {key: {"enum": each} for key, each in values.items()}, "required": [*values]}
 
 
@@ -136,8 +136,8 @@ def _using(name: str, family: type[Drive], framing: Framing) -> list[dict[str, A
     return [stated, by_default] if framing is family.framings[0] else [stated]
 
 
-_SHORT = r"^\s*(0*\d{1,3}(\.\d+)?\s*us|0+(\.\d+)?\s*ms|0+(\.000\d*)?\s*s)\s*$"  # less than 1 ms
-_SLOW = 15_000  # bit/s; at this baud rate and below, 1.5 characters take 1 ms or more
+_SHORT = r"^\s*(0*\d{1,3}(\.\d+)?\s*us|0+(\.\d+)?\s*ms|0+(\.000\d*)?\s*s)\s*$"  # a silence of less than 1 ms
+_SLOW = 15_000  # bit/s; up to this baud rate, 1.5 characters take 1 ms or more
 
 
 def _short_silences(families: _Families) -> list[dict[str, Any]]:
@@ -173,7 +173,7 @@ def _drive_schema(families: _Families) -> dict[str, Any]:
     readable = {register.name for family in families.values() for register in family.readings()}
     drive = json_schema(
         DRIVE_KEYS,
-        additionalProperties={"type": "number"},  # options of families in files
+        additionalProperties={"type": "number"},  # options of families from files, which are not known here
         allOf=[
             *(_of_family(name, family) for name, family in families.items()),
             *(_used(name) for name in sorted(readable)),
@@ -204,7 +204,7 @@ def _polls_of(register: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _twice(name: str) -> dict[str, Any]:
-    """Return the condition that a list polls a register twice, by its name and in a table."""
+    """Return the condition that a list polls a register twice: by its name, and in a table."""
     in_table = {"type": "object", "properties": {"register": {"const": name}}, "required": ["register"]}
     return {"allOf": [{"contains": {"const": name}}, {"contains": in_table}]}
 
@@ -231,7 +231,7 @@ def _used(name: str) -> dict[str, Any]:
 
 
 def _integrals(families: _Families) -> Iterator[dict[str, Any]]:
-    """Yield the parts of the schema for channels with the integral of one register: its possible units."""
+    """Yield the parts of the schema for the possible units of channels that are integrals of one register."""
     models: dict[tuple[str, str], list[str]] = {}
     for model, family in families.items():
         for register in family.readings():
@@ -249,7 +249,7 @@ def _integrals(families: _Families) -> Iterator[dict[str, Any]]:
 
 
 def _units_of_integrals(families: _Families) -> dict[str, Any]:
-    """Return the schema of an integral's unit for each unit of a register."""
+    """Return, for each unit of a register, the schema of the units that its integral may have."""
     found = {}
     for number, unit in enumerate(_units(families)):
         integral = unit_of(unit).times(SECOND)
@@ -264,7 +264,7 @@ def _units(families: _Families) -> list[str]:
 
 
 def _of_family(name: str, family: type[Drive]) -> dict[str, Any]:
-    """Return the part of the schema that applies to drives with this model."""
+    """Return the part of the schema for drives with this model."""
     registers = family.registers.values()
     readable = [register.name for register in registers if register.readable]
     not_in_eeprom = [register.name for register in registers if register.kept is not Kept.EEPROM]

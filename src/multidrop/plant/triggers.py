@@ -1,4 +1,4 @@
-"""Triggers: conditions such as "pump-1.output_current > 30", as channels of a plant."""
+"""Triggers: conditions such as "pump-1.output_current > 30", which become channels of a plant."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from multidrop.channels import Channel, ChannelSet
 from multidrop.channels.grammar import ExpressionError, ReferenceStep, parse
 from multidrop.plant.model import Plant, PolledDrive, series_of
 
-PRE_S, POST_S = 5.0, 10.0  # default times before and after a trigger
-FAULT = "fault"  # the condition for a fault of any drive, and the name of the register that shows it
+PRE_S, POST_S = 5.0, 10.0  # s recorded before and after a trigger by default
+FAULT = "fault"  # condition that means a fault of any drive, and the name of the register with the fault
 
-TriggerSeries = tuple[str, str]  # a drive, and the name of a register or channel
+TriggerSeries = tuple[str, str]  # drive, and name of a register or channel
 
 
 class TriggerChannels(NamedTuple):
-    """A plant with a channel for each condition; the trigger is the moment when the channel leaves 0."""
+    """A plant with a channel for each condition. A trigger occurs when its channel is no longer 0."""
 
     plant: Plant
-    texts: Mapping[TriggerSeries, str]  # text of each trigger, by its channel
-    numbers: Mapping[TriggerSeries, int]  # index of each trigger's condition, by its channel
-    signals: Mapping[str, Sequence[TriggerSeries]]  # registers to show, by the trigger's text
+    texts: Mapping[TriggerSeries, str]  # by channel: the text of the trigger
+    numbers: Mapping[TriggerSeries, int]  # by channel: the index of the condition
+    signals: Mapping[str, Sequence[TriggerSeries]]  # by text of the trigger: the registers to show
 
 
 def with_triggers(plant: Plant, conditions: Collection[str]) -> TriggerChannels:
@@ -38,7 +38,8 @@ def with_triggers(plant: Plant, conditions: Collection[str]) -> TriggerChannels:
     by_fault = _showing_faults(plant) if FAULT in conditions else []
     for number, condition in enumerate(conditions):
         channel = Channel(f"trigger_{number + 1}", condition, is_kept=False)
-        own = {names[-1]: condition}  # the last drive, because a channel may only use channels above it
+        # the channel belongs to the last drive, because a channel may only use channels declared before it
+        own = {names[-1]: condition}
         if condition == FAULT:
             channel = replace(channel, value=f"{FAULT} != 0")
             own = {drive: f"fault of {drive}" for drive in by_fault}
@@ -60,10 +61,10 @@ def with_triggers(plant: Plant, conditions: Collection[str]) -> TriggerChannels:
 
 
 def _references(condition: str) -> list[TriggerSeries]:
-    """Return the registers and channels in a condition; the drive is "" if the condition names none."""
+    """Return the drives and names of the registers in a condition; the drive is "" if none is given."""
     try:
         return [(step.drive, step.name) for step in parse(condition) if isinstance(step, ReferenceStep)]
-    except ExpressionError:  # the check of the channels reports it
+    except ExpressionError:  # the check of the channels reports this mistake
         return []
 
 
@@ -84,7 +85,7 @@ def _showing_faults(plant: Plant) -> list[str]:
 
 
 def _with_channel(plant: Plant, channel: Channel, drives: Collection[str]) -> Plant:
-    """Return the plant with this channel added to the drives with these names."""
+    """Return a plant in which the drives with these names have this channel."""
 
     def extended(polled: PolledDrive) -> PolledDrive:
         more = [channel] if polled.drive.name in drives else []

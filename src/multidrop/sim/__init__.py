@@ -1,4 +1,4 @@
-"""Simulate drives on ptys and TCP ports: they behave as documented, with the timing of a serial line."""
+"""Simulate drives on ptys and TCP ports. They behave as documented, with the timing of a serial line."""
 
 from multidrop.sim.drive import DriveCounters as DriveCounters
 from multidrop.sim.drive import EncodedDrive as EncodedDrive

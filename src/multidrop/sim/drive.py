@@ -1,7 +1,8 @@
-"""SimulatedDrive: answers requests from its memory, whose layout comes from the drive's class.
+"""SimulatedDrive: answers requests from its memory. The drive's class determines the memory's layout.
 
-Input is a request with its time, output a reply or None; no port and no clock. The protocols are Modbus
-(application protocol V1.1b3) and Delixi's own (third part of Delixi's "RS-485 communication protocol").
+The input is a request with its time, the output is a reply or None. It has no port and no clock. The
+protocols are Modbus (application protocol V1.1b3) and Delixi's own (third part of Delixi's "RS-485
+communication protocol").
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ NO_DATA = bytes(4)  # unused D3..D0
 
 
 class Reason(Enum):
-    """A reason to refuse a request. Each family has an exception code for the reason, or does not reply."""
+    """A reason to refuse a request. Each family has an exception code for the reason, or sends no reply."""
 
     FUNCTION = "no such function"
     READ_ADDRESS = "nothing to be read there"
@@ -51,12 +52,15 @@ class Refusal(Exception):
 
 @dataclass(frozen=True)
 class DriveProtocol:
-    """A protocol's functions and usual exception codes. If a reason has no code, the drive does not reply."""
+    """A protocol's functions and default exception codes.
+
+    Without a code for a reason, the drive does not reply.
+    """
 
     answers: Mapping[int, Callable[[SimulatedDrive, Message], Message]]
     codes: Mapping[Reason, int]
-    octets: int  # bytes of a request for one register, without checksum
-    no_data: bytes = b""  # data of an exception reply
+    octets: int  # bytes in a request for one register, without the checksum
+    no_data: bytes = b""  # data bytes of an exception reply
 
 
 def _with_data(request: Message, data: bytes) -> Message:
@@ -97,14 +101,14 @@ def _write_coils(sim: SimulatedDrive, request: Message) -> Message:
 
 
 def _write_several(sim: SimulatedDrive, request: Message, raws: list[int]) -> Message:
-    # writes have the same length limit as reads
+    # the limit for the length of a read also applies to writes
     sim.check_count({0x0F: 0x01, 0x10: 0x03}[request.function], request.count)
     sim.write(request.function, request.start, raws)
     return Message(request.address, request.function, request.start, request.count)
 
 
 def _return_query_data(sim: SimulatedDrive, request: Message) -> Message:
-    if request.start != 0:  # only subfunction 0 is simulated
+    if request.start != 0:  # of function 08, only subfunction 0 is simulated
         raise Refusal(Reason.FUNCTION)
     return request
 
@@ -172,8 +176,8 @@ DELIXI = DriveProtocol(
 PROTOCOLS = {Framing.RTU: MODBUS, Framing.ASCII: MODBUS, Framing.TCP: MODBUS, Framing.DELIXI: DELIXI}
 
 
-MOST_REMEMBERED = 10_000  # limit of a drive's recorded writes, to save memory
-# maps the function code of a write to that of a read with the same length limit
+MOST_REMEMBERED = 10_000  # limit of the recorded writes of a drive, to save memory
+# by function code of a write: the function code of a read with the same length limit
 _COUNTED_AS = {0x06: 0x03, 0x10: 0x03}
 # Longest silence within a frame, in s. Sources: the Modbus serial-line guide, 2.5.2.1; the third part of
 # Delixi's document; for TCP an assumed long time.
@@ -184,20 +188,20 @@ class Written(NamedTuple):
     """A write that was carried out."""
 
     time: float
-    name: str  # the register's name
+    name: str  # name of the written register
     address: int
     raw: int
 
 
 @dataclass
 class DriveCounters:
-    """Numbers of one drive's requests, replies and writes since its creation."""
+    """Counts of one drive's requests, replies and writes since it was created."""
 
-    requests: int = 0  # not counting broadcasts
+    requests: int = 0  # number of requests, without broadcasts
     replies: int = 0  # refusals included
     refusals: int = 0
     broadcasts: int = 0
-    damaged: int = 0  # number of damaged frames with this drive's address
+    damaged: int = 0  # number of damaged frames with the drive's address
     early: int = 0  # number of frames that came too soon after a reply
     functions: Counter[int] = field(default_factory=Counter)
     eeprom_writes: Counter[str] = field(default_factory=Counter)
@@ -205,7 +209,7 @@ class DriveCounters:
 
 
 def _most_cells(drive: Drive) -> dict[int, int]:
-    """Return the most cells that one request may access, by the function code of reads.
+    """Return the largest number of cells in one request, by the function code of reads.
 
     A register that is longer than the family's limit can still be read whole.
     """
@@ -219,15 +223,16 @@ def _most_cells(drive: Drive) -> dict[int, int]:
 
 
 class SimulatedDrive:
-    """A simulated drive of any class; its registers hold the values written to them.
+    """A simulated drive of any class. Its registers keep the values written to them.
 
-    `drive[name]` gets or sets a register's value in its unit (None means "no value"), or a text.
+    `drive[name]` gets or sets a register's value in its unit, or a text. None means "no value".
     """
 
-    functions: ClassVar[Collection[int] | None] = None  # supported function codes; None: all of the protocol
-    # exception codes by reason; None: those of the protocol
+    # supported function codes; None: all functions of the protocol
+    functions: ClassVar[Collection[int] | None] = None
+    # exception codes by reason; None: the default codes of the protocol
     codes: ClassVar[Mapping[Reason, int] | None] = None
-    needs_silence: ClassVar[bool] = False  # True: ignore a frame without silence before it
+    needs_silence: ClassVar[bool] = False  # True if the drive ignores a frame without silence before it
 
     def __init__(self, drive: Drive, *, response_delay: float | None = None) -> None:
         self.drive = drive
@@ -236,7 +241,7 @@ class SimulatedDrive:
         self.memory = Memory(type(drive), drive.framing)
         self.counters = DriveCounters()
         self.now = 0.0  # time of the last request
-        self.deaf_until = 0.0  # time until which all frames are ignored; inf: for ever
+        self.deaf_until = 0.0  # time in s until which all frames are ignored; inf: for ever
         self.most = _most_cells(drive)
         for proof in drive.identity_proofs:
             self.memory.set(drive.register(proof.register), proof.example)
@@ -257,7 +262,7 @@ class SimulatedDrive:
             self.memory.set_text(self.drive.texts[name], value)
             return
         register = self.drive.register(name)
-        if isinstance(value, str):  # a named value; an unknown name raises ValueError
+        if isinstance(value, str):  # the name of a named value; an unknown name raises ValueError
             value = register.parse(value)
         self.memory.set(register, value)
         for cell in self.memory.of(register):
@@ -267,7 +272,7 @@ class SimulatedDrive:
         """Advance the drive's state to the time `now`."""
 
     def refresh(self, cell: MemoryCell) -> None:
-        """Update the cell to the value that a read at `self.now` returns."""
+        """Set the cell to the value that a read returns at the time `self.now`."""
 
     def accept(self, cell: MemoryCell, raw: int) -> int:
         """Return the raw count to store when `raw` is written. Raises Refusal if the drive rejects it."""
@@ -280,7 +285,7 @@ class SimulatedDrive:
         return raw
 
     def _accept_long(self, raws: Mapping[MemoryCell, int]) -> None:
-        """Raise Refusal if a write sets all words of a register to a value outside the register's span."""
+        """Raise Refusal if a write of all words of a register sets a value outside the register's limits."""
         for register in {cell.register for cell in raws if cell.register and cell.register.words > 1}:
             cells = self.memory.of(register)
             if all(cell in raws for cell in cells):
@@ -290,7 +295,7 @@ class SimulatedDrive:
                     raise Refusal(Reason.VALUE)
 
     def changed(self, cell: MemoryCell) -> None:
-        """React to a cell that was written over the line, or set by the user of the simulator."""
+        """React to a change of a cell, by a write over the line or by the user of the simulator."""
 
     def eeprom_written(self) -> None:
         """React to a write to the EEPROM."""
@@ -300,12 +305,15 @@ class SimulatedDrive:
 
     @property
     def delay(self) -> float:
-        """The time in s from the request's end to the reply's start: at least the silence after a frame."""
+        """The time in s from the request's end to the reply's start.
+
+        It is at least the silence after a frame.
+        """
         return max(self.response_delay, self.silence)
 
     @property
     def silence(self) -> float:
-        """The silence in s that the drive needs around an RTU frame; text frames need none."""
+        """The silence in s that the drive needs before and after an RTU frame. Text frames need none."""
         return self.drive.needed_silence() if self.drive.framing is Framing.RTU else 0.0
 
     @property
@@ -322,7 +330,7 @@ class SimulatedDrive:
             return self.answer(frame.message, frame.end)
         if not self._is_for_all(frame.address) and not self._knows(frame.function):
             return self.answer(Message(frame.address, frame.function), frame.end)
-        return None  # the frame's length does not fit its function code
+        return None  # the length does not fit the function code
 
     def _is_for_all(self, address: int) -> bool:
         return address == 0 and self.drive.framing is not Framing.TCP
@@ -412,7 +420,7 @@ class SimulatedDrive:
     def wears_eeprom(self, cell: MemoryCell, function: int, address: int) -> bool:
         """Return True if a write to this cell may wear the EEPROM.
 
-        That includes settings whose memory the document does not state, unless they are coils.
+        A setting whose memory the document does not state counts as EEPROM, but a coil does not.
         """
         register = cell.register
         if register is None or (function, address) in self.memory.aliases:
@@ -423,12 +431,15 @@ class SimulatedDrive:
 
 
 def encoded(address: int, table: Table, register_address: int) -> int:
-    """Return an EncodedDrive's raw count at these addresses in this table; a coil has its lowest bit."""
+    """Return the raw count of an EncodedDrive with this address, for a register at this address of a table.
+
+    A coil has the lowest bit of the count.
+    """
     return (address * 257 + register_address * 31 + (table.read or table.write or 0)) & 0x7FFF
 
 
 def proof(drive: Drive, register: Register[Any]) -> float:
-    """Return the value that an EncodedDrive returns for this register; NaN for "no value"."""
+    """Return the value that a read of this register from an EncodedDrive must return; NaN for "no value"."""
     if register in drive.known_counts():
         return register.coding.value_of(_known(drive, register))
     size = 2 if register.table.carrier is Carrier.WORD else 4
@@ -438,14 +449,14 @@ def proof(drive: Drive, register: Register[Any]) -> float:
 
 
 def _known(drive: Drive, register: Register[Any]) -> int:
-    """Return a raw count within the range stated by the family's document."""
+    """Return a raw count within the known range of this register."""
     least, most = drive.known_counts()[register]
     raw = encoded(drive.address, register.table, register.address)
     return least + raw % (most - least + 1)
 
 
 class EncodedDrive(SimulatedDrive):
-    """A drive whose raw counts depend on its address, the table and the register: see `encoded`.
+    """A drive whose raw counts depend on its address, the table and the register; see `encoded`.
 
     Writes are confirmed but change no count.
     """

@@ -1,4 +1,4 @@
-"""Simulated drives of the built-in families, after the manual that each class names."""
+"""Simulated drives of the built-in families. Each class follows the manual that it names."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ from multidrop.sim.profiles import (
 
 CHE_CONTROL, CHE_SETPOINT = 0x1000, 0x2000
 CHE_STARTS = range(1, 5)
-CHE_FULL = 10_000  # raw setpoint for 100 %
+CHE_FULL = 10_000  # raw count of the setpoint 100 %
 CHE_DEVICE_CODE = 0x0101  # CHE, universal
-CHE_MODBUS_FAULTS = {1: 2, 2: 4, 3: 5, 6: 8, 0x11: 3, 0x12: 6}  # exception code: value of register 5001H
+CHE_MODBUS_FAULTS = {1: 2, 2: 4, 3: 5, 6: 8, 0x11: 3, 0x12: 6}  # value of register 5001H, by exception code
 
 
 def _signed(raw: int) -> int:
@@ -63,8 +63,8 @@ class SimulatedCHE(MotorDrive):
         **MODBUS.codes,
         Reason.VALUE: 0x12,
         Reason.LOCKED: 0x12,
-        Reason.CANNOT: 1,  # the manual uses this code also for a command during a fault
-        Reason.DAMAGED: 0x11,  # manual, section 11.1: a receive error is answered with a fault frame
+        Reason.CANNOT: 1,  # the manual also uses this code for a command during a fault
+        Reason.DAMAGED: 0x11,  # manual, section 11.1: a damaged request gets an exception reply
     }
 
     storing = 0.0
@@ -84,7 +84,8 @@ class SimulatedCHE(MotorDrive):
     def accept(self, cell: MemoryCell, raw: int) -> int:
         if self.now < self._busy_until:
             raise Refusal(Reason.BUSY)
-        if cell.address == CHE_SETPOINT:  # the drive accepts negative setpoints, but multidrop sends none
+        # the drive accepts negative setpoints, although multidrop sends none
+        if cell.address == CHE_SETPOINT:
             if not -CHE_FULL <= _signed(raw) <= CHE_FULL:
                 raise Refusal(Reason.VALUE)
             return raw
@@ -116,13 +117,15 @@ class SimulatedCHE(MotorDrive):
     }
 
 
-DELIXI_UNDER_VOLTAGE = 7  # fault number of POFF
+DELIXI_UNDER_VOLTAGE = 7  # fault number of the fault POFF
 
-DELIXI_BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400)  # indexed by P04.28
-DELIXI_MODBUS_FORMATS = ("7N2", "7E1", "7O1", "8N2", "8E1", "8O1")  # indexed by P04.29: ASCII, then RTU
+DELIXI_BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400)  # baud rates, indexed by P04.28
+# character formats, indexed by P04.29: three of ASCII, then three of RTU
+DELIXI_MODBUS_FORMATS = ("7N2", "7E1", "7O1", "8N2", "8E1", "8O1")
 DELIXI_NATIVE_FORMATS = ("8N1", "8E1", "8O1")
-DELIXI_COMMANDS, DELIXI_STARTS = range(1, 5), (2, 3)  # values of the run command (K = 02)
-DELIXI_RUN_SOURCE, DELIXI_FREQUENCY_SOURCE = 0, 1  # P00.00 and P00.01
+# valid values of the run command (K = 02), and those that start the motor
+DELIXI_COMMANDS, DELIXI_STARTS = range(1, 5), (2, 3)
+DELIXI_RUN_SOURCE, DELIXI_FREQUENCY_SOURCE = 0, 1  # indexes of the parameters P00.00 and P00.01
 DELIXI_BY_LINE = {DELIXI_RUN_SOURCE: 2, DELIXI_FREQUENCY_SOURCE: 1}
 
 
@@ -192,7 +195,8 @@ class SimulatedDelixiNative(MotorDrive):
         return super().accept(cell, raw)
 
     def changed(self, cell: MemoryCell) -> None:
-        if cell.name == "stored_frequency":  # the setpoint that was written last applies: copy it
+        # the setpoint that was written last applies, so it becomes the run setpoint
+        if cell.name == "stored_frequency":
             self.memory.set(self.drive.register("frequency"), self["stored_frequency"])
         super().changed(cell)
 
@@ -217,14 +221,14 @@ class SimulatedDelixiNative(MotorDrive):
 
 
 def _printed(fault: int) -> int:
-    """Return the raw count whose hex digits are the number's decimal digits: fault 10 is 00000010H."""
+    """Return the raw count whose hex digits are the fault number's decimal digits: 00000010H for fault 10."""
     return int(str(fault), 16)
 
 
-ERMAN_COILS = range(13)  # including reserved coils, 3 to 8 and 10 to 12
+ERMAN_COILS = range(13)  # all coils, including the reserved coils 3 to 8 and 10 to 12
 ERMAN_STOP, ERMAN_EMERGENCY_STOP = 1, 2
-ERMAN_EMERGENCY_STOPPED = 1 << 0  # bit of the register for the last fault
-ERMAN_OVERLOADED = 1 << 5  # bit of the register for the state
+ERMAN_EMERGENCY_STOPPED = 1 << 0  # bit of the last fault register
+ERMAN_OVERLOADED = 1 << 5  # bit of the state register
 ERMAN_STATES = {Phase.STOPPED: 0, Phase.CONSTANT: 1, Phase.ACCELERATING: 2, Phase.DECELERATING: 3}
 
 
@@ -238,7 +242,7 @@ class SimulatedERMAN(MotorDrive):
     """
 
     functions = (0x01, 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F, 0x10)
-    # All examples in the manual have 03 for an invalid address; the table in section 5 has another code.
+    # All examples in the manual reply 03 to an invalid address, but the table in section 5 has another code.
     codes = {
         Reason.FUNCTION: 1,
         Reason.READ_ADDRESS: 3,
@@ -251,7 +255,7 @@ class SimulatedERMAN(MotorDrive):
         self.memory.make_writable(COIL, ERMAN_COILS)
 
     def accepts_broadcast(self, request: Message) -> bool:
-        return True  # section 6 allows every request to address 0
+        return True  # by section 6, any request may be sent to address 0
 
     def _start(self, on: int) -> None:
         if not on:
@@ -287,23 +291,25 @@ class SimulatedERMAN(MotorDrive):
     }
     read_handlers = {
         "status": _state,
-        "last_fault": lambda self: self.motor.fault_record(1),  # not cleared by a reset
+        "last_fault": lambda self: self.motor.fault_record(1),  # a reset does not clear this register
     }
 
 
 IBD_SETPOINT = 0x2001
-IBD_STORED_SETPOINT, IBD_FREQUENCY_SOURCE, IBD_RUN_SOURCE = 100, 101, 102  # addresses of Prb.00, .01 and .02
+# addresses of Prb.00, Prb.01 and Prb.02
+IBD_STORED_SETPOINT, IBD_FREQUENCY_SOURCE, IBD_RUN_SOURCE = 100, 101, 102
 IBD_BY_PARAMETER, IBD_BY_LINE, IBD_RUN_BY_LINE = 0, 5, 2
 IBD_STOP, IBD_RUN, IBD_JOG = 1, 2, 3  # values of bits 1 and 0 of 2000H
-IBD_ALWAYS_SEEN = 1 << 11 | 1 << 12  # bits of PrA.22 that are set in the manual's example
-IBD_LARGEST = {107: 36000, 108: 36000}  # assumed maxima of Prb.07 and Prb.08; the manual states none
-IBD_OUTPUTS = {323: 1 << 8, 324: 1 << 9, 325: 1 << 10, 328: 1 << 13}  # Prd.nn: the output's bit in PrA.22
+IBD_ALWAYS_SEEN = 1 << 11 | 1 << 12  # bits without a name that are 1 in the manual's example of PrA.22
+IBD_LARGEST = {107: 36000, 108: 36000}  # assumed largest values of Prb.07 and Prb.08; the manual states none
+# address of the output's function Prd.nn, and the output's bit in PrA.22
+IBD_OUTPUTS = {323: 1 << 8, 324: 1 << 9, 325: 1 << 10, 328: 1 << 13}
 IBD_RUNNING, IBD_FAULT, IBD_ACCELERATING, IBD_DECELERATING = (
     1,
     3,
     7,
     8,
-)  # output functions, as set in Prd.23 to .28
+)  # functions of the outputs, as set in Prd.23 to Prd.28
 IBD_BAUDRATES = (4800, 9600, 19200, 38400)
 IBD_FORMATS = ("8N1", "8E1", "8O1")
 
@@ -320,7 +326,7 @@ class SimulatedIBD(MotorDrive):
     """
 
     functions = (0x03, 0x06)
-    needs_silence = True  # according to the manual's table "message in RTU mode"
+    needs_silence = True  # stated by the manual's table "message in RTU mode"
     codes = {}
     initial_values = {
         IBD_FREQUENCY_SOURCE: IBD_BY_LINE,
@@ -352,7 +358,7 @@ class SimulatedIBD(MotorDrive):
     def _control(self, bits: int) -> None:
         """Carry out a control word.
 
-        The manual is ambiguous about BIT3 and BIT2; here they form one number.
+        BIT3 and BIT2, which are ambiguous in the manual, form one number here.
         """
         if bits & 0x10:
             self.motor.reset()
@@ -374,7 +380,7 @@ class SimulatedIBD(MotorDrive):
         return sum(bits, IBD_ALWAYS_SEEN)
 
     def _run_state(self) -> int:
-        """Return the value of PA28, the run state, which some sibling models have."""
+        """Return the value of PA28, the run state, which only some related models have."""
         if not self.motor.energised:
             return 0
         return 2 if self.motor.frequency < 0 else 1
@@ -407,14 +413,15 @@ YD_TIMEOUT_SETTING = 0x0803
     YD_DC_BRAKE,
     YD_SECOND_RAMP,
 ) = (1 << bit for bit in range(15, 5, -1))
-# maps a control bit to the value that it adds to the preset's number
+# by control bit: the value that it adds to the number of the preset speed
 YD_PRESET_BITS = {1 << 3: 1, 1 << 2: 2, 1 << 1: 4, 1 << 0: 8}
-YD_PRESET_SPEEDS = (0x0018, 0x0019, 0x0020, 0x0021, 0x0022, 0x0023, 0x0024)  # addresses of Sr1 to Sr7
+# addresses of the parameters Sr1 to Sr7
+YD_PRESET_SPEEDS = (0x0018, 0x0019, 0x0020, 0x0021, 0x0022, 0x0023, 0x0024)
 YD_PANEL_ONLY = (0x0001, 0x0007, 0x0015)
-YD_BAUDRATES = (1200, 2400, 4800, 9600)  # indexed by F800
-YD_RESTART_TIME = 2.0  # time in s after a reset in which requests are ignored
+YD_BAUDRATES = (1200, 2400, 4800, 9600)  # baud rates, indexed by F800
+YD_RESTART_TIME = 2.0  # s after a reset during which requests are ignored
 YD_EMERGENCY_STOPPED, YD_COMMUNICATION_LOST = 0x11, 0x18
-YD_HELD = (0x1200, 0x1201)  # addresses frozen from a trip until the reset
+YD_HELD = (0x1200, 0x1201)  # addresses of the registers that are frozen from a trip until the reset
 
 
 class SimulatedYD1000(MotorDrive):
@@ -436,15 +443,15 @@ class SimulatedYD1000(MotorDrive):
     needs_silence = True  # notes, section 4.3
 
     _panel_runs = False
-    _in_force = 0  # control word in force
-    _message_at = math.inf  # time of the last message in s; inf: no message yet, so no timeout
+    _in_force = 0  # the control word that was accepted last
+    _message_at = math.inf  # time of the last message in s; inf: there was none, so that no timeout can occur
 
     def prepare(self) -> None:
         self.memory.make_readable(HOLDING, [YD_CONTROL])
 
     @property
     def panel_runs(self) -> bool:
-        """True while the panel commands the motor to run. Ignored while the line is in control."""
+        """True if the panel commands the motor to run. It has no effect while the line is in control."""
         return self._panel_runs
 
     @panel_runs.setter
@@ -485,7 +492,7 @@ class SimulatedYD1000(MotorDrive):
         return cell.address not in YD_PANEL_ONLY and super().wears_eeprom(cell, function, address)
 
     def pass_time(self, now: float) -> None:
-        limit = self.word(YD_TIMEOUT_SETTING) or math.inf  # F803, in s; 0 disables the timeout
+        limit = self.word(YD_TIMEOUT_SETTING) or math.inf  # F803, the timeout in s; 0 disables it
         if now > self._message_at + limit and not self.motor.fault:
             self.motor.run_to(self._message_at + limit)
             self.trip(YD_COMMUNICATION_LOST)
@@ -506,7 +513,7 @@ class SimulatedYD1000(MotorDrive):
 
     def _control(self, word: int) -> None:
         direction = -1 if word & YD_REVERSE else 1
-        if not word & YD_COMMANDED:  # other bits have an effect only together with bit 15 (8.1)
+        if not word & YD_COMMANDED:  # without bit 15, the other bits have no effect (8.1)
             panel = self.motor.run if self.panel_runs else self.motor.stop
             panel()
         elif word & YD_RESET:
@@ -527,7 +534,7 @@ class SimulatedYD1000(MotorDrive):
         self._in_force = word if word & YD_COMMANDED else 0
 
     def _restart(self) -> None:
-        """Drop all state that is not in the EEPROM, and ignore the line for YD_RESTART_TIME."""
+        """Lose all state that is not in EEPROM, and ignore the line for YD_RESTART_TIME seconds."""
         self.motor.coast()
         self.motor.reset()
         self.deaf_until = self.now + YD_RESTART_TIME
@@ -544,7 +551,7 @@ class SimulatedYD1000(MotorDrive):
             return bits
         return (
             bits | YD_RUN | self._in_force & (YD_JOG | YD_DC_BRAKE)
-        )  # YD_RUN is set while braking too (8.2, table 2)
+        )  # YD_RUN is also set while the motor is braked with direct current (8.2, table 2)
 
     write_handlers = {"control": _control}
     read_handlers = {
@@ -567,7 +574,7 @@ FAMILIES: Mapping[type[Drive], type[SimulatedDrive]] = {
     CiA402: SimulatedCiA402,
     DanfossFC: SimulatedDanfossFC,
     Delta: SimulatedDelta,
-    Inovance: SimulatedInovance,  # listed before Invt, its base class
+    Inovance: SimulatedInovance,  # listed before its base class Invt, so that it is found first
     Invt: SimulatedInvt,
     Optidrive: SimulatedOptidrive,
     Yaskawa: SimulatedYaskawa,
@@ -575,7 +582,7 @@ FAMILIES: Mapping[type[Drive], type[SimulatedDrive]] = {
 
 
 def simulated(drive: Drive, *, response_delay: float | None = None) -> SimulatedDrive:
-    """Return a simulation of the drive; for a user's class or family file, a plain SimulatedDrive.
+    """Return a simulation of the drive. A user's class or family file gets a plain SimulatedDrive.
 
     Raises TypeError for a family instead of a drive.
     """

@@ -1,4 +1,4 @@
-"""Faults of simulated lines and drives, the TOML file that sets their rates, and a wire that has them.
+"""Faults of simulated lines and drives: their rates in a TOML file, and a simulated wire that has them.
 
 All random decisions derive from one seed.
 """
@@ -24,7 +24,7 @@ from multidrop.toml_check import Key, TomlPlace, duration_of
 from multidrop.toml_document import read_document
 
 MOST_BURST = 4096
-RATE, DURATION, WHOLE = (int, float), str, int  # types of the values in a fault file
+RATE, DURATION, WHOLE = (int, float), str, int  # types of rates, durations and whole numbers in a faults file
 
 
 def _rate(means: str, example: str = "0.01") -> Any:
@@ -49,7 +49,7 @@ def _check_rates(faults: Any) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class DriveFaults:
-    """The faults of one simulated drive. A damaged reply has one wrong bit, which every checksum detects."""
+    """The faults of one simulated drive. A damaged reply has one wrong bit, so every checksum detects it."""
 
     loss: float = _rate("of its replies are lost")
     damage: float = _rate("of its replies have one bit turned")
@@ -67,11 +67,11 @@ class DriveFaults:
 
 @dataclass(frozen=True, kw_only=True)
 class Faults:
-    """Rates of a simulated line's faults, and the faults of its drives by name.
+    """Rates of a simulated line's faults, and the faults of its drives, by drive name.
 
     At most one of `drop`, `flip` and `repeat` happens to a frame. So the checksum of every framing detects
-    the fault. A reply that comes after its family's response timeout looks like the reply to the next
-    identical request.
+    the fault. A reply that comes after the response timeout looks like the reply to the next identical
+    request.
     """
 
     seed: int = _whole(0, "the same one brings the same faults", "7")
@@ -100,7 +100,7 @@ class Faults:
 
 
 def rates_of(kind: type) -> list[str]:
-    """Return the names of the fields that are rates."""
+    """Return the names of the fields whose value is a rate."""
     return [one.name for one in fields(kind) if one.metadata.get("kind") is RATE]
 
 
@@ -110,7 +110,7 @@ def _keys(kind: type) -> dict[str, Key]:
 
 
 def _help(kind: type) -> str:
-    # zip ends before the field `drives`, which has no key
+    # zip stops before the last field, `drives`, which has no key of its own
     lines = zip(_keys(kind).values(), fields(kind), strict=False)
     return "".join(f"  {key.example:<20}{one.metadata['means']}\n" for key, one in lines)
 
@@ -148,7 +148,7 @@ def load_faults(path: Path | str, drives: Collection[str] | None = None) -> Faul
 
 
 def _given(kind: type, table: Any, place: TomlPlace) -> dict[str, Any]:
-    """Return the valid entries of a table; add an error to `place` for every other entry."""
+    """Return the valid entries of a table. Each other entry adds an error to `place`."""
     keys = _keys(kind)
     given = place.check(table, keys)
     for name in given:
@@ -163,14 +163,14 @@ DAMAGES: Mapping[str, Callable[[bytes, int, int], bytes]] = {
     "flip": lambda frame, at, bit: frame[:at] + bytes([frame[at] ^ 1 << bit]) + frame[at + 1 :],
     "repeat": lambda frame, at, bit: frame[: at + 1] + frame[at:],
 }
-DRIFT_S = 20.0  # period of a drifting load, in s
+DRIFT_S = 20.0  # s of one cycle of a load that changes slowly
 
 
 class FaultyWire(Wire):
-    """A wire with `faults`, which may be changed at any time; `struck` counts the faults that occurred.
+    """A wire with `faults`, which may change at any time. `struck` counts the faults that have occurred.
 
-    The fault `hang_up` removes the port. It needs a link to a pty or a TCP port, because a bare pty cannot be
-    reopened under its name.
+    The fault `hang_up` removes the port. It needs a TCP port, or a link to a pty: a pty without a link cannot
+    be reopened under its name.
     """
 
     def __init__(
@@ -198,12 +198,13 @@ class FaultyWire(Wire):
         self.faults = faults
         self.struck: Counter[str] = Counter()
         self._random = random.Random(f"{faults.seed} {name}")
-        self._stray: list[Transmission] = []  # noise and echoes in transmission to the client
-        self._held: Transmission | None = None  # a reply that is delayed until the next reply
-        # time at which the removed port returns; None while the port is there
+        self._stray: list[Transmission] = []  # noise and echoes that are being sent to the client
+        self._held: Transmission | None = None  # a reply that is delayed until the next reply is sent
+        # time in s at which the removed port returns; None while the port exists
         self._back_at: float | None = None
-        self._due: dict[tuple[str, str], float] = {}  # (drive, event): time of its next silence or trip
-        self._loads: dict[str, float] = {}  # mean load of each drive whose load drifts
+        # time in s of a drive's next silence or trip, by drive and event
+        self._due: dict[tuple[str, str], float] = {}
+        self._loads: dict[str, float] = {}  # average load of each drive whose load changes slowly
 
     def _strikes(self, fault: str, of: Faults | DriveFaults | None = None) -> bool:
         rate: float = getattr(of or self.faults, fault)
@@ -237,7 +238,7 @@ class FaultyWire(Wire):
         super().receive(self._damaged(chunk), now, baudrate)
 
     def _pass_time(self, sim: SimulatedDrive, faults: DriveFaults, now: float) -> None:
-        """Silence the drive, trip its motor and change its load if its `faults` are due."""
+        """Make the drive silent, trip its motor or change its load if one of its `faults` is due."""
         name = sim.drive.name
         if self._is_due(name, "silence", faults, now):
             sim.deaf_until = max(sim.deaf_until, now + faults.silent_for)
@@ -289,7 +290,7 @@ class FaultyWire(Wire):
         return {sim for sim in self.drives if isinstance(sim, MotorDrive) and sim.motor.energised}
 
     def _make_noise(self, begin: float, character: float) -> None:
-        """Add noise bytes, received by the client and by the drives."""
+        """Send noise bytes to the client and to the drives."""
         noise = self._random.randbytes(self._random.randint(1, self.faults.burst))
         self._stray.append(Transmission(noise, begin, character))
         for group in self._groups:
@@ -343,14 +344,15 @@ class FaultyWire(Wire):
         return min(times, default=None)
 
     def _hang_up(self, now: float) -> None:
-        self.where = self.path  # so that a TCP port is reopened under the same number
-        self._name = os.path.realpath(self.path)  # the name of the pty to which the link leads
+        # the path includes the port number, so that a TCP port is reopened under the same number
+        self.where = self.path
+        self._name = os.path.realpath(self.path)  # name of the pty to which the link points
         self.close()
         self._back_at = now + self._up_to(self.faults.away)
 
     def _come_back(self) -> None:
         self._back_at = None
-        # ptys that occupy the former name, so that the new pty gets another name
+        # ptys that use up the former name, so that the new pty gets another name
         taken = _ptys_up_to(self._name) if self._strikes("rename") else []
         try:
             self.open()
@@ -360,7 +362,10 @@ class FaultyWire(Wire):
 
 
 def _ptys_up_to(name: str) -> list[int]:
-    """Open ptys until one has this name; return their descriptors. A new pty gets the lowest free number."""
+    """Open ptys until one of them has this name; return their descriptors.
+
+    A new pty gets the lowest free number.
+    """
     taken: list[int] = []
     while name.startswith("/dev/pts/"):
         taken += os.openpty()
@@ -370,7 +375,7 @@ def _ptys_up_to(name: str) -> list[int]:
 
 
 def overload_code(drive: Drive) -> int:
-    """Return the family's fault code for an overload, or else that of its first named fault, or else 1."""
+    """Return the family's fault code for an overload, else the code of its first named fault, else 1."""
     for name in ("fault", "last_fault", "fault_record_1"):
         register = drive.registers.get(name)
         if register is not None and register.values is not None:

@@ -19,9 +19,10 @@ from multidrop.drive.number_format import arranged, bits_of
 from multidrop.drive.register import Access, Carrier, Register, Table
 from multidrop.drive.text import Text
 
-# maps a function code that writes one cell to the code that writes several cells
+# by function code that writes one cell: the code that writes several
 _ALSO_WRITES = {0x05: 0x0F, 0x06: 0x10}
-_DELIXI_ALSO_WRITES = {0x05: 0x06, 0x06: 0x05}  # 05 writes to RAM, 06 to EEPROM
+# the function codes 05 (RAM) and 06 (EEPROM) write the same parameters
+_DELIXI_ALSO_WRITES = {0x05: 0x06, 0x06: 0x05}
 _DELIXI_STORES = 0x06
 _MASKS = {Carrier.BIT: 0x1, Carrier.WORD: 0xFFFF, Carrier.NUMBER: 0xFFFF, Carrier.LONG: 0xFFFF_FFFF}
 _BYTES = {Carrier.BIT: 1, Carrier.WORD: 2, Carrier.NUMBER: 4, Carrier.LONG: 4}
@@ -29,7 +30,7 @@ _BYTES = {Carrier.BIT: 1, Carrier.WORD: 2, Carrier.NUMBER: 4, Carrier.LONG: 4}
 
 @dataclass(eq=False)
 class MemoryCell:
-    """One address of one table; `register` is None for a reserved address."""
+    """The bit or word at one address of one table. `register` is None for a reserved address."""
 
     table: Table
     address: int
@@ -42,18 +43,19 @@ class MemoryCell:
 
 
 class Memory:
-    """The cells of one drive, found by function code and address."""
+    """The cells of one drive, which are found by function code and address."""
 
     def __init__(self, drive: type[Drive], framing: Framing) -> None:
         self._framing = framing
         self._also = _DELIXI_ALSO_WRITES if framing is Framing.DELIXI else _ALSO_WRITES
-        # cells by read function (tables with the same read function share cells) and address
+        # cells by read function and address, because tables with the same read function share their cells
         self._cells: dict[tuple[object, int], MemoryCell] = {}
-        # cells by function and address; None: unreadable, also as part of a longer read
+        # cells by function and address; None: a read that includes this address is refused
         self._read: dict[tuple[int, int], MemoryCell | None] = {}
         self._gaps = [(table.read, table, addresses) for table, addresses in drive.readable_gaps.items()]
         self._written: dict[tuple[int, int], MemoryCell] = {}
-        self.aliases: set[tuple[int, int]] = set()  # (function, address) of writes that do not wear EEPROM
+        # function and address of writes that go to RAM, although the register is kept in EEPROM
+        self.aliases: set[tuple[int, int]] = set()
         for register in drive.registers.values():
             self.declare(register)
         for text in drive.texts.values():
@@ -67,14 +69,14 @@ class Memory:
         return cell
 
     def declare(self, register: Register[Any]) -> None:
-        """Add the register's cells, and store its factory value in them."""
+        """Add the cells of the register, with its factory value."""
         table = register.table
         for at in range(register.words):
             cell = self._cell(table, register.address + at)
             if _is_better(register, cell.register):
                 cell.register = register
             if table.read is not None and register.access is Access.COMMAND:
-                # mark the address as unreadable, unless another register makes it readable
+                # a read of this address is refused, unless another register makes it readable
                 self._read.setdefault((table.read, cell.address), None)
             elif table.read is not None:
                 self._read[table.read, cell.address] = cell
@@ -148,7 +150,7 @@ class Memory:
         return 0 if register.scaled_by is None else int(self.get(register.scaled_by) or 0)
 
     def set_raw(self, register: Register[Any], raw: int) -> None:
-        """Store this raw count. If the register uses only some bits of its words, the other bits are kept."""
+        """Store this raw count. If the register uses only some bits of its word, the other bits are kept."""
         self._put(register, raw, register.coding.mask)
 
     def _put(self, register: Register[Any], raw: int, mask: int) -> None:
@@ -177,7 +179,7 @@ class Memory:
         return range(text.address, text.address + text.length)
 
     def of(self, register: Register[Any]) -> list[MemoryCell]:
-        """Return the register's cells, in the order of their addresses."""
+        """Return the register's cells in the order of their addresses."""
         return [self._cell(register.table, register.address + at) for at in range(register.words)]
 
 
@@ -187,9 +189,9 @@ def _space(table: Table) -> object:
 
 
 def _is_better(register: Register[Any], known: Register[Any] | None) -> bool:
-    """Return True if `register` should replace `known` in a cell.
+    """Return True if `register` should replace the register `known` of a cell.
 
-    Writable registers take precedence, then registers that use whole words.
+    Writable registers take precedence, then registers that use all bits of their words.
     """
     if known is None or register.access is not Access.READING:
         return True
@@ -204,7 +206,10 @@ def _placed(register: Register[Any], raw: int) -> int:
 
 
 def _no_value(register: Register[Any]) -> tuple[int, int]:
-    """Return the bits that mean "no value", and their mask. Raises ValueError if there are none."""
+    """Return the bits that mean "no value" for this register, and their mask.
+
+    Raises ValueError if there are none.
+    """
     for mask, pattern in register.coding.invalid_patterns:
         return pattern, mask
     if register.is_float:
@@ -218,5 +223,5 @@ def pack(table: Table, raw: int) -> bytes:
 
 
 def decode(register: Register[Any], raw: int) -> Any:
-    """Return the value of a one-cell register with this raw count; None if the count means "no value"."""
+    """Return the value of a register of one cell that has this raw count; None for "no value"."""
     return register.value_in(pack(register.table, raw), 0)

@@ -18,14 +18,14 @@ from multidrop.sim.drive import Reason, Refusal, SimulatedDrive
 from multidrop.sim.memory import MemoryCell
 
 MAGNETISING = 0.3  # no-load current as a fraction of the rated current
-ACCELERATING_TORQUE = 0.5  # fraction of the rated torque, added to the load while accelerating
+ACCELERATING_TORQUE = 0.5  # fraction of the rated torque that acceleration adds to the torque of the load
 BRAKING_TORQUE = 0.3
-SLIP = 0.04  # slip at rated torque
-HEATING = 35.0  # heatsink temperature above ambient at rated current, in K
-WARMING_TIME = 120.0  # thermal time constant in s
-RUN_OUT_TIME = 10.0  # time in s in which the shaft coasts from the rated frequency to rest
-REGENERATION = 0.06  # relative rise of the DC bus voltage while braking
-SAG = 0.02  # relative fall of the DC bus voltage at rated current
+SLIP = 0.04  # relative slip at the rated torque
+HEATING = 35.0  # rise of the heatsink temperature at the rated current, in K
+WARMING_TIME = 120.0  # thermal time constant of the heatsink in s
+RUN_OUT_TIME = 10.0  # s in which the motor coasts from the rated frequency to rest
+REGENERATION = 0.06  # relative rise of the DC bus voltage while the motor brakes
+SAG = 0.02  # relative fall of the DC bus voltage at the rated current
 
 
 class Phase(Enum):
@@ -40,7 +40,7 @@ class Rating:
     """The nameplate data of a motor."""
 
     frequency: float = 50.0  # Hz
-    voltage: float = 400.0  # rated voltage in V; the mains have the same voltage
+    voltage: float = 400.0  # rated voltage in V, which is also the mains voltage
     current: float = 5.0  # A
     power: float = 2.2  # kW
     torque: float = 14.6  # Nm
@@ -48,7 +48,7 @@ class Rating:
 
 
 class Motor:
-    """The state of one motor at the time of the last `run_to`.
+    """The state of one motor at the time of the last call of `run_to`.
 
     `target`, `acceleration_time`, `deceleration_time`, `maximum_frequency` and `load` may be changed at any
     time. The ramp times, in s, are those from 0 to the maximum frequency, and back to 0.
@@ -57,7 +57,7 @@ class Motor:
     def __init__(self, rating: Rating | None = None) -> None:
         self.rating = rating or Rating()
         self.now = 0.0
-        self.target = 0.0  # in Hz; a negative target reverses `direction`
+        self.target = 0.0  # frequency in Hz to run at; a negative value reverses `direction`
         self.jog_frequency = 5.0
         self.maximum_frequency = self.rating.frequency
         self.acceleration_time = 10.0
@@ -72,8 +72,8 @@ class Motor:
         self.run_seconds = 0.0
         self.fault = 0
         self.faults: deque[int] = deque(maxlen=4)  # fault codes, the latest first
-        self._goal: float | None = 0.0  # frequency to ramp to in Hz; None: `target`
-        self._brakes = False  # True while direct current holds the motor
+        self._goal: float | None = 0.0  # frequency in Hz at which the present ramp ends; None: at `target`
+        self._brakes = False  # True while the motor is held with direct current
 
     def run(self, direction: int | None = None) -> None:
         """Run at `target`, which may change at any time. Without `direction`, keep the present direction."""
@@ -110,7 +110,7 @@ class Motor:
         self.energised = False
 
     def trip(self, code: int) -> None:
-        """Coast because of a fault; the motor stays off until `reset`."""
+        """Switch the voltage off because of a fault. The motor stays off until `reset` is called."""
         self.coast()
         self.fault = code
         self.faults.appendleft(code)
@@ -145,7 +145,10 @@ class Motor:
             self.energised = False
 
     def _approach(self, goal: float, ramp_time: float, seconds: float) -> float:
-        """Ramp towards `goal` for at most `seconds`; return the seconds that remain once it is reached."""
+        """Ramp towards `goal`, in Hz, for at most `seconds`.
+
+        Return the seconds that remain when `goal` is reached, or 0.
+        """
         distance = abs(goal - self.frequency)
         needed = distance * ramp_time / self.maximum_frequency
         if needed <= seconds:
@@ -155,7 +158,10 @@ class Motor:
         return 0.0
 
     def fault_record(self, number: int) -> int:
-        """Return the code of the fault with this number (1: the latest); 0 if there is none."""
+        """Return the code of a fault: 1 is the latest, 2 the one before.
+
+        Return 0 if there were fewer faults.
+        """
         return self.faults[number - 1] if number <= len(self.faults) else 0
 
     @property
@@ -176,7 +182,7 @@ class Motor:
 
     @property
     def torque(self) -> float:
-        """Torque as a fraction of the rated torque; negative while the motor brakes."""
+        """Torque as a fraction of the rated torque. It is negative while the motor brakes."""
         if not self.energised:
             return 0.0
         extra = {Phase.ACCELERATING: ACCELERATING_TORQUE, Phase.DECELERATING: -BRAKING_TORQUE}
@@ -208,7 +214,7 @@ class Motor:
         return abs(self.shaft) * 60 / self.rating.pole_pairs * (1 - SLIP * max(self.torque, 0.0))
 
 
-# Maps the name of a monitor register to the function that computes its value.
+# by name of a register: the function that computes its value
 MONITORS: Mapping[str, Callable[[Motor], float]] = {
     "output_frequency": lambda motor: abs(motor.frequency),
     "reference_frequency": lambda motor: abs(motor.target),
@@ -224,7 +230,7 @@ MONITORS: Mapping[str, Callable[[Motor], float]] = {
     "last_fault": lambda motor: motor.fault_record(1),
 } | {f"fault_record_{nth}": lambda motor, nth=nth: motor.fault_record(nth) for nth in range(1, 5)}
 
-# Functions that return the value of 100 %, for monitors whose unit is %.
+# by name of a register in %: the function that returns the value of 100 %
 RATED: Mapping[str, Callable[[Rating], float]] = {
     "output_frequency": lambda rating: rating.frequency,
     "reference_frequency": lambda rating: rating.frequency,
@@ -236,7 +242,7 @@ RATED: Mapping[str, Callable[[Rating], float]] = {
 }
 
 
-COMMANDS: Mapping[str, Callable[[Motor], None]] = {  # maps the name of a control word to its action
+COMMANDS: Mapping[str, Callable[[Motor], None]] = {  # by name of a control word: its effect on the motor
     "FORWARD": lambda motor: motor.run(1),
     "REVERSE": lambda motor: motor.run(-1),
     "JOG_FORWARD": lambda motor: motor.jog(1),
@@ -250,16 +256,18 @@ _SETTINGS = ("acceleration_time", "deceleration_time", "maximum_frequency")
 
 
 class MotorDrive(SimulatedDrive):
-    """A simulated drive with a motor. A monitor register set by `drive[name] = value` keeps that value.
+    """A simulated drive with a motor. A register that is set with `drive[name] = value` keeps that value.
 
-    Registers with usual names need no code: a setting such as `acceleration_time` configures the motor, and a
-    reading such as `output_current` shows its state. For other registers, a family names its functions by
-    register: `write_handlers` are called with a written raw count, `read_handlers` return the raw count read.
+    Registers with common names need no code. A setting such as `acceleration_time` configures the motor, and
+    a reading such as `output_current` shows its state. For other registers, a family has functions by
+    register name: `write_handlers` get the raw count that was written, `read_handlers` return the raw count
+    to read.
     """
 
     write_handlers: ClassVar[Mapping[str, Callable[[Any, int], None]]] = {}
     read_handlers: ClassVar[Mapping[str, Callable[[Any], int]]] = {}
-    initial_values: ClassVar[Mapping[int, int]] = {}  # address of holding register: raw count at power-up
+    # raw counts after power-up, by address of the holding register
+    initial_values: ClassVar[Mapping[int, int]] = {}
 
     def __init__(
         self, drive: Drive, *, response_delay: float | None = None, rating: Rating | None = None
@@ -285,10 +293,10 @@ class MotorDrive(SimulatedDrive):
         super().__setitem__(name, value)
 
     def prepare(self) -> None:
-        """Set up initial state that the drive's class does not declare."""
+        """Set up initial state that the drive class does not declare."""
 
     def trip(self, code: int) -> None:
-        """Trip the motor with this fault code of the family."""
+        """Trip the motor with this fault code of the drive's family."""
         self.motor.trip(code)
 
     def pass_time(self, now: float) -> None:
@@ -307,14 +315,14 @@ class MotorDrive(SimulatedDrive):
         return self._known("frequency") or 0.0
 
     def _known(self, name: str) -> float | None:
-        """Return the register's value; None if the class lacks the register or its scale is unknown."""
+        """Return the register's value; None if the drive lacks the register or its scale is unknown."""
         register = self.drive.registers.get(name)
         if register is None or register.step is None:
             return None
         return float(self.memory.get(register))
 
     def run_or_stop(self, action: int, direction: int | None) -> None:
-        """Carry out the action of a control word: 0 none, 1 stop, 2 run, 3 jog."""
+        """Carry out an action: 0 none, 1 stop, 2 run, 3 jog."""
         if action == 1:
             self.motor.stop()
         elif action == 2:
@@ -325,7 +333,7 @@ class MotorDrive(SimulatedDrive):
             self.motor.direction = direction
 
     def carry_out_named(self, raw: int) -> None:
-        """Carry out the named control word with this raw count; see COMMANDS."""
+        """Carry out the control word with this raw count, by its name in COMMANDS."""
         COMMANDS[self.drive.register("control").decode(raw).name](self.motor)
 
     def word(self, address: int) -> int:

@@ -1,4 +1,4 @@
-"""The simulator's end of a line: a pty, or a TCP port that serves one client at a time."""
+"""The simulator's end of a simulated line: a pty, or a TCP port that serves one client at a time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MOST_READ = 4096
 
 
 def is_dead_link(link: Path) -> bool:
-    """Return True if a killed simulator left this link: its pty is gone or belongs to another program."""
+    """Return True if a killed simulator left this link: its pty is gone or is used by another program."""
     if not link.is_symlink():
         return False
     target = str(link.readlink())
@@ -64,7 +64,7 @@ class PtyPort:
     def write(self, data: bytes) -> None:
         with contextlib.suppress(
             BlockingIOError
-        ):  # without a reading client, bytes are lost, as on a real line
+        ):  # if no client reads, the bytes are lost, as on a real line
             os.write(self._master, data)
 
     def baudrate(self) -> int | None:
@@ -101,7 +101,7 @@ class TCPPort:
 
     def read(self) -> bytes:
         if self._client is None:
-            with contextlib.suppress(BlockingIOError, ConnectionError):  # the client has disconnected already
+            with contextlib.suppress(BlockingIOError, ConnectionError):  # the client has already disconnected
                 self._client, _ = self._listener.accept()
                 self._client.setblocking(False)
                 self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -135,7 +135,7 @@ class TCPPort:
         self._listener.close()
 
 
-SimulatedEnd = PtyPort | TCPPort  # both are non-blocking
+SimulatedEnd = PtyPort | TCPPort  # both types have the same methods, which never block
 
 
 def open_port(where: str, settings: Settings) -> SimulatedEnd:

@@ -41,7 +41,7 @@ class ProfileDrive(MotorDrive):
     """
 
     is_local = False
-    word_before = 0  # the previous control word
+    word_before = 0
 
     def prepare(self) -> None:
         if "signature" in self.drive.registers:
@@ -109,7 +109,7 @@ class SimulatedProfidrive(ProfileDrive):
 
     def powered_up(self) -> None:
         self._is_inhibited = True
-        self._is_on = False  # True: OFF1 is not active
+        self._is_on = False  # True if OFF1 is not active
         self._is_enabled = False
 
     def trip(self, code: int) -> None:
@@ -172,13 +172,13 @@ class SimulatedProfidrive(ProfileDrive):
     read_handlers = {"status": _state}
 
 
-_COMMANDS = 0x8F  # bits 7 and 3 to 0
+_COMMANDS = 0x8F  # command bits 7 and 3 to 0
 DISABLED, READY, SWITCHED_ON, ENABLED = range(4)
 _STATES = {DISABLED: 0x40, READY: 0x21, SWITCHED_ON: 0x23, ENABLED: 0x27}
 
 
 class SimulatedCiA402(ProfileDrive):
-    """CiA 402. A control word moves up one state at most; "disable voltage" and a trip lead to the lowest.
+    """CiA 402. A control word raises the state by one at most; "disable voltage" or a trip makes it lowest.
 
     The factory settings are the standard's: "shutdown" coasts, and "disable operation" ramps down.
     A drive in local control ignores all words. `stays_off` prevents switching on, as missing mains
@@ -278,7 +278,7 @@ class SimulatedDanfossFC(ProfileDrive):
     read_handlers = {"status": _state}
 
 
-EXTERNAL_FAULT = 49  # fault code of EF, an external fault
+EXTERNAL_FAULT = 49  # fault code of "EF", an external fault
 
 
 class SimulatedDelta(ProfileDrive):
@@ -332,7 +332,7 @@ class SimulatedInvt(ProfileDrive):
         return super().accept(cell, raw)
 
     def _canonical(self, raw: int) -> InvtControl | None:
-        """Return the profile's control word for this raw count, which the family may have renumbered."""
+        """Return the profile's control word for a raw count. A family may have renumbered the words."""
         values: Any = self.drive.register("control").values
         return next((InvtControl[member.name] for member in values if member == raw), None)
 
@@ -412,7 +412,7 @@ class SimulatedYaskawa(ProfileDrive):
 class SimulatedOptidrive(ProfileDrive):
     """Optidrive E3: the motor runs while bit 0 is set and digital input 1 is on, even after a reset.
 
-    `is_enabled` is that input. With `is_first_reading`, register 6 has the layout of the first guide: the
+    `is_enabled` is that input. With `is_first_reading`, register 6 is as in the first guide: the
     fault code in the low byte, the state in the high byte.
     """
 

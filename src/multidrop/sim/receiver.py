@@ -1,4 +1,4 @@
-"""Split received bytes into requests, as a drive does. The input is bytes with times; the output is frames.
+"""Split received bytes into requests, as a drive does. The input is bytes with times, the output is frames.
 
 Invalid bytes affect only the frames that they damage. Buffers are bounded. Silence ends an RTU frame, so
 bytes that follow a request without a pause damage it, unless they start another request.
@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 from multidrop.core import Framing, Message, crc16, lrc, parse_request, sum8
 
 MOST_RTU = 256
-TCP_HEAD, MOST_TCP = 6, 260  # bytes before the unit id; longest frame in bytes
+TCP_HEAD, MOST_TCP = 6, 260  # number of bytes before the unit id; length of the longest frame
 MOST_TEXT = 513
-LEAST_RTU = 4  # shortest frame in bytes: address, function, CRC
-# Function codes of requests: a byte can be a request's address only if one of these codes follows.
+LEAST_RTU = 4  # bytes of the shortest frame: address, function code, CRC
+# Function codes of requests. A byte can be a request's address only if one of these codes follows it.
 _REQUESTS = frozenset(code for code in range(256) if parse_request(Framing.RTU, bytes([1, code]))[0] == 0)
 
 
@@ -31,7 +31,7 @@ class Frame:
     intact: bool
     begin: float  # time of the first bit, in s
     end: float  # time of the last bit, in s
-    transaction: int = 0  # transaction id of a Modbus TCP frame
+    transaction: int = 0  # transaction id of a Modbus TCP frame; 0 for other frames
 
     @property
     def address(self) -> int:
@@ -54,13 +54,13 @@ class Receiver:
         self.character = character
         self.most_gap = most_gap
         self._buffer = bytearray()
-        self._end = float("-inf")  # time of the last received bit, in s
+        self._end = float("-inf")  # time in s of the last bit received
         cuts = {Framing.RTU: self._cut_rtu, Framing.TCP: self._cut_tcp}
         self._cut = cuts.get(framing, self._cut_text)
 
     @property
     def silent_at(self) -> float | None:
-        """The time in s at which silence will end the buffered frame; None if no frame is buffered."""
+        """The time in s at which silence will end the buffered frame; None if the buffer is empty."""
         return self._end + self.most_gap if self._buffer else None
 
     def feed(self, chunk: bytes, now: float) -> list[Frame]:
@@ -76,14 +76,14 @@ class Receiver:
         return frames
 
     def silence(self, now: float) -> list[Frame]:
-        """Return [frame] if the silence until `now` has ended a frame without a valid request; else []."""
+        """Return [frame] if the silence until `now` ended a frame that is not a valid request; else []."""
         if not self._buffer or now < self._end + self.most_gap:
             return []
         rest = bytes(self._buffer)
         self._buffer.clear()
         if self.framing is not Framing.RTU or not LEAST_RTU <= len(rest) <= MOST_RTU:
             return []
-        if _first_request(rest) is not None:  # ignore a valid request that other bytes followed
+        if _first_request(rest) is not None:  # a valid request that was followed by other bytes is ignored
             return []
         intact = crc16(rest[:-2], len(rest) - 2) == int.from_bytes(rest[-2:], "little")
         return [self._frame(rest[:-2], None, intact, 0, len(rest))]
@@ -92,7 +92,7 @@ class Receiver:
         self._buffer.clear()
 
     def _frame(self, body: bytes, message: Message | None, intact: bool, after: int, length: int) -> Frame:
-        """Return a frame of `length` characters, after which `after` further characters were received."""
+        """Return a frame of `length` characters; `after` characters were received after it."""
         end = self._end - after * self.character
         return Frame(body, message, intact, end - length * self.character, end)
 
@@ -117,7 +117,7 @@ class Receiver:
         return None
 
     def _cut_tcp(self) -> Frame | None:
-        """Return the next frame, or None; if the header is invalid, drop all bytes."""
+        """Return the next frame, or None. If the header is invalid, discard all bytes."""
         data = bytes(self._buffer)
         if len(data) < TCP_HEAD:
             return None

@@ -1,4 +1,7 @@
-"""Simulator: runs any number of wires in one thread. No other file of `multidrop.sim` reads a clock."""
+"""Simulator: runs any number of simulated wires in one thread.
+
+No other file of `multidrop.sim` reads a clock.
+"""
 
 from __future__ import annotations
 
@@ -35,14 +38,15 @@ class Simulator:
         self._thread = threading.Thread(target=self._run_in_thread, name="multidrop-sim", daemon=True)
         self.failure: BaseException | None = None
         """The first exception of a simulated drive, or of the thread itself; None: there was none."""
-        self._failed: set[int] = set()  # numbers of wires whose first failure was logged
+        self._failed: set[int] = set()  # indexes of the wires whose first failure was logged
         self._changing = threading.Lock()
         self._is_over = False
         self._is_open = False
-        self._wakes: list[tuple[float, int]] = []  # heap of (time, number of the wire)
-        # Maps each wire's number to its next wake-up. Other times in the heap are outdated.
+        self._wakes: list[tuple[float, int]] = []  # heap of pairs: wake-up time in s, index of the wire
+        # By index of the wire: the time of its next wake-up. Other times in the heap no longer apply.
         self._planned: dict[int, float] = {}
-        self._attended: dict[int, tuple[SimulatedEnd, int]] = {}  # the port registered for each wire
+        # by index of the wire: the port that the selector observes, and its descriptor
+        self._attended: dict[int, tuple[SimulatedEnd, int]] = {}
 
     def __enter__(self) -> Self:
         try:
@@ -55,7 +59,7 @@ class Simulator:
     @undisturbed
     def _start(self) -> None:
         with self._changing:
-            if not self._is_over:  # False if the thread has ended already
+            if not self._is_over:  # False if the thread has already ended
                 self.open()
                 self._is_open = True
                 self._thread.start()
@@ -79,12 +83,15 @@ class Simulator:
     def _run_in_thread(self) -> None:
         try:
             self.run()
-        except BaseException as failure:  # all wires are silent from now on
+        except BaseException as failure:  # after this, no simulated drive replies
             self.failure = self.failure or failure
             _log.critical("the simulator has ended: no drive answers any more", exc_info=failure)
 
     def open(self) -> None:
-        """Open all ports, so that their paths are known; if one fails, close all and raise that error."""
+        """Open all ports, which determines their paths.
+
+        If one cannot be opened, close all and raise its error.
+        """
         self._selector = selectors.DefaultSelector()
         self._interrupted, self._interrupter = socket.socketpair()
         self._interrupter.setblocking(False)
@@ -99,7 +106,10 @@ class Simulator:
             raise
 
     def forked(self) -> None:
-        """Create new wake-up sockets in a forked child, which must not interrupt its parent's simulator."""
+        """Create new wake-up sockets in a forked child.
+
+        With the old ones it would wake its parent's simulator.
+        """
         self._interrupted, self._interrupter = socket.socketpair()
 
     def close(self) -> None:
@@ -141,7 +151,7 @@ class Simulator:
         return monotonic() * self._speed
 
     def _sleep(self) -> None:
-        """Wait for received bytes or the next wake-up time.
+        """Wait until bytes are received, or until the next wake-up time.
 
         This calls select() on the selector's own descriptor, because select() is accurate to a microsecond,
         but epoll_wait() only to a millisecond.
@@ -153,7 +163,7 @@ class Simulator:
             select.select([self._selector], [], [], limit)
 
     def _note(self, number: int, failure: Exception) -> None:
-        """Log a wire's failure if it is the wire's first; all wires continue."""
+        """Log the first failure of a wire. All wires continue."""
         self.failure = self.failure or failure
         if number not in self._failed:
             self._failed.add(number)
@@ -172,7 +182,7 @@ class Simulator:
             self._advance(number)
 
     def _advance(self, number: int) -> None:
-        """Send the client the bytes that are due, and plan the wire's next wake-up."""
+        """Send the client the bytes that are due, and compute the wire's next wake-up time."""
         wire = self.wires[number]
         try:
             data = wire.advance(self._now())
@@ -188,7 +198,7 @@ class Simulator:
             heapq.heappush(self._wakes, (wake, number))
 
     def _attend(self, number: int) -> None:
-        """Register the wire's present port with the selector; the port may have been closed or reopened."""
+        """Let the selector observe the wire's present port, which may have been closed or reopened."""
         port, before = self.wires[number].port, self._attended.get(number)
         now = (port, port.fileno()) if port else None
         if now == before:
@@ -207,7 +217,7 @@ def serve(
     *,
     speed: float = 1.0,
 ) -> None:
-    """Run wires in the main thread until the process is interrupted or terminated.
+    """Simulate wires in the main thread until the process is interrupted or terminated.
 
     `announce` is called once, as soon as the wires' paths are known.
     """

@@ -1,4 +1,4 @@
-"""Wire: a simulated line with its drives and its transmission times.
+"""Wire: a simulated line with drives, and the time that each character takes.
 
 Input and output are bytes with times; the port at the line's end is in port.py.
 """
@@ -16,14 +16,14 @@ from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.port import SimulatedEnd, open_port
 from multidrop.sim.receiver import Frame, Receiver
 
-CHUNK = 1e-3  # characters that end within this time, in s, are delivered together
-ROUNDING = 1e-6  # tolerance, in character times: rounding errors must not delay a due byte
-UNPACED_GAP = 20e-3  # a silence of this many s ends a frame on an unpaced wire
+CHUNK = 1e-3  # s; characters that end within this time of each other are delivered together
+ROUNDING = 1e-6  # fraction of a character's time: rounding errors below this do not delay a byte
+UNPACED_GAP = 20e-3  # s of silence that end a frame on an unpaced wire
 
 
 @dataclass
 class Transmission:
-    """A reply in transmission. Its n-th character ends n character times after `begin`."""
+    """A reply that is being sent. Its n-th character ends n character times after `begin`."""
 
     data: bytes
     begin: float
@@ -40,7 +40,7 @@ class Transmission:
         return self.begin + min(len(self.data), self.sent + group) * self.character
 
     def take(self, now: float) -> bytes:
-        """Return the characters whose last bit was sent by `now`, except those already returned."""
+        """Return the characters that were sent by the time `now`, without those already returned."""
         if now < self.begin:
             return b""
         passed = len(self.data)
@@ -52,7 +52,7 @@ class Transmission:
 
 
 class ReceiverGroup:
-    """Drives that share a receiver, because they have the same framing, baud rate and longest silence."""
+    """Drives that receive the same frames: they have the same framing, baud rate and longest silence."""
 
     def __init__(self, receiver: Receiver, settings: Settings) -> None:
         self.receiver = receiver
@@ -89,10 +89,10 @@ class Wire:
         self.name = name
         self.where = port
         self.port: SimulatedEnd | None = None  # None while closed
-        self._pace = 0.0 if unpaced else 1.0  # factor by which every duration is multiplied
+        self._pace = 0.0 if unpaced else 1.0  # factor for all durations: 1, or 0 on an unpaced wire
         self._groups = self._group()
-        self._outgoing: list[Transmission] = []  # replies to send, ordered by start time
-        self._quiet_since = -math.inf  # time in s at which the last reply ended
+        self._outgoing: list[Transmission] = []  # replies that are not completely sent, ordered by start time
+        self._quiet_since = -math.inf  # time in s at which the last reply ended, or -inf
         self._baudrate: int | None = None
 
     def _group(self) -> list[ReceiverGroup]:
@@ -125,7 +125,7 @@ class Wire:
                 self._deliver(group, group.receiver.feed(chunk, now))
 
     def advance(self, now: float) -> bytes:
-        """Advance to `now` s; return the bytes that reach the client until then."""
+        """Advance to the time `now` in s. Return the bytes that the client receives until then."""
         for group in self._groups:
             if frames := group.receiver.silence(now):
                 self._deliver(group, frames)
@@ -137,7 +137,7 @@ class Wire:
             if now < self._outgoing[0].end:
                 break
             self._quiet_since = self._outgoing.pop(0).end
-            if self._outgoing:  # the next reply waits until this reply has ended
+            if self._outgoing:  # the next reply waits until this one has ended
                 self._outgoing[0].begin = max(self._outgoing[0].begin, self._quiet_since)
         return bytes(received)
 
@@ -169,11 +169,11 @@ class Wire:
         bisect.insort(self._outgoing, Transmission(data, begin, character), key=lambda reply: reply.begin)
 
     def _keeps_silence(self, sim: SimulatedDrive, frame: Frame) -> bool:
-        """Return True if a drive accepts the frame; count a frame that came too soon after a reply.
+        """Return True if the drive accepts the frame. A frame that came too soon after a reply is counted.
 
-        A frame that starts during a reply is lost. Silence is measured only from the end of a reply, because
-        the simulator knows that time exactly. So a late wake-up of this process never counts as an early
-        frame.
+        A frame that starts during a reply is lost. Silence is measured only from the end of the simulator's
+        own replies, whose time it knows exactly. So a late wake-up of this process never makes a frame count
+        as early.
         """
         replying = self._outgoing and self._outgoing[0].begin <= frame.begin
         silent_for = frame.begin - (self._outgoing[0].end if replying else self._quiet_since)
@@ -185,7 +185,7 @@ class Wire:
 
     @property
     def path(self) -> str:
-        """The path that a client opens, while a simulator runs the line."""
+        """The path that a client opens. It exists only while a simulator runs the wire."""
         if self.port is None:
             raise RuntimeError(f"{self.name} is not open: run it in a Simulator")
         return self.port.path
