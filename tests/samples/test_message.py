@@ -161,20 +161,20 @@ def written(options: pa.ipc.IpcWriteOptions | None = None, **other: pa.Array) ->
 @table(
     ("column", "rows", "said"),
     [
-        ("time", times(None, UTC_0), "its time is missing in some rows"),
-        ("clock_ns", pa.array([None, 5], pa.int64()), "its monotonic_ns is missing in some rows"),
-        ("drive", named("fan", None), "its drive is missing in some rows"),
-        ("register", named(None, "speed"), "its register is missing in some rows"),
-        ("status", named("ok", None), "its status is missing in some rows"),
-        ("drive", NAMELESS, "one drive has no name"),
-        ("status", NAMELESS, "one status has no name"),
-        ("unit", NAMELESS, "one unit has no name"),
-        ("drive", named("fan\0", "fan"), "one drive has a NUL character"),
-        ("register", named("speed", "\0"), "one register has a NUL character"),
-        ("status", named("ok", "o\0k"), "one status has a NUL character"),
-        ("unit", named("Hz", "\0"), "one unit has a NUL character"),
-        ("drive", named("f" * 1001, "fan"), "one drive is longer than 1000 bytes"),
-        ("register", named("speed", "ü" * 501), "one register is longer than 1000 bytes"),
+        ("time", times(None, UTC_0), "some rows have no time"),
+        ("clock_ns", pa.array([None, 5], pa.int64()), "some rows have no monotonic_ns"),
+        ("drive", named("fan", None), "some rows have no drive"),
+        ("register", named(None, "speed"), "some rows have no register"),
+        ("status", named("ok", None), "some rows have no status"),
+        ("drive", NAMELESS, "the column drive has a null text"),
+        ("status", NAMELESS, "the column status has a null text"),
+        ("unit", NAMELESS, "the column unit has a null text"),
+        ("drive", named("fan\0", "fan"), "a drive has a NUL character"),
+        ("register", named("speed", "\0"), "a register has a NUL character"),
+        ("status", named("ok", "o\0k"), "a status has a NUL character"),
+        ("unit", named("Hz", "\0"), "a unit has a NUL character"),
+        ("drive", named("f" * 1001, "fan"), "a drive is longer than 1000 bytes"),
+        ("register", named("speed", "ü" * 501), "a register is longer than 1000 bytes"),
         ("uncertainty_us", pa.array([1, 1 << 31], pa.int64()), "Integer value 2147483648 not in range"),
     ],
 )
@@ -258,7 +258,7 @@ def test_columns_that_a_conversion_would_make_much_larger_are_rejected(
     columns = alike(rows)
     data = written(ZSTD, **(columns | {column: OF_ONE_TEXT[column](rows)}))
     before = most_allocated()
-    with pytest.raises(MessageError, match=f"its {column} has another type"):
+    with pytest.raises(MessageError, match=f"the column {column} has another type"):
         unpack(data)
     assert most_allocated() - before < 8 << 20
 
@@ -269,7 +269,7 @@ def test_rows_that_need_no_bytes_are_limited_too(most_allocated: Callable[[], in
     sink = pa.BufferOutputStream()
     with pa.ipc.new_stream(sink, schema) as writer:
         writer.write_batch(rows)
-    with pytest.raises(MessageError, match="its time has another type"):
+    with pytest.raises(MessageError, match="the column time has another type"):
         unpack(sink.getvalue())
     assert most_allocated() < 1 << 20
 
@@ -277,7 +277,7 @@ def test_rows_that_need_no_bytes_are_limited_too(most_allocated: Callable[[], in
 def test_an_older_format_version_is_rejected() -> None:
     """The older version marks compressed buffers differently."""
     options = pa.ipc.IpcWriteOptions(metadata_version=pa.ipc.MetadataVersion.V4)
-    with pytest.raises(MessageError, match="its Arrow metadata version is not 5"):
+    with pytest.raises(MessageError, match="the Arrow metadata version is not 5"):
         unpack(written(options))
 
 

@@ -1,4 +1,5 @@
-"""Fleet: several gateways share the lines of a plant through NATS JetStream; each line has one master.
+"""Fleet: several gateways share the lines of a plant through NATS JetStream; one gateway polls each line.
 
-Samples flow from the poller through Spool, Forwarder, the stream `samples` and Hub to Parquet or PostgreSQL.
+The gateway that polls a line is called the line's master. It spools samples on its disk (Spool) and sends
+them to the NATS stream `samples` (Forwarder). Hub stores the stream in Parquet files or PostgreSQL.
 """

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from multidrop.printable import masked
 
 MOST_DENIALS = 1000
-REFUSALS = (  # a part of nats-py's error message, and the sentence that users see instead of it
+REFUSALS = (  # a part of nats-py's error message, and the sentence that users see in its place
     ("authorization violation", "{} refuses these credentials, or the lack of any: see --credentials"),
     ("certificate_verify_failed", "the certificate of {} is not trusted ({why}); name its issuer with --ca"),
     (
@@ -59,7 +59,7 @@ class OutcomeUnknown(FleetError):
 
 
 class Conflict(Exception):
-    """A record was not replaced, because its revision is not the expected one."""
+    """A record was not replaced, because another client has changed it since it was read."""
 
 
 def failure_to_connect(url: str, failure: BaseException) -> FleetError:
@@ -75,7 +75,10 @@ def failure_to_connect(url: str, failure: BaseException) -> FleetError:
 
 
 def _words(text: str) -> str:
-    """Return an error's text without "[Errno ...]"; for failed connects, only the system's own texts."""
+    """Return an error's text without "[Errno ...]".
+
+    For failed connections, return only the operating system's description of each error.
+    """
     numbers = dict.fromkeys(re.findall(r"\[Errno (\d+)\] Connect call failed", text))
     if numbers:
         return ", ".join(os.strerror(int(number)) for number in numbers)
@@ -83,15 +86,16 @@ def _words(text: str) -> str:
 
 
 class Denials:
-    """Counts the server's denials on one connection, by subject, and logs each denied subject once."""
+    """Counts requests that the server denied on one connection, by subject. Logs each denied subject once."""
 
     def __init__(self) -> None:
         # number of denials by kind ("publish" or "subscription") and subject
         self._counts: Counter[tuple[str, str]] = Counter()
-        self._raised = ""  # the subject whose denied subscription is raised instead of logged
+        # if a subscription to this subject is denied, `raising` raises an error, and the denial is not logged
+        self._raised = ""
 
     async def note(self, failure: Exception) -> None:
-        """Count a denial, if this error message of a server reports one."""
+        """Count a denial if this error from a server reports one."""
         found = _DENIAL.search(str(failure))
         if not found:
             return

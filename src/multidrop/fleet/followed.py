@@ -1,4 +1,4 @@
-"""FollowedFleet: a fleet's lines and newest rows, for a gateway that polls no lines of its own."""
+"""FollowedFleet: a fleet's lines and newest samples, for a gateway that polls no lines of its own."""
 
 from __future__ import annotations
 
@@ -26,27 +26,31 @@ from multidrop.polling import BatchColumns
 from multidrop.samples import MessageError, unpack
 from multidrop.transport import LineStatistics
 
-MOST_READ, MOST_READ_BYTES = 64, 8 << 20  # limits of one answer: number of messages, and their bytes
-MOST_BATCHES = 100  # limit of batches of rows that the gateway has not taken yet
-PAUSE_S = 0.2  # pause before the next read if there is no new message
+# limits of one read from the stream: number of messages, and their size in bytes
+MOST_READ, MOST_READ_BYTES = 64, 8 << 20
+MOST_BATCHES = 100  # limit of batches of samples that wait for the gateway; the oldest are dropped
+PAUSE_S = 0.2  # pause before the next read from the stream if there was no new message
 AGAIN_S = 1.0  # pause after a failure, and between two checks of the fleet's lines
-SILENT_S = 6.0  # a line counts as lost after this many seconds without a row
-MOST_NAMES = 65_535  # limit of the drives, and of the registers, seen since the start: codes have 16 bits
-MOST_STATUSES = 1000  # limit of different statuses seen since the start
-OTHER = "other"  # replaces each status beyond MOST_STATUSES
-NO_VALUE = "no valid value"  # replaces the status "ok" of a row that has no value
-LATE_S = 5.0  # rows that are older than this (in s) on arrival are reported
-EARLY_S = 2.0  # rows dated further in the future than this (in s) are reported: a clock is wrong
+SILENT_S = 6.0  # a line counts as lost after this many seconds without a sample
+MOST_NAMES = 65_535  # limit of different drive names, and of register names: their codes have 16 bits
+MOST_STATUSES = 1000  # limit of different status texts
+OTHER = "other"  # shown for each further status beyond MOST_STATUSES
+NO_VALUE = "no valid value"  # status of a row that is marked "ok" but has no value
+LATE_S = 5.0  # samples that are older than this on arrival are reported
+EARLY_S = 2.0  # samples dated further in the future than this are reported, because a clock is wrong
 
 _log = logging.getLogger("multidrop.fleet")
 
 
 class FollowedLine(NamedTuple):
-    """A line that a gateway of the fleet polls. It has those attributes of a Bus that the views read."""
+    """A line that another gateway of the fleet polls.
+
+    It has those attributes of a Bus that the web page and other parts of `multidrop serve` read.
+    """
 
     identity: str  # the port
     why_lost: str = ""
-    is_lost: bool = False  # False: this process has no port that could be lost
+    is_lost: bool = False  # always False, because this process has no port for the line
     audit_trouble: str = ""
 
     @property
@@ -55,7 +59,7 @@ class FollowedLine(NamedTuple):
 
 
 class FollowedRows:
-    """The newest row of each register in some messages. Its columns are those of a Batch."""
+    """The newest sample of each register in a group of messages, with the columns of a Batch."""
 
     def __init__(self, columns: BatchColumns) -> None:
         self._columns = columns
@@ -65,9 +69,9 @@ class FollowedRows:
 
 
 class NameCodes:
-    """Codes of at most `most` names, in the order of their first use.
+    """Numbers names in the order of their first use.
 
-    All further names share the code of `rest`.
+    If there are `most` names already, each new name gets the number of the name `rest`.
     """
 
     def __init__(self, most: int, rest: str, *names: str) -> None:
@@ -84,13 +88,13 @@ class NameCodes:
 
 
 class RowReader:
-    """Converts messages into rows with this computer's monotonic times. One thread at a time uses it."""
+    """Converts messages into samples with this computer's monotonic times. One thread at a time uses it."""
 
     def __init__(self, clocks: Callable[[], tuple[int, int]]) -> None:
-        # pairs of drive and register; rows of other pairs are ignored
+        # pairs of drive and register to read; samples of other pairs are ignored
         self.known: Container[tuple[str, str]] = ()
         self._clocks = clocks
-        # names beyond the limit become "", and the gateway ignores their rows
+        # further names are counted as "", a name that the gateway ignores
         self._drives, self._registers = NameCodes(MOST_NAMES, ""), NameCodes(MOST_NAMES, "")
         self._statuses = NameCodes(MOST_STATUSES, OTHER, "ok")
         self._newest: dict[tuple[str, str], int] = {}  # time of the newest row, by drive and register
@@ -139,8 +143,8 @@ class RowReader:
 
 
 def _newest_rows(message: StreamMessage) -> list[tuple[tuple[str, str], tuple[Any, ...]]]:
-    """Return the newest row of each register by drive and register: time, uncertainty, value and status."""
-    if message.sequence == 0:  # the message is not from a gateway
+    """Return the newest sample (time, uncertainty, value, status) of each pair of drive and register."""
+    if message.sequence == 0:  # no gateway has sent this message
         return []
     try:
         table = unpack(message.data)
@@ -168,10 +172,10 @@ def _clocks() -> tuple[int, int]:
 
 
 class FollowedFleet:
-    """The lines of a fleet, with the methods of a Poller that a gateway uses.
+    """The lines of a fleet, with those methods of a Poller that `multidrop serve` uses.
 
-    `path` is only for samples; `watch` reads the fleet's records. `on_change` is called in the loop when the
-    fleet's lines have changed; the gateway then calls `adopt`.
+    `path` is only for samples; `watch` reads the fleet's records. `on_change` is called in the event loop
+    when the fleet's lines have changed; the gateway then calls `adopt`.
     """
 
     dropped = 0
@@ -186,22 +190,22 @@ class FollowedFleet:
         self._reader = RowReader(_clocks)
         self._rows: deque[FollowedRows] = deque(maxlen=MOST_BATCHES)
         self._folder = TemporaryDirectory(prefix="multidrop-")
-        self._records: Mapping[str, Record] = {}  # the lines to adopt
-        self._wanted: Mapping[str, int] = {}  # revisions of the lines for which `on_change` was called
+        self._records: Mapping[str, Record] = {}  # line records that the next call of `adopt` will use
+        self._wanted: Mapping[str, int] = {}  # revisions of the line records at the last call of `on_change`
         # By line: the record's revision, and the line (None: its record has a mistake).
         self._lines: dict[str, tuple[int, PlantLine | None]] = {}
         self._line_of: dict[str, str] = {}  # by drive
         self._begun = time.monotonic()
-        self._heard: dict[str, float] = {}  # by line: when its newest row arrived
+        self._heard: dict[str, float] = {}  # by line: when its newest sample arrived
 
     # ---- reading ----
 
     def works(self) -> list[Coroutine[Any, Any, None]]:
-        """Return the coroutines that must run as long as the fleet is followed."""
+        """Return the coroutines that must run as long as this object is used."""
         return [self.path.keep(), self._read_rows(), self._watch_lines()]
 
     async def _read_rows(self) -> None:
-        """Read new messages until cancelled, starting after the present end of the stream."""
+        """Read new samples until cancelled. Older messages of the stream are skipped."""
         while True:
             try:
                 place = (await stream_info(self.path)).last
@@ -263,7 +267,7 @@ class FollowedFleet:
         return self._rows.popleft() if self._rows else None
 
     def adopt(self, plant: Plant) -> dict[str, LineError]:
-        """Use the fleet's present lines, and all else from the plant file."""
+        """Use the fleet's present lines; take all other settings from the plant file."""
         records, before = self._records, self._lines
         self._lines = {
             name: before[name]
@@ -291,14 +295,14 @@ class FollowedFleet:
 
     @property
     def buses(self) -> dict[str, FollowedLine]:
-        """The lines by name. If a line is not polled, it has the reason."""
+        """The lines by name. A line that is not polled has a reason in `why_lost`."""
         state = self._watch.state()
         return {
             line.name: FollowedLine(line.port, self._why_lost(line.name, state)) for line in self.plant.lines
         }
 
     def _why_lost(self, line: str, fleet: Mapping[str, Any]) -> str:
-        """Return why no values of this line arrive; "" if a value has arrived recently."""
+        """Return the reason why no values of this line arrive; "" if a value has arrived recently."""
         master = fleet["lines"].get(line, {}).get("master")
         gateway = fleet["gateways"].get(master, {})
         says = gateway.get("says")

@@ -37,14 +37,15 @@ from multidrop.samples import PolledUnits, Spool
 from multidrop.supervisor import Ended, end_tasks, supervisor
 
 SPOOL_BYTES = 10_000_000_000
-LINES_AT_ONCE = 32  # limit of lines that are opened or closed at the same time
+LINES_AT_ONCE = 32  # limit of lines that are opened or closed concurrently
 STATE = {"state": str, "lines": int, "margin_s": float, "trouble": str, "troubles": dict, "spool": dict}
 SPOOL = {"bytes": int, "lost": int, "behind": int | None, "lag_s": float | None, "trouble": str | None}
-FORWARD_S = 10.0  # time limit at shutdown for forwarding samples; the rest is forwarded after the next start
-IN_TROUBLE_S = 3.0  # time limit for forwarding samples at shutdown, if the samples' stream has a problem
-SYNC_S = 3.0  # time limit at shutdown for writing the last rows to the disk
+# time limit at shutdown for forwarding samples; the other samples are forwarded after the next start
+FORWARD_S = 10.0
+IN_TROUBLE_S = 3.0  # time limit at shutdown if the stream of samples has a problem
+SYNC_S = 3.0  # time limit at shutdown for writing the last samples to the disk
 ENDING_S = 0.05
-LOOK_S = 0.2  # pause between checks of the threads
+LOOK_S = 0.2  # pause between checks of the gateway's threads
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -119,10 +120,10 @@ class FleetGateway:
                 await self._until_the_end()
                 for name in ("look", "member"):
                     supervisor().let_go(name)
-                self.member.end()  # no effect if `end` was called already
+                self.member.end()  # has no effect if the gateway is already shutting down
                 await asyncio.wait([member])
                 await end_tasks(looking)
-                # the supervisor reports these exceptions
+                # the supervisor reports these three exceptions
                 with suppress(Ended, PollingFailed, asyncio.CancelledError):
                     member.result()
                 with suppress(PollingFailed):
@@ -140,7 +141,7 @@ class FleetGateway:
         await end_tasks(*waits)
 
     async def _look(self) -> None:
-        """Check the watched threads and the poller repeatedly; report failed polling, and return."""
+        """Check the threads and the poller repeatedly. If polling has failed, report this and return."""
         while True:
             supervisor().look()
             if failure := self.lines.poller.failure:
@@ -176,7 +177,7 @@ class FleetGateway:
     async def _answer(self, message: Msg) -> None:
         """Answer a request about this gateway.
 
-        Without a session, ignore the request: another gateway of this name may have one.
+        If this process has no session, ignore the request, because another gateway of this name may have one.
         """
         if not self.member.lease.session or not names.is_inbox(message.reply):
             return
@@ -187,7 +188,7 @@ class FleetGateway:
             await message.respond(json.dumps(with_short_texts(self.state())).encode())
 
     def state(self) -> dict[str, Any]:
-        """Return the state that `multidrop fleet status` shows."""
+        """Return the state of this gateway that `multidrop fleet status` shows."""
         member, spool = self.member, self.spool.state()
         lost = {line: f"port lost: {why}" for line, why in member.keeper.lost.items()}
         failing = {line: f"polling fails: {why}" for line, why in self.lines.poller.line_failures.items()}
@@ -258,13 +259,16 @@ class FleetLines:
     async def take(self, line: str, description: Any) -> None:
         """Open the line and poll it. If that raises, the line is not polled and its port is closed.
 
-        Raises LineError if its port does not exist, and ValueError for a mistake in its description. A user's
-        own class may raise other errors.
+        Raises LineError if its port does not exist, and ValueError for a mistake in its description. Drive
+        classes that users have written may raise other errors.
         """
         await self._in_thread(self._take, Record(line, 0, description))
 
     async def _in_thread(self, act: Callable[..., object], *details: object) -> None:
-        """Call `act` in a daemon thread. SystemExit, which would end the loop, becomes RuntimeError."""
+        """Call `act` in a daemon thread.
+
+        Convert SystemExit, which would end the event loop, to RuntimeError.
+        """
         async with self._free:
             await supervisor().thread("line", inf, partial(act, *details))
 
@@ -273,7 +277,8 @@ class FleetLines:
         polled = {drive.name for bus in self.poller.buses.values() for drive in bus.drives}
         # a line without polled drives would be refused by `add_line`
         if not any(one.drive.name in polled for one in line.drives):
-            self._units.note(line, time.monotonic_ns())  # must precede the line's first row
+            # units must be known before the line's first sample arrives
+            self._units.note(line, time.monotonic_ns())
         before = self.poller.buses.get(line.name)
         try:
             self.poller.add_line(line)
@@ -288,7 +293,7 @@ class FleetLines:
     def _let_go(self, line: str) -> None:
         try:
             self.poller.remove_line(line)
-        except PollingFailed:  # polling of all lines has ended; closing the port is enough
+        except PollingFailed:  # the poller has stopped on all lines, so only the port must be closed
             self.poller.bus(line).close()
 
     def port_loss(self, line: str) -> PortLoss | None:
@@ -305,9 +310,9 @@ class FleetLines:
 
 
 class CommandedLines:
-    """Polls lines, and accepts commands for a line while it is polled.
+    """Polls lines, and accepts commands for each polled line.
 
-    `may_wait` returns True until the lines must be closed because the lease is about to expire.
+    `may_wait` returns False when the lines must be closed because the lease is about to expire.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Metrics of a fleet's gateway: its state as OpenMetrics, and the HTTP port that serves it on this computer.
+"""Metrics of a fleet's gateway in the OpenMetrics format, and the HTTP port that serves them locally.
 
 A figure that is unknown, such as the lease's remaining time when there is no lease, has no sample. Every
 client that can connect can read the metrics, so the port listens only on loopback addresses. The port also
@@ -23,7 +23,7 @@ from multidrop.toml_check import parse_address
 _SUFFIXES = {"gauge": "", "counter": "_total"}
 _PREFIX = "multidrop_fleet_"
 EXAMPLE = "127.0.0.1:9464"
-MOST_HEAD = 8192  # size limit of a request's head, in bytes
+MOST_HEAD = 8192  # size limit of a request's header, in bytes
 MOST_CLIENTS = 32
 PATIENCE_S = 5.0  # time limit for receiving a request and sending its answer
 NAMES = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:[0-9]{1,5})?")
@@ -126,13 +126,13 @@ async def serving(listener: socket.socket, metrics: Metrics) -> AsyncIterator[No
 def _answer(head: bytes, metrics: Metrics) -> bytes:
     try:
         return answer(head, metrics)
-    except Exception:  # the failure is reported to the client and in the log
+    except Exception:  # the client gets status 500, and the failure is logged
         _log.exception("metrics failed")
         return _response(500, "the metrics failed; this gateway's log says why")
 
 
 def answer(head: bytes, metrics: Metrics) -> bytes:
-    """Return the whole response to a request, whatever its bytes are."""
+    """Return the whole HTTP response to a request, whatever bytes the request has."""
     lines = head.decode("latin-1").split("\r\n")
     fields = [line.partition(":") for line in lines[1:] if line]
     headers = {name.strip().lower(): value.strip() for name, _, value in fields}

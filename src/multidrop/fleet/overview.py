@@ -20,12 +20,13 @@ from multidrop.fleet.servers.setup import check_buckets
 from multidrop.printable import masked
 
 MOVES_SHOWN = 20
-MISSED_MS = 30 * 24 * 3600 * 1000  # a missing gateway is reported for this long: 30 days
-EVERY_S = 1.0  # pause between two reads of the fleet
+# a gateway that has ended without a shutdown is listed as missing for this long: 30 days
+MISSED_MS = 30 * 24 * 3600 * 1000
+EVERY_S = 1.0  # pause between two reads of the fleet's state
 
 
 class FleetView:
-    """The state of a fleet, read over one server path.
+    """The state of a fleet, read over one server connection.
 
     Each call of `look` reads the changed records and asks every gateway for its state.
     """
@@ -52,7 +53,7 @@ class FleetView:
         said = await asyncio.gather(*map(self._ask, present))
         self._says = dict(zip(present, said, strict=True))
         for state in filter(None, said):
-            with suppress(KeyError, TypeError, ValueError):  # a gateway sent invalid moves
+            with suppress(KeyError, TypeError, ValueError):  # raised if a gateway has sent invalid moves
                 self._records.moves.add(map(move_of, state.pop("last_moves")))
 
     async def _ask(self, gateway: str) -> dict[str, Any] | None:
@@ -97,7 +98,8 @@ class FleetView:
 
     def _lines(self, sessions: Container[str]) -> dict[str, Any]:
         observer, plant = self._records.observer, self._records.plant.records
-        held: dict[tuple[str, int], bool] = {}  # by owner: is its session still alive (cached)
+        # by owner: whether its session is alive; saves repeated checks
+        held: dict[tuple[str, int], bool] = {}
         found: dict[str, Any] = {}
         for name in self._records.lines():
             record = self._records.owner(name)
@@ -129,7 +131,7 @@ class FleetWatch:
         self.trouble: str | None = None  # why the newest read failed; None if it succeeded
 
     async def look(self) -> None:
-        """Read the fleet again. If that fails, set `trouble` and keep the last view."""
+        """Read the fleet's state again. If that fails, set `trouble` and keep the last view."""
         begun = self._clock()
         try:
             await self._view.look()

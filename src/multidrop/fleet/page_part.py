@@ -1,9 +1,8 @@
-"""The part `fleet` of `multidrop serve`: shows a fleet on the page, and can stop it with a commander's key.
+"""The part `fleet` of `multidrop serve`: shows a fleet on the web page, and can stop it with a key.
 
-If the plant file has no lines, the part also has a `source`: the gateway gets the fleet's lines and rows
-from it.
-
-`multidrop.gateway` imports this module by its name, as it imports its other parts.
+Parts are the optional features of `multidrop serve`. If the plant file has no lines, this part also has a
+`source`: the gateway gets the fleet's lines and samples from it. `multidrop.gateway` imports this module by
+its name, like every other part.
 """
 
 from __future__ import annotations
@@ -25,10 +24,10 @@ if TYPE_CHECKING:
     from multidrop.fleet.servers.connections import ServerPath
 
 EXAMPLE = "nats://127.0.0.1:4222"
-OLD_S = 5.0  # an older view of the fleet makes the part unhealthy
+OLD_S = 5.0  # if the view of the fleet is older than this, the page reports a problem
 AGAIN_S = 1.0  # pause between attempts to connect as a commander
 LOG = "fleet-commands.jsonl"
-WHOLE = "the fleet"  # name for all drives in the answer to a stop
+WHOLE = "the fleet"  # name that stands for all drives in the answer to a stop
 NO_COMMANDER = (
     "the stop was NOT sent: [serve.fleet] has no commander; use `multidrop fleet stop` or the hard-wired stop"
 )
@@ -49,7 +48,7 @@ class FleetSettings:
     commander: str = ""
     samples: str = ""
     ca: str = ""
-    libraries: ClassVar[tuple[str, ...]] = ("nats",)  # imported when the part is built
+    libraries: ClassVar[tuple[str, ...]] = ("nats",)  # packages that this part needs, imported in `build`
 
     def __post_init__(self) -> None:
         wrong = [
@@ -65,7 +64,7 @@ Settings = FleetSettings
 
 
 class FleetPart:
-    """A part that reads a fleet's state once a second.
+    """The part `fleet`, which reads a fleet's state once a second.
 
     `command` returns a new client for commands, which is not connected yet. It is None if this page may not
     stop the fleet.
@@ -90,7 +89,7 @@ class FleetPart:
         return self._command is not None
 
     def take(self, batch: object) -> None:
-        """Ignore the batch: its rows are from the gateway's own lines, or from `source`."""
+        """Ignore the batch of samples: it is from the gateway's own lines, or from `source`."""
 
     async def run(self) -> None:
         works = [self._path.keep(), self._watch.run()]
@@ -108,7 +107,7 @@ class FleetPart:
             await end_tasks(*tasks)
 
     async def _keep_commander(self, command: Callable[[], FleetCommands]) -> None:
-        """Stay connected as a commander, so that a stop does not wait for a connection."""
+        """Keep a connection with the commander's key, so that a stop does not wait for a connection."""
         while True:
             try:
                 async with command() as self._commands:
@@ -122,8 +121,8 @@ class FleetPart:
     async def stop(self, by: str, drives: Sequence[str] | None = None) -> Mapping[str, tuple[bool, str]]:
         """Stop these drives, or all drives of the fleet if None.
 
-        Return for each drive whether it is stopped, and a sentence. A failure that concerns all drives
-        has the key "the fleet".
+        Return for each drive whether it is stopped, and a sentence. A failure that concerns all drives has
+        the key "the fleet".
         """
         if not self.can_stop:
             return {WHOLE: (False, NO_COMMANDER)}
@@ -156,14 +155,14 @@ class FleetPart:
 
 
 class HasFolder(Protocol):
-    """The attributes of the gateway's PartContext that this part uses."""
+    """The attribute of the gateway's PartContext that this part uses."""
 
-    folder: Path  # base of relative file names
+    folder: Path  # relative file names start from this folder
     plant: Plant
 
 
 def build(settings: FleetSettings, inside: HasFolder) -> FleetPart:
-    """Return the part. It connects to the servers only when `run` is called.
+    """Return the part; it connects to the servers when `run` is called.
 
     Raises ImportError without the NATS client, OSError or ValueError for invalid files.
     """

@@ -49,22 +49,22 @@ from multidrop.polling import BatchColumns
 
 LATEST = 4  # MetadataVersion.V5: older versions mark compressed buffers differently
 MOST_MESSAGES = 100  # limit of Arrow messages in a stream: the schema, dictionaries and rows
-_DICTIONARY, _RECORD_BATCH = 2, 3  # kinds of messages: MessageHeader in Message.fbs
+_DICTIONARY, _RECORD_BATCH = 2, 3  # kinds of Arrow messages, from MessageHeader in Message.fbs
 _I8, _U16, _I32, _U32, _I64 = (Struct(f"<{kind}") for kind in "bHiIq")
 _BUFFER = Struct("<qq")  # a buffer's offset in the body, and its length
-# stands in place of the unpacked size if a buffer is not compressed, because compression would not shrink it
+# in place of a buffer's unpacked size: the buffer is not compressed, because it would not shrink
 _NOT_COMPRESSED = -1
-MOST_BYTES = 900_000  # limit of a message; NATS accepts 1 MiB by default, including headers
+MOST_BYTES = 900_000  # size limit of a message; NATS accepts 1 MiB by default, including headers
 MOST_ROWS = 1 << 16
 MOST_UNPACKED = 4 << 20  # limit of the unpacked size in bytes; enough for 2.4 MB of rows and their names
-MOST_NAME = 1000  # limit of a name, status or unit in bytes, because PostgreSQL indexes names
-MOST_SAID = 300  # limit of characters of an error's text
+MOST_NAME = 1000  # limit of a name, status or unit in bytes, because PostgreSQL indexes these texts
+MOST_SAID = 300  # limit, in characters, of an error's text
 LONGEST_US = (1 << 31) - 1
 COMPRESSED = pa.ipc.IpcWriteOptions(compression=pa.Codec("zstd", 1))
-# type of names; its codes are wide enough for tables that join many messages
+# type of columns with names; codes have 32 bits because a table may join many messages
 NAMED = pa.dictionary(pa.int32(), pa.utf8())
 TIMES = pa.timestamp("ns", "UTC")
-ROWS = pa.schema(  # columns that `unpack` returns, the same as in recordings
+ROWS = pa.schema(  # columns of the table that `unpack` returns, the same as in recordings
     [
         pa.field("time", TIMES, nullable=False),
         pa.field("monotonic_ns", pa.int64(), nullable=False),
@@ -76,7 +76,7 @@ ROWS = pa.schema(  # columns that `unpack` returns, the same as in recordings
         pa.field("unit", NAMED),
     ]
 )
-_TYPES: Mapping[str, Sequence[Any]] = {  # allowed types of a message's columns, except dictionaries
+_TYPES: Mapping[str, Sequence[Any]] = {  # allowed types of a message's columns, except dictionary columns
     "time": [TIMES],
     "clock_ns": [pa.int64()],
     "uncertainty_us": [pa.int32(), pa.int64()],
@@ -84,26 +84,26 @@ _TYPES: Mapping[str, Sequence[Any]] = {  # allowed types of a message's columns,
 }
 _KINDS = {"time": pa.int64(), "monotonic_ns": pa.int64(), "uncertainty_ns": pa.int64()}
 _KINDS |= {"drive": pa.uint16(), "register": pa.uint16(), "value": pa.float64(), "status": pa.uint16()}
-RAW = "raw count"  # unit of values without a known scale, as in a `History`
+RAW = "raw count"  # unit of values whose scale is unknown, as in a `History`
 
 
 def unpacked_size(data: bytes | memoryview) -> int:
-    """Return the unpacked size of all buffers in bytes. Raises ValueError or pa.ArrowException."""
+    """Return the size in bytes of all buffers after unpacking. Raises ValueError or pa.ArrowException."""
     size = 0
     for number, message in enumerate(pa.ipc.MessageReader.open_stream(data)):
         if number == MOST_MESSAGES:
-            raise ValueError(f"it has more than {MOST_MESSAGES} parts")
+            raise ValueError(f"the message has more than {MOST_MESSAGES} parts")
         try:
             size += _size(memoryview(message.metadata), memoryview(message.body or b""))
         except struct_error:
-            raise ValueError("it is truncated") from None
+            raise ValueError("the message is truncated") from None
     return size
 
 
 def _size(metadata: memoryview, body: memoryview) -> int:
     message = _Table(metadata, _U32.unpack_from(metadata)[0])
     if message.number(0, _U16) != LATEST:
-        raise ValueError("its Arrow metadata version is not 5")
+        raise ValueError("the Arrow metadata version is not 5")
     kind = message.number(1, _I8)
     rows = message.table(2)
     if kind == _DICTIONARY and rows:
@@ -155,7 +155,7 @@ class _Table:
 
 
 class MessageError(ValueError):
-    """These bytes are not a valid message."""
+    """Bytes that are not a valid message of samples."""
 
 
 class SinkError(OSError):
@@ -170,7 +170,7 @@ class Packed(NamedTuple):
 
 
 class RowBuffer:
-    """Holds copies of the rows of many batches of one poller, so that the batches' memory can be reused."""
+    """Holds copies of the rows of one poller's batches, so that the batches' memory can be reused."""
 
     def __init__(self) -> None:
         self.rows = 0
@@ -178,7 +178,7 @@ class RowBuffer:
         self._columns = {name: bytearray() for name in _KINDS}
 
     def add(self, columns: BatchColumns) -> bool:
-        """Copy the rows; return False if they are from another poller, whose name codes differ."""
+        """Copy the rows; return False if they are from another poller, which numbers names differently."""
         names = {"drive": columns.drives, "register": columns.registers, "status": columns.statuses}
         if any(not _continues(names[of], known) for of, known in self._names.items()):
             return False
@@ -214,7 +214,7 @@ class RowBuffer:
 def _units(
     column: Mapping[str, Any], names: Mapping[str, Sequence[str]], units: PolledUnits
 ) -> tuple[Any, Sequence[str]]:
-    """Return the unit code of each row, and the unit of each code."""
+    """Return each row's unit as a code, and the text of each code."""
     table = units.table(names["drive"], names["register"])
     registers = pa.scalar(len(names["register"]), pa.uint32())
     series = pc.add(pc.multiply(column["drive"].cast(pa.uint32()), registers), column["register"])
@@ -254,17 +254,17 @@ def _table(data: bytes | memoryview) -> Any:
     """Return the table in an Arrow stream. Raises ValueError if it is too large or has other column types."""
     size = unpacked_size(data)
     if size > MOST_UNPACKED:
-        raise ValueError(f"{size} bytes unpacked; the limit is {MOST_UNPACKED}")
+        raise ValueError(f"the message has {size} bytes unpacked; the limit is {MOST_UNPACKED}")
     with pa.ipc.open_stream(data) as reader:
         for field in reader.schema:
             if not _is_ours(field):
-                raise ValueError(f"its {field.name} has another type")
+                raise ValueError(f"the column {field.name} has another type")
         batches = []
         rows = 0
         for batch in reader:
             rows += len(batch)
             if rows > MOST_ROWS:
-                raise ValueError(f"{rows} rows; the limit is {MOST_ROWS}")
+                raise ValueError(f"the message has {rows} rows; the limit is {MOST_ROWS}")
             batches.append(batch)
         return pa.Table.from_batches(batches, reader.schema)
 
@@ -276,10 +276,10 @@ def _is_ours(field: Any) -> bool:
 
 
 def _check(rows: Any) -> None:
-    """Raise ValueError for rows that no sink accepts: the hub could never store them, nor later messages."""
+    """Raise ValueError for rows that no sink accepts. Otherwise they would block all later messages."""
     for field, column in zip(rows.schema, rows.columns, strict=True):
         if not field.nullable and column.null_count:
-            raise ValueError(f"its {field.name} is missing in some rows")
+            raise ValueError(f"some rows have no {field.name}")
         if pa.types.is_dictionary(field.type):
             for chunk in column.chunks:
                 _check_names(field.name, chunk.dictionary)
@@ -287,11 +287,11 @@ def _check(rows: Any) -> None:
 
 def _check_names(kind: str, names: Any) -> None:
     if names.null_count:
-        raise ValueError(f"one {kind} has no name")
+        raise ValueError(f"the column {kind} has a null text")
     if (pc.max(pc.binary_length(names)).as_py() or 0) > MOST_NAME:
-        raise ValueError(f"one {kind} is longer than {MOST_NAME} bytes")
+        raise ValueError(f"a {kind} is longer than {MOST_NAME} bytes")
     if pc.any(pc.match_substring(names, "\0")).as_py():
-        raise ValueError(f"one {kind} has a NUL character")
+        raise ValueError(f"a {kind} has a NUL character")
 
 
 def _microseconds(ns: Any) -> Any:
@@ -332,7 +332,7 @@ def _stream(rows: Any) -> bytes:
 
 
 class UnitChange(NamedTuple):
-    """A change of unit: before `until_ns` (monotonic, in ns), the series had the unit `code`."""
+    """A change of a register's unit: before `until_ns` (monotonic, in ns), its unit had this `code`."""
 
     until_ns: int
     series: int
@@ -340,18 +340,19 @@ class UnitChange(NamedTuple):
 
 
 class UnitTable(NamedTuple):
-    """Unit codes by series. A series is the values of one register of one drive.
+    """The unit of each register of each drive, as a code.
 
-    Its number is drive * len(registers) + register, with the codes of the two names.
+    The values of one register of one drive are a series. Its number is drive * len(registers) + register,
+    with the codes of the two names.
     """
 
     newest: Any  # pa.Array of the present unit code of each series; null if unknown
-    changes: Sequence[UnitChange]  # newest change first
+    changes: Sequence[UnitChange]  # the newest change comes first
     texts: Sequence[str]  # unit texts by code
 
 
 class PolledUnits:
-    """The unit of each register, and since when it has this unit. Thread-safe."""
+    """The units of all polled registers, and since when each register has its unit. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

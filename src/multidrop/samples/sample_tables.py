@@ -34,14 +34,15 @@ from multidrop.samples.message import SinkError
 HEAD = b"PGCOPY\n\xff\r\n\0" + bytes(8)
 END = b"\xff\xff"
 EPOCH_US = 946_684_800_000_000  # 2000-01-01, the epoch of PostgreSQL
-FLOAT8, TEXT = 701, 25  # PostgreSQL's type ids (oids)
+FLOAT8, TEXT = 701, 25  # type ids (oids) of float8 and text in PostgreSQL
 NULL = b"\xff\xff\xff\xff"
 PIECE = 1 << 18  # approximate size of one piece of COPY data, in bytes
-_FIRST = Struct(">hiqiq")  # number of columns; then time and time_ns, each after its length
+# start of a row of COPY data: its number of columns, then time and time_ns, each after its length
+_FIRST = Struct(">hiqiq")
 _NUMBER = Struct(">ii")
 _ARRAY = Struct(">iiiiii")
 ANSWER_S = 10  # time limit for connecting
-# libpq's time limits if the server's computer does not answer: in s; the last one in ms
+# libpq's time limits for a server that does not answer: in s; the last one in ms
 SILENT_SERVER: dict[str, int] = {
     "keepalives_idle": 10,
     "keepalives_interval": 5,
@@ -78,7 +79,7 @@ class RegisterSet(NamedTuple):
 
 
 class ExchangeRow(NamedTuple):
-    """The values of one drive that were requested together."""
+    """The values that one request has read from a drive."""
 
     time_ns: int
     uncertainty_ns: int | None
@@ -89,7 +90,7 @@ class ExchangeRow(NamedTuple):
 
 
 class ExchangeRows(NamedTuple):
-    """The exchanges of a message, and the names that occur in them."""
+    """The exchanges in a message, and the drives' and registers' names in them."""
 
     exchanges: list[ExchangeRow]
     drives: frozenset[str]
@@ -97,7 +98,7 @@ class ExchangeRows(NamedTuple):
 
 
 def exchanges_of(table: Any) -> ExchangeRows:
-    """Return the exchanges in a table of `message.ROWS`, sorted by time and drive."""
+    """Return the exchanges in a table with the columns of `message.ROWS`, sorted by time and drive."""
     table = table.combine_chunks()
     if not len(table):
         return ExchangeRows([], frozenset(), frozenset())
@@ -136,7 +137,7 @@ def exchanges_of(table: Any) -> ExchangeRows:
 
 
 def _numbers(column: Any, kind: str) -> list[Any]:
-    """Return a column's numbers, with None for nulls. Ten times as fast as `to_pylist`."""
+    """Return a column's numbers, with None for nulls. This is ten times as fast as `to_pylist`."""
     data: Any = memoryview(column.buffers()[1]).cast("B")
     found: list[Any] = data.cast(kind)[column.offset :][: len(column)].tolist()
     if column.null_count:
@@ -146,7 +147,7 @@ def _numbers(column: Any, kind: str) -> list[Any]:
 
 
 def _changes(first: Any, second: Any) -> list[int]:
-    """Return the indices of rows in which either column differs from the row before; includes 0."""
+    """Return 0 and the indices of all rows in which either column differs from the row before."""
     changed = [pc.not_equal(column[1:], column[:-1]) for column in (first, second)]
     either = pc.or_(*changed)
     return [0, *(at + 1 for at in pc.indices_nonzero(either).to_pylist())]
@@ -155,7 +156,7 @@ def _changes(first: Any, second: Any) -> list[int]:
 def copied(
     found: Iterable[ExchangeRows], drives: Mapping[str, int], sets: Mapping[RegisterSet, int]
 ) -> Iterator[bytes]:
-    """Yield the data of a COPY in pieces, with the columns of the statement `COPY`."""
+    """Yield the data of a PostgreSQL COPY in pieces, with the columns of the statement `COPY`."""
     piece = [HEAD]
     size = 0
     for one in found:
@@ -208,7 +209,7 @@ def _array(kind: int, elements: list[bytes], *, has_nulls: bool) -> bytes:
 
 
 class SampleTables:
-    """A connection to a database with these tables, for one writer.
+    """A connection to a PostgreSQL database with these tables, for one writer.
 
     `database` is a connection string, such as "dbname=plant"; `login` has further parameters of libpq. All
     methods raise psycopg.Error, which `sentences` converts to SinkError.
@@ -239,10 +240,11 @@ class SampleTables:
         return self._connection
 
     def prepare(self, position: str, columns: str) -> None:
-        """Create missing tables, including the writer's table for its position; read the names that have
-        an id.
+        """Create missing tables, including the writer's table for its position.
+
+        Then read all names that have an id.
         """
-        # queried first: "create if not exists" needs the right to create even if the object exists
+        # first query whether the object exists: "create if not exists" always needs the right to create it
         for query, name, statement in (
             ("select to_regnamespace(%s)", "multidrop", "create schema if not exists multidrop"),
             ("select to_regclass(%s)", "multidrop.samples", TABLES),
@@ -263,7 +265,7 @@ class SampleTables:
                 copy.write(piece)
 
     def _name(self, found: Sequence[ExchangeRows]) -> None:
-        """Insert those names that have no id in the database yet."""
+        """Insert the names that have no id in the database yet."""
         drives = sorted({name for one in found for name in one.drives} - self._drives.keys())
         query = "insert into multidrop.drives (name) select unnest(%s::text[]) returning name, id"
         if drives:
@@ -277,7 +279,7 @@ class SampleTables:
 
 @contextmanager
 def sentences() -> Iterator[None]:
-    """Raise SinkError with one sentence for an error of PostgreSQL."""
+    """Convert PostgreSQL's errors to SinkError with one sentence."""
     try:
         yield
     except psycopg.Error as failure:

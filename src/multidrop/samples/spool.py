@@ -36,12 +36,12 @@ FORMAT = "multidrop spool 1"
 HEAD = "spool.json"
 _NAME = re.compile(r"(\d{12,})-(\d+)\.(arrows|damaged)")
 _TEMPORARY = re.compile(r"\..+\.tmp")
-ENOUGH_ROWS = 1 << 14  # number of waiting rows at which a message is written
-ENOUGH_S = 1.0  # age of the oldest waiting row at which a message is written
+ENOUGH_ROWS = 1 << 14  # a message is written when this many rows wait in memory
+ENOUGH_S = 1.0  # a message is written when its oldest row has waited this long
 MOST_WAITING = 1_000_000  # limit of rows that wait in memory while the disk is slow or full: 38 MB
 AGAIN_S = 1.0  # pause after a disk error
 LOG_S = 60.0  # time between log lines about lost rows
-ENDING_S = 10.0  # time limit of `close` for the disk
+ENDING_S = 10.0  # time limit of `close` for writing to the disk
 _log = logging.getLogger("multidrop.samples.spool")
 
 
@@ -67,7 +67,7 @@ class SpoolFolder:
 
     def __init__(self, path: Path, gateway: str) -> None:
         self.path = path
-        # sentence about the newest message if the disk stored only a part of it
+        # a sentence about the newest message if only a part of it is on the disk
         self.damage: str | None = None
         with ExitStack() as stack:
             try:
@@ -84,7 +84,7 @@ class SpoolFolder:
         self.close = lock.close
 
     def _head(self, wanted: dict[str, str]) -> str:
-        """Return the log's id from the folder's `spool.json`; create both in an empty folder."""
+        """Return the id of the folder's log from `spool.json`; create this file in an empty folder."""
         path = self.path / HEAD
         if not path.exists():
             others = sorted(one.name for one in self.path.iterdir() if not one.name.startswith("."))
@@ -106,7 +106,7 @@ class SpoolFolder:
         return str(found["log"])
 
     def _listed(self) -> dict[int, StoredMessage]:
-        """Return the messages by sequence number. Remove unfinished files of a killed process."""
+        """Return the folder's messages by sequence number. Remove unfinished files of a killed process."""
         found = {}
         self.newest = 0
         for path in self.path.iterdir():
@@ -114,7 +114,7 @@ class SpoolFolder:
                 path.unlink()
             elif match := _NAME.fullmatch(path.name):
                 number = int(match[1])
-                # this counts damaged messages too, so that their numbers are not reused
+                # counts damaged messages too, so that their numbers are not reused
                 self.newest = max(self.newest, number)
                 if match[3] == "arrows":
                     found[number] = StoredMessage(number, int(match[2]), path.stat().st_size, path)
@@ -162,14 +162,15 @@ class SpoolState(NamedTuple):
     """The state of a spool. Counts of rows start when the spool is opened."""
 
     log: str  # id of the log, from `spool.json`
-    written: int  # rows that reached the disk
-    lost: int  # rows dropped before they reached the disk, or removed from it before they were sent
+    written: int  # number of rows that reached the disk
+    # rows that were dropped before they reached the disk, or removed from the disk before they were sent
+    lost: int
     waiting: int  # rows that wait in memory
-    oldest: int  # sequence number of the oldest message; 0 without one
+    oldest: int  # sequence number of the oldest message; 0 if there is none
     newest: int
-    acknowledged: int | None  # the receiver has all messages up to this one; None: not known yet
+    acknowledged: int | None  # the receiver has all messages up to this sequence number; None: not known yet
     stored: int  # size of all stored messages in bytes
-    trouble: str | None  # the disk's present error; None if the disk works
+    trouble: str | None  # the disk's present error; None if writing works
 
 
 class Spool:
@@ -196,23 +197,25 @@ class Spool:
         self.gateway = gateway
         self._folder = SpoolFolder(Path(folder), gateway)
         self.log = self._folder.log
-        self.on_message: Callable[[], object] = lambda: None  # called in the spool's thread, per message
+        # called in the spool's thread for each written message
+        self.on_message: Callable[[], object] = lambda: None
         self._most = most
         self._units = units or PolledUnits()
         self._keep_sent = keep_sent
         self._stored = sum(message.size for message in self._folder.messages.values())
         self._changing = threading.Condition()
         self._waiting: deque[RowBuffer] = deque()
-        self._packed: deque[Packed] = deque()  # used only by the spool's thread
-        self._first_s: float | None = None  # when the oldest waiting row arrived
+        self._packed: deque[Packed] = deque()  # messages to write; used only by the spool's thread
+        self._first_s: float | None = None  # arrival time of the oldest waiting row
         self._taken = self._written = self._lost = 0
         self._acknowledged: int | None = None
         self._missing: Sequence[tuple[int, int]] = ()
-        # by removed message: the number of its rows. `acknowledge` shows whether these rows are lost.
+        # Removed messages of which it is unknown whether the receiver has them: the number of rows of each.
+        # `acknowledge` decides whether these rows are lost.
         self._undecided: dict[int, int] = {}
         self._trouble: str | None = None
         self._logged_s: float | None = None
-        self._wanted = 0  # `sync` waits until this many appended rows are on the disk
+        self._wanted = 0  # `sync` waits until this many of the appended rows are on the disk
         self._over = False
         if self._folder.damage:
             _log.error("%s", self._folder.damage)
@@ -266,7 +269,7 @@ class Spool:
     # ---- for the forwarder: any thread ----
 
     def following(self, sequence: int) -> StoredMessage | None:
-        """Return the stored message with the next higher sequence number; None if there is none."""
+        """Return the stored message that follows this sequence number; None if there is none."""
         with self._changing:
             messages = self._folder.messages
             first = max(sequence + 1, next(iter(messages), sequence + 1))
@@ -280,8 +283,7 @@ class Spool:
             return self._folder.messages.get(sequence)
 
     def acknowledge(self, sequence: int, missing: Sequence[tuple[int, int]] = ()) -> None:
-        """Note that the receiver has all messages up to this sequence number, so that their removal loses
-        no rows.
+        """Note that the receiver has all messages up to this sequence number: removing them loses no rows.
 
         `missing` are exceptions, as pairs of the first and the last sequence number.
         """
@@ -305,7 +307,7 @@ class Spool:
         while not is_over:
             try:
                 is_over = self._write_due_rows()
-            except Exception as failure:  # such as MemoryError: continue with the waiting rows
+            except Exception as failure:  # such as MemoryError; the rows that wait are written later
                 _log.error("writing the spool %s failed; retrying", self._folder.path, exc_info=failure)
                 time.sleep(AGAIN_S)
 
@@ -347,7 +349,7 @@ class Spool:
         return max(0.0, self._first_s + ENOUGH_S - time.monotonic())
 
     def _pause(self) -> bool:
-        """Wait before a retry. If the spool is closing, count the rows in memory as lost; return True."""
+        """Wait before a retry. If the spool is closing, count the waiting rows as lost, and return True."""
         with self._changing:
             if not self._over:
                 self._changing.wait_for(lambda: self._over, AGAIN_S)
@@ -358,7 +360,7 @@ class Spool:
     def _write(self, packed: Packed) -> bool:
         try:
             stored = self._folder.write(packed.data, packed.rows)
-        except Exception as failure:  # whatever fails, polling must continue
+        except Exception as failure:  # polling must continue whatever fails here
             self._note(str(failure))
             return False
         with self._changing:
@@ -383,7 +385,7 @@ class Spool:
             self._remove_acknowledged()
 
     def _remove_acknowledged(self) -> None:
-        """Remove the oldest message if the receiver has it: the disk may be full."""
+        """Remove the oldest message if the receiver has it, because the disk may be full."""
         oldest = self.following(0)
         if oldest and self._is_sent(oldest.sequence) and oldest.sequence < self._folder.newest:
             self._remove(oldest)
@@ -400,7 +402,7 @@ class Spool:
 
     def _remove(self, message: StoredMessage) -> bool:
         try:
-            # called without the lock, because a disk that hangs must not delay `append`
+            # called without the lock, so that a disk that hangs does not delay `append`
             message.path.unlink(missing_ok=True)
         except OSError as failure:
             _log.error("the spool cannot remove %s: %s", message.path, failure.strerror)

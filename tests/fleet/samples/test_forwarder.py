@@ -316,7 +316,7 @@ async def test_a_missing_stream_is_reported_and_waited_for(running: Cluster, tmp
                 await asked
         with pytest.raises(FleetError, match="there is no stream 'samples', or it has no leader now"):
             await read_after(path, 0, 10, 1000)
-        with pytest.raises(FleetError, match=r"no stream takes samples\.a\.b"):
+        with pytest.raises(FleetError, match=r"no stream stores samples\.a\.b"):
             await publish(path, subject_of("a", "b"), b"", {})
         spool = filled(tmp_path / "spool", 1)
         async with forwarding(spool, path) as forwarder:

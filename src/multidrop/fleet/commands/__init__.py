@@ -1,1 +1,1 @@
-"""Commands and stops that are sent to drives through the gateway that polls them."""
+"""Commands and stops for drives, which NATS delivers to the gateway that polls the drive."""

@@ -1,16 +1,17 @@
-"""The command desks of a gateway: CommandDesk, StopDesk, and CommandSubjects, which connects them to NATS.
+"""CommandDesk and StopDesk receive commands and stops in a gateway; CommandSubjects connects them to NATS.
 
-Both act only on lines whose master is this gateway. The command desk checks a command and sends the
-sender an offer with a token. If the sender returns the token within a second, measured by this computer's
-CLOCK_BOOTTIME, the desk carries out the command. The command is recorded on the disk before it is sent,
-and again when it has ended.
+Both act only on lines whose master is this gateway. The command desk checks a command and sends the sender an
+offer with a token. If the sender returns the token within a second, measured by this computer's
+CLOCK_BOOTTIME, the desk carries out the command. The command is recorded on the disk before it is sent, and
+again when it has ended.
 
 A stop needs no offer and no entry in `[fleet.may]`: sending a stop twice is harmless, but a late stop may do
 harm. The stop is sent first and recorded afterwards.
 
 A gateway subscribes to a line's subjects only while it polls the line. For a line without a master, the
-server therefore reports to a sender that there is no receiver. Each message arrives once on each path; the
-desks recognise copies by the id that the sender chose. No stream stores these messages.
+server therefore reports to a sender that there is no receiver. A gateway is connected to several servers and
+gets each message from each of them. The desks recognise copies by the id that the sender chose. No stream
+stores these messages.
 """
 
 from __future__ import annotations
@@ -51,21 +52,22 @@ from multidrop.fleet.servers.connections import ServerPath
 from multidrop.plant import drive_meant
 from multidrop.supervisor import supervisor
 
-HOLD_S = 0.5  # how long to wait for a command's end before answering "under way"
-AWAITED_S = 3.0  # how long a release of a line waits for commands; most writes and read-backs are faster
-POLL_S = 0.01  # pause between checks whether the commands have ended
+HOLD_S = 0.5  # an answer waits this long for a command or stop to end, then says "under way"
+AWAITED_S = 3.0  # time limit for commands in progress before their line is closed; most commands are faster
+POLL_S = 0.01  # pause between checks whether these commands have ended
 MOST_WRITES = 8  # limit of concurrent commands on one line; stops are not counted
-WAY = "fleet"  # how the audit log marks commands that came through the fleet
-STOPS_REMEMBERED = 1000  # limit of stops in memory; the oldest are removed
+WAY = "fleet"  # entry in the audit log for commands that came through the fleet
+STOPS_REMEMBERED = 1000  # limit of remembered stops; the oldest are forgotten
 CALLED = "a stop was called"
 
 _log = logging.getLogger("multidrop.fleet")
 
 
 class CommandDesk:
-    """Offers commands on this gateway's lines, and carries out the accepted offers.
+    """Checks commands for this gateway's lines, and carries them out once their sender has confirmed them.
 
-    To accept an offer, its sender publishes the offer's token on the NATS subject `subject`.
+    For a valid command, the desk returns an offer with a token. The sender confirms the command by publishing
+    the token on the NATS subject `subject`.
     """
 
     def __init__(
@@ -86,7 +88,7 @@ class CommandDesk:
     # ---- offering a command ----
 
     def offer(self, line: str, data: bytes) -> Offered | CommandAnswer | None:
-        """Check the command in a message; return an offer or a refusal.
+        """Check a command message; return an offer, or an answer with the reason why the command is refused.
 
         Return None unless this gateway is the line's master: the sender uses the first answer that it gets.
         """
@@ -103,9 +105,9 @@ class CommandDesk:
     # ---- carrying out an offered command ----
 
     async def do(self, data: bytes) -> CommandAnswer:
-        """Carry out an offered command once; return its result, also for copies of the message.
+        """Carry out an offered command once; return its result, also for copies of the confirmation.
 
-        A message with `ask` instead of `do` only asks for the result. If `ask` comes before any `do`, answer
+        A message with `ask` instead of `do` only requests the result. If `ask` comes before any `do`, answer
         "not sent", and withdraw the offer so that this answer stays true.
         """
         try:
@@ -168,7 +170,7 @@ class CommandDesk:
 
     def _limit_ns(self, offer: Offer) -> float:
         """Return the deadline for sending the command (CLOCK_MONOTONIC, ns); 0 if its offer is void."""
-        # CLOCK_MONOTONIC is read before CLOCK_BOOTTIME: a pause between the two reads only shortens the limit
+        # CLOCK_MONOTONIC is read first, so a pause between the two reads can only make the limit earlier
         now_ns = time.monotonic_ns()
         return 0 if offer.why_void else now_ns + self.offers.left_ns(offer)
 
@@ -209,14 +211,17 @@ def _prepared(held: HeldLine, request: CommandRequest) -> Prepared:
 
 
 class StopDesk:
-    """Carries out stops on this gateway's lines. Each stop voids the earlier offers for its drives."""
+    """Stops drives of this gateway's lines.
+
+    Each stop cancels all earlier offers of commands to its drives.
+    """
 
     def __init__(self, gateway: str, lines: HeldLines, offers: Offers, log: CommandLog) -> None:
         self.gateway = gateway
         self._lines = lines
         self._offers = offers
         self._log = log
-        # tasks that carry out stops; the keys are a `HeldLine.number` and the stop's message
+        # running stops, by the line's `HeldLine.number` and the bytes of the stop's message
         self._stops: dict[tuple[int, object], asyncio.Task[CommandAnswer]] = {}
         self._repeated = RepeatedStops()
 
@@ -224,9 +229,11 @@ class StopDesk:
         """Stop drives of a line now; return None unless this gateway is the line's master.
 
         A damaged message stops all drives of the line. A copy of a message gets the answer to the first copy;
-        a message without an id is always a new stop. A stop that takes longer than HOLD_S is answered with
-        "under way" and its progress; the sender then asks again. If this gateway has released or lost the
-        line in the meantime, and the motors still run, return None, because the line's next master answers.
+        a message without an id is always a new stop.
+
+        A stop that takes longer than HOLD_S is answered with "under way" and its progress; the sender then
+        asks again. Return None if this gateway has released or lost the line in the meantime and motors still
+        run: the line's next master answers.
         """
         held = self._lines.for_stop(line)
         if held is None:
@@ -268,7 +275,10 @@ class StopDesk:
             return CommandAnswer(CommandOutcome.UNKNOWN, text, self.gateway)
 
     async def _stop(self, held: HeldLine, request: StopRequest) -> CommandAnswer:
-        """Stop the drives in parallel. If a drive's stop is already being repeated, send one more command."""
+        """Stop the drives in parallel.
+
+        If an earlier stop of a drive is still being repeated, send one more stop command.
+        """
         self._offers.void(held.name, request.drives, CALLED)
         drives = held.drives
         asked = list(drives) if request.drives is None else list(dict.fromkeys(request.drives))
@@ -291,7 +301,7 @@ class StopDesk:
         return answer
 
     def _note(self, record: Mapping[str, Any]) -> None:
-        """Write a record to the log in a task. Records keep the order of the calls."""
+        """Write a record of a stop to the log in a task. Records keep the order of the calls."""
         supervisor().start("note of a stop", self._write(record))
 
     async def _write(self, record: Mapping[str, Any]) -> None:
@@ -307,7 +317,7 @@ Handler = Callable[[bytes], Awaitable[Offered | CommandAnswer | None]]
 
 
 class CommandSubjects:
-    """The subscriptions for commands and stops, in one run of a gateway."""
+    """A gateway's NATS subscriptions for commands and stops, from its start to its shutdown."""
 
     def __init__(self, gateway: str, paths: Sequence[ServerPath], lines: HeldLines, log: CommandLog) -> None:
         self._paths = paths
@@ -337,7 +347,7 @@ class CommandSubjects:
 
     async def _subscribe(self, subject: str, handler: Handler) -> None:
         async def take(message: Msg) -> None:
-            # in a task, so that messages do not wait for each other
+            # in a task, so that a slow answer does not delay the next message
             supervisor().start("answer", _answer(message, handler))
 
         await asyncio.gather(*(path.subscribe(subject, take) for path in self._paths))
@@ -346,7 +356,7 @@ class CommandSubjects:
         await asyncio.gather(*(path.unsubscribe(one) for path in self._paths for one in subjects))
 
     def _change(self, work: Coroutine[Any, Any, None]) -> None:
-        """Change subscriptions in a task. A failure ends the gateway, because it could miss stops."""
+        """Change subscriptions in a task. If this fails, the gateway ends, because it could miss stops."""
 
         async def change() -> None:
             try:

@@ -33,7 +33,7 @@ from multidrop.plant import drive_meant
 from multidrop.printable import did_you_mean
 from multidrop.supervisor import Ended, end_tasks, reason_of
 
-LOST_S = 6.0  # after this many seconds without any answer, a command's result is reported as unknown
+LOST_S = 6.0  # time limit without any answer, after which a command's result is reported as unknown
 AGAIN_S = 0.2
 # how long a stop waits for a new master: a change of masters takes 1 s, or 4 s if a gateway died
 NO_MASTER_S = 6.0
@@ -45,7 +45,7 @@ _log = logging.getLogger("multidrop.fleet")
 
 
 def _ignore(answer: CommandAnswer) -> None:
-    """Ignore the progress of a stop: the caller needs only the final answer."""
+    """Ignore the progress of a stop. This is the default for callers that need only the final answer."""
 
 
 class FleetCommands:
@@ -114,8 +114,8 @@ class FleetCommands:
     async def carry_out(self, request: CommandRequest, agreed: str = "") -> CommandAnswer:
         """Send a command once, and return its result. Raises the errors of `write`.
 
-        `agreed` is the text of the preview that a person has confirmed. If the text of the offer differs
-        from `agreed`, the command is not sent.
+        `agreed` is the preview's text that a person has confirmed. The command is not sent if the gateway's
+        offer has another text.
         """
         line = await self._line_of(request.drive)
         record = {"id": request.id, "line": line, "what": request.words, "by": request.by}
@@ -153,7 +153,10 @@ class FleetCommands:
         return CommandAnswer(CommandOutcome.NOT_SENT, f"{request.words} was not sent: {why}")
 
     async def _do(self, offered: Offered) -> CommandAnswer:
-        """Confirm the offer once and return the result. If no answer comes, ask only for the result."""
+        """Confirm the offered command once and return its result.
+
+        If no answer comes, request only the result.
+        """
         path = self._path()
         try:
             message = await path.request(offered.subject, json.dumps({"do": offered.token}).encode())
@@ -170,7 +173,10 @@ class FleetCommands:
     async def _end_of(
         self, answer: CommandAnswer, subject: str, asked: bytes, lost: str, on_news: News = _ignore
     ) -> CommandAnswer:
-        """Ask on all paths in turn until the result is final. Return UNKNOWN after LOST_S without answers."""
+        """Request a command's result over each server connection in turn until it is final.
+
+        Return UNKNOWN after LOST_S without answers.
+        """
         loop = asyncio.get_running_loop()
         ends, at = loop.time() + LOST_S, 0
         reported = {""}
@@ -259,7 +265,7 @@ class FleetCommands:
         return next((path for path in self._paths if path.is_open), self._paths[0])
 
     def _described(self) -> dict[str, list[str]]:
-        """Return the names of the drives by line."""
+        """Return the names of the plant's drives, by line."""
         found = {}
         for name, record in self._plant.records.items():
             line = record.value.get("line") if isinstance(record.value, dict) else None
@@ -273,7 +279,11 @@ class FleetCommands:
         return self._find(drive)
 
     async def _read_plant(self, otherwise: str) -> None:
-        """Read the plant's changed records. If that fails, use an older copy: masters check each command."""
+        """Update the local copy of the plant from the servers.
+
+        If the servers fail, keep the old copy, because masters check each command. Raises FleetError if there
+        is no copy yet; its message starts with `otherwise`.
+        """
         try:
             await self._plant.look()
         except FleetError as failure:
@@ -306,7 +316,7 @@ async def _first_answer(
     """Send a stop until a gateway answers or may have received it; return that answer or UNDER_WAY.
 
     Return NOT_SENT if no gateway can have received the stop within NO_MASTER_S, or if this client may not
-    send stops. During the wait, `on_news` reports that the stop was not sent yet.
+    send stops. While no gateway has received it, `on_news` gets a report that the stop is not sent yet.
     """
     loop = asyncio.get_running_loop()
     ends, reported = loop.time() + NO_MASTER_S, ""
@@ -326,11 +336,11 @@ async def _first_answer(
 
 
 async def _ask_all(paths: Sequence[ServerPath], line: str, request: StopRequest, what: str) -> CommandAnswer:
-    """Send a stop on all paths in parallel, and return the first answer.
+    """Send a stop on all server connections in parallel, and return the first answer.
 
-    Return UNDER_WAY if a gateway may have received the stop without answering. Raises NobodyThere if no path
-    delivered the stop, and one path reports that the line has no master. Raises NotDelivered if all paths
-    failed for other reasons.
+    Return UNDER_WAY if a gateway may have received the stop without answering. Raises NobodyThere if no
+    connection delivered the stop, and a server reports that the line has no master. Raises NotDelivered if
+    all connections failed for other reasons.
     """
     subject, data = names.stop_subject(line), encode(request)
     asking = [asyncio.create_task(path.request(subject, data)) for path in paths]

@@ -1,4 +1,4 @@
-"""Messages of commands as JSON: requests, offers and answers; and the log of each command's steps."""
+"""JSON messages for commands (requests, offers and answers), and the log of each command's steps."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from multidrop.supervisor import supervisor
 MOST_BYTES = 64 * 1024  # limit of a message's size in bytes
 MOST_CHARACTERS = 200  # limit of a name's, an id's or a value's length
 UNNAMED = "somebody"  # name of a stop's sender if the message has no name
-WRITING_S = 10.0  # if writing a record takes longer, the disk is reported as hanging
-CLOSING_S = 1.0  # how long, in s, closing waits for the record that is being written
+WRITING_S = 10.0  # time limit for writing a record; after it, the disk is reported as hanging
+CLOSING_S = 1.0  # how long, in s, `close` waits for the record that is being written
 
 
 class CommandAnswer(NamedTuple):
@@ -44,7 +44,7 @@ class CommandAnswer(NamedTuple):
         return cls(result.outcome, with_name(drive, result.text), held=result.held)
 
     def as_json(self) -> dict[str, Any]:
-        """Return this answer for a message or a log, without empty fields."""
+        """Return this answer as JSON for a message or a log, without empty fields."""
         found: dict[str, Any] = {"outcome": self.outcome.value, "text": self.text}
         found |= {key: text for key, text in (("gateway", self.gateway), ("held", self.held)) if text}
         if self.drives:
@@ -68,7 +68,7 @@ class CommandRequest(NamedTuple):
 
     @property
     def entry(self) -> str:
-        """Return the entry of the plant's list that allows this command, such as "pump.start"."""
+        """Return the entry of `[fleet.may]` that allows this command, such as "pump.start"."""
         return f"{self.drive}.{self.verb or self.register}"
 
     @property
@@ -129,7 +129,7 @@ def read_command(data: bytes) -> CommandRequest:
 
 
 def read_stop(data: bytes) -> tuple[StopRequest, str]:
-    """Return the stop in a message, and why the message is damaged ("" if it is not).
+    """Return the stop in a message, and a sentence about damage in the message ("" if it is intact).
 
     A damaged message stops all drives of the line: stopping too many drives does less harm than stopping
     none. Names are made printable; a missing id is "".
@@ -188,7 +188,7 @@ def _answer(found: Any) -> CommandAnswer:
         raise ValueError("an answer must be a JSON object")
     drives = found.get("drives", {})
     if not isinstance(drives, dict):
-        raise ValueError("drives of an answer must be a JSON object")
+        raise ValueError("`drives` of an answer must be a JSON object")
     return CommandAnswer(
         CommandOutcome(_long_text(found, "outcome")),
         _long_text(found, "text"),
@@ -206,7 +206,7 @@ def _long_text(found: Mapping[str, Any], key: str) -> str:
 
 
 def worst(answers: Sequence[CommandAnswer]) -> CommandOutcome:
-    """Return the most serious outcome of the commands to several drives."""
+    """Return the most serious outcome among these answers."""
     order = (
         CommandOutcome.UNKNOWN,
         CommandOutcome.NOT_SENT,
@@ -229,7 +229,7 @@ class CommandLog:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._log: AuditLog | None = None
-        self._turn = asyncio.Lock()  # keeps records in the order of the calls
+        self._turn = asyncio.Lock()  # writes records in the order of the calls
         self._writing = threading.Lock()
         self._is_closed = False
 
@@ -253,7 +253,7 @@ class CommandLog:
                 await supervisor().thread("command log", WRITING_S, lambda: self._add(record, now_ns))
             except OSError:
                 raise
-            except Exception as failure:  # the thread could not start, or failed
+            except Exception as failure:  # the thread that writes the record did not start, or failed
                 raise OSError(f"{self.path}: {type(failure).__name__}: {failure}") from failure
 
     def _add(self, record: Mapping[str, Any], now_ns: int) -> None:
@@ -263,7 +263,7 @@ class CommandLog:
             log.sync()
 
     def close(self) -> None:
-        """Wait until the present record is written, then close the file; later records are refused."""
+        """Wait until the record in progress is written, then close the file; later records are refused."""
         self._is_closed = True
         if self._writing.acquire(timeout=CLOSING_S):
             if self._log:

@@ -1,7 +1,7 @@
-"""Offers: commands that a line's master has checked and offers to carry out, each once within a second.
+"""Offers: commands that a line's master has checked, and will carry out if confirmed within a second.
 
-Offers are kept only in memory, so a restarted gateway never carries out an offer that it made before the
-restart.
+Each offer is carried out at most once. Offers are kept only in memory, so a restarted gateway never carries
+out an offer that it made before the restart.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from multidrop.drive import verb_arguments, verbs_of
 from multidrop.fleet.commands.messages import CommandAnswer, CommandRequest
 from multidrop.fleet.leases.rules import SECOND
 
-LIMIT_NS = 1 * SECOND  # time from the offer to the command's first frame
-REMEMBERED = 10_000  # limit of offers in memory; the oldest are removed
+LIMIT_NS = 1 * SECOND  # time limit from the offer until the command's first frame is sent
+REMEMBERED = 10_000  # limit of remembered offers; the oldest are forgotten
 _MOVING = ("start", "jog", "reset_fault", "set_frequency")
-LISTS = ("write", "verbs")  # keys of [fleet.may]
+LISTS = ("write", "verbs")  # the two lists in the plant file's table [fleet.may]
 
 
 # ---- checking a request ----
 
 
 class Prepared(NamedTuple):
-    """A checked command: `text` describes it, `work` carries it out."""
+    """A checked command: `text` describes it for users, `work` carries it out."""
 
     text: str
     work: Callable[[], CommandResult]
 
 
 def commands_of(drive: Drive) -> list[str]:
-    """Return the verbs for which an offer can be made. Stops are not among them: they need no offer."""
+    """Return the drive's verbs that can be commanded through the fleet. Stops are sent without an offer."""
     return [verb for verb in verbs_of(drive) if verb != "stop"]
 
 
 def prepare(drive: Drive, request: CommandRequest) -> Prepared:
-    """Return the checked command for a request, without sending a frame.
+    """Check a request, and return its command without sending it.
 
     Raises ValueError, TypeError or Unsupported if the command must not be sent. WriteForbidden is a
     ValueError.
@@ -59,7 +59,8 @@ def _prepare_verb(drive: Drive, request: CommandRequest) -> Prepared:
     arguments = verb_arguments(verb, request.options)
     if verb in _MOVING:
         drive.check_confirmed(verb)
-    next(getattr(drive, verb).script(**arguments), None)  # raises if the family does not allow the verb
+    # the script's first step raises an error if the drive's family does not allow the verb
+    next(getattr(drive, verb).script(**arguments), None)
     options = "".join(f", {name} = {getattr(value, 'value', value)}" for name, value in arguments.items())
     text = f"{drive.name}: {verb}{options}"
     if verb not in _MOVING:
@@ -130,7 +131,10 @@ class Offers:
         return self._by_token.get(token)
 
     def take(self, offer: Offer) -> bool:
-        """Mark the offer as taken. Return True at the first call: only then carry out the command."""
+        """Mark the offer as taken.
+
+        Return True only at the first call, so that the command is carried out once.
+        """
         is_first = not offer.is_taken
         offer.is_taken = True
         return is_first
@@ -148,14 +152,14 @@ class Offers:
         return f"{age_s:.1f} s have passed since the offer, and {LIMIT_NS / SECOND:g} s is allowed"
 
     def void(self, line: str, drives: Collection[str] | None, why: str) -> None:
-        """Void the unfinished offers for these drives of a line; None means all its drives."""
+        """Cancel the unfinished offers for these drives of a line; None means all drives of the line."""
         for offer in self._by_token.values():
             is_one = offer.held.name == line and (drives is None or offer.request.drive in drives)
             if is_one and offer.answer is None:
                 offer.why_void = offer.why_void or why
 
     def withdraw(self, offer: Offer, why: str) -> None:
-        """Withdraw an offer, unless its command has started already."""
+        """Cancel an offer, unless its command has started already."""
         if self.take(offer):
             self.end(
                 offer, CommandAnswer(CommandOutcome.NOT_SENT, f"{offer.request.words} was not sent: {why}")
@@ -171,7 +175,7 @@ class Offers:
 
 
 class HeldLine:
-    """A line that this gateway polls. It has a new `number` each time this gateway becomes its master."""
+    """A line that this gateway polls. `number` is new each time this gateway becomes the line's master."""
 
     _numbers = count(1)
 
@@ -195,11 +199,11 @@ class HeldLine:
 
 
 class HeldLines:
-    """The lines for which this gateway accepts commands and stops. `bus` returns the bus of a polled line.
+    """The lines for which this gateway accepts commands and stops.
 
-    `may_stop` returns True while this gateway is the line's master. `may_command` returns True once no
-    frame of the previous master can still be on the line. A stop that collides with such a frame is
-    repeated, but a command would be lost.
+    `bus` returns the bus of a polled line. `may_stop` returns True while this gateway is the line's master.
+    `may_command` returns True once no frame of the previous master can still be on the line. A stop that
+    collides with such a frame is repeated, but a command would be lost.
     """
 
     def __init__(

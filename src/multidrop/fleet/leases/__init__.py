@@ -1,1 +1,1 @@
-"""Leases: a gateway's right to poll lines for a limited time, and the rules by which this right ends."""
+"""Leases: a lease allows a gateway to poll lines for a limited time."""

@@ -1,6 +1,6 @@
-"""Lease: a gateway's own session, which is renewed on three paths, and the deadline for sending.
+"""Lease: a gateway's own session, which it renews on three NATS servers, and its deadline for sending.
 
-LifeLock lets a gateway prove that the earlier process which used its folder is dead.
+LifeLock proves to a gateway that the previous process with the same folder is dead.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ def boottime_ns() -> int:
 
 
 class HeldRecord(NamedTuple):
-    """Our lease record on one path."""
+    """This gateway's lease record in the bucket of one server path."""
 
     revision: int
     sent: int  # when its renewal was sent (CLOCK_BOOTTIME, ns)
 
 
 class Lease:
-    """The lease of one gateway: a session, recorded on three paths.
+    """The lease of one gateway: a session, which is recorded in three lease buckets.
 
-    `until` is the deadline for sending (CLOCK_BOOTTIME, ns). `note` returns further fields of the record, for
-    other gateways and for display.
+    Each bucket is written over its own server path. `until` is the deadline for sending on lines
+    (CLOCK_BOOTTIME, ns). `note` returns further fields of the record, for other gateways and for display.
     """
 
     def __init__(
@@ -61,9 +61,9 @@ class Lease:
     ) -> None:
         self.name = name
         self.terms = terms
-        self.session = 0  # number of the present session; 0 between sessions
+        self.session = 0  # number of the present session; 0 without a session
         self.until = 0
-        self.trouble = ""  # why the session cannot start
+        self.trouble = ""  # reason why no session can start
         self.began_ms = 0  # start of the session, UTC in ms
         self.held: list[HeldRecord | None] = [None] * len(buckets)
         self._buckets = buckets
@@ -73,8 +73,10 @@ class Lease:
         self._note = note
         self._nonce = uuid.uuid4().hex
         self._watched: list[SeenRevision | None] = [None] * len(buckets)
-        self._newest = 0  # newest session number of this process; later sessions get higher numbers
-        self._ended: set[int] = set()  # paths on which other gateways have ended this session's record
+        # highest session number that this process has used; later sessions get higher numbers
+        self._newest = 0
+        # server paths on which another gateway has ended this session's lease record
+        self._ended: set[int] = set()
 
     # ---- state ----
 
@@ -84,33 +86,33 @@ class Lease:
 
     @property
     def left_s(self) -> float:
-        """Return how many seconds this gateway may still send; negative after the deadline."""
+        """Return for how many more seconds this gateway may send; negative after the deadline."""
         return (self.until - self.clock()) / SECOND
 
     @property
     def best(self) -> int:
-        """Return the path of the newest renewal, because that path's server has the newest records."""
+        """Return the number of the server path with the newest renewal: its server has the newest records."""
         return max(range(len(self.held)), key=lambda path: held.sent if (held := self.held[path]) else 0)
 
     @property
     def is_over(self) -> bool:
-        """Return True if the session cannot be renewed, because we hold too few of its records."""
+        """Return True if the session cannot be renewed, because it has too few valid lease records."""
         return sum(path is not None for path in self.held) < self.terms.needed
 
     @property
     def is_weak(self) -> bool:
-        """Return True if other gateways have ended one of our three records: one more ends the session."""
+        """Return True if other gateways have ended one of the three records. One more ends the session."""
         return bool(self.session and self._ended)
 
     async def could_be_whole(self) -> bool:
-        """Return True if all paths answer, so that a new session would hold all three records."""
+        """Return True if all servers answer, so that a new session could write all three lease records."""
         records = await asyncio.gather(*(self._read(path) for path in range(len(self._buckets))))
         return None not in records
 
     # ---- start ----
 
     async def begin(self) -> None:
-        """Start a session as soon as all earlier sessions of this gateway are over."""
+        """Wait until all earlier sessions of this gateway are over, then start a session."""
         reported = ""
         while not await self.try_to_begin():
             if self.trouble != reported:
@@ -119,7 +121,10 @@ class Lease:
             await asyncio.sleep(JOIN_S)
 
     async def try_to_begin(self) -> bool:
-        """Start a session by taking the free records. Return False if too few are free; call again later."""
+        """Start a session by writing the free lease records.
+
+        Return False if too few records are free; the caller tries again later.
+        """
         paths = range(len(self._buckets))
         records = await asyncio.gather(*(self._read(path) for path in paths))
         known = {path: record for path, record in enumerate(records) if record is not None}
@@ -152,7 +157,11 @@ class Lease:
             return None
 
     def _is_free(self, path: int, record: Record) -> bool:
-        """Return True if the record's session was ended, its process died, or the record is stale."""
+        """Return True if a new session may replace this lease record.
+
+        The record's session was ended, its process has died, or the record was not renewed for the time of a
+        lease.
+        """
         value = record.value
         if record.revision == NONE_YET or (value and value["ended"] and "by" not in value):
             return True
@@ -194,7 +203,7 @@ class Lease:
     # ---- renewal ----
 
     async def renew(self, path: int) -> None:
-        """Renew the record on one path forever. Each path has its own task, so no path waits for another.
+        """Renew one of the three lease records forever. A task for each record calls this.
 
         A failed renewal is repeated soon, because the bucket may get a leader at any moment. Renewals on two
         paths are enough to poll.
@@ -218,20 +227,21 @@ class Lease:
         except (Conflict, OutcomeUnknown):
             await self._look_again(path, nonce, held)
         except FleetError:
-            pass  # not delivered, or not permitted
+            pass  # the renewal was not delivered, or not permitted
         else:
             if nonce == self._nonce:  # otherwise the answer belongs to an earlier session
                 self.held[path] = HeldRecord(revision, sent)
                 self._extend()
 
     async def _look_again(self, path: int, nonce: str, held: HeldRecord) -> None:
-        """Read the record again after a renewal that failed, or whose outcome is unknown."""
+        """Read the lease record again after a renewal that failed, or whose outcome is unknown."""
         record = await self._read(path)
         if record is None or nonce != self._nonce:
             return
         value = record.value
         if value and value["nonce"] == nonce and not value["ended"]:
-            # This renewal or an earlier one stored the record. The earlier one's time is safe in both cases.
+            # The record was written by this renewal or by an earlier one. The lease counts from the earlier
+            # one's time, which is safe in both cases.
             self.held[path] = HeldRecord(record.revision, held.sent)
         elif record.revision > held.revision:
             self._lose(path)
@@ -244,10 +254,11 @@ class Lease:
         )
 
     async def _take_late(self, path: int) -> None:
-        """Take the record on a path that was not available when the session started.
+        """Write the lease record in a bucket that was not available when the session started.
 
-        That record's session ended when we took its records on the other paths. While we hold too few
-        records, another gateway of this name may still need this one.
+        Replace a record of an earlier session: that session ended when this one replaced its other records.
+        Keep the record while this session has too few records, because another gateway of this name may need
+        it.
         """
         nonce = self._nonce
         record = await self._read(path)
@@ -265,7 +276,7 @@ class Lease:
     def _extend(self) -> None:
         until = lease_rules.deadline([held.sent if held else None for held in self.held], self.terms)
         if until > self.until and lease_rules.may_send(self.clock(), until):
-            with suppress(ValueError):  # raised if this process was suspended after the clock was read
+            with suppress(ValueError):  # raised if this process was suspended after it had read the clock
                 self._mastership.extend(until)
                 self.until = until
 
@@ -277,7 +288,7 @@ class Lease:
         self.until = 0
         held, value = self.held, self._value(ended=True)
         self.session, self.held, self._ended = 0, [None] * len(held), set()
-        self._nonce = ""  # ignore answers to renewals in flight
+        self._nonce = ""  # answers to renewals in flight are ignored from now on
         self._watched = [None] * len(held)
 
         async def write(path: int, revision: int) -> None:
@@ -288,14 +299,18 @@ class Lease:
 
 
 def _least_session(record: Record) -> int:
-    """Return the session in a record; for an invalid record its revision, which is at least as high."""
+    """Return the session number in a lease record.
+
+    For an invalid record, return the record's revision, which is at least as high as its session number.
+    """
     return int(record.value["session"]) if record.value else record.revision
 
 
 async def put_end(bucket: Bucket, end: Record) -> None:
-    """Replace our own record by `end`, which marks our session as ended. Raises the errors of `Bucket.put`.
+    """Replace this gateway's own lease record by `end`, which marks the session as ended.
 
-    If a cancelled renewal was stored in the meantime, replace that record too.
+    If a cancelled renewal was stored in the meantime, replace that record too. Raises the errors of
+    `Bucket.put`.
     """
     try:
         await bucket.put(end.key, end.value, end.revision)
@@ -307,7 +322,7 @@ async def put_end(bucket: Bucket, end: Record) -> None:
 
 
 class LifeLock:
-    """A lock on a local file, held until the process ends: its next holder knows that this process is dead.
+    """A lock on a local file. The process holds it until it ends, so its next holder knows that it is dead.
 
     The file holds a random id, because containers may share the machine id and the path. Raises FleetError if
     another process of this computer holds the lock.
@@ -330,7 +345,7 @@ class LifeLock:
                 os.fsync(file.fileno())
 
     def proves_death(self, value: Mapping[str, Any]) -> bool:
-        """Return True if the process that wrote this record is dead: it held the lock that we hold now."""
+        """Return True if the process that wrote this lease record is dead: this process has its lock now."""
         mine = (str(self.path), self.id, machine_id())
         return "" not in mine and (value.get("lock"), value.get("lock_id"), value.get("machine")) == mine
 
@@ -339,9 +354,10 @@ class LifeLock:
 
 
 def machine_id() -> str:
-    """Return an id of this computer's present boot; "" if unknown: then no process can be proved to be dead.
+    """Return an id of this computer's present boot; "" if it is unknown.
 
-    Computers with copies of one disk have the same machine id and lock file, but different boot ids.
+    With an unknown id, no process can be proved to be dead. Computers with copies of one disk have the same
+    machine id and lock file, but different boot ids.
     """
     with suppress(OSError):
         ids = [path.read_text("utf-8", "replace").strip() for path in IDS]

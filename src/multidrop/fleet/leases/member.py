@@ -40,22 +40,22 @@ from multidrop.supervisor import Ended, end_tasks, supervisor
 _log = logging.getLogger("multidrop.fleet")
 
 GUARD_LOOK_S = 0.02
-STEP_S = 0.05  # time between steps while no record changes
-LEAST_STEP_S = 0.01  # least time between steps
-TIDY_NS = SECOND // 2  # time between checks of this gateway's lines, if no change was reported
+STEP_S = 0.05  # pause between two steps of the state machine while no record changes
+LEAST_STEP_S = 0.01  # least pause between two steps
+TIDY_NS = SECOND // 2  # time between checks of this gateway's lines if no change was reported
 SETTLE_S = 3.0
-# End other gateways' sessions only while this much of our own lease (in s) is left. If less is left, the
-# servers may be failing for all gateways.
+# A gateway ends the sessions of others only if its own lease is valid for at least this many seconds. If less
+# is left, the servers may be failing for all gateways.
 SOUND_S = 1.0
 WEAK_LOOK_S = 1.0
-# After the STARTING state, a session that has lost one of its three records is kept for at least this long.
+# A session that has lost one of its three lease records is kept for at least this time after STARTING.
 WEAK_NS = 10 * SECOND
-SERVERS_LOOK_S = 0.05  # pause between checks of the servers
+SERVERS_LOOK_S = 0.05  # pause between checks of the servers' states
 SILENT_SERVER_S = 60.0  # a server that is silent for longer than this (in s) is ignored
 
 
 class IncompatibleGateways:
-    """Detects gateways with incompatible ownership rules. While one is alive, this gateway claims no line.
+    """Detects gateways with incompatible rules of ownership. While one is alive, this gateway claims no line.
 
     So while a fleet is updated, gateways of the new version wait until those of the old version are stopped.
     """
@@ -66,7 +66,7 @@ class IncompatibleGateways:
         self._observer = observer
 
     def look(self, present: Mapping[str, Mapping[str, Any]]) -> None:
-        """Update the set from the sessions in `present`; ignore sessions that are no longer renewed."""
+        """Update the set of incompatible gateways from the sessions in `present`; ignore expired sessions."""
         others = {name for name, value in present.items() if value.get("rules") != RULES}
         found = frozenset(others - {self._me} - self._observer.dead(others).keys())
         if found != self.gateways:
@@ -87,8 +87,8 @@ class Releases:
     A line is closed before it is released. It has no master until the release is stored and the other gateway
     has claimed it. If too few buckets have a leader, a release cannot be stored, so this gateway continues to
     poll the line. It also continues while a server is silent: when a server that was cut off returns, buckets
-    may lose their leaders for seconds, in which no gateway could claim the line. `on_change` is called when
-    the servers' state has changed.
+    may lose their leaders for seconds, and during that time no gateway could claim the line. `on_change` is
+    called when the servers' state has changed.
     """
 
     def __init__(
@@ -101,8 +101,8 @@ class Releases:
         self._on_change = on_change
         self._clock = clock
         self._has_lines = False
-        # by bucket with a leader: since when (in s) one of the bucket's servers is silent; None if all of
-        # them answer
+        # The buckets that have a leader: by bucket, the time (s) since which one of its servers is silent;
+        # None if all of its servers answer.
         self._led: dict[str, float | None] = {}
 
     def due(self, lines: Set[str], wait_s: float = SILENT_SERVER_S) -> set[str]:
@@ -124,7 +124,7 @@ class Releases:
             await asyncio.sleep(SERVERS_LOOK_S)
 
     async def look(self) -> None:
-        """Check the servers once, if any line waits for its release."""
+        """Check the servers' states once. Without a line that waits for its release, do nothing."""
         buckets = names.OWNERS if self._has_lines else ()
         found = await asyncio.gather(*(known_cluster(self._path(), bucket) for bucket in buckets))
         now, before, self._led = self._clock(), self._led, {}
@@ -170,7 +170,7 @@ class Member:
         self.records = ShareRecords(name, self.best, terms, self._wake, self._is_mine)
         self.keeper = LineKeeper(lines, self.lease, self.records, self._mark_dirty)
         self._shares = Shares()
-        self._share: set[str] = set()  # the lines that this gateway should be the master of
+        self._share: set[str] = set()  # the lines that this gateway should poll
         self._releases = Releases(self.best, self._mark_dirty)
         self._settled_at = 0
         self._is_dirty = True
@@ -203,7 +203,7 @@ class Member:
 
     @property
     def wanted(self) -> Mapping[str, str]:
-        """The name of the gateway that each line is assigned to, by line."""
+        """The lines and the gateway that each is assigned to."""
         return self._shares.wanted
 
     @property
@@ -211,7 +211,7 @@ class Member:
         return self.lease.clock() >= self._settled_at
 
     def best(self) -> ServerPath:
-        """Return the path over which the lease was renewed last; without a lease, return any open path."""
+        """Return the connection that renewed the lease last; without a lease, return any open connection."""
         path = self.paths[self.lease.best]
         return path if path.is_open else next((one for one in self.paths if one.is_open), path)
 
@@ -219,7 +219,7 @@ class Member:
         self._is_dirty = True
 
     def _wake(self) -> None:
-        """Take the next step immediately."""
+        """Let the state machine take its next step immediately."""
         self._is_dirty = True
         self._woken.set()
 
@@ -305,9 +305,9 @@ class Member:
                 await asyncio.wait_for(self._woken.wait(), STEP_S - LEAST_STEP_S)
 
     async def _prepare(self) -> None:
-        """Wait until all records were read, which may take longer than a lease lasts.
+        """Wait until all records are read, and no incompatible gateway is alive.
 
-        Also wait until no incompatible gateway is alive.
+        Reading may take longer than a lease is valid.
         """
         while True:
             self._note_others(self.records.observer.sessions())
@@ -332,11 +332,11 @@ class Member:
             await asyncio.sleep(GUARD_LOOK_S)
 
     async def _watch_weakness(self) -> None:
-        """Decide when to give up this session after other gateways have ended one of its three records.
+        """Give up this session after other gateways have ended one of its three lease records.
 
-        If the session were kept, it would end as soon as one more server fails. Giving it up leaves the
-        lines without a master for a moment. So only one gateway at a time gives up its session, when all
-        paths answer and lines can be claimed.
+        A session with two records would end as soon as one more server fails. Giving it up leaves the lines
+        without a master for a moment. So only one gateway at a time gives up its session, when all servers
+        answer and lines can be claimed.
         """
         while True:
             await asyncio.sleep(WEAK_LOOK_S)
@@ -353,7 +353,10 @@ class Member:
     # ---- one step ----
 
     async def step(self) -> None:
-        """Do the work that is due. Only ending the sessions of dead gateways waits for servers."""
+        """Take one step of the state machine.
+
+        It waits for servers only to end the sessions of dead gateways.
+        """
         observer = self.records.observer
         present = observer.sessions()
         if not self.lease.is_valid:
@@ -373,7 +376,7 @@ class Member:
             self.keeper.reconcile()
 
     def _note_others(self, present: Mapping[str, Mapping[str, Any]]) -> set[str]:
-        """Return the other gateways that take lines, and note the time if this set has changed."""
+        """Return the other gateways that poll lines, and note the time if this set has changed."""
         self._incompatible.look(present)
         self.keeper.may_claim = not self._incompatible.gateways
         others = {name for name, value in present.items() if not value["draining"]}
@@ -398,7 +401,10 @@ class Member:
     def _unopened(
         self, present: Mapping[str, Mapping[str, Any]], sharing: Iterable[str], lines: Iterable[str]
     ) -> tuple[tuple[str, frozenset[str]], ...]:
-        """Return the lines that each gateway could not open, of gateways whose lease record lists them."""
+        """Return the lines that each gateway has reported because it could not open them.
+
+        A gateway whose lease record has no list of such lines is left out.
+        """
         unopened = {name: value.get("unopened") for name, value in present.items()}
         unopened[self.name] = list(self.keeper.unopened.named())
         known = {name: said for name in sorted(sharing) if isinstance(said := unopened.get(name), list)}

@@ -22,17 +22,18 @@ from multidrop.fleet.leases.rules import SeenRevision, Terms
 from multidrop.fleet.servers.buckets import Bucket, Follower, Record
 from multidrop.supervisor import end_tasks
 
-# lease terms for viewers: a session is over as soon as any gateway has ended it
+# lease terms for viewers: they treat a session as over as soon as any gateway has ended it
 BELIEVING = lease_rules.USUAL._replace(lease=0, guard=0)
 
-LOOK_S = 0.1  # pause between reads of a path; a takeover may take this much longer
-ENDING_S = 0.1  # how long to wait for answers when ending sessions; later ones show in the next read
+LOOK_S = 0.1  # pause between two reads of a lease bucket; it delays a takeover by at most this time
+# how long to wait for answers when a session is ended; a later answer is replaced by the next read
+ENDING_S = 0.1
 
 _log = logging.getLogger("multidrop.fleet")
 
 
 class Observer:
-    """The lease records on all paths, and when this process saw them change."""
+    """The lease records of all gateways in three buckets, and when this process saw each record change."""
 
     def __init__(
         self, me: str, buckets: Sequence[Bucket], terms: Terms, clock: Callable[[], int] = boottime_ns
@@ -42,12 +43,12 @@ class Observer:
         self.paths = [Follower(bucket) for bucket in buckets]
         self.ended = 0  # number of sessions that this process ended
         self._watched: list[dict[str, SeenRevision]] = [{} for _ in buckets]
-        self._looked = [0] * len(self.paths)  # start of the newest read that was answered, by path (ns)
-        self._over: dict[str, int] = {}  # highest number of a session that is certainly over, by gateway
+        self._looked = [0] * len(self.paths)  # start of the newest read that was answered, by bucket (ns)
+        self._over: dict[str, int] = {}  # by gateway: its highest session number that is certainly over
         self._clock = clock
 
     def restart_waits(self) -> None:
-        """Restart all waiting times, because this gateway was cut off and may have missed renewals.
+        """Restart the waiting times for all lease records, because this gateway may have missed renewals.
 
         A session that is already over stays over, because it cannot be renewed.
         """
@@ -56,9 +57,9 @@ class Observer:
             seen.update({name: one._replace(since=now) for name, one in seen.items()})
 
     async def look(self, path: int) -> bool:
-        """Read the changes on a path; return True if a session has ended, or may be ended now.
+        """Read the changes in one lease bucket; return True if a session has ended, or may be ended now.
 
-        Raises FleetError if the path's servers cannot be reached.
+        Raises FleetError if no server of this path can be reached.
         """
         begun = self._clock()
         found = await self.paths[path].look()
@@ -68,7 +69,7 @@ class Observer:
         return any(record.value and record.value["ended"] for record in found) or bool(self.dead())
 
     async def rest(self, path: int) -> None:
-        """Wait until the next read is due, or until a record may have become stale."""
+        """Wait until the next read is due, or until a lease record may have become stale."""
         begins = self._clock() - self.terms.lease
         due = ((one.since - begins) / lease_rules.SECOND for one in self._watched[path].values())
         await asyncio.sleep(min([LOOK_S, *(left for left in due if left > 0)]))
@@ -86,7 +87,7 @@ class Observer:
         return [follower.records.get(gateway) for follower in self.paths]
 
     def is_over(self, gateway: str, session: int) -> bool:
-        """Return True if this session was ended on enough paths."""
+        """Return True if enough lease records of this session were ended for the session to be over."""
         if session <= self._over.get(gateway, 0):
             return True
         now = self._clock()
@@ -94,7 +95,7 @@ class Observer:
         return lease_rules.is_over(sum(ended), self.terms)
 
     def sessions(self) -> dict[str, dict[str, Any]]:
-        """Return each gateway whose session is not over, with its newest record."""
+        """Return each gateway whose session is not over, with its newest lease record."""
         found = {}
         now = self._clock()
         for name in sorted({name for follower in self.paths for name in follower.records}):
@@ -110,7 +111,10 @@ class Observer:
         return found
 
     def missing(self) -> dict[str, dict[str, Any]]:
-        """Return each gateway whose session only other gateways have ended, with its record."""
+        """Return the gateways that other gateways have declared dead, with their lease records.
+
+        A gateway that has ended its own session is not among them.
+        """
         present = self.sessions()
         found = {}
         for name in sorted({name for follower in self.paths for name in follower.records} - present.keys()):
@@ -123,7 +127,7 @@ class Observer:
         return found
 
     def weak(self) -> list[str]:
-        """Return the gateways whose session continues with two records: other gateways ended the third."""
+        """Return the gateways that have only two valid lease records, because others have ended the third."""
         return [
             name
             for name, value in self.sessions().items()
@@ -144,7 +148,7 @@ class Observer:
         return not is_ended_by_another(record) or self._is_stale(path, record, now)
 
     def unseen_s(self, gateway: str) -> float:
-        """Return how many seconds ago renewals were last seen on two paths."""
+        """Return how many seconds ago renewals of two lease records of this gateway were last seen."""
         seen = [watched[gateway].since for watched in self._watched if gateway in watched]
         latest = sorted(seen, reverse=True)[: self.terms.needed]
         return (self._clock() - latest[-1]) / lease_rules.SECOND if latest else 0.0
@@ -152,11 +156,11 @@ class Observer:
     # ---- dead gateways ----
 
     def dead(self, present: Iterable[str] | None = None) -> dict[str, dict[int, Record]]:
-        """Return the gateways whose sessions may be ended, each with its stale records by path.
+        """Return the gateways whose sessions may be ended, each with its stale lease records by path.
 
         A record counts as stale only if it was already stale at the start of the last answered read of its
-        path. While no reads are answered, this process does not see renewals of the record. `present` are the
-        names in `sessions`, if the caller already has them.
+        bucket. While no reads are answered, this process does not see renewals of the record. `present` are
+        the names in `sessions`, if the caller already has them.
         """
         found = {}
         for name in self.sessions() if present is None else present:
@@ -197,16 +201,16 @@ class Observer:
         return self.ended > before
 
     def _remember_ended_sessions(self) -> None:
-        """Remember the sessions that are over, so that `restart_waits` does not revive them."""
+        """Remember the sessions that are over, so that `restart_waits` does not make them alive again."""
         for name in {name for follower in self.paths for name in follower.records}:
             session = max((record.value["session"] for _, record in self._of(name)), default=0)
             if self.is_over(name, session):
                 self._over[name] = max(session, self._over.get(name, 0))
 
     async def _end_enough(self, records: Mapping[int, Record]) -> bool:
-        """End these records concurrently; return True if this call has ended one.
+        """End these lease records concurrently; return True if this call has ended one.
 
-        Wait only for as many answers as a session's end needs, because a path without a leader gives none.
+        Wait only for as many answers as a session's end needs, because a bucket without a leader gives none.
         """
         ends = [asyncio.create_task(self._end(path, record)) for path, record in records.items()]
         answers: list[bool] = []
@@ -217,13 +221,16 @@ class Observer:
                 if len(answers) >= self.terms.ended:
                     break
         except TimeoutError:
-            pass  # the next step decides again, with newer records
+            pass  # the next step of the gateway decides again, with newer records
         finally:  # a cancelled request may still be stored; the next read shows whether it was
             await end_tasks(*ends)
         return any(answers)
 
     async def _end(self, path: int, record: Record) -> bool:
-        """End a record; return False if it has changed since. Raises FleetError if the outcome is unknown."""
+        """End a lease record; return False if it has changed since it was read.
+
+        Raises FleetError if the outcome is unknown.
+        """
         value = {**record.value, "ended": True, "by": self.me}
         try:
             revision = await self.paths[path].bucket.put(record.key, value, record.revision)
@@ -236,5 +243,5 @@ class Observer:
 
 
 def is_ended_by_another(record: Record) -> bool:
-    """Return True if this record ends a session, and another gateway has written it."""
+    """Return True if this lease record ends a session, and was written by another gateway."""
     return bool(record.value and record.value["ended"] and record.value.get("by", record.key) != record.key)

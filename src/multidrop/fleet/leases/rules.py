@@ -20,53 +20,59 @@ from typing import NamedTuple
 
 SECOND = 1_000_000_000  # one second in ns
 PATHS = 3
-RENEW_S = 0.5  # time between renewals of a path
-RULES = 2  # version of the ownership rules (ownership.py); increment it if these rules change
+RENEW_S = 0.5  # time between renewals of a lease record
+RULES = 2  # version of the rules in ownership.py; increment it if those rules change
 
 
 class Terms(NamedTuple):
-    """The times and quorums of a lease, the same for all gateways of a fleet. Times are in ns."""
+    """The times (ns) and numbers of records that a lease needs, the same for all gateways of a fleet."""
 
     lease: int = 2_300_000_000
-    guard: int = 700_000_000  # from the end of a session to the first request of the next master
-    needed: int = 2  # number of paths that the holder must renew
-    ended: int = 2  # number of paths that another gateway must end to take over
+    guard: int = 700_000_000  # time from the end of a session to the first request of the line's next master
+    needed: int = 2  # number of lease records that the holder must renew
+    ended: int = 2  # number of lease records that another gateway must end to take over
 
 
 USUAL = Terms()
 
 
 class SeenRevision(NamedTuple):
-    """A revision of a record, and when this observer first saw it."""
+    """A revision of a lease record, and when this process first saw it."""
 
     revision: int
-    since: int  # by the observer's own CLOCK_BOOTTIME, in ns
+    since: int  # by this process's own CLOCK_BOOTTIME, in ns
 
 
 def deadline(sent: Iterable[int | None], terms: Terms) -> int:
-    """Return the time (ns) until which the holder may send; 0 if too few paths were renewed.
+    """Return the time (ns) until which the holder may send; 0 if too few lease records were renewed.
 
-    `sent` has an entry for each path: when its newest acknowledged renewal was sent, or None.
+    `sent` has an entry for each record: when its newest acknowledged renewal was sent, or None.
     """
     latest = sorted((moment for moment in sent if moment is not None), reverse=True)
     return latest[terms.needed - 1] + terms.lease if len(latest) >= terms.needed else 0
 
 
 def may_send(now: int, until: int) -> bool:
-    """Return True if the holder may send now. The engine makes the same comparison before each write."""
+    """Return True if the lease's holder may send now.
+
+    The C engine makes the same comparison before each write.
+    """
     return now < until
 
 
 def watch(before: SeenRevision | None, revision: int, now: int) -> SeenRevision:
-    """Return the observation of a record after a read: `before`, or a new one if the revision is new."""
+    """Return the observation of a lease record after a read:
+
+    `before`, or a new one if the revision is new.
+    """
     return before if before is not None and before.revision == revision else SeenRevision(revision, now)
 
 
 def is_stale(watched: SeenRevision, now: int, terms: Terms) -> bool:
-    """Return True if this revision may be ended, because no newer one was seen for the time of a lease."""
+    """Return True if this lease record may be ended: no newer revision was seen for the time of a lease."""
     return now - watched.since >= terms.lease
 
 
 def is_over(ended: int, terms: Terms) -> bool:
-    """Return True if a session with this many ended paths is over, so that its lines have no master."""
+    """Return True if a session is over after this many of its lease records were ended."""
     return ended >= terms.ended

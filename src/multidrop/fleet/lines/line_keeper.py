@@ -1,9 +1,9 @@
 """LineKeeper: claims, polls, closes and releases a gateway's lines, with one task at a time for each line.
 
-A line is polled only while its records name our present session and the lease is valid. Half a second before
-the lease expires, all lines are closed. A line stops being ours right before its release is sent, because the
-release may be stored at any later time, even without an answer. The line is ours again once newer records
-name us.
+A gateway polls a line only while the line's ownership records name the gateway's present session and its
+lease is valid. Half a second before the lease expires, it closes all lines. Right before it sends a line's
+release, it stops treating the line as its own, because the release may be stored at any later time, even
+without an answer. The line is its own again once newer records name this session.
 """
 
 from __future__ import annotations
@@ -38,17 +38,18 @@ from multidrop.supervisor import end_tasks
 _log = logging.getLogger("multidrop.fleet")
 
 REPORTED_NS = 2_000_000_000  # report a lost port immediately if the newest reply is older than this
-# Lines are closed this many seconds before the lease expires. The kernel's timer fires half of the guard time
-# after the expiry.
+# Lines are closed this many seconds before the lease expires.
 SILENT_S = 0.5
 TAKE_AGAIN_S = 2.0  # pause between attempts to open a line
-WRITTEN_AT_ONCE = 64  # limit of records written together: larger batches would delay renewals of the lease
+# limit of ownership records written together: larger batches would delay renewals of the lease
+WRITTEN_AT_ONCE = 64
 LINES_AT_ONCE = 32
 WRITERS = 2  # limit of concurrent batches of writes in each bucket
-# Two renewal periods. If the last renewal of our lease on one path is this much older than those on the other
-# paths, that path's bucket may have no leader.
+# Two renewal periods. If the last renewal of a lease record is this much older than those of the other two,
+# the servers of its bucket may have no leader.
 LAG_NS = SECOND
-SPARE_S = 0.15  # how long to wait after the first bucket's answer before the spare bucket is used
+# after this time without enough stored records, a claim also writes the spare ownership record
+SPARE_S = 0.15
 
 
 class Lines(Protocol):
@@ -68,9 +69,9 @@ class Lines(Protocol):
 
 
 class PortLoss(NamedTuple):
-    """The loss of a polled line's port: why it could not be reopened, and how old the newest reply is (ns).
+    """How a polled line lost its port: the reason, and the age of the newest reply (ns).
 
-    `why` is None until the first attempt to reopen it has failed. `silent_ns` is None if no drive ever
+    `why` is None until the first attempt to reopen the port has failed. `silent_ns` is None if no drive ever
     replied.
     """
 
@@ -79,7 +80,7 @@ class PortLoss(NamedTuple):
 
 
 class TakenLine(NamedTuple):
-    """A polled line: the revision of its plant record, and when polling started (CLOCK_BOOTTIME, ns)."""
+    """The revision of a polled line's plant record, and when polling started (CLOCK_BOOTTIME, ns)."""
 
     revision: int
     since: int
@@ -88,7 +89,7 @@ class TakenLine(NamedTuple):
 class LineKeeper:
     """The lines that one gateway polls, and the task in progress on each.
 
-    `on_change` is called when the member should take its next step.
+    `on_change` is called when the gateway's state machine (Member) should take its next step.
     """
 
     def __init__(
@@ -96,18 +97,19 @@ class LineKeeper:
     ) -> None:
         self.lines = lines
         self.polled: dict[str, TakenLine] = {}
-        self.troubles: dict[str, str] = {}  # why lines could not be opened, by line
-        # how the port was lost, by line; only lines that are not polled because their port is lost
+        self.troubles: dict[str, str] = {}  # by line: why the line could not be opened
+        # by line that is no longer polled: how its port was lost
         self.lost: dict[str, str] = {}
         self.unopened = UnopenedLines(lambda: lease.clock())
-        self.releasing: set[str] = set()  # our lines that must be released to other gateways
+        self.releasing: set[str] = set()  # this gateway's lines that it must release to other gateways
         self.may_claim = True  # False while a gateway of an incompatible version is alive
         self._lease = lease
         self._records = records
         self._owners = OwnerRecords(lease, records, lambda: self.may_poll, self._take_new)
         self._on_change = on_change
         self._is_leaving = False
-        self._at_work: dict[str, asyncio.Task[None]] = {}  # task that opens, closes or claims a line
+        # task in progress on a line: to open, close or claim it
+        self._at_work: dict[str, asyncio.Task[None]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._again_at: dict[str, float] = {}
         self._failure: BaseException | None = None
@@ -126,14 +128,14 @@ class LineKeeper:
 
     @property
     def moves(self) -> int:
-        """The number of claims and releases of lines by this gateway."""
+        """The number of lines that this gateway has claimed or released."""
         return self._owners.moves
 
     def is_mine(self, line: str) -> bool:
         return self._owners.is_mine(line)
 
     def claim_of(self, line: str) -> Claim | None:
-        """Return the records to write in order to claim the line; None if it cannot be claimed now."""
+        """Return the records that must be written to claim the line; None if it cannot be claimed now."""
         return None if line in self._at_work else self._owners.claim_of(line)
 
     def may_stop(self, line: str) -> bool:
@@ -147,7 +149,7 @@ class LineKeeper:
         return self._lease.clock() - self.polled[line].since >= self._lease.terms.guard
 
     async def fail(self) -> None:
-        """Wait until an attempt to close a line fails; then raise the error, so that the process ends."""
+        """Wait until an attempt to close a line fails; then raise its error, which ends the process."""
         await self._has_failed.wait()
         assert self._failure is not None
         raise self._failure
@@ -161,7 +163,7 @@ class LineKeeper:
             self._start(lines, self._owners.claim({line: claims[line] for line in lines}))
 
     def reconcile(self) -> None:
-        """Close lines that are no longer ours, open those that are, and release those that are closed.
+        """Close lines of other gateways, open this gateway's lines, and release closed lines that must move.
 
         If a line should stay ours after its release was sent, claim it again, because the release may have
         been stored.
@@ -191,7 +193,7 @@ class LineKeeper:
             self.claim({line: claim for line in doubted if (claim := self.claim_of(line))})
 
     def _look_at_ports(self) -> None:
-        """Note which polled lines lost their ports, so that other gateways can take such lines later."""
+        """Note which polled lines lost their ports. Other gateways can take such lines later."""
         for line in self.polled.keys() - self._at_work.keys():
             if loss := self.lines.port_loss(line):
                 why = loss.why or ("it is being reopened" if (loss.silent_ns or 0) > REPORTED_NS else "")
@@ -228,19 +230,19 @@ class LineKeeper:
 
     def _start(self, lines: Sequence[str], work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(work)
-        self._tasks.add(task)  # the event loop keeps no reference to tasks
+        self._tasks.add(task)  # keeps a reference, because the event loop keeps none
         self._at_work |= dict.fromkeys(lines, task)
         task.add_done_callback(lambda done: self._done(lines, done))
 
     def _done(self, lines: Sequence[str], task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         for line in lines:
-            if self._at_work.get(line) is task:  # otherwise the line's next task has started already
+            if self._at_work.get(line) is task:  # otherwise the next task on this line has started already
                 del self._at_work[line]
         self._on_change()
         failure = None if task.cancelled() else task.exception()
         if failure and not self._failure:
-            self._failure = failure  # the line may still be open: `fail` ends the process
+            self._failure = failure  # the line may still be open; `fail` ends the process
             self._has_failed.set()
 
     def _take_new(self, line: str) -> None:
@@ -254,7 +256,7 @@ class LineKeeper:
                 return
             try:
                 await self.lines.take(line, record.value)
-            except Exception as failure:  # such as an exception in a user's own class: other lines continue
+            except Exception as failure:  # such as an error in a user's drive class; other lines continue
                 is_foreseen = isinstance(failure, (OSError, ValueError))
                 why = str(failure) if is_foreseen else f"{type(failure).__name__}: {failure}"
                 reported, self.troubles[line] = self.troubles.get(line), why
@@ -291,10 +293,10 @@ def _some_at_once(lines: Iterable[str]) -> Iterator[list[str]]:
 
 
 class OwnerRecords:
-    """The lines whose records name our present session, and the writing of these records.
+    """The ownership records that name this gateway's present session, and the writing of such records.
 
-    Records are written only while `may_write()` returns True. `on_mine` is called with each line that becomes
-    ours.
+    Records are written only while `may_write()` returns True. `on_mine` is called with each line that this
+    gateway now owns.
     """
 
     def __init__(
@@ -309,7 +311,8 @@ class OwnerRecords:
         self._records = records
         self._may_write = may_write
         self._on_mine = on_mine
-        self._offered: dict[tuple[str, str], int] = {}  # revision at the latest release, by line and bucket
+        # by line and bucket: revision of the record that the latest release replaces
+        self._offered: dict[tuple[str, str], int] = {}
         self._writing = {bucket: asyncio.Semaphore(WRITERS) for bucket in names.OWNERS}
 
     @property
@@ -317,7 +320,10 @@ class OwnerRecords:
         return self._lease.name, self._lease.session
 
     def is_mine(self, line: str) -> bool:
-        """Return True if records with enough votes name us, not counting records whose release was sent."""
+        """Return True if ownership records with enough votes name this session.
+
+        Records for which a release was sent are not counted.
+        """
         me, votes = self._me, 0
         for bucket, record in self._records.of(line).items():
             if owner_of(record) == me and record and self._offered.get((line, bucket)) != record.revision:
@@ -325,7 +331,7 @@ class OwnerRecords:
         return votes >= NEEDED
 
     def doubted(self, line: str) -> set[str]:
-        """Return the buckets to which this line's release was sent, with an unknown outcome."""
+        """Return the buckets to which a release of this line was sent without a known outcome."""
         return {
             bucket
             for bucket, record in self._records.of(line).items()
@@ -342,12 +348,18 @@ class OwnerRecords:
         return self._records.owned_by(*self._me)
 
     def claim_of(self, line: str) -> Claim | None:
-        """Return the records to write to claim the line; None if it cannot be claimed, or is ours already."""
+        """Return the records that must be written to claim the line.
+
+        Return None if the line cannot be claimed, or is this gateway's already.
+        """
         is_over = self._records.observer.is_over
         return claim_of(self._me, self._records.of(line), is_over, self.doubted(line), self._leaderless())
 
     def _leaderless(self) -> set[str]:
-        """Return the bucket, if any, that may have no leader: our lease on its path is not renewed."""
+        """Return the ownership bucket, if any, that may have no leader.
+
+        If its home server has failed, the lease record with the same home server is not renewed.
+        """
         sent = [path.sent if path else 0 for path in self._lease.held]
         since = sorted(sent)[1] - LAG_NS
         return {bucket for bucket, moment in zip(names.OWNERS, sent, strict=True) if moment < since}
@@ -356,7 +368,7 @@ class OwnerRecords:
         """Write the first records of these claims; also write the spare records if a bucket answers late.
 
         A refused claim is repeated soon with newer records. So after a refusal, do not wait for further
-        answers, such as those of a bucket that may have no leader.
+        answers, which a bucket without a leader would not give.
         """
         now_ms, begun = time.time_ns() // 1_000_000, time.monotonic()
         values = {
@@ -382,7 +394,7 @@ class OwnerRecords:
         late = await self._decide(claims, (late - vain).union(spare.values()), refused)
         if refused:
             late, vain = set(), late | vain
-        await end_tasks(*vain)  # a cancelled request may still be stored; the next read shows whether it was
+        await end_tasks(*vain)  # a cancelled write may still be stored; the next read shows whether it was
         await asyncio.gather(*late)
 
     async def _decide(
@@ -392,7 +404,7 @@ class OwnerRecords:
         refused: set[str],
         within_s: float | None = None,
     ) -> set[asyncio.Task[set[str]]]:
-        """Wait until each line is ours or refused, for at most `within_s`; return the unanswered writes.
+        """Wait until each line is owned or refused, for at most `within_s`; return the unanswered writes.
 
         Add the lines of refused writes to `refused`.
         """
@@ -405,10 +417,10 @@ class OwnerRecords:
         return late
 
     async def give_away(self, lines: Sequence[str]) -> None:
-        """Release these lines: replace each record that names us by a record that names no gateway.
+        """Release these lines: replace each record that names this session by a record that names no gateway.
 
-        `is_mine` returns False for all of them before the first write is sent, so a late answer to a claim
-        cannot make a line ours.
+        `is_mine` returns False for all these lines before the first write is sent, so a late answer to a
+        claim cannot make a line this gateway's own.
         """
         now_ms, nobody = time.time_ns() // 1_000_000, (NOBODY, 0)
         given: list[tuple[str, Record]] = []
@@ -422,7 +434,7 @@ class OwnerRecords:
         self.moves += sum(not self._naming_us(line) for line in lines)
 
     def _write(self, records: Iterable[tuple[str, Record]]) -> dict[str, asyncio.Task[set[str]]]:
-        """Start a task for each bucket that replaces its records; each task returns the refused lines."""
+        """Start a task per bucket, which writes its records and returns the lines of refused records."""
         by_bucket: dict[str, list[Record]] = {}
         for bucket, record in records:
             by_bucket.setdefault(bucket, []).append(record)
@@ -431,7 +443,7 @@ class OwnerRecords:
         }
 
     async def _write_in(self, bucket: str, records: Sequence[Record]) -> set[str]:
-        """Replace the records whose revision has not changed; return the lines of the refused records."""
+        """Replace the records whose revision has not changed; return the lines of refused records."""
         follower = self._records.owners[bucket]
         async with self._writing[bucket]:
             if not self._may_write():

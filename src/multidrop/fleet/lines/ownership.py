@@ -20,14 +20,15 @@ from typing import Any, NamedTuple
 from multidrop.fleet.servers.buckets import NONE_YET, Record
 
 NOBODY = ""
-NEEDED = 2  # votes that a master needs
+NEEDED = 2  # number of votes that make a session the master of a line
 
 Owner = tuple[str, int]  # a gateway and its session
-LineRecords = Mapping[str, Record | None]  # a line's records by bucket, in writing order; None: not read yet
+# a line's ownership records by bucket, in the order of writing; None: not read yet
+LineRecords = Mapping[str, Record | None]
 
 
 class Claim(NamedTuple):
-    """The records to write to become master of a line: their present revisions, by bucket.
+    """The ownership records that must be written to become the master of a line, as revisions by bucket.
 
     The `spare` records are written if a write of a `first` record gets no answer. Each written record has
     this many `votes`.
@@ -40,14 +41,14 @@ class Claim(NamedTuple):
 
 
 class Step(NamedTuple):
-    """The lines that a gateway should claim, and those that it should release."""
+    """The lines that a gateway should claim now, and the lines that it should release now."""
 
     claims: dict[str, Claim]  # the records to write, by line
     releases: set[str]
 
 
 def owner_of(record: Record | None) -> Owner:
-    """Return the gateway and session that a record names; NOBODY and 0 for a free line."""
+    """Return the gateway and session that an ownership record names; NOBODY and 0 for a free line."""
     if record is None or not record.value:
         return NOBODY, 0
     return record.value["gateway"], record.value["session"]
@@ -67,7 +68,7 @@ def votes_of(owner: Owner, records: Iterable[Record | None]) -> int:
 
 
 def owner_by(records: LineRecords) -> Record | None:
-    """Return the newest record of the owner with enough votes; None if there is no such owner.
+    """Return the newest ownership record of the owner with enough votes; None without such an owner.
 
     The owner of a free line is NOBODY.
     """
@@ -77,7 +78,7 @@ def owner_by(records: LineRecords) -> Record | None:
 
 
 def turn_of(records: LineRecords) -> int:
-    """Return the highest turn in the records; 0 if the line never had a master."""
+    """Return the number of claims and releases of the line so far; 0 if it never had a master."""
     turn = 0
     for record in records.values():
         if record and record.value and record.value["turn"] > turn:
@@ -92,14 +93,15 @@ def claim_of(
     doubted: Collection[str] = (),
     leaderless: Collection[str] = (),
 ) -> Claim | None:
-    """Return the records to write to get enough votes; None if we have enough already, or cannot get enough.
+    """Return the records to write to get enough votes.
 
-    In the `doubted` buckets our release of the line was sent, but its outcome is unknown. Buckets that may be
-    `leaderless` are written last.
+    Return None if this session has enough votes already, or cannot get enough. In the `doubted` buckets the
+    line's release was sent by this gateway, but its outcome is unknown. Buckets that may be `leaderless` are
+    written last.
     """
     first_bucket, first = next(iter(records.items()), ("", None))
     if not first:
-        return None  # the first record may have two votes, and was not read yet
+        return None  # the line's first record, which may have two votes, was not read yet
     if first.revision == NONE_YET:
         return Claim({first_bucket: NONE_YET}, {}, 1, NEEDED)
     free: dict[str, int] = {}
@@ -111,7 +113,7 @@ def claim_of(
         elif record and (owner == me or owner[0] == NOBODY or is_over(*owner)):
             free[bucket] = record.revision
         elif record and record.value["votes"] >= NEEDED:
-            return None  # another session, which is alive, already has both votes
+            return None  # another living session already has both votes
     if not 0 < needed <= len(free):
         return None
     wanted = {bucket: free[bucket] for bucket in sorted(free, key=leaderless.__contains__)[:needed]}

@@ -1,8 +1,8 @@
 """The records that a gateway or viewer reads about its fleet: sessions, masters of lines, the plant.
 
-A large fleet has thousands of lines. In its share, a gateway reads master records only for lines that
-it is not yet the master of. It need not read the records of its own lines: no other gateway takes these
-lines while its session lasts. So a gateway whose lines do not change reads no master records.
+A large fleet has thousands of lines. A gateway reads the ownership records only of lines that it should poll
+and does not poll yet. It need not read the records of the lines that it polls: no other gateway takes these
+lines while its session lasts. So a gateway whose lines do not change reads no ownership records.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from multidrop.fleet.servers.buckets import FOLLOW_S, NONE_YET, Bucket, Follower
 from multidrop.fleet.servers.connections import ServerPath
 
 _UNREAD: LineRecords = {}
-ASKED_AT_ONCE = 500  # limit of lines in one request; servers allow 1024
+ASKED_AT_ONCE = 500  # limit of lines in one read request; servers allow 1024
 # how long a line with an unanswered write is read again: longer than an election takes, because the write may
 # still be stored after an election
 DOUBT_S = 30.0
-MOST_MOVES = 100  # number of the latest moves that are kept
-MOST_REPORTED = 20  # limit of the moves that a gateway reports with its state
+MOST_MOVES = 100  # number of remembered moves of lines between gateways
+MOST_REPORTED = 20  # limit of the moves in the state that a gateway reports
 
 
 class FleetRecords:
-    """The records of all buckets, as far as they were read.
+    """This process's copy of the records in all buckets.
 
-    `on_change` is called when lines or masters have changed, when a session has ended, and when one may be
-    ended.
+    `on_change` is called when lines or masters have changed, when a session has ended, and when a session may
+    be ended.
     """
 
     def __init__(
@@ -48,9 +48,10 @@ class FleetRecords:
             bucket: self._owner_follower(Bucket(bucket, path), partial(self._note_owner, bucket))
             for bucket in names.OWNERS
         }
-        self._of: dict[str, dict[str, Record | None]] = {}  # records that name masters, by line and bucket
-        self._owned: dict[Owner, set[str]] = {}  # by session: lines with a record that names it
-        self._masters: dict[str, tuple[str, int]] = {}  # the line's master and turn, by line
+        self._of: dict[str, dict[str, Record | None]] = {}  # ownership records, by line and bucket
+        # lines that have an ownership record of a session, by session
+        self._owned: dict[Owner, set[str]] = {}
+        self._masters: dict[str, tuple[str, int]] = {}  # by line: its master and the number of its moves
         self.plant = Follower(Bucket(names.PLANT, path), self._note_plant)
         self._has_plant_changed = False
         self._lines: tuple[str, ...] = ()
@@ -67,11 +68,11 @@ class FleetRecords:
         return Follower(bucket, on_take)
 
     def of(self, line: str) -> LineRecords:
-        """Return the records that name a line's master, by bucket; an empty mapping if none was read."""
+        """Return a line's ownership records, by bucket; an empty mapping if none was read."""
         return self._of.get(line, _UNREAD)
 
     def owner(self, line: str) -> Record | None:
-        """Return a record of the line's owner, a master or NOBODY; None if no owner has enough votes."""
+        """Return a record that names the line's owner (may be NOBODY); None if no owner has enough votes."""
         return owner_by(self.of(line))
 
     def lines(self) -> tuple[str, ...]:
@@ -112,7 +113,7 @@ class FleetRecords:
     async def _look_at_plant(self) -> bool:
         try:
             return bool(await self.plant.look())
-        finally:  # also after a failure, because records that were read before the failure are not read again
+        finally:  # also after a failure: records that were read before it are not read again
             if self._has_plant_changed:
                 self._has_plant_changed = False
                 self._lines = tuple(sorted(filter(self.is_in_plant, self.plant.records)))
@@ -129,13 +130,13 @@ class FleetRecords:
             if former in self._owned and former not in map(owner_of, records.values()):
                 self._owned[former].discard(line)
                 if not self._owned[former]:
-                    # delete the empty set, because former sessions would accumulate over years
+                    # delete the empty set; otherwise such sets would accumulate over years
                     del self._owned[former]
         if record.value:
             self._note_move(line)
 
     def _note_move(self, line: str) -> None:
-        """Note a move of the line. The former master is unknown if an earlier record was not read."""
+        """Remember that a line has moved. Its former master is unknown if an earlier record was not read."""
         record = self.owner(line)
         if not record:
             return
@@ -144,16 +145,16 @@ class FleetRecords:
         if turn != seen:
             self._masters[line] = master, turn
             known = before if turn == seen + 1 else None
-            # the two are equal if a gateway has claimed its own line again after an uncertain release
+            # they are equal if a gateway has claimed its own line again after an uncertain release
             if known != master:
                 self.moves.add([Move(line, turn, record.value["since"], known, master)])
 
 
 class ShareFollower(Follower):
-    """The master records of this gateway's share of lines, in one bucket.
+    """The ownership records, in one bucket, of the lines that this gateway should poll.
 
-    Revision 0 means that the line never had a master. `is_mine` returns True for a record that names our
-    present session, `has` for a line that we are the master of.
+    Revision 0 means that the line never had a master. `is_mine` returns True for a record that names this
+    gateway's present session. `has` returns True for a line whose master is this gateway.
     """
 
     def __init__(
@@ -163,8 +164,10 @@ class ShareFollower(Follower):
         self._is_mine = is_mine
         self._has = has
         self._share: frozenset[str] = frozenset()
-        self._asked: frozenset[str] | None = frozenset()  # lines to read at each look; None: find them first
-        self._doubted: dict[str, float] = {}  # by line with an unanswered write: when that write was sent
+        # lines to read at each look; None: not determined yet
+        self._asked: frozenset[str] | None = frozenset()
+        # lines with an unanswered write to their record, and when that write was sent
+        self._doubted: dict[str, float] = {}
         self._is_urgent = asyncio.Event()
 
     def want(self, lines: Iterable[str]) -> None:
@@ -178,11 +181,11 @@ class ShareFollower(Follower):
         self._is_urgent.set()
 
     def recompute(self) -> None:
-        """Find again, before the next read, which lines must be read."""
+        """Determine again, before the next read, which lines must be read."""
         self._asked = None
 
     async def look(self) -> list[Record]:
-        """Read the records that were not read yet or may have changed; return those that have changed."""
+        """Read the ownership records that are unknown or may have changed; return those that have changed."""
         self._is_urgent.clear()
         asked = self._to_ask()
         changed: list[Record] = []
@@ -201,7 +204,7 @@ class ShareFollower(Follower):
         return sorted(self._doubted.keys() | self._asked)
 
     def _may_change(self, line: str) -> bool:
-        """Return True if the record is unknown, or names another gateway.
+        """Return True if the line's ownership record is unknown, or names another gateway.
 
         A record that names no gateway need not be read again: a claim shows whether the line is still free.
         """
@@ -217,7 +220,7 @@ class ShareFollower(Follower):
 
 
 class ShareRecords(FleetRecords):
-    """The records that a gateway needs: all sessions, the plant, and the masters of its share of lines."""
+    """The records that a gateway needs: all sessions, the plant, and the owners of lines it should poll."""
 
     def __init__(
         self,
@@ -255,10 +258,10 @@ class ShareRecords(FleetRecords):
 
 
 class Move(NamedTuple):
-    """A line's move from one gateway to another. A name is "" if there is none, None if it is unknown."""
+    """A change of a line's master. A gateway's name is "" if there is none, None if it is unknown."""
 
     line: str
-    turn: int  # number of the move: all observers of a move see the same number
+    turn: int  # number of the line's move, the same for all gateways
     at_ms: int  # UTC by the clock of the gateway that wrote the record; only for display
     before: str | None
     after: str
@@ -276,14 +279,14 @@ def move_of(sent: Any) -> Move:
 
 
 class Moves:
-    """The latest moves. A release of a line and the claim that follows it are one move."""
+    """The latest changes of lines' masters. A release of a line and the following claim are one move."""
 
     def __init__(self, most: int = MOST_MOVES) -> None:
         self._most = most
         self._moves: dict[tuple[str, int], Move] = {}
 
     def add(self, moves: Iterable[Move]) -> None:
-        """Add moves. If a move was reported before, keep the more complete report."""
+        """Add moves. If two reports describe the same move, keep the more complete report."""
         for move in moves:
             key = (move.line, move.turn)
             known = self._moves.get(key)

@@ -27,17 +27,20 @@ from multidrop.fleet.leases.rules import SECOND
 
 BOUND = 110  # limit of a gateway's lines, in percent of the mean
 NUMBER_BITS = 16  # the low bits of a weight hold its gateway's number
-QUIET_NS = SECOND // 2  # while settling, assign lines only after this time without new or lost gateways
-OPENINGS = 3  # number of failed attempts to open a line before the line is reported
-LOST_NS = 6 * SECOND  # a lost port is reported this long after the last reply
-REPLY_NS = 3 * SECOND  # a newest reply that is older than this does not show when the port was lost
-FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND  # first and longest wait before a trial
-TRIAL_NS = 60 * SECOND  # if the line does not come back within this time, its trial ends
-MOST_BYTES = 8_000  # limit, in bytes, of all line names in a lease record
+# while a session starts, lines are assigned only after this time without new or lost gateways
+QUIET_NS = SECOND // 2
+OPENINGS = 3  # number of failed attempts to open a line after which the line is reported to other gateways
+# a line is reported to other gateways if its port is lost and no reply has come for this time
+LOST_NS = 6 * SECOND
+REPLY_NS = 3 * SECOND  # a reply older than this does not show when the port was lost
+# first and longest wait before a gateway again tries to open a line that it has reported
+FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND
+TRIAL_NS = 60 * SECOND  # such a trial ends if the line is not assigned to this gateway again within this time
+MOST_BYTES = 8_000  # limit, in bytes, of the names of reported lines in a lease record
 
 
 def assign(lines: Sequence[str], gateways: Sequence[str]) -> dict[str, str]:
-    """Return the gateway of each line; an empty dict without gateways.
+    """Return the gateway that each line is assigned to; an empty dict without gateways.
 
     Assigning 10,000 lines to 20 gateways takes 20 ms, so do not call this in an event loop.
     """
@@ -61,8 +64,8 @@ def assign(lines: Sequence[str], gateways: Sequence[str]) -> dict[str, str]:
 def hand_over(wanted: Mapping[str, str], unopened: Mapping[str, Collection[str]]) -> dict[str, str]:
     """Return each line's gateway after moving lines away from gateways that cannot open them.
 
-    `unopened` maps a gateway to the lines that it cannot open. A line that no gateway can open stays with
-    its gateway. Gateways that are not keys of `unopened` get no lines.
+    `unopened` maps a gateway to the lines that it cannot open. A line that no gateway can open stays with its
+    gateway. Gateways that are not keys of `unopened` get no further lines.
     """
     found = dict(wanted)
     for line in {line for lines in unopened.values() for line in lines} & wanted.keys():
@@ -98,7 +101,7 @@ def _hash(name: str) -> int:
 
 
 class Sharers(NamedTuple):
-    """The gateways that share the lines, and each gateway's lines that it could not open."""
+    """The input of an assignment: the gateways, all lines, and the lines that each gateway could not open."""
 
     gateways: tuple[str, ...]
     lines: tuple[str, ...]
@@ -106,30 +109,30 @@ class Sharers(NamedTuple):
 
 
 class Shares:
-    """The gateway that each line is assigned to, for the latest set of sharers."""
+    """The assignment of lines to gateways."""
 
     def __init__(self) -> None:
-        self.wanted: dict[str, str] = {}  # each line's gateway
-        self.home: dict[str, str] = {}  # how lines would be assigned if every gateway could open every line
+        self.wanted: dict[str, str] = {}  # the gateway that should poll each line
+        self.home: dict[str, str] = {}  # the assignment if every gateway could open every line
         self._made: Sharers | None = None
         self._others: frozenset[str] = frozenset()
         self._seen_at = 0
 
     def reset(self) -> None:
-        """Assign the lines again at the next `make`, because a new session has started."""
+        """Assign the lines again at the next call of `make`, because a new session has started."""
         self._made = None
 
     def note_others(self, others: frozenset[str], now: int) -> None:
-        """Note the other gateways that take lines now; `now` is in ns."""
+        """Note the other gateways that poll lines now; `now` is in ns."""
         if others != self._others:
             self._others, self._seen_at = others, now
 
     async def make(self, sharers: Sharers, now: int, *, is_settled: bool) -> bool:
         """Assign the lines to gateways if anything has changed; return True if they were assigned now.
 
-        The work is done in a thread, because it takes long. Until `is_settled`, lines are not assigned while
-        further gateways appear, as in a cold start. Otherwise the first gateway would read the records of all
-        lines.
+        The work is done in a thread, because it takes long. Before `is_settled`, lines are not assigned while
+        further gateways appear, as at the start of a whole fleet. Otherwise the first gateway would read the
+        records of all lines.
         """
         is_early = not is_settled and now - self._seen_at < QUIET_NS
         if sharers == self._made or is_early:
@@ -145,18 +148,21 @@ class Shares:
 
 
 class UnopenedLines:
-    """Lines whose port this gateway cannot open, so that other gateways should take them. `clock` returns ns.
+    """The lines whose ports this gateway cannot open; it reports them so that other gateways take them.
 
-    Only as many lines are reported as fit into a lease record. This gateway retries the others itself.
+    Only as many lines are reported as fit into a lease record. This gateway itself retries the lines beyond
+    that limit. `clock` returns ns.
     """
 
     def __init__(self, clock: Callable[[], int]) -> None:
         self.hopeless: frozenset[str] = frozenset()  # lines that all gateways have reported
-        self.home: frozenset[str] | None = None  # our share if all ports could be opened; None: unknown
+        # the lines that this gateway would poll if all ports could be opened; None: unknown
+        self.home: frozenset[str] | None = None
         self._clock = clock
         self._failures: dict[str, int] = {}
         self._lost_since: dict[str, int] = {}
-        self._named: dict[str, None] = {}  # reported lines, in the order in which they will be tried
+        # reported lines, in the order in which this gateway will try to open them again
+        self._named: dict[str, None] = {}
         self._wait_ns = FIRST_WAIT_NS
         self._trial_at = 0
         self._tried = ""
@@ -169,11 +175,11 @@ class UnopenedLines:
             self._name(line)
 
     def lost(self, line: str, silent_ns: int | None = None) -> None:
-        """Note that the port of a polled line is lost; report the line when LOST_NS have passed.
+        """Note that the port of a polled line is lost; after LOST_NS, report the line to other gateways.
 
-        `silent_ns` is the age of the newest reply on the line. LOST_NS starts at that reply, because in a
+        `silent_ns` is the age of the newest reply on the line. LOST_NS counts from that reply, because in a
         network that drops everything, writes and connection attempts fail only after seconds. If `silent_ns`
-        is None or large, LOST_NS starts at the first call.
+        is None or large, LOST_NS counts from the first call.
         """
         now = self._clock()
         since = now - silent_ns if silent_ns is not None and silent_ns <= REPLY_NS else now
@@ -185,10 +191,10 @@ class UnopenedLines:
         self._failures.pop(line, None)
         self._lost_since.pop(line, None)
         self._named.pop(line, None)
-        if line == self._tried:  # the network is back: try the other reported lines immediately
+        if line == self._tried:  # the network works again: try the other reported lines immediately
             self._tried, self._wait_ns, self._trial_at = "", FIRST_WAIT_NS, self._clock()
             for other in self._named.keys() - (self._named.keys() if self.home is None else self.home):
-                # the other line is not assigned to us, so a trial would not return it to us
+                # this line would not be assigned to this gateway after a trial
                 del self._named[other]
 
     def gone(self, line: str) -> None:
@@ -196,9 +202,9 @@ class UnopenedLines:
         self._lost_since.pop(line, None)
 
     def named(self) -> frozenset[str]:
-        """Return the lines that other gateways should take.
+        """Return the reported lines, which other gateways should take.
 
-        Call this often, because each call may start a trial.
+        Call this often: each call may withdraw the report of one line, as a trial.
         """
         now = self._clock()
         if self._tried and now - self._tried_since >= TRIAL_NS:

@@ -1,9 +1,9 @@
-"""Forwarder: sends a spool's messages to the stream, in order, each exactly once.
+"""Forwarder: sends a spool's messages to the NATS stream, in order, each exactly once.
 
 One message is in flight at a time. Each message states the stream position of the previous message of its
 subject. The stream stores the message only if that position is right. At the start, and after a timeout or
-refusal, the forwarder asks the stream for the last message of the subject, and continues with the next
-one. So the forwarder needs no file with an offset, and the stream refuses a duplicate however late it comes.
+refusal, the forwarder asks the stream for the last message of the subject, and continues with the next one.
+So the forwarder needs no file with an offset, and the stream refuses a duplicate however late it comes.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from multidrop.fleet.servers.names import checked_name
 from multidrop.samples import Spool, StoredMessage
 
 AGAIN_S = 0.25  # pause after a failure
-LOOKING_S = 1.0  # time between checks for messages that the spool did not announce
+LOOKING_S = 1.0  # pause between checks for new messages, in case the spool has announced none
 SET_BACK = (
     "the servers have message {} of the log {}, and the spool has {}: its folder was copied or set back; "
     "move it away to start a new log"
@@ -43,9 +43,9 @@ class NotOurLog(Exception):
 
 
 class Forwarder:
-    """Sends the messages of a spool over this path: `await forwarder.run()` runs until it is cancelled.
+    """Sends the messages of a spool over this connection: `await forwarder.run()` runs until it is cancelled.
 
-    Raises ValueError if the gateway's name cannot be part of a subject.
+    Raises ValueError if the gateway's name cannot be part of a NATS subject.
     """
 
     def __init__(self, spool: Spool, path: ServerPath) -> None:
@@ -53,12 +53,12 @@ class Forwarder:
         self._subject = subject_of(checked_name("gateway", spool.gateway), spool.log)
         self._news = asyncio.Event()
         self.sent = 0  # messages sent since the start
-        # sequence number of this log's newest message in the stream; None: not known yet
+        # sequence number of the spool's newest message in the stream; None: not known yet
         self.last: int | None = None
         self.trouble: str | None = None
 
     def lag_s(self) -> float | None:
-        """Return the age (s, by the system clock) of the oldest message that the stream lacks, else 0.
+        """Return the age (s, by the system clock) of the oldest message not in the stream yet; 0 without one.
 
         Return None if the stream's position is not known yet, or if the spool has removed the message.
         """
@@ -101,10 +101,10 @@ class Forwarder:
                         await self._news.wait()
                 continue
             data = await asyncio.to_thread(_read, stored.path)
-            if data is None:  # the full spool has just removed the message
+            if data is None:  # the spool is full and has just removed the message
                 continue
             found = await publish(self._path, self._subject, data, self._headers(stored, data, place))
-            if found is None:  # refused: our earlier attempt was stored after all
+            if found is None:  # refused, because the earlier attempt was stored after all
                 return
             place, sequence = found, stored.sequence
             self.sent += 1
@@ -112,9 +112,9 @@ class Forwarder:
             self._note(None)
 
     async def _ask(self) -> tuple[int, int]:
-        """Return the position and the sequence number of this log's last message in the stream."""
+        """Return the stream position and the sequence number of the spool's last message in the stream."""
         last = await last_of(self._path, self._subject)
-        if last is None or last.sequence == 0:  # no message is stored now, or the last message is forged
+        if last is None or last.sequence == 0:  # none is stored now, or the last message is forged
             sequence = self.last or 0
             self._have(sequence)
             return (last.place if last else 0), sequence

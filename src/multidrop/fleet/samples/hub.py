@@ -1,7 +1,8 @@
-"""Hub: reads the stream into a sink, which stores rows and their position in the stream in one commit.
+"""Hub: reads the stream of samples into a sink (Parquet files or a database).
 
-The hub uses no NATS consumer and acknowledges no messages. After a failure it asks the sink for the stored
-position, and reads the stream from there.
+The sink stores rows and their position in the stream in one commit. The hub uses no NATS consumer and
+acknowledges no messages. After a failure it asks the sink for the stored position, and reads the stream from
+there.
 """
 
 from __future__ import annotations
@@ -17,27 +18,31 @@ from multidrop.fleet.samples.samples_stream import StreamInfo, StreamMessage, re
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.samples import MessageError, SinkError, unpack
 
-MOST_READ = 64  # limit of messages in one answer
+MOST_READ = 64  # limit of messages in one read from the stream
 MOST_READ_BYTES = 8 << 20
-MOST_ROWS = 1_000_000  # limit of rows in one commit: 50 MB
-MOST_BYTES = 256 << 20  # limit in bytes of messages and rows in one commit; a single answer may exceed it
+MOST_ROWS = 1_000_000  # limit of rows in one commit; a million rows need 50 MB
+MOST_BYTES = 256 << 20  # limit in bytes of messages and rows in one commit; a single read may exceed it
 LOOKING_S = 0.2  # pause before the next read if there is no new message
 AGAIN_S = 1.0  # pause after a failure
-BEHIND_S = 5.0  # how long to wait for a server that has not received the stream's newest messages yet
+BEHIND_S = 5.0  # how long to wait for a server that does not have the stream's newest messages yet
 T = TypeVar("T")
 
 _log = logging.getLogger("multidrop.fleet.samples.hub")
 
 
 class SourceCheck:
-    """Checks that no message of a log is missing or repeated. Alarms are logged as errors and counted."""
+    """Checks that no message of a gateway's log is missing or repeated.
+
+    Alarms are logged as errors and counted.
+    """
 
     def __init__(self, last: Mapping[str, int]) -> None:
-        self.last = dict(last)  # sequence number of the last message, by gateway and log
+        self.last = dict(last)  # sequence number of the last message, by gateway and id of its log
         self.alarms = 0
         self.missing = 0  # number of missing messages
         self.doubled = 0  # number of repeated messages, which are ignored
-        self._lost: dict[str, int] = {}  # by gateway and log: lost rows that the spool has reported
+        # number of lost rows that the spool has reported, by gateway and id of its log
+        self._lost: dict[str, int] = {}
 
     def take(self, message: StreamMessage) -> bool:
         """Return True if the message is new and must be stored."""
@@ -60,20 +65,20 @@ class SourceCheck:
         return True
 
     def alarm(self, sentence: str) -> None:
-        """Log and count an event that must never happen."""
+        """Log and count an error that must never happen, such as a missing message."""
         self.alarms += 1
         _log.error("%s", sentence)
 
 
 class NotThisHubs(SinkError):
-    """The sink belongs to another stream or another hub, so the hub does not retry."""
+    """The sink belongs to another stream or another hub. The hub does not retry."""
 
 
 class StoredPosition(NamedTuple):
     """The position up to which a sink has stored the stream."""
 
     place: int  # stream position of the last stored message
-    sources: Mapping[str, int]  # sequence number of the last stored message, by log
+    sources: Mapping[str, int]  # sequence number of the last stored message, by gateway and id of its log
 
 
 class Commit(NamedTuple):
@@ -83,12 +88,12 @@ class Commit(NamedTuple):
     first: int  # stream position of the commit's first message
     last: int
     sources: Mapping[str, int]
-    tables: Sequence[Any]  # pyarrow.Table of message.ROWS; may be empty
+    tables: Sequence[Any]  # one pyarrow.Table per message, with the columns of message.ROWS; may be empty
     rows: int
 
 
 class SampleSink(Protocol):
-    """A store of rows. Its methods are called in a thread, and raise SinkError."""
+    """A store of rows, such as a database. The hub calls its methods in a thread; they raise SinkError."""
 
     def begin(self, stream: str) -> StoredPosition:
         """Return the stored position in this stream. Called at the start and after each failure."""
@@ -110,7 +115,7 @@ async def _on_thread(act: Callable[..., T], *arguments: Any) -> T:
 
 
 class HubState(NamedTuple):
-    """Positions in the stream, counts since the start, and the present problem (None without one)."""
+    """The hub's positions in the stream, its counts since the start, and its present problem (or None)."""
 
     place: int  # stream position of the last stored message
     behind: int  # messages in the stream that are not stored yet

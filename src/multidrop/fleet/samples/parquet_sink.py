@@ -35,10 +35,11 @@ from multidrop.recording import FileLock
 from multidrop.samples import ROWS, SinkError
 from multidrop.whole_file import UNFINISHED, whole_file
 
-KEY = "multidrop"  # key of multidrop's part of a Parquet file's metadata, as in all recordings
+KEY = "multidrop"  # key in a Parquet file's metadata for multidrop's own entry, as in all recordings
 SECOND_NS = 1_000_000_000
 FORM = "%Y%m%dT%H%M%SZ"
-WRITTEN = {  # in the file, names are dictionary-encoded; `History` and DuckDB read them as plain texts
+# Parquet files store these columns as dictionaries; `History` and DuckDB read them as plain texts
+WRITTEN = {
     "compression": "zstd",
     "compression_level": 1,
     "store_schema": False,
@@ -51,7 +52,7 @@ _log = logging.getLogger("multidrop.fleet.samples.hub")
 
 
 class ParquetSink:
-    """Writes each commit as one file.
+    """Writes each of the hub's commits as one Parquet file.
 
     Raises SinkError if the folder cannot be written, or belongs to another hub.
     """
@@ -72,7 +73,7 @@ class ParquetSink:
         if others:
             self.close()
             raise NotThisHubs(
-                f"{self.folder} is not a hub's folder: it holds {others[0]!r}; name an empty one"
+                f"{self.folder} is not a hub's folder: it holds {others[0]!r}; name an empty folder"
             )
 
     def close(self) -> None:
@@ -162,7 +163,7 @@ async def compact_for_ever(folder: Path, every: float = EVERY_S) -> None:
         await asyncio.sleep(every)
         try:
             await _compact(words)
-        except Exception as failure:  # such as a process that cannot start; the loop retries
+        except Exception as failure:  # such as an error when the process starts; the loop tries again
             _log.error("merging files failed; retrying", exc_info=failure)
 
 

@@ -15,8 +15,8 @@ from multidrop.fleet.samples.hub import Commit, NotThisHubs, StoredPosition
 from multidrop.samples import SinkError
 from multidrop.samples.sample_tables import SampleTables, sentences
 
-# One hub at a time locks the database, for as long as its connection lasts. The server drops a dead
-# connection after 25 s.
+# Take a lock that only one hub at a time can hold, for as long as its connection lasts. The server drops a
+# dead connection after 25 s.
 TAKEN = """
 set tcp_keepalives_idle = 10; set tcp_keepalives_interval = 5; set tcp_keepalives_count = 3;
 set lock_timeout = '3s'; select pg_advisory_lock(hashtext('multidrop hub that writes')); set lock_timeout = 0
@@ -30,7 +30,7 @@ MOVE = "update multidrop.hub set place = %s, sources = %s where stream = %s and 
 
 
 class PostgresSink:
-    """Writes each commit of the hub in one database transaction.
+    """Writes each of the hub's commits in one database transaction.
 
     `where` is a connection string, such as "dbname=plant".
     """

@@ -30,9 +30,9 @@ from multidrop.supervisor import end_tasks, supervisor
 
 STREAM = "samples"
 SEQUENCE, DIGEST, LOST = "Multidrop-Sequence", "Multidrop-Digest", "Multidrop-Lost"
-BY_SERVER = "Nats-Stream"  # a server adds this header to each stored message that it returns
+BY_SERVER = "Nats-Stream"  # header that a server adds to each stored message that it returns
 EXPECTED = "Nats-Expected-Last-Subject-Sequence"
-ANSWER_S = 5.0  # time limit of an answer; an election takes 4 to 9 s, so requests are retried
+ANSWER_S = 5.0  # time limit for a server's answer; an election takes 4 to 9 s, so requests are retried
 NO_MESSAGE, NO_STREAM, WRONG_SEQUENCE = 10037, 10059, 10071  # error codes of JetStream
 SENTENCES = {  # messages of FleetError, by JetStream's error code
     NO_STREAM: f"there is no stream {STREAM!r}: create it with `multidrop fleet init`",
@@ -59,7 +59,7 @@ class LastMessage(NamedTuple):
 
     place: int  # position in the stream
     sequence: (
-        int  # number in the log; 0 if the message is a server's answer that was directed to this subject
+        int  # number in the gateway's log; 0 for a server's answer that a client has directed to this subject
     )
     digest: str
 
@@ -73,7 +73,7 @@ def digest_of(data: bytes) -> str:
 
 
 async def _answer_to(request: Awaitable[T]) -> T:
-    """Return the answer to a request. Raises CancelledError if this task was cancelled in the meantime.
+    """Return the answer to a request; raise CancelledError if this task was cancelled in the meantime.
 
     In Python 3.11, `asyncio.wait_for` swallows that exception if an answer arrives at the same moment.
     """
@@ -104,10 +104,11 @@ async def samples_path(
 
 
 async def create_stream(path: ServerPath, *, replicas: int = 3, most_bytes: int = -1) -> int:
-    """Create the stream if it is missing. Return the stream's size limit in bytes, or -1 if it is unlimited.
+    """Create the stream of samples if it is missing.
 
-    Above `most_bytes`, the oldest messages are removed. The servers reserve that much space. A stream without
-    a limit fills their disks, and then no lease can be renewed.
+    Return the stream's size limit in bytes, or -1 if it is unlimited. Above `most_bytes`, the oldest messages
+    are removed. The servers reserve that much space. A stream without a limit fills their disks, and then no
+    lease can be renewed.
     """
     config = {
         "name": STREAM,
@@ -157,7 +158,9 @@ async def publish(path: ServerPath, subject: str, data: bytes, headers: dict[str
     try:
         answer = await _answer_to(path.request(subject, data, headers, ANSWER_S))
     except NobodyThere as failure:
-        raise FleetError(f"no stream takes {subject}: it is missing, or has no leader now") from failure
+        raise FleetError(
+            f"no stream stores {subject}: the stream is missing, or has no leader now"
+        ) from failure
     found = parsed_answer(answer.data)
     if error := found.get("error"):
         if error.get("err_code") == WRONG_SEQUENCE:
@@ -168,12 +171,12 @@ async def publish(path: ServerPath, subject: str, data: bytes, headers: dict[str
 
 
 def number_of(text: str | None) -> int:
-    """Return a header's number; 0 if it is missing or invalid."""
+    """Return the number in a header's text; 0 if the header is missing or invalid."""
     return int(text) if text and text.isascii() and text.isdigit() and len(text) < 19 else 0
 
 
 async def _ask(path: ServerPath, subject: str, what: Mapping[str, Any], *none: int) -> Any:
-    """Return the answer of JetStream's API to a request; None for an error whose code is in `none`."""
+    """Send a request to JetStream's API and return the answer; None for an error whose code is in `none`."""
     try:
         return await _answer_to(ask(path, subject, what, ANSWER_S))
     except NobodyThere as failure:
@@ -204,7 +207,7 @@ class StreamMessage(NamedTuple):
     gateway: str
     log: str
     sequence: int
-    lost: int  # rows that the gateway's spool had lost when it sent the message
+    lost: int  # number of rows that the gateway's spool had lost when it sent the message
     data: bytes
 
 
@@ -218,7 +221,7 @@ async def read_after(path: ServerPath, place: int, messages: int, size: int) -> 
     try:
         await _answer_to(path.gather(Request(SUBJECT, json.dumps(wanted).encode()), get, ANSWER_S))
     except FleetError as failure:
-        # no message before the lost one is missing; the next call reads the rest
+        # messages before the lost one are complete; the next call reads the rest
         if get.found or get.has_hole:
             return get.found
         raise _refused(get.end_line) if get.last.done() else failure from failure
@@ -226,7 +229,7 @@ async def read_after(path: ServerPath, place: int, messages: int, size: int) -> 
 
 
 class SampleGet(DirectGet):
-    """The messages that one direct get returns, parsed from raw headers.
+    """The messages in the answer to one direct get, parsed from raw headers.
 
     A sender may write any headers into a message, and the server appends its own headers. A parser that stops
     at an invalid header would miss the server's headers, and take the sender's claim for the message's
@@ -236,7 +239,7 @@ class SampleGet(DirectGet):
     def __init__(self) -> None:
         super().__init__()
         self.found: list[StreamMessage] = []
-        self.has_hole = False  # True if a message of the answer was lost on the way
+        self.has_hole = False  # True if a message of the answer was lost between the server and this client
         self.end_line = ""
 
     def take(self, headers: bytes, data: bytes) -> None:

@@ -1,1 +1,1 @@
-"""The NATS servers of a fleet: connections, buckets, setup and rights."""
+"""The NATS servers of a fleet: connections to them, buckets of records, setup, and rights of users."""

@@ -18,8 +18,8 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 STATUS = slice(9, 12)  # position of the status in headers such as "NATS/1.0 404 No Messages"
-PROCESSED = 4  # number of the arguments of Client._process_msg that follow the subscription id
-# statuses that end an answer: 204 comes after the last message, 404 if there is no message
+PROCESSED = 4  # number of the arguments that Client._process_msg has after the subscription id
+# statuses that end a complete answer: 204 follows the last message, 404 means that there is no message
 WHOLE = ("204", "404")
 
 
@@ -40,7 +40,7 @@ class Request(NamedTuple):
 
 
 class Gathered:
-    """Collects answers that arrive one by one; the future `last` gets the status of the final answer."""
+    """Collects answers that arrive one by one. The future `last` gets the status of the final one."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -76,14 +76,14 @@ class DirectGet(Gathered):
 
 
 class Replies(Gathered):
-    """Collects the answers to several requests, in the order of the requests; None for a missing answer."""
+    """Collects the answers to several requests, in the order of the requests. A missing answer is None."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
         self.found: list[bytes | None] = [None] * number
 
     def take(self, place: int, headers: bytes, data: bytes) -> None:
-        """Keep the first answer to request number `place`."""
+        """Store the first answer to request number `place`."""
         if self.found[place] is None:
             self.found[place] = data
             self.count += 1
@@ -92,7 +92,7 @@ class Replies(Gathered):
 
 
 class BatchClient(Client):
-    """A nats-py client with an additional subscription for the answers to batches."""
+    """A nats-py client with an additional subscription, which receives the answers to batches of requests."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -105,12 +105,12 @@ class BatchClient(Client):
         """Collect the answer to a direct get. Raises OSError if it is incomplete, and nats-py's errors."""
         await self._ask([request], [get.take], get, silence_s)
         if not get.last.done():
-            raise TimeoutError(f"no message came for {silence_s:g} s")
+            raise TimeoutError(f"the server sent no message for {silence_s:g} s")
         if get.last.result() not in WHOLE:
-            raise OSError(f"it ended with status {get.last.result() or 'none'}")
+            raise OSError(f"the answer to a read ended with status {get.last.result() or 'none'}")
 
     async def replies(self, requests: Sequence[Request], silence_s: float) -> list[bytes | None]:
-        """Send all requests together and return their answers; None for each answer that is late."""
+        """Send all requests together, and return their answers; None for an answer that came too late."""
         replies = Replies(len(requests))
         takers = [partial(replies.take, place) for place in range(len(requests))]
         await self._ask(requests, takers, replies, silence_s)
@@ -156,7 +156,10 @@ class BatchClient(Client):
         await super()._process_pong()
 
     async def _process_msg(self, sid: int, *rest: Any) -> None:
-        """Handle an answer without nats-py's queue. `rest` is subject, reply subject, data and headers."""
+        """Handle an answer directly, without nats-py's queue.
+
+        `rest` has the message's subject, reply subject, data and headers.
+        """
         if sid != self._batch_sid or len(rest) != PROCESSED:
             await super()._process_msg(sid, *rest)
             return
@@ -175,7 +178,7 @@ class BatchClient(Client):
 
 
 def stored_message(headers: bytes, data: bytes) -> DirectMessage | None:
-    """Return the message with these headers; None if they mark the end of an answer.
+    """Return the stored message in an answer; None if these headers mark the end of the answer.
 
     The writer's own headers come first and may have any name. The server's headers come last.
     """

@@ -1,7 +1,7 @@
-"""Buckets: records by key, which are replaced only at a known revision and read without a NATS consumer.
+"""Buckets of records by key. A record is replaced only at a known revision.
 
-Any user with write access to a bucket can write any bytes. So records have a known shape: an invalid record
-is ignored, and does not affect other records.
+Records are read without a NATS consumer. Any user with write access to a bucket can write any bytes. So
+records have a known shape: an invalid record is ignored, and does not affect other records.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from multidrop.fleet.servers.connections import ANSWER_S, ServerPath
 
 NONE_YET = 0  # revision of a key that has no record
 BATCH = 1000  # limit of records in one read
-FOLLOW_S = 0.2  # time between reads of a bucket
-MOST_STRANGE = 1000  # how many of a bucket's invalid records are logged
+FOLLOW_S = 0.2  # pause between reads of a bucket's changes
+MOST_STRANGE = 1000  # limit of logged invalid records in each bucket
 _WRONG_REVISION = (10071, 10164)
 _NO_MESSAGE = 10037
 _NO_STREAM = 10059
-_UNAVAILABLE = 10008  # JetStream's error code: no leader, and none can be elected
+_UNAVAILABLE = 10008  # JetStream's error code if a bucket has no leader, and its servers can elect none
 LEASE = {
     **dict.fromkeys(("session", "began", "pid"), int),
     **dict.fromkeys(("nonce", "host", "machine", "lock", "lock_id"), str),
@@ -39,7 +39,7 @@ SHAPES: Mapping[str, Mapping[str, Any]] = {
     **dict.fromkeys(names.OWNERS, OWNER),
     names.PLANT: LINE,
 }
-MOST_TEXT = 300  # limit of characters of a text in a gateway's state
+MOST_TEXT = 300  # limit, in characters, of each text in a gateway's state
 SMALL, LARGE = 1 << 14, 1 << 20  # limits of a record's bytes; a line's record contains its family files
 _KINDS: Mapping[Any, str] = {
     **{int: "a whole number", float: "a number", str: "a text", bool: "true or false", dict: "a table"},
@@ -61,7 +61,10 @@ class Record(NamedTuple):
 
 
 class WriteAnswers(NamedTuple):
-    """Replaced records with their new revisions, and keys of refused records. Other outcomes are unknown."""
+    """The outcome of writes: replaced records with their new revisions, and keys of refused records.
+
+    The outcome for all other records is unknown.
+    """
 
     stored: list[Record]
     refused: set[str]
@@ -134,7 +137,7 @@ class ServerError(FleetError):
 
 
 class Bucket:
-    """A bucket of records. `path` returns the connection to use for each request."""
+    """A bucket of records. `path` returns the server connection to use for each request."""
 
     def __init__(self, name: str, path: Callable[[], ServerPath]) -> None:
         self.name = name
@@ -238,7 +241,7 @@ OnTake = Callable[[Record | None, Record], object]
 
 
 class Follower:
-    """The records of a bucket by key, as far as they were read.
+    """A local copy of a bucket's records by key, as far as they were read.
 
     `on_take` is called with the former and the new record whenever a newer record was read.
     """
@@ -264,7 +267,10 @@ class Follower:
         await asyncio.sleep(FOLLOW_S)
 
     def take(self, record: Record) -> bool:
-        """Keep a record unless a newer record of its key was read before. Return True if it was kept."""
+        """Store a record in the copy unless a newer record of its key was read before.
+
+        Return True if it was stored.
+        """
         before = self.records.get(record.key)
         if before is not None and before.revision >= record.revision:
             return False
@@ -274,7 +280,7 @@ class Follower:
 
 
 class LeaseBucket(Bucket):
-    """A bucket of leases, to which records are written in the name of `writer`.
+    """A bucket of leases, to which the gateway `writer` writes records.
 
     A record's subject is `<gateway>.<writer>`, so servers can check which user writes. A gateway's valid
     record is the newest one of all writers, and is replaced only at its revision. A gateway may write only in
@@ -311,7 +317,10 @@ def largest(bucket: str) -> int:
 
 
 def parsed(bucket: str, key: str, data: bytes) -> tuple[Any, str]:
-    """Return a record's value and "", or None and why it is invalid. A removed record is None and ""."""
+    """Return a record's value and ""; for an invalid record, None and the reason.
+
+    For a removed record, return None and "".
+    """
     if not data:
         return None, ""
     if not names.is_name(key):
@@ -329,7 +338,7 @@ def parsed(bucket: str, key: str, data: bytes) -> tuple[Any, str]:
 
 
 def misshapen(value: Any, shape: Mapping[str, Any]) -> str:
-    """Return how a value differs from a shape; "" if it fits. Further entries are allowed."""
+    """Return how a JSON value differs from a required shape; "" if it fits. Further entries are allowed."""
     if not isinstance(value, dict):
         return "not a table"
     for name, kind in shape.items():

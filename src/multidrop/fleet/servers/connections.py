@@ -48,23 +48,27 @@ CONNECT_S = 1.0
 ANSWER_S = 1.0  # time limit of an answer; leases are renewed twice a second
 PONG_S = 0.7  # time limit of a ping; if a server is slower, the path moves to another server
 KEEP_S = 1.0  # pause between checks of a connection
-# If the limit of attempts were 0, nats-py would retry a closed port until `connect` times out.
+# One attempt: with a limit of 0, nats-py would retry a closed port until `connect` times out.
 ONE_TRY = {"allow_reconnect": False, "max_reconnect_attempts": 1, "reconnect_time_wait": 0.05}
 SEED = "SU"  # prefix of a user's secret key
 CREDS = "-----BEGIN NATS USER JWT-----"
-# silence before each repeat of a read; after the last silence the read fails
+# A read is repeated if no data comes for the first of these times (s), again after the next one, and so on.
+# It fails after the last one.
 AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)
-SLOW = 3.0  # silence before a repeat, as a multiple of the usual time of an answer
-MOST_SILENCE_S = 1.0  # limit of the silence before a repeat, because requests time out then
-FORGET = 0.97  # factor by which the usual time of an answer decays with each answer
-MOST_REPEATS = 300.0  # limit of the budget: twice the repeats needed until servers notice a dead route (3 s)
-EARNED = 0.5  # repeats that each timely answer adds to the budget
+SLOW = 3.0  # a read is repeated only after this many times the usual response time
+MOST_SILENCE_S = 1.0  # limit of the wait before a repeat, because requests time out after this time
+# The usual response time is the longest recent one. Each answer multiplies it by this factor, so that one
+# slow answer is forgotten after about a hundred fast ones.
+FORGET = 0.97
+# Limit of saved repeats: twice as many as are needed until servers notice a dead route (3 s).
+MOST_REPEATS = 300.0
+EARNED = 0.5  # number of repeats that the budget gains by each timely answer
 
 _log = logging.getLogger("multidrop.fleet")
 
 
 class ServerPath:
-    """A connection to its home server while that server answers, otherwise to any other server."""
+    """A connection to a home server while that server answers, otherwise to any other server."""
 
     def __init__(
         self, urls: Sequence[str], options: Mapping[str, Any] | None = None, pong_s: float = PONG_S
@@ -72,16 +76,16 @@ class ServerPath:
         self.urls = [masked(url) for url in urls]  # the first is the home server
         self._full = dict(zip(self.urls, urls, strict=True))  # URLs with users and passwords, by masked URL
         self.url = ""  # URL of the present server
-        self.others: Sequence[ServerPath] = ()  # the other paths of this process, for repeated reads
-        self.budget = RepeatBudget()  # shared by all paths of this process
+        self.others: Sequence[ServerPath] = ()  # the other connections of this process, for repeated reads
+        self.budget = RepeatBudget()  # shared by all connections of this process
         self._options = options or {}
         self._pong_s = pong_s
         self._client: BatchClient | None = None
         self._denials = Denials()
-        self._trouble = ""  # the failure that was logged last; "" since the last success
+        self._trouble = ""  # the failure that was logged last; "" once the connection works again
         self._leaving: set[asyncio.Task[None]] = set()
         self._wanted: dict[str, Callable[[Msg], Any]] = {}  # the function to call with messages, by subject
-        self._standing: dict[str, Subscription] = {}  # subscriptions at the present server, by subject
+        self._standing: dict[str, Subscription] = {}  # active subscriptions at the present server, by subject
         self._changing = asyncio.Lock()
 
     @property
@@ -129,7 +133,7 @@ class ServerPath:
             await asyncio.sleep(KEEP_S)
 
     async def check(self) -> None:
-        """Check the connection once; `keep` repeats this."""
+        """Check the connection once. `keep` calls this repeatedly."""
         if not self.is_open or not await self._answers():
             self._leave()
             await self.open()
@@ -153,7 +157,7 @@ class ServerPath:
                 await self._update_subscriptions(client, standing)
             except (NatsError, OSError) as failure:
                 await _close(client)
-                raise FleetError(f"{url} was lost again at once: {failure}") from None
+                raise FleetError(f"the new connection to {url} was lost at once: {failure}") from None
             self._leave()
             self._client, self.url, self._standing, self._denials = client, url, standing, denials
 
@@ -165,7 +169,7 @@ class ServerPath:
             self._client, self.url = None, ""
 
     async def subscribe(self, subject: str, called: Callable[[Msg], Any]) -> None:
-        """Call a coroutine function with each message of a subject, also after a change of server."""
+        """Await `called` with each message of a subject, also after a change of server."""
         self._wanted[subject] = called
         await self._change_subscriptions()
 
@@ -181,7 +185,7 @@ class ServerPath:
                     await self._update_subscriptions(self._client, self._standing)
 
     async def _update_subscriptions(self, client: BatchClient, standing: dict[str, Subscription]) -> None:
-        """Subscribe the client to exactly the subjects in `_wanted`; `standing` is updated."""
+        """Subscribe the client to exactly the subjects in `_wanted`, and update `standing`."""
         while standing.keys() != self._wanted.keys():
             for subject in self._wanted.keys() - standing.keys():
                 if called := self._wanted.get(subject):  # `unsubscribe` may have removed the subject
@@ -195,7 +199,8 @@ class ServerPath:
             await self.subscribe(subject, called)
             client = self._connected()
             with suppress(NatsError, OSError, TimeoutError):
-                await client.flush()  # this ping may overtake pending data, but the second ping cannot
+                # the server may answer this ping before it handles pending data, but not the second ping
+                await client.flush()
                 await client.flush()
 
     async def request(
@@ -299,19 +304,19 @@ async def _close(client: BatchClient) -> None:
 
 
 def _abort(client: BatchClient) -> None:
-    """Close the socket, and end the tasks that nats-py leaves if it is cancelled or the server is gone."""
+    """Close the client's socket, and end tasks that nats-py leaves if cancelled or without its server."""
     for subscription in client._subs.values():
         subscription._stop_processing()
     reading = client._reading_task
     if reading is not None and reading.done() and not reading.cancelled():
-        reading.exception()  # fetched, so that asyncio does not report it
+        reading.exception()  # fetches the exception, so that asyncio does not report it
     writer = getattr(client._transport, "_io_writer", None)
     if writer is not None and writer.transport is not None:
         writer.transport.abort()
 
 
 def paths_of(urls: Sequence[str], options: Mapping[str, Any] | None = None) -> list[ServerPath]:
-    """Return three paths. With three URLs, each path has a different home server."""
+    """Return three connections (paths). With three URLs, each has a different home server."""
     paths = [ServerPath([*urls[at % len(urls) :], *urls[: at % len(urls)]], options) for at in range(PATHS)]
     for path in paths:
         path.others, path.budget = [other for other in paths if other is not path], paths[0].budget
@@ -386,7 +391,7 @@ def _context(ca: Path | None) -> ssl.SSLContext:
 
 
 class RepeatBudget:
-    """The budget for repeated reads of one process, and how long to wait before a repeat.
+    """Limits how often one process repeats reads, and determines how long to wait before a repeat.
 
     If all servers are slow, repeated reads make them even slower. So the budget is empty at first. Each
     timely answer earns half a repeat. If a read was repeated, and its first request is answered after all,
@@ -399,10 +404,10 @@ class RepeatBudget:
 
     def __init__(self) -> None:
         self._left = 0.0
-        self._took_s = MOST_SILENCE_S / SLOW  # usual time of an answer; at first an assumed value
+        self._took_s = MOST_SILENCE_S / SLOW  # usual response time; the first value is an assumption
 
     def note(self, *, is_late: bool) -> None:
-        """Update the budget when the first request of a read was answered.
+        """Update the budget after a read whose first request was answered.
 
         `is_late` means that the read was repeated before the answer came.
         """
@@ -416,7 +421,7 @@ class RepeatBudget:
         return max(least_s, min(SLOW * self._took_s, MOST_SILENCE_S))
 
     def spend(self, paths: Sequence[ServerPath]) -> Sequence[ServerPath]:
-        """Return as many of these paths as the budget allows, and charge the budget for a repeat on each."""
+        """Return as many of these connections as the budget allows, and charge one repeat for each."""
         asked = paths[: int(self._left)]
         self._left -= len(asked)
         return asked
@@ -427,7 +432,7 @@ async def first_answer(
 ) -> list[DirectMessage]:
     """Return the messages of the first complete answer. Raises FleetError if no complete answer comes.
 
-    The request is first sent on the first path only, because that path usually answers immediately.
+    The request is first sent on the first connection only, because that one usually answers immediately.
     """
     loop = asyncio.get_running_loop()
     gets: dict[asyncio.Task[None], DirectGet] = {}

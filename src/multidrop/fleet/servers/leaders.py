@@ -25,12 +25,14 @@ from multidrop.supervisor import end_tasks
 
 # a server counts as silent after this time (in ns); followers contact their leader once a second
 SILENT_NS = 2_000_000_000
-SOON_S = 0.4  # time limit for leaders' answers, which usually take some milliseconds
-HAND_OVER_S = 3.0  # time between hand-overs of a bucket: shorter than the time between two elections
-SILENT_FOR_S = 60.0  # a server that is silent for longer than this is ignored
+SOON_S = 0.4  # time limit for a leader's answer, which usually takes some milliseconds
+HAND_OVER_S = 3.0  # pause between hand-overs of one bucket: shorter than the time between two elections
+# if a server is silent for longer than this, buckets are no longer handed over because of it
+SILENT_FOR_S = 60.0
 HANDED_S = 1.0  # time limit of a hand-over; it takes 0.03 to 0.3 s
 LEADER_LOOK_S = 0.02
-# interval of `keep_leaders`: leaders notice a silent server after 2 s, and it starts elections after 4 s
+# pause between checks by `keep_leaders`: leaders notice a silent server after 2 s, and that server starts
+# elections after 4 s
 KEEP_S = 0.4
 
 
@@ -56,13 +58,16 @@ class Replica(NamedTuple):
 
 
 class Cluster(NamedTuple):
-    """A bucket's leader ("" for none) and its followers."""
+    """The leader of a bucket ("" for none) and the servers that follow it."""
 
     leader: str = ""
     followers: tuple[Replica, ...] = ()
 
     def home_of(self, place: int) -> str:
-        """Return the server that should lead bucket number `place`. Servers take turns, sorted by name."""
+        """Return the server that should lead bucket number `place`.
+
+        The servers, sorted by name, take the buckets in turn.
+        """
         servers = sorted([self.leader, *(follower.name for follower in self.followers)])
         return servers[place % len(servers)]
 
@@ -100,20 +105,20 @@ def cluster_of(info: Mapping[str, Any], path: ServerPath) -> Cluster:
 
 
 async def known_cluster(path: ServerPath, bucket: str) -> Cluster:
-    """Return a bucket's leader and followers; a cluster without a leader if no server answers."""
+    """Return a bucket's leader and followers. If no server answers, the result has no leader."""
     with suppress(FleetError):
         return cluster_of(await ask(path, f"STREAM.INFO.KV_{bucket}"), path)
     return Cluster()
 
 
 async def have_leaders(path: ServerPath) -> bool:
-    """Return True if lines can be claimed: two of the three master buckets have a leader."""
+    """Return True if lines can be claimed: two of the three ownership buckets have a leader."""
     clusters = await asyncio.gather(*(known_cluster(path, bucket) for bucket in names.OWNERS))
     return sum(bool(cluster.leader) for cluster in clusters) >= NEEDED
 
 
 async def led_clusters(path: ServerPath) -> dict[str, Cluster]:
-    """Return, by bucket, the cluster of each lease or master bucket whose leader answers within SOON_S."""
+    """Return the lease and ownership buckets whose leaders answer within SOON_S, with their clusters."""
     buckets = (*names.LEASES, *names.OWNERS)
     looks = [asyncio.create_task(known_cluster(path, bucket)) for bucket in buckets]
     try:
@@ -128,7 +133,10 @@ async def led_clusters(path: ServerPath) -> dict[str, Cluster]:
 
 
 async def bring_leaders_home(path: ServerPath, clusters: Mapping[str, Cluster]) -> int:
-    """Hand over each bucket to its home server if that server is a ready follower. Return how many moved."""
+    """Hand over each bucket to its home server if that server is ready to lead.
+
+    Return the number of buckets that were handed over.
+    """
     moved = 0
     for place, bucket in (*enumerate(names.LEASES), *enumerate(names.OWNERS)):
         if cluster := clusters.get(bucket):
@@ -147,7 +155,7 @@ async def hand_over(path: ServerPath, bucket: str, server: str) -> None:
 
 
 class LeaseTerms:
-    """Keeps the Raft terms of the lease buckets newer than those of a silent server, by hand-overs."""
+    """Hands over the leadership of lease buckets to keep their Raft terms newer than a silent server's."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -155,9 +163,10 @@ class LeaseTerms:
         self._handed_at: dict[str, float] = {}  # time of the last hand-over, by bucket
 
     async def keep_ahead(self, path: ServerPath, clusters: Mapping[str, Cluster]) -> bool:
-        """Hand over the lease buckets that are due, and return True if any was due.
+        """Hand over each lease bucket that has a silent server, unless its last hand-over is too recent.
 
-        Stop after a failed hand-over, so that at most one bucket must wait for an election.
+        Return True if a hand-over was tried. Stop after a failed hand-over, so that at most one bucket must
+        wait for an election.
         """
         led = {bucket: clusters[bucket] for bucket in names.LEASES if bucket in clusters}
         silent = {bucket: cluster for bucket, cluster in led.items() if cluster.has_silent}
@@ -185,7 +194,10 @@ class LeaseTerms:
 
 
 async def _leads_now(path: ServerPath, bucket: str, server: str) -> bool:
-    """Hand a bucket over to this server; return True once the server leads it, False after HANDED_S."""
+    """Hand a bucket over to this server; return True once the server leads it.
+
+    Return False if that takes longer than HANDED_S.
+    """
     await hand_over(path, bucket, server)
     with suppress(TimeoutError):
         async with asyncio.timeout(HANDED_S):
@@ -198,7 +210,7 @@ async def _leads_now(path: ServerPath, bucket: str, server: str) -> bool:
 async def keep_leaders(
     path: Callable[[], ServerPath], is_ours: Callable[[], bool], clock: Callable[[], float] = time.monotonic
 ) -> None:
-    """Manage the buckets' leaders forever, whenever `is_ours()` returns True."""
+    """Manage the buckets' leaders forever, while `is_ours()` returns True."""
     terms = LeaseTerms(clock)
     while True:
         await asyncio.sleep(KEEP_S)

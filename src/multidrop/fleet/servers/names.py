@@ -1,4 +1,4 @@
-"""Names in NATS: the names of buckets and subjects, and valid names for the gateways and lines in them."""
+"""Names in NATS: bucket names, subjects, and the names of gateways and lines that are part of subjects."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def is_name(text: str) -> bool:
 
 @functools.lru_cache(1 << 16)
 def owner_buckets(line: str) -> tuple[str, ...]:
-    """Return the buckets that have the records of a line's master, in the order of writing."""
+    """Return the buckets that have the records of a line's owner, in the order of writing."""
     first = zlib.crc32(line.encode()) % len(OWNERS)
     return OWNERS[first:] + OWNERS[:first]
 

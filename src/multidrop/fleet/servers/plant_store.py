@@ -1,7 +1,7 @@
-"""Plant store: the plant's lines, with their family files, in the bucket `plant`, by line name.
+"""Plant store: the plant's lines, with their family files, as records in the bucket `plant`.
 
-A line's record holds the line's table of the plant file, and the text of the family files that it uses. So a
-gateway needs only the records of the lines that it polls.
+A record has the name of its line. It holds the line's table of the plant file, and the text of the family
+files that the line uses. So a gateway needs only the records of the lines that it polls.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from multidrop.fleet.servers.buckets import NONE_YET, Bucket, Follower, Record
 from multidrop.plant import FLEET_KEYS, MAY_KEYS, allowed, check_channels
 from multidrop.toml_check import TomlPlace
 
-AT_ONCE = 64  # limit of concurrent writes of records
+AT_ONCE = 64  # limit of concurrent writes to the bucket
 SOCKETS = ("socket://", "tcp://")
 
 
@@ -139,10 +139,10 @@ def line_of(record: Record, folder: Path) -> PlantLine:
     for name, text in value["files"].items():
         path = Path(name)
         if path.is_absolute() or ".." in path.parts:
-            raise ValueError(f"line {record.key}: the file {name!r} is outside of its folder")
+            raise ValueError(f"line {record.key}: the file {name!r} is outside the line's folder")
         (home / path).parent.mkdir(parents=True, exist_ok=True)
         (home / path).write_text(text, "utf-8")
-    plant = home / "line.plant"  # no family file has this suffix
+    plant = home / "line.plant"  # `.plant` is no suffix of family files, so this name is free
     plant.write_text(f"line = [{_toml(value['line'])}]\n", "utf-8")
     return Plant.load(plant).lines[0]
 

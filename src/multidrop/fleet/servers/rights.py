@@ -53,17 +53,18 @@ from multidrop.whole_file import whole_file
 API = "$JS.API"
 STORE = "multidrop"
 LAST_ANSWER = "10s"  # how long the server forwards further answers to one request
-ANSWER = '{ max: 1, expires: "1m" }'  # limits of an answer; a stop of many drives may take long
+ANSWER = '{ max: 1, expires: "1m" }'  # limits of answers to one request; a stop of many drives may take long
 _STORED = ("$JS.", "$KV.", f"{STREAM}.")
-_MANY = "$JS.API.DIRECT.GET."  # prefix of the requests that get several answers
+_MANY = "$JS.API.DIRECT.GET."  # prefix of JetStream requests that get several answers
 # Without this import, a server answers every JetStream request in a user's account with "not enabled".
 # No user has the right to send this request.
 _INFO = "$JS.API.INFO"
 CLUSTER = "multidrop"
-ROUTE_PORTS = 2000  # a server's port for routes is its client port plus this, such as 6222 for 4222
+# a server's port for routes to other servers is its client port plus this, such as 6222 for 4222
+ROUTE_PORTS = 2000
 MOST_PORTS = 65535
 DATA = Path("/var/lib/nats")
-PINGS = 'ping_interval: "1s", ping_max: 2'  # for routes: a dead route is noticed after 3 s
+PINGS = 'ping_interval: "1s", ping_max: 2'  # for routes between servers: a dead route is noticed after 3 s
 
 
 class UserRights(NamedTuple):
@@ -127,7 +128,7 @@ OTHERS: Mapping[str, UserRights] = {
 
 
 def rights_of(gateways: Sequence[str]) -> dict[str, UserRights]:
-    """Return the rights of each user of a fleet with these gateways, by user name.
+    """Return the rights of a fleet with these gateways, by user name.
 
     Raises ValueError for a name that is invalid or used twice.
     """
@@ -188,7 +189,7 @@ def _import(kind: str, account: str, subject: str) -> str:
 
 
 def _shared(some: Iterable[str], others: Iterable[str]) -> Iterator[str]:
-    """Yield each subject that matches an entry of both lists. A * matches one token."""
+    """Yield each subject that matches an entry of both lists. In an entry, * stands for one token."""
     for one in some:
         for other in others:
             words = list(zip(one.split("."), other.split("."), strict=False))

@@ -17,7 +17,7 @@ from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.leaders import bring_leaders_home, cluster_of, led_clusters
 
 CONTEST = "contest"
-ROUNDS = 40  # number of tests in `_contest`; nats-server 2.9.10 fails one of the first few
+ROUNDS = 40  # number of tests of concurrent writes; nats-server 2.9.10 fails one of the first few
 CLAIMANTS = 6
 MOST_REPLICAS = 3
 WAIT_S = 10.0  # time limit of retries; an election takes 4 to 9 s
@@ -29,7 +29,7 @@ _log = logging.getLogger("multidrop.fleet")
 
 
 async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
-    """Create the missing buckets, and return a summary. Raises FleetError with one sentence.
+    """Create the missing buckets of a fleet, and return a summary. Raises FleetError with one sentence.
 
     Existing buckets stay as they are. Creating a bucket requires answers of all servers.
     """
@@ -46,7 +46,7 @@ async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
     await _contest(paths, reached)
     for bucket in names.BUCKETS:
         await _retried(paths[0], partial(_create, paths[0], bucket_settings(bucket, replicas)))
-    # Wait until a server returns the bucket's records; right after the bucket's creation none does.
+    # Wait until a server returns the bucket's records: right after its creation, no server does.
     await _retried(paths[0], partial(Bucket(names.PLANT, lambda: paths[0]).changes, 0))
     await bring_leaders_home(paths[0], await led_clusters(paths[0]))
     servers = {path.server_name: path.version for path in paths}
@@ -132,7 +132,7 @@ async def _remove(path: ServerPath, stream: str) -> None:
 async def _retried(path: ServerPath, attempt: Callable[[], Awaitable[T]]) -> T:
     """Repeat an attempt for up to WAIT_S, because an election or another change may be in progress.
 
-    Raises NoRight or the servers' last refusal; FleetError if they have no quorum.
+    Raises NoRight, the servers' last refusal, or FleetError if the servers have no quorum.
     """
     loop = asyncio.get_running_loop()
     ends = loop.time() + WAIT_S
