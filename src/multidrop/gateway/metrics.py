@@ -1,6 +1,6 @@
-"""The plant and its gateway as Prometheus metric families, in base units such as volts and seconds.
+"""The values of a plant and its gateway as Prometheus metrics, in base units such as volts and seconds.
 
-A silent drive has no values: its series disappear, so an old value never looks current.
+A silent drive has no values: its time series end, so an old value never looks current.
 """
 
 from __future__ import annotations
@@ -25,19 +25,20 @@ from multidrop.transport import LineStatistics
 if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
 
-Sample = tuple[str, Mapping[str, str], float]  # suffix of the metric's name, labels, value
+# one sample of a metric: suffix of the metric's name, labels, value
+Sample = tuple[str, Mapping[str, str], float]
 HEALTH = ("ok", "degraded", "failed")
 STATES = (RUNS, STANDS, FAULT, SILENT, UNKNOWN)
 
 
 class BaseUnit(NamedTuple):
-    """The unit of a metric, and the factor by which a register's value is multiplied."""
+    """The unit of a metric, and the factor that converts a register's value to this unit."""
 
     name: str
     factor: float = 1.0
 
 
-UNITS = {  # a metric's unit, by the unit of its register
+UNITS = {  # by unit of a register: the unit of its metric
     "Hz": BaseUnit("hertz"),
     "kHz": BaseUnit("hertz", 1e3),
     "A": BaseUnit("amperes"),
@@ -60,8 +61,8 @@ UNITS = {  # a metric's unit, by the unit of its register
     "raw count": BaseUnit("raw"),
     "": BaseUnit("number"),
 }
-CODE = BaseUnit("code")  # unit of registers with named values; the metric has the raw counts
-OTHER = BaseUnit("other")  # for all other units: each series has its unit as a label
+CODE = BaseUnit("code")  # unit of registers with named values; their metrics have the raw counts
+OTHER = BaseUnit("other")  # for all other units: the register's own unit is in a label
 TEXTS = {
     "code": "Numbers of named values, such as states.",
     "number": "Values without a unit.",
@@ -71,7 +72,7 @@ TEXTS = {
 
 
 def families_of(gateway: Gateway) -> Iterator[MetricFamily]:
-    """Yield the metrics of the plant, and of the gateway itself."""
+    """Yield all metrics of the plant, and of the gateway itself."""
     version = [("_info", {"version": gateway.version}, 1.0)]
     yield MetricFamily("multidrop_build", "info", "The version.", version)
     status = health_of(gateway)["status"]
@@ -90,7 +91,7 @@ def families_of(gateway: Gateway) -> Iterator[MetricFamily]:
     failures = [("_total", {"part": name}, float(n)) for name, n in counts.items()]
     yield MetricFamily("multidrop_part_failures", "counter", "Failures by part.", failures)
     for feed in gateway.feeds.values():
-        with suppress(Exception):  # a failing part hides only its own figures
+        with suppress(Exception):  # a part that raises an exception loses only its own metrics
             yield from getattr(feed, "figures", list)()
     with suppress(OSError):  # no /proc, or no file descriptor left
         yield from process_families()
@@ -117,7 +118,7 @@ def _models(hub: Hub) -> Iterator[Sample]:
 
 
 def _value_families(hub: Hub) -> Iterator[MetricFamily]:
-    """Yield one family of polled registers' current values for each unit, then one family of all ages."""
+    """Yield a metric family of polled values for each unit, then one with the age of each value."""
     values: dict[str, list[Sample]] = {}
     ages: list[Sample] = []
     now_ns = hub.now_ns()
@@ -145,7 +146,7 @@ def base_unit(register: Register[Any]) -> BaseUnit:
 
 
 def _alarms(hub: Hub, lasting: list[Alarm]) -> Iterator[Sample]:
-    """Yield 0 or 1 for each kind of alarm of each line and drive."""
+    """Yield a sample for each kind of alarm of each line and drive: 1 if such an alarm is active, else 0."""
     active = {(alarm.drive or alarm.line, alarm.kind) for alarm in lasting}
     for line in hub.plant.lines:
         yield "", {"line": line.name, "drive": "", "kind": PORT}, float((line.name, PORT) in active)

@@ -1,1 +1,1 @@
-"""Live data of the drives: frames, events, alarms and views."""
+"""Live data of the drives: their newest values, the frames sent to pages, triggers and alarms."""

@@ -1,4 +1,4 @@
-"""AlarmFile: keeps alarms on disk, in a thread of its own, so that polling never waits for a disk."""
+"""AlarmFile: keeps alarms on disk, in its own thread, so that polling never waits for a disk."""
 
 from __future__ import annotations
 
@@ -13,23 +13,24 @@ from typing import Any
 from multidrop.gateway.live.alarms import KINDS, MOST_ENDED, Alarm
 from multidrop.whole_file import whole_file
 
-MOST_WAITING = 10_000  # limit of alarms queued for writing
-MOST_BYTES = 4 << 20  # a longer file is rewritten with only the newest alarms
+MOST_WAITING = 10_000  # limit of alarms that wait to be written
+MOST_BYTES = 4 << 20  # in bytes: a longer file is rewritten with only the newest alarms
 SLOW_S = 10.0  # a disk access that takes longer than this (in s) is reported
 CLOSE_S = 2.0
 
 
 class AlarmFile:
-    """A file of alarms as JSON lines; if an alarm has several lines, the last line counts.
+    """A file of alarms as JSON lines. If several lines are about one alarm, the last of them counts.
 
-    All disk access is in `run`, which needs a thread of its own. No method raises.
+    All disk access is in `run`, which needs its own thread. No method raises.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.past: list[Alarm] | None = None  # alarms of earlier runs; None until they are read
+        # alarms of earlier runs of the gateway; None until they are read
+        self.past: list[Alarm] | None = None
         self._failure = ""
-        self._since = time.monotonic()  # start of the present disk access in s; inf while idle
+        self._since = time.monotonic()  # when the present disk access started, in s; inf if there is none
         self._waiting: Queue[Alarm | None] = Queue(MOST_WAITING)
         self._ended = threading.Event()
 
@@ -41,7 +42,7 @@ class AlarmFile:
         return f"alarms are not kept: {self._failure}" if self._failure else ""
 
     def note(self, alarm: Alarm) -> None:
-        """Queue an alarm that started, ended or changed."""
+        """Queue an alarm that started, ended or changed, to be written."""
         try:
             self._waiting.put_nowait(alarm)
         except Full:
@@ -58,7 +59,7 @@ class AlarmFile:
     # ---- on the thread ----
 
     def run(self) -> None:
-        """Read the alarms of earlier runs, then write queued alarms until `close`."""
+        """Read the alarms of earlier runs, then write the queued alarms until `close` is called."""
         try:
             self._keep()
         finally:
@@ -109,7 +110,10 @@ class AlarmFile:
 
 
 def _line(alarm: Alarm) -> str:
-    """Return the alarm's line. It starts with a newline: a power cut may have truncated the line before."""
+    """Return the alarm's line.
+
+    It starts with a newline, because a power cut may have truncated the line before it.
+    """
     return f"\n{json.dumps(alarm.as_json())}\n"
 
 

@@ -1,4 +1,4 @@
-"""Alarms of drives and lines, and the limits of values that raise them. This module does no I/O."""
+"""Alarms of drives and lines, and the limits of values that raise alarms. This module does no I/O."""
 
 from __future__ import annotations
 
@@ -24,15 +24,17 @@ from multidrop.gateway.live.hub import (
 )
 from multidrop.toml_check import DURATION, Key, TomlPlace, duration_of
 
-STOPPED, PORT, LIMIT = "stopped", "port", "limit"  # kinds of alarms in addition to FAULT and SILENT
-KINDS = (FAULT, STOPPED, LIMIT, PORT, SILENT)  # the most serious kind first
+STOPPED, PORT, LIMIT = "stopped", "port", "limit"  # kinds of alarms, besides FAULT and SILENT
+KINDS = (FAULT, STOPPED, LIMIT, PORT, SILENT)  # kinds of alarms, the most serious kind first
 UNCALLED = "the motor stopped, and no stop was called here"
-# a motor counts as stopped after this time (in ms) at rest, because a reversing motor passes 0 Hz
+# in ms: a motor counts as stopped after this time at rest; a motor that reverses also passes 0 Hz, but
+# briefly
 STANDS_MS = 2000
 MOST_ENDED = 1000  # limit of ended alarms that are kept
 MOST_SHOWN = 20  # limit of ended alarms that clients see
-SEPARATOR = "; "  # between a drive's exceeded limits in the alarm's text
-LOST = ("port lost", "port refused its settings")  # statuses of a line's rows while its port is lost
+SEPARATOR = "; "  # text between a drive's exceeded limits in an alarm's text
+# the status of all rows of a line starts with one of these while the line's port is lost
+LOST = ("port lost", "port refused its settings")
 LIMIT_KEYS = {
     "drive": Key(str, 'drive = "pump-1"', needed=True),
     "register": Key(str, 'register = "output_current"', needed=True),
@@ -55,19 +57,19 @@ class Alarm(NamedTuple):
     """A problem of a drive or a line, present or past; times are UTC in ms."""
 
     time: int
-    drive: str  # "" for an alarm of a line
+    drive: str  # the drive's name; "" if the alarm is about a line
     text: str
     ended: int | None
     kind: str
     line: str = ""
-    is_before: bool = False  # True: `time` is when the alarm was first seen; it may have started earlier
+    is_before: bool = False  # True: `time` is when the alarm was first seen, but it may have started earlier
     acknowledged: int | None = None
-    by: str = ""  # the caller who acknowledged the alarm
+    by: str = ""  # name of the caller who acknowledged the alarm
     note: str = ""
 
     @property
     def id(self) -> str:
-        """A unique id, stable across restarts."""
+        """A unique id, the same after a restart of the gateway."""
         return f"{self.time} {self.kind} {self.drive or self.line}"
 
     @property
@@ -80,7 +82,7 @@ class Alarm(NamedTuple):
         return {"id": self.id, **self._asdict()}
 
     def as_answer(self) -> dict[str, Any]:
-        """Return the alarm for clients, with times as ISO 8601 text."""
+        """Return the alarm as clients get it, with times as ISO 8601 text."""
         times = {"time": self.time, "ended": self.ended, "acknowledged": self.acknowledged}
         return self.as_json() | {key: ms and iso_time(ms) for key, ms in times.items()}
 
@@ -88,7 +90,7 @@ class Alarm(NamedTuple):
 class Alarms:
     """The active alarms, and the latest ended ones.
 
-    `since` is a UTC time in ms: alarms that ended earlier may be forgotten. `note` is called with each alarm
+    `since` is a UTC time in ms; alarms that ended before it may be missing. `note` is called with each alarm
     that started, ended or changed, and with the kind of change.
     """
 
@@ -100,23 +102,23 @@ class Alarms:
         # active alarms, oldest first, by line, drive and kind
         self._lasting: dict[tuple[str, str, str], Alarm] = {}
         self._ended: deque[Alarm] = deque(maxlen=MOST_ENDED)
-        self._known: set[tuple[str, str]] = set()  # lines and drives seen so far
-        # by drive: value of the argument `stops` of `look` when a run was first seen
+        self._known: set[tuple[str, str]] = set()  # lines and drives whose state was seen before
+        # by drive: the argument `stops` of `look` when the motor was first seen running
         self._runs: dict[str, int] = {}
-        self._stands: dict[str, int] = {}  # by drive: when a motor that ran was first seen at rest
-        self.begun = 0  # number of alarms so far
+        self._stands: dict[str, int] = {}  # by drive: when its motor was first seen at rest after running
+        self.begun = 0  # number of alarms that started so far
 
     # ---- observations ----
 
     def look(self, time: int, drive: str, shown: Shown, stops: int | None = None) -> None:
-        """Note a drive's state. A fault stays active while its drive is silent.
+        """Note a drive's state, and start or end its alarms. A fault stays active while its drive is silent.
 
-        `stops` is the number of commands so far that can end a run of the motor. If it is None, a motor at
-        rest raises no alarm.
+        `stops` is the number of commands so far that can end a run of the motor. If it is None, a stopped
+        motor raises no alarm.
         """
         state, words = shown.state, shown.words
         if state == SILENT:
-            # for a lost port, the line has one alarm instead of one for each drive
+            # if a port is lost, its line has one alarm, and its drives have none
             if not (words or "").startswith(LOST):
                 self._begin(time, "", drive, SILENT, words or "no reply")
             return
@@ -151,7 +153,9 @@ class Alarms:
         self._stands.pop(drive, None)
 
     def look_at_line(self, time: int, line: str, lost: str | None) -> None:
-        """Note why a line's port is lost. If `lost` is None, note that the port works."""
+        """Start the alarm about a line's lost port, with the reason `lost`; if `lost` is None, end the
+        alarm.
+        """
         if lost is None:
             self._end(time, line, "", PORT)
         else:
@@ -160,8 +164,8 @@ class Alarms:
     def look_at_limits(self, time: int, drive: str, exceeded: Callable[[str], str]) -> None:
         """Start, update or end the alarm about a drive's exceeded limits.
 
-        `exceeded` is called with the text of the active alarm ("" without one), and returns the alarm's
-        new text ("" if no limit is exceeded).
+        `exceeded` is called with the active alarm's text ("" if there is none). It returns the new text (""
+        if no limit is exceeded).
         """
         lasting = self._lasting.get(("", drive, LIMIT))
         text = exceeded(lasting.text if lasting else "")
@@ -171,7 +175,10 @@ class Alarms:
             self._end(time, "", drive, LIMIT)
 
     def note_there(self, line: str) -> None:
-        """Note that a line works: if its port is lost later, the start of that alarm is exact."""
+        """Note that a line works.
+
+        If its port is lost later, the start of that alarm is then known exactly.
+        """
         self._known.add((line, ""))
 
     def forget(self, name: str, time: int) -> None:
@@ -185,7 +192,7 @@ class Alarms:
     # ---- acknowledgement, and alarms of earlier runs ----
 
     def acknowledge(self, id: str, time: int, by: str, note: str = "") -> Alarm:
-        """Acknowledge an alarm, and return it; this also ends an alarm of kind "stopped".
+        """Acknowledge an alarm, and return it. This ends the alarm if its kind is "stopped".
 
         Raises KeyError for an unknown id.
         """
@@ -219,12 +226,13 @@ class Alarms:
                 self._take_up(alarm, time, names)
 
     def _take_up(self, alarm: Alarm, time: int, names: Collection[str]) -> None:
-        """Continue an alarm of an earlier run, or end it if it is over or its drive or line was removed."""
+        """Continue an alarm of an earlier run. End it if it is over, or if its drive or line was removed."""
         key = alarm.key
         present = self._lasting.get(key)
         is_seen = key[:2] in self._known and present is None
         if present is not None and present.is_before and present.text in (alarm.text, UNNAMED):
-            self._lasting[key] = alarm  # both are the same alarm: keep the earlier one, with its start
+            # the alarm seen now is the same one: keep the earlier record, which has the start
+            self._lasting[key] = alarm
         elif present is not None or is_seen or (alarm.drive or alarm.line) not in names:
             self._ended.append(alarm._replace(ended=time))
             self._note(self._ended[-1], AlarmChange.ENDED)
@@ -247,7 +255,7 @@ class Alarms:
 
     @property
     def lasting(self) -> list[Alarm]:
-        """The active alarms: unacknowledged ones first, then the gravest kind, then the newest."""
+        """The active alarms: unacknowledged before acknowledged ones, then by kind, then the newest first."""
         return sorted(
             self._lasting.values(),
             key=lambda alarm: (alarm.acknowledged is not None, KINDS.index(alarm.kind), -alarm.time),
@@ -264,7 +272,7 @@ class Alarms:
             return
         is_less = kind == LIMIT and before is not None and _parts(text) < _parts(before.text)
         if before is not None and (before.text == UNNAMED or kind == PORT or is_less):
-            # the active alarm continues, with this more precise text
+            # the same alarm continues, with a new text
             self._lasting[key] = before._replace(text=text)
             self._note(self._lasting[key], AlarmChange.CHANGED)
             return
@@ -283,7 +291,7 @@ class Alarms:
 
 
 def _parts(text: str) -> set[str]:
-    """Return the exceeded limits that the text of an alarm of kind LIMIT lists."""
+    """Return the set of exceeded limits that an alarm's text of kind LIMIT lists."""
     return {*text.split(SEPARATOR)}
 
 
@@ -291,15 +299,16 @@ def _parts(text: str) -> set[str]:
 
 
 class Limit(NamedTuple):
-    """A bound of a polled value. It is exceeded once the value has been beyond it for `lasting_s` seconds.
+    """An upper or lower limit of a polled value.
 
-    It stays exceeded until the value is back within the bound by `hysteresis`, in the register's unit.
+    The limit is exceeded once the value has been beyond it for `lasting_s` seconds. It stays exceeded until
+    the value is back by at least `hysteresis`, in the register's unit.
     """
 
     drive: str
     register: str
     unit: str
-    is_above: bool  # True: the bound is an upper limit; False: a lower limit
+    is_above: bool  # True: an upper limit; False: a lower limit
     bound: float
     lasting_s: float = 0.0
     hysteresis: float = 0.0
@@ -309,12 +318,12 @@ class Limit(NamedTuple):
         return f"{self.register} {side} {self.bound:g} {self.unit}".rstrip()
 
     def is_beyond(self, value: float, margin: float) -> bool:
-        """Return True if the value is beyond the bound, or back by less than `margin`."""
+        """Return True if the value is beyond the limit, or within it by less than `margin`."""
         return value > self.bound - margin if self.is_above else value < self.bound + margin
 
 
 class Limits:
-    """The limits of a plant, and for each of them the time when its value went beyond the bound."""
+    """The limits of a plant's values, and for each limit the time when its value went beyond it."""
 
     def __init__(self, limits: Iterable[Limit]) -> None:
         self._of: dict[str, list[Limit]] = {}
@@ -326,11 +335,11 @@ class Limits:
         return drive in self._of
 
     def exceeded(self, now_s: float, drive: str, values: Mapping[str, float], before: str) -> str:
-        """Return the drive's exceeded limits as a text; "" if there are none.
+        """Return a text with the drive's exceeded limits; "" if there are none.
 
-        `values` has the current values by register. While a value is missing, its limit keeps its state,
-        and `lasting_s` starts again afterwards. `before` is the text that the previous call returned, or
-        the text of an alarm of an earlier run.
+        `values` has the current values by register. While a value is missing, its limit stays exceeded or not
+        exceeded, and `lasting_s` starts again afterwards. `before` is the text that the previous call
+        returned, or the text of an alarm of an earlier run.
         """
         found = []
         for limit in self._of.get(drive, ()):
@@ -350,7 +359,7 @@ class Limits:
 
 
 def current_values(hub: Hub, drive: str) -> dict[str, float]:
-    """Return the newest values of a drive's polled registers by name, without those that are too old."""
+    """Return the newest values of a drive's polled registers by name, without values that are too old."""
     return {
         register.name: good[2]
         for register, _, good, is_current in hub.known(drive)
@@ -359,7 +368,7 @@ def current_values(hub: Hub, drive: str) -> dict[str, float]:
 
 
 def read_limits(tables: Any, plant: Plant, place: TomlPlace) -> tuple[Limit, ...]:
-    """Return the limits in the tables `[[serve.limit]]`; mistakes are added to `place`."""
+    """Return the limits in the tables `[[serve.limit]]` of a plant file; add mistakes to `place`."""
     units = {
         (polled.drive.name, poll.register.name): poll.register.unit
         for polled in plant.drives
@@ -376,9 +385,10 @@ def read_limits(tables: Any, plant: Plant, place: TomlPlace) -> tuple[Limit, ...
 
 
 def _limit(given: Mapping[str, Any], lasting_s: float, units: Mapping[tuple[str, str], str] | None) -> Limit:
-    """Return a limit. `units` has the unit of each polled register, or is None if the plant has no lines.
+    """Return the limit in one table `[[serve.limit]]`.
 
-    Raises ValueError for an invalid limit.
+    `units` has the unit of each polled register, or is None if the plant has no lines. Raises ValueError for
+    an invalid limit.
     """
     drive, register = given["drive"], given["register"]
     if units is not None and (drive, register) not in units:

@@ -1,4 +1,4 @@
-"""Reads in addition to polling: identities, and registers and parameters of viewed drives."""
+"""Reads in addition to polling: identities, and registers and parameters of drives that a user views."""
 
 from __future__ import annotations
 
@@ -14,28 +14,30 @@ from typing import Any
 from multidrop import Bus, BusError, Drive, NoReply, Plant, WriteForbidden, params
 from multidrop.supervisor import Hung, supervisor
 
-PAUSE_S = 0.2  # least pause between two reads on a line, which leaves time for polling
-SHARE = 20  # the pause is at least this many times the duration of the last read
-LOOKED_S = 3.0  # a drive is read until this many seconds after its last view
-MOST_DRIVES = 4  # limit of drives that are read concurrently
-READ_S = 30.0  # time limit of one read
+PAUSE_S = 0.2  # shortest pause, in s, between two reads on a line, which leaves time for polling
+SHARE = 20  # the pause after a read is at least this many times the duration of the read
+LOOKED_S = 3.0  # a drive is read until this many seconds after a page last requested its values
+MOST_DRIVES = 4  # limit of drives whose registers are read concurrently
+READ_S = 30.0  # time limit, in s, of reading one register
 UNANSWERED = "no reply"
 
-ROUND_S = 2.0  # pause between two rounds of identity checks
-ASKED_S = 30.0  # time limit of one identity check
+ROUND_S = 2.0  # pause, in s, between two rounds in which all unknown identities are checked
+ASKED_S = 30.0  # time limit, in s, of one identity check
 REST_S = 0.1  # pause before each read of an identity check, which leaves time for polling
 
 MOST_READS = 2  # limit of drives whose parameters are read concurrently
-PARAMETERS_S = 3600.0  # time limit of reading a drive's parameters
-# pause after a block of parameters: this many times the block's duration, and its limit in s
+PARAMETERS_S = 3600.0  # time limit, in s, of reading all parameters of a drive
+# pause after a block of parameters: this many times the duration of the block's read, but not longer than the
+# second number in s
 PARAMETER_SHARE, MOST_PAUSE_S = 3, 1.0
 
-ReadValues = dict[str, list[Any]]  # by register: value or None, time (UTC, ms), "ok" or the failure
+# by register: its value or None, the time of the read (UTC, ms), "ok" or the reason of the failure
+ReadValues = dict[str, list[Any]]
 _log = logging.getLogger("multidrop.gateway")
 
 
 class SideReads:
-    """Reads all registers of viewed drives, one read at a time per line.
+    """Reads the unpolled registers of drives that a page shows, one read at a time per line.
 
     `is_there` returns whether a drive answers.
     """
@@ -49,7 +51,8 @@ class SideReads:
     ) -> None:
         self._bus = bus
         self._is_there = is_there
-        self._turns: dict[str, asyncio.Lock] = {}  # by line: a lock that is held during a read
+        # by line: a lock that makes the line's reads wait for each other
+        self._turns: dict[str, asyncio.Lock] = {}
         self._clock = clock
         self._utc_ms = utc_ms
         self._looked: dict[str, float] = {}
@@ -57,7 +60,7 @@ class SideReads:
         self._tasks: dict[str, asyncio.Task[None]] = {}
 
     def look(self, plant: Plant, name: str) -> ReadValues:
-        """Return the values read so far, and read on for LOOKED_S. Raises ValueError for an unknown drive."""
+        """Return the values read so far; read on for LOOKED_S. Raises ValueError for an unknown drive."""
         line, drive = plant.find_drive(name)
         self._looked[name] = self._clock()
         found = self._found.setdefault(name, {})
@@ -69,7 +72,7 @@ class SideReads:
         return found
 
     def _can_read(self, line: str) -> bool:
-        """Return True if this process has a bus for the line."""
+        """Return True if the gateway has a bus for this line."""
         try:
             return self._bus(line) is not None
         except ValueError:
@@ -80,7 +83,7 @@ class SideReads:
         return len(self._tasks)
 
     def cancel(self) -> None:
-        """Cancel all reads after a reload, because names may mean other drives now."""
+        """Cancel all reads. Called after a reload, because a drive's name may mean another drive now."""
         for task in self._tasks.values():
             task.cancel()
         self._tasks.clear()
@@ -102,11 +105,12 @@ class SideReads:
                     async with turn:
                         await self._read_in_turn(line, drive, register)
                     if found.get(register, ["", 0, ""])[2].startswith(UNANSWERED):
-                        registers.remove(register)  # not read again: each attempt would cost a timeout
+                        # a register without a reply is not read again, because each attempt costs a timeout
+                        registers.remove(register)
         finally:
             if self._tasks.get(drive.name) is asyncio.current_task():
                 del self._tasks[drive.name]
-                self._found.pop(drive.name, None)  # values that are no longer updated must not be shown
+                self._found.pop(drive.name, None)  # pages must not get values that are no longer updated
 
     async def _read_in_turn(self, line: str, drive: Drive, register: str) -> None:
         begun = self._clock()
@@ -126,10 +130,10 @@ class SideReads:
 
 
 class Identities:
-    """Checks each drive's identity once while its port is open, so that the drive's first stop need not
-    wait for the check.
+    """Checks each drive's identity once while its port is open, so that the drive's first stop need not wait
+    for the check.
 
-    `fail` is called in the `except` block of an unexpected exception, so it can log the exception.
+    `fail` is called in the `except` block of an unexpected exception, so that it can log the exception.
     """
 
     def __init__(
@@ -143,10 +147,10 @@ class Identities:
         self._bus = bus
         self._is_there = is_there
         self._fail = fail
-        self._refused: dict[str, str] = {}  # the refusal that was logged last, by drive
+        self._refused: dict[str, str] = {}  # by drive: the reason of the failed check that was logged last
 
     async def run(self) -> None:
-        """Check all drives in rounds, forever: a drive may answer again, and a port may be reopened."""
+        """Check all drives in rounds, forever, because drives may answer again and ports may be reopened."""
         while True:
             drives = [(line.name, polled.drive) for line in self._plant().lines for polled in line.drives]
             for line, drive in drives:
@@ -172,7 +176,7 @@ class Identities:
             if self._refused.get(drive.name) != str(refusal):
                 _log.warning("%s", refusal)
             self._refused[drive.name] = str(refusal)
-        except (BusError, ValueError):  # checked again in a later round, unless the drive was removed
+        except (BusError, ValueError):  # retried in a later round, unless the drive was removed
             pass
 
 
@@ -181,7 +185,7 @@ class Identities:
 
 @dataclass
 class ParameterRead:
-    """One read of a drive's parameters: its progress, its result, or its error."""
+    """One read of all parameters of a drive: its progress, and its result or error."""
 
     drive: Drive
     done: int = 0
@@ -200,7 +204,7 @@ class ParameterRead:
 
 
 class ParameterReads:
-    """The newest ParameterRead of each drive, kept until the drive's next one or a reload."""
+    """The newest ParameterRead of each drive. It is kept until the drive's next one, or until a reload."""
 
     def __init__(self) -> None:
         self._reads: dict[str, ParameterRead] = {}
@@ -238,7 +242,7 @@ class ParameterReads:
 
 
 class _Paced:
-    """Progress callback: counts the parameters that were read, and pauses after each block."""
+    """Progress callback of a parameter read: counts the parameters, and pauses after each block."""
 
     def __init__(self, read: ParameterRead) -> None:
         self._read = read

@@ -1,8 +1,8 @@
-"""Frames: the state of the plant for all viewers, made at most five times a second.
+"""Frames: descriptions of the plant's state for all viewers, made at most five times a second.
 
-A viewer requests a frame only after it has the frame before, so no queue builds up for a slow viewer.
-The request has the number of the viewer's newest frame, and the answer has the changes since that frame. If
-the gateway no longer remembers that frame, the answer is the whole newest frame.
+A viewer, such as a page, requests a frame only after it has received the previous frame, so no queue builds
+up for a slow viewer. The request has the number of the viewer's newest frame, and the answer has the changes
+since that frame. If the gateway no longer remembers that frame, the answer is the whole newest frame.
 """
 
 from __future__ import annotations
@@ -22,22 +22,23 @@ from multidrop.gateway.live.alarms import LOST, Alarms
 from multidrop.gateway.live.hub import Hub, KeptRow
 from multidrop.gateway.live.recent_statistics import RecentStatistics
 
-LEAST_S = 0.2  # least mean time between two frames
-EARLY_S = 0.02  # after a late frame, the next frame may come this much earlier than LEAST_S
-WAIT_S = 20.0  # longest wait for a frame
+LEAST_S = 0.2  # shortest mean time, in s, between two frames
+EARLY_S = 0.02  # in s: after a late frame, the next frame may come this much earlier than LEAST_S
+WAIT_S = 20.0  # longest wait, in s, of a request for a frame
 MOST_VIEWERS = 200  # limit of concurrently waiting viewers
 WHOLE = -1  # frame number in the request of a viewer that has no frame yet
-REMEMBERED = 6  # number of newest frames that are kept, for viewers that are up to a second behind
+# number of newest frames that are kept, so that viewers up to a second behind still get changes only
+REMEMBERED = 6
 
 Times = tuple[int, int]  # one moment in UTC and by CLOCK_MONOTONIC, both in ns
 MOST_AGE_NS = round(MOST_AGE_S * 1e9)
-# values of WriteForbidden.rule
+# values of the field `rule` of WriteForbidden
 TOO_LATE, OVERTAKEN, DOUBLED = "too late", "a stop was called", "it came before"
 ANOTHER_PLANT = "the plant was read again"
 
 
 class Encoded(NamedTuple):
-    """A frame as it is sent: the whole frame, or only its changes since an earlier one."""
+    """A frame as it is sent to a viewer: the whole frame, or only the changes since an earlier frame."""
 
     n: int
     plain: bytes
@@ -54,7 +55,7 @@ def frame_of(
     revision: int,
     time_ns: int,
 ) -> dict[str, Any]:
-    """Return the present frame. `stops` has the number of stops of each drive so far."""
+    """Return the present frame. `stops` has the number of stops called so far, by drive."""
     return {
         "n": n,
         "revision": revision,
@@ -73,7 +74,10 @@ def frame_of(
 
 
 def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
-    """Return a drive's part of the frame. A fresh value is a pair: value, index of its age in `ages_ms`."""
+    """Return a drive's entry in the frame.
+
+    A fresh value is a pair: the value, and its age as an index into the list `ages_ms` of the frame.
+    """
     shown = hub.seen(name)
     answer = hub.last_answer(name)
     now = time_ns, hub.now_ns()
@@ -96,15 +100,16 @@ def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
 
 
 def _age_ms(now: Times, asked: Times) -> int:
-    """Return the larger of two ages in ms: that by UTC, and that by CLOCK_MONOTONIC.
+    """Return the age in ms of a request sent at `asked`: the larger of the ages by UTC and by
+    CLOCK_MONOTONIC.
 
-    UTC may be set back, and CLOCK_MONOTONIC stops while the computer sleeps: both make an age too small.
+    UTC may be set back, and CLOCK_MONOTONIC stops while the computer sleeps. Both make an age too small.
     """
     return max(one // 1_000_000 - then // 1_000_000 for one, then in zip(now, asked, strict=True))
 
 
 class TimeNumbers(dict[Times, int]):
-    """Numbers the distinct request times of a frame from 0. All values of one request share one number."""
+    """Numbers the distinct request times in a frame from 0, because many values share one request."""
 
     def __missing__(self, time: Times) -> int:
         self[time] = number = len(self)
@@ -114,9 +119,9 @@ class TimeNumbers(dict[Times, int]):
 def _unknown(
     hub: Hub, newest: KeptRow | None, good: KeptRow | None, times: TimeNumbers, now: Times
 ) -> tuple[Any, ...]:
-    """Return the entry of a value that is not fresh: None, index of the age, status.
+    """Return the entry of a value that is not fresh: None, index of the age, status of the newest read.
 
-    If there is an earlier good value, that value and the index of its age follow.
+    If an earlier read succeeded, its value and the index of its age follow.
     """
     if newest is None:
         return None, times[now], "not asked yet"
@@ -133,7 +138,7 @@ def _finite(value: float) -> float | None:
 def lost_of(hub: Hub, line: str) -> str | None:
     """Return why a line's port is stalled or lost; None if the port works.
 
-    The port counts as lost if the newest rows of all registers of the line have a status in LOST.
+    The port counts as lost if the newest reads of all registers of the line failed with a status in LOST.
     """
     if line in hub.stalled:
         return hub.stalled[line]
@@ -150,7 +155,7 @@ def lost_of(hub: Hub, line: str) -> str | None:
 
 
 def changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
-    """Return the entries of `now` whose values differ from those of `before`, which has the same keys.
+    """Return the entries of `now` whose values differ from those in `before`, which has the same keys.
 
     Nested objects are compared in the same way.
     """
@@ -164,8 +169,8 @@ def changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
 class Frames:
     """The newest frames, and the viewers that wait for the next frame.
 
-    `clock` returns monotonic seconds. Frame numbers start at `begin`, which is random so that a frame of an
-    earlier process is never mistaken for a frame of this process.
+    `clock` returns monotonic seconds. Frame numbers start at `begin`. It must be random, so that a frame of
+    an earlier process is never mistaken for one of this process.
     """
 
     def __init__(
@@ -175,7 +180,7 @@ class Frames:
         self._clock = clock
         self._begin = begin
         self._remembered: deque[dict[str, Any]] = deque(maxlen=REMEMBERED)  # the newest last
-        # encodings of the newest frame, by the number of the frame that a viewer has already (or WHOLE)
+        # encodings of the newest frame by the number of the frame that the viewer has, or by WHOLE
         self._encoded: dict[int, Encoded] = {}
         self._due = 0.0
         self._timer: asyncio.TimerHandle | None = None
@@ -189,7 +194,7 @@ class Frames:
         return len(self._waiting)
 
     def note_news(self) -> None:
-        """Note that the state has changed since the newest frame."""
+        """Note that the plant's state has changed since the newest frame."""
         self._has_news = True
         self._build_when_due()
 
@@ -224,7 +229,7 @@ class Frames:
         turn: asyncio.Future[None] = loop.create_future()
         self._waiting.add(turn)
         self._build_when_due()
-        timer = loop.call_later(WAIT_S, _let_go, turn)  # cheaper than asyncio.wait_for
+        timer = loop.call_later(WAIT_S, _let_go, turn)  # cheaper than one asyncio.wait_for for each viewer
         try:
             await turn
         finally:
@@ -233,20 +238,21 @@ class Frames:
         return self._since(n)
 
     def close(self) -> None:
-        """Answer all waiting viewers now, without a frame."""
+        """Answer all waiting viewers now, without a new frame."""
         self._is_closed = True
         self._wake()
 
     def _since(self, n: int) -> Encoded | None:
         """Return the changes from frame `n` to the newest frame; None if frame `n` is the newest.
 
-        Return the whole newest frame if frame `n` is forgotten, or is from before a reload.
+        If frame `n` is not remembered, or is from before a reload, return the whole newest frame.
         """
         if not self._remembered or self._remembered[-1]["n"] == n:
             return None
         newest = self._remembered[-1]
         known = next((one for one in self._remembered if one["n"] == n), None)
-        if known is None or known["revision"] != newest["revision"]:  # after a reload, the keys may differ
+        # frames from before a reload may have other keys
+        if known is None or known["revision"] != newest["revision"]:
             n, known = WHOLE, None
         if n not in self._encoded:
             frame = newest if known is None else {"n": newest["n"], "since": n, **changes(known, newest)}
@@ -276,9 +282,9 @@ def _let_go(turn: asyncio.Future[None]) -> None:
 class SeenFrames:
     """Protects commands over HTTP from networks that delay or repeat them.
 
-    A write, or a verb that may move a motor, names the newest frame that its sender has seen. The command is
-    sent once, within MOST_AGE_S of that frame, and only if no stop and no reload followed the frame. Clocks
-    of other computers are not used.
+    A write, or a verb that may start a motor, contains the number of the newest frame that its sender has
+    seen. The command is sent once, within MOST_AGE_S of that frame, and only if no stop of the drive and no
+    reload followed the frame. Clocks of other computers are not used.
 
     `clock` returns a time in ns that goes on while the computer sleeps.
     """
@@ -286,12 +292,12 @@ class SeenFrames:
     def __init__(self, clock: Callable[[], int], commands: Commands) -> None:
         self.clock = clock
         self._commands = commands
-        self._made: dict[int, int] = {}  # by a frame's number: when the frame was made (ns)
-        # admitted commands, by the number of the frame that they named
+        self._made: dict[int, int] = {}  # by frame number: when the frame was made (ns)
+        # by frame number: the admitted commands that contained this number
         self._came: dict[int, set[object]] = {}
 
     def note(self, n: int) -> None:
-        """Note that the frame of this number is made now."""
+        """Record that frame `n` is made now."""
         now_ns = self.clock()
         self._made[n] = now_ns
         for old in [one for one, made_ns in self._made.items() if now_ns - made_ns > MOST_AGE_NS]:
@@ -303,15 +309,15 @@ class SeenFrames:
 
         Return the time in ns until which the command may be sent.
 
-        Raises WriteForbidden if the command is too late or a repetition, or if a stop or reload
-        followed the frame.
+        Raises WriteForbidden if the command is too late or repeats another, or if a stop of the drive or a
+        reload followed the frame.
         """
         made_ns = self._made.get(seen)
         until_ns = 0 if made_ns is None else made_ns + MOST_AGE_NS
         if made_ns is None or self.clock() > until_ns:
             last = f"frame {seen} is not from the last {MOST_AGE_S:g} s"
             raise WriteForbidden(f"{what} was not sent: {last}: check and confirm again", rule=TOO_LATE)
-        if (self._commands.plant_ns or 0) >= made_ns:  # a name may mean another drive now
+        if (self._commands.plant_ns or 0) >= made_ns:  # the drive's name may mean another drive now
             since = f"the plant file was reloaded after frame {seen}"
             raise WriteForbidden(f"{what} was not sent: {since}: check and confirm again", rule=ANOTHER_PLANT)
         if (self._commands.stopped_ns(drive) or 0) >= made_ns:

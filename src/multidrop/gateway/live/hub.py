@@ -1,7 +1,8 @@
-"""Hub: the newest row of every register of every drive, and each drive's state from these rows.
+"""Hub: the newest row of every register of every drive, and each drive's state, computed from these rows.
 
-Rows and times are arguments: this module does no I/O. Rows have times of CLOCK_MONOTONIC, which stops while
-the computer sleeps. So after a sleep all earlier rows count as stale.
+A row is one read of a register: its value, or a miss if the read failed. Rows and times are arguments: this
+module does no I/O. Rows are dated by CLOCK_MONOTONIC, which stops while the computer sleeps. So after a sleep
+all earlier rows count as stale.
 """
 
 from __future__ import annotations
@@ -18,13 +19,14 @@ from multidrop.core import STATUSES, UNASKED, Status
 from multidrop.drive import FAULT_RECORDS, StateReader
 from multidrop.plant import current_for, series_of
 
-KeptRow = tuple[int, int, float, int]  # UTC ns, monotonic ns, value (undefined in a miss), status code
-# register, newest row, newest good row, whether the good row is fresh
+# a row: UTC in ns, monotonic time in ns, value (undefined if the read failed), status code
+KeptRow = tuple[int, int, float, int]
+# a register with its newest row, its newest row with a value, and whether that value is fresh
 Known = tuple[Register[Any], KeptRow | None, KeptRow | None, bool]
 RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
-UNNAMED = "it shows a fault"  # text for a fault that has no text of its own
-NOT_ASKED = "not asked recently"  # text for the state UNKNOWN if no value is fresh
-# text for UNKNOWN if some values are missing: the drive may have a fault
+UNNAMED = "it shows a fault"  # text of a fault without a text of its own
+NOT_ASKED = "not asked recently"  # text for the state UNKNOWN if the drive was not polled recently
+# text for the state UNKNOWN if some values are missing, so that the drive may have a fault
 INCOMPLETE = "not all of it is known"
 _STATES = {
     Condition.STOPPED: STANDS,
@@ -34,37 +36,41 @@ _STATES = {
     Condition.FAULT: FAULT,
     Condition.UNKNOWN: UNKNOWN,
 }
-# the time asleep may increase by less than this without a sleep, because its two clocks are read one by one
+# in ns: the computer's time asleep must increase by more than this to count as a sleep. The two clocks of
+# which it is the difference are read one after the other.
 LEAST_SLEEP_NS = 100_000_000
 FAULT_REGISTER = "fault"
-# a fault is over if the motor still turns this long (in ns) after the fault record changed
+# in ns: a fault counts as over if the motor still turns this long after the fault record changed
 RAN_NS = 3_000_000_000
-_ANSWERED = ("exception ", "no valid value")  # prefixes of a miss's status if the drive replied
-# polling skips most requests of a drive that does not reply
+# if the status of a failed read starts with one of these, the drive has replied
+_ANSWERED = ("exception ", "no valid value")
+# polling leaves out most reads of a silent drive; both statuses then mean that the drive is silent
 _SKIPPED, _NO_REPLY = STATUSES[Status.NOT_ASKED], STATUSES[Status.NO_REPLY]
 
 
 class RegisterRows:
-    """The newest rows of one polled register of one drive."""
+    """The newest rows (reads) of one polled register of one drive."""
 
     __slots__ = ("good", "holds_ns", "newest", "register", "since_ns")
 
     def __init__(self, register: Register[Any], period_s: float, since_ns: int) -> None:
         self.register = register
         self.holds_ns = round(current_for(period_s) * 1e9)  # how long a value stays current
-        # rows requested before this time are ignored: they belong to another drive of the same name
+        # rows requested before this time are ignored, because they are from another drive of the same name
         self.since_ns = since_ns
         self.newest: KeptRow | None = None
         self.good: KeptRow | None = None
 
     def is_current(self, now_ns: int, woke_ns: int) -> bool:
-        """Return True if the newest value is current and was requested after the computer's last sleep."""
+        """Return True if the newest value is not too old, and was requested after the computer's last
+        sleep.
+        """
         good = self.good
         return good is not None and good[1] >= woke_ns and now_ns - good[1] <= self.holds_ns
 
 
 class FreshValues(Mapping[str, float]):
-    """The fresh values of one drive's registers; freshness is checked at each access."""
+    """A mapping of one drive's fresh values by register; the freshness is checked at each access."""
 
     def __init__(self, cells: Mapping[str, RegisterRows], now_ns: int, woke_ns: int) -> None:
         self._cells = cells
@@ -90,18 +96,19 @@ class FreshValues(Mapping[str, float]):
         return sum(1 for _ in self)
 
 
-FREQUENCIES = ("output_frequency", "motor_speed")  # registers that show a drive's frequency, the best first
+# registers that show a motor's frequency, the preferred one first
+FREQUENCIES = ("output_frequency", "motor_speed")
 MINUTE_POINTS = 60
-LEAST_POINT_MS = 900  # least time between two points of the last minute
+LEAST_POINT_MS = 900  # shortest time, in ms, between two points of the curve of the last minute
 
 
 class Newest(NamedTuple):
-    """The newest row of one register of one drive."""
+    """The newest row of one register of one drive: a value, or a failed read."""
 
     time: int  # when the request was sent, UTC in ns
     monotonic_ns: int
-    value: float | None  # None: this row is a miss
-    status: str  # "ok", or the reason for a miss
+    value: float | None  # None: the read failed
+    status: str  # "ok", or the reason why the read failed
     holds_ns: int  # how long a value of this register stays current
 
 
@@ -125,7 +132,7 @@ class Shown(NamedTuple):
 
 
 class _Trip(NamedTuple):
-    """A fault known only from a change of the drive's fault record."""
+    """A fault that only a change of the drive's fault record has shown."""
 
     words: str
     at_ns: int
@@ -139,7 +146,7 @@ def _rows_of(polls: Iterable[Polled], cycle_s: float, since_ns: int) -> dict[str
 
 
 class _WatchedDrive:
-    """One drive of the plant, with the rows of its polled registers and its fault record."""
+    """One drive of the plant, with the newest rows of its polled registers and its fault record."""
 
     def __init__(self, polled: PolledDrive, cycle_s: float, since_ns: int) -> None:
         self.polled = polled
@@ -147,14 +154,15 @@ class _WatchedDrive:
         self.record: float | None = None  # newest value of the fault record
         self.trip: _Trip | None = None
         self.cells = _rows_of(polled.polls, cycle_s, since_ns)
-        # not in `cells`, because the rows of channels do not show whether the drive answers
+        # computed channels are not in `cells`, because their values do not show whether the drive answers
         self.channels = _rows_of(polled.series[len(polled.polls) :], cycle_s, since_ns)
         self.frequency = next((name for name in FREQUENCIES if name in self.cells), "")
-        self.minute: deque[tuple[int, float | None]] = deque(maxlen=MINUTE_POINTS)  # time in ms, value
+        # frequency in the last minute: pairs of time in ms and value
+        self.minute: deque[tuple[int, float | None]] = deque(maxlen=MINUTE_POINTS)
 
 
 class Hub:
-    """The newest rows of a plant; `take` receives every batch.
+    """The newest rows of a plant's registers. `take` must be called with every batch of rows.
 
     `clock` returns CLOCK_MONOTONIC and the computer's total time asleep, both in ns. `late_s` is how long
     after its request a row may arrive, in s.
@@ -167,20 +175,20 @@ class Hub:
         self._clock = clock
         self._late_s = late_s
         _, self._slept_ns = clock()
-        self._woke_ns = 0  # monotonic time at which a sleep was noticed
-        self.time = 0  # time of the newest row, UTC in ns
-        self._time_ns = 0  # the same, monotonic: the clock of UTC may be set back
+        self._woke_ns = 0  # monotonic time, in ns, at which the computer's latest sleep was noticed
+        self.time = 0  # request time of the newest row, UTC in ns
+        self._time_ns = 0  # the same as monotonic time, because UTC may be set back
         self.taken = 0  # number of batches received
         self.unopened: dict[str, str] = {}  # by line: why its port could not be opened
         self.stalled: dict[str, str] = {}  # by line: why its open port accepts no bytes
-        # by the codes of drive and register in a batch, as one number; None: not in the plant
+        # by drive and register code of a batch, combined into one number; None: not in the plant
         self._cells: dict[int, RegisterRows | None] = {}
         self._statuses: tuple[str, ...] = ("ok",)
         self._watched: dict[str, _WatchedDrive] = {}
         self.adopt(plant)
 
     def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
-        """Use another plant, and keep the rows of unchanged drives.
+        """Use another plant, and keep the rows of the drives that it does not change.
 
         For other drives, rows requested before this call are ignored: a name may mean another drive now. Pass
         `plant.metadata()["planned"]` as `planned` if it is known: computing it for hundreds of lines takes
@@ -202,11 +210,11 @@ class Hub:
                 )
         for (drive, name), seconds in ChannelSet(series_of(plant, planned)).holds_s.items():
             cell = self._watched[drive].channels[name]
-            # longer if an input of the channel belongs to another drive, whose values stay current longer
+            # the channel may have an input from another drive, whose values stay current longer
             cell.holds_ns = max(cell.holds_ns, round(seconds * 1e9))
 
     def take(self, batch: Batch) -> None:
-        """Note the newest rows of a batch; takes about 1 us per row."""
+        """Store the newest rows of a batch; takes about 1 us per row."""
         columns = batch.columns()
         cells = self._cells
         self._statuses = columns.statuses
@@ -243,7 +251,7 @@ class Hub:
         return watched.cells.get(register) or watched.channels.get(register) if watched else None
 
     def now_ns(self) -> int:
-        """Return the present time by the clock of rows, CLOCK_MONOTONIC."""
+        """Return the present time in ns by CLOCK_MONOTONIC, which also dates the rows."""
         return self._times()[0]
 
     def woke_ns(self) -> int:
@@ -254,9 +262,9 @@ class Hub:
         return self._times()[1]
 
     def _times(self) -> tuple[int, int]:
-        """Return the present time, and when the latest sleep was noticed.
+        """Return the present time, and when the computer's latest sleep was noticed (CLOCK_MONOTONIC, ns).
 
-        The clock is read on each call because the process may have been suspended until now.
+        The clock is read on each call, because the process may have been suspended until now.
         """
         now_ns, slept_ns = self._clock()
         if slept_ns > self._slept_ns + LEAST_SLEEP_NS:
@@ -267,7 +275,7 @@ class Hub:
     # ---- the last minute ----
 
     def note_minute(self) -> None:
-        """Add each drive's newest frequency to the record of its last minute; call this once a second."""
+        """Add each drive's newest frequency to its curve of the last minute. Call this once a second."""
         for watched in self._watched.values():
             cell = watched.cells.get(watched.frequency)
             if cell is None or cell.newest is None:
@@ -278,7 +286,10 @@ class Hub:
                 watched.minute.append((ms, None if status or not isfinite(value) else value))
 
     def last_minute(self) -> dict[str, dict[str, list[tuple[int, float | None]]]]:
-        """Return the last minute by drive and register: times in ms, and values; None is a miss."""
+        """Return the frequencies of the last minute by drive and register: pairs of time in ms and value.
+
+        The value is None if the read failed.
+        """
         return {
             name: {watched.frequency: list(watched.minute)}
             for name, watched in self._watched.items()
@@ -288,7 +299,7 @@ class Hub:
     # ---- values ----
 
     def newest(self, drive: str, register: str) -> Newest | None:
-        """Return the newest row, which may be a miss; None before the first request."""
+        """Return the newest row of a register, which may be a failed read; None before the first read."""
         cell = self._cell(drive, register)
         if cell is None or cell.newest is None:
             return None
@@ -317,7 +328,7 @@ class Hub:
         return self._statuses[code]
 
     def last_answer(self, drive: str) -> KeptRow | None:
-        """Return a drive's newest value of any register; None if it never answered."""
+        """Return the newest value that a drive has sent, of any register; None if it never answered."""
         watched = self._watched.get(drive)
         good = [cell.good for cell in watched.cells.values() if cell.good] if watched else []
         return max(good, default=None, key=itemgetter(1))
@@ -329,18 +340,21 @@ class Hub:
         return self.seen(drive).state
 
     def seen(self, drive: str) -> Shown:
-        """Return a drive's state, with the text of its fault or the reason of its silence."""
+        """Return a drive's state, with the text of its fault or the reason why it is silent."""
         watched = self._watched.get(drive)
         return Shown(UNKNOWN, None) if watched is None else self._look(watched)
 
     def is_set_to_zero(self, drive: str) -> bool:
-        """Return True if a drive's setpoint is known to be 0: its motor may then rest during a run."""
+        """Return True if a drive's frequency setpoint is known to be 0.
+
+        Its motor may then rest during a run.
+        """
         watched = self._watched[drive]
         setpoint = watched.polled.drive.setpoint_name
         return bool(FreshValues(watched.cells, *self._times()).get(setpoint) == 0)
 
     def note_reset(self, drive: str) -> None:
-        """Forget a fault that the drive's fault record has shown, because the fault was reset."""
+        """Forget the fault that a change of a drive's fault record has shown, because the fault was reset."""
         watched = self._watched.get(drive)
         if watched is not None:
             _forget_trip(watched)
@@ -368,14 +382,16 @@ class Hub:
         if not watched.reader.has_state and fresh.get(FAULT_REGISTER):
             register = watched.polled.drive.registers[FAULT_REGISTER]
             return Shown(FAULT, _words(register, fresh[FAULT_REGISTER]))
-        # 0 Hz alone does not show a state, because the drive may run with setpoint 0
+        # 0 Hz does not show that a drive is stopped, because it may run with setpoint 0
         if any(fresh.get(name) for name in FREQUENCIES):
             return Shown(RUNS, None)
         note = found.note if found is not None else _lack(watched)
         return Shown(UNKNOWN, INCOMPLETE if any(name not in fresh for name in watched.cells) else None, note)
 
     def _unseen(self, watched: _WatchedDrive) -> Shown:
-        """Return SILENT for a drive without fresh values, or UNKNOWN if it has replied or was not asked."""
+        """Return the state of a drive without fresh values: SILENT, or UNKNOWN if it replied or was not
+        polled.
+        """
         newest = [cell.newest for cell in watched.cells.values() if cell.newest]
         misses = [row for row in newest if row[3] != 0]
         if not misses or len(misses) < len(watched.cells):
@@ -388,7 +404,7 @@ class Hub:
 
 
 def _lack(watched: _WatchedDrive) -> str:
-    """Return the page's text that says why a drive's state is unknown."""
+    """Return the text for the page about why a drive's state is unknown."""
     reader = watched.reader
     if not reader.has_state:
         return "its family has no register for its state"
@@ -398,7 +414,10 @@ def _lack(watched: _WatchedDrive) -> str:
 
 
 def _look_for_trip(watched: _WatchedDrive) -> None:
-    """Note a fault if the fault record has changed. Skip its first value: that fault may be an old one."""
+    """Note a fault if the drive's fault record has changed.
+
+    The first value of the record is skipped, because that fault may be an old one.
+    """
     name = next((name for name in FAULT_RECORDS if name in watched.cells), "")
     cell = watched.cells.get(name)
     if cell is None or cell.good is None:
@@ -411,19 +430,19 @@ def _look_for_trip(watched: _WatchedDrive) -> None:
 
 
 def _turns_since(watched: _WatchedDrive, since_ns: int) -> bool:
-    """Return True if all values that show a turning motor were requested after this time."""
+    """Return True if all values that show whether the motor turns were requested after this time."""
     cells = [cell for name in ("status", *FREQUENCIES) if (cell := watched.cells.get(name)) and cell.good]
     return all(cell.good[1] > since_ns for cell in cells if cell.good)
 
 
 def _forget_trip(watched: _WatchedDrive) -> None:
     watched.trip = None
-    # replaced, because the old reader remembers the fault record
+    # a new reader, because the old one remembers the fault record
     watched.reader = StateReader(watched.polled.drive)
 
 
 def _words(register: Register[Any], value: float) -> str:
-    """Return a value as text: its name, or the number with its register's name."""
+    """Return a value as text: the name of a named value, else the register's name and the number."""
     if register.values is not None:
         return register.in_words(register.decode(value))
     return f"{register.name.replace('_', ' ')}: {register.format(value)}"
@@ -443,7 +462,9 @@ def published_value(register: Register[Any], value: float) -> float | str:
 
 
 def published_values(hub: Hub, drive: str) -> dict[str, float | str | None]:
-    """Return the values of a drive's polled registers; None for stale, infinite and missing values."""
+    """Return the values of a drive's polled registers by name; None for stale, infinite and missing
+    values.
+    """
     return {
         register.name: published_value(register, good[2])
         if is_current and good is not None and newest is good and isfinite(good[2])

@@ -1,4 +1,4 @@
-"""Recent statistics of lines and drives, over seconds and over an hour. This module does no I/O."""
+"""Statistics of lines and drives over the last seconds and the last hour. This module does no I/O."""
 
 from __future__ import annotations
 
@@ -9,29 +9,32 @@ from typing import Any
 from multidrop import Plant
 from multidrop.transport import LineStatistics, Statistics
 
-SECONDS = 5.0  # time over which a line's use is averaged; refresh interval of the last minute's figures
+# in s: time over which a line's use is averaged, and interval of refreshing the figures of the last minute
+SECONDS = 5.0
 MINUTES = 60
 
 Reading = Mapping[str, LineStatistics]
 
 
 class RecentStatistics:
-    """The recent readings of a poller's statistics; `tick` adds one about every second."""
+    """The recent statistics of a poller. `tick` adds a reading of its counters about once a second."""
 
     def __init__(self, plant: Plant) -> None:
         self.newest: Reading = {}
         self._recent: deque[tuple[float, Reading]] = deque()
         self._minute: dict[str, LineStatistics | None] = {}  # by line: statistics over the last minute
-        self._due = 0.0  # when the figures of the last minute are refreshed
+        self._due = 0.0  # monotonic time, in s, at which the figures of the last minute are refreshed next
         self._drives: dict[str, dict[str, Any]] = {}  # by drive: figures of the last minute
-        self._figures: dict[str, dict[str, Any]] = {}  # by line: figures from the newest reading
-        # one reading a minute; only two, because readings are large
+        # by line: figures from the newest reading of the counters
+        self._figures: dict[str, dict[str, Any]] = {}
+        # one reading of the counters per minute; only the last two, because readings are large
         self._minutes: deque[tuple[int, Reading]] = deque(maxlen=2)
-        self._hours: dict[str, deque[dict[str, Any]]] = {}  # figures of whole minutes by line
+        # by line: figures of each of the last 60 whole minutes
+        self._hours: dict[str, deque[dict[str, Any]]] = {}
         self.adopt(plant)
 
     def adopt(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:
-        """Continue with another plant, and forget the figures of lines that it lacks."""
+        """Continue with another plant, and forget the figures of lines that are not in it."""
         planned = plant.metadata()["planned"] if planned is None else planned
         self._planned = {name: float(line["utilisation"]) for name, line in planned.items()}
         self._hours = {name: minutes for name, minutes in self._hours.items() if name in self._planned}
@@ -40,7 +43,7 @@ class RecentStatistics:
         self._refresh()
 
     def tick(self, now: float, utc_ms: int, reading: Reading) -> None:
-        """Add a reading; `now` is monotonic time in s."""
+        """Add a reading of the poller's counters; `now` is monotonic time in s."""
         self.newest = reading
         self._recent.append((now, reading))
         while now - self._recent[0][0] > SECONDS:
@@ -64,10 +67,9 @@ class RecentStatistics:
         }
 
     def line(self, name: str) -> dict[str, Any]:
-        """Return a line's figures: measured and planned share of wire time, and exchanges per second.
+        """Return a line's figures: measured and planned share of its time in use, exchanges per second.
 
-        For the last minute, they also include the 99th percentile of response delays in ms, and the number
-        of misses.
+        The figures also have the 99th percentile of response delays in ms and the number of missed values, both for the last minute.
         """
         return self._figures.get(name) or self._line_figures(name, None)
 
@@ -89,11 +91,12 @@ class RecentStatistics:
             return None, None
         seconds = max(now.seconds - before.seconds, 1e-9)
         used_s = (now.counters.ideal_ns - before.counters.ideal_ns) / 1e9
-        exchanges = now.exchanges - before.exchanges  # negative after a reload that removed a drive
+        # negative after a reload that removed a drive with its counters
+        exchanges = now.exchanges - before.exchanges
         return round(max(0.0, used_s / seconds), 4), round(max(0.0, exchanges / seconds), 1)
 
     def drive_figures(self, name: str) -> dict[str, Any]:
-        """Return a drive's share of misses and response delay (99th percentile, ms) in the last minute."""
+        """Return a drive's share of missed values and response delay (99th percentile, ms) in the last minute."""
         return self._drives.get(name, {"missed": None, "p99": None})
 
     def _last_minute(self, line: str) -> LineStatistics | None:
@@ -124,12 +127,12 @@ class RecentStatistics:
 
 
 def misses_of(statistics: Statistics) -> dict[str, int]:
-    """Return the number of misses by reason; reasons without misses are left out."""
+    """Return the number of missed values by the reason of the miss; reasons without a miss are left out."""
     return {why: n for why, n in statistics.misses.items() if n > 0}
 
 
 def asked_of(statistics: Statistics) -> int:
-    """Return the number of requested values, received or missed."""
+    """Return the number of requested values, whether received or missed."""
     return statistics.samples + sum(statistics.misses.values())
 
 

@@ -1,4 +1,6 @@
-"""The part `trigger`: conditions over polled values, and the last moment at which each became true."""
+"""The gateway's part `trigger`: conditions over polled values, and the last moment at which each became
+true.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ from multidrop.polling import slot_rows
 from multidrop.supervisor import supervisor
 from multidrop.toml_check import DURATION, parse_duration
 
-ADOPT_S = 30.0  # time limit for checking the conditions against a new plant
+ADOPT_S = 30.0  # time limit, in s, for checking the conditions against a new plant
 LONGEST_NAME = 60  # limit of a trigger's name, in characters
 EXAMPLE = 'conditions = { trip = "pump-1.output_current > 30" }'
 TEXTS = {"additionalProperties": {"type": "string", "minLength": 1}, "minProperties": 1}
@@ -48,7 +50,7 @@ class TriggerSettings:
         refuse(mistakes)
 
     def check(self, plant: Plant) -> list[str]:
-        """Return a sentence for each condition that does not fit the plant."""
+        """Return an error sentence for each condition that does not fit the plant."""
         try:
             if plant.lines:
                 with_triggers(plant, self.conditions.values())
@@ -75,12 +77,15 @@ class Trigger(NamedTuple):
 
 
 class Triggers:
-    """The conditions, and in `last` the last trigger by name. Raises ValueError for a wrong condition."""
+    """Watches the plant file's conditions; `last` has the last trigger by name.
+
+    Raises ValueError for a wrong condition.
+    """
 
     def __init__(self, settings: TriggerSettings, plant: Plant) -> None:
         self._settings = settings
         self._plant = plant
-        self._is_new = asyncio.Event()  # set if `adopt` has brought another plant
+        self._is_new = asyncio.Event()  # set when `adopt` was called with another plant
         self._conditions: _Conditions | None = _Conditions(plant, settings.conditions)
         self._around_ns = tuple(round(parse_duration(one) * 1e9) for one in (settings.pre, settings.post))
         self.last: dict[str, Trigger] = {}
@@ -92,12 +97,17 @@ class Triggers:
             _log.info("trigger %s: %s", trigger.name, trigger.condition)
 
     def adopt(self, plant: Plant) -> None:
-        """Evaluate the conditions over another plant, after `run` has checked them in a thread."""
+        """Use another plant; its rows are used once `run` has checked the conditions against it in a
+        thread.
+        """
         self._plant, self._conditions = plant, None
         self._is_new.set()
 
     async def run(self) -> None:
-        """Check the conditions against each plant that is adopted. Raises ValueError if one does not fit."""
+        """Check the conditions against each plant that is adopted.
+
+        Raises ValueError if a condition does not fit the plant.
+        """
         while True:
             await self._is_new.wait()
             self._is_new.clear()
@@ -111,7 +121,7 @@ class Triggers:
         """Do nothing: triggers are only in memory."""
 
     def as_answer(self) -> list[dict[str, Any]]:
-        """Return the last trigger of each name for clients, the newest first, with the time range to show."""
+        """Return the last trigger of each name for clients, the newest first, and the time range that a page shows around it."""
         pre_ns, post_ns = self._around_ns
         return [
             {
@@ -127,7 +137,7 @@ class Triggers:
 
 
 class _Conditions:
-    """Conditions that are evaluated over the rows of a plant. Raises ValueError if one does not fit."""
+    """Conditions over a plant's polled values. Raises ValueError if a condition does not fit the plant."""
 
     def __init__(self, plant: Plant, conditions: Mapping[str, str]) -> None:
         self._names = [*conditions]
@@ -139,16 +149,18 @@ class _Conditions:
             series
             for text, signals in found.signals.items()
             for series in signals
-            if text in conditions.values() or series[1] == FAULT  # others are only listed in the trigger
+            # other registers of a condition are only listed in its trigger, and are not needed here
+            if text in conditions.values() or series[1] == FAULT
         }
         self._inputs = {series: slot for series, slot in self._channels.inputs.items() if series in needed}
         self._by_slot = {slot: name for name, slot in self._channels.slots.items()}
-        self._slots: dict[tuple[int, int], int] = {}  # slots of the inputs, by drive and register code
-        self._sizes = (0, 0)  # how many drive and register names the newest batch has
-        self._was: dict[int, bool] = {}  # by slot: whether the condition was true
+        # by drive and register code: the index of an input of the conditions
+        self._slots: dict[tuple[int, int], int] = {}
+        self._sizes = (0, 0)  # how many drive names and register names the newest batch has
+        self._was: dict[int, bool] = {}  # by index of a condition: whether the condition was true
 
     def triggers(self, batch: Batch) -> Iterator[Trigger]:
-        """Yield a trigger for each condition that changes from false to true in this batch."""
+        """Yield a trigger for each condition that changes from false to true within this batch."""
         columns = batch.columns()
         if self._sizes != (sizes := (len(columns.drives), len(columns.registers))):
             self._sizes = sizes
@@ -159,7 +171,8 @@ class _Conditions:
                 for (drive, register), slot in self._inputs.items()
                 if drive in drives and register in registers
             }
-        # A batch has the rows of channels after those of registers. Here all must be in the order of time.
+        # In a batch, computed channels follow the polled registers. The conditions need all rows in the order
+        # of time.
         rows = sorted(
             slot_rows(columns, self._slots), key=lambda row: (row.monotonic_ns, self._by_slot[row.slot][0])
         )
@@ -178,7 +191,7 @@ class _Conditions:
 def _with_triggers_only(
     drive: DriveSeries, triggers: Container[TriggerSeries], holds_s: Mapping[TriggerSeries, float]
 ) -> DriveSeries:
-    """Return a drive's series whose only channels are triggers; the drive's other channels are inputs.
+    """Return a drive's series in which only triggers are computed; its other channels become inputs.
 
     The values of these inputs come from rows, whose totals continue after a restart. Totals computed here
     would not.

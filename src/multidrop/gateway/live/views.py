@@ -1,4 +1,4 @@
-"""Views of the gateway for pages and health probes, made on request."""
+"""The answers to requests of pages and of health probes, made on request."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from multidrop.gateway.gateway import Gateway
 
 CURRENTS = ("output_current",)
-LEDGER_S = 6.0  # time limit for the EEPROM ledger, which waits 5 s for a lock
+LEDGER_S = 6.0  # time limit, in s, of reading the ledger of EEPROM writes, which waits up to 5 s for a lock
 
 
 # ---- the description of a plant: lines, drives, registers and the caller's rights ----
@@ -39,7 +39,7 @@ def describe(gateway: Gateway, right: Right | None, language: str) -> dict[str, 
         "version": gateway.version,
         "name": gateway.hub.plant.path.name,
         "demo": gateway.settings.is_demo,
-        "file": gateway.reload.has_file,  # True: a reload is possible
+        "file": gateway.reload.has_file,  # True: the gateway can reload its plant file
         "history": "history" in {**gateway.feeds, **gateway.parts.pending},  # True: /api/history is available
         "fleet": fleet is not None,  # True: /api/fleet is available
         "fleet_stop": getattr(fleet, "can_stop", False),  # True: /api/fleet/stop is available
@@ -84,9 +84,9 @@ def _drive(hub: Hub, polled: PolledDrive, language: str) -> dict[str, Any]:
 
 
 def _key_registers(drive: Drive, periods: dict[str, float]) -> dict[str, str | None]:
-    """Return the names of the registers for frequency, electric current and setpoint.
+    """Return the names of a drive's registers for frequency, electric current and setpoint, by purpose.
 
-    If several registers fit, a polled one is preferred. The name is None if the drive has no such register.
+    If several registers fit, a polled one is preferred. The name is None if no register fits.
     """
     wanted = {"frequency": FREQUENCIES, "current": CURRENTS, "setpoint": (drive.setpoint_name,)}
     found: dict[str, str | None] = {}
@@ -121,9 +121,10 @@ def _register(register: Register[Any], language: str) -> dict[str, Any]:
 
 
 def _span(register: Register[Any]) -> tuple[float | None, float | None]:
-    """Return the least and largest writable value: the manual's range, or else that of the number format.
+    """Return the least and the largest value that may be written to a register.
 
-    Both are None for a float without a range, for named values, and if the register cannot be written.
+    They are the manual's range, or else that of the number format. Both are None for a float without a range,
+    for named values, and if the register cannot be written.
     """
     if register.span is not None:
         return register.span
@@ -138,7 +139,7 @@ def _span(register: Register[Any]) -> tuple[float | None, float | None]:
 
 
 async def drive_view(gateway: Gateway, name: str) -> dict[str, Any]:
-    """Return the details of one drive. Raises ValueError for an unknown drive."""
+    """Return the details of one drive that the page shows. Raises ValueError for an unknown drive."""
     name = drive_meant(name, drives_of(gateway.plant))
     line, drive = gateway.plant.find_drive(name)
     bus = gateway.poller.buses.get(line.name) if gateway.poller else None
@@ -189,7 +190,7 @@ async def _wear_within(ledger: Ledger, port: str, drive: Drive) -> list[dict[str
             for one in found
         ]
 
-    with contextlib.suppress(OSError):  # Hung is an OSError
+    with contextlib.suppress(OSError):  # Hung, raised if the disk hangs, is an OSError too
         return await supervisor().within("ledger", LEDGER_S, wear)
     return []
 
@@ -209,9 +210,9 @@ def line_views(gateway: Gateway) -> dict[str, Any]:
 
 
 def health_of(gateway: Gateway) -> dict[str, Any]:
-    """Return the health as "ok", "degraded" or "failed", with details by line and part.
+    """Return the gateway's health as "ok", "degraded" or "failed", with details by line and part.
 
-    "failed" means that no rows have arrived yet, or that a permanent task or thread has ended.
+    "failed" means that no values were polled yet, or that a task or thread that must run forever has ended.
     """
     supervisor().look()
     dead, hung = supervisor().dead | gateway.parts.dead, supervisor().hung
@@ -242,7 +243,7 @@ def health_of(gateway: Gateway) -> dict[str, Any]:
 
 
 def parts_of(gateway: Gateway) -> dict[str, str]:
-    """Return the health of each part: "ok", or its problem."""
+    """Return the health of each part of the gateway: "ok", or a sentence about its problem."""
     parts, dead, kept = gateway.parts, supervisor().dead, gateway.alarm_file
     return (
         {name: _health_of_part(feed) for name, feed in parts.feeds.items()}
@@ -254,15 +255,13 @@ def parts_of(gateway: Gateway) -> dict[str, str]:
 
 
 def failing_lines_of(gateway: Gateway) -> dict[str, str]:
-    """Return the reason for each line whose polling raises an exception, as a user's class may do."""
+    """Return by line why its polling fails with an exception, which a user's drive class may raise."""
     failures = {} if gateway.poller is None else gateway.poller.line_failures
     return {line: f"polling fails: {why}" for line, why in failures.items()}
 
 
 def audit_trouble_of(gateway: Gateway) -> str:
-    """Return why a line's newest write is missing in the audit log; "" if the newest writes of all lines are
-    there.
-    """
+    """Return why the newest write on a line is missing in the audit log; "" if no line has this problem."""
     if gateway.unaudited:
         return gateway.unaudited
     buses = gateway.poller.buses if gateway.poller else {}
@@ -271,7 +270,9 @@ def audit_trouble_of(gateway: Gateway) -> str:
 
 
 def troubles_of(gateway: Gateway) -> list[str]:
-    """Return a sentence for the page about each problem other than a lost line."""
+    """Return a sentence for the page about each problem, except lost lines, which the page shows
+    elsewhere.
+    """
     troubles = {f"line {line}": why for line, why in failing_lines_of(gateway).items()}
     troubles |= supervisor().hung | supervisor().dead
     troubles |= {name: one for name, one in parts_of(gateway).items() if one != "ok"}
@@ -282,7 +283,7 @@ def troubles_of(gateway: Gateway) -> list[str]:
 def _health_of_part(feed: object) -> str:
     try:
         return str(getattr(feed, "health", str)()) or "ok"
-    except Exception as failure:  # report the exception as a problem of the part
+    except Exception as failure:  # the part's method `health` itself has failed
         return f"{type(failure).__name__}: {failure}"
 
 
