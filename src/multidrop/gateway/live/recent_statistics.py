@@ -69,7 +69,8 @@ class RecentStatistics:
     def line(self, name: str) -> dict[str, Any]:
         """Return a line's figures: measured and planned share of its time in use, exchanges per second.
 
-        The figures also have the 99th percentile of response delays in ms and the number of missed values, both for the last minute.
+        They also have two figures for the last minute: the 99th percentile of response delays in ms, and the
+        number of missed values.
         """
         return self._figures.get(name) or self._line_figures(name, None)
 
@@ -96,7 +97,10 @@ class RecentStatistics:
         return round(max(0.0, used_s / seconds), 4), round(max(0.0, exchanges / seconds), 1)
 
     def drive_figures(self, name: str) -> dict[str, Any]:
-        """Return a drive's share of missed values and response delay (99th percentile, ms) in the last minute."""
+        """Return a drive's figures for the last minute.
+
+        They are the share of missed values, and the 99th percentile of response delays in ms.
+        """
         return self._drives.get(name, {"missed": None, "p99": None})
 
     def _last_minute(self, line: str) -> LineStatistics | None:

@@ -121,7 +121,10 @@ class Triggers:
         """Do nothing: triggers are only in memory."""
 
     def as_answer(self) -> list[dict[str, Any]]:
-        """Return the last trigger of each name for clients, the newest first, and the time range that a page shows around it."""
+        """Return the last trigger of each name for clients, the newest first.
+
+        Each has the time range that a page shows around it.
+        """
         pre_ns, post_ns = self._around_ns
         return [
             {

@@ -1,4 +1,4 @@
-"""The address map: all values of the Modbus server as a table, which SCADA systems import."""
+"""The address map: a table of all values of the Modbus server, for import into SCADA systems."""
 
 from __future__ import annotations
 
@@ -17,49 +17,56 @@ from multidrop.gateway.modbus_server.settings import ModbusSettings, Unit, Units
 from multidrop.gateway.modbus_server.words import NUMBERS, STATE, STOP, reading_function
 from multidrop.printable import spreadsheet_text
 
-NO_ANSWER = "exception 0BH"  # the answer if the gateway has no current value, and the drive gives none
+# the exception code that a read gets if neither the gateway nor the drive has a current value
+NO_ANSWER = "exception 0BH"
 _WRITE_FUNCTIONS = {Carrier.BIT: 5, Carrier.WORD: 6}
 
 
 class AddressRow(NamedTuple):
     """A value that Modbus clients can read or write.
 
-    The value in `unit` is number * step + offset. If `scale_address` is given, first multiply the number by
-    ten to the power of the number at that address. None means that a column does not apply.
+    The value in the unit `unit` is number * step + offset. If `scale_address` is given, first multiply the
+    number by ten to the power of the number at that address. None means that a column does not apply to this
+    value.
     """
 
     line: str
     drive: str
     tcp_port: int
     unit_id: int
-    status_address: int  # address of the drive's state in the common block
+    status_address: int  # address of the drive's state in the common block, which is the same for all drives
     name: str
     title: str
     access: str  # "read", "write" or "read and write"
     function: int | None  # for reading
     write_function: int | None
-    address: int  # counted from 0
-    words: int  # number of 16-bit words; for coils and discrete inputs, of bits
+    address: int  # address of the value in a request, counted from 0
+    words: int  # number of 16-bit words; for coils and discrete inputs, number of bits
     format: str
-    order: str = ""  # order of the bytes, A the most significant
-    bits: str = ""  # if the number is only a part of its words: which bits
+    order: str = ""  # order of the bytes, such as "AB"; A is the most significant byte
+    bits: str = ""  # which bits of the words the number has; "": all
     step: float | None = 1
     offset: float = 0
     scale_address: int | None = None
     unit: str = ""
-    unknown: str = NO_ANSWER  # the answer if there is no current value
-    source: str = "gateway"  # "gateway": its own value; "polled": a polled value; "drive": read on request
+    unknown: str = NO_ANSWER  # what a read returns if there is no current value
+    # where the value is from: "gateway": computed; "polled": polled from the drive; "drive": read on request
+    source: str = "gateway"
     note: str = ""
 
 
-# Returns a row of one drive. Arguments: the value's name, and the columns of the row from `access` on.
+# A function that returns a row of one drive. Its arguments are the value's name, and the row's columns from
+# `access` on.
 MakeRow = Callable[..., AddressRow]
 
 
 def address_map(
     units: Units, settings: ModbusSettings, ports: Mapping[str, int], may: May
 ) -> list[AddressRow]:
-    """Return a row for each value of these units; `ports` has the TCP ports by line."""
+    """Return a row for each value of these units, which are the drives that clients can address.
+
+    `ports` has the TCP ports by line.
+    """
     rows: list[AddressRow] = []
     for port, number, unit in units:
         first = (unit.line, unit.drive.name, ports[port], number, settings.common + STATE)
@@ -76,8 +83,8 @@ def to_csv(rows: Sequence[AddressRow]) -> str:
 
 
 def to_json(rows: Sequence[AddressRow]) -> str:
-    """Return the table as JSON, a line for each row."""
-    # row by row, because all other threads, also those of stops, wait until a call of json.dumps ends
+    """Return the table as JSON, with one row on each line."""
+    # row by row, because all threads, including those of stops, wait until a call of json.dumps ends
     return "[\n" + ",\n".join(json.dumps(row._asdict(), allow_nan=False) for row in rows) + "\n]"
 
 

@@ -1,7 +1,7 @@
 """Connections of Modbus TCP clients.
 
-Requests are always received, even from a client that does not read its answers. So a stop waits neither
-for earlier requests nor until its client reads answers.
+Requests are received even from a client that does not read its answers. So a stop waits neither for earlier
+requests nor until its client reads answers.
 """
 
 from __future__ import annotations
@@ -23,39 +23,44 @@ from multidrop.gateway.modbus_server.protocol import (
 )
 from multidrop.supervisor import supervisor
 
-SLICE = 64  # limit of one client's requests that are answered in one turn
-SLICE_S = 0.002  # limit of one client's turn in s
-ROUND_S = 0.004  # time limit in s of one turn of all busy clients together; a stop waits at most this long
+SLICE = 64  # limit of requests of one client that are answered in one turn
+SLICE_S = 0.002  # limit, in s, of the duration of one client's turn
+# limit, in s, of the duration of a round, in which each busy client has a turn; a stop waits at most this
+# long
+ROUND_S = 0.004
 MOST_CLIENTS = 64  # limit of clients per TCP port
-MOST_BEHIND = 1 << 18  # limit of one client's pending requests in bytes
-MOST_UNTAKEN = 1 << 18  # limit of a client's unread answers in bytes
-MOST_UNDER_WAY = 16  # limit of one client's requests that wait for lines
-IDLE_S = 300.0  # a client that is idle for this long is disconnected
-FORGETTABLE_S = 10.0  # a client idle for this long is disconnected if a new client needs its place
-STALLED_S = 10.0  # a client that reads none of its answers for this long is disconnected
-SWEEP_S = 1.0  # interval of checking all clients
+MOST_BEHIND = 1 << 18  # limit, in bytes, of the requests of one client that wait for a turn
+MOST_UNTAKEN = 1 << 18  # limit, in bytes, of the answers that one client has not read yet
+MOST_UNDER_WAY = 16  # limit of one client's requests that wait for a drive's line
+IDLE_S = 300.0  # in s: a client that sends no request for this long is disconnected
+# in s: a client without a request for this long is disconnected if a new client needs its place
+FORGETTABLE_S = 10.0
+STALLED_S = 10.0  # in s: a client that reads none of its answers for this long is disconnected
+SWEEP_S = 1.0  # interval, in s, of checking all clients for these limits
 
 _log = logging.getLogger("multidrop.gateway")
 
 
-# An answer: its frame, or an awaitable that returns the frame; None closes the connection. If the client
-# disconnects, the awaitable is cancelled: shield work that must be finished.
+# The answer to a request: a frame, or an awaitable of the frame. None closes the connection. If the client
+# disconnects, the awaitable is cancelled, so work that must be finished has to be shielded.
 Answer = bytes | Awaitable[bytes] | None
 
 
 class ModbusClient(asyncio.Protocol):
-    """One connection. Each answer has the transaction id of its request and is sent when it is ready.
+    """One client's connection. Each answer has the transaction id of its request, and is sent as soon as it
+    is ready.
 
-    Writes start on arrival, in their order; other requests wait for their turn.
+    Writes start when they arrive, in their order. Other requests wait for the client's turn.
     """
 
     def __init__(self, port: ModbusPort) -> None:
         self._port = port
         self._came = bytearray()  # received bytes, not parsed yet
-        self._waiting = bytearray()  # frames waiting for their turn
+        self._waiting = bytearray()  # received requests that wait for the client's turn
         self._under_way: set[asyncio.Future[bytes]] = set()
         self._is_draining = False
-        self._is_refused = False  # True after a forbidden or invalid request: the connection will be closed
+        # True: a request was forbidden or invalid, and the connection will be closed
+        self._is_refused = False
         self._has_ended = False  # True: the client has closed its sending side, but may still read
         self._has_lost_answers = False
         self._stalled_since: float | None = None
@@ -87,7 +92,8 @@ class ModbusClient(asyncio.Protocol):
         self._port.share.note(self, is_busy=False)
         self._port.forget(self)
         for task in self._under_way:
-            asyncio.get_running_loop().call_soon(task.cancel)  # later: by then, the task has started
+            # not immediately, because the task must have started
+            asyncio.get_running_loop().call_soon(task.cancel)
 
     def data_received(self, data: bytes) -> None:
         if self._is_refused:
@@ -102,7 +108,7 @@ class ModbusClient(asyncio.Protocol):
         return bool(self._under_way or self._waiting or self._is_draining)
 
     def pause_writing(self) -> None:
-        """Hold back the answers of a client that does not read them; keep reading its requests."""
+        """Hold back the answers of a client that does not read them, but still accept its requests."""
         self._stalled_since = self._port.clock()
 
     def resume_writing(self) -> None:
@@ -113,7 +119,7 @@ class ModbusClient(asyncio.Protocol):
     # ---- requests and answers ----
 
     def _drain(self) -> None:
-        """Parse received bytes and answer some requests; continue after other clients' turns."""
+        """Parse received bytes and answer some requests; the rest is done after other clients' turns."""
         is_looked_at = self._look()
         self._is_draining = self._answer_some() or not is_looked_at
         self._port.share.note(self, is_busy=self._is_draining)
@@ -129,7 +135,10 @@ class ModbusClient(asyncio.Protocol):
         self._close_if_done()
 
     def _look(self) -> bool:
-        """Start received writes and queue other requests; return False if unprocessed frames remain."""
+        """Start the writes among the received requests, and queue the others.
+
+        Return False if the time for this was too short for all of them.
+        """
         begun = self._port.clock()
         answers: list[bytes] = []
         is_in_time = True
@@ -176,8 +185,8 @@ class ModbusClient(asyncio.Protocol):
         return bool(self._waiting) and self._stalled_since is None
 
     def _answered(self, request: MbapRequest) -> bytes:
-        """Return the answer to a request if it is known immediately; b"" if it will follow later, or if
-        there is none.
+        """Return the answer to a request if it is known already; b"" if it follows later, or if there is
+        none.
         """
         answer = self._port.serve(request, self)
         if isinstance(answer, bytes):
@@ -208,7 +217,7 @@ class ModbusClient(asyncio.Protocol):
             self.close()
 
     def _write(self, data: bytes) -> None:
-        """Write answers; drop them if the client has stopped reading and left too many bytes unread."""
+        """Send answers. Drop them if the client has stopped reading and has left too many bytes unread."""
         if not data or self.transport is None or self.transport.is_closing():
             return
         if self._stalled_since is not None and self.transport.get_write_buffer_size() > MOST_UNTAKEN:
@@ -219,7 +228,7 @@ class ModbusClient(asyncio.Protocol):
         self.transport.write(data)
 
     def close(self) -> None:
-        """Close this connection after all written answers are sent."""
+        """Close this connection after its pending bytes are sent."""
         if self.transport is not None:
             self.transport.close()
 
@@ -233,7 +242,7 @@ class ModbusClient(asyncio.Protocol):
 
 
 class RoundShare:
-    """Divides the time for clients in one round of the event loop among the busy clients of all ports."""
+    """Divides the duration of a round among the clients, on all ports, that have requests waiting."""
 
     def __init__(self) -> None:
         self._busy: set[ModbusClient] = set()
@@ -246,7 +255,7 @@ class RoundShare:
 
     @property
     def slice_s(self) -> float:
-        """The seconds for which one client may be served in a round."""
+        """The longest duration, in s, of one client's turn in the present round."""
         return min(SLICE_S, ROUND_S / max(1, len(self._busy)))
 
 
@@ -257,8 +266,8 @@ async def _awaited(answer: Awaitable[bytes]) -> bytes:
 class ModbusPort:
     """One TCP port and its clients.
 
-    `serve` answers a request, `may_connect` returns whether an address is allowed, `clock` returns seconds.
-    All ports of a server have the same `share`.
+    `serve` answers a request, `may_connect` returns whether a client's address is allowed, and `clock`
+    returns seconds. All ports of a server have the same `share`.
     """
 
     def __init__(
@@ -281,7 +290,10 @@ class ModbusPort:
         self._server = await loop.create_server(lambda: ModbusClient(self), sock=listener)
 
     def admit(self, client: ModbusClient) -> None:
-        """Accept a new client, or refuse it; if the port is full, close the client that was idle longest."""
+        """Accept a new client or refuse it.
+
+        If the port is full, close the client that has been idle longest.
+        """
         if not self._may_connect(client.address):
             _log.warning("modbus client %s is refused: its address is not in clients", client.address)
             self.refused += 1
@@ -307,7 +319,7 @@ class ModbusPort:
         self.clients.discard(client)
 
     def sweep(self) -> None:
-        """Close clients that are idle for too long, or do not read their answers."""
+        """Close clients that have been idle for too long, or that do not read their answers."""
         now = self.clock()
         for client in list(self.clients):
             if client.stalled_for(now) >= STALLED_S:

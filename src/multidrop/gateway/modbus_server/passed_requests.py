@@ -1,8 +1,7 @@
-"""Requests of Modbus clients and vendors' tools that reach the drives: reads, writes and stops.
+"""Requests of Modbus clients and vendors' tools that are passed on to drives: reads, writes and stops.
 
-Reads are sent to the drives one at a time, before polls, within a share of the line's time. Their time is
-measured, so timeouts of a silent drive count too. Writes obey the same rules as all commands, and never start
-a motor.
+Reads are sent one at a time, before polls, within a share of the line's time. Their duration is measured, so
+timeouts of a silent drive count too. Writes obey the same rules as all commands, and never start a motor.
 """
 
 from __future__ import annotations
@@ -33,14 +32,17 @@ from multidrop.gateway.modbus_server.settings import StopWrite, Unit
 from multidrop.gateway.modbus_server.words import STOP
 from multidrop.supervisor import supervisor
 
-SHARE = 0.2  # default share of a line's time
-BURST_S = 0.2  # limit of the unused line time, in s, that clients save up
-MOST_WAITING = 8  # limit of waiting requests per line
-EXPIRY_S = 1.0  # a request that has waited for this long is dropped
+SHARE = 0.2  # default share of a line's time that is used for requests of clients
+BURST_S = 0.2  # limit, in s, of unused line time that is saved for later requests
+MOST_WAITING = 8  # limit of the requests that wait for one line
+EXPIRY_S = 1.0  # in s: a request that has waited for this long is dropped
 CLOSED = "the gateway is shutting down, or has read its plant file again"
-SETTLE_S = 1.0  # how long writes are refused after a standstill, until the waiting requests are read
-STOP_WAIT_S = 0.4  # how long a stop's answer waits for the motor: less than the usual timeout of clients
-REFUSAL_S = 1.0  # least time between two audit records of a line's refused writes
+# in s: writes are refused for this long after the gateway stood still, until the requests that arrived
+# meanwhile are read
+SETTLE_S = 1.0
+# in s: how long the answer to a stop waits for the motor; less than the usual timeout of clients
+STOP_WAIT_S = 0.4
+REFUSAL_S = 1.0  # in s: shortest time between two entries in the audit log about refused writes on one line
 _log = logging.getLogger("multidrop.gateway")
 
 
@@ -49,27 +51,30 @@ class _WaitingRead:
     client: object
     work: Callable[[float], Awaitable[Any]]
     answer: asyncio.Future[Any]
-    expires: float  # time of the event loop's clock in s
+    expires: float  # when the request is dropped, in s of the event loop's clock
     timer: asyncio.TimerHandle | None = None
 
 
 class LineShare:
-    """Sends all clients' requests on one line: one at a time, in order, within a share of the line's time."""
+    """Sends the requests of all clients on one line: one at a time, in order, within a share of the
+    line's time.
+    """
 
     def __init__(self, share: float = SHARE) -> None:
         self._loop = asyncio.get_running_loop()
         self.share = share
         self._waiting: list[_WaitingRead] = []
         self._running: asyncio.Task[None] | None = None
-        self._left_s = BURST_S  # line time available now; negative after a long request
+        self._left_s = BURST_S  # line time, in s, that requests may use now; negative after a long request
         self._filled = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
 
     def ask(self, client: object, work: Callable[[float], Awaitable[Any]]) -> asyncio.Future[Any]:
-        """Queue work, and return a future of its result; `work` is called with the seconds until its expiry.
+        """Queue a request, and return a future of its result.
 
-        If the work is dropped, this call or the future raises PassingBusy. If the queue is full and another
-        client has at least two more waiting requests, the last request of that client is dropped instead.
+        `work` sends the request; it is called with the seconds until the request expires. If the request is
+        dropped, this call or the future raises PassingBusy. If the queue is full and another client has at
+        least two more waiting requests, the last request of that client is dropped instead.
         """
         if len(self._waiting) >= MOST_WAITING:
             self._make_place(client)
@@ -99,7 +104,7 @@ class LineShare:
             asked.answer.set_exception(PassingBusy(why))
 
     def _forget(self, asked: _WaitingRead) -> None:
-        """Remove a request that is answered, or whose client has disconnected, from the queue."""
+        """Remove a request from the queue, because it is answered or its client has disconnected."""
         if asked.timer is not None:
             asked.timer.cancel()
         if asked in self._waiting:
@@ -129,7 +134,9 @@ class LineShare:
         self._filled = now
 
     async def _run(self, asked: _WaitingRead) -> None:
-        """Carry out a request to its end, even if its client disconnects, because the line stays in use."""
+        """Carry out a request to its end, even if its client disconnects, because the line stays busy
+        until then.
+        """
         begun = self._loop.time()
         try:
             result = await asked.work(asked.expires - begun)
@@ -163,9 +170,11 @@ class LineShare:
 
 
 class Standstill:
-    """Detects that the gateway did not run for more than MOST_AGE_S; then refuses writes for SETTLE_S.
+    """Detects that the gateway did not run for more than MOST_AGE_S, and then refuses writes for SETTLE_S.
 
-    The computer may have slept, for example. A Modbus request contains no time, so its age is unknown.
+    For example, the computer may have slept. Writes that arrived meanwhile may be old, and a Modbus request
+    contains no time that would show it.
+
     `clock` returns CLOCK_BOOTTIME in ns.
     """
 
@@ -184,7 +193,7 @@ class Standstill:
     def admit(self, what: str) -> float:
         """Return the deadline for sending a write that is received now (CLOCK_BOOTTIME, ns).
 
-        Raises WriteForbidden after a standstill.
+        Raises WriteForbidden if the gateway has just stood still.
         """
         self.note()
         if self._ran_ns < self._until_ns:
@@ -200,14 +209,14 @@ class WritingClient(Protocol):
     def address(self) -> str: ...
     @property
     def is_full(self) -> bool:
-        """True while too many requests of this client are in progress."""
+        """True while so many requests of this client are in progress that it must not start another."""
 
 
 class ClientWrites:
     """Carries out the writes of clients that share a role and an interface, such as "modbus".
 
-    `common` has the addresses of the common block, or is None without such a block. Writes received after a
-    `standstill` are refused.
+    `common` has the addresses of the common block, or is None if there is no such block. Writes are refused
+    after the `standstill` has detected that the gateway did not run.
     """
 
     def __init__(
@@ -220,15 +229,16 @@ class ClientWrites:
         self._common = common or range(0)
         self._common_stop = common.start + STOP if common else None
         self._stops: dict[str, set[asyncio.Task[int]]] = {}  # stops in progress, by drive
-        self._recorded: dict[str, float] = {}  # by line: time of the newest record of a refused write
+        # by line: when the latest audit entry about a refused write was made
+        self._recorded: dict[str, float] = {}
 
     def begin(
         self, unit: Unit, request: MbapRequest, client: WritingClient, stop_wait_s: float = STOP_WAIT_S
     ) -> Awaitable[bytes]:
         """Start a write or a stop, and return an awaitable of its answer.
 
-        The answer to a stop comes after `stop_wait_s` at the latest. Raises Declined for a request that is
-        not allowed.
+        A stop is answered after `stop_wait_s` at the latest. Raises Declined for a request that is not
+        allowed.
         """
         if self._role < Right.STOP:
             raise Declined(ModbusCode.ILLEGAL_FUNCTION)  # clients may only read
@@ -236,9 +246,11 @@ class ClientWrites:
         register = unit.writable(carrier, address)
         is_one = count == (register.words if register else 1)
         if not is_one and unit.has_stop_in(written, self._common_stop):
-            with suppress(Declined):  # raised only if many stops of the drive are in progress already
+            # Declined here means that enough stops of the drive are in progress already
+            with suppress(Declined):
                 self._begin_stop(unit, client)
-            raise Declined(ModbusCode.ILLEGAL_VALUE)  # the rest is not written: it may start a motor
+            # refuse the rest of the words, because they may start a motor
+            raise Declined(ModbusCode.ILLEGAL_VALUE)
         if carrier is Carrier.WORD and address in self._common:
             if address != self._common_stop:
                 raise Declined(ModbusCode.ILLEGAL_ADDRESS)
@@ -262,7 +274,10 @@ class ClientWrites:
         return self._later(request, supervisor().start("modbus write", write), None)
 
     async def _later(self, request: MbapRequest, task: asyncio.Task[int], wait_s: float | None) -> bytes:
-        """Return the answer to a command, or after `wait_s` "acknowledge"; then the command continues."""
+        """Return the answer to a command.
+
+        If it takes longer than `wait_s`, return "acknowledge"; the command continues.
+        """
         done, _ = await asyncio.wait([task], timeout=wait_s)
         # "acknowledge" means that the command is still in progress
         code = task.result() if done else ModbusCode.ACKNOWLEDGE
@@ -271,7 +286,7 @@ class ClientWrites:
     async def _write_one(
         self, unit: Unit, register: Register[Any], raw: float, request: MbapRequest, client: WritingClient
     ) -> int:
-        """Write a register; return 0 or an exception code."""
+        """Write a register; return 0 if it succeeded, else an exception code."""
         value = raw if register.values is not None else register.decode(raw)
         name, caller = unit.drive.name, self._caller(client)
         result = await self._commands.write(name, register.name, value, caller, self._admit)
@@ -282,7 +297,7 @@ class ClientWrites:
     def note_refused(
         self, line: str, drive: str, request: MbapRequest, why: str, client: WritingClient
     ) -> None:
-        """Record a refused write in the audit log, at most once in REFUSAL_S for each line."""
+        """Make an entry in the audit log about a refused write, at most one in REFUSAL_S for each line."""
         now = asyncio.get_running_loop().time()
         if now - self._recorded.get(line, -inf) >= REFUSAL_S:
             self._recorded[line] = now

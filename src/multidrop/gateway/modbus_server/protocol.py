@@ -30,9 +30,9 @@ from multidrop.drive import Carrier
 from multidrop.gateway.commands import BUSY, STOOD_STILL
 from multidrop.gateway.http.rights import NOT_ALLOWED, NOT_LISTED
 
-MOST_DATA = 253  # limit, in bytes, of a function code and its data (application protocol V1.1b3, 4.1)
+MOST_DATA = 253  # limit, in bytes, of a function code with its data (application protocol V1.1b3, 4.1)
 _HEADER = struct.Struct(">HHHB")
-_FUNCTION = _HEADER.size  # offset of the function code
+_FUNCTION = _HEADER.size  # offset of the function code in a frame
 
 
 class InvalidHeader(ValueError):
@@ -45,7 +45,7 @@ class MbapRequest(NamedTuple):
     transaction: int
     unit: int
     function: int
-    data: bytes  # after the function code
+    data: bytes  # the bytes after the function code
 
     @property
     def text(self) -> str:
@@ -60,7 +60,7 @@ class MbapRequest(NamedTuple):
 
 
 def take_frame(buffer: bytearray) -> bytes | None:
-    """Remove the first frame from the buffer and return it; None if it is incomplete.
+    """Remove the first frame from the buffer and return it; None if the frame is incomplete.
 
     Raises InvalidHeader for an invalid header, after which the start of the next frame is unknown.
     """
@@ -88,7 +88,10 @@ def request_of(frame: bytes) -> MbapRequest:
 
 
 def take_request(buffer: bytearray) -> MbapRequest | None:
-    """Remove the first request from the buffer and return it; None if incomplete. Raises InvalidHeader."""
+    """Remove the first request from the buffer and return it; None if it is incomplete.
+
+    Raises InvalidHeader for an invalid header.
+    """
     frame = take_frame(buffer)
     return None if frame is None else request_of(frame)
 
@@ -111,14 +114,14 @@ class PassingBusy(Exception):
 
 
 class Declined(Exception):
-    """Raised for a request that must be answered with this exception code."""
+    """Raised for a request that is answered with this exception code."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"exception {code:02X}H")
         self.code = code
 
 
-# Exception codes by type of the error; the first matching type decides.
+# Exception codes by type of the error. The first type that matches decides.
 _CODES: tuple[tuple[type[BaseException], ModbusCode], ...] = (
     (PassingBusy, ModbusCode.BUSY),
     (Expired, ModbusCode.BUSY),
@@ -143,7 +146,7 @@ _RULES: Mapping[str, ModbusCode] = {
 
 
 def code_of(error: BaseException | None) -> int:
-    """Return the exception code for an error; an exception reply of a drive keeps its code."""
+    """Return the exception code that reports an error. An exception reply of a drive keeps its code."""
     if isinstance(error, DriveException):
         return error.code if 1 <= error.code <= 0x7F else ModbusCode.DEVICE_FAILURE
     if isinstance(error, WriteForbidden) and (code := _RULES.get(error.rule)):
@@ -153,8 +156,10 @@ def code_of(error: BaseException | None) -> int:
     return next((code for kind, code in _CODES if isinstance(error, kind)), ModbusCode.DEVICE_FAILURE)
 
 
-MOST_READ = {1: 2000, 2: 2000, 3: 125, 4: 125}  # limit of bits or words, by function: sections 6.1 to 6.4
-MOST_WRITTEN = {0x0F: 1968, 0x10: 123}  # limit of bits or words, by function: 6.11 and 6.12
+# by function: limit of the bits or words in one request (application protocol, 6.1 to 6.4)
+MOST_READ = {1: 2000, 2: 2000, 3: 125, 4: 125}
+# by function: limit of the bits or words in one request (application protocol, 6.11 and 6.12)
+MOST_WRITTEN = {0x0F: 1968, 0x10: 123}
 ADDRESSES = 0x10000
 
 
@@ -182,7 +187,9 @@ def read_range(request: MbapRequest) -> range:
 
 
 def reply_data(function: int, words: list[int]) -> bytes:
-    """Return a reply's data: words, or bits packed from the least significant bit of the first byte."""
+    """Return the data of a reply: words, or bits packed into bytes, the first bit in the least
+    significant place.
+    """
     if function in (3, 4):
         return struct.pack(f">B{len(words)}H", 2 * len(words), *words)
     size = (len(words) + 7) // 8

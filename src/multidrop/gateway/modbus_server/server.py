@@ -1,6 +1,6 @@
 """Modbus TCP server: answers the requests of clients such as SCADA systems.
 
-Reads are answered from polled rows if possible.
+Reads are answered with polled values if possible.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def build(settings: ModbusSettings, context: PartContext) -> ModbusServer:
 
 
 class ModbusServer:
-    """The Modbus TCP server of a plant: a port for each line in `ports`, one for all others.
+    """The Modbus TCP server of a plant: a TCP port for each line in `ports`, and one for all other lines.
 
     `ask(drive, function, start, count, expiry)` reads words or bits from a drive; `expiry` is in s. Raises
     ValueError with all mistakes if unit ids clash.
@@ -54,7 +54,8 @@ class ModbusServer:
         self, plant: Plant, hub: Hub, commands: Commands, settings: ModbusSettings, ask: Ask
     ) -> None:
         self.settings = settings
-        self.ports: dict[str, int] = {}  # TCP port by line; MAIN: of the lines without a port of their own
+        # TCP port by line; with the key MAIN, the port of all lines without their own port
+        self.ports: dict[str, int] = {}
         self._hub = hub
         self._commands = commands
         self._ask = ask
@@ -63,13 +64,13 @@ class ModbusServer:
         self._standstill = Standstill()
         self._writes = ClientWrites(commands, role, "modbus", settings.common_addresses, self._standstill)
         self._shares: dict[str, LineShare] = {}
-        self._sockets: dict[str, Any] = {}  # listening sockets by line
+        self._sockets: dict[str, Any] = {}  # listening sockets by line, like `ports`
         self._listening: list[ModbusPort] = []
 
     # ---- start and end ----
 
     def listen(self) -> None:
-        """Open all ports, or none. Raises OSError for the first port that cannot be opened."""
+        """Open all TCP ports, or none. Raises OSError for the first port that cannot be opened."""
         for line, number in {MAIN: self.settings.port, **self.settings.ports}.items():
             try:
                 self._sockets[line] = listen(self.settings.host, number)
@@ -119,7 +120,9 @@ class ModbusServer:
     # ---- requests ----
 
     def serve(self, port: str, request: MbapRequest, client: ModbusClient) -> Answer:
-        """Return the answer to a request, or an awaitable of it; None for a broadcast, which is forbidden."""
+        """Return the answer to a request, or an awaitable of it; None for a broadcast, which is not
+        allowed.
+        """
         if request.unit == 0:
             return None
         unit = self._units.find(port, request.unit)
@@ -151,7 +154,10 @@ class ModbusServer:
         return request.reply(reply_data(function, words))
 
     def _in_blocks(self, unit: Unit, addresses: range) -> list[int] | None:
-        """Return words of the common block or of the channel block; None for other addresses."""
+        """Return the words at these addresses of the common block or of the channel block.
+
+        Return None for other addresses.
+        """
         for start, block in ((self.settings.common, unit.common), (self.settings.channels, unit.channels)):
             reach = range(start, start + block.length)
             if addresses.start < reach.stop and reach.start < addresses.stop:
@@ -164,14 +170,15 @@ class ModbusServer:
     def _pass(
         self, unit: Unit, request: MbapRequest, addresses: range, reason: Unavailable, client: ModbusClient
     ) -> Awaitable[bytes]:
-        """Pass a read on to the drive itself, if the settings allow it."""
+        """Pass a read on to the drive, if the settings allow it."""
         passing = self.settings.passing
         if passing == "off" and reason is Unavailable.UNPOLLED:
             raise Declined(ModbusCode.ILLEGAL_ADDRESS)
         if passing == "declared" and not unit.is_declared(request.function, addresses):
             raise Declined(ModbusCode.ILLEGAL_ADDRESS)
         if passing == "off" or self._hub.state(unit.drive.name) == "silent":
-            raise Declined(ModbusCode.NO_RESPONSE)  # not sent: polling notices when the drive answers again
+            # not sent: the setting `passing` is "off", or the drive is silent
+            raise Declined(ModbusCode.NO_RESPONSE)
         if client.is_full:
             raise Declined(ModbusCode.BUSY)
         share = self._shares.get(unit.line)

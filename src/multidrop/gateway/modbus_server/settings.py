@@ -1,4 +1,4 @@
-"""The table [serve.modbus] of a plant file, and the units: drives as Modbus clients address them."""
+"""The table [serve.modbus] of a plant file, and its units: the drives as Modbus clients address them."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ EXAMPLE = 'listen = "127.0.0.1:1502"'
 PASSING = ("off", "declared", "any")
 ROLES = ("look", "stop", "write")
 NETWORK = r"^([0-9.]+|[0-9A-Fa-f:.]*:[0-9A-Fa-f:.]*)(/[0-9.]+)?$"
-MAIN = ""  # key of the TCP port of all lines that have no port of their own
-UNITS = range(1, 248)  # 0 is a broadcast, 248 to 255 are reserved
-LAST_UNIT = 255  # reserved ids, up to this one, are accepted too, because some devices use them
+MAIN = ""  # key of the TCP port that all lines without their own port share
+UNITS = range(1, 248)  # valid unit ids of drives; 0 is a broadcast, 248 to 255 are reserved
+LAST_UNIT = 255  # the reserved ids 248 to 255 are accepted too, because some devices use them
 _WRITES = {Carrier.BIT: (0x05, 0x0F), Carrier.WORD: (0x06, 0x10)}
 _STOPS = ("stop", "coast", "emergency_stop")
 
 
 def _whole_numbers(least: int, most: int) -> dict[str, Any]:
-    """Return the JSON Schema of a table of whole numbers."""
+    """Return the JSON Schema of a table whose values are whole numbers from `least` to `most`."""
     return {"additionalProperties": {"type": "integer", "minimum": least, "maximum": most}}
 
 
@@ -45,19 +45,19 @@ class ModbusSettings:
     """The settings of the Modbus server. Raises ValueError with a line for each mistake."""
 
     listen: str = field(default="127.0.0.1:1502", metadata=ADDRESS)
-    # Which reads go to the drive if polled rows cannot answer them.
+    # Which reads are sent to the drive if polled values cannot answer them.
     passing: str = field(default="declared", metadata={"enum": [*PASSING]})
-    # Unit ids by drive; default: the drive's address.
+    # Unit ids by drive. The default is the drive's address.
     units: Mapping[str, int] = field(default_factory=dict, metadata=_whole_numbers(1, 255))
-    # TCP ports by line; default: the port of `listen`.
+    # TCP ports by line. The default is the port of `listen`.
     ports: Mapping[str, int] = field(default_factory=dict, metadata=_whole_numbers(0, 65535))
-    # The role of all clients, because Modbus has no tokens.
+    # The role of all Modbus clients, because Modbus has no tokens.
     may: str = field(default="look", metadata={"enum": [*ROLES]})
-    # Allowed addresses and networks; empty: only this computer.
+    # Addresses and networks from which clients may connect; empty: only from this computer.
     clients: Sequence[str] = field(default=(), metadata={"items": {"type": "string", "pattern": NETWORK}})
-    # Address of the common block.
+    # Address of the common block, which has the same values for every drive.
     common: int = field(default=0xF000, metadata={"minimum": 0, "maximum": 0x10000 - COMMON_LENGTH})
-    # Address of the first computed channel of each drive.
+    # Address of the block with a drive's computed channels.
     channels: int = field(default=0xF100, metadata={"minimum": 0, "maximum": 0xFFFF})
 
     def __post_init__(self) -> None:
@@ -77,12 +77,12 @@ class ModbusSettings:
 
     @property
     def port(self) -> int:
-        """The TCP port of all lines that have no port of their own."""
+        """The TCP port that all lines without their own port share."""
         return parse_address(self.listen, EXAMPLE)[1]
 
     @property
     def addresses(self) -> dict[str, tuple[str, int]]:
-        """Host and port of each listening socket, by the key of its setting, such as "ports.hall"."""
+        """The host and port of each listening socket, by the setting's key, such as "ports.hall"."""
         own = {f"ports.{line}": (self.host, number) for line, number in self.ports.items()}
         return {"listen": (self.host, self.port), **own}
 
@@ -122,7 +122,7 @@ class ModbusSettings:
 
 
 def is_allowed(address: str, clients: Sequence[str]) -> bool:
-    """Return True if a client at this address may connect; without `clients`, only this computer may."""
+    """Return True if a client at this address may connect. If `clients` is empty, only this computer may."""
     host = ip_address(address.partition("%")[0])
     host = getattr(host, "ipv4_mapped", None) or host
     if not clients:
@@ -131,7 +131,7 @@ def is_allowed(address: str, clients: Sequence[str]) -> bool:
 
 
 def listen_mistakes(listen: str, example: str, clients: Sequence[str]) -> Iterator[str]:
-    """Yield a sentence if `listen` is invalid, or open to other machines without a list of `clients`.
+    """Yield an error sentence if `listen` is invalid, or open to other machines without a list of `clients`.
 
     `example` is a valid setting, which the sentence may quote.
     """
@@ -149,7 +149,7 @@ def listen_mistakes(listen: str, example: str, clients: Sequence[str]) -> Iterat
 
 
 def client_mistakes(clients: Sequence[str]) -> Iterator[str]:
-    """Yield a sentence for each entry that is neither an address nor a network."""
+    """Yield an error sentence for each entry that is neither an address nor a network."""
     for network in clients:
         if not _is_network(network):
             yield f"clients: {network!r} is neither an address nor a network such as 10.0.0.0/24"
@@ -170,7 +170,7 @@ def _is_network(text: object) -> bool:
 
 
 class StopWrite(NamedTuple):
-    """A register, and a raw value that stops the motor if it is written to the register."""
+    """A register, and the raw value that stops the motor when it is written to this register."""
 
     register: str
     raw: float
@@ -186,7 +186,7 @@ class Unit:
         self.common = CommonBlock(polled)
         self.channels = ChannelBlock(polled)
         self.stops = frozenset(_stop_writes(polled.drive))
-        # addresses by the function code that reads them; 0: no function does
+        # readable addresses by the function code that reads them; 0: those that no function reads
         self._readable: dict[int, set[int]] = {code: set() for code in range(5)}
         self._gaps: list[tuple[int, range]] = []
         self._writable: dict[tuple[Carrier, int], Register[Any]] = {}
@@ -220,7 +220,9 @@ class Unit:
         return self._writable.get((carrier, address))
 
     def has_stop_in(self, written: WriteRequest, common_stop: int | None) -> bool:
-        """Return True if a request writes a stop to a register, or to `common_stop` in the common block."""
+        """Return True if a request contains a write that stops the motor: to a register, or to the
+        address `common_stop`.
+        """
         carrier, start, size, data = written
         for at in range(size):
             if carrier is Carrier.WORD and start + at == common_stop and data[2 * at : 2 * at + 2] != b"\0\0":
@@ -233,7 +235,7 @@ class Unit:
         return False
 
     def holding_addresses(self) -> set[int]:
-        """Return the addresses of all words that the drive's registers and texts use."""
+        """Return the addresses of all words that the drive's registers and texts use, for reads or writes."""
         written = {
             at
             for register in self.drive.registers.values()
@@ -244,9 +246,9 @@ class Unit:
 
 
 def _stop_writes(drive: Any) -> Iterator[StopWrite]:
-    """Yield the register and raw value of the first write of each stop verb of the family.
+    """Yield each register and raw value that stop the motor: the first write of each stop verb of the family.
 
-    Also yield the other raw values in `harmless` of the register's declaration, such as YD1000's 8000H.
+    Also yield the other raw values in `harmless` of the same registers' declarations, such as YD1000's 8000H.
     Omit 0, which may mean "no command".
     """
     for name in _STOPS:
@@ -258,16 +260,15 @@ def _stop_writes(drive: Any) -> Iterator[StopWrite]:
             if isinstance(register, Register) and value is not None:
                 counts = {register.encode(value), *filter(None, register.harmless or ())}
                 yield from (StopWrite(register.name, raw) for raw in counts)
-        except Exception:  # the family lacks this verb, or the verb's script needs a bus
+        except Exception:  # the family lacks this verb, or the verb's steps need a bus
             continue
 
 
 class Units:
     """All units of a plant, by TCP port (MAIN, or a line's name) and unit id.
 
-    The drives of a line with its own port are reached only on that port. Raises ValueError with a
-    sentence per line for each mistake, such as two drives with one unit id, or an unknown name in the
-    settings.
+    Drives on a line with its own TCP port are reached only on that port. Raises ValueError with a line for
+    each mistake, such as two drives with one unit id, or an unknown name in the settings.
     """
 
     def __init__(self, plant: Plant, settings: ModbusSettings) -> None:
@@ -282,7 +283,7 @@ class Units:
         refuse(wrong)
 
     def find(self, port: str, number: int) -> Unit | None:
-        """Return the unit of this number on a port; None if there is none."""
+        """Return the drive with this unit id on a TCP port; None if there is none."""
         return self._units.get((port, number))
 
     def __iter__(self) -> Iterator[tuple[str, int, Unit]]:
@@ -300,9 +301,11 @@ def _by_port(plant: Plant, settings: ModbusSettings) -> Mapping[str, Mapping[int
 
 
 def _clashes(port: str, units: Mapping[int, list[Unit]]) -> Iterator[str]:
-    """Yield a sentence for each duplicate or invalid unit id, and a sentence that lists the free ids."""
+    """Yield an error sentence for each duplicate or invalid unit id on a TCP port, and one that lists
+    the free ids.
+    """
     where = "" if port == MAIN else f" on the port of line {port}"
-    wrong: list[str] = []  # names of drives
+    wrong: list[str] = []  # names of the drives with an invalid unit id
     for number, found in sorted(units.items()):
         names = " and ".join(f"{unit.drive.name} (line {unit.line})" for unit in found)
         if not 1 <= number <= LAST_UNIT:
@@ -332,7 +335,9 @@ def _ranges(numbers: Iterable[int]) -> str:
 
 
 def _overlap(unit: Unit, settings: ModbusSettings) -> Iterator[str]:
-    """Yield a sentence for each overlap of the common block, the channel block and the registers."""
+    """Yield an error sentence for each overlap of the common block, the channel block and the drive's
+    registers.
+    """
     channels = range(settings.channels, settings.channels + unit.channels.length)
     if channels.stop > 0x10000 or set(channels) & (unit.holding_addresses() | set(settings.common_addresses)):
         yield (

@@ -1,4 +1,6 @@
-"""Connections of vendors' tools: pseudo-terminals, TCP connections, and the RTU requests in their bytes."""
+"""Connections of drive vendors' tools, as pseudo-terminals or over TCP, and the RTU requests in their
+bytes.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +14,15 @@ from multidrop.core import FrameFault, Framing, crc16, parse_request
 from multidrop.gateway.modbus_server.protocol import MbapRequest
 from multidrop.recording import FileLock
 
-MOST_READ = 256  # bytes of one read
+MOST_READ = 256  # limit, in bytes, of one read from a connection
 _DEVICES = "/dev/pts/"
-# The target of each link that a gateway makes starts with this text, so that gateways recognise their links
-# and replace no others. Links are made and read with `os`, because a Path would drop the ".".
+# Each link that a gateway makes points to a path that starts with this text. So gateways recognise their
+# links and replace no others. Links are made and read with `os`, because a Path would drop the ".".
 _OURS = "/dev/pts/./"
-LEAST_FRAME, MOST_FRAME = 4, 256  # in bytes: address, function, data, checksum
-EXCEPTION = 0x80  # bit of a function code that only replies have
+LEAST_FRAME, MOST_FRAME = 4, 256  # limits, in bytes, of an RTU frame: address, function code, data, checksum
+EXCEPTION = 0x80  # bit of a function code that is set only in exception replies
 _CHECKSUM = 2
-_MBAP = 6  # bytes of a Modbus TCP frame before the unit id
+_MBAP = 6  # number of bytes before the unit id in a Modbus TCP frame
 
 
 class End(Protocol):
@@ -28,7 +30,7 @@ class End(Protocol):
 
     @property
     def address(self) -> str:
-        """The tool's address in logs: a path or an IP address."""
+        """The tool's address for logs: a path or an IP address."""
 
     def fileno(self) -> int: ...
     def read(self) -> bytes | None:
@@ -48,8 +50,9 @@ class Terminal:
 
     This object keeps the tool's side open, so that the pseudo-terminal still exists after a tool has closed
     it. The baud rate and format that a tool sets have no effect. A lock on a file beside the link shows that
-    its gateway is alive. An existing link is replaced only if its gateway was killed. Raises OSError if the
-    link cannot be made, or if its path is in use.
+    the gateway that made the link runs. An existing link is replaced only if its gateway was killed.
+
+    Raises OSError if the link cannot be made, or if its path is in use.
     """
 
     def __init__(self, link: Path) -> None:
@@ -96,7 +99,10 @@ class Terminal:
         termios.tcflush(self._slave, termios.TCIFLUSH)
 
     def _make_raw(self) -> None:
-        """Turn echo and translation off. An echo of the reply to a write would look like a second write."""
+        """Turn echo and translation of bytes off.
+
+        With echo, the gateway would receive its own reply to a write, which looks like a second write.
+        """
         import termios
         import tty
 
@@ -106,7 +112,7 @@ class Terminal:
             tty.setraw(self._slave, termios.TCSANOW)
 
     def close(self) -> None:
-        """Close the pseudo-terminal, and remove the link if it still leads to this pseudo-terminal."""
+        """Close the pseudo-terminal, and remove the link if it still points to this pseudo-terminal."""
         if not self._is_open:
             return
         self._is_open = False
@@ -152,7 +158,7 @@ class Connection:
             self._peer.send(data)
 
     def discard(self) -> None:
-        """Leave sent bytes as they are: TCP cannot take them back."""
+        """Do nothing: TCP cannot take back the bytes that were sent."""
 
     def close(self) -> None:
         self._peer.close()
@@ -164,8 +170,8 @@ class Connection:
 class RequestCutter:
     """Collects a tool's bytes and returns whole requests.
 
-    Source: MODBUS over Serial Line V1.02, section 2.5.1. On a serial line, silence separates frames. A
-    pseudo-terminal and TCP do not keep the silence, so a frame is recognised by its length and checksum.
+    Source: MODBUS over Serial Line V1.02, section 2.5.1. On a serial line, silence separates frames. The
+    silence is lost in a pseudo-terminal and in TCP, so a frame is recognised by its length and checksum.
     """
 
     def __init__(self) -> None:
@@ -176,9 +182,9 @@ class RequestCutter:
         self._came += data
 
     def take(self) -> MbapRequest | None:
-        """Remove the first request and return it; None if no request is complete.
+        """Remove the first complete request and return it; None if there is none.
 
-        Bytes before this request that belong to no request are dropped.
+        Bytes before it that belong to no request are dropped.
         """
         while len(self._came) >= LEAST_FRAME:
             length = _request_length(self._came, self._is_in_step)
@@ -194,11 +200,11 @@ class RequestCutter:
 
     @property
     def has_rest(self) -> bool:
-        """True if bytes of an incomplete request wait for the rest."""
+        """True if bytes of an incomplete request are waiting for the rest of the request."""
         return bool(self._came)
 
     def skip(self) -> bool:
-        """Drop the first byte, because the rest of the request that it starts did not come.
+        """Drop the first byte, because the request that starts there was never completed.
 
         Return False if no byte is left.
         """
@@ -217,14 +223,14 @@ def _request_length(came: bytearray, is_in_step: bool) -> int | None:
         return None
     if found != FrameFault.BAD_FUNCTION:
         return max(found, 0)
-    # The length of requests of other functions is unknown. But a tool waits after its request, so the request
-    # ends where the received bytes end.
+    # Requests of other functions have an unknown length. But a tool waits for the reply to a request, so the
+    # request ends where the received bytes end.
     if not is_in_step or came[1] >= EXCEPTION or len(came) > MOST_FRAME:
         return 0
     return None if crc16(bytes(came), len(came)) else len(came)
 
 
 def rtu_reply(frame: bytes) -> bytes:
-    """Return an RTU frame with the content of a Modbus TCP frame."""
+    """Return an RTU frame with the contents of a Modbus TCP frame."""
     body = frame[_MBAP:]
     return body + int(crc16(body, len(body))).to_bytes(2, "little")

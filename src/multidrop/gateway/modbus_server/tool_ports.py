@@ -1,7 +1,7 @@
-"""Tool ports: pass the requests of vendors' tools on to the drives of a line, in the line's spare time.
+"""Tool ports: pass the requests of drive vendors' tools on to the drives of a line, in the line's spare time.
 
-A tool port behaves like the line itself: a request to another address, or to a silent drive, gets no
-reply. Reads go to the drive one at a time. Writes obey the same rules as those of Modbus TCP clients.
+A tool port behaves like the line itself: a request to an unused address, or to a silent drive, gets no reply.
+Reads are sent to the drive one at a time. Writes obey the same rules as those of Modbus TCP clients.
 """
 
 from __future__ import annotations
@@ -58,21 +58,23 @@ RTU_EXAMPLE = 'rtu = { hall = "127.0.0.1:4001" }'
 LEAST_TIMEOUT_S, MOST_TIMEOUT_S = 0.05, 10.0
 _TEXT = {"type": "string", "minLength": 1}
 WAY = "tool"
-# the tools' share of a line's time: on a line that polling fully uses, and on an idle line
+# limits of the tools' share of a line's time: the first on a line that polling uses fully, the second on an
+# idle line
 LEAST_SHARE, MOST_SHARE = 0.1, 0.5
-MOST_TOOLS = 8  # limit of TCP connections per line
-PAUSE_S = 0.005  # pause between two reads of MOST_READ bytes, so that a tool cannot keep the loop busy
-REST_S = 0.2  # an incomplete request is dropped after this time in s without further bytes
-PLAN_S = 60.0  # time limit for computing a line's planned utilisation
-IDLE_S = 300.0  # a TCP connection is closed after this time without a request
-SWEEP_S = 1.0  # interval of checking for idle connections
-# a stop's answer waits for the motor, and a read waits for the line, for this share of `timeout`
+MOST_TOOLS = 8  # limit of TCP connections to one line
+# pause, in s, between two reads from a tool, so that one tool cannot keep the event loop busy
+PAUSE_S = 0.005
+REST_S = 0.2  # in s: an incomplete request is dropped if no more bytes arrive for this long
+PLAN_S = 60.0  # time limit, in s, for computing how much of a line's time polling takes
+IDLE_S = 300.0  # in s: a TCP connection without a request for this long is closed
+SWEEP_S = 1.0  # interval, in s, of checking for idle connections
+# the answer to a stop waits for the motor, and a read waits for the line, for at most this share of `timeout`
 WAIT_SHARE = 0.75
-# Codes of failures after which a tool on a real line would get no reply.
+# Exception codes for a drive that cannot be reached. On a real line, a tool would get no reply then.
 _SILENT = (ModbusCode.NO_PATH, ModbusCode.NO_RESPONSE)
 _log = logging.getLogger("multidrop.gateway")
-# Starts a request. Returns None if the request gets no answer; else an awaitable of the answer's frame, or of
-# None if no answer is sent after all.
+# A function that starts a request. It returns None if the request gets no answer. Else it returns an
+# awaitable of the answer's frame, or of None if it turns out that no answer is sent.
 Serve = Callable[[MbapRequest, "Tool"], Awaitable["bytes | None"] | None]
 
 
@@ -80,24 +82,26 @@ Serve = Callable[[MbapRequest, "Tool"], Awaitable["bytes | None"] | None]
 class ToolSettings:
     """The settings of the tool ports. Raises ValueError with a line for each mistake."""
 
-    # Path of the link to the pseudo-terminal, by line.
+    # Path of the symbolic link to a line's pseudo-terminal, by line.
     pty: Mapping[str, str] = field(default_factory=dict, metadata={"additionalProperties": _TEXT})
-    # Address and port for RTU over TCP, by line.
+    # Host and port of a line's RTU over TCP, by line.
     rtu: Mapping[str, str] = field(
         default_factory=dict, metadata={"additionalProperties": {**_TEXT, **ADDRESS}}
     )
-    # The role of all tools.
+    # The role of all tools: what they may do.
     may: str = field(default="look", metadata={"enum": [*ROLES]})
     # Addresses and networks that may connect to `rtu`; empty: only this computer.
     clients: Sequence[str] = field(default=(), metadata={"items": {"type": "string", "pattern": NETWORK}})
-    # Time limit in s for the answer to a request; should be less than the tool's own timeout.
+    # Time limit, in s, for the answer to a request. It should be shorter than the tool's own timeout.
     timeout: float = field(default=0.4, metadata={"minimum": LEAST_TIMEOUT_S, "maximum": MOST_TIMEOUT_S})
 
     def __post_init__(self) -> None:
         refuse(self._mistakes())
 
     def check(self, plant: Plant) -> list[str]:
-        """Return a sentence for each line in `pty` or `rtu` that the plant lacks, or that has no Modbus."""
+        """Return an error sentence for each line in `pty` or `rtu` that is not in the plant, or has no
+        Modbus drives.
+        """
         lines = {line.name: line for line in plant.lines}
         return [*self._line_mistakes(lines)] if lines else []
 
@@ -106,7 +110,7 @@ class ToolSettings:
 
     @property
     def addresses(self) -> dict[str, tuple[str, int]]:
-        """Host and port of each listening socket, by the key of its setting, such as "rtu.hall"."""
+        """The host and port of each listening socket, by the setting's key, such as "rtu.hall"."""
         return {f"rtu.{line}": parse_address(where, RTU_EXAMPLE) for line, where in self.rtu.items()}
 
     @property
@@ -155,14 +159,14 @@ def build(settings: ToolSettings, context: PartContext) -> ToolPorts:
 
 
 class Tool:
-    """A connected tool. Only the tool's newest request is answered, because a tool sends a request only
-    after it has given up the earlier ones.
+    """A connected tool. Only its newest request is answered, because a tool sends one only after it has given
+    up the previous one.
 
-    A reply later than `timeout` s after its request is dropped: the tool could take it for the reply to
-    its next request.
+    A reply that comes later than `timeout` s after its request is dropped, because the tool could take it for
+    the reply to its next request.
     """
 
-    is_full = False  # a single tool has no limit of writes: that of the line is enough
+    is_full = False  # the number of writes is limited for the line, not for a single tool
 
     def __init__(self, end: End, serve: Serve, timeout: float) -> None:
         self.address = end.address
@@ -188,7 +192,9 @@ class Tool:
             self._loop.call_later(PAUSE_S, self._listen)
 
     def _take_in(self) -> bool:
-        """Read bytes and start their requests; return False if the tool has disconnected."""
+        """Read the received bytes and start the requests in them; return False if the tool has
+        disconnected.
+        """
         try:
             data = self._end.read()
         except OSError as failure:
@@ -209,13 +215,13 @@ class Tool:
         while (request := self._cutter.take()) is not None:
             try:
                 self._begin(request)
-            except Exception:  # later requests are still served: one may be a stop
+            except Exception:  # continue, because a later request may be a stop
                 _log.exception("a request of tool %s failed", self.address)
 
     def _drop_rest(self) -> None:
-        """Drop an incomplete request, unless the rest of it has come while the event loop was busy.
+        """Drop an incomplete request, unless the rest of it has arrived while the event loop was busy.
 
-        Requests after the dropped bytes are served, because one may be a stop.
+        Requests in the bytes after it are served, because one of them may be a stop.
         """
         self._rest = None
         if self._take_in() and self._rest is None:
@@ -239,7 +245,8 @@ class Tool:
 
     def _give_up(self) -> None:
         if self._answering is not None and not self._answering.done():
-            self._loop.call_soon(self._answering.cancel)  # later: by then, the task has started
+            # not immediately, because the task must have started
+            self._loop.call_soon(self._answering.cancel)
         self._answering = None
 
     async def _answer(self, request: MbapRequest, answer: Awaitable[bytes | None]) -> None:
@@ -257,7 +264,7 @@ class Tool:
             self._end.discard()
 
     def close(self) -> None:
-        """Close the connection without its pending answer; writes in progress continue."""
+        """Close the connection; a pending answer is not sent, but writes in progress continue."""
         if not self.is_open:
             return
         self.is_open = False
@@ -268,7 +275,7 @@ class Tool:
 
 
 class ToolLine:
-    """The drives of a line by address, as its tools see them."""
+    """The drives of one line by address, as the line's tools see them."""
 
     def __init__(
         self,
@@ -320,15 +327,16 @@ class ToolLine:
         if unit.drive.framing is Framing.DELIXI:
             raise Declined(ModbusCode.ILLEGAL_FUNCTION)  # the drive's protocol has no Modbus functions
         if self._hub.state(unit.drive.name) == SILENT:
-            # not sent, and not answered: polling notices when the drive answers again
+            # a silent drive gets no reads: polling will notice when it answers again
             raise Declined(ModbusCode.NO_RESPONSE)
         return self._passed(unit, request, start, count, tool)
 
     async def _passed(
         self, unit: Unit, request: MbapRequest, start: int, count: int, tool: Tool
     ) -> bytes | None:
-        """Read from the drive once the line has time for tools. Answer "busy" if the read has not started
-        after WAIT_SHARE of the timeout.
+        """Read from the drive once the line has time for tools.
+
+        Answer "busy" if the read has not started within WAIT_SHARE of the timeout.
         """
         is_begun = False
         until = asyncio.get_running_loop().time() + self._timeout
@@ -351,7 +359,7 @@ class ToolLine:
             return _exception(request, code_of(failure))
         finally:
             if asked is not None:
-                asked.cancel()  # cancels the read only if it still waits for the line
+                asked.cancel()  # cancels the read only if it has not started yet
         if count:
             return request.reply(reply_data(request.function, found))
         length = bytes([len(found)]) if request.function == SERVER_ID else b""
@@ -359,7 +367,7 @@ class ToolLine:
 
 
 def _exception(request: MbapRequest, code: int) -> bytes | None:
-    """Return the frame of an exception, or None if a tool on a real line would get no reply."""
+    """Return the frame of an exception reply; None if a tool on a real line would get no reply."""
     return None if code in _SILENT else request.exception(code)
 
 
@@ -368,7 +376,10 @@ async def _at_once(frame: bytes | None) -> bytes | None:
 
 
 def _asked(request: MbapRequest) -> tuple[int, int]:
-    """Return first address and count of a read. Raises Declined for an invalid or unknown request."""
+    """Return the first address and the count of a read request.
+
+    Raises Declined for an invalid or unknown request.
+    """
     function, data = request.function, request.data
     if function in (STATUS, SERVER_ID) and not data:
         return 0, 0
@@ -381,7 +392,7 @@ def _asked(request: MbapRequest) -> tuple[int, int]:
 class ToolPorts:
     """The tool ports of a plant: for each line a pseudo-terminal, a TCP port, or both.
 
-    `folder` is the base of relative paths of pseudo-terminals.
+    Relative paths of pseudo-terminals are relative to `folder`.
     """
 
     def __init__(
@@ -399,7 +410,7 @@ class ToolPorts:
         self._terminals: dict[str, Terminal] = {}
         self._listeners: dict[str, socket.socket] = {}
         self._at_terminals: list[Tool] = []
-        self._tools: dict[str, list[Tool]] = {}  # TCP connections by line
+        self._tools: dict[str, list[Tool]] = {}  # tools that are connected over TCP, by line
 
     def listen(self) -> None:
         """Open all ports, or none. Raises OSError for the first port that cannot be opened."""
@@ -437,7 +448,7 @@ class ToolPorts:
                 supervisor().start("tool share", self._learn_share(self.lines[line.name], line))
 
     async def _learn_share(self, tools: ToolLine, line: PlantLine) -> None:
-        """Set the share of the line's time for tools: half of the share that polling leaves."""
+        """Set the tools' share of the line's time to half of the share that polling leaves."""
         used = await supervisor().within("tool share", PLAN_S, partial(utilisation_of, self._plant, line))
         tools.share.share = min(MOST_SHARE, max(LEAST_SHARE, (1 - used) / 2))
 
@@ -454,7 +465,7 @@ class ToolPorts:
         loop = asyncio.get_running_loop()
         try:
             peer, (host, *_) = listener.accept()
-        except OSError as failure:  # such as too many open files
+        except OSError as failure:  # for example, too many files are open
             _log.warning("a tool could not connect to line %s: %s", line, failure)
             loop.remove_reader(listener.fileno())
             loop.call_later(SWEEP_S, self._accept_on, line)
@@ -501,5 +512,5 @@ class ToolPorts:
 
 
 def utilisation_of(plant: Plant, line: PlantLine) -> float:
-    """Return the planned share of the line's time that polling takes."""
+    """Return the share of the line's time that polling takes according to its plan."""
     return float(replace(plant, lines=(line,)).metadata()["planned"][line.name]["utilisation"])

@@ -1,11 +1,13 @@
-"""The 16-bit words that Modbus clients read: those that a drive sent, and its common block.
+"""The 16-bit words that Modbus clients read: words that a drive has sent, and the drive's common block.
 
-Rows have values in units, but Modbus clients expect the drive's raw words. Batches have no raw words,
-because these would cost 8 bytes per row. A word is computed only if it is certain: encoding the value
-as a raw count and decoding it must give the value again, and the neighbouring counts must give other
-values. The words of some registers are always uncertain: a register that is only a part of a word, one that
-has a scale register, and one with the format `I8` or `U32_EITHER`, which do not determine all bits. A float's
-zero is uncertain too, because its sign is unknown.
+Polled values are numbers in units, but Modbus clients expect the drive's raw words. Batches of polled values
+do not keep the raw words, which would cost 8 bytes per value. So a word is computed from the value, and used
+only if it is certain: encoding the value as a raw count and decoding it must give the value again, and the
+neighbouring counts must give other values.
+
+The words of some registers are always uncertain: a register that is only a part of a word, one that has a
+scale register, and one with the format `I8` or `U32_EITHER`, which do not determine all bits. A float's zero
+is uncertain too, because its sign is unknown.
 
 The common block has a drive's state, values and stop at the same addresses and in the same units for every
 drive. Numbers of two words have the high word first. A value that is not fresh reads as a reserved number,
@@ -28,47 +30,54 @@ from multidrop.gateway.live.hub import Hub, Newest
 
 _FLOATS = {NumberFormat.F16: (">e", ">H"), NumberFormat.F32: (">f", ">I"), NumberFormat.F64: (">d", ">Q")}
 _OPEN = frozenset({NumberFormat.I8, NumberFormat.U32_EITHER})
-MOST_KNOWN = 8192  # limit of cached values; all drives of a family share the cache
+MOST_KNOWN = 8192  # limit of the cached values; all drives of a family share the cache
 _MOST_EXACT = 1 << 53  # a float64 represents every whole number up to this one
 _FUNCTIONS = {Carrier.BIT: (1, 2), Carrier.WORD: (3, 4)}
 COMMON_LENGTH = 16  # length of the common block in words
-STATE, FAULT, FREQUENCY, CURRENT, SETPOINT, AGE, STOP = 0, 1, 2, 4, 6, 8, 10  # offsets in words
+# offsets in the common block, in words
+STATE, FAULT, FREQUENCY, CURRENT, SETPOINT, AGE, STOP = 0, 1, 2, 4, 6, 8, 10
 STATES = {"unknown": 0, "stands": 1, "runs": 2, "fault": 3, "silent": 4}
 NO_FAULT, FAULT_WITHOUT_NUMBER, FAULT_UNKNOWN = 0, 0xFFFE, 0xFFFF
 NO_NUMBER = -(1 << 31)  # 8000 0000H: the value is unknown, or out of range
-NEVER, LONGEST_AGE = 0xFFFF_FFFF, 0xFFFF_FFFE  # ages in ms: no value was read yet; limit of ages
+# ages in ms: reserved number for "no value was read yet", and the largest age
+NEVER, LONGEST_AGE = 0xFFFF_FFFF, 0xFFFF_FFFE
 _PER_UNIT = 100
 
 
 def reading_function(table: Table) -> int:
-    """Return the Modbus function from 1 to 4 that reads a table; 0 if none does."""
+    """Return the Modbus function code, 1 to 4, that reads a table; 0 if there is none."""
     code = table.read or 0
     return code if code in _FUNCTIONS.get(table.carrier, ()) else 0
 
 
 class Unavailable(Enum):
-    """The reason why a read of these addresses cannot be answered from polled rows."""
+    """The reason why polled values cannot answer a read of these addresses."""
 
     UNPOLLED = "not polled, or the words are uncertain"
     STALE = "polled, but the newest row is a miss or old"
 
 
 def is_fresh(row: Newest | None, now_ns: int, since_ns: int = 0) -> bool:
-    """Return True if a row has a value that is still current and was requested at `since_ns` or later."""
+    """Return True if a read succeeded, its value is not too old, and it was requested at `since_ns` or
+    later.
+    """
     if row is None or row.value is None:
         return False
     return row.monotonic_ns >= since_ns and now_ns - row.monotonic_ns <= row.holds_ns
 
 
 def is_certain(register: Register[Any]) -> bool:
-    """Return True if the words of this register are certain for most of its values."""
+    """Return True if the raw words can be computed from most values of this register."""
     coding = register.coding
     return register.part is None and not register.scale_register and coding.number_format not in _OPEN
 
 
 @lru_cache(maxsize=MOST_KNOWN)
 def exact_data(register: Register[Any], value: float) -> bytes | None:
-    """Return the bytes that the drive sends for this value (a coil: one byte, 0 or 1); None if uncertain."""
+    """Return the bytes that the drive sends for this value (a coil: one byte, 0 or 1).
+
+    Return None if they are uncertain.
+    """
     coding = register.coding
     if not is_certain(register):
         return None
@@ -100,7 +109,7 @@ def _nearest_count(register: Register[Any], value: float) -> float | None:
         return raw if abs(raw * multiplier) + abs(addend) <= _MOST_EXACT else None
     code, _ = _FLOATS[register.coding.number_format]
     held: float = struct.unpack(code, struct.pack(code, count))[0]
-    return held if held else None  # None for a float's zero: its sign is unknown
+    return held if held else None  # a float's zero: its sign is unknown
 
 
 def _neighbours(raw: float, number_format: NumberFormat) -> Iterable[float]:
@@ -114,7 +123,7 @@ def _neighbours(raw: float, number_format: NumberFormat) -> Iterable[float]:
 
 
 class _PolledRegister:
-    """A polled register, with the words computed from its latest value."""
+    """A polled register, and the raw words computed from its latest value."""
 
     __slots__ = ("_data", "_register", "_value", "name")
 
@@ -125,10 +134,10 @@ class _PolledRegister:
         self._data: bytes | None = None
 
     def word(self, row: Newest | None, at: int, now_ns: int, since_ns: int) -> int | Unavailable:
-        """Return the word (of a coil: the bit) at this offset in the newest row, or the reason why it is
-        unknown.
+        """Return the word at the offset `at` in the register's newest value (of a coil: the bit), or why it
+        is unknown.
 
-        Misses, stale rows and rows older than `since_ns` are not used.
+        Failed reads, stale values and values requested before `since_ns` are not used.
         """
         if row is None or not is_fresh(row, now_ns, since_ns):
             return Unavailable.STALE
@@ -142,7 +151,7 @@ class _PolledRegister:
 
 
 class DriveWords:
-    """The polled words of one drive, by function code and address."""
+    """The raw words of one drive's polled registers, by function code and address."""
 
     def __init__(self, polled: PolledDrive) -> None:
         self._at: dict[tuple[int, int], list[tuple[_PolledRegister, int]]] = {}
@@ -167,9 +176,10 @@ class DriveWords:
         now_ns: int,
         since_ns: int = 0,
     ) -> list[int] | Unavailable:
-        """Return the words or bits at these addresses from fresh rows, or why that is impossible.
+        """Return the words or bits at these addresses from fresh polled values, or why that is impossible.
 
-        `newest` returns the newest row of a register by name. Rows older than `since_ns` are not used.
+        `newest` returns the newest read of a register by name. Values requested before `since_ns` are not
+        used.
         """
         words: list[int] = []
         reasons: list[Unavailable] = []
@@ -195,7 +205,7 @@ class DriveWords:
 def _newest_word(
     found: list[tuple[Newest | None, _PolledRegister, int]], now_ns: int, since_ns: int
 ) -> int | Unavailable:
-    """Return the word at an address that several registers share, from the newest of their rows."""
+    """Return the word at an address that several registers share, from the register that was read last."""
     reason = Unavailable.STALE
     for row, polled, at in sorted(found, key=lambda one: -one[0].monotonic_ns if one[0] else 0):
         word = polled.word(row, at, now_ns, since_ns)
@@ -213,12 +223,12 @@ class CommonNumber(NamedTuple):
     """A number of the common block, as the address map describes it."""
 
     name: str
-    at: int  # offset in words
+    at: int  # offset in the common block, in words
     words: int
     format: str
     step: float
     unit: str | None  # None: the unit of the drive's setpoint
-    unknown: int  # the reserved number for a value that is not current
+    unknown: int  # the reserved number that means "no current value"
     note: str = ""
 
 
@@ -239,7 +249,7 @@ NUMBERS = (
 
 
 class CommonBlock:
-    """The common block of one drive; its words are computed on request."""
+    """The common block of one drive. Its words are computed on request."""
 
     length = COMMON_LENGTH
 
@@ -265,12 +275,17 @@ class CommonBlock:
         return words
 
     def _fresh_value(self, hub: Hub, now_ns: int, woke_ns: int, name: str, unit: str | None) -> float | None:
-        """Return a polled register's fresh value, if its unit is `unit` (None: any unit); None otherwise."""
+        """Return a polled register's fresh value; None if there is none, or if its unit is not `unit`.
+
+        With `unit` None, any unit fits.
+        """
         row = hub.newest(self._name, name) if (name, unit) in self._polled else None
         return row.value if row and is_fresh(row, now_ns, woke_ns) else None
 
     def _fault(self, hub: Hub, now_ns: int, woke_ns: int, state: str) -> int:
-        """Return the present fault's number in its drive family, or one of the reserved fault numbers."""
+        """Return the number that the drive's family gives the present fault, or one of the reserved
+        fault numbers.
+        """
         if state != "fault":
             return NO_FAULT if state in ("stands", "runs") else FAULT_UNKNOWN
         value = self._fresh_value(hub, now_ns, woke_ns, "fault", "")
@@ -283,7 +298,7 @@ class CommonBlock:
         answer = hub.last_answer(self._name)
         if answer is None:
             return NEVER
-        if answer[1] < woke_ns:  # requested before a sleep of unknown length
+        if answer[1] < woke_ns:  # the value was requested before the computer slept, for an unknown time
             return LONGEST_AGE
         return min(max(now_ns - answer[1], 0) // 1_000_000, LONGEST_AGE)
 
@@ -297,7 +312,7 @@ class ChannelBlock:
         self.length = 2 * len(self.channels)
 
     def words(self, hub: Hub, now_ns: int) -> list[int]:
-        """Return the words at the monotonic time `now_ns`; a value that is not fresh is NaN."""
+        """Return the block's words at the monotonic time `now_ns`. A value that is not fresh is NaN."""
         since_ns = hub.woke_ns()
         words: list[int] = []
         for channel in self.channels:
