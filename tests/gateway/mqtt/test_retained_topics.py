@@ -230,6 +230,10 @@ CHANNEL = """
 name = "half"
 value = "output_frequency / 2 + 25"
 unit = "Hz"
+[[serve.limit]]
+drive = "pump-2"
+register = "half"
+above = 10
 [serve.mqtt]
 broker = "{}"
 rows = true
@@ -237,10 +241,10 @@ rows = true
 
 
 @pytest.mark.long
-def test_values_of_a_channel_reach_a_broker(tmp_path: Path) -> None:
+def test_values_and_alarms_of_a_channel_reach_a_broker(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     with mosquitto(tmp_path) as broker, served(tmp_path, CHANNEL.format(broker.address)):
-        listener = Listener(broker, "multidrop/pump-2/#")
+        listener = Listener(broker, "multidrop/#")
         try:
             listener.wait_for(
                 lambda one: (
@@ -250,6 +254,11 @@ def test_values_of_a_channel_reach_a_broker(tmp_path: Path) -> None:
             found = listener.wait_for(lambda one: one.topic.endswith("/rows") and b'"half"' in one.payload)
             row = next(row for row in json.loads(found.payload)["rows"] if row["register"] == "half")
             assert (row["drive"], row["value"], row["unit"], row["status"]) == ("pump-2", 25.0, "Hz", "ok")
+            with closing(Listener(broker, "multidrop/#")) as later:
+                found = later.wait_for(lambda one: one.topic == "multidrop/alarms" and one.payload != b"[]")
+            [alarm] = json.loads(found.payload)
+            assert (alarm["drive"], alarm["kind"]) == ("pump-2", "limit")
+            assert "half above 10 Hz" in alarm["text"]
         finally:
             listener.close()
 
