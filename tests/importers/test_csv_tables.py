@@ -1,4 +1,4 @@
-"""CSV tables: ambiguous cells, and facts that the table does not state, are marked as gaps."""
+"""Import of CSV tables: ambiguous cells, and properties that the table does not state, are marked as gaps."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ UNPLACED = ["whether its address counts from 0 or 1; 0 was assumed", "its table;
 
 
 def row(folder: Path, header: str, cells: str) -> ImportedDevice:
-    """Return the device imported from a table with one row, the register `a`."""
+    """Return the device imported from a table with one row, which declares the register `a`."""
     return only(folder, "t.csv", f"name,{header}\na,{cells}\n")
 
 
 def found(device: ImportedDevice) -> list[str]:
-    """Return the device's gaps, except those about address numbering and a missing table."""
+    """Return the device's gaps, except those about the address numbering and about a missing table."""
     return [gap for gap in gaps(device, "a") if gap not in UNPLACED]
 
 
@@ -45,7 +45,7 @@ def found(device: ImportedDevice) -> list[str]:
             30775,
             None,
             "",
-        ),  # the digit 3 contradicts the stated table
+        ),  # the first digit 3 contradicts the table that the row states
         ("address,type", "13001,uint16", 13001, None, "13001 names a discrete, and its row a number"),
         ("address,unit", "13001,kWh", 13001, None, "13001 names a discrete, and its row a number"),
         ("address,type", "00010,int16", 10, None, "00010 names a coil, and its row a number"),
@@ -63,7 +63,7 @@ def found(device: ImportedDevice) -> list[str]:
         ("Address [HEX],type", "10,uint16", 0x10, None, ""),
     ],
 )
-def test_address_and_table_are_read_from_every_notation(
+def test_address_and_table_in_a_csv_cell_are_read_from_every_notation(
     tmp_path: Path, header: str, cells: str, at: int, table: str | None, gap: str
 ) -> None:
     device = row(tmp_path, header, cells)
@@ -73,19 +73,19 @@ def test_address_and_table_are_read_from_every_notation(
     assert said == [] if not gap else said[0].startswith(gap)
 
 
-def test_register_whose_address_exceeds_65535_is_reported_as_not_imported(tmp_path: Path) -> None:
+def test_csv_address_above_65535_is_reported_as_not_imported(tmp_path: Path) -> None:
     device = only(tmp_path, "t.csv", "name,address,type\na,103247,float\nb,5,uint16\n")
     assert list(entries(device)) == ["b"]
     assert omissions(device) == ["a: its address is not from 0 to 65535"]
 
 
-def test_decimal_address_in_a_column_with_hex_addresses_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_decimal_address_among_hex_addresses_is_marked_as_a_gap(tmp_path: Path) -> None:
     device = only(tmp_path, "t.csv", "name,address,type\na,10,uint16\nb,1F,uint16\n")
     assert "its address 10 may be hex, as others of its column are" in gaps(device, "a")
     assert "b: it cannot be read:" in omissions(device)[0]
 
 
-def test_unit_of_a_coil_is_left_out_and_reported_as_a_gap(tmp_path: Path) -> None:
+def test_unit_of_a_coil_in_a_csv_table_is_left_out_and_marked_as_a_gap(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,table,unit", "5,uint16,coil,V")
     assert entries(device)["a"] == {"at": 5, "table": "coil"}
     assert found(device) == ["its type, unit and scale were left out: a coil is a bit"]
@@ -114,7 +114,7 @@ def test_unit_of_a_coil_is_left_out_and_reported_as_a_gap(tmp_path: Path) -> Non
         ("scale", "x/10", None, "only its count is read: its scale 'x/10' or offset '' is not a number"),
     ],
 )
-def test_scale_column_with_several_conventions_is_marked_as_a_gap(
+def test_scale_column_with_several_meanings_is_marked_as_a_gap(
     tmp_path: Path, header: str, cell: str, step: float | None, gap: str
 ) -> None:
     device = row(tmp_path, f"address,type,{header}", f"0x10,uint16,{cell}")
@@ -122,21 +122,21 @@ def test_scale_column_with_several_conventions_is_marked_as_a_gap(
     assert found(device) == ([gap] if gap else [])
 
 
-def test_neuron_s_decimal_is_a_factor_and_its_bias_is_added(tmp_path: Path) -> None:
+def test_decimal_of_a_neuron_tag_is_a_factor_and_its_bias_is_added(tmp_path: Path) -> None:
     header = "address,attribute,type,decimal,precision,bias"
     device = row(tmp_path, header, "1!400001,Read Subscribe,UINT16,2,3,-40")
     assert entries(device)["a"] == {"at": 0, "step": 2, "offset": -40}
     assert (gaps(device, "a"), omissions(device)) == ([], [])
 
 
-def test_second_scale_column_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_second_scale_column_of_a_csv_table_is_marked_as_a_gap(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,scale,gain", "0x10,uint16,0.1,10")
     assert found(device) == ["its gain 10 was not carried over beside its scale"]
     device = row(tmp_path, "address,type,data type", "0x10,uint16,int32")
     assert found(device) == ["the column data type was not carried over"]
 
 
-def test_offset_together_with_a_scale_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_offset_together_with_a_scale_column_is_marked_as_a_gap(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,scale,offset", "0x10,uint16,0.1,-40")
     assert found(device) == ["its offset -40 was taken as added after the step"]
 
@@ -168,7 +168,7 @@ def test_offset_together_with_a_scale_is_marked_as_a_gap(tmp_path: Path) -> None
         ("type,bit", "bool,3", None, ""),
     ],
 )
-def test_missing_number_type_is_marked_as_a_gap(
+def test_missing_number_type_in_a_csv_table_is_marked_as_a_gap(
     tmp_path: Path, header: str, cells: str, number_format: str | None, gap: str
 ) -> None:
     device = row(tmp_path, f"address,{header}", f"0x10,{cells}")
@@ -177,13 +177,13 @@ def test_missing_number_type_is_marked_as_a_gap(
     assert said == ([gap] if gap else [])
 
 
-def test_ambiguous_length_of_a_text_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_ambiguous_length_of_a_text_in_a_csv_table_is_marked_as_a_gap(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,length", "0x10,string,8")
     assert found(device) == ["its length was taken for registers, and may be characters"]
     assert found(row(tmp_path, "address,type,registers", "0x10,string,8")) == []
 
 
-def test_register_of_three_words_without_a_type_is_reported_as_not_imported(tmp_path: Path) -> None:
+def test_csv_register_of_three_words_without_a_type_is_not_imported(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="a: its type of 3 registers has no number format"):
         row(tmp_path, "address,count", "0x10,3")
 
@@ -197,7 +197,7 @@ def test_register_of_three_words_without_a_type_is_reported_as_not_imported(tmp_
         ("", None, "the order of its words is not stated"),
     ],
 )
-def test_ambiguous_byte_order_is_marked_as_a_gap(
+def test_ambiguous_byte_order_in_a_csv_table_is_marked_as_a_gap(
     tmp_path: Path, cell: str, order: str | None, gap: str
 ) -> None:
     device = row(tmp_path, "address,type,byte order", f"0x10,uint32,{cell}")
@@ -217,19 +217,19 @@ WRITTEN = ["it is written there; what a write does is not known here"]
         ("sometimes", ["its access 'sometimes' is not known; it is read here"]),
     ],
 )
-def test_write_access_and_unknown_access_are_marked_as_gaps(
+def test_write_access_and_unknown_access_in_a_csv_table_are_marked_as_gaps(
     tmp_path: Path, word: str, said: list[str]
 ) -> None:
     assert found(row(tmp_path, "address,type,access", f"0x10,uint16,{word}")) == said
 
 
 @table("word", ["W", "WO", "Write", "write only", "Write-only"])
-def test_write_only_register_is_reported_as_not_imported(tmp_path: Path, word: str) -> None:
+def test_write_only_register_of_a_csv_table_is_reported_as_not_imported(tmp_path: Path, word: str) -> None:
     with pytest.raises(ValueError, match="a: is only written: a command is never imported"):
         row(tmp_path, "address,type,access", f"0x10,uint16,{word}")
 
 
-def test_writing_function_codes_mark_a_register_as_written(tmp_path: Path) -> None:
+def test_csv_row_with_a_writing_function_code_is_marked_as_written(tmp_path: Path) -> None:
     assert found(row(tmp_path, "address,type,fc", '0x10,uint16,"03,06,16"')) == WRITTEN
     with pytest.raises(ValueError, match="a: is only written"):
         row(tmp_path, "address,type,fc", "0x10,uint16,16")
@@ -238,24 +238,24 @@ def test_writing_function_codes_mark_a_register_as_written(tmp_path: Path) -> No
 # ---- columns and files ----
 
 
-def test_columns_that_are_not_imported_are_reported(tmp_path: Path) -> None:
+def test_csv_columns_that_are_not_imported_are_reported(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,enum,room,wobble", "0x10,uint16,0=off,hall,1")
     assert found(device) == ["the column enum was not carried over"]
     assert omissions(device) == ["the column wobble: is not known here, and was not carried over"]
 
 
-def test_a_column_named_register_that_has_numbers_has_the_addresses(tmp_path: Path) -> None:
+def test_csv_column_named_register_with_numbers_is_read_as_addresses(tmp_path: Path) -> None:
     device = only(tmp_path, "t.csv", "Register,Name,Type\n16,volts,uint16\n")
     assert entries(device)["volts"]["at"] == 16
 
 
-def test_lines_above_the_column_header_are_skipped(tmp_path: Path) -> None:
+def test_lines_above_the_column_names_of_a_csv_table_are_skipped(tmp_path: Path) -> None:
     text = "Meter M-1\nInput registers;;\nName;Address;Type\nvolts;0x10;uint16\n"
     assert entries(only(tmp_path, "t.csv", text))["volts"]["at"] == 16
 
 
 @pytest.mark.parametrize("unit", [0, 255])
-def test_unit_ids_0_and_255_are_valid_addresses(tmp_path: Path, unit: int) -> None:
+def test_unit_ids_0_and_255_in_a_csv_table_are_valid_addresses(tmp_path: Path, unit: int) -> None:
     assert row(tmp_path, "address,type,slave", f"0x10,uint16,{unit}").address == unit
 
 
@@ -271,7 +271,7 @@ def test_unit_ids_0_and_255_are_valid_addresses(tmp_path: Path, unit: int) -> No
         ("device,m,1\npoll,file,0,1,BE_BE\nref,a,0,uint16,r\n", "a: its table file is not known"),
     ],
 )
-def test_invalid_table_raises_value_error_with_the_reason(tmp_path: Path, text: str, reason: str) -> None:
+def test_invalid_csv_table_raises_value_error_with_the_reason(tmp_path: Path, text: str, reason: str) -> None:
     with pytest.raises(ValueError, match=re.escape(reason)):
         only(tmp_path, "t.csv", text)
 
@@ -279,7 +279,7 @@ def test_invalid_table_raises_value_error_with_the_reason(tmp_path: Path, text: 
 # ---- modpoll ----
 
 
-def test_missing_modpoll_byte_order_defaults_to_be_le_and_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_missing_byte_order_in_modpoll_is_be_le_and_is_marked_as_a_gap(tmp_path: Path) -> None:
     text = "device,m,1\npoll,holding_register,0,4,{}\nref,a,0,uint32,{},V,0.1{}\n"
     device = only(tmp_path, "m.csv", text.format("", "r", ""))
     assert entries(device)["a"]["order"] == "CDAB"
@@ -291,7 +291,7 @@ def test_missing_modpoll_byte_order_defaults_to_be_le_and_is_marked_as_a_gap(tmp
         only(tmp_path, "m.csv", text.format("BE_BE", "r", ",more"))
 
 
-def test_modpoll_texts_ignore_the_polls_byte_order(tmp_path: Path) -> None:
+def test_byte_order_of_a_modpoll_poll_does_not_apply_to_texts(tmp_path: Path) -> None:
     text = "device,m,1\npoll,holding_register,0,4,LE_LE\nref,a,0,string8,r\nref,b,4,bool8,r\n"
     device = only(tmp_path, "m.csv", text)
     assert entries(device)["a"] == {"at": 0, "length": 4}

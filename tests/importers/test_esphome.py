@@ -1,4 +1,4 @@
-"""ESPHome's `modbus_controller`: entities and their devices, offsets, masks, filters, and packages."""
+"""Import of ESPHome's `modbus_controller`: entities, devices, offsets, masks, filters and packages."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CONTROLLER = "modbus_controller: {id: dev, address: 1}\n"
 
 
 def entity(folder: Path, keys: str, kind: str = "sensor") -> ImportedDevice:
-    """Return the device with one entity, `a` at the holding register 5, that has these keys."""
+    """Return the device with the entity `a` at holding register 5, which has these keys."""
     item = f"{{platform: modbus_controller, name: a, address: 5, register_type: holding, {keys}}}"
     return only(folder, "node.yaml", f"{CONTROLLER}{kind}:\n  - {item}\n")
 
@@ -27,13 +27,13 @@ def entity(folder: Path, keys: str, kind: str = "sensor") -> ImportedDevice:
     ("keys", "expected"),
     [
         ("value_type: U_WORD, bitmask: 0x00F0", {"part": "4-7"}),
-        ("value_type: S_WORD, bitmask: 0xFF00", {"part": "8-15"}),  # masked numbers are unsigned in ESPHome
+        ("value_type: S_WORD, bitmask: 0xFF00", {"part": "8-15"}),  # in ESPHome a masked number is unsigned
         ("value_type: S_WORD, bitmask: 0xFFFF", {"number_format": "I16"}),
         ("value_type: U_DWORD, bitmask: 0xFFFF", {"number_format": "U32", "part": "0-15"}),
         (
             "value_type: U_QWORD, bitmask: 0xFFFF",
             {"number_format": "U64"},
-        ),  # ESPHome ignores a mask of 64 bits
+        ),  # ESPHome ignores the bit mask of 64-bit numbers
         ("value_type: S_DWORD_R", {"number_format": "I32", "order": "CDAB"}),
         ("offset: 4", {"at": 7}),
         ("byte_offset: 2", {"at": 6}),
@@ -42,7 +42,7 @@ def entity(folder: Path, keys: str, kind: str = "sensor") -> ImportedDevice:
         ("filters: {multiply: 0.5}", {"step": 0.5}),
     ],
 )
-def test_entity_becomes_a_register(tmp_path: Path, keys: str, expected: dict[str, object]) -> None:
+def test_esphome_entity_becomes_a_register(tmp_path: Path, keys: str, expected: dict[str, object]) -> None:
     device = entity(tmp_path, keys)
     assert entries(device)["a"] == {"at": 5} | expected
     assert gaps(device, "a") == []
@@ -62,16 +62,16 @@ def test_entity_becomes_a_register(tmp_path: Path, keys: str, expected: dict[str
         ("unit_of_measurement: '${unit}'", "its unit is ${unit}"),
     ],
 )
-def test_unsupported_changes_of_the_value_are_marked_as_gaps(tmp_path: Path, keys: str, gap: str) -> None:
+def test_unsupported_esphome_filters_are_marked_as_gaps(tmp_path: Path, keys: str, gap: str) -> None:
     assert gaps(entity(tmp_path, keys), "a") == [gap]
 
 
-def test_multiply_of_a_number_entity_becomes_a_divisor(tmp_path: Path) -> None:
-    """ESPHome multiplies written values by `multiply`, so reading divides by it."""
+def test_multiply_of_an_esphome_number_becomes_a_divisor(tmp_path: Path) -> None:
+    """ESPHome multiplies values by `multiply` when it writes them, so a read divides by it."""
     assert entries(entity(tmp_path, "multiply: 10", "number"))["a"] == {"at": 5, "step": 0.1}
 
 
-def test_binary_sensor_with_several_mask_bits_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_esphome_binary_sensor_with_several_mask_bits_is_marked_as_a_gap(tmp_path: Path) -> None:
     one = entity(tmp_path, "bitmask: 0x8", "binary_sensor")
     assert (entries(one)["a"], gaps(one, "a")) == ({"at": 5, "part": "3"}, [])
     several = entity(tmp_path, "bitmask: 0xC", "binary_sensor")
@@ -81,11 +81,11 @@ def test_binary_sensor_with_several_mask_bits_is_marked_as_a_gap(tmp_path: Path)
     )
 
 
-def test_inverted_switch_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_inverted_esphome_switch_is_marked_as_a_gap(tmp_path: Path) -> None:
     assert "inverted was not carried over" in gaps(entity(tmp_path, "inverted: true", "switch"), "a")
 
 
-def test_text_sensor_without_response_size_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_esphome_text_sensor_without_response_size_is_marked_as_a_gap(tmp_path: Path) -> None:
     device = entity(tmp_path, "register_count: 4", "text_sensor")
     assert entries(device)["a"]["length"] == 4
     assert gaps(device, "a") == ["its response_size is not stated; 8 bytes were assumed"]
@@ -96,7 +96,7 @@ def test_text_sensor_without_response_size_is_marked_as_a_gap(tmp_path: Path) ->
     ]
 
 
-def test_custom_command_is_reported_as_not_imported(tmp_path: Path) -> None:
+def test_esphome_entity_with_custom_command_is_reported_as_not_imported(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="a: it is read by a custom_command, which is no read of registers"):
         entity(tmp_path, "custom_command: [1, 3]")
 
@@ -116,11 +116,11 @@ VOLTS, AMPS = ONE.format("modbus_controller_id: fast, ", "volts", 3), ONE.format
 FAST = "  - {id: fast, address: 1, modbus_id: m}\n"
 
 
-def test_entity_without_a_controller_id_belongs_to_the_only_controller(tmp_path: Path) -> None:
+def test_esphome_entity_without_controller_id_belongs_to_the_only_controller(tmp_path: Path) -> None:
     assert list(entries(only(tmp_path, "node.yaml", node(FAST, VOLTS, AMPS)))) == ["volts", "amps"]
 
 
-def test_controllers_with_the_same_bus_and_address_are_one_device(tmp_path: Path) -> None:
+def test_esphome_controllers_with_the_same_bus_and_address_are_one_device(tmp_path: Path) -> None:
     slow = ONE.format("modbus_controller_id: slow, ", "amps", 4)
     controllers = FAST + "  - {id: slow, address: 0x01, modbus_id: m}\n"
     assert list(entries(only(tmp_path, "node.yaml", node(controllers, VOLTS, slow)))) == ["volts", "amps"]
@@ -130,7 +130,7 @@ def test_controllers_with_the_same_bus_and_address_are_one_device(tmp_path: Path
     assert (first.title, second.title) == ("node", "node 2")
 
 
-def test_an_entity_without_a_controller_id_is_not_imported_if_there_are_several_controllers(
+def test_esphome_entity_that_names_none_of_several_controllers_is_not_imported(
     tmp_path: Path,
 ) -> None:
     controllers = FAST + "  - {id: slow, address: 2, modbus_id: m}\n"
@@ -140,7 +140,7 @@ def test_an_entity_without_a_controller_id_is_not_imported_if_there_are_several_
     ]
 
 
-def test_line_settings_come_from_the_uart_of_the_controllers_bus(tmp_path: Path) -> None:
+def test_esphome_line_settings_come_from_the_uart_of_the_controllers_bus(tmp_path: Path) -> None:
     text = (
         "uart: [{id: u, baud_rate: 4800, parity: EVEN}, {id: w, baud_rate: 19200, parity: NONE}]\n"
         "modbus: [{id: m, uart_id: w}, {id: n, uart_id: u}]\n"
@@ -148,7 +148,7 @@ def test_line_settings_come_from_the_uart_of_the_controllers_bus(tmp_path: Path)
     assert str(only(tmp_path, "node.yaml", text + node(FAST, VOLTS)).line) == "19200, 8N1"
 
 
-def test_substitutions_and_packages_in_the_file_are_resolved(tmp_path: Path) -> None:
+def test_substitutions_and_packages_in_an_esphome_file_are_resolved(tmp_path: Path) -> None:
     text = """
 substitutions: { unit_id: 7, volt: 0x10, u: V }
 packages:
@@ -164,7 +164,9 @@ packages:
 
 
 @pytest.mark.parametrize("text", [f"sensor:\n  - {VOLTS}\n", f"- {VOLTS}\n"])
-def test_package_without_its_controller_has_an_unknown_address(run: Run, tmp_path: Path, text: str) -> None:
+def test_esphome_package_without_its_controller_has_an_unknown_address(
+    run: Run, tmp_path: Path, text: str
+) -> None:
     device = only(tmp_path, "package.yaml", text)
     assert (device.title, device.address, list(entries(device))) == ("fast", None, ["volts"])
     source, family, plant = (tmp_path / name for name in ("package.yaml", "m.toml", "plant.toml"))
@@ -181,7 +183,9 @@ def test_package_without_its_controller_has_an_unknown_address(run: Run, tmp_pat
         (node(FAST, VOLTS.replace("address: 3", "id: 3")), "volts: it has no address"),
     ],
 )
-def test_invalid_document_raises_value_error_with_the_reason(tmp_path: Path, text: str, reason: str) -> None:
+def test_invalid_esphome_document_raises_value_error_with_the_reason(
+    tmp_path: Path, text: str, reason: str
+) -> None:
     (tmp_path / "a.yaml").write_text(text)
     with pytest.raises(ValueError, match=re.escape(reason)):
         read_devices(tmp_path / "a.yaml")

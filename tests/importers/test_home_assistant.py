@@ -1,4 +1,4 @@
-"""Home Assistant's `modbus:`: layouts, types and orders of all its versions, switches, and hubs' lines."""
+"""Import of Home Assistant's `modbus:`: layouts and types of all its versions, switches, and lines."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytest.importorskip("yaml")
 
 
 def sensor(folder: Path, keys: str, kind: str = "sensors") -> ImportedDevice:
-    """Return the device of a hub with one entity, `a` at address 5, that has these keys."""
+    """Return the device of a hub with one entity, `a` at address 5, which has these keys."""
     hub = f"modbus:\n  - name: hub\n    {kind}:\n      - {{name: a, slave: 1, address: 5, {keys}}}\n"
     return only(folder, "configuration.yaml", hub)
 
@@ -38,7 +38,7 @@ def sensor(folder: Path, keys: str, kind: str = "sensors") -> ImportedDevice:
         ('data_type: custom, count: 1, structure: ">H"', None),
     ],
 )
-def test_the_width_may_be_given_by_count_or_by_structure(
+def test_home_assistant_width_may_be_given_by_count_or_structure(
     tmp_path: Path, keys: str, number_format: str | None
 ) -> None:
     device = sensor(tmp_path, keys)
@@ -46,7 +46,7 @@ def test_the_width_may_be_given_by_count_or_by_structure(
     assert gaps(device, "a") == []
 
 
-def test_missing_or_contradictory_width_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_missing_or_contradictory_home_assistant_width_is_marked_as_a_gap(tmp_path: Path) -> None:
     device = sensor(tmp_path, "data_type: float")
     assert entries(device)["a"]["number_format"] == "F16"
     assert "the width of its type float is not stated" in gaps(device, "a")[0]
@@ -55,21 +55,21 @@ def test_missing_or_contradictory_width_is_marked_as_a_gap(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("keys", ["data_type: int, count: 3", "data_type: uint8", "data_type: custom"])
-def test_an_entity_of_unsupported_type_is_refused_and_the_error_names_the_type(
+def test_home_assistant_entity_of_unsupported_type_is_refused_with_the_type(
     tmp_path: Path, keys: str
 ) -> None:
     with pytest.raises(ValueError, match=r"a: its type \w+ has no number format"):
         sensor(tmp_path, keys)
 
 
-def test_the_count_of_virtual_entities_is_the_number_of_words_of_all_together(tmp_path: Path) -> None:
-    """Reported as home-assistant/core#97744."""
+def test_home_assistant_count_is_the_words_of_all_virtual_entities_together(tmp_path: Path) -> None:
+    """See home-assistant/core#97744."""
     found = entries(sensor(tmp_path, "slave_count: 2, count: 6, data_type: int32, swap: word"))
     assert [entry["at"] for entry in found.values()] == [5, 7, 9]
     assert {(entry["number_format"], entry["order"]) for entry in found.values()} == {("I32", "CDAB")}
 
 
-def test_reverse_order_swaps_the_words(tmp_path: Path) -> None:
+def test_home_assistant_reverse_order_swaps_the_words(tmp_path: Path) -> None:
     number = "data_type: float, count: 2"
     assert entries(sensor(tmp_path, f"{number}, reverse_order: true"))["a"]["order"] == "CDAB"
     assert "order" not in entries(sensor(tmp_path, f"{number}, reverse_order: false"))["a"]
@@ -77,18 +77,18 @@ def test_reverse_order_swaps_the_words(tmp_path: Path) -> None:
     assert gaps(both, "a") == ["only its count is read: it has both swap byte and reverse_order"]
 
 
-def test_nan_value_text_is_parsed_as_hex_without_a_prefix(tmp_path: Path) -> None:
+def test_home_assistant_nan_value_is_parsed_as_hex_without_a_prefix(tmp_path: Path) -> None:
     assert entries(sensor(tmp_path, 'nan_value: "7FFF"'))["a"]["invalid"] == 0x7FFF
     assert entries(sensor(tmp_path, 'nan_value: "0x8000"'))["a"]["invalid"] == 0x8000
     assert entries(sensor(tmp_path, "nan_value: 8000"))["a"]["invalid"] == 8000
 
 
-def test_min_value_0_and_precision_0_are_marked_as_gaps(tmp_path: Path) -> None:
+def test_home_assistant_min_value_0_and_precision_0_are_marked_as_gaps(tmp_path: Path) -> None:
     assert gaps(sensor(tmp_path, "min_value: 0"), "a") == ["min_value was not carried over"]
     assert gaps(sensor(tmp_path, "precision: 0"), "a") == ["precision was not carried over"]
 
 
-def test_unit_given_as_a_secret_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_home_assistant_unit_given_as_a_secret_is_marked_as_a_gap(tmp_path: Path) -> None:
     device = sensor(tmp_path, "unit_of_measurement: !secret unit")
     assert "unit" not in entries(device)["a"]
     assert gaps(device, "a") == ["its unit is !secret unit"]
@@ -98,13 +98,13 @@ WRITTEN = "it is written there; what a write does is not known here"
 
 
 @pytest.mark.parametrize("plural", ["holdings", "coils"])
-def test_write_type_of_a_switch_does_not_change_its_table(tmp_path: Path, plural: str) -> None:
+def test_write_type_of_a_home_assistant_switch_does_not_change_its_table(tmp_path: Path, plural: str) -> None:
     device = sensor(tmp_path, f"write_type: {plural}", "switches")
     assert entries(device)["a"].get("table", "holding") == plural.rstrip("s")
     assert gaps(device, "a") == [WRITTEN]
 
 
-def test_switch_is_read_at_its_verify_address(tmp_path: Path) -> None:
+def test_home_assistant_switch_is_read_at_its_verify_address(tmp_path: Path) -> None:
     verify = "verify: {address: 9, input_type: input, state_on: 37, state_off: 36, delay: 1}"
     device = sensor(tmp_path, f"command_on: 24, command_off: 25, {verify}", "switches")
     assert entries(device)["a"] == {"at": 9, "table": "input"}
@@ -115,7 +115,7 @@ def test_switch_is_read_at_its_verify_address(tmp_path: Path) -> None:
     ]
 
 
-def test_brightness_and_colour_registers_of_a_light_are_marked_as_gaps(tmp_path: Path) -> None:
+def test_brightness_and_colour_of_a_home_assistant_light_are_marked_as_gaps(tmp_path: Path) -> None:
     device = sensor(tmp_path, "brightness_address: 7, color_temp_address: 0", "lights")
     assert gaps(device, "a")[1:] == [
         "brightness_address was not carried over",
@@ -145,7 +145,7 @@ def indented(text: str, by: int) -> str:
         ("modbus:\n  - sensors: {name: volts, slave: 1, address: 1, data_type: float32}\n", "/dev/ttyUSB0"),
     ],
 )
-def test_hub_is_found_in_every_layout(tmp_path: Path, text: str, port: str) -> None:
+def test_home_assistant_hub_is_found_in_every_layout(tmp_path: Path, text: str, port: str) -> None:
     device = only(tmp_path, "a.yaml", text)
     assert entries(device)["volts"] == {"at": 1, "number_format": "F32"}
     assert tomllib.loads(plant_text(device, "m.toml"))["line"][0]["port"] == port
@@ -170,7 +170,7 @@ switch:
 """
 
 
-def test_the_platform_layout_used_before_2021_is_imported(tmp_path: Path) -> None:
+def test_home_assistant_platform_layout_of_before_2021_is_imported(tmp_path: Path) -> None:
     found: dict[str, Any] = {}
     for device in devices(tmp_path, "old.yaml", LEGACY):
         assert (device.address, device.line.port) == (2, "/dev/ttyS0")
@@ -200,7 +200,9 @@ def test_the_platform_layout_used_before_2021_is_imported(tmp_path: Path) -> Non
         ("- {name: a, address: 1, data_type: string}\n", "a: it has no count"),
     ],
 )
-def test_invalid_document_raises_value_error_with_the_reason(tmp_path: Path, text: str, reason: str) -> None:
+def test_invalid_home_assistant_document_raises_value_error_with_the_reason(
+    tmp_path: Path, text: str, reason: str
+) -> None:
     (tmp_path / "a.yaml").write_text(text)
     with pytest.raises(ValueError, match=re.escape(reason)):
         read_devices(tmp_path / "a.yaml")
@@ -219,14 +221,16 @@ def test_invalid_document_raises_value_error_with_the_reason(tmp_path: Path, tex
         ("type: serial, port: !secret port", "/dev/ttyUSB0"),
     ],
 )
-def test_unknown_host_never_becomes_a_serial_port(tmp_path: Path, hub: str, port: str) -> None:
+def test_unknown_host_of_a_home_assistant_hub_never_becomes_a_serial_port(
+    tmp_path: Path, hub: str, port: str
+) -> None:
     device = only(tmp_path, "a.yaml", f"modbus:\n  - {{{hub}, sensors: [{{slave: 1, address: 1}}]}}\n")
     assert tomllib.loads(plant_text(device, "m.toml"))["line"][0]["port"] == port
     assert ("the hub: its type udp is not spoken here" in omissions(device)) == ("udp" in hub)
 
 
 @pytest.mark.parametrize("unit", [0, 248, 255])
-def test_slave_outside_1_to_247_behind_modbus_tcp_gets_a_family_and_a_plant(
+def test_home_assistant_slave_outside_1_to_247_on_tcp_gets_family_and_plant(
     run: Run, tmp_path: Path, unit: int
 ) -> None:
     source, family, plant = (tmp_path / name for name in ("a.yaml", "m.toml", "plant.toml"))
@@ -240,7 +244,7 @@ def test_slave_outside_1_to_247_behind_modbus_tcp_gets_a_family_and_a_plant(
         plant_text(read_devices(source)[0], "m.toml")
 
 
-def test_hubs_with_the_same_name_can_be_selected(run: Run, tmp_path: Path) -> None:
+def test_home_assistant_hubs_with_the_same_name_can_be_selected(run: Run, tmp_path: Path) -> None:
     source = tmp_path / "a.yaml"
     source.write_text(
         "modbus:\n"

@@ -1,4 +1,4 @@
-"""Importers: an example file of each layout becomes a family that loads, with every gap marked."""
+"""Importers: an example file of each format becomes a family file that loads, with every gap marked."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from multidrop.sim import SimulatedDrive
 
 
 def loaded(folder: Path, device: ImportedDevice, *names: str) -> dict[str, Register[Any]]:
-    """Return these registers of the family file written for the device."""
+    """Return these registers from the family file that was written for the device."""
     device.registers = [register for register in device.registers if register.name in names]
     device.texts = []
     path = folder / "imported.toml"
@@ -174,7 +174,7 @@ def test_sunspec_model_becomes_a_loadable_family(tmp_path: Path) -> None:
     assert registers["wh"].number_in(b"\x80" + bytes(7), 0) == 2.0**63
 
 
-# the points of SunSpec's model 101 in order, and a SolarEdge inverter's reply from evcc-io/evcc#15445
+# The points of SunSpec's model 101 in order, and the reply of a SolarEdge inverter in evcc-io/evcc#15445.
 POINTS = """
     A AphA AphB AphC A_SF V1 V2 V3 PhVphA PhVphB PhVphC V_SF W W_SF Hz Hz_SF VA VA_SF VAr VAr_SF PF PF_SF
     WH WH_SF DCA DCA_SF DCV DCV_SF DCW DCW_SF TmpCab TmpSnk TmpTrns TmpOt Tmp_SF
@@ -208,8 +208,8 @@ def test_values_of_a_published_sunspec_reply_are_right(
         drive.read(drive.register("tmpcab"))
 
 
-def test_scale_register_out_of_reach_is_reported_and_left_out(tmp_path: Path) -> None:
-    """A register and its scale register must fit into one request, which reads at most 125 registers."""
+def test_sunspec_scale_register_too_far_away_is_left_out_and_reported(tmp_path: Path) -> None:
+    """A register and its scale register must fit into one request of at most 125 registers."""
     points = [
         {"name": "A", "type": "int16", "size": 1, "sf": "S"},
         {"name": "gap", "type": "pad", "size": 130},
@@ -290,17 +290,17 @@ def bomb(levels: int) -> str:
         ("modbus: [}", "is not YAML"),
     ],
 )
-def test_costly_or_unsafe_yaml_is_refused(tmp_path: Path, text: str, expected: str) -> None:
+def test_yaml_that_is_costly_or_unsafe_to_read_is_refused(tmp_path: Path, text: str, expected: str) -> None:
     pytest.importorskip("yaml")
     (tmp_path / "a.yaml").write_text(text)
     with pytest.raises(ValueError, match=re.escape(expected)):
         read_devices(tmp_path / "a.yaml")
 
 
-def test_registers_beyond_the_limit_of_a_family_are_reported_as_not_imported(
+def test_registers_above_the_limit_of_a_family_are_reported_as_not_imported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Entries beyond the limit are not checked, because that would be slow for a large file."""
+    """Entries above the limit are not checked, because that would be slow for a large file."""
     declared: list[str] = []
 
     def noted(found: ImportedRegister) -> Register[Any]:
@@ -335,14 +335,16 @@ def test_registers_beyond_the_limit_of_a_family_are_reported_as_not_imported(
         ("a.xls", "a", "its suffix is not one of .csv"),
     ],
 )
-def test_file_that_is_not_a_table_is_refused(tmp_path: Path, name: str, text: str, expected: str) -> None:
+def test_file_that_is_not_a_register_table_is_refused(
+    tmp_path: Path, name: str, text: str, expected: str
+) -> None:
     path = tmp_path / name
     path.write_text(text)
     with pytest.raises(ValueError, match=re.escape(expected)):
         read_devices(path)
 
 
-def test_texts_from_a_file_cannot_inject_toml(tmp_path: Path) -> None:
+def test_texts_from_an_imported_file_cannot_inject_toml(tmp_path: Path) -> None:
     name = 'a"]\n[command]\nrun = { at = 1 }\n'
     document = {"device": {"channels": [{"name": name, "reg_type": "holding", "address": 1, "units": name}]}}
     device = only(tmp_path, "x.json", document)
@@ -363,7 +365,7 @@ modbus:
 """
 
 
-def test_line_settings_are_written_into_the_plant_file(tmp_path: Path) -> None:
+def test_imported_line_settings_are_written_into_the_plant_file(tmp_path: Path) -> None:
     pytest.importorskip("yaml")
     north, south, west, east = devices(tmp_path, "configuration.yaml", HUBS)
     assert [list(entries(hub)) for hub in (north, south, west)] == [["volt"], ["amp"], ["watt"]]
@@ -403,7 +405,7 @@ def test_line_settings_of_telegraf_and_esphome_are_imported(tmp_path: Path) -> N
     assert str(only(tmp_path, "node.yaml", node + sensor).line) == "9600, 8E1"
 
 
-def test_invalid_controller_address_is_reported(tmp_path: Path) -> None:
+def test_invalid_telegraf_controller_address_is_reported(tmp_path: Path) -> None:
     plugin = '[[inputs.modbus]]\ncontroller = "{}"\n'
     for controller in ("tcp://gate:99999", "tcp://gate:modbus", "tcp://[fe80::1"):
         named = rf"t\.conf: controller = '{re.escape(controller)}' is not an address: "
@@ -411,7 +413,7 @@ def test_invalid_controller_address_is_reported(tmp_path: Path) -> None:
             devices(tmp_path, "t.conf", plugin.format("tcp://hall") + plugin.format(controller))
 
 
-def test_telegraf_register_with_scattered_addresses_is_reported_as_not_imported(tmp_path: Path) -> None:
+def test_telegraf_register_with_scattered_addresses_is_not_imported(tmp_path: Path) -> None:
     field = '{{ name = "{}", byte_order = "ABCD", data_type = "UINT32", address = {} }}'
     listed = ", ".join(
         field.format(*each) for each in (("good", [4, 5]), ("split", [4, 9]), ("one", [4, 5, 6]))
@@ -424,7 +426,7 @@ def test_telegraf_register_with_scattered_addresses_is_reported_as_not_imported(
     ]
 
 
-def test_read_limits_are_imported(tmp_path: Path) -> None:
+def test_read_limits_of_a_device_are_imported(tmp_path: Path) -> None:
     template = '{{"device": {{"max_read_registers": {}, "channels": [{}]}}}}'
     channels = ", ".join(
         f'{{"name": "{name}", "address": {at}, "format": "{kind}"}}'
@@ -440,7 +442,7 @@ def test_read_limits_are_imported(tmp_path: Path) -> None:
 # ---- the command `multidrop import` ----
 
 
-def test_devices_with_the_same_address_on_two_hubs_are_separate(run: Run, tmp_path: Path) -> None:
+def test_devices_with_the_same_address_on_two_hubs_stay_separate(run: Run, tmp_path: Path) -> None:
     pytest.importorskip("yaml")
     source = tmp_path / "configuration.yaml"
     source.write_text(HUBS)
@@ -452,7 +454,7 @@ def test_devices_with_the_same_address_on_two_hubs_are_separate(run: Run, tmp_pa
     assert (status, "amp = " in out) == (0, True)
 
 
-def test_import_writes_a_family_and_a_plant(run: Run, tmp_path: Path) -> None:
+def test_import_command_writes_a_family_file_and_a_plant_file(run: Run, tmp_path: Path) -> None:
     source, family, plant = (tmp_path / name for name in ("c.csv", "meter.toml", "plant.toml"))
     source.write_text(MODPOLL)
     status, out, err = run("import", source, "--out", family, "--plant", plant)
@@ -463,7 +465,7 @@ def test_import_writes_a_family_and_a_plant(run: Run, tmp_path: Path) -> None:
     assert run("import", source, "--out", family)[0] == 2
 
 
-def test_device_with_only_text_registers_gets_no_plant_file(run: Run, tmp_path: Path) -> None:
+def test_imported_device_with_only_text_registers_gets_no_plant_file(run: Run, tmp_path: Path) -> None:
     source, family, plant = (tmp_path / name for name in ("c.csv", "label.toml", "plant.toml"))
     source.write_text("name,address,type\nlabel,1!400001.8,STRING\n")
     status, _, err = run("import", source, "--out", family, "--plant", plant)
@@ -471,7 +473,7 @@ def test_device_with_only_text_registers_gets_no_plant_file(run: Run, tmp_path: 
     assert not family.exists()
 
 
-def test_import_of_several_devices_asks_which_device(run: Run, tmp_path: Path) -> None:
+def test_import_command_asks_which_of_several_devices_to_import(run: Run, tmp_path: Path) -> None:
     source = tmp_path / "telegraf.conf"
     source.write_text(TELEGRAF)
     status, _, err = run("import", source)

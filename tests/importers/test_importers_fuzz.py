@@ -1,4 +1,4 @@
-"""Damaged and hostile files give a family that loads, or a one-sentence error, in bounded time."""
+"""Damaged and hostile files become a family that loads, or give a one-sentence error, in bounded time."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ODD = (
     *b'"" true class None [reading] string int64 float64 #WS 1!'.split(),
     *("\u202e".encode(), "é".encode()),
 )
-ENOUGH = 20.0  # limit of CPU time in s, generous for a slow machine
+ENOUGH = 20.0  # limit of CPU time for one file in s, generous for a slow machine
 
 
 def damaged(seed: int) -> bytes:
@@ -55,7 +55,7 @@ def damaged(seed: int) -> bytes:
     max_examples=examples(400), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(st.integers(0, 1 << 32))
-def test_damaged_file_gives_a_family_or_one_error(tmp_path: Path, seed: int) -> None:
+def test_damaged_file_is_imported_or_refused_with_one_error(tmp_path: Path, seed: int) -> None:
     read("import", damaged(seed), tmp_path)
 
 
@@ -110,7 +110,7 @@ PLAUSIBLE: dict[str, st.SearchStrategy[Any]] = {
 
 
 def entries_of(needed: str, keys: str) -> st.SearchStrategy[list[dict[str, Any]]]:
-    """Return a strategy for lists of entries: required keys, and other keys with random values or null."""
+    """Return a strategy for lists of entries with required keys, and with random values or null in others."""
     value = {key: PLAUSIBLE.get(key, ANYTHING) for key in (*needed.split(), *keys.split())}
     plausible = st.fixed_dictionaries(
         {key: value[key] for key in needed.split()}, optional={key: value[key] for key in keys.split()}
@@ -143,10 +143,10 @@ ROWS = st.lists(st.lists(st.text("0123456789!#.BLWS,;xH-au\t \"'", max_size=8), 
     max_examples=examples(100), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(CHANNELS, POINTS, SENSORS, ENTITIES, ROWS)
-def test_imported_device_gives_a_family_that_loads(
+def test_imported_device_with_random_keys_gives_a_family_that_loads(
     tmp_path: Path, channels: Any, points: Any, sensors: Any, entities: Any, rows: Any
 ) -> None:
-    """The YAML files contain JSON, which YAML parsers accept."""
+    """The YAML importers get JSON, which YAML parsers accept."""
     platform = [{"platform": "modbus_controller", **entity} for entity in entities]
     documents = {
         ".json": (
@@ -201,7 +201,7 @@ HOSTILE = {
     "aliases": b".yaml\na: &a [1]\nmodbus: [" + b"*a," * 200_000 + b"]",
 }
 
-COSTLY = (  # files that take up to a second each; the short run tries only the first
+COSTLY = (  # files that need up to one second each; a short test run uses only the first
     *("a row of a million cells", "aliases", "many tables", "many rows of one name", "too many rows"),
     *("many devices", "many entries", "large groups", "lists in lists of yaml"),
 )
@@ -210,7 +210,7 @@ COSTLY = (  # files that take up to a second each; the short run tries only the 
 @pytest.mark.long
 @pytest.mark.uncounted
 @pytest.mark.parametrize("name", [*(name for name in HOSTILE if name not in COSTLY), *usually(*COSTLY)])
-def test_hostile_file_is_read_or_refused_in_bounded_time(tmp_path: Path, name: str) -> None:
+def test_hostile_file_is_imported_or_refused_in_bounded_time(tmp_path: Path, name: str) -> None:
     begin = process_time()
     read("import", HOSTILE[name], tmp_path)
     assert process_time() - begin < ENOUGH
@@ -225,13 +225,13 @@ before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 read("import", Path(sys.argv[1]).read_bytes(), Path(sys.argv[2]))
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 """
-MOST_MEMORY = 400_000  # limit in KiB for a file of up to 5 MB; a row of a million empty cells needs 150,000
+MOST_MEMORY = 400_000  # limit in KiB for a file of up to 5 MB; one row of a million empty cells needs 150,000
 
 
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform == "win32", reason="getrusage tells memory on POSIX alone")
 @pytest.mark.parametrize("name", usually("aliases", "a row of a million cells", "many entries", "deep lists"))
-def test_hostile_file_is_read_or_refused_in_bounded_memory(tmp_path: Path, name: str) -> None:
+def test_hostile_file_is_imported_or_refused_in_bounded_memory(tmp_path: Path, name: str) -> None:
     (tmp_path / "given").write_bytes(HOSTILE[name])
     tests = Path(__file__).parents[1]
     folders = [tests / "fuzz", *(tests / "support").iterdir()]

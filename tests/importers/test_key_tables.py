@@ -1,4 +1,4 @@
-"""Every key of a source's schema has a treatment; an unknown key becomes a gap."""
+"""Every key of another program's schema is imported, ignored or marked as a gap. Unknown keys become gaps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tables import table
 from multidrop.importers import csv_tables, esphome, home_assistant, sunspec, telegraf, wb
 from multidrop.importers.device import KeyTable, Treatment, unimported_keys
 
-# Keys copied from each program's documentation and schemas, not from the importers.
+# Keys from each program's documentation and schemas, typed independently of the importers.
 SCHEMAS: dict[str, tuple[KeyTable, str]] = {
     "home assistant: sensors": (
         home_assistant.KEYS["sensors"],
@@ -165,20 +165,20 @@ NEURON_COLUMNS = "group interval name address attribute type description decimal
 
 
 @table("source", SCHEMAS)
-def test_every_key_of_a_source_schema_has_a_treatment(source: str) -> None:
+def test_every_key_of_another_programs_schema_is_handled(source: str) -> None:
     table, keys = SCHEMAS[source]
     assert [key for key in keys.split() if key not in table] == []
     assert set(table.values()) <= set(Treatment)
 
 
 @table("columns", [IOBROKER_COLUMNS, NEURON_COLUMNS])
-def test_every_column_of_a_known_table_layout_has_a_treatment(columns: str) -> None:
+def test_every_column_of_a_known_csv_layout_is_handled(columns: str) -> None:
     carried = {alias for aliases in csv_tables.COLUMNS.values() for alias in aliases}
     known = carried | csv_tables.IRRELEVANT | csv_tables.GAPS
     assert [column for column in columns.split() if column not in known] == []
 
 
-def test_keys_that_are_not_carried_over_are_reported_unless_empty() -> None:
+def test_keys_that_are_not_imported_are_reported_unless_empty() -> None:
     table = home_assistant.KEYS["sensors"]
     given = {"name": "a", "icon": "x", "min_value": 0, "max_value": None, "zero_suppress": False, "new": 1}
     assert unimported_keys(given, table) == [
@@ -206,14 +206,14 @@ UNKNOWN: dict[str, tuple[str, str | dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize("source", UNKNOWN)
-def test_key_unknown_to_an_importer_is_a_gap_of_its_register(tmp_path: Path, source: str) -> None:
+def test_key_that_an_importer_does_not_know_is_a_gap_of_its_register(tmp_path: Path, source: str) -> None:
     pytest.importorskip("yaml")
     device = only(tmp_path, *UNKNOWN[source])
     assert list(entries(device)) == ["a"]
     assert "novel is not known here, and was not carried over" in gaps(device, "a")
 
 
-def test_hub_settings_that_are_not_imported_are_reported(tmp_path: Path) -> None:
+def test_settings_of_a_hub_that_are_not_imported_are_reported(tmp_path: Path) -> None:
     pytest.importorskip("yaml")
     hub = f"modbus:\n  - name: hub\n    delay: 5\n    novel: 1\n    timeout: 3\n    sensors: [{SENSOR}}}]\n"
     assert omissions(only(tmp_path, "a.yaml", hub)) == [

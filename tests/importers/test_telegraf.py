@@ -1,4 +1,4 @@
-"""Import of Telegraf's inputs.modbus: unit ids, texts, line settings, and types that depend on the style."""
+"""Import of Telegraf's inputs.modbus: unit ids, texts, line settings, and types of each style."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ HEAD = '[[inputs.modbus]]\nname = "m"\nslave_id = 1\ncontroller = "tcp://10.0.0.
 
 
 def of_registers(folder: Path, keys: str, more: str = "") -> ImportedDevice:
-    """Return the device of a configuration in the register style with one field, `a`."""
+    """Return the device of a configuration in Telegraf's register style with one field, `a`."""
     return only(folder, "t.conf", f'{HEAD}holding_registers = [{{ name = "a", {keys} }}]\n{more}')
 
 
 def of_a_request(folder: Path, keys: str, more: str = "") -> ImportedDevice:
-    """Return the device of a configuration in the request style with one field, `a`."""
+    """Return the device of a configuration in Telegraf's request style with one field, `a`."""
     request = f'[[inputs.modbus.request]]\nslave_id = 1\nfields = [{{ name = "a", {keys} }}]\n'
     return only(folder, "t.conf", HEAD + request + more)
 
@@ -40,7 +40,7 @@ def of_a_request(folder: Path, keys: str, more: str = "") -> ImportedDevice:
         ('byte_order = "AB", data_type = "BIT", bit = 3, address = [5]', {"part": "3"}),
     ],
 )
-def test_float32_in_the_register_style_is_a_whole_number(
+def test_telegraf_float32_in_the_register_style_is_a_whole_number(
     tmp_path: Path, keys: str, expected: dict[str, object]
 ) -> None:
     found = entries(of_registers(tmp_path, keys))["a"]
@@ -48,7 +48,7 @@ def test_float32_in_the_register_style_is_a_whole_number(
     assert found == expected
 
 
-def test_float32_in_the_other_styles_is_a_float(tmp_path: Path) -> None:
+def test_telegraf_float32_in_the_other_styles_is_a_float(tmp_path: Path) -> None:
     assert entries(of_a_request(tmp_path, 'address = 5, type = "FLOAT32"'))["a"]["number_format"] == "F32"
     metric = (
         '[[inputs.modbus.metric]]\nslave_id = 1\nfields = [{ name = "b", address = 5, type = "FLOAT32" }]\n'
@@ -56,31 +56,31 @@ def test_float32_in_the_other_styles_is_a_float(tmp_path: Path) -> None:
     assert entries(only(tmp_path, "t.conf", HEAD + metric))["b"]["number_format"] == "F32"
 
 
-def test_float64_without_ieee_in_the_register_style_is_reported_as_not_imported(tmp_path: Path) -> None:
+def test_telegraf_float64_in_the_register_style_is_not_imported(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="a: its type FLOAT64 has no number format"):
         of_registers(tmp_path, 'byte_order = "ABCD", data_type = "FLOAT64", address = [5, 6, 7, 8]')
 
 
-def test_missing_type_and_output_type_are_marked_as_gaps(tmp_path: Path) -> None:
+def test_missing_telegraf_type_and_output_type_are_marked_as_gaps(tmp_path: Path) -> None:
     assert gaps(of_a_request(tmp_path, "address = 5"), "a") == ["its type is not stated; UINT16 was assumed"]
     device = of_a_request(tmp_path, 'address = 5, type = "INT16", scale = 0.1, output = "INT64"')
     assert gaps(device, "a") == ["output was not carried over"]
 
 
 @pytest.mark.parametrize(("place", "order"), [("both", None), ("lower", "B")])
-def test_text_in_the_low_bytes_is_imported(tmp_path: Path, place: str, order: str | None) -> None:
+def test_telegraf_text_in_the_low_bytes_is_imported(tmp_path: Path, place: str, order: str | None) -> None:
     workaround = f'[inputs.modbus.workarounds]\nstring_register_location = "{place}"\n'
     device = of_a_request(tmp_path, 'address = 5, type = "STRING", length = 4', workaround)
     assert (entries(device)["a"]["length"], entries(device)["a"].get("order")) == (4, order)
 
 
-def test_text_in_the_high_bytes_is_reported_as_not_imported(tmp_path: Path) -> None:
+def test_telegraf_text_in_the_high_bytes_is_reported_as_not_imported(tmp_path: Path) -> None:
     workaround = '[inputs.modbus.workarounds]\nstring_register_location = "upper"\n'
     with pytest.raises(ValueError, match="a: a text whose string_register_location is upper"):
         of_a_request(tmp_path, 'address = 5, type = "STRING", length = 4', workaround)
 
 
-def test_fields_of_a_style_other_than_the_stated_one_are_ignored(tmp_path: Path) -> None:
+def test_telegraf_fields_of_a_style_other_than_the_stated_one_are_ignored(tmp_path: Path) -> None:
     both = f'{HEAD}configuration_type = "request"\ncoils = [{{ name = "old", address = [1] }}]\n'
     request = (
         '[[inputs.modbus.request]]\nslave_id = 1\nfields = [{ name = "new", address = 1, type = "INT16" }]\n'
@@ -88,7 +88,7 @@ def test_fields_of_a_style_other_than_the_stated_one_are_ignored(tmp_path: Path)
     assert list(entries(only(tmp_path, "t.conf", both + request))) == ["new"]
 
 
-def test_request_without_a_slave_id_is_reported(tmp_path: Path) -> None:
+def test_telegraf_request_without_a_slave_id_is_reported(tmp_path: Path) -> None:
     request = '[[inputs.modbus.request]]\nfields = [{ name = "a", address = 1, type = "INT16" }]\n'
     device = only(tmp_path, "t.conf", HEAD + request)
     assert device.address == 1
@@ -97,7 +97,7 @@ def test_request_without_a_slave_id_is_reported(tmp_path: Path) -> None:
     ]
 
 
-def test_required_pauses_of_a_device_are_reported(tmp_path: Path) -> None:
+def test_pauses_that_telegraf_keeps_for_a_device_are_reported(tmp_path: Path) -> None:
     workaround = '[inputs.modbus.workarounds]\npause_after_connect = "1s"\n'
     device = of_a_request(tmp_path, 'address = 5, type = "INT16"', workaround)
     assert omissions(device) == ["workarounds: pause_after_connect was not carried over"]
@@ -115,7 +115,9 @@ def test_required_pauses_of_a_device_are_reported(tmp_path: Path) -> None:
         ('controller = "tcp://gate:${PORT}"', {"port": "tcp://HOST:502"}),
     ],
 )
-def test_controller_gives_the_line_settings(tmp_path: Path, line: str, expected: dict[str, str]) -> None:
+def test_telegraf_controller_gives_the_line_settings(
+    tmp_path: Path, line: str, expected: dict[str, str]
+) -> None:
     field = 'holding_registers = [{ name = "a", byte_order = "AB", data_type = "INT16", address = [7] }]\n'
     (device,) = devices(tmp_path, "t.conf", f"[[inputs.modbus]]\nslave_id = 1\n{line}\n{field}")
     (plant,) = tomllib.loads(plant_text(device, "m.toml"))["line"]
@@ -124,7 +126,7 @@ def test_controller_gives_the_line_settings(tmp_path: Path, line: str, expected:
 
 
 @pytest.mark.parametrize("unit", [0, 255])
-def test_slave_ids_0_and_255_are_valid_addresses(tmp_path: Path, unit: int) -> None:
+def test_telegraf_slave_ids_0_and_255_are_valid_addresses(tmp_path: Path, unit: int) -> None:
     text = HEAD.replace("slave_id = 1", f"slave_id = {unit}")
     field = 'coils = [{ name = "a", address = [7] }]\n'
     assert only(tmp_path, "t.conf", text + field).address == unit
@@ -150,7 +152,9 @@ def test_slave_ids_0_and_255_are_valid_addresses(tmp_path: Path, unit: int) -> N
         ),
     ],
 )
-def test_invalid_file_raises_value_error_with_the_reason(tmp_path: Path, text: str, reason: str) -> None:
+def test_invalid_telegraf_file_raises_value_error_with_the_reason(
+    tmp_path: Path, text: str, reason: str
+) -> None:
     (tmp_path / "t.conf").write_text(text)
     with pytest.raises(ValueError, match=re.escape(reason)):
         read_devices(tmp_path / "t.conf")

@@ -1,4 +1,4 @@
-"""wb-mqtt-serial: shifted subdevices, bits, counts that mean "no value", texts, and configurations."""
+"""Import of wb-mqtt-serial's templates and configurations: subdevices, bits, invalid counts and texts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from multidrop.importers import ImportedDevice, family_text, read_devices
 
 
 def channel(folder: Path, **keys: Any) -> ImportedDevice:
-    """Return the device of a template with one channel: the input register `a` at address 5."""
+    """Return the device of a template with one channel, the input register `a` at address 5."""
     given = {"name": "a", "reg_type": "input", "address": 5, **keys}
     return only(folder, "w.json", {"device": {"channels": [given]}})
 
@@ -33,7 +33,7 @@ def places(device: ImportedDevice) -> list[tuple[str, int]]:
     return [(register.name, register.address) for register in device.registers]
 
 
-def test_registers_of_a_subdevice_are_shifted_for_each_channel_that_uses_it(tmp_path: Path) -> None:
+def test_registers_of_a_wb_subdevice_are_shifted_for_each_channel_that_uses_it(tmp_path: Path) -> None:
     first = {"name": "First", "device_type": "ch", "shift": 256}
     second = {"name": "Second", "device_type": "ch", "shift": "0x200", "stride": 2}
     device = only(tmp_path, "w.json", with_subdevice(first, second))
@@ -46,7 +46,7 @@ def test_registers_of_a_subdevice_are_shifted_for_each_channel_that_uses_it(tmp_
     assert omissions(device) == []
 
 
-def test_shifts_of_nested_subdevices_are_added(tmp_path: Path) -> None:
+def test_shifts_of_nested_wb_subdevices_are_added(tmp_path: Path) -> None:
     inner = {"device_type": "in", "device": {"channels": [VOLTAGE]}}
     used = {"name": "Inner", "device_type": "in", "shift": 3}
     document = with_subdevice(
@@ -55,7 +55,7 @@ def test_shifts_of_nested_subdevices_are_added(tmp_path: Path) -> None:
     assert places(only(tmp_path, "w.json", document)) == [("outer_inner_voltage", 16 + 103)]
 
 
-def test_subdevice_that_contains_itself_is_cut_off(tmp_path: Path) -> None:
+def test_wb_subdevice_that_contains_itself_is_cut_off(tmp_path: Path) -> None:
     again = {"name": "Again", "device_type": "ch", "shift": 1}
     device = only(tmp_path, "w.json", with_subdevice(again, channels=[VOLTAGE, again]))
     assert len(device.registers) == 8
@@ -73,7 +73,7 @@ def test_subdevice_that_contains_itself_is_cut_off(tmp_path: Path) -> None:
         ({"name": "X", "address": 1}, "subdevice ch: no channel uses it, so its address is not known"),
     ],
 )
-def test_subdevices_of_unknown_address_are_reported_as_not_imported(
+def test_wb_subdevices_of_unknown_address_are_reported_as_not_imported(
     tmp_path: Path, used: dict[str, Any], reason: str
 ) -> None:
     document = with_subdevice({"name": "Known", "address": 7}, used)
@@ -92,14 +92,14 @@ def test_subdevices_of_unknown_address_are_reported_as_not_imported(
         (
             {"address": "5:8:4", "format": "s16"},
             {"part": "8-11"},
-        ),  # wb-mqtt-serial ignores the sign of a part
+        ),  # wb-mqtt-serial ignores the sign of a number that uses only some bits
         ({"address": "5:8:16", "format": "s16"}, {"number_format": "I32", "part": "8-23"}),
         ({"format": "s24"}, {"number_format": "I32", "part": "0-23"}),
         ({"format": "u8"}, {"part": "0-7"}),
         ({"format": "s8"}, {"number_format": "I8"}),
     ],
 )
-def test_bits_of_a_register_are_imported_as_a_part_of_the_word(
+def test_bits_of_a_wb_register_are_imported_as_a_part_of_the_word(
     tmp_path: Path, keys: dict[str, Any], expected: dict[str, Any]
 ) -> None:
     device = channel(tmp_path, **keys)
@@ -107,12 +107,12 @@ def test_bits_of_a_register_are_imported_as_a_part_of_the_word(
     assert gaps(device, "a") == []
 
 
-def test_bits_across_three_registers_are_a_gap(tmp_path: Path) -> None:
+def test_bits_across_three_wb_registers_are_marked_as_a_gap(tmp_path: Path) -> None:
     device = channel(tmp_path, address="5:30:4")
     assert gaps(device, "a") == ["only its count is read: its bits 30 to 33 of the format u16"]
 
 
-def test_low_byte_format_of_a_written_register_selects_its_low_byte(tmp_path: Path) -> None:
+def test_8_bit_format_of_a_written_wb_register_selects_its_low_byte(tmp_path: Path) -> None:
     assert entries(channel(tmp_path, reg_type="holding", format="u8"))["a"] == {"at": 5, "part": "0-7"}
 
 
@@ -125,7 +125,7 @@ def test_low_byte_format_of_a_written_register_selects_its_low_byte(tmp_path: Pa
         ({"format": "s16", "error_value": "0x7FFF", "unsupported_value": "0xFFFE"}, [0x7FFF, 0xFFFE]),
     ],
 )
-def test_error_value_is_decoded_in_the_registers_format(
+def test_wb_error_value_is_decoded_in_the_registers_format(
     tmp_path: Path, keys: dict[str, Any], invalid: Any
 ) -> None:
     device = channel(tmp_path, **keys)
@@ -149,24 +149,24 @@ def test_error_value_is_decoded_in_the_registers_format(
         ({"format": "bcd8"}, "its format bcd8 has fewer digits than its registers hold"),
     ],
 )
-def test_keys_that_are_not_imported_are_marked_as_gaps(
+def test_wb_keys_that_are_not_imported_are_marked_as_gaps(
     tmp_path: Path, keys: dict[str, Any], gap: str
 ) -> None:
     assert gaps(channel(tmp_path, **keys), "a") == [gap]
 
 
-def test_text_without_its_size_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_wb_text_without_its_size_is_marked_as_a_gap(tmp_path: Path) -> None:
     assert gaps(channel(tmp_path, format="string8"), "a") == ["string_data_size is not stated; 1 was assumed"]
 
 
-def test_parts_of_a_composite_channel_are_marked_as_gaps(tmp_path: Path) -> None:
+def test_parts_of_a_composite_wb_channel_are_marked_as_gaps(tmp_path: Path) -> None:
     parts = [{"reg_type": "input", "address": at} for at in (5, 7)]
     device = only(tmp_path, "w.json", {"device": {"channels": [{"name": "a", "consists_of": parts}]}})
     assert places(device) == [("a", 5), ("a_2", 7)]
     assert gaps(device, "a") == ["its place in a larger channel was not carried over"]
 
 
-def test_value_names_with_text_numbers_are_imported(tmp_path: Path) -> None:
+def test_names_of_values_with_numbers_as_text_are_imported(tmp_path: Path) -> None:
     named = channel(tmp_path, enum=["0", "2"], enum_titles=["off", "on"])
     assert entries(named)["a"]["values"] == {"off": 0, "on": 2}
 
@@ -181,7 +181,7 @@ def test_value_names_with_text_numbers_are_imported(tmp_path: Path) -> None:
         ({"format": "string8", "word_order": "little_endian"}, "a text whose word_order is little_endian"),
     ],
 )
-def test_text_in_an_unsupported_order_is_reported_as_not_imported(
+def test_wb_text_in_an_unsupported_order_is_reported_as_not_imported(
     tmp_path: Path, keys: dict[str, Any], reason: str
 ) -> None:
     with pytest.raises(ValueError, match=f"a: {reason}"):
@@ -216,7 +216,7 @@ CONFIG = {
 }
 
 
-def test_configuration_gives_a_device_for_each_slave(tmp_path: Path) -> None:
+def test_wb_configuration_gives_a_device_for_each_slave(tmp_path: Path) -> None:
     meter, relay, net = devices(tmp_path, "wb-mqtt-serial.json", CONFIG)
     assert [(each.title, each.address, each.line.port) for each in (meter, relay, net)] == [
         ("Meter", 10, "/dev/ttyRS485-1"),
@@ -241,22 +241,23 @@ def test_configuration_gives_a_device_for_each_slave(tmp_path: Path) -> None:
         ({"device": {"channels": [{"address": 1, "word_order": "x"}]}}, "word_order = 'x' is none of"),
     ],
 )
-def test_invalid_document_raises_value_error_with_the_reason(
+def test_invalid_wb_document_raises_value_error_with_the_reason(
     tmp_path: Path, document: dict[str, Any], reason: str
 ) -> None:
     with pytest.raises(ValueError, match=re.escape(reason)):
         only(tmp_path, "w.json", document)
 
 
-def test_refusal_names_the_file(tmp_path: Path) -> None:
+def test_import_error_names_the_file(tmp_path: Path) -> None:
     (tmp_path / "w.json").write_text("{}")
     with pytest.raises(ValueError, match=re.escape(str(tmp_path / "w.json"))):
         read_devices(tmp_path / "w.json")
 
 
-def test_translations_of_names_become_titles(tmp_path: Path) -> None:
-    """For a parameter, its `title` is translated. For a channel of a subdevice, two names are translated
-    and joined: the subdevice's and the channel's.
+def test_translations_of_wb_names_become_titles(tmp_path: Path) -> None:
+    """A parameter's `title` is translated.
+
+    For a channel of a subdevice, the translated names of both are joined.
     """
     words = {"Voltage": "Напряжение", "First": "Первый", "mode_title": "Режим", "Energy": ""}
     document = with_subdevice({"name": "First", "device_type": "ch"}, {**VOLTAGE, "address": 1})

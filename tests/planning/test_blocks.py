@@ -1,4 +1,4 @@
-"""Plans: never over a limit, never across forbidden addresses, never slower than a brute-force search."""
+"""Read plans: never above a limit, never across forbidden addresses, never slower than another plan."""
 
 import math
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ from multidrop.planning.bus_time import gap, in_order, silence
 
 
 class Example(Drive):
-    """A family whose reads have at most four registers, and may include reserved addresses up to 20."""
+    """A family that reads at most four registers at once, and may read reserved addresses up to 20."""
 
     most_registers = {HOLDING: 4, INPUT: 2}
     readable_gaps = {HOLDING: range(0, 21)}
@@ -50,7 +50,7 @@ class Example(Drive):
 
 
 def duration(drive: Drive, block: Block, delay: float | None = None) -> float:
-    """Return the seconds that silence, request, response delay and reply take together."""
+    """Return the seconds of silence, request, response delay and reply together."""
     return silence(drive) + sending(drive, block) + (drive.response_delay if delay is None else delay)
 
 
@@ -58,7 +58,7 @@ def spans(drive: Drive, *names: str) -> list[tuple[int, int]]:
     return [(block.start, block.count) for block in blocks(drive, [drive.register(name) for name in names])]
 
 
-def test_neighbouring_registers_are_read_together_up_to_the_limit() -> None:
+def test_neighbouring_registers_are_read_together_up_to_the_read_limit() -> None:
     drive = Example(1)
     assert spans(drive, "a", "b") == [(1, 2)]
     assert spans(drive, "a", "b", "c") == [(1, 4)]
@@ -66,20 +66,20 @@ def test_neighbouring_registers_are_read_together_up_to_the_limit() -> None:
     assert spans(drive, "state_1", "state_2", "state_3") in ([(1, 2), (3, 1)], [(1, 1), (2, 2)])
 
 
-def test_forbidden_addresses_are_never_read_across() -> None:
+def test_a_read_never_includes_forbidden_addresses() -> None:
     assert spans(Example(1), "far", "farther") == [(30, 1), (32, 1)]
 
 
-def test_blocks_do_not_depend_on_order_or_repetition_of_the_registers() -> None:
+def test_read_plan_does_not_depend_on_order_or_repetition_of_registers() -> None:
     assert spans(Example(1), "c", "a", "b", "a") == [(1, 4)]
 
 
-def test_planning_a_register_that_cannot_be_read_raises() -> None:
+def test_read_plan_for_a_register_that_cannot_be_read_raises() -> None:
     with pytest.raises(ValueError, match=r"run of .* cannot be read: it is a command"):
         blocks(Example(1), [Example.run])
 
 
-def test_blocks_have_the_standards_read_requests() -> None:
+def test_blocks_have_the_read_requests_of_the_modbus_standard() -> None:
     (block,) = blocks(Example(7), [Example.a, Example.b])
     assert block.request == Message(7, 3, 1, 2)
     assert write_request(Example(7), Example.coil, 1) == Message(7, 5, 3, data=b"\xff\x00")
@@ -90,18 +90,18 @@ def test_blocks_have_the_standards_read_requests() -> None:
         write_request(Example(7), Example.a, 1)
 
 
-def test_the_duration_of_a_block_includes_characters_silence_and_response_delay() -> None:
+def test_duration_of_a_block_includes_characters_silence_and_response_delay() -> None:
     drive = Example(1, baudrate=9600, format="8N1")
     (block,) = blocks(drive, [Example.a])
     characters = 8 + 7
-    silence = 3.5 * 10 / 9600 + 1 / 9600  # one bit more, in case of a second stop bit
+    silence = 3.5 * 10 / 9600 + 1 / 9600  # one bit is added in case the drive sends a second stop bit
     expected = characters * 10 / 9600 + silence + drive.response_delay
     assert duration(drive, block) == pytest.approx(expected)
 
 
-def test_other_readable_registers_are_read_across_but_never_a_command() -> None:
+def test_a_read_may_include_other_readable_registers_but_never_a_command() -> None:
     class Sparse(Drive):
-        """A family whose undeclared addresses are never read."""
+        """A family whose undeclared addresses must not be read."""
 
         most_registers = {HOLDING: 10}
         low = reading(1)
@@ -114,7 +114,7 @@ def test_other_readable_registers_are_read_across_but_never_a_command() -> None:
     assert spans(Sparse(1), "high", "beyond") == [(3, 1), (5, 1)]
 
 
-def test_registers_of_different_rates_share_no_block() -> None:
+def test_registers_with_different_polling_rates_share_no_request() -> None:
     drive = Example(1)
     found = planned(drive, [(Example.a, 0.1), (Example.b, None), (Example.c, 0.1)])
     assert [(each.block.start, each.block.count, each.every) for each in found] == [(1, 4, 0.1), (2, 1, None)]
@@ -132,7 +132,7 @@ def partitions(registers: list[Register[float]]) -> Iterator[list[list[Register[
 
 
 def cheapest_of_all(drive: Drive, registers: list[Register[float]], delay: float | None = None) -> float:
-    """Return the shortest time, in s, of all divisions of one table's sorted registers into requests."""
+    """Return the shortest time in s of all ways to divide the sorted registers of one table into requests."""
     table = registers[0].table
     limit, gaps = drive.most_registers.get(table, 1), drive.readable_gaps.get(table, range(0))
     readable = {
@@ -165,8 +165,10 @@ def span(register: Register[float]) -> range:
     st.sampled_from([1200, 9600, 38400, 115200]),
     st.sampled_from([Framing.RTU, Framing.ASCII]),
 )
-def test_no_other_plan_takes_less_time(pairs: dict[int, bool], baudrate: int, framing: Framing) -> None:
-    """Registers of one and two words, some side by side, with reserved addresses between others."""
+def test_no_other_way_to_read_random_registers_takes_less_time(
+    pairs: dict[int, bool], baudrate: int, framing: Framing
+) -> None:
+    """Registers have one or two words. Some are neighbours, and reserved addresses lie between others."""
     registers = {
         f"r{address}": reading(address, number_format=NumberFormat.U32 if pair else NumberFormat.U16)
         for address, pair in pairs.items()
@@ -196,7 +198,7 @@ def test_no_other_plan_takes_less_time(pairs: dict[int, bool], baudrate: int, fr
 
 
 class Scattered(Drive):
-    """A family whose registers have readable gaps of many lengths between them."""
+    """A family with readable gaps of many lengths between its registers."""
 
     framings = (Framing.RTU, Framing.ASCII)
     most_registers = {HOLDING: 90}
@@ -214,7 +216,7 @@ class Scattered(Drive):
     st.floats(0, 0.2),
     st.floats(0, 1),
 )
-def test_a_plan_is_the_quickest_exactly_at_the_delays_that_it_suits(
+def test_read_plan_is_the_quickest_exactly_at_the_delays_that_it_states(
     wanted: set[Register[float]], baudrate: int, framing: Framing, delay: float, part: float
 ) -> None:
     drive = Scattered(1, baudrate=baudrate, framing=framing)
@@ -222,7 +224,7 @@ def test_a_plan_is_the_quickest_exactly_at_the_delays_that_it_suits(
     found = plan(drive, [(register, None) for register in registers], delay)
 
     def excess(at: float) -> float:
-        """Return the seconds by which the best plan is quicker than `found` at the response delay `at`."""
+        """Return by how many seconds the best plan is quicker than `found` at this response delay."""
         own = sum(duration(drive, one.block, at) for one in found.planned)
         return own - cheapest_of_all(drive, registers, at)
 
@@ -236,7 +238,7 @@ def test_a_plan_is_the_quickest_exactly_at_the_delays_that_it_suits(
             assert excess(outside) > 1e-6
 
 
-def test_a_plan_of_several_rates_suits_the_delays_that_suit_every_rate() -> None:
+def test_plan_of_several_polling_rates_states_the_delays_at_which_all_are_quickest() -> None:
     drive = Scattered(1, baudrate=9600)
     rates = {0.1: [Scattered.r0, Scattered.r2], None: [Scattered.r3, Scattered.r5]}
     apart = [
@@ -252,7 +254,7 @@ def test_a_plan_of_several_rates_suits_the_delays_that_suit_every_rate() -> None
 
 @table("framing", list(Framing))
 @table("table", [HOLDING, INPUT, COIL, DISCRETE])
-def test_characters_are_counted_as_frames_are_built(framing: Framing, table: Table) -> None:
+def test_predicted_number_of_characters_equals_that_of_built_frames(framing: Framing, table: Table) -> None:
     drive = Example(1)
     drive.framing = framing
     for count in range(1, 126):
@@ -260,12 +262,13 @@ def test_characters_are_counted_as_frames_are_built(framing: Framing, table: Tab
         block = Block(table, 0, count, (), request)
         if framing is Framing.DELIXI:
             request = Message(1, 7, 0, data=bytes(4))
-        wire = Framing.RTU if framing is Framing.TCP else framing  # the framing behind a gateway
+        # the framing on the serial line behind a TCP gateway
+        wire = Framing.RTU if framing is Framing.TCP else framing
         frames = len(build_request(wire, request)) + reply_length(wire, request)
         assert sending(drive, block) == pytest.approx(frames * drive.settings.character)
 
 
-FORBIDDEN = {  # addresses that the documents do not declare as readable
+FORBIDDEN = {  # addresses that the document does not declare as readable, by family
     "erman-er-g-220": {"holding register": (89, 0xFFFF), "input register": (0x1000, 0xFFFF)},
     "invt-che": {"holding register": (0x1000, 0x1000, 0x3017, 0x4FFF, 0x5002, 0xFFFF)},
     "innovert-ibd": {"holding register": (0, 2, 5, 21, 0x2000, 0x2001)},
@@ -284,7 +287,7 @@ def test_no_other_plan_for_a_built_in_family_takes_less_time(data: st.DataObject
             tables.setdefault(register.table, []).append(register)
     registers = data.draw(st.sampled_from([*tables.values()]))
     first = data.draw(st.integers(0, len(registers) - 1))
-    near = registers[first : first + 12]  # neighbouring registers, so that some can share a request
+    near = registers[first : first + 12]  # neighbouring registers, of which some can share a request
     wanted = data.draw(st.lists(st.sampled_from(near), unique=True, min_size=1, max_size=8))
     drive = family(
         1,
@@ -299,7 +302,8 @@ def test_no_other_plan_for_a_built_in_family_takes_less_time(data: st.DataObject
         forbidden = [range(low, high + 1) for low, high in zip(bounds[::2], bounds[1::2], strict=True)]
         asked = range(block.start, block.start + block.count)
         assert not any(at in part for at in asked for part in forbidden)
-        if model.startswith(("delixi", "yd1000")):  # their documents describe only reads of one register
+        # the documents of these families only describe reads of one register
+        if model.startswith(("delixi", "yd1000")):
             assert len(block.registers) == 1
 
 
@@ -312,7 +316,7 @@ def silences(order: list[Drive], switching: float = 0.0) -> float:
 
 @st.composite
 def companies(draw: st.DrawFn) -> list[Drive]:
-    """Return up to six drives of any families, with any settings."""
+    """Return up to six drives of any family with any line settings."""
     kinds = draw(st.lists(st.sampled_from(sorted(MODELS)), min_size=1, max_size=6))
     return [
         MODELS[kind](
@@ -326,14 +330,14 @@ def companies(draw: st.DrawFn) -> list[Drive]:
 
 @settings(max_examples=examples(100))
 @given(companies())
-def test_no_other_order_of_the_drives_has_less_silence(drives: list[Drive]) -> None:
+def test_no_other_polling_order_of_the_drives_has_less_silence(drives: list[Drive]) -> None:
     order = in_order(drives)
     assert sorted(each.address for each in order) == [drive.address for drive in drives]
     least = min(silences([drives[0], *rest]) for rest in permutations(drives[1:]))
     assert silences(order) == pytest.approx(least, abs=1e-8)
 
 
-def test_if_switching_takes_time_drives_with_equal_settings_are_side_by_side() -> None:
+def test_drives_with_equal_line_settings_are_polled_in_a_row_if_switching_takes_time() -> None:
     families = ("invt-che", "delixi-modbus", "innovert-ibd")
     drives = [
         MODELS[model](address, baudrate=baudrate)
@@ -347,7 +351,7 @@ def test_if_switching_takes_time_drives_with_equal_settings_are_side_by_side() -
     assert silences(order, 0.05) < silences(drives, 0.05)
 
 
-def test_the_gap_between_two_exchanges_is_the_longer_silence_plus_the_switching_time() -> None:
+def test_pause_between_two_drives_is_the_longer_silence_plus_the_switching_time() -> None:
     slow, fast = MODELS["yd1000"](1), MODELS["erman-er-g-220"](2)
     longer = 24 * 11 / 9600 + 1 / 9600
     assert gap(slow, fast) == gap(fast, slow) == pytest.approx(longer)
@@ -355,7 +359,7 @@ def test_the_gap_between_two_exchanges_is_the_longer_silence_plus_the_switching_
     assert gap(fast, fast, switching=0.002) == pytest.approx(1.75e-3 + 1 / 38400)
 
 
-def test_a_block_of_a_table_without_read_function_raises() -> None:
+def test_block_of_a_table_without_a_read_function_raises() -> None:
     table = Table("command word", None, 0x06)
     with pytest.raises(ValueError, match=r"^a command word cannot be read$"):
         read_request(Example(1), table, 0, 1)

@@ -1,4 +1,4 @@
-"""Predictions, compared with manually counted frame lengths and with the core; and properties of any line."""
+"""Predictions of a line's performance, compared with frame lengths counted manually, and with the C core."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ predict = partial(predict_with_host, lateness=0.0)
 
 
 class Simple(Drive):
-    """A family whose four registers take two requests."""
+    """A family with four registers that need two requests."""
 
     title = "SIMPLE"
     baudrates = (9600, 19200, 38400)
@@ -47,7 +47,8 @@ class Simple(Drive):
     d = reading(12)
 
 
-OWN = (8 + 9) * 10 * BIT + 4e-3  # request and reply of two registers, 8N1
+# s of one exchange: request and reply of two registers in 8N1, and the response delay
+OWN = (8 + 9) * 10 * BIT + 4e-3
 SILENCE = 3.5 * 10 * BIT + BIT
 
 
@@ -56,7 +57,7 @@ def asked(drive: Drive, every: float | None = None, *names: str) -> list[Planned
     return planned(drive, [(register, every) for register in registers])
 
 
-def test_the_predicted_cycle_includes_characters_response_delays_and_silences() -> None:
+def test_predicted_bus_cycle_includes_characters_response_delays_and_silences() -> None:
     drives = [Simple(1, name="one", format="8N1"), Simple(2, name="two", format="8N1")]
     found = predict([each for drive in drives for each in asked(drive)])
     assert found.cycle == pytest.approx(4 * (OWN + SILENCE))
@@ -66,7 +67,7 @@ def test_the_predicted_cycle_includes_characters_response_delays_and_silences() 
     assert found.exchanges_per_second(drives[0]) == pytest.approx(2 / found.cycle)
 
 
-def test_equal_lines_are_simulated_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_prediction_simulates_equal_lines_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
     begun = 0
 
     class CountedSchedule(prediction.Schedule[prediction.Job]):
@@ -86,14 +87,14 @@ def test_equal_lines_are_simulated_only_once(monkeypatch: pytest.MonkeyPatch) ->
     assert begun == 3
 
 
-def test_a_prediction_includes_a_shorter_silence() -> None:
+def test_prediction_includes_a_shorter_silence_declared_for_a_drive() -> None:
     usual, short = ErmanERG220(1), ErmanERG220(1, silence=500e-6)
     cycles = [predict(asked(each, None, "output_current")).cycle for each in (usual, short)]
     assert cycles[0] - cycles[1] == pytest.approx(1.25e-3)
 
 
-def test_a_prediction_includes_10_ms_of_silence_before_and_after_an_ibd() -> None:
-    """Two of a cycle's three silences are as long as the IBD needs. The other drives need a shorter one."""
+def test_prediction_includes_10_ms_of_silence_before_and_after_an_innovert_ibd() -> None:
+    """In a cycle of three drives, two of the three silences are those of the IBD, which are the longest."""
     che, other, ibd = InvtCHE(1, format="8N1"), InvtCHE(2, format="8N1"), InnovertIBD(3)
     exchanges = [asked(one, None, "output_current") for one in (che, other, ibd)]
     found = predict([one for each in exchanges for one in each])
@@ -101,7 +102,7 @@ def test_a_prediction_includes_10_ms_of_silence_before_and_after_an_ibd() -> Non
     assert found.cycle == pytest.approx(own + 2 * (10e-3 + BIT) + SILENCE)
 
 
-def test_each_switch_of_settings_adds_its_time() -> None:
+def test_prediction_includes_the_time_of_each_change_of_line_settings() -> None:
     drives = [ErmanERG220(1), YD1000(2), ErmanERG220(3)]
     exchanges = [each for drive in drives for each in asked(drive, None, "output_frequency")]
     free, dear = predict(exchanges), predict(exchanges, switching=0.01)
@@ -109,7 +110,7 @@ def test_each_switch_of_settings_adds_its_time() -> None:
     assert (free.switches, predict(asked(ErmanERG220(1))).switches) == (2, 0)
 
 
-def test_a_prediction_for_a_network_port_includes_no_switching() -> None:
+def test_prediction_for_a_network_port_includes_no_change_of_line_settings() -> None:
     drives = [InvtCHE(1, baudrate=9600), InvtCHE(2, baudrate=19200)]
     for drive in drives:
         drive.take_framing_of("tcp://10.0.0.7")
@@ -118,7 +119,7 @@ def test_a_prediction_for_a_network_port_includes_no_switching() -> None:
     assert predict(exchanges, switching=0.01).cycle == predict(exchanges).cycle
 
 
-def test_suggestions_include_the_switching_time() -> None:
+def test_suggested_settings_include_the_time_of_changing_line_settings() -> None:
     drives = [ErmanERG220(1), YD1000(2)]
     exchanges = [each for drive in drives for each in asked(drive, 0.06, "output_frequency")]
     periods = []
@@ -130,13 +131,13 @@ def test_suggestions_include_the_switching_time() -> None:
     assert periods[1] > periods[0]
 
 
-def test_measured_delays_replace_the_documented_delays() -> None:
+def test_prediction_uses_measured_instead_of_documented_response_delays() -> None:
     one, two = Simple(1), Simple(2)
     exchanges = [*asked(one), *asked(two)]
     assert predict(exchanges, {one: 9e-3}).cycle == pytest.approx(predict(exchanges).cycle + 2 * 5e-3)
 
 
-def test_registers_without_a_period_get_the_time_that_slow_rates_leave() -> None:
+def test_registers_without_a_period_get_the_line_time_that_others_leave() -> None:
     timed, eager = Simple(1, format="8N1"), Simple(2, format="8N1")
     found = predict([*asked(timed, 0.1), *asked(eager)])
     load = 2 * (OWN + SILENCE) / 0.1
@@ -145,7 +146,7 @@ def test_registers_without_a_period_get_the_time_that_slow_rates_leave() -> None
     assert predict(asked(timed, 0.1)).utilisation == pytest.approx(load)
 
 
-def test_a_rate_that_is_too_high_reaches_what_the_line_allows() -> None:
+def test_prediction_for_a_rate_that_is_too_high_is_the_rate_that_the_line_allows() -> None:
     drives = [Simple(address, format="8N1") for address in range(1, 5)]
     found = predict([each for drive in drives for each in asked(drive, 0.05)])
     assert found.utilisation == pytest.approx(8 * (OWN + SILENCE) / 0.05)
@@ -153,7 +154,7 @@ def test_a_rate_that_is_too_high_reaches_what_the_line_allows() -> None:
     assert [rate.reached for rate in found.rates] == pytest.approx([1 / found.cycle] * 4, rel=0.01)
 
 
-def test_a_drive_without_a_period_keeps_its_share_of_an_overloaded_line() -> None:
+def test_drive_without_a_period_keeps_its_share_of_an_overloaded_line() -> None:
     hasty, eager = Simple(1, name="hasty", format="8N1"), Simple(2, name="eager", format="8N1")
     found = predict([*asked(hasty, 0.02), *asked(eager)])
     assert [(rate.drive.name, rate.fits) for rate in found.rates] == [("hasty", False), ("eager", True)]
@@ -161,7 +162,7 @@ def test_a_drive_without_a_period_keeps_its_share_of_an_overloaded_line() -> Non
     assert found.rates[0].reached == pytest.approx((1 - TURN_SHARE) / (2 * (OWN + SILENCE)), rel=0.01)
 
 
-def test_a_prediction_adds_the_hosts_lateness_to_each_exchange() -> None:
+def test_prediction_adds_the_delay_of_the_computer_to_each_exchange() -> None:
     exchanges = [*asked(Simple(1)), *asked(Simple(2))]
     assert predict_with_host(exchanges).cycle == pytest.approx(predict(exchanges).cycle + 4 * LATENESS)
 
@@ -170,7 +171,7 @@ def test_a_prediction_adds_the_hosts_lateness_to_each_exchange() -> None:
 
 
 def carried_out(exchanges: Sequence[Planned]) -> float:
-    """Return the seconds that a bus cycle takes in the core if every drive has its documented delay."""
+    """Return the seconds of a bus cycle in the C core if every drive has its documented response delay."""
     drives = in_order(dict.fromkeys(exchange.drive for exchange in exchanges))
     order = [exchange for drive in drives for exchange in exchanges if exchange.drive is drive]
     peers = {each: Peer(least_timeout=0.02, most_timeout=each.response_timeout) for each in drives}
@@ -203,7 +204,7 @@ def carried_out(exchanges: Sequence[Planned]) -> float:
         max_size=8,
     )
 )
-def test_the_cores_line_takes_the_predicted_time(wanted: list[tuple[str, int, int]]) -> None:
+def test_bus_cycle_of_the_c_core_takes_the_predicted_time(wanted: list[tuple[str, int, int]]) -> None:
     exchanges: list[Planned] = []
     for address, (model, framing, count) in enumerate(wanted, 1):
         family = MODELS[model]
@@ -220,8 +221,10 @@ PERIODS = st.sampled_from([None, 0.02, 0.1, 0.5, 2.0])
 @pytest.mark.story
 @settings(max_examples=examples(40), deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(sorted(MODELS)), PERIODS), min_size=1, max_size=8))
-def test_predicted_rates_never_need_more_than_the_lines_time(wanted: list[tuple[str, float | None]]) -> None:
-    """The exchanges predicted for one second, each timed as if its drive were alone, fit into a second."""
+def test_predicted_rates_never_need_more_time_than_the_line_has(
+    wanted: list[tuple[str, float | None]],
+) -> None:
+    """The exchanges that are predicted for one second fit into one second."""
     exchanges: list[Planned] = []
     for address, (model, every) in enumerate(wanted, 1):
         drive = MODELS[model](address)
@@ -256,7 +259,7 @@ def with_suggestion(drives: list[Drive], found: Suggestions, every: float, which
 
 
 @pytest.mark.parametrize("which", ["every", "baudrate", "registers"])
-def test_each_suggestion_makes_the_line_reach_its_rates(which: str) -> None:
+def test_each_suggested_change_makes_the_line_reach_its_polling_rates(which: str) -> None:
     drives: list[Drive] = [Simple(address, name=f"drive-{address}") for address in range(1, 5)]
     exchanges = [each for drive in drives for each in asked(drive, 0.15)]
     prediction = predict(exchanges)
@@ -265,9 +268,9 @@ def test_each_suggestion_makes_the_line_reach_its_rates(which: str) -> None:
     assert predict(with_suggestion(drives, found, 0.15, which)).fits
 
 
-def test_a_suggestion_is_no_larger_than_needed() -> None:
+def test_suggested_change_is_no_larger_than_needed() -> None:
     drive = Simple(1)
-    exchanges = asked(drive, 0.045)  # two exchanges take 51 ms
+    exchanges = asked(drive, 0.045)  # the two exchanges take 51 ms
     found = suggest(exchanges, predict(exchanges))
     assert found.every[0][1] <= 0.056
     assert found.baudrate is not None
@@ -275,7 +278,7 @@ def test_a_suggestion_is_no_larger_than_needed() -> None:
     assert found.registers == 2  # one request
 
 
-def test_a_change_that_does_not_help_is_not_suggested() -> None:
+def test_change_that_does_not_help_is_not_suggested() -> None:
     drive = YD1000(1)
     exchanges = asked(drive, 0.001, "output_frequency")
     found = suggest(exchanges, predict(exchanges))
@@ -285,18 +288,18 @@ def test_a_change_that_does_not_help_is_not_suggested() -> None:
     assert "every" in str(found)
 
 
-def test_duration_text_returns_a_plant_files_notation() -> None:
+def test_duration_text_returns_the_notation_of_plant_files() -> None:
     assert [duration_text(each) for each in (0.05, 0.0025, 1.0, 60.0)] == ["50 ms", "2.5 ms", "1 s", "60 s"]
 
 
-def test_a_prediction_depends_on_the_framing() -> None:
+def test_prediction_depends_on_the_framing() -> None:
     rtu, text = InnovertIBD(1), InnovertIBD(1, framing=Framing.ASCII)
     ascii_own = (17 + 15 + 1.5) * 10 * BIT + text.response_delay + BIT  # ":0103....LRC\r\n"
     assert predict(asked(text, None, "output_current")).cycle == pytest.approx(ascii_own)
     assert predict(asked(rtu, None, "output_current")).cycle > 10e-3
 
 
-def test_suggestions_as_text_form_one_sentence() -> None:
+def test_suggested_changes_as_text_form_one_sentence() -> None:
     every = 'every = "100 ms" instead of 50 ms'
     found = Suggestions(((0.05, 0.1),), (19200, (YD1000(1, name="fan-1"), YD1000(2, name="fan-2"))), 3)
     assert str(found) == (
@@ -334,7 +337,7 @@ SENTENCE = (
 )
 
 
-def test_readable_gaps_would_save_a_fifth_of_the_meters_reading_time() -> None:
+def test_readable_gaps_would_save_a_fifth_of_a_meters_reading_time() -> None:
     drive = Meter(1, baudrate=9600, format="8N1")
     gain = reading_gain(drive, [(drive.register(name), None) for name in ADDRESSES])
     assert gain is not None
@@ -345,7 +348,7 @@ def test_readable_gaps_would_save_a_fifth_of_the_meters_reading_time() -> None:
     assert reading_gain(told, [(told.register(name), None) for name in ADDRESSES]) is None
 
 
-def test_the_suggestion_for_a_family_file_uses_its_notation(tmp_path: Path) -> None:
+def test_suggestion_for_a_family_file_uses_its_notation(tmp_path: Path) -> None:
     source = (
         "[family]\ntitle = 'Meter'\nmanual = 'of this test'\ncounts_from = 0\n[reading]\n"
         "low = { at = 1, unit = 'V' }\nhigh = { at = 3, unit = 'V' }\n"
@@ -371,7 +374,7 @@ def test_readable_gaps_are_not_suggested_if_declared_or_useless() -> None:
         assert reading_gain(drive, [(register, None) for register in drive.readings()]) is None
 
 
-def test_a_stated_limit_bounds_the_gain_of_readable_gaps() -> None:
+def test_stated_read_limit_bounds_the_gain_of_readable_gaps() -> None:
     class Limited(Drive):
         most_registers = {HOLDING: 3}
         a = reading(1)
@@ -403,10 +406,11 @@ def test_plan_and_models_suggest_readable_gaps_only_for_a_users_own_class(
         main(["models", model])
         told = " ".join(capsys.readouterr().out.split())
         assert "readable_gaps" not in told
-        assert "the family states none" not in told or model in SHIPPED  # some document no limit
+        # the documents of some families in files state no limit
+        assert "the family states none" not in told or model in SHIPPED
 
 
-def test_plan_and_models_show_a_familys_groups_and_interval(
+def test_plan_and_models_show_a_familys_register_groups_and_pauses(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = (

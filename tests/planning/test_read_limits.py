@@ -1,4 +1,4 @@
-"""Block sizes if no limit is stated, tables with the same read function, groups that share a request."""
+"""Limits of one read: families without a stated limit, tables with one read function, register groups."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def spans(drive: Drive, *names: str) -> list[tuple[int, int]]:
 @pytest.mark.parametrize(
     ("table", "most", "apart"), [(HOLDING, 125, 1), (INPUT, 125, 1), (COIL, 2000, 8), (DISCRETE, 2000, 8)]
 )
-def test_without_a_stated_limit_adjacent_registers_are_read_up_to_the_standards_limit(
+def test_adjacent_registers_are_read_up_to_the_modbus_limit_by_default(
     table: Table, most: int, apart: int
 ) -> None:
     drive = family(**{f"r{at}": reading(at, table=table) for at in range(most + 1)})(1)
@@ -61,17 +61,17 @@ def test_without_a_stated_limit_adjacent_registers_are_read_up_to_the_standards_
     assert max(counts) <= most
 
 
-def test_undeclared_addresses_are_never_read_across() -> None:
+def test_a_read_never_includes_undeclared_addresses_by_default() -> None:
     drive = family(a=reading(1), b=reading(2), c=reading(4), d=reading(5), e=reading(7), order=command(6))(1)
     assert spans(drive, "a", "b", "c", "d", "e") == [(1, 2), (4, 2), (7, 1)]
 
 
-def test_a_request_may_include_a_declared_register_that_is_not_wanted() -> None:
+def test_a_read_may_include_a_declared_register_that_is_not_wanted() -> None:
     drive = family(a=reading(1), b=reading(2), c=reading(3))(1)
     assert spans(drive, "a", "c") == [(1, 3)]
 
 
-def test_a_limit_of_one_table_does_not_apply_to_other_tables() -> None:
+def test_read_limit_of_one_table_does_not_apply_to_other_tables() -> None:
     registers = {f"h{at}": reading(at) for at in range(4)}
     registers |= {f"i{at}": reading(at, table=INPUT) for at in range(4)}
     drive = family(most_registers={HOLDING: 2}, **registers)(1)
@@ -100,7 +100,7 @@ REQUESTS = {
 
 
 @table("model", REQUESTS)
-def test_the_requests_of_built_in_families_are_unchanged(model: str) -> None:
+def test_requests_that_read_the_built_in_families_are_unchanged(model: str) -> None:
     drive = MODELS[model](3)
     found = [(block.request.function, block.start, block.count) for block in blocks(drive, drive.readings())]
     assert sorted(found) == REQUESTS[model]
@@ -109,7 +109,7 @@ def test_the_requests_of_built_in_families_are_unchanged(model: str) -> None:
 # ---- a meter of 39 floats ----
 
 
-def test_a_meter_of_39_floats_needs_eight_requests_or_four_with_readable_gaps() -> None:
+def test_meter_of_39_floats_needs_eight_requests_or_four_with_readable_gaps() -> None:
     assert len(ADDRESSES) == 39
     lines = []
     for meter in (Meter, StatedMeter):
@@ -120,7 +120,7 @@ def test_a_meter_of_39_floats_needs_eight_requests_or_four_with_readable_gaps() 
     assert lines == [(8, 0.341), (4, 0.268)]
 
 
-def test_by_default_requests_to_the_meter_include_only_declared_registers() -> None:
+def test_requests_to_a_meter_include_only_declared_registers_by_default() -> None:
     drive = Meter(1)
     declared = {at for address in ADDRESSES.values() for at in (address, address + 1)}
     asked = [range(one.start, one.start + one.count) for one in blocks(drive, drive.readings())]
@@ -132,7 +132,7 @@ def test_by_default_requests_to_the_meter_include_only_declared_registers() -> N
 
 
 class Mixed(Drive):
-    """A family with registers written by function 06, and others only by 10H. All are read by 03."""
+    """A family in which function 06 writes some registers and 10H writes others. Function 03 reads all."""
 
     low = setting(1, "", span=(0, 9))
     multiple = setting(2, "", span=(0, 9), table=HOLDING_MULTIPLE)
@@ -140,14 +140,14 @@ class Mixed(Drive):
     other = reading(4, table=INPUT)
 
 
-def test_tables_of_one_read_function_share_requests() -> None:
+def test_tables_that_are_read_by_the_same_function_share_requests() -> None:
     drive = Mixed(1)
     found = blocks(drive, drive.registers.values())
     assert [(one.request.function, one.start, one.count) for one in found] == [(3, 1, 3), (4, 4, 1)]
     assert (HOLDING_MULTIPLE.read, HOLDING_MULTIPLE.write, HOLDING_MULTIPLE.name) == (3, 16, HOLDING.name)
 
 
-def test_of_tables_with_one_read_function_the_smallest_limit_applies() -> None:
+def test_smallest_limit_applies_to_tables_with_the_same_read_function() -> None:
     class Narrow(Mixed):
         most_registers = {HOLDING_MULTIPLE: 2, HOLDING: 3}
 
@@ -155,7 +155,7 @@ def test_of_tables_with_one_read_function_the_smallest_limit_applies() -> None:
     assert len(blocks(drive, [Narrow.low, Narrow.multiple, Narrow.read_only])) == 2
 
 
-def test_a_register_of_one_word_can_be_written_by_10h() -> None:
+def test_register_of_one_word_can_be_written_by_function_10h() -> None:
     drive, sim = Mixed(1), SimulatedDrive(Mixed(1))
     request = write_request(drive, Mixed.multiple, 7)
     assert request == Message(1, 0x10, 2, 1, b"\0\7")
@@ -182,7 +182,7 @@ LAYOUTS = st.lists(
 
 
 def partitions(registers: list[Register[float]]) -> list[list[list[Register[float]]]]:
-    """Return all partitions of the registers into groups, which need not be neighbours."""
+    """Return all ways to divide the registers into groups, which need not be neighbours."""
     if not registers:
         return [[]]
     first, *others = registers
@@ -230,7 +230,7 @@ def test_no_other_plan_for_overlapping_registers_takes_less_time(
 
 
 class Grouped(Drive):
-    """A family with energy in two separate registers, a state that is read first, and large gaps."""
+    """A family with an energy in two registers, a state that must be read first, and large gaps."""
 
     most_registers = {HOLDING: 100}
     readable_gaps = {HOLDING: range(200)}
@@ -243,7 +243,7 @@ class Grouped(Drive):
 
 
 @pytest.mark.parametrize("baudrate", [1200, 9600, 115200])
-def test_a_group_shares_a_request_even_if_separate_requests_are_quicker(baudrate: int) -> None:
+def test_grouped_registers_share_a_request_even_if_two_requests_are_quicker(baudrate: int) -> None:
     drive = Grouped(1, baudrate=baudrate)
     assert (0, 61) in spans(drive, "energy_high", "energy_low")
     found = [
@@ -252,13 +252,13 @@ def test_a_group_shares_a_request_even_if_separate_requests_are_quicker(baudrate
     assert all(Grouped.energy_high in block.registers for block in found)
 
 
-def test_a_single_register_of_a_group_is_read_without_the_rest_of_the_group() -> None:
+def test_one_register_of_a_group_can_be_read_without_the_others() -> None:
     assert spans(Grouped(1), "energy_low") == [(60, 1)]
     rates = [(Grouped.energy_high, 1.0), (Grouped.energy_low, None)]
     assert [(one.block.start, one.block.count) for one in planned(Grouped(1), rates)] == [(0, 1), (60, 1)]
 
 
-def test_groups_are_read_first_and_in_the_declared_order() -> None:
+def test_grouped_registers_are_read_first_in_the_declared_order() -> None:
     order = [block.registers[0].name for block in blocks(Grouped(1), Grouped.registers.values())]
     assert order[:2] == ["latch", "energy_high"]
     assert order[-1] == "other"
@@ -280,7 +280,7 @@ def test_groups_are_read_first_and_in_the_declared_order() -> None:
         ({"most_registers": {HOLDING: 0}}, "not a number from 1 to 125"),
     ],
 )
-def test_an_invalid_group_limit_or_interval_is_a_declaration_error(
+def test_invalid_group_limit_or_pause_of_a_family_is_a_declaration_error(
     details: dict[str, Any], sentence: str
 ) -> None:
     registers = {"a": reading(1), "b": reading(2), "far": reading(9), "input_3": reading(3, table=INPUT)}

@@ -1,4 +1,4 @@
-"""The schedule, with a clock that the test sets."""
+"""The order in which a line's requests are sent, with a clock that the test sets."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def schedule(*jobs: Job) -> Schedule[Job]:
 
 
 def take(made: Schedule[Job], now_ms: int, ahead_ms: int, most: int = 1000) -> list[tuple[Job, int]]:
-    """Take the turns of an idle line until `ahead_ms` from now; return pairs (job, earliest time in ms)."""
+    """Return the requests planned until `ahead_ms` from now: pairs of a job and its earliest time in ms."""
     now = now_ms * MS
     return [
         (each, not_before // MS) for each, not_before, _ in made.take(now, now, now + ahead_ms * MS, most)
@@ -38,7 +38,7 @@ def take(made: Schedule[Job], now_ms: int, ahead_ms: int, most: int = 1000) -> l
 
 
 def carry_out(made: Schedule[Job], seconds: int) -> list[tuple[Job, int | None, int]]:
-    """Run one job at a time; return each with its slot and the time of its request."""
+    """Carry out one job at a time. Return each with the start of its slot and the time of its request."""
     at, done = 0, []
     while at < seconds * 1000 * MS:
         ((chosen, not_before, due),) = made.take(at, at, at + 10_000 * MS, 1)
@@ -52,29 +52,29 @@ def fail(made: Schedule[Job], drive: int, failures: int, now_ms: int, late_until
     made.back_off.observe(drive, failures, now_ms * MS, late_until_ns=late_until_ms * MS, cost_ns=0)
 
 
-def test_slots_start_at_multiples_of_the_period_whenever_they_are_planned() -> None:
+def test_polls_are_due_at_multiples_of_the_period_whenever_they_are_planned() -> None:
     made = schedule(poll := job(period_ms=20))
     planned = [due for now in range(0, 1000, 37) for _, due in take(made, now, 100)]
     assert planned == list(range(0, planned[-1] + 1, 20))
     assert poll.skipped == 0
 
 
-def test_slots_missed_in_a_stall_are_counted_and_skipped() -> None:
+def test_polls_missed_during_a_stall_are_counted_and_skipped() -> None:
     made = schedule(poll := job(period_ms=20))
     assert take(made, 0, 1) == [(poll, 0)]
-    assert take(made, 110, 1) == [(poll, 100)]  # the slots from 20, 40, 60 and 80 ms are over
+    assert take(made, 110, 1) == [(poll, 100)]  # the slots that started at 20, 40, 60 and 80 ms are over
     assert poll.skipped == 4
     assert take(made, 111, 10) == [(poll, 120)]
 
 
-def test_a_slot_that_ends_before_the_line_is_free_is_not_queued() -> None:
-    """Earlier turns keep the line busy until after the slot's end."""
+def test_poll_whose_slot_ends_before_the_line_is_free_is_not_queued() -> None:
+    """Earlier requests keep the line busy until the slot has ended."""
     made = schedule(poll := job(period_ms=20))
     assert made.take(0, 110 * MS, 111 * MS, 9) == [(poll, 100 * MS, 100 * MS)]
     assert poll.skipped == 5
 
 
-def test_the_slot_that_ends_first_is_first_and_jobs_without_a_period_fill_the_rest() -> None:
+def test_most_urgent_poll_is_sent_first_and_polls_without_period_fill_the_rest() -> None:
     timed, late = job(1, 40), job(2, 60)
     first, second, third = job(3), job(4), job(5)
     made = schedule(first, late, second, timed, third)
@@ -83,57 +83,57 @@ def test_the_slot_that_ends_first_is_first_and_jobs_without_a_period_fill_the_re
     assert [each for each, _ in take(made, 40, 10)] == [timed, first]
 
 
-def test_slow_jobs_that_are_due_together_do_not_delay_a_fast_job() -> None:
+def test_slow_polls_that_are_due_together_do_not_delay_a_fast_poll() -> None:
     slow = [job(drive, 1000, duration_ms=20) for drive in range(2, 32)]
     made = schedule(*slow, fast := job(1, 50, duration_ms=10))
     done = carry_out(made, 10)
     waited = [sent - due for each, due, sent in done if each is fast]
     assert len(waited) == pytest.approx(200, abs=1)
-    assert max(waited) <= 20 * MS  # the longest wait: until the job in flight has ended
+    assert max(waited) <= 20 * MS  # the longest wait is the duration of the exchange in progress
     assert [each.skipped for each in made.jobs] == [0] * 31
 
 
-def test_on_an_overloaded_line_every_job_gets_a_share() -> None:
+def test_every_poll_gets_a_share_of_an_overloaded_line() -> None:
     fast = [job(drive, 20, duration_ms=10) for drive in (1, 2, 3)]
     slow = [job(drive, 1000, duration_ms=10) for drive in (4, 5)]
     turn = [job(drive, duration_ms=10) for drive in (6, 7)]
     made = schedule(*turn, *fast, *slow)
     done = carry_out(made, 100)
     counts = {each: sum(1 for other, _, _ in done if other is each) for each in made.jobs}
-    assert [counts[each] for each in slow] == pytest.approx([100, 100], abs=1)  # slow jobs keep all slots
+    assert [counts[each] for each in slow] == pytest.approx([100, 100], abs=1)  # the slow jobs lose no slot
     assert max(counts[each] for each in fast) - min(counts[each] for each in fast) <= 2
     assert sum(counts[each] for each in turn) / len(done) == pytest.approx(TURN_SHARE, abs=0.002)
     assert abs(counts[turn[0]] - counts[turn[1]]) <= 1
-    for each in (*fast, *slow):  # every slot was carried out, or is counted as skipped
+    for each in (*fast, *slow):  # every slot was either carried out or counted as skipped
         slots = 100_000 * MS // (each.period_ns or 1)
         assert counts[each] + each.skipped == pytest.approx(slots, abs=1)
 
 
-def test_jobs_without_a_period_get_their_share_from_the_start_of_an_overload() -> None:
+def test_polls_without_a_period_get_their_share_when_an_overload_starts() -> None:
     made = schedule(turn := job(1, duration_ms=10))
-    take(made, 0, 10_000)  # turns before the overload
+    take(made, 0, 10_000)  # requests sent before the overload starts
     for drive in (2, 3):
         made.add(job(drive, 10, duration_ms=10), 10_000 * MS)
     taken = [each for each, _ in take(made, 10_000, 3_000)]
     assert taken.count(turn) >= 3000 / 10 * TURN_SHARE - 6
 
 
-def test_an_unused_share_of_jobs_without_a_period_is_not_saved_up() -> None:
+def test_unused_share_of_polls_without_a_period_is_not_saved_up() -> None:
     made = schedule(job(1, 10, duration_ms=10))
     take(made, 0, 10_000)
     made.add(turn := job(2, duration_ms=10), 10_000 * MS)
     assert [each for each, _ in take(made, 10_000, 100)].count(turn) <= 1
 
 
-def test_jobs_of_one_kind_go_together_if_no_slot_is_missed() -> None:
+def test_polls_with_equal_line_settings_are_sent_in_a_row_if_none_is_late() -> None:
     jobs = [job(drive, 210, duration_ms=10, kind=drive % 2) for drive in range(1, 21)]
     done = carry_out(schedule(*jobs), 20)
     switches = sum(one.kind != other.kind for (one, _, _), (other, _, _) in pairwise(done))
-    assert switches < len(done) / 5  # about two changes of kind in each round of twenty jobs
+    assert switches < len(done) / 5  # about two changes of line settings for every twenty jobs
     assert [each.skipped for each in jobs] == [0] * 20
 
 
-def test_a_slot_that_is_about_to_end_goes_before_jobs_of_the_last_kind() -> None:
+def test_late_poll_is_sent_before_polls_with_the_present_line_settings() -> None:
     made = schedule(one := job(1, 30, 10, kind=1), *(job(drive, 1000, 10, kind=2) for drive in range(2, 12)))
     made.take(0, 0, 1, 1)
     waited = [sent - due for each, due, sent in carry_out(made, 1) if each is one]
@@ -141,15 +141,15 @@ def test_a_slot_that_is_about_to_end_goes_before_jobs_of_the_last_kind() -> None
     assert one.skipped == 0
 
 
-def test_no_job_of_the_round_gets_a_second_turn_while_others_wait() -> None:
+def test_no_poll_without_a_period_gets_a_second_turn_while_others_wait() -> None:
     jobs = [job(drive) for drive in range(5)]
     made = schedule(*jobs)
     assert [each for each, _ in take(made, 0, 35)] == [*jobs, *jobs[:2]]
     assert [each for each, _ in take(made, 0, 10)] == jobs[2:4]
 
 
-def test_an_interrupted_round_continues_at_the_same_job() -> None:
-    """If it restarted, frequent interruptions would keep the last jobs of the round from their turns."""
+def test_interrupted_round_of_polls_continues_at_the_same_poll() -> None:
+    """If the round started again from its first job, frequent interruptions would starve the last jobs."""
     jobs = [job(drive) for drive in range(5)]
     made = schedule(*jobs)
     assert made.cycle(0) == jobs
@@ -160,27 +160,27 @@ def test_an_interrupted_round_continues_at_the_same_job() -> None:
     fail(made, 0, 0, now_ms=15)
     assert made.cycle(15 * MS) == [*jobs[1:], jobs[0]]
     made.remove(jobs[2])
-    made.go_on(jobs[2])  # job 2 was next when the round was interrupted
+    made.go_on(jobs[2])  # the round was interrupted before job 2
     assert made.cycle(15 * MS)[0] in jobs
 
 
-def test_take_returns_at_most_the_given_number_of_turns() -> None:
+def test_take_returns_at_most_the_given_number_of_requests() -> None:
     made = schedule(job(1), job(2, 10))
     assert len(take(made, 0, 1000, most=7)) == 7
 
 
-def test_the_schedule_returns_at_least_one_job_even_if_it_is_long() -> None:
+def test_schedule_returns_at_least_one_request_even_if_it_is_long() -> None:
     made = schedule(long := job(duration_ms=500))
     assert take(made, 0, 1) == [(long, 0)]
 
 
-def test_exchanges_that_are_already_queued_count_towards_the_horizon() -> None:
+def test_queued_requests_count_towards_the_planning_horizon() -> None:
     made = schedule(job(1))
     assert made.take(0, 100 * MS, 100 * MS, 9) == []
     assert len(made.take(0, 90 * MS, 100 * MS, 9)) == 2
 
 
-def test_a_silent_drive_rests_longer_each_time_while_others_are_polled() -> None:
+def test_silent_drive_is_asked_less_often_each_time_while_others_are_polled() -> None:
     dead, alive = job(1), job(2)
     made = schedule(dead, alive)
     fail(made, 1, 2, now_ms=0)
@@ -198,7 +198,7 @@ def test_a_silent_drive_rests_longer_each_time_while_others_are_polled() -> None
     assert LONGEST_REST_NS // MS <= rests[-1] <= LONGEST_REST_NS // MS + 100
 
 
-def test_a_rest_ends_exactly_on_time() -> None:
+def test_silent_drive_is_asked_again_exactly_when_its_pause_ends() -> None:
     made = schedule(dead := job(1))
     at = 0
     for failures, rest_ms in enumerate([500, 1000, 2000, 2000], 2):
@@ -208,7 +208,7 @@ def test_a_rest_ends_exactly_on_time() -> None:
         assert [each for each, _, _ in made.take(at, at, at + 1, 9)] == [dead]
 
 
-def test_only_the_first_rest_is_short_if_a_request_without_reply_costs_much() -> None:
+def test_only_the_first_pause_of_a_drive_is_short_if_timeouts_take_much_time() -> None:
     made = schedule(lossy := job(1))
     for failures, at_ms, rest_ms in ((2, 0, 500), (3, 500, 20_000)):
         made.back_off.observe(1, failures, at_ms * MS, late_until_ns=0, cost_ns=300 * MS)
@@ -239,8 +239,10 @@ def test_requests_to_silent_drives_use_at_most_their_share_of_the_line() -> None
 @pytest.mark.story
 @pytest.mark.parametrize("dead", usually(10, 1, 5))
 @pytest.mark.parametrize("period_ms", [None, 400], ids=["in turn", "at a rate"])
-def test_with_dead_drives_the_others_keep_97_percent_of_their_rate(dead: int, period_ms: int | None) -> None:
-    """Of 31 drives, those that answer keep 97 % of the rate that they have without the dead ones."""
+def test_answering_drives_keep_97_percent_of_their_rate_beside_dead_drives(
+    dead: int, period_ms: int | None
+) -> None:
+    """Of 31 drives, some are dead. The others keep 97 % of the rate that they have without the dead ones."""
     answered: list[int] = []
     for count in (31, 31 - dead):
         made = schedule(*(job(drive, period_ms, duration_ms=12) for drive in range(count)))
@@ -261,7 +263,7 @@ def test_with_dead_drives_the_others_keep_97_percent_of_their_rate(dead: int, pe
     assert answered[0] >= 0.97 * answered[1]
 
 
-def test_a_resting_drive_gets_one_request_and_after_a_reply_all_its_jobs() -> None:
+def test_silent_drive_gets_one_request_and_all_its_polls_after_a_reply() -> None:
     made = schedule(job(1), job(1), other := job(2))
     fail(made, 1, 2, now_ms=0)
     woken = take(made, 501, 50)
@@ -270,16 +272,16 @@ def test_a_resting_drive_gets_one_request_and_after_a_reply_all_its_jobs() -> No
     assert len({each for each, _ in take(made, 520, 50)}) == 3
 
 
-def test_a_silent_drive_gets_its_shortest_request_at_any_rate() -> None:
+def test_silent_drive_gets_its_shortest_request_whatever_its_rate() -> None:
     made = schedule(job(1, 100, 20), short := job(1, 60_000, 7), job(1, None, 9))
     fail(made, 1, 2, now_ms=0)
     take(made, 1, 400)
-    assert take(made, 501, 50) == [(short, 0)]  # this request uses no slot of the job
+    assert take(made, 501, 50) == [(short, 0)]  # a request that tries a silent drive uses no slot of its job
     fail(made, 1, 0, now_ms=502)
     assert (short, 60_000) in take(made, 502, 60_000, most=10_000)
 
 
-def test_a_silent_drive_is_tried_in_the_spare_time_of_other_drives() -> None:
+def test_silent_drive_is_tried_in_the_spare_time_of_other_drives() -> None:
     made = schedule(dead := job(1), timed := job(2, 10, 5))
     fail(made, 1, 2, now_ms=0)
     take(made, 0, 450)
@@ -287,21 +289,21 @@ def test_a_silent_drive_is_tried_in_the_spare_time_of_other_drives() -> None:
     assert [each for each, _ in taken[:3]] == [timed, dead, timed]
 
 
-def test_a_silent_drive_is_tried_even_without_spare_time() -> None:
+def test_silent_drive_is_tried_even_if_the_line_has_no_spare_time() -> None:
     made = schedule(dead := job(1), job(2, 10, 10), job(3, 10, 10))
     fail(made, 1, 2, now_ms=0)
     asked = sum(dead in (each for each, _ in take(made, now, 100)) for now in range(0, 5000, 100))
     assert asked >= 3
 
 
-def test_a_drive_gets_no_request_while_its_late_reply_may_come() -> None:
+def test_drive_gets_no_request_while_its_late_reply_may_come() -> None:
     made = schedule(poll := job(1), other := job(2))
     fail(made, 1, 1, now_ms=0, late_until_ms=300)
     assert {each for each, _ in take(made, 0, 299)} == {other}
     assert poll in {each for each, _ in take(made, 300, 20)}
 
 
-def test_a_drive_gets_a_request_once_its_late_reply_has_come() -> None:
+def test_drive_gets_a_request_once_its_late_reply_has_come() -> None:
     made = schedule(poll := job(1), job(2))
     fail(made, 1, 1, now_ms=0, late_until_ms=900)
     assert poll not in [each for each, _ in take(made, 0, 100)]
@@ -309,15 +311,15 @@ def test_a_drive_gets_a_request_once_its_late_reply_has_come() -> None:
     assert poll in [each for each, _ in take(made, 100, 20)]
 
 
-def test_a_resting_drive_is_tried_once_after_its_late_reply() -> None:
+def test_silent_drive_is_tried_once_after_its_late_reply() -> None:
     made = schedule(poll := job(1), job(2))
     fail(made, 1, 2, now_ms=0, late_until_ms=900)
     fail(made, 1, 2, now_ms=100, late_until_ms=0)
     assert [each for each, _ in take(made, 100, 60)].count(poll) == 1
 
 
-def test_jobs_of_the_last_kind_go_first_only_if_all_due_jobs_fit_exactly() -> None:
-    """With a nanosecond less, the job whose slot ends first goes first."""
+def test_polls_with_the_present_line_settings_go_first_only_if_all_fit_in_time() -> None:
+    """If the time is a nanosecond too short, the job whose slot ends first is sent first."""
     for less, order in ((0, [2, 1]), (1, [1, 2])):
         made = schedule(job(3, 1000, 10, kind=2))
         take(made, 0, 1)
@@ -326,14 +328,14 @@ def test_jobs_of_the_last_kind_go_first_only_if_all_due_jobs_fit_exactly() -> No
         assert [each.drive for each, _ in take(made, 10, 1 + 19)] == order
 
 
-def test_after_the_line_has_caught_up_the_slot_that_ends_first_goes_first() -> None:
+def test_poll_whose_slot_ends_first_goes_first_after_a_delay_is_made_up() -> None:
     made = schedule(quick := job(1, 10, 2), slow := job(2, 1000, 2), middling := job(3, 100, 2))
     take(made, 0, 1, most=3)
-    taken = take(made, 1000, 1010)  # slots of the quick job are over
+    taken = take(made, 1000, 1010)  # the slots of the quick job are over
     assert [each for each, due in taken if due >= 2000] == [quick, middling, slow]
 
 
-def test_a_started_slot_is_skipped_if_its_drive_falls_silent() -> None:
+def test_due_poll_is_skipped_if_its_drive_falls_silent() -> None:
     made = schedule(one := job(1, 100), two := job(2, 100))
     assert take(made, 0, 100, most=1) == [(one, 0)]
     fail(made, 2, 1, now_ms=5, late_until_ms=60)
@@ -342,13 +344,13 @@ def test_a_started_slot_is_skipped_if_its_drive_falls_silent() -> None:
     assert {each for each, _ in take(made, 100, 20)} == {one, two}
 
 
-def test_a_job_whose_drive_gets_no_request_is_skipped_in_the_round() -> None:
+def test_poll_of_a_drive_that_gets_no_request_loses_its_turn() -> None:
     made = schedule(*(jobs := [job(drive, None, 10) for drive in range(3)]))
     fail(made, 1, 1, now_ms=0, late_until_ms=10_000)
     assert [each for each, _ in take(made, 0, 40)] == [jobs[0], jobs[2], jobs[0], jobs[2]]
 
 
-def test_the_plan_reserves_the_whole_timeout_for_a_request_to_a_silent_drive() -> None:
+def test_schedule_reserves_the_whole_timeout_for_a_request_to_a_silent_drive() -> None:
     made = schedule(dead := job(1), job(2))
     made.back_off.observe(1, 2, 0, late_until_ns=0, cost_ns=2 * MS)
     take(made, 1, 400)
@@ -356,7 +358,7 @@ def test_the_plan_reserves_the_whole_timeout_for_a_request_to_a_silent_drive() -
     assert take(made, 60_000, 300) == [(dead, 0)]
 
 
-def test_observing_the_same_failures_again_does_not_end_a_rest() -> None:
+def test_reporting_the_same_failures_again_does_not_end_the_pause_of_a_drive() -> None:
     made = schedule(poll := job(1), job(2))
     for now in (0, 100):
         fail(made, 1, 2, now_ms=now)
@@ -370,38 +372,38 @@ def test_polling_of_a_drive_does_not_pause_after_one_failure() -> None:
     assert take(made, 0, 5) == [(poll, 0)]
 
 
-def test_slots_of_a_resting_drive_are_reported_with_the_time_they_were_due() -> None:
+def test_polls_of_a_silent_drive_are_reported_with_the_time_they_were_due() -> None:
     made = schedule(poll := job(1, period_ms=100))
     fail(made, 1, 2, now_ms=0)
     assert take(made, 0, 350) == []
     assert made.unasked == [(poll, due * MS) for due in (0, 100, 200, 300)]
 
 
-def test_a_job_without_a_period_is_reported_once_per_rest() -> None:
+def test_poll_without_a_period_is_reported_once_per_pause_of_its_drive() -> None:
     made = schedule(poll := job(1), job(2))
     fail(made, 1, 2, now_ms=7)
     take(made, 8, 300)
     assert made.unasked == [(poll, 7 * MS)]
 
 
-def test_pass_all_returns_every_slot_and_every_job_of_the_round() -> None:
+def test_pass_all_returns_every_due_poll_and_every_poll_without_a_period() -> None:
     made = schedule(poll := job(1, period_ms=100), fast := job(2))
     assert made.pass_all(150 * MS) == [(fast, 150 * MS), (poll, 0), (poll, 100 * MS)]
 
 
-def test_pass_slots_returns_the_slots_that_were_not_requested() -> None:
+def test_pass_slots_returns_the_due_polls_that_were_not_requested() -> None:
     made = schedule(poll := job(1, period_ms=100), job(2))
     take(made, 0, 50)
     assert made.pass_slots(250 * MS) == [(poll, 100 * MS), (poll, 200 * MS)]
 
 
-def test_pass_slots_includes_started_slots_and_slots_that_start_now() -> None:
+def test_pass_slots_includes_polls_that_are_due_now_or_were_started() -> None:
     made = schedule(one := job(1, 100), two := job(2, 100), begun := job(3, 1000))
     assert [each for each, _ in take(made, 0, 100, most=2)] == [one, two]
     assert made.pass_slots(100 * MS) == [(begun, 0), (one, 100 * MS), (two, 100 * MS)]
 
 
-def test_removing_a_job_keeps_the_order_of_the_other_jobs() -> None:
+def test_removing_a_poll_keeps_the_order_of_the_others() -> None:
     jobs = [job(drive) for drive in range(4)]
     made = schedule(*jobs, timed := job(9, 1000), other := job(8, 1000))
     assert [each for each, _ in take(made, 0, 20)] == [timed, other, *jobs[:2]]
@@ -412,14 +414,14 @@ def test_removing_a_job_keeps_the_order_of_the_other_jobs() -> None:
     assert made.jobs == [*jobs[1:], other]
 
 
-def test_a_job_removed_during_its_slot_is_not_carried_out() -> None:
+def test_poll_that_is_removed_when_it_is_due_is_not_sent() -> None:
     made = schedule(first := job(1, 1000), second := job(2, 1000))
     assert take(made, 0, 100, most=1) == [(first, 0)]
     made.remove(second)
     assert take(made, 5, 100) == []
 
 
-def test_new_jobs_get_the_place_in_the_round_and_the_next_slot_of_those_they_replace() -> None:
+def test_replacement_of_a_poll_keeps_its_turn_and_its_next_due_time() -> None:
     jobs = [job(drive) for drive in range(4)]
     made = schedule(*jobs)
     assert [each for each, _ in take(made, 0, 10)] == jobs[:2]
@@ -433,7 +435,7 @@ def test_new_jobs_get_the_place_in_the_round_and_the_next_slot_of_those_they_rep
     assert set(made.jobs) == {jobs[1], both, one, other, slower}
 
 
-def test_cycle_returns_the_round_only_if_all_drives_answer_and_no_job_has_slots() -> None:
+def test_cycle_returns_polls_only_if_all_drives_answer_and_none_has_a_period() -> None:
     made = schedule(one := job(1), two := job(2))
     assert made.cycle(0) == [one, two]
     fail(made, 1, 0, now_ms=0)
@@ -458,10 +460,10 @@ KINDS = st.lists(
 
 @pytest.mark.slow
 @given(KINDS, st.lists(st.integers(0, 60) | st.just(700), min_size=30, max_size=60))
-def test_stalls_cause_neither_drift_nor_bursts(
+def test_polls_neither_drift_nor_pile_up_after_stalls(
     kinds: list[tuple[int, int | None, int, int]], stalls: list[int]
 ) -> None:
-    """The line or Python stalls for longer than the horizon of the planned turns."""
+    """The line or the Python process stalls for longer than requests are planned in advance."""
     made = schedule(*(job(*kind) for kind in kinds))
     busy_until = now = 0
     slots: dict[Job, list[int]] = {each: [] for each in made.jobs}
@@ -469,24 +471,25 @@ def test_stalls_cause_neither_drift_nor_bursts(
         for each, not_before, due in made.take(now, busy_until, now + 100 * MS, 64):
             busy_until = max(busy_until, now, not_before)
             if due is not None and each.period_ns:
-                assert busy_until < due + each.period_ns  # the slot is not over
+                assert busy_until < due + each.period_ns  # the slot has not ended
                 slots[each].append(due)
             busy_until += each.duration_ns
         now += stall * MS
     for each, taken in slots.items():
         if each.period_ns:
-            assert all(due % each.period_ns == 0 for due in taken)  # slots start at each multiple
-            assert taken == sorted(set(taken))  # each slot once
+            # slots start at each multiple of the period
+            assert all(due % each.period_ns == 0 for due in taken)
+            assert taken == sorted(set(taken))  # each slot is taken once
             assert each.due_ns // each.period_ns == len(taken) + each.skipped  # none uncounted
 
 
 @settings(max_examples=examples(50))
 @given(KINDS)
-def test_every_job_gets_turns_on_any_overloaded_line(kinds: list[tuple[int, int | None, int, int]]) -> None:
+def test_every_poll_gets_turns_on_any_overloaded_line(kinds: list[tuple[int, int | None, int, int]]) -> None:
     made = schedule(*(job(*kind) for kind in kinds))
     done = carry_out(made, 3)
-    # A job waits at most for one turn of each other job, the share of jobs without a period, and a few
-    # rounds of its kind.
+    # A job waits at most for one request of each other job, for the share of jobs without a period, and for a
+    # few rounds of jobs with its line settings.
     longest = 80 * MS + 8 * 10 * MS / TURN_SHARE + 1000 * MS
     for each in made.jobs:
         sent = [0, *(at for other, _, at in done if other is each), 3000 * MS]
@@ -497,7 +500,9 @@ def test_every_job_gets_turns_on_any_overloaded_line(kinds: list[tuple[int, int 
 
 @settings(max_examples=examples(50))
 @given(KINDS)
-def test_no_slot_is_skipped_if_all_jobs_fit(kinds: list[tuple[int, int | None, int, int]]) -> None:
+def test_no_poll_is_skipped_if_all_fit_into_the_shortest_period(
+    kinds: list[tuple[int, int | None, int, int]],
+) -> None:
     """All jobs together fit into the shortest period, so no slot is ever skipped."""
     least = sum(duration for _, _, duration, _ in kinds)
     made = schedule(*(job(d, p and p + least, duration, kind) for d, p, duration, kind in kinds))
@@ -508,8 +513,8 @@ def test_no_slot_is_skipped_if_all_jobs_fit(kinds: list[tuple[int, int | None, i
             assert sum(1 for other, _, _ in done if other is each) >= 2900 * MS // each.period_ns
 
 
-def test_a_drive_that_answers_again_gets_no_request_while_an_earlier_reply_may_come() -> None:
-    """The first of two requests got no reply, so `late_until_ns` is set; the second one was answered."""
+def test_answering_drive_gets_no_request_while_an_earlier_reply_may_still_come() -> None:
+    """The first of two requests got no reply, so `late_until_ns` is set. The second one was answered."""
     made = schedule(quick := job(1), timed := job(2, period_ms=10))
     fail(made, 1, 0, now_ms=0, late_until_ms=100)
     fail(made, 2, 0, now_ms=0, late_until_ms=60)
@@ -519,7 +524,7 @@ def test_a_drive_that_answers_again_gets_no_request_while_an_earlier_reply_may_c
 
 
 class Operation(RuleBasedStateMachine):
-    """Random events on a line: jobs come and go, the host stalls, drives fall silent, the port vanishes."""
+    """Random events on a line: jobs come and go, the host stalls, drives fall silent, the port is lost."""
 
     AHEAD = 100 * MS
 
@@ -529,9 +534,10 @@ class Operation(RuleBasedStateMachine):
         self.now = self.busy_until = 1000 * MS
         self.added: dict[Job, int] = {}
         self.slots: dict[Job, list[int]] = {}  # start times of the slots that were carried out
-        self.passed: Counter[Job] = Counter()  # number of slots reported because no request was sent
+        # number of slots that were reported as passed, because no request was sent
+        self.passed: Counter[Job] = Counter()
         self.failures = dict.fromkeys(range(4), 0)
-        self.silent_until = dict.fromkeys(range(4), 0)  # until when a late reply may come
+        self.silent_until = dict.fromkeys(range(4), 0)  # by drive: until when a late reply may come
 
     @rule(drive=st.integers(0, 3), period=st.none() | st.integers(5, 80), duration=st.integers(1, 10))
     def add(self, drive: int, period: int | None, duration: int) -> None:
@@ -578,12 +584,13 @@ class Operation(RuleBasedStateMachine):
             assert each in self.made.jobs
             # No request is sent while a late reply may come, even if the line is ready earlier.
             assert max(self.now, not_before) >= self.silent_until[each.drive]
-            if each.period_ns and due is None:  # a request to a silent drive, outside the slots
+            if each.period_ns and due is None:  # a request that tries a silent drive, outside the slots
                 assert self.failures[each.drive] >= 2
             elif each.period_ns:
-                assert (due - self.added[each]) % each.period_ns == 0  # slots start at each multiple
-                assert due > max(self.slots[each], default=-1)  # each slot once, in their order
-                assert due > at - each.period_ns  # the slot is not over: missed slots are not repeated
+                # slots start at each multiple of the period
+                assert (due - self.added[each]) % each.period_ns == 0
+                assert due > max(self.slots[each], default=-1)  # each slot is taken once, in order
+                assert due > at - each.period_ns  # the slot has not ended: missed slots are not repeated
                 self.slots[each].append(due)
             else:
                 self.slots[each].append(at)
@@ -600,7 +607,7 @@ class Operation(RuleBasedStateMachine):
                 assert slots == len(self.slots[job]) + job.skipped + self.passed[job]
 
     def teardown(self) -> None:
-        """Check that all drives, once they answer again, are polled: in the round or at their rates."""
+        """Check that all drives are polled again once they answer: in turn, or at their rates."""
         for drive in range(4):
             self.wake(drive)
         load = sum(job.duration_ns / job.period_ns for job in self.made.jobs if job.period_ns)
@@ -621,7 +628,7 @@ TestOperation.settings = settings(max_examples=examples(100), stateful_step_coun
 # ---- removed jobs ----
 
 
-def test_the_next_due_job_is_found_after_a_job_was_removed() -> None:
+def test_next_due_poll_is_found_after_another_poll_was_removed() -> None:
     made: Schedule[Job] = Schedule()
     jobs = {at: job(at, 1000) for at in (13, 14, 1, 15)}
     for at, each in jobs.items():
@@ -630,7 +637,7 @@ def test_the_next_due_job_is_found_after_a_job_was_removed() -> None:
     assert take(made, 0, 14) == [(jobs[13], 13)]
 
 
-def test_only_slots_within_the_horizon_are_planned() -> None:
+def test_only_polls_within_the_planning_horizon_are_planned() -> None:
     made: Schedule[Job] = Schedule()
     soon, later = job(1, 1000), job(2, 1000)
     made.add(soon, 10 * MS)
@@ -638,15 +645,15 @@ def test_only_slots_within_the_horizon_are_planned() -> None:
     assert take(made, 0, 100) == [(soon, 10)]
 
 
-def test_after_a_job_is_removed_the_round_continues_with_the_next_job() -> None:
+def test_turns_continue_with_the_next_poll_after_one_is_removed() -> None:
     first, second, third = job(1), job(2), job(3)
     made = schedule(first, second, third)
     assert take(made, 0, 1, 1) == [(first, 0)]
-    made.remove(second)  # the job that was next
+    made.remove(second)  # the job whose turn was next
     assert [each for each, _ in take(made, 5, 1, 1)] == [third]
 
 
-def test_a_forgotten_drive_is_polled_like_a_new_one() -> None:
+def test_drive_that_was_forgotten_is_polled_like_a_new_drive() -> None:
     made = schedule(silent := job(1), job(2))
     fail(made, 1, 9, 0)
     made.remove(silent)
@@ -670,18 +677,19 @@ def answer(made: Schedule[Job], asked: Job, now_ms: int) -> None:
     made.back_off.observe(asked.drive, 0, now_ms * MS, late_until_ns=0, cost_ns=0, has_answered=True)
 
 
-def test_a_new_drive_gets_one_request_until_the_outcome_is_known() -> None:
+def test_new_drive_gets_one_request_until_its_result_is_known() -> None:
     made = meet(one := job(1), two := job(1), job(2, period_ms=50), job(2))
     assert [asked.drive for asked, _ in take(made, 0, 1000)] == [2, 1]
     assert take(made, 10, 1000) == []
     assert made.cycle(10 * MS) == []
-    made.back_off.conclude(one.drive)  # concluded without an answer, for example after a damaged reply
+    # concluded without a valid answer, for example because the reply was damaged
+    made.back_off.conclude(one.drive)
     assert [asked for asked, _ in take(made, 20, 1000)] == [two]
     answer(made, two, 30)
     assert [asked for asked, _ in take(made, 30, 20)] == [one, two, one, two]
 
 
-def test_no_slot_of_a_new_drive_is_lost_repeated_or_early() -> None:
+def test_no_poll_of_a_new_drive_is_lost_repeated_or_early() -> None:
     made = meet(fast := job(1, period_ms=20), slow := job(1, period_ms=50), job(2, period_ms=1000))
     assert {asked.drive for asked, _ in take(made, 0, 300, most=2)} == {1, 2}
     assert take(made, 1, 300) == []
@@ -691,13 +699,13 @@ def test_no_slot_of_a_new_drive_is_lost_repeated_or_early() -> None:
     assert (fast.skipped, slow.skipped) == (0, 0)
 
 
-def test_a_silent_new_drive_rests_immediately() -> None:
+def test_new_drive_that_does_not_reply_gets_no_more_requests_for_a_while() -> None:
     made = meet(dead := job(1), living := job(2))
     assert [asked for asked, _ in take(made, 0, 100)] == [dead, living]
     answer(made, living, 1)
     made.back_off.conclude(dead.drive)
     made.back_off.observe(1, 1, 60 * MS, late_until_ns=0, cost_ns=450 * MS, has_answered=False)
-    rest_ms = 30_000  # 450 ms are 1.5 % of this rest, which is the share of silent drives
+    rest_ms = 30_000  # 450 ms of requests are 1.5 % of this pause, the share of silent drives
     assert {asked for asked, _ in take(made, 60, rest_ms)} == {living}
     assert made.unasked == [(dead, 60 * MS)]
     assert take(made, 60 + rest_ms, 1) == [(dead, 0)]
@@ -706,22 +714,24 @@ def test_a_silent_new_drive_rests_immediately() -> None:
     assert set(made.cycle((60 + rest_ms) * MS)) == {dead, living}
 
 
-def test_silent_new_drives_get_a_second_request_immediately_if_they_are_few() -> None:
-    """The silent drives may exist, because a reply may have been lost."""
+def test_few_silent_new_drives_get_a_second_request_immediately() -> None:
+    """The drives may exist, because their first request or reply may have been lost."""
     lost, living = job(1), job(2)
     for cost_ms, again in {300: {lost}, 500: set()}.items():
         made = meet(lost, living)
         take(made, 0, 100)
         made.back_off.conclude(lost.drive)
         made.back_off.observe(1, 1, 60 * MS, late_until_ns=200 * MS, cost_ns=cost_ms * MS, has_answered=False)
-        assert lost not in {asked for asked, _ in take(made, 70, 100)}  # the other drive is pending
+        # the result of the other drive's request is not known yet
+        assert lost not in {asked for asked, _ in take(made, 70, 100)}
         answer(made, living, 90)
         assert lost not in {asked for asked, _ in take(made, 100, 90)}
         assert {asked for asked, _ in take(made, 200, 20)} - {living} == again
-        assert lost not in {asked for asked, _ in take(made, 230, 20)}  # this drive is still pending
+        # the result of this drive's request is not known yet
+        assert lost not in {asked for asked, _ in take(made, 230, 20)}
 
 
-def test_when_a_silent_drive_answers_again_exactly_one_other_is_tried() -> None:
+def test_exactly_one_other_silent_drive_is_tried_when_one_answers_again() -> None:
     made = schedule(*(jobs := [job(drive) for drive in range(4)]))
     for failures, drive in itertools.product((2, 3), (0, 1, 2)):
         made.back_off.observe(drive, failures, 0, late_until_ns=0, cost_ns=300 * MS)

@@ -1,4 +1,4 @@
-"""The pytest plugin, used by another package: by the tests on the page `Test your own program`."""
+"""The pytest plugin, used by another package, whose tests are those of the page `Test your own program`."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_ten_tests_of_another_package_pass_in_parallel(
     assert re.search(r"^11 passed", done.stdout, re.MULTILINE), done.stdout + done.stderr
 
 
-def test_each_line_of_a_plant_is_simulated_at_a_port_of_its_kind(
+def test_pytest_plugin_simulates_each_line_of_a_plant_at_a_port_of_its_kind(
     tmp_path: Path, simulated_plant: Callable[..., SimulatedPlant]
 ) -> None:
     path = tmp_path / "plant.toml"
@@ -71,7 +71,9 @@ def test_each_line_of_a_plant_is_simulated_at_a_port_of_its_kind(
         simulated_plant(path, faults=Faults(drives={"hall-2": DriveFaults()}))
 
 
-def test_values_of_a_simulated_line_are_set_by_name(simulated_line: Callable[..., FaultyWire]) -> None:
+def test_pytest_plugin_sets_values_of_a_simulated_line_by_name(
+    simulated_line: Callable[..., FaultyWire],
+) -> None:
     line = simulated_line(Toy(1), speed=50)
     line.drives[0]["output_frequency"] = 12.5
     with Bus(line.path) as bus:

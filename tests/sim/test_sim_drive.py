@@ -1,4 +1,4 @@
-"""A simulated drive of a user's class: memory, access, limits, refusals, counters."""
+"""A simulated drive of a user's class: its memory, access to registers, limits, refusals and counters."""
 
 import math
 
@@ -26,7 +26,7 @@ from multidrop.sim.motor import Motor, Phase, Rating
 ON, OFF = b"\xff\x00", b"\x00\x00"
 
 
-def test_a_family_instead_of_a_drive_is_refused() -> None:
+def test_simulating_a_family_instead_of_a_drive_is_refused() -> None:
     with pytest.raises(TypeError, match=r"Toy is a family, not a drive: write Toy\(1\) for address 1"):
         simulated(Toy)  # type: ignore[arg-type]
 
@@ -81,7 +81,7 @@ def exception_of(reply: Message | None) -> int:
     [
         ("output_frequency", 50.0, 4, 1, 1, "01 f4"),
         ("temperature", -10, 4, 2, 1, "ff f6"),
-        ("energy", 12345.67, 4, 3, 2, "00 12 d6 87"),  # 1234567 = 12D687H
+        ("energy", 12345.67, 4, 3, 2, "00 12 d6 87"),  # 1234567 is 12D687H
         ("energy_swapped", 12345.67, 4, 5, 2, "d6 87 00 12"),
         ("power", 1.5, 4, 7, 2, "3f c0 00 00"),
         ("door", 1, 2, 5, 1, "01"),
@@ -98,11 +98,11 @@ def test_value_set_on_a_simulated_drive_is_read_over_the_line(
     assert sim[name] == value
 
 
-def test_read_returns_default_values_and_0_in_readable_gaps(sim: SimulatedDrive) -> None:
+def test_simulated_drive_returns_factory_values_and_0_in_readable_gaps(sim: SimulatedDrive) -> None:
     assert data_of(ask(sim, 3, 0x10, 4)) == "00 32 00 00 00 00 00 00"
 
 
-def test_written_register_is_read_back_and_recorded(sim: SimulatedDrive) -> None:
+def test_register_written_to_a_simulated_drive_is_read_back_and_recorded(sim: SimulatedDrive) -> None:
     request = Message(7, 6, 0x10, data=b"\x00\xc8")
     assert sim.answer(request, 3.5) == request
     assert sim["acceleration_time"] == 20
@@ -116,7 +116,7 @@ def test_write_of_several_registers_sets_a_32_bit_value(sim: SimulatedDrive) -> 
     assert sim["total"] == 1234567
 
 
-def test_coil_writes_set_values_and_reject_invalid_data(sim: SimulatedDrive) -> None:
+def test_coil_writes_to_a_simulated_drive_are_stored_or_refused(sim: SimulatedDrive) -> None:
     assert ask(sim, 5, 5, data=ON) == Message(7, 5, 5, data=ON)
     assert ask(sim, 0x0F, 5, 2, b"\x02") == Message(7, 0x0F, 5, 2)
     assert (sim["relay"], sim["lamp"]) == (0, 1)
@@ -135,46 +135,46 @@ def test_refused_write_of_several_registers_changes_no_register(sim: SimulatedDr
         (3, 0x10, 11, b"", 3),
         (3, 0x10, 0, b"", 3),
         (4, 0x00, 1, b"", 2),
-        (4, 0x08, 2, b"", 2),  # the second of two input registers is undefined
+        (4, 0x08, 2, b"", 2),  # the class declares only the first of the two input registers
         (3, 0xFFFF, 2, b"", 2),
         (3, 0x30, 1, b"", 2),  # write-only
-        (3, 0x8010, 1, b"", 2),  # the RAM alias can only be written
-        (6, 0x01, 0, b"\x00\x01", 2),  # a read-only input register
+        (3, 0x8010, 1, b"", 2),  # the address in RAM can only be written
+        (6, 0x01, 0, b"\x00\x01", 2),  # an input register can only be read
         (6, 0x11, 0, b"\x00\x01", 2),  # a reserved address
-        (6, 0x30, 0, b"\x13\x89", 3),  # 50.01 Hz, above the span
+        (6, 0x30, 0, b"\x13\x89", 3),  # 50.01 Hz is above the limit
         (8, 0x01, 0, b"\x00\x00", 1),
         (0x2B, 0, 0, b"", 1),
     ],
 )
-def test_invalid_request_gets_the_exception_code(
+def test_simulated_drive_refuses_an_invalid_request_with_an_exception(
     sim: SimulatedDrive, function: int, start: int, count: int, data: bytes, code: int
 ) -> None:
     assert exception_of(ask(sim, function, start, count, data)) == code
     assert sim.counters.refusals == 1
 
 
-def test_negative_value_below_its_span_is_refused(sim: SimulatedDrive) -> None:
+def test_simulated_drive_refuses_a_negative_value_below_its_limit(sim: SimulatedDrive) -> None:
     assert exception_of(ask(sim, 6, 0x40, data=b"\xff\x9c")) == 0  # -100
     assert sim["offset"] == -100
     assert exception_of(ask(sim, 6, 0x40, data=b"\xff\x9b")) == 3
 
 
-def test_dead_drive_does_not_reply(sim: SimulatedDrive) -> None:
+def test_simulated_drive_that_is_off_does_not_reply(sim: SimulatedDrive) -> None:
     sim.deaf_until = math.inf
     assert ask(sim, 4, 1, 1) is None
     assert sim.counters.requests == 0
 
 
-def test_diagnostics_request_is_echoed(sim: SimulatedDrive) -> None:
+def test_simulated_drive_echoes_a_diagnostics_request(sim: SimulatedDrive) -> None:
     assert ask(sim, 8, 0, data=b"\xa5\x37") == Message(7, 8, 0, data=b"\xa5\x37")
 
 
-def test_request_to_another_address_gets_no_reply(sim: SimulatedDrive) -> None:
+def test_simulated_drive_ignores_a_request_to_another_address(sim: SimulatedDrive) -> None:
     assert sim.answer(Message(8, 4, 1, 1), 0.0) is None
     assert sim.counters.requests == 0
 
 
-def test_broadcast_write_is_carried_out_without_a_reply(sim: SimulatedDrive) -> None:
+def test_simulated_drive_carries_out_a_broadcast_write_without_a_reply(sim: SimulatedDrive) -> None:
     assert sim.answer(Message(0, 6, 0x30, data=b"\x13\x88"), 0.0) is None
     assert sim.memory.get(Own.frequency) == 50
     assert sim.answer(Message(0, 6, 0x99, data=b"\x13\x88"), 0.0) is None
@@ -182,7 +182,7 @@ def test_broadcast_write_is_carried_out_without_a_reply(sim: SimulatedDrive) -> 
     assert (sim.counters.broadcasts, sim.counters.requests) == (3, 0)
 
 
-def test_a_drive_whose_class_has_no_broadcasts_ignores_a_broadcast() -> None:
+def test_simulated_drive_without_broadcasts_in_its_class_ignores_them() -> None:
     class Deaf(Own):
         broadcasts = False
 
@@ -191,7 +191,7 @@ def test_a_drive_whose_class_has_no_broadcasts_ignores_a_broadcast() -> None:
     assert sim["frequency"] == 0
 
 
-def test_eeprom_writes_are_counted_but_not_writes_to_the_ram_alias(sim: SimulatedDrive) -> None:
+def test_eeprom_writes_are_counted_but_not_writes_to_the_ram_address(sim: SimulatedDrive) -> None:
     ask(sim, 6, 0x10, data=b"\x00\xc8")
     ask(sim, 6, 0x10, data=b"\x00\xc8")
     ask(sim, 6, 0x8010, data=b"\x01\x90")
@@ -200,7 +200,7 @@ def test_eeprom_writes_are_counted_but_not_writes_to_the_ram_alias(sim: Simulate
     assert sim["acceleration_time"] == 40
 
 
-def test_requests_are_counted_by_function(sim: SimulatedDrive) -> None:
+def test_simulated_drive_counts_requests_by_function(sim: SimulatedDrive) -> None:
     ask(sim, 4, 1, 1)
     ask(sim, 4, 1, 1)
     ask(sim, 6, 0x10, data=b"\x00\xc8")
@@ -209,19 +209,19 @@ def test_requests_are_counted_by_function(sim: SimulatedDrive) -> None:
 
 
 @pytest.mark.long
-def test_record_of_writes_keeps_the_latest_10000(sim: SimulatedDrive) -> None:
+def test_simulated_drive_records_only_the_latest_10000_writes(sim: SimulatedDrive) -> None:
     for _ in range(11_000):
         ask(sim, 6, 0x10, data=b"\x00\xc8")
     assert len(sim.counters.writes) == 10_000
     assert sim.counters.eeprom_writes["acceleration_time"] == 11_000
 
 
-def test_value_of_a_write_only_register_is_readable_by_name(sim: SimulatedDrive) -> None:
+def test_value_of_a_write_only_register_can_be_read_by_the_test(sim: SimulatedDrive) -> None:
     ask(sim, 6, 0x30, data=b"\x13\x88")
     assert sim["frequency"] == 50
 
 
-def test_users_class_gets_a_general_simulated_drive() -> None:
+def test_users_class_gets_a_simulated_drive_without_a_motor() -> None:
     assert type(simulated(Own(3))) is SimulatedDrive
 
 
@@ -235,7 +235,7 @@ def every_register() -> list[tuple[Register[float], int]]:
 
 
 @table(("register", "at"), every_register())
-def test_an_encoded_drive_returns_a_code_of_drive_table_and_register(
+def test_encoded_drive_returns_a_number_made_of_address_table_and_register(
     register: Register[float], at: int
 ) -> None:
     sim = EncodedDrive(Own(7))
@@ -257,13 +257,13 @@ def test_encoded_drive_confirms_writes_and_keeps_its_values() -> None:
     assert ask(sim, 3, 0x10, 1) == before
 
 
-def test_adjacent_drives_and_registers_have_different_codes() -> None:
+def test_adjacent_encoded_drives_and_registers_have_different_numbers() -> None:
     tables = (HOLDING, INPUT, Table("another", 7, None))
     codes = {encoded(address, table, at) for address in range(1, 9) for table in tables for at in range(8)}
     assert len(codes) == 8 * 3 * 8
 
 
-def test_simulated_value_can_be_set_by_name_or_as_text() -> None:
+def test_value_of_a_simulated_drive_can_be_set_by_name_or_as_text() -> None:
     sim = simulated(Toy(1))
     sim["fault"] = "overcurrent"
     sim["output_current"] = "2.5"
@@ -281,21 +281,21 @@ RATING = Rating(frequency=50, voltage=400, current=10, power=4, torque=26, pole_
 @pytest.fixture
 def motor() -> Motor:
     motor = Motor(RATING)
-    motor.acceleration_time = 10  # s from 0 to 50 Hz: 5 Hz/s
-    motor.deceleration_time = 5  # s from 50 Hz to 0: 10 Hz/s
+    motor.acceleration_time = 10  # s from 0 to 50 Hz, so 5 Hz/s
+    motor.deceleration_time = 5  # s from 50 Hz to 0, so 10 Hz/s
     motor.target = 40
     return motor
 
 
 @pytest.fixture
 def turning(motor: Motor) -> Motor:
-    """Return the motor at 40 Hz, 100 s after its start."""
+    """Return the motor while it runs at 40 Hz, 100 s after its start."""
     motor.run()
     motor.run_to(100)
     return motor
 
 
-def test_motor_has_no_voltage_until_run_is_called(motor: Motor) -> None:
+def test_simulated_motor_has_no_voltage_until_it_is_run(motor: Motor) -> None:
     motor.run_to(1000)
     assert (motor.frequency, motor.current, motor.voltage, motor.phase) == (0, 0, 0, Phase.STOPPED)
 
@@ -309,21 +309,23 @@ def test_motor_has_no_voltage_until_run_is_called(motor: Motor) -> None:
         (100, 40, Phase.CONSTANT),
     ],
 )
-def test_motor_accelerates_along_its_ramp(motor: Motor, now: float, frequency: float, phase: Phase) -> None:
+def test_simulated_motor_accelerates_along_its_ramp(
+    motor: Motor, now: float, frequency: float, phase: Phase
+) -> None:
     motor.run()
     motor.run_to(now)
     assert motor.frequency == pytest.approx(frequency)
     assert motor.phase is phase
 
 
-def test_ramp_is_the_same_in_one_step_or_many(motor: Motor) -> None:
+def test_ramp_of_a_simulated_motor_does_not_depend_on_the_time_steps(motor: Motor) -> None:
     motor.run()
     for step in range(1, 401):
         motor.run_to(step / 100)
     assert motor.frequency == pytest.approx(20)
 
 
-def test_stop_ramps_down_and_then_removes_the_voltage(turning: Motor) -> None:
+def test_stop_of_a_simulated_motor_ramps_down_and_removes_the_voltage(turning: Motor) -> None:
     turning.stop()
     turning.run_to(102)
     assert turning.frequency == pytest.approx(20)
@@ -332,7 +334,7 @@ def test_stop_ramps_down_and_then_removes_the_voltage(turning: Motor) -> None:
     assert (turning.frequency, turning.phase, turning.energised) == (0, Phase.STOPPED, False)
 
 
-def test_lower_target_is_reached_along_the_deceleration_ramp(turning: Motor) -> None:
+def test_simulated_motor_reaches_a_lower_target_along_its_ramp(turning: Motor) -> None:
     turning.target = 30
     turning.run_to(100.5)
     assert turning.frequency == pytest.approx(35)
@@ -340,17 +342,17 @@ def test_lower_target_is_reached_along_the_deceleration_ramp(turning: Motor) -> 
     assert turning.frequency == 30
 
 
-def test_reversal_decelerates_to_zero_first(turning: Motor) -> None:
+def test_simulated_motor_decelerates_to_zero_before_it_reverses(turning: Motor) -> None:
     turning.run(-1)
-    turning.run_to(104)  # 4 s from 40 Hz to 0, at 10 Hz/s
+    turning.run_to(104)  # 4 s from 40 Hz to 0 at 10 Hz/s
     assert turning.frequency == pytest.approx(0)
-    turning.run_to(106)  # 2 s in reverse, at 5 Hz/s
+    turning.run_to(106)  # 2 s in reverse at 5 Hz/s
     assert turning.frequency == pytest.approx(-10)
     turning.run_to(104 + 8)
     assert turning.frequency == pytest.approx(-40)
 
 
-def test_coast_removes_the_voltage_while_the_shaft_runs_down(turning: Motor) -> None:
+def test_coast_removes_the_voltage_while_the_shaft_slows_down(turning: Motor) -> None:
     speed = turning.speed
     turning.coast()
     assert (turning.frequency, turning.current, turning.voltage) == (0, 0, 0)
@@ -360,14 +362,14 @@ def test_coast_removes_the_voltage_while_the_shaft_runs_down(turning: Motor) -> 
     assert turning.speed == 0
 
 
-def test_target_is_limited_to_the_maximum_frequency(motor: Motor) -> None:
+def test_frequency_of_a_simulated_motor_is_limited_to_its_maximum(motor: Motor) -> None:
     motor.target = 400
     motor.run()
     motor.run_to(1000)
     assert motor.frequency == 50
 
 
-def test_voltage_follows_frequency_and_current_follows_load(turning: Motor) -> None:
+def test_motor_voltage_follows_frequency_and_motor_current_follows_load(turning: Motor) -> None:
     assert turning.voltage == pytest.approx(400 * 40 / 50)
     light = turning.current
     turning.load = 1.0
@@ -399,7 +401,7 @@ def test_heatsink_warms_under_load_and_cools_at_rest(motor: Motor) -> None:
     assert motor.heatsink == pytest.approx(25, abs=0.01)
 
 
-def test_fault_prevents_a_run_until_reset_which_starts_nothing(turning: Motor) -> None:
+def test_fault_of_a_simulated_motor_prevents_a_run_until_the_reset(turning: Motor) -> None:
     turning.trip(7)
     turning.run()
     turning.jog()
@@ -413,20 +415,20 @@ def test_fault_prevents_a_run_until_reset_which_starts_nothing(turning: Motor) -
     assert turning.frequency == 40
 
 
-def test_fault_record_keeps_the_four_latest_faults(motor: Motor) -> None:
+def test_fault_record_of_a_simulated_motor_keeps_four_faults(motor: Motor) -> None:
     for code in range(1, 6):
         motor.trip(code)
     assert [motor.fault_record(number) for number in range(1, 6)] == [5, 4, 3, 2, 0]
 
 
-def test_run_time_counts_only_while_the_motor_runs(motor: Motor) -> None:
+def test_run_time_of_a_simulated_motor_counts_only_while_it_runs(motor: Motor) -> None:
     motor.run_to(10_000)
     motor.run()
     motor.run_to(17_200)
     assert motor.run_seconds == 7200
 
 
-def test_run_to_an_earlier_time_changes_nothing(motor: Motor) -> None:
+def test_advancing_a_simulated_motor_to_an_earlier_time_changes_nothing(motor: Motor) -> None:
     motor.run()
     motor.run_to(4)
     motor.run_to(3)

@@ -1,4 +1,4 @@
-"""Every family's simulation replies as its document says: whole frames in, whole frames out.
+"""The simulated drive of every family replies to whole frames as its document says.
 
 A frame whose checksum is written out is printed in the family's document. A frame marked "built" is composed
 from the document's tables. checksums.py computes the checksums of all other frames.
@@ -25,7 +25,7 @@ from multidrop.sim.families import SimulatedCHE, SimulatedDelixiNative, Simulate
 
 
 class Bench:
-    """One simulated drive on an unpaced wire, and its simulated time."""
+    """One simulated drive on a wire without delays, and its simulated time."""
 
     def __init__(self, drive: Drive) -> None:
         sim = simulated(drive)
@@ -73,7 +73,7 @@ def erman() -> Bench:
     return Bench(ErmanERG220(1))
 
 
-def test_erman_control_registers_are_read_as_printed(erman: Bench) -> None:
+def test_simulated_erman_control_registers_are_read_as_printed(erman: Bench) -> None:
     erman.sim["control_register"] = 0x0100
     erman.sim["frequency"] = 50.0
     erman.sim["maximum_frequency"] = 50.0
@@ -81,21 +81,21 @@ def test_erman_control_registers_are_read_as_printed(erman: Bench) -> None:
     assert erman.exchange("01 03 00 01 00 04 15 C9") == "01 03 08 01 00 01 F4 01 F4 00 32 25 C4"
 
 
-def test_erman_state_registers_are_read_as_printed_with_a_corrected_checksum(erman: Bench) -> None:
+def test_simulated_erman_state_registers_are_read_as_printed(erman: Bench) -> None:
     erman.sim["output_frequency"] = 50.0
     erman.sim["output_current"] = 21.4
     erman.sim["dc_bus_voltage"] = 562
     assert erman.exchange("01 04 00 01 00 05 61 C9") == "01 04 0A 01 F4 00 00 00 D6 00 00 02 32 7F 1B"
 
 
-def test_erman_writes_several_registers_with_function_10(erman: Bench) -> None:
+def test_simulated_erman_writes_several_registers_with_function_10h(erman: Bench) -> None:
     assert erman.exchange("01 10 00 0C 00 02 04 00 C8 01 90 73 F8") == "01 10 00 0C 00 02 81 CB"
     assert (erman.sim["acceleration_time"], erman.sim["deceleration_time"]) == (20, 40)
     assert (erman.motor.acceleration_time, erman.motor.deceleration_time) == (20, 40)
     assert erman.exchange("01 0F 00 00 00 09 02 01 01 25 2C") == "01 0F 00 00 00 09 95 CD"
 
 
-def test_erman_coils_are_read_as_printed(erman: Bench) -> None:
+def test_simulated_erman_coils_are_read_as_printed(erman: Bench) -> None:
     assert erman.exchange("01 01 00 00 00 0C 3C 0F")[:11] == "01 01 02 00"
     erman.exchange("01 05 00 00 FF 00 8C 3A")
     assert erman.exchange("01 01 00 00 00 0C 3C 0F")[:14] == "01 01 02 01 00"
@@ -114,32 +114,32 @@ def test_erman_coils_are_read_as_printed(erman: Bench) -> None:
         (Message(1, 0x10, 0x58, 2, b"\x00\x00\x00\x00"), "01 90 03 0C 01"),
     ],
 )
-def test_erman_refuses_wrong_addresses_with_the_printed_reply(
+def test_simulated_erman_refuses_wrong_addresses_with_the_printed_reply(
     erman: Bench, request_: Message, reply: str
 ) -> None:
     assert erman.send(build_request(Framing.RTU, request_)) == bytes.fromhex(reply)
 
 
-def test_erman_refuses_an_unknown_function_with_exception_01(erman: Bench) -> None:
+def test_simulated_erman_refuses_an_unknown_function_with_exception_01(erman: Bench) -> None:
     assert erman.send(checksums.rtu("01 2B")) == checksums.rtu("01 AB 01")
 
 
 @pytest.mark.parametrize(
     "frame",
     [
-        bytes.fromhex("01 04 00 01 00 05 15 C9"),  # the printed checksum, which is wrong
-        checksums.rtu("02 04 00 01 00 05"),  # request to another drive
+        bytes.fromhex("01 04 00 01 00 05 15 C9"),  # the checksum is wrong in the document
+        checksums.rtu("02 04 00 01 00 05"),  # the request is for another drive
         checksums.rtu("00 05 00 01 FF 00"),  # a broadcast
-        checksums.rtu("01 03 00 01 00"),  # a request of a wrong length
+        checksums.rtu("01 03 00 01 00"),  # the request is too short
         checksums.rtu("01 10 00 0C 00 02 03 00 C8 01"),
     ],
 )
-def test_erman_does_not_reply_to_damaged_foreign_or_broadcast_frames(erman: Bench, frame: bytes) -> None:
+def test_simulated_erman_ignores_damaged_foreign_and_broadcast_frames(erman: Bench, frame: bytes) -> None:
     assert erman.send(frame) == b""
     assert erman.sim.counters.replies == 0
 
 
-def test_erman_start_and_stop_ramp_the_motor(erman: Bench) -> None:
+def test_simulated_erman_ramps_the_motor_at_start_and_stop(erman: Bench) -> None:
     erman.exchange("01 06 00 02 01 1D E9 93")  # setpoint 28.5 Hz
     assert erman.read(4, 0x400, 2) == [0, 0]
     erman.exchange("01 05 00 00 FF 00 8C 3A")
@@ -155,7 +155,7 @@ def test_erman_start_and_stop_ramp_the_motor(erman: Bench) -> None:
     assert (erman.read(4, 0x400, 2), erman.read(4, 0x01)) == ([0, 0], [0])
 
 
-def test_erman_start_is_ignored_while_stop_is_on_and_clearing_stop_starts_nothing(erman: Bench) -> None:
+def test_simulated_erman_ignores_a_start_while_the_stop_coil_is_on(erman: Bench) -> None:
     erman.exchange("01 06 00 02 01 1D E9 93")
     erman.exchange("01 05 00 01 FF 00 DD FA")  # stop on
     erman.exchange("01 05 00 00 FF 00 8C 3A")  # start on
@@ -166,9 +166,9 @@ def test_erman_start_is_ignored_while_stop_is_on_and_clearing_stop_starts_nothin
     assert erman.motor.energised
 
 
-def test_erman_emergency_stop_prevents_a_start_until_a_reset_and_stays_the_last_fault(erman: Bench) -> None:
+def test_simulated_erman_emergency_stop_prevents_a_start_until_a_reset(erman: Bench) -> None:
     erman.exchange("01 05 00 00 FF 00 8C 3A")
-    erman.exchange("01 05 00 02 FF 00 2D FA")  # emergency stop (built)
+    erman.exchange("01 05 00 02 FF 00 2D FA")  # emergency stop; the frame is built from the tables
     assert not erman.motor.energised
     assert erman.read(4, 0x402, 2) == [0, 1]
     erman.send(checksums.rtu("01 05 00 02 00 00"))
@@ -195,18 +195,18 @@ def che() -> Bench:
     return Bench(MyCHE(1, maximum_frequency=60))
 
 
-def test_che_device_code_register_reads_0101(che: Bench) -> None:
+def test_simulated_che_device_code_register_reads_0101h(che: Bench) -> None:
     assert che.exchange("01 03 30 16 00 01 6A CE")[:14] == "01 03 02 01 01"
 
 
-def test_che_stores_a_written_parameter() -> None:
+def test_simulated_che_stores_a_written_parameter() -> None:
     che = Bench(MyCHE(2))
-    frame = "02 06 00 08 13 88 05 6D"  # example of section 11.6.2
+    frame = "02 06 00 08 13 88 05 6D"  # the example of section 11.6.2
     assert che.exchange(frame) == frame
     assert che.sim["jump"] == 0x1388
 
 
-def test_che_setpoint_is_a_percentage_of_the_maximum_frequency(che: Bench) -> None:
+def test_simulated_che_setpoint_is_a_percentage_of_the_maximum_frequency(che: Bench) -> None:
     che.exchange("01 06 20 00 13 88 8F 5C")  # 50.00 %
     che.exchange("01 06 10 00 00 01 4C CA")
     che.wait(60)
@@ -215,7 +215,7 @@ def test_che_setpoint_is_a_percentage_of_the_maximum_frequency(che: Bench) -> No
     assert che.read(3, 0x1001) == [1]
 
 
-def test_che_negative_setpoint_reverses_the_motor(che: Bench) -> None:
+def test_simulated_che_runs_in_reverse_at_a_negative_setpoint(che: Bench) -> None:
     assert che.write(0x2000, 0x10000 - 5000) == 0
     che.write(0x1000, 1)
     che.wait(60)
@@ -225,7 +225,7 @@ def test_che_negative_setpoint_reverses_the_motor(che: Bench) -> None:
 
 
 @pytest.mark.parametrize(("word", "stopped_after"), [(5, False), (6, True), (8, False)])
-def test_che_stop_words_ramp_down_and_coast_word_stops_immediately(
+def test_simulated_che_ramps_down_at_a_stop_and_coasts_immediately(
     che: Bench, word: int, stopped_after: bool
 ) -> None:
     che.write(0x2000, 10_000)
@@ -239,7 +239,7 @@ def test_che_stop_words_ramp_down_and_coast_word_stops_immediately(
     assert che.read(3, 0x1001) == [3]
 
 
-def test_che_refuses_a_start_during_a_fault_until_a_reset(che: Bench) -> None:
+def test_simulated_che_refuses_a_start_during_a_fault_until_a_reset(che: Bench) -> None:
     che.sim.trip(10)
     assert (che.read(3, 0x1001), che.read(3, 0x5000)) == ([4], [10])
     assert che.write(0x1000, 1) == 0x01  # the manual uses this code also for a command during a fault
@@ -251,19 +251,19 @@ def test_che_refuses_a_start_during_a_fault_until_a_reset(che: Bench) -> None:
     ("body", "reply"),
     [
         ("01 03 40 00 00 01", "01 83 02"),  # undefined address
-        ("01 03 80 0B 00 01", "01 83 02"),  # the alias in RAM cannot be read
+        ("01 03 80 0B 00 01", "01 83 02"),  # the address in RAM cannot be read
         ("01 03 30 00 00 11", "01 83 03"),  # 17 registers, one too many
         ("01 06 10 00 00 09", "01 86 12"),
         ("01 04 30 00 00 01", "01 84 01"),
     ],
 )
-def test_che_refuses_invalid_requests_with_the_documented_exception(
+def test_simulated_che_refuses_invalid_requests_with_documented_exceptions(
     che: Bench, body: str, reply: str
 ) -> None:
     assert che.send(checksums.rtu(body)) == checksums.rtu(reply)
 
 
-def test_che_parameter_writes_wear_the_eeprom_but_alias_writes_do_not(che: Bench) -> None:
+def test_value_of_a_simulated_drive_can_be_set_by_name_or_as_text(che: Bench) -> None:
     for _ in range(3):
         che.write(11, 50)
     che.write(0x800B, 70)
@@ -271,7 +271,7 @@ def test_che_parameter_writes_wear_the_eeprom_but_alias_writes_do_not(che: Bench
     assert che.sim.counters.eeprom_writes == {"acceleration_time": 3}
 
 
-def test_che_refuses_a_write_while_it_stores_the_previous_value(che: Bench) -> None:
+def test_simulated_che_refuses_a_write_while_it_stores_the_previous_one(che: Bench) -> None:
     assert isinstance(che.sim, SimulatedCHE)
     che.sim.storing = 0.5
     assert che.write(11, 50) == 0
@@ -281,7 +281,7 @@ def test_che_refuses_a_write_while_it_stores_the_previous_value(che: Bench) -> N
     assert che.write(11, 60) == 0
 
 
-def test_che_refuses_to_change_a_locked_parameter_while_running(che: Bench) -> None:
+def test_simulated_che_refuses_to_change_a_locked_parameter_while_running(che: Bench) -> None:
     che.write(0x2000, 5000)
     assert che.write(12, 1) == 0
     che.write(0x1000, 1)
@@ -289,7 +289,7 @@ def test_che_refuses_to_change_a_locked_parameter_while_running(che: Bench) -> N
     assert che.sim["locked"] == 1
 
 
-def test_che_replies_to_a_damaged_frame_with_exception_11(che: Bench) -> None:
+def test_simulated_che_replies_to_a_damaged_frame_with_exception_11h(che: Bench) -> None:
     assert che.send(bytes.fromhex("01 03 10 01 00 01 D1 0B")) == checksums.rtu("01 83 11")
     assert che.send(bytes.fromhex("02 03 10 01 00 01 D1 0B")) == b""
     assert che.sim.counters.damaged == 1
@@ -303,11 +303,11 @@ def ibd() -> Bench:
     return Bench(InnovertIBD(1))
 
 
-def test_ibd_shows_its_terminals(ibd: Bench) -> None:
+def test_simulated_innovert_ibd_reports_the_bits_of_its_terminals(ibd: Bench) -> None:
     assert ibd.exchange("01 03 00 16 00 01 65 CE") == "01 03 02 18 00 B2 44"
 
 
-def test_ibd_programmed_outputs_show_the_motor_s_state(ibd: Bench) -> None:
+def test_simulated_innovert_ibd_outputs_show_the_motors_state(ibd: Bench) -> None:
     ibd.exchange("01 06 20 01 13 88 DE 9C")
     ibd.exchange("01 06 20 00 00 02 03 CB")
     ibd.wait(1)
@@ -323,19 +323,20 @@ def test_ibd_programmed_outputs_show_the_motor_s_state(ibd: Bench) -> None:
     assert ibd.read(3, 22) == [0x1800]
 
 
-def test_ibd_direction_bits_alone_reverse_a_running_motor(ibd: Bench) -> None:
+def test_direction_bits_alone_reverse_a_running_simulated_innovert_ibd(ibd: Bench) -> None:
     assert ibd.write(0x2001, 2000) == 0
-    for bits, direction in ((0x06, -1), (0x08, 1), (0x0C, -1)):  # run in reverse; forward; both bits: reverse
+    # reverse; forward; reverse, which both bits together mean
+    for bits, direction in ((0x06, -1), (0x08, 1), (0x0C, -1)):
         assert ibd.write(0x2000, bits) == 0
         assert ibd.motor.direction == direction
         assert ibd.motor.energised
 
 
-def test_ibd_jog_is_ended_by_a_stop_but_not_by_a_run_command(ibd: Bench) -> None:
+def test_jog_of_a_simulated_innovert_ibd_is_ended_only_by_a_stop(ibd: Bench) -> None:
     ibd.write(0x2001, 5000)
     ibd.write(0x2000, 3)
     ibd.wait(60)
-    assert ibd.write(0x2000, 2) == 0  # confirmed without effect
+    assert ibd.write(0x2000, 2) == 0  # the run command is confirmed, but has no effect during a jog
     ibd.wait(60)
     assert ibd.motor.frequency == ibd.motor.jog_frequency
     ibd.write(0x2000, 0)
@@ -348,7 +349,7 @@ def test_ibd_jog_is_ended_by_a_stop_but_not_by_a_run_command(ibd: Bench) -> None
     assert ibd.motor.frequency == 50
 
 
-def test_ibd_a_trip_ends_a_jog(ibd: Bench) -> None:
+def test_trip_ends_a_jog_of_a_simulated_innovert_ibd(ibd: Bench) -> None:
     ibd.write(0x2001, 5000)
     ibd.write(0x2000, 3)
     ibd.sim.trip(1)
@@ -358,7 +359,7 @@ def test_ibd_a_trip_ends_a_jog(ibd: Bench) -> None:
     assert ibd.motor.frequency == 50
 
 
-def test_ibd_obeys_the_line_only_if_its_source_parameters_select_it(ibd: Bench) -> None:
+def test_simulated_innovert_ibd_obeys_the_line_only_if_set_to_it(ibd: Bench) -> None:
     ibd.write(0x2001, 5000)
     ibd.write(102, 0)  # Prb.02
     assert ibd.write(0x2000, 2) == 0
@@ -374,7 +375,7 @@ def test_ibd_obeys_the_line_only_if_its_source_parameters_select_it(ibd: Bench) 
     assert ibd.motor.frequency == 50
 
 
-def test_ibd_stores_the_maximum_for_a_larger_value(ibd: Bench) -> None:
+def test_simulated_innovert_ibd_stores_the_maximum_for_a_larger_value(ibd: Bench) -> None:
     assert ibd.write(107, 60_000) == 0
     assert ibd.read(3, 107) == [36_000]
     assert ibd.write(0x2001, 50_000) == 0
@@ -384,20 +385,22 @@ def test_ibd_stores_the_maximum_for_a_larger_value(ibd: Bench) -> None:
 @pytest.mark.parametrize(
     ("function", "start", "count"), [(3, 107, 5), (3, 0x2000, 1), (3, 50, 1), (4, 3, 1), (0x10, 107, 1)]
 )
-def test_ibd_does_not_reply_to_invalid_requests(ibd: Bench, function: int, start: int, count: int) -> None:
+def test_simulated_innovert_ibd_ignores_invalid_requests(
+    ibd: Bench, function: int, start: int, count: int
+) -> None:
     data = b"\0\1" if function == 0x10 else b""
     assert ibd.sim.answer(Message(1, function, start, count, data), 0.0) is None
     assert len(ibd.read(3, 100, 3)) == 3
 
 
-def test_ibd_answers_a_read_of_4_registers_but_not_of_5(ibd: Bench) -> None:
-    """The other reasons for silence are excluded: all five registers are readable."""
+def test_simulated_innovert_ibd_replies_to_a_read_of_4_registers_but_not_5(ibd: Bench) -> None:
+    """All five registers are readable, so only their number can be the reason for the silence."""
     ibd.sim.memory.make_readable(HOLDING, range(100, 105))
     assert len(ibd.read(3, 100, 4)) == 4
     assert ibd.sim.answer(Message(1, 3, 100, 5), 0.0) is None
 
 
-def test_ibd_carries_out_a_broadcast_without_a_reply(ibd: Bench) -> None:
+def test_simulated_innovert_ibd_carries_out_a_broadcast_without_a_reply(ibd: Bench) -> None:
     ibd.exchange("01 06 20 01 13 88 DE 9C")
     ibd.exchange("01 06 20 00 00 02 03 CB")
     ibd.wait(60)
@@ -406,7 +409,7 @@ def test_ibd_carries_out_a_broadcast_without_a_reply(ibd: Bench) -> None:
     assert not ibd.motor.energised
 
 
-def test_ibd_0010h_which_is_delixis_forward_bit_resets_the_fault(ibd: Bench) -> None:
+def test_delixis_forward_command_resets_a_fault_of_a_simulated_innovert_ibd(ibd: Bench) -> None:
     ibd.sim.trip(1)
     ibd.exchange("01 06 20 00 00 10 83 C6")  # built
     assert (ibd.motor.fault, ibd.motor.energised) == (0, False)
@@ -420,7 +423,7 @@ def delixi() -> Bench:
     return Bench(DelixiModbus(1))
 
 
-def test_delixi_output_frequency_is_read_as_printed(delixi: Bench) -> None:
+def test_simulated_delixi_output_frequency_is_read_as_printed(delixi: Bench) -> None:
     delixi.exchange("01 06 00 02 13 88 25 5C")
     delixi.exchange("01 06 20 00 00 12 02 07")
     delixi.wait(60)
@@ -430,13 +433,13 @@ def test_delixi_output_frequency_is_read_as_printed(delixi: Bench) -> None:
     assert delixi.read(3, 0x020D) == [9]
 
 
-def test_delixi_output_frequency_is_read_in_ascii_as_printed() -> None:
+def test_simulated_delixi_output_frequency_is_read_in_ascii_as_printed() -> None:
     delixi = Bench(DelixiModbus(1, framing=Framing.ASCII))
     delixi.sim["output_frequency"] = 50
     assert delixi.exchange(":010301F4000106") == ":01030213885F"
 
 
-def test_delixi_obeys_the_line_only_if_its_source_parameters_select_it(delixi: Bench) -> None:
+def test_simulated_delixi_obeys_the_line_only_if_its_parameters_select_it(delixi: Bench) -> None:
     delixi.exchange("01 06 00 02 13 88 25 5C")
     delixi.sim["run_source"] = 0  # P00.00
     assert delixi.exchange("01 06 20 00 00 12 02 07") == "01 06 20 00 00 12 02 07"
@@ -448,7 +451,7 @@ def test_delixi_obeys_the_line_only_if_its_source_parameters_select_it(delixi: B
     assert (delixi.motor.energised, delixi.motor.frequency) == (True, 0)
 
 
-def test_delixi_reverse_word_turns_the_motor_in_reverse(delixi: Bench) -> None:
+def test_simulated_delixi_reverse_command_turns_the_motor_in_reverse(delixi: Bench) -> None:
     delixi.exchange("01 06 00 02 13 88 25 5C")
     delixi.exchange("01 06 20 00 00 22 02 13")  # built
     delixi.wait(60)
@@ -456,13 +459,13 @@ def test_delixi_reverse_word_turns_the_motor_in_reverse(delixi: Bench) -> None:
 
 
 @pytest.mark.parametrize(("function", "start", "count"), [(3, 0x01F4, 2), (3, 0x9999, 1), (4, 0x01F4, 1)])
-def test_delixi_does_not_reply_to_invalid_requests(
+def test_simulated_delixi_ignores_invalid_requests(
     delixi: Bench, function: int, start: int, count: int
 ) -> None:
     assert delixi.sim.answer(Message(1, function, start, count), 0.0) is None
 
 
-def test_delixi_obeys_only_run_commands_among_broadcasts(delixi: Bench) -> None:
+def test_simulated_delixi_obeys_only_run_commands_among_broadcasts(delixi: Bench) -> None:
     delixi.sim.answer(Message(0, 6, 2, data=b"\x13\x88"), 0.0)
     assert delixi.sim["frequency"] == 0
     delixi.sim.answer(Message(0, 6, 0x2000, data=b"\x00\x12"), 0.0)
@@ -477,7 +480,7 @@ def native() -> Bench:
     return Bench(DelixiNative(1))
 
 
-def test_native_frequency_and_run_state_are_read(native: Bench) -> None:
+def test_simulated_delixi_native_frequency_and_run_state_are_read(native: Bench) -> None:
     assert native.exchange(":010300000000000004")[:9] == ":01030001"  # built; stopped
     native.exchange(":0104000100001388A1")
     native.exchange(":010200020000000005")
@@ -493,7 +496,7 @@ def test_native_frequency_and_run_state_are_read(native: Bench) -> None:
     ("fault", "shown", "state"),
     [(9, "00000009", 4), (10, "00000010", 4), (14, "00000014", 4), (7, "00000007", 5)],
 )
-def test_native_fault_and_fault_record_show_the_printed_digits(
+def test_simulated_delixi_native_faults_show_the_printed_digits(
     native: Bench, fault: int, shown: str, state: int
 ) -> None:
     native.sim.trip(fault)
@@ -510,13 +513,14 @@ def test_native_fault_and_fault_record_show_the_printed_digits(
 @pytest.mark.parametrize(
     ("frame", "reply"),
     [
-        (checksums.delixi("0102000900000000"), b":01F0000000000000F1\r\n"),  # no such command
-        (checksums.delixi("0107270F00000000"), checksums.delixi("01FC000000000000")),  # no such parameter
-        (b":010200020000000006\r\n", b":01FF00000000000000\r\n"),  # checksum 06, which is wrong; 05 is right
-        (b":0102000205\r\n", b""),  # a request of a wrong length
+        (checksums.delixi("0102000900000000"), b":01F0000000000000F1\r\n"),  # this run command does not exist
+        # this parameter does not exist
+        (checksums.delixi("0107270F00000000"), checksums.delixi("01FC000000000000")),
+        (b":010200020000000006\r\n", b":01FF00000000000000\r\n"),  # the checksum 06 is wrong; 05 is right
+        (b":0102000205\r\n", b""),  # the request is too short
     ],
 )
-def test_native_invalid_requests_get_the_documented_error_replies(
+def test_simulated_delixi_native_sends_the_documented_error_replies(
     native: Bench, frame: bytes, reply: bytes
 ) -> None:
     assert native.send(frame) == reply
@@ -526,7 +530,7 @@ class MyNative(DelixiNative):
     ramp = setting(17, "s", step=0.1, span=(0.1, 600), table=PARAMETER, while_running=False)
 
 
-def test_native_refuses_values_beyond_limits_and_locked_parameters() -> None:
+def test_simulated_delixi_native_refuses_wrong_values_and_locked_parameters() -> None:
     native = Bench(MyNative(1))
     assert native.send(checksums.delixi("0106001100000064")) == checksums.delixi("0106001100000064")
     assert native.send(checksums.delixi("0106001100001771")) == checksums.delixi(
@@ -537,38 +541,39 @@ def test_native_refuses_values_beyond_limits_and_locked_parameters() -> None:
     assert native.sim["ramp"] == 10
 
 
-def test_native_start_during_a_fault_is_refused(native: Bench) -> None:
+def test_simulated_delixi_native_refuses_a_start_during_a_fault(native: Bench) -> None:
     native.sim.trip(1)
     assert native.exchange(":010200020000000005") == ":01F0000000000000F1"
     assert not native.motor.energised
 
 
-def test_native_refuses_parameter_writes_while_locked(native: Bench) -> None:
+def test_simulated_delixi_native_refuses_parameter_writes_while_locked(native: Bench) -> None:
     assert isinstance(native.sim, SimulatedDelixiNative)
     native.sim.locked = True
     locked = checksums.delixi("01FE000000000000")
     assert native.exchange(":0106000200001388A4").encode() + b"\r\n" == locked
     assert native.send(checksums.delixi("0105000200001388")) == locked
-    assert native.exchange(":0104000100001388A1") == ":0104000100001388A1"  # the run setpoint is not locked
+    # the setpoint in RAM is not locked
+    assert native.exchange(":0104000100001388A1") == ":0104000100001388A1"
     assert native.exchange(":010200020000000005") == ":010200020000000005"
     native.sim.locked = False
     assert native.exchange(":0106000200001388A4") == ":0106000200001388A4"
 
 
-def test_native_drive_refuses_commands_unless_its_run_source_is_the_line(native: Bench) -> None:
+def test_simulated_delixi_native_refuses_commands_unless_the_line_is_selected(native: Bench) -> None:
     native.sim["run_source"] = 0  # P00.00
     assert native.exchange(":010200020000000005") == ":01F0000000000000F1"
     assert not native.motor.energised
 
 
-def test_native_only_function_06_wears_the_eeprom(native: Bench) -> None:
+def test_only_function_06_wears_the_eeprom_of_a_simulated_delixi_native(native: Bench) -> None:
     native.exchange(":0104000100001388A1")
     assert not native.sim.counters.eeprom_writes
     native.exchange(":0106000200001388A4")
     assert native.sim.counters.eeprom_writes == {"stored_frequency": 1}
 
 
-def test_native_carries_out_a_broadcast_run_command_without_a_reply(native: Bench) -> None:
+def test_simulated_delixi_native_carries_out_a_broadcast_without_a_reply(native: Bench) -> None:
     native.exchange(":0104000100001388A1")
     native.exchange(":010200020000000005")
     native.wait(60)
@@ -577,7 +582,7 @@ def test_native_carries_out_a_broadcast_run_command_without_a_reply(native: Benc
     assert not native.motor.energised
 
 
-def test_native_and_modbus_drives_ignore_frames_of_the_other_protocol(native: Bench) -> None:
+def test_simulated_delixi_drives_ignore_frames_of_the_other_protocol(native: Bench) -> None:
     assert native.exchange(":010301F4000106") == ""
     assert Bench(DelixiModbus(1, framing=Framing.ASCII)).exchange(":010701F400000000FD") == ""
 
@@ -600,16 +605,16 @@ def run_at(yd: Bench, setpoint: int, word: int = FORWARD) -> None:
     yd.wait(60)
 
 
-def test_yd_address_and_maximum_frequency_are_readable(yd: Bench) -> None:
+def test_simulated_yd1000_address_and_maximum_frequency_are_readable(yd: Bench) -> None:
     assert yd.exchange("01 03 08 02 00 01 27 AA")[:14] == "01 03 02 00 01"
     assert yd.exchange("01 03 00 11 00 01 D4 0F")[:14] == "01 03 02 1F 40"  # FH, the maximum frequency: 80 Hz
 
 
-def test_yd_refuses_to_read_two_registers_at_once(yd: Bench) -> None:
+def test_simulated_yd1000_refuses_to_read_two_registers_at_once(yd: Bench) -> None:
     assert yd.sim.answer(Message(1, 3, 0x1100, 2), 0.0) == Message(1, 3, exception=3)
 
 
-def test_yd_runs_at_the_setpoint_written_over_the_line(yd: Bench) -> None:
+def test_simulated_yd1000_runs_at_the_setpoint_written_over_the_line(yd: Bench) -> None:
     run_at(yd, 5000)
     assert (yd.read(3, 0x1100), yd.read(3, 0x1201)) == ([5000], [1 << 10])
     yd.write(0x1000, FORWARD | 1 << 9)
@@ -620,13 +625,13 @@ def test_yd_runs_at_the_setpoint_written_over_the_line(yd: Bench) -> None:
     assert yd.read(3, 0x1100) == [0]
 
 
-def test_yd_shows_current_and_voltage_in_percent(yd: Bench) -> None:
+def test_simulated_yd1000_shows_current_and_voltage_in_percent(yd: Bench) -> None:
     run_at(yd, 5000)
     assert yd.read(3, 0x1203) == [round(10_000 * yd.motor.current / yd.motor.rating.current)]
-    assert yd.read(3, 0x1205) == [10_000]  # 50 Hz are the rated frequency
+    assert yd.read(3, 0x1205) == [10_000]  # 100 %, because 50 Hz are the rated frequency
 
 
-def test_yd_obeys_the_panel_while_bit_15_is_off(yd: Bench) -> None:
+def test_simulated_yd1000_obeys_the_panel_while_bit_15_is_off(yd: Bench) -> None:
     assert isinstance(yd.sim, SimulatedYD1000)
     yd.sim.panel_runs = True
     yd.write(0x1002, 3000)
@@ -635,7 +640,7 @@ def test_yd_obeys_the_panel_while_bit_15_is_off(yd: Bench) -> None:
     assert yd.motor.frequency == 30
 
 
-def test_yd_trip_freezes_only_1200h_and_1201h(yd: Bench) -> None:
+def test_trip_of_a_simulated_yd1000_freezes_only_1200h_and_1201h(yd: Bench) -> None:
     run_at(yd, 5000)
     yd.read(3, 0x1200)
     yd.write(0x1000, STOP | 1 << 12)  # emergency stop
@@ -644,11 +649,11 @@ def test_yd_trip_freezes_only_1200h_and_1201h(yd: Bench) -> None:
     assert yd.read(3, 0x1200) == [5000]
     assert yd.read(3, 0x1201) == [1 << 10]
     assert yd.read(3, 0x1202) == [5000]
-    assert (yd.read(3, 0x1203), yd.read(3, 0x1205)) == ([0], [0])  # only 1200H and 1201H are frozen
+    assert (yd.read(3, 0x1203), yd.read(3, 0x1205)) == ([0], [0])  # other registers are not frozen
     assert yd.read(3, 0x1210) != [0]
 
 
-def test_yd_reset_restarts_the_drive_which_ignores_requests_meanwhile(yd: Bench) -> None:
+def test_simulated_yd1000_ignores_requests_while_a_reset_restarts_it(yd: Bench) -> None:
     yd.write(0x1001, 5000)
     yd.sim.trip(3)
     assert yd.write(0x1000, RESET) == 0
@@ -660,8 +665,8 @@ def test_yd_reset_restarts_the_drive_which_ignores_requests_meanwhile(yd: Bench)
 
 
 @pytest.mark.parametrize("bit", [13, 12, 11, 10, 8, 7], ids=lambda bit: f"bit {bit}")
-def test_yd_command_bit_without_bit_15_has_no_effect(yd: Bench, bit: int) -> None:
-    """Without bit 15 the panel is in control (8.1). In this test, the panel lets the motor run."""
+def test_simulated_yd1000_ignores_command_bits_without_bit_15(yd: Bench, bit: int) -> None:
+    """Without bit 15, the panel commands the drive (8.1). Here the panel lets the motor run."""
     assert isinstance(yd.sim, SimulatedYD1000)
     yd.sim.panel_runs = True
     run_at(yd, 3000)
@@ -678,11 +683,12 @@ def test_yd_command_bit_without_bit_15_has_no_effect(yd: Bench, bit: int) -> Non
         (0xC600, 1 << 10 | 1 << 9),
         (0xC440, 1 << 10 | 1 << 6),
         (0xC100, 1 << 10 | 1 << 8),
-        (0xC080, 1 << 10 | 1 << 7),  # bit "run" while braking with direct current (8.2, table 2)
+        # the bit "run" is also set while the motor is braked with direct current (8.2, table 2)
+        (0xC080, 1 << 10 | 1 << 7),
         (0xC000, 0),
     ],
 )
-def test_yd_status_bits_show_the_motors_state(yd: Bench, word: int, state: int) -> None:
+def test_simulated_yd1000_status_bits_show_the_motors_state(yd: Bench, word: int, state: int) -> None:
     run_at(yd, 3000, word)
     assert yd.read(3, 0x1201) == [state]
     yd.write(0x1000, STOP)
@@ -690,7 +696,7 @@ def test_yd_status_bits_show_the_motors_state(yd: Bench, word: int, state: int) 
     assert not yd.motor.energised
 
 
-def test_yd_direct_current_brake_keeps_the_motor_energised_at_0_hz(yd: Bench) -> None:
+def test_direct_current_brake_of_a_simulated_yd1000_keeps_voltage_at_0_hz(yd: Bench) -> None:
     run_at(yd, 3000)
     yd.write(0x1000, STOP | 1 << 7)
     yd.wait(10)
@@ -700,7 +706,7 @@ def test_yd_direct_current_brake_keeps_the_motor_energised_at_0_hz(yd: Bench) ->
 @pytest.mark.parametrize(
     ("bits", "speed"), [(0x8, 1), (0x4, 2), (0xC, 3), (0x2, 4), (0xA, 5), (0x6, 6), (0xE, 7)]
 )
-def test_yd_preset_speed_bits_select_the_speed(yd: Bench, bits: int, speed: int) -> None:
+def test_preset_speed_bits_of_a_simulated_yd1000_select_the_speed(yd: Bench, bits: int, speed: int) -> None:
     yd.write(0x1001, 5000)
     for number, address in enumerate((0x18, 0x19, 0x20, 0x21, 0x22, 0x23, 0x24), start=1):
         assert yd.write(address, 1000 + number * 100) == 0
@@ -712,39 +718,42 @@ def test_yd_preset_speed_bits_select_the_speed(yd: Bench, bits: int, speed: int)
 @pytest.mark.parametrize(
     ("address", "value"),
     [
-        (0x0012, 8001),  # UL: 0.5 to FH
+        (0x0012, 8001),  # limits of UL: 0.5 Hz to FH
         (0x0012, 49),
-        (0x0013, 8001),  # LL: 0.0 to UL
-        (0x0018, 8001),  # Sr1: LL to UL
-        (0x0100, 8001),  # F100: 0.0 to FH
-        (0x1001, 8001),  # 0.0 to FH
+        (0x0013, 8001),  # limits of LL: 0 Hz to UL
+        (0x0018, 8001),  # limits of Sr1: LL to UL
+        (0x0100, 8001),  # limits of F100: 0 Hz to FH
+        (0x1001, 8001),  # limits of 1001H: 0 Hz to FH
         (0x1002, 8001),
         (0x0802, 64),
         (0x0803, 101),
     ],
     ids=lambda each: f"{each:04X}",
 )
-def test_yd_refuses_values_beyond_the_documented_limits(yd: Bench, address: int, value: int) -> None:
+def test_simulated_yd1000_refuses_values_beyond_the_documented_limits(
+    yd: Bench, address: int, value: int
+) -> None:
     before = yd.read(3, address)
     assert yd.write(address, value) == 3
     assert yd.read(3, address) == before
 
 
-def test_yd_limits_follow_the_present_values_of_other_parameters(yd: Bench) -> None:
+def test_limits_of_a_simulated_yd1000_follow_other_parameters(yd: Bench) -> None:
     assert yd.write(0x0012, 6000) == 0  # UL
     assert (yd.write(0x0013, 6001), yd.write(0x0013, 2000)) == (3, 0)  # LL
     assert (yd.write(0x0018, 1999), yd.write(0x0018, 2000)) == (3, 0)  # Sr1
-    assert (yd.write(0x0012, 1999), yd.write(0x0011, 5999)) == (3, 3)  # refused: UL < LL, FH < UL
+    # refused, because UL would be below LL, and FH below UL
+    assert (yd.write(0x0012, 1999), yd.write(0x0011, 5999)) == (3, 3)
 
 
 @pytest.mark.parametrize("address", [0x0001, 0x0007, 0x0015])
-def test_yd_does_not_store_the_panel_s_setpoint(yd: Bench, address: int) -> None:
+def test_simulated_yd1000_does_not_store_the_panels_setpoint(yd: Bench, address: int) -> None:
     assert yd.write(address, 1) == 0
     assert yd.read(3, address) == [0]
     assert not yd.sim.counters.eeprom_writes
 
 
-def test_yd_watchdog_is_inactive_after_a_reset_until_the_first_message(yd: Bench) -> None:
+def test_simulated_yd1000_watchdog_waits_for_the_first_message_after_a_reset(yd: Bench) -> None:
     yd.write(0x0803, 1)
     yd.write(0x1000, RESET)
     yd.now += 5
@@ -753,27 +762,27 @@ def test_yd_watchdog_is_inactive_after_a_reset_until_the_first_message(yd: Bench
     assert yd.read(3, 0x1210) != [0]
 
 
-def test_yd_obeys_a_broadcast_setpoint_but_no_broadcast_setting(yd: Bench) -> None:
+def test_simulated_yd1000_obeys_a_broadcast_setpoint_but_no_setting(yd: Bench) -> None:
     yd.sim.answer(Message(0, 6, 0x1001, data=b"\x13\x88"), 0.0)
     yd.sim.answer(Message(0, 6, 0x0009, data=b"\x00\x32"), 0.0)
     assert (yd.sim["frequency"], yd.sim["acceleration_time"]) == (50, 10)
 
 
-def test_yd_every_write_except_commands_wears_the_eeprom(yd: Bench) -> None:
+def test_every_write_except_commands_wears_the_eeprom_of_a_simulated_yd1000(yd: Bench) -> None:
     yd.write(0x0009, 50)
     yd.write(0x1001, 5000)
     assert yd.sim.counters.eeprom_writes == {"acceleration_time": 1}
 
 
-def test_yd_refuses_to_change_some_parameters_while_running(yd: Bench) -> None:
-    assert yd.write(0x0012, 6000) == 0  # lower UL first, because FH may not be below UL
+def test_simulated_yd1000_refuses_to_change_some_parameters_while_running(yd: Bench) -> None:
+    assert yd.write(0x0012, 6000) == 0  # lower UL first, because FH must not be below UL
     assert yd.write(0x0011, 6000) == 0
     yd.write(0x1001, 5000)
     yd.write(0x1000, FORWARD)
     assert yd.write(0x0011, 8000) == 4
 
 
-def test_yd_watchdog_trips_when_the_line_is_silent_too_long(yd: Bench) -> None:
+def test_simulated_yd1000_watchdog_trips_if_the_line_is_silent_too_long(yd: Bench) -> None:
     yd.write(0x0803, 5)
     yd.write(0x1001, 5000)
     yd.write(0x1000, FORWARD)
@@ -787,12 +796,13 @@ def test_yd_watchdog_trips_when_the_line_is_silent_too_long(yd: Bench) -> None:
 # ---- all families ----
 
 
-CONFIRMED = {  # frames that are confirmed with a copy; those of InvtCHE and YD1000 are built
+CONFIRMED = {  # Frames to which the reply is a copy. Those of InvtCHE and YD1000 are built from the tables.
     "erman": (
         lambda: ErmanERG220(1),
         "01 05 00 00 FF 00 8C 3A",  # start
-        "01 06 00 02 01 1D E9 93",  # setpoint 28.5 Hz, with the address corrected
-        "01 06 00 01 01 1D 19 93",  # as printed, to 0001H; the library never sends it
+        "01 06 00 02 01 1D E9 93",  # setpoint 28.5 Hz; the address is corrected
+        # the printed frame with the wrong address 0001H, which the library never sends
+        "01 06 00 01 01 1D 19 93",
         "01 08 00 00 A5 37 DA 8D",
     ),
     "che": (
@@ -827,12 +837,14 @@ CONFIRMED = {  # frames that are confirmed with a copy; those of InvtCHE and YD1
 
 
 @table(("make", "frame"), [(make, frame) for make, *frames in CONFIRMED.values() for frame in frames])
-def test_write_is_confirmed_with_a_copy_of_the_request(make: Callable[[], Drive], frame: str) -> None:
+def test_simulated_drive_confirms_a_write_with_a_copy_of_the_request(
+    make: Callable[[], Drive], frame: str
+) -> None:
     assert Bench(make()).exchange(frame) == frame
 
 
 @table("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, DelixiNative, YD1000])
-def test_every_declared_register_is_readable_and_writable_as_declared(family: type[Drive]) -> None:
+def test_simulated_registers_are_readable_and_writable_as_declared(family: type[Drive]) -> None:
     bench = Bench(family(1))
     for register in family.registers.values():
         if register.readable:
@@ -846,8 +858,8 @@ def test_every_declared_register_is_readable_and_writable_as_declared(family: ty
 
 
 @table("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, DelixiNative, YD1000])
-def test_encoded_drive_of_every_family_reads_its_codes(family: type[Drive]) -> None:
-    """Each register, read with whole frames, has the value that `encoded` or `known_counts` states."""
+def test_encoded_drive_of_every_family_is_read_with_its_numbers(family: type[Drive]) -> None:
+    """Each register, read with whole frames, has the value that `encoded` or `known_counts` returns."""
     drive = family(5)
     known = drive.known_counts()
     wire = Wire([EncodedDrive(drive)], unpaced=True)

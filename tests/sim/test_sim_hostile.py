@@ -1,4 +1,4 @@
-"""The effect of each simulated fault on a line's bytes, and how a faults file is loaded."""
+"""Simulated faults: the effect of each fault on the bytes of a line, and the loading of a faults file."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from multidrop.transport.prepared import make_exchange
 READ = checksums.rtu("01 03 00 02 00 01")
 REPLY = checksums.rtu("01 03 02 00 00")
 START = checksums.rtu("01 06 10 00 C4 00")  # start command of a YD1000
-WHOLE = 5.0  # in this many s every delayed byte arrives
+WHOLE = 5.0  # s after which every delayed byte has arrived
 
 
 class LineClient:
-    """The client of a line with faults, on simulated time that advances with its requests."""
+    """The client of a line with faults. Simulated time advances with its requests."""
 
     def __init__(self, *drives: SimulatedDrive, **faults: Any) -> None:
         self.wire = FaultyWire(drives or [SimulatedDrive(Toy(1))], Faults(**faults))
@@ -53,11 +53,11 @@ def bits(one: bytes, other: bytes) -> int:
     return (int.from_bytes(one) ^ int.from_bytes(other)).bit_count()
 
 
-def test_wire_without_faults_delivers_the_plain_reply() -> None:
+def test_simulated_line_without_faults_delivers_the_plain_reply() -> None:
     assert LineClient().bytes_after() == REPLY
 
 
-def test_same_seed_gives_the_same_faults() -> None:
+def test_simulated_faults_with_the_same_seed_are_the_same() -> None:
     def story(seed: int) -> list[Any]:
         line = LineClient(seed=seed, drop=0.2, delay=0.3, noise=0.2, merge=0.2, split=0.3)
         return [line.after() for _ in range(50)]
@@ -66,28 +66,29 @@ def test_same_seed_gives_the_same_faults() -> None:
 
 
 @table(("fault", "length"), [("drop", -1), ("flip", 0), ("repeat", 1)])
-def test_damaged_frame_has_exactly_one_fault(fault: str, length: int) -> None:
+def test_damaged_frame_has_exactly_one_simulated_fault(fault: str, length: int) -> None:
     line = LineClient(**{fault: 0.5})
     found = [line.bytes_after() for _ in range(200)]
     damaged = [each for each in found if each not in (REPLY, b"")]
-    assert 20 < len(damaged) < 80  # about a quarter: the reply is damaged, but not the request
+    # in about a quarter of the exchanges, the reply is damaged but not the request
+    assert 20 < len(damaged) < 80
     assert {len(each) - len(REPLY) for each in damaged} == {length}
     if fault == "flip":
         assert {bits(each, REPLY) for each in damaged} == {1}
     assert line.wire.struck[fault] >= len(damaged) + found.count(b"")
 
 
-def test_twice_fault_delivers_the_reply_twice() -> None:
+def test_fault_twice_delivers_the_reply_twice() -> None:
     assert LineClient(twice=1).bytes_after() == 2 * REPLY
 
 
-def test_delay_fault_delays_the_reply_by_up_to_late() -> None:
+def test_fault_delay_delays_the_reply_by_up_to_late_seconds() -> None:
     usual = LineClient().after()[0][0]
     delays = [LineClient(delay=1, late=0.5, seed=seed).after()[0][0] - usual for seed in range(50)]
     assert 0 <= min(delays) < 0.1 < 0.4 < max(delays) <= 0.5
 
 
-def test_merge_fault_holds_a_reply_until_the_next_reply() -> None:
+def test_fault_merge_sends_a_reply_together_with_the_next_one() -> None:
     line = LineClient(SimulatedDrive(Toy(1)), SimulatedDrive(Toy(2)), merge=1, late=4.0)
     line.wire.receive(READ, 0.0)
     assert timeline(line.wire, 0.3) == []
@@ -97,14 +98,14 @@ def test_merge_fault_holds_a_reply_until_the_next_reply() -> None:
     assert received[-1][0] < 0.5
 
 
-def test_merge_fault_releases_a_reply_after_late_seconds() -> None:
+def test_fault_merge_sends_a_delayed_reply_after_late_seconds() -> None:
     line = LineClient(merge=1, late=0.2)
     received = line.after()
     assert b"".join(piece for _, piece in received) == REPLY
     assert received[-1][0] < 0.4
 
 
-def test_split_fault_puts_a_pause_inside_the_reply() -> None:
+def test_fault_split_puts_a_pause_inside_the_reply() -> None:
     pauses = []
     for seed in range(50):
         times, pieces = zip(*LineClient(split=1, pause=0.5, seed=seed).after(), strict=True)
@@ -113,11 +114,11 @@ def test_split_fault_puts_a_pause_inside_the_reply() -> None:
     assert max(pauses) > 0.4
 
 
-def test_echo_fault_returns_the_request_before_the_reply() -> None:
+def test_fault_echo_returns_the_request_before_the_reply() -> None:
     assert LineClient(echo=1).bytes_after() == READ + REPLY
 
 
-def test_noise_fault_adds_bytes_before_the_reply() -> None:
+def test_fault_noise_adds_bytes_before_the_reply() -> None:
     lengths = set()
     line = LineClient(noise=1, burst=9)
     for _ in range(100):
@@ -127,12 +128,12 @@ def test_noise_fault_adds_bytes_before_the_reply() -> None:
     assert lengths == set(range(1, 10))
 
 
-def test_start_noise_occurs_only_when_a_motor_starts() -> None:
+def test_fault_start_noise_occurs_only_when_a_motor_starts() -> None:
     line = LineClient(simulated(YD1000(1)), start_noise=1)
     stop = checksums.rtu("01 06 10 00 C0 00")
     assert line.bytes_after(stop) == stop
     assert len(line.bytes_after(START)) > len(START)
-    assert line.bytes_after(START) == START  # the motor runs already
+    assert line.bytes_after(START) == START  # no noise, because the motor already runs
     assert line.wire.struck["start_noise"] == 1
 
 
@@ -140,7 +141,7 @@ def test_start_noise_occurs_only_when_a_motor_starts() -> None:
 
 
 def two_drives(**faults: Any) -> LineClient:
-    """Return the client of a line whose second drive has these faults."""
+    """Return the client of a line with two drives, of which the second has these faults."""
     drives = [SimulatedDrive(Toy(1, name="sound")), SimulatedDrive(Toy(2, name="flaky"))]
     return LineClient(*drives, drives={"flaky": DriveFaults(**faults)})
 
@@ -149,7 +150,7 @@ FLAKY_READ, FLAKY_REPLY = checksums.rtu("02 03 00 02 00 01"), checksums.rtu("02 
 
 
 @table("fault", ["loss", "damage", "delay"])
-def test_a_fault_of_one_drive_affects_only_its_replies(fault: str) -> None:
+def test_simulated_faults_of_one_drive_affect_only_its_replies(fault: str) -> None:
     line = two_drives(**{fault: 1}, late=3.0)
     usual = LineClient().after()[0][0]
     assert line.bytes_after() == REPLY
@@ -165,20 +166,20 @@ def test_a_fault_of_one_drive_affects_only_its_replies(fault: str) -> None:
     assert line.wire.struck == {fault: 1}
 
 
-def test_silence_fault_stops_a_drives_replies_for_its_duration() -> None:
+def test_fault_silence_stops_a_drives_replies_for_its_duration() -> None:
     line = two_drives(silence=30.0, silent_for=9.0, first=10.0)
     replies = [line.bytes_after(FLAKY_READ) == FLAKY_REPLY for _ in range(10)]  # one request every 5 s
     assert replies == [True, True, False, False, True, True, True, True, False, False]
     assert line.bytes_after() == REPLY
 
 
-def test_trip_fault_trips_a_running_motor_and_drift_changes_its_load() -> None:
+def test_fault_trip_trips_a_running_motor_and_fault_drift_changes_its_load() -> None:
     sim = simulated(YD1000(1, name="flaky"))
     assert isinstance(sim, MotorDrive)
     line = LineClient(sim, drives={"flaky": DriveFaults(trip=20.0, first=10.0, drift=0.2)})
     loads = set()
     for _ in range(3):
-        line.after()  # no trip, because the motor is at rest
+        line.after()  # no trip occurs, because the motor is at rest
         loads.add(sim.motor.load)
     assert sim.motor.fault == 0
     assert len(loads) == 3
@@ -189,12 +190,12 @@ def test_trip_fault_trips_a_running_motor_and_drift_changes_its_load() -> None:
 
 
 @table("model", MODELS.values())
-def test_overload_code_of_every_family_is_valid(model: type[Drive]) -> None:
+def test_overload_fault_code_of_every_family_is_valid(model: type[Drive]) -> None:
     drive = model(1)
     assert 0 < overload_code(drive) < 0x10000
 
 
-def test_trip_fault_for_a_drive_without_a_motor_is_refused() -> None:
+def test_fault_trip_is_refused_for_a_drive_without_a_motor() -> None:
     with pytest.raises(
         ValueError, match="flaky has no simulated motor, so it takes no trip and no drift: remove them"
     ):
@@ -205,7 +206,7 @@ def test_trip_fault_for_a_drive_without_a_motor_is_refused() -> None:
 
 
 @pytest.mark.parametrize("port", ["link", "socket://127.0.0.1:0"])
-def test_port_that_hung_up_is_reopened_at_its_path(port: str, tmp_path: Path) -> None:
+def test_simulated_port_that_was_removed_returns_at_its_path(port: str, tmp_path: Path) -> None:
     where = str(tmp_path / port) if port == "link" else port
     wire = FaultyWire([simulated(Toy(1))], Faults(hang_up=1, away=0.02, rename=1), port=where, unpaced=True)
     with Simulator([wire]) as sim:
@@ -223,7 +224,7 @@ def test_port_that_hung_up_is_reopened_at_its_path(port: str, tmp_path: Path) ->
         found = b""
         while not found:
             line = opened(path)
-            with suppress(PortLost):  # connected while the port was closing
+            with suppress(PortLost):  # the client had connected while the port was closing
                 found = read(line)
             line.close()
         assert found == REPLY
@@ -253,7 +254,7 @@ def read(line: Line) -> bytes:
     return found.raw
 
 
-def test_hang_up_fault_for_a_bare_pty_is_refused() -> None:
+def test_fault_hang_up_is_refused_for_a_pty_without_a_link() -> None:
     with pytest.raises(ValueError, match=r"^line: a port that hangs up must be a link or a TCP port"):
         FaultyWire([simulated(Toy(1))], Faults(hang_up=0.1))
 
@@ -267,7 +268,7 @@ def test_every_key_of_a_faults_file_is_loaded(tmp_path: Path) -> None:
     assert load_faults(path) == Faults(**dict.fromkeys(rates_of(Faults), 0.25), late=2.0, seed=3)
 
 
-def test_all_mistakes_of_a_faults_file_are_reported_together(tmp_path: Path) -> None:
+def test_all_mistakes_in_a_faults_file_are_reported_together(tmp_path: Path) -> None:
     path = tmp_path / "faults.toml"
     path.write_text('drop = 1.5\nflips = 0.1\nlate = "soon"\nburst = 0\nseed = "x"\naway = 3\ndelay = true\n')
     with pytest.raises(ValueError, match=re.escape(str(path))) as mistake:
@@ -310,7 +311,7 @@ def test_drive_tables_of_a_faults_file_set_the_drives_faults(tmp_path: Path) -> 
         ("drop =", "is not TOML: "),
     ],
 )
-def test_an_invalid_faults_file_is_refused(text: str | None, sentence: str, tmp_path: Path) -> None:
+def test_invalid_faults_file_is_refused(text: str | None, sentence: str, tmp_path: Path) -> None:
     path = tmp_path / "faults.toml"
     if text is not None:
         path.write_text(text)
@@ -318,7 +319,9 @@ def test_an_invalid_faults_file_is_refused(text: str | None, sentence: str, tmp_
         load_faults(path)
 
 
-def test_the_help_lists_the_keys_of_a_faults_file(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_of_the_simulate_command_lists_the_keys_of_a_faults_file(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert main(["simulate", "--help"]) == 0
     printed = capsys.readouterr().out
     keys = {*rates_of(Faults), *rates_of(DriveFaults), "seed", "late", "silence", "trip"}

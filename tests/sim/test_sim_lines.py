@@ -1,4 +1,4 @@
-"""Simulated lines on real ptys and TCP ports, with a client that is independent of the simulator."""
+"""Simulated lines on real ptys and TCP ports, used by a client that is independent of the simulator."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from multidrop.families.innovert_ibd import InnovertIBD
 from multidrop.families.invt_che import InvtCHE, parameter
 from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, encoded, serve, simulated
 
-READ = Message(1, 0x03, 0x3000, 2)  # a read of a CHE
+READ = Message(1, 0x03, 0x3000, 2)  # a read request to an INVT CHE
 
 
 def wire(*, unpaced: bool = True, port: str = "pty") -> Wire:
@@ -62,7 +62,7 @@ def test_simulated_port_can_be_opened_and_read_repeatedly(port: str, unpaced: bo
         for _ in range(3):
             with opened(sim.wires[0].path) as fd:
                 assert exchange(fd, READ).data == expected()
-            time.sleep(0.005)  # silence before the next request on a paced line
+            time.sleep(0.005)  # a paced line needs silence before the next request
 
 
 def test_ended_simulator_leaves_no_thread_or_descriptor() -> None:
@@ -85,16 +85,17 @@ def test_one_thread_simulates_many_lines() -> None:
                 assert exchange(fd, Message(at, 3, 0x3000, 2)).data == expected(at)
 
 
-def test_paced_reply_is_never_faster_than_the_wire() -> None:
+def test_reply_on_a_paced_line_is_never_faster_than_a_serial_line() -> None:
     with Simulator([wire(unpaced=False)]) as sim, opened(sim.wires[0].path) as fd:
         begin = time.monotonic()
         exchange(fd, READ)
         taken = time.monotonic() - begin
     delay = sim.wires[0].drives[0].delay
-    assert taken >= (8 + 9) * 10 / 9600 + delay  # no upper limit: the test machine may be busy
+    # without an upper limit, because the test machine may be busy
+    assert taken >= (8 + 9) * 10 / 9600 + delay
 
 
-def test_second_tcp_client_is_served_after_the_first_disconnects() -> None:
+def test_simulator_serves_a_second_tcp_client_after_the_first_disconnects() -> None:
     with Simulator([wire(port="socket://127.0.0.1:0")]) as sim, ExitStack() as clients:
         path = sim.wires[0].path
         with opened(path) as first:
@@ -105,8 +106,8 @@ def test_second_tcp_client_is_served_after_the_first_disconnects() -> None:
         assert parse_reply(Framing.RTU, receive(second, 9), READ)[0] == 9
 
 
-def test_second_tcp_client_is_served_after_the_first_resets_its_connection() -> None:
-    """A killed client's connection ends like this: unread bytes are discarded and the connection is reset."""
+def test_simulator_serves_a_second_tcp_client_after_a_connection_reset() -> None:
+    """The connection of a killed client ends like this: with unread bytes and a reset of the connection."""
     with Simulator([wire(port="socket://127.0.0.1:0")]) as sim:
         path = sim.wires[0].path
         host, _, port = path.removeprefix("socket://").partition(":")
@@ -118,7 +119,7 @@ def test_second_tcp_client_is_served_after_the_first_resets_its_connection() -> 
 
 
 class Broken(Wire):
-    """A wire whose method `distort` raises an exception."""
+    """A wire whose method `distort`, which every reply passes, raises an exception."""
 
     def distort(self, reply: bytes) -> bytes:
         raise ZeroDivisionError("a mistake of the test's own")
@@ -135,7 +136,7 @@ def test_exception_in_the_simulator_thread_is_raised_on_exit() -> None:
         ask_in_vain(Broken([EncodedDrive(InvtCHE(1))], unpaced=True))
 
 
-def test_drives_of_three_framings_reply_on_one_line() -> None:
+def test_simulated_drives_with_three_framings_reply_on_one_line() -> None:
     drives = [
         EncodedDrive(InvtCHE(1)),
         simulated(InnovertIBD(2, framing="ascii")),
@@ -148,8 +149,8 @@ def test_drives_of_three_framings_reply_on_one_line() -> None:
         assert exchange(fd, READ).data == expected()
 
 
-def test_drives_ignore_a_client_at_another_baud_rate() -> None:
-    drives = [EncodedDrive(InvtCHE(1)), simulated(ErmanERG220(2))]  # baud rates 9600 and 38400
+def test_simulated_drives_ignore_a_client_at_another_baud_rate() -> None:
+    drives = [EncodedDrive(InvtCHE(1)), simulated(ErmanERG220(2))]  # the baud rates are 9600 and 38400
     state = Message(2, 4, 0x0400, 4)
     with Simulator([Wire(drives, unpaced=True)]) as sim:
         path = sim.wires[0].path
@@ -163,21 +164,21 @@ def test_drives_ignore_a_client_at_another_baud_rate() -> None:
             assert receive(fd, 1, patience=0.05) == b""
 
 
-def test_valid_frame_after_garbage_is_answered() -> None:
+def test_simulated_drive_answers_a_valid_frame_after_garbage() -> None:
     with Simulator([wire()]) as sim, opened(sim.wires[0].path) as fd:
         for garbage in (b"\x00", bytes(range(256)), b":::" * 2000, b"\xff" * 5000):
             os.write(fd, garbage)
-            time.sleep(0.03)  # longer than the silence that ends a frame on an unpaced wire
+            time.sleep(0.03)  # longer than the silence that ends a frame on a wire without delays
             assert exchange(fd, READ).data == expected()
 
 
-def test_unknown_function_gets_an_exception_reply_after_silence() -> None:
+def test_simulated_drive_refuses_an_unknown_function_after_silence() -> None:
     with Simulator([Wire([simulated(ErmanERG220(1))])]) as sim, opened(sim.wires[0].path, 38400) as fd:
         os.write(fd, checksums.rtu("01 2B"))
         assert receive(fd, 5) == checksums.rtu("01 AB 01")
 
 
-def test_named_pty_is_opened_through_its_link(tmp_path: Path) -> None:
+def test_simulated_pty_is_opened_through_its_link(tmp_path: Path) -> None:
     link = tmp_path / "hall-1"
     with Simulator([wire(port=str(link))]) as sim:
         assert sim.wires[0].path == str(link)
@@ -189,7 +190,7 @@ def test_named_pty_is_opened_through_its_link(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("url", ["socket://127.0.0.1", "socket://:5020"])
-def test_tcp_port_without_host_or_port_is_refused(url: str) -> None:
+def test_simulated_tcp_port_without_host_or_port_is_refused(url: str) -> None:
     with pytest.raises(ValueError, match=r"socket://host:port, such as"), Simulator([wire(port=url)]):
         pass
 
@@ -222,8 +223,8 @@ def test_terminated_simulator_process_removes_its_link(tmp_path: Path) -> None:
 PATIENCE = 60.0
 
 
-def test_signal_ends_serve_even_if_its_handler_has_not_run() -> None:
-    """The signal goes to another thread, so that its handler does not run before the main thread sleeps."""
+def test_signal_ends_the_simulator_even_if_its_handler_has_not_run() -> None:
+    """The signal goes to another thread, so its handler does not run before the main thread sleeps."""
 
     def terminate() -> None:
         time.sleep(0.05)
@@ -264,7 +265,9 @@ class IllDrive(EncodedDrive):
         raise Ill("of this drive")
 
 
-def test_failing_drive_gives_no_reply_and_other_wires_continue(caplog: pytest.LogCaptureFixture) -> None:
+def test_simulated_drive_that_fails_sends_no_reply_and_other_lines_continue(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     wires = [Wire([drive], unpaced=True) for drive in (IllDrive(Toy(1)), EncodedDrive(Toy(1)))]
     simulator = Simulator(wires)
 
@@ -282,7 +285,7 @@ def test_failing_drive_gives_no_reply_and_other_wires_continue(caplog: pytest.Lo
     assert [record.name for record in caplog.records if record.levelname == "ERROR"] == ["multidrop.sim"]
 
 
-def test_ended_simulator_thread_logs_its_failure(
+def test_simulator_thread_that_ends_logs_its_failure(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     simulator = Simulator([Wire([EncodedDrive(Toy(1))])])
@@ -299,7 +302,7 @@ def test_ended_simulator_thread_logs_its_failure(
 
 
 @pytest.mark.slow
-def test_speed_makes_simulated_time_pass_faster() -> None:
+def test_option_speed_makes_simulated_time_pass_faster() -> None:
     """With `speed=20` a motor's ramp of 10 s takes less than one second."""
     sim = simulated(YD1000(1))
     with Simulator([Wire([sim])], speed=20) as simulator, Bus(simulator.wires[0].path) as bus:
@@ -307,11 +310,11 @@ def test_speed_makes_simulated_time_pass_faster() -> None:
         fan.set_frequency(50.0)
         fan.start()
         until(lambda: fan.read(fan.output_frequency) == 50.0)
-        assert sim.now > 10 * time.monotonic()  # `now` is the time of the simulator's clock
+        assert sim.now > 10 * time.monotonic()  # `now` is the simulated time in s
 
 
 @table("speed", [0, -1, float("inf"), float("nan")])
-def test_speed_that_is_not_positive_is_refused(speed: float) -> None:
+def test_simulator_speed_that_is_not_positive_is_refused(speed: float) -> None:
     with pytest.raises(ValueError, match="is not a positive number"):
         Simulator([], speed=speed)
 
@@ -326,7 +329,7 @@ class MyCHE(InvtCHE):
 def mbpoll(
     sim: SimulatedDrive, options: str, *values: int, wait: str = "10"
 ) -> subprocess.CompletedProcess[str]:
-    """Run mbpoll once against this drive to read, or to write the values; `wait` is its timeout in s.
+    """Run mbpoll once to read from this drive, or to write the values to it. `wait` is its timeout in s.
 
     The option -P is none, because a pty stores no parity.
     """
@@ -339,7 +342,7 @@ def mbpoll(
 
 
 def values(done: subprocess.CompletedProcess[str]) -> list[str]:
-    """Return the text behind "[address]:" in mbpoll's output."""
+    """Return the texts after "[address]:" in the output of mbpoll."""
     assert done.returncode == 0, done.stderr
     return [line.split()[1] for line in done.stdout.splitlines() if line.startswith("[")]
 

@@ -1,4 +1,4 @@
-"""One line of simulated drives on simulated time: which drives receive a byte, and when."""
+"""A simulated line on simulated time: which drives receive a byte, and when they reply."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def exchange(wire: Wire, frame: bytes, now: float, baudrate: int | None = None) 
     return b"".join(piece for _, piece in timeline(wire, now + 5))
 
 
-def test_reply_starts_after_the_requests_last_bit_and_the_response_delay() -> None:
+def test_simulated_reply_starts_after_the_requests_end_and_the_response_delay() -> None:
     wire = Wire([SimulatedDrive(Own(1, baudrate=9600), response_delay=0.02)])
     wire.receive(READ, 10.0)
     received = timeline(wire, 11.0)
@@ -39,7 +39,7 @@ def test_reply_starts_after_the_requests_last_bit_and_the_response_delay() -> No
 
 
 @table("baudrate", [1200, 9600, 19200, 38400, 115200])
-def test_each_byte_is_delivered_at_its_last_bit_or_slightly_later(baudrate: int) -> None:
+def test_each_simulated_byte_arrives_at_its_last_bit_or_slightly_later(baudrate: int) -> None:
     drive = Own(1, baudrate=baudrate)
     wire = Wire([SimulatedDrive(drive, response_delay=0.05)])
     wire.receive(checksums.rtu("01 03 00 01 00 02"), 0.0)
@@ -49,15 +49,18 @@ def test_each_byte_is_delivered_at_its_last_bit_or_slightly_later(baudrate: int)
     for at, piece in timeline(wire, 1.0):
         passed += len(piece)
         ends = begin + passed * character
-        assert at == pytest.approx(ends)  # the last byte of a piece arrives at its last bit
-        assert at - (ends - (len(piece) - 1) * character) <= max(1e-3, character) + 1e-9  # and the first one
+        assert at == pytest.approx(ends)  # the last byte of each chunk arrives at its last bit
+        # the first byte of each chunk arrives at most 1 ms after its last bit
+        assert at - (ends - (len(piece) - 1) * character) <= max(1e-3, character) + 1e-9
     assert passed == 9
 
 
 @table("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, YD1000])
 @table("extra", [b"\0", b"\x01\x03", b"\xff\xff\xff"])
-def test_valid_frame_followed_by_more_bytes_gets_no_reply(family: type[Drive], extra: bytes) -> None:
-    """The manuals allow no bytes after the checksum (ERMAN, section 5; CHE, 11.5; YD1000, section 5)."""
+def test_simulated_drive_ignores_a_valid_frame_followed_by_more_bytes(
+    family: type[Drive], extra: bytes
+) -> None:
+    """The manuals allow no byte after the checksum (ERMAN, section 5; CHE, 11.5; YD1000, section 5)."""
     wire = Wire([simulated(family(1))])
     register = next(each for each in wire.drives[0].drive.readings() if each.step is not None)
     good = checksums.rtu(f"01 {register.table.read:02X} {register.address:04X} 00 01")
@@ -65,7 +68,7 @@ def test_valid_frame_followed_by_more_bytes_gets_no_reply(family: type[Drive], e
     assert exchange(wire, good, 20.0) != b""
 
 
-def test_rtu_reply_waits_t3_5_even_for_a_shorter_response_delay() -> None:
+def test_simulated_rtu_reply_waits_t3_5_even_with_a_shorter_response_delay() -> None:
     wire = Wire([SimulatedDrive(Own(1, baudrate=9600), response_delay=0.0)])
     wire.receive(READ, 0.0)
     assert timeline(wire, 1.0)[0][0] == pytest.approx((8 + 3.5 + 1) * CHARACTER_8N1)
@@ -80,14 +83,16 @@ def test_rtu_reply_waits_t3_5_even_for_a_shorter_response_delay() -> None:
     ],
     ids=lambda each: getattr(each, "model", None),
 )
-def test_silence_before_a_reply_is_that_of_the_family(drive: Drive, request_: str, silence: float) -> None:
+def test_simulated_silence_before_a_reply_is_that_of_the_family(
+    drive: Drive, request_: str, silence: float
+) -> None:
     wire = Wire([simulated(drive, response_delay=0.0)])
     wire.receive(checksums.rtu(request_), 0.0)
     character = drive.settings.character
     assert timeline(wire, 1.0)[-1][0] == pytest.approx((8 + 7) * character + silence)
 
 
-def test_unpaced_wire_replies_without_delay() -> None:
+def test_simulated_line_without_pacing_replies_without_delay() -> None:
     wire = Wire([SimulatedDrive(Own(1), response_delay=0.5)], unpaced=True)
     wire.receive(READ, 10.0)
     assert wire.advance(10.0) == checksums.rtu("01 03 02 00 00")
@@ -95,7 +100,7 @@ def test_unpaced_wire_replies_without_delay() -> None:
     assert wire.advance(10.0) == checksums.rtu("01 03 02 00 00")
 
 
-def test_request_too_soon_after_a_reply_gets_no_reply() -> None:
+def test_simulated_drive_ignores_a_request_too_soon_after_a_reply() -> None:
     sim = simulated(InnovertIBD(1))
     wire = Wire([sim])
     request = checksums.rtu("01 03 00 03 00 01")
@@ -111,7 +116,7 @@ def test_request_too_soon_after_a_reply_gets_no_reply() -> None:
     assert sim.counters.early == 1
 
 
-def test_request_during_a_reply_gets_no_reply() -> None:
+def test_simulated_drive_ignores_a_request_during_a_reply() -> None:
     sim = SimulatedDrive(Own(1), response_delay=0.02)
     wire = Wire([sim])
     wire.receive(READ, 0.0)
@@ -122,7 +127,7 @@ def test_request_during_a_reply_gets_no_reply() -> None:
     assert sim.counters.requests == 1
 
 
-def test_early_request_is_counted_but_answered_unless_the_manual_forbids() -> None:
+def test_early_request_is_counted_and_answered_unless_the_manual_forbids_it() -> None:
     sim = SimulatedDrive(Own(1), response_delay=0.02)
     wire = Wire([sim])
     wire.receive(READ, 0.0)
@@ -131,7 +136,7 @@ def test_early_request_is_counted_but_answered_unless_the_manual_forbids() -> No
     assert sim.counters.early == 1
 
 
-def test_fast_drives_reply_precedes_a_slow_drives_late_reply() -> None:
+def test_reply_of_a_fast_drive_arrives_before_the_late_reply_of_a_slow_one() -> None:
     slow, quick = SimulatedDrive(Own(1), response_delay=0.5), SimulatedDrive(Own(2), response_delay=0.01)
     slow["value"], quick["value"] = 1, 2
     wire = Wire([slow, quick])
@@ -144,7 +149,7 @@ def test_fast_drives_reply_precedes_a_slow_drives_late_reply() -> None:
     assert received[-1][0] == pytest.approx(0.5 + (8 + 7) * CHARACTER_8N1)
 
 
-def test_overlapping_replies_are_sent_one_after_another() -> None:
+def test_overlapping_simulated_replies_are_sent_one_after_another() -> None:
     slow, quick = SimulatedDrive(Own(1), response_delay=0.5), SimulatedDrive(Own(2), response_delay=0.01)
     wire = Wire([slow, quick])
     wire.receive(READ, 0.0)
@@ -155,7 +160,7 @@ def test_overlapping_replies_are_sent_one_after_another() -> None:
     assert received[-1][0] - received[0][0] == pytest.approx(13 * CHARACTER_8N1)
 
 
-def test_late_reply_is_sent_before_the_reply_to_the_next_request() -> None:
+def test_late_simulated_reply_is_sent_before_the_next_reply() -> None:
     slow, quick = SimulatedDrive(Own(1), response_delay=0.5), SimulatedDrive(Own(2), response_delay=0.01)
     slow["value"], quick["value"] = 1, 2
     wire = Wire([slow, quick])
@@ -165,7 +170,7 @@ def test_late_reply_is_sent_before_the_reply_to_the_next_request() -> None:
     assert received == checksums.rtu("01 03 02 00 01") + checksums.rtu("02 03 02 00 02")
 
 
-def test_drives_of_two_framings_share_a_line() -> None:
+def test_simulated_drives_with_two_framings_share_a_line() -> None:
     rtu, text = Own(1, framing="rtu"), Own(2, framing="ascii")
     native = DelixiNative(3)
     wire = Wire([simulated(rtu), simulated(text), simulated(native)], unpaced=True)
@@ -174,14 +179,14 @@ def test_drives_of_two_framings_share_a_line() -> None:
         (checksums.ascii("020300010001"), checksums.ascii("0203020000")),
         (checksums.delixi("0303000000000000"), checksums.delixi("0303000100000000")),
         (READ, checksums.rtu("01 03 02 00 00")),
-        (checksums.ascii("010300010001"), b""),  # no reply: this address belongs to the RTU drive
+        (checksums.ascii("010300010001"), b""),  # no reply, because this address is that of the RTU drive
         (checksums.rtu("02 03 00 01 00 01"), b""),
     ]:
         wire.receive(frame, 0.0)
         assert wire.advance(10.0) == reply
 
 
-def test_drive_receives_only_its_own_baud_rate() -> None:
+def test_simulated_drive_receives_only_its_own_baud_rate() -> None:
     slow, fast = Own(1, baudrate=9600), Own(2, baudrate=19200)
     wire = Wire([simulated(slow), simulated(fast)])
     other = checksums.rtu("02 03 00 01 00 01")
@@ -189,17 +194,18 @@ def test_drive_receives_only_its_own_baud_rate() -> None:
     assert exchange(wire, READ, 10.0, 9600) != b""
     assert exchange(wire, other, 20.0, 9600) == b""
     assert exchange(wire, other, 30.0, 19200) != b""
-    assert exchange(wire, READ, 40.0, None) != b""  # unknown baud rate: every drive receives
+    # the client's baud rate is unknown, so every drive receives the request
+    assert exchange(wire, READ, 40.0, None) != b""
 
 
-def test_frame_is_dropped_if_the_baud_rate_changes_within_it() -> None:
+def test_frame_is_discarded_if_the_baud_rate_changes_within_it() -> None:
     wire = Wire([simulated(Own(1, baudrate=9600))])
     wire.receive(READ[:4], 0.0, 9600)
     wire.receive(b"", 0.001, 19200)
     assert exchange(wire, READ, 0.002, 9600) != b""
 
 
-def test_all_drives_carry_out_a_broadcast_and_none_replies() -> None:
+def test_all_simulated_drives_carry_out_a_broadcast_and_none_replies() -> None:
     sims = [
         simulated(Own(address, framing=framing))
         for address, framing in ((1, "rtu"), (2, "rtu"), (3, "ascii"))
@@ -209,11 +215,11 @@ def test_all_drives_carry_out_a_broadcast_and_none_replies() -> None:
     assert [sim["value"] for sim in sims] == [42, 42, 0]
 
 
-def test_request_to_an_absent_address_gets_no_reply() -> None:
+def test_request_to_an_absent_simulated_drive_gets_no_reply() -> None:
     assert exchange(Wire([simulated(Own(1))]), checksums.rtu("09 03 00 01 00 01"), 0.0) == b""
 
 
-def test_two_drives_with_the_same_address_are_refused() -> None:
+def test_two_simulated_drives_with_the_same_address_are_refused() -> None:
     with pytest.raises(ValueError, match="the same address"):
         Wire([simulated(Own(1)), simulated(Own(1))])
     Wire([simulated(Own(1)), simulated(Own(1, framing="ascii")), simulated(Own(1, baudrate=19200))])
@@ -221,7 +227,7 @@ def test_two_drives_with_the_same_address_are_refused() -> None:
         Wire([])
 
 
-def test_the_function_distort_can_change_replies() -> None:
+def test_method_distort_of_a_simulated_wire_can_change_replies() -> None:
     class Noisy(Wire):
         def distort(self, reply: bytes) -> bytes:
             return b"\x00" + reply
@@ -229,7 +235,7 @@ def test_the_function_distort_can_change_replies() -> None:
     assert exchange(Noisy([simulated(Own(1))]), READ, 0.0) == b"\x00" + checksums.rtu("01 03 02 00 00")
 
 
-def test_an_idle_wire_has_no_next_wake_up() -> None:
+def test_idle_simulated_wire_has_no_next_wake_up_time() -> None:
     wire = Wire([simulated(each) for each in (ErmanERG220(1), InvtCHE(2), DelixiModbus(3))])
     assert wire.wake is None
     wire.receive(b"\x01", 0.0)
@@ -238,7 +244,7 @@ def test_an_idle_wire_has_no_next_wake_up() -> None:
     assert wire.wake is None
 
 
-def test_path_of_a_wire_that_is_not_open_raises_runtime_error() -> None:
+def test_path_of_a_simulated_wire_that_is_not_open_raises_runtime_error() -> None:
     with pytest.raises(RuntimeError, match="not open"):
         _ = Wire([simulated(Own(1))], name="hall-1").path
 
@@ -249,11 +255,12 @@ def test_path_of_a_wire_that_is_not_open_raises_runtime_error() -> None:
 CHARACTER = 1e-3
 GAP = 3.5e-3
 
-READ_FRAME = bytes.fromhex("01 03 00 01 00 04 15 C9")  # ERMAN, section 6
-WRITE = bytes.fromhex("01 10 00 0C 00 02 04 00 C8 01 90 73 F8")  # ERMAN, section 7
-RUN = b":010620000012C7\r\n"  # Delixi, part 2
+READ_FRAME = bytes.fromhex("01 03 00 01 00 04 15 C9")  # the frame in section 6 of the ERMAN document
+# the frame in section 7 of the ERMAN document
+WRITE = bytes.fromhex("01 10 00 0C 00 02 04 00 C8 01 90 73 F8")
+RUN = b":010620000012C7\r\n"  # the frame in part 2 of Delixi's document
 OVER_TCP = bytes.fromhex("00 01 00 00 00 06 01 03 00 16 00 01")
-NATIVE = b":010200020000000005\r\n"  # Delixi, part 3
+NATIVE = b":010200020000000005\r\n"  # the frame in part 3 of Delixi's document
 
 
 def receiver_rtu() -> Receiver:
@@ -264,13 +271,13 @@ def functions(frames: list[Frame]) -> list[int]:
     return [frame.function for frame in frames if frame.message]
 
 
-def test_frame_has_the_times_of_its_first_and_last_bit() -> None:
+def test_received_frame_has_the_times_of_its_first_and_last_bit() -> None:
     (frame,) = receiver_rtu().feed(READ_FRAME, 10.0)
     assert frame.message is not None
     assert (frame.begin, frame.end) == pytest.approx((10.0, 10.008))
 
 
-def test_frame_received_in_pieces_without_a_gap_is_one_frame() -> None:
+def test_frame_received_in_chunks_without_a_pause_is_one_frame() -> None:
     receiver = receiver_rtu()
     assert receiver.feed(WRITE[:5], 10.0) == []
     (frame,) = receiver.feed(WRITE[5:], 10.005)
@@ -285,7 +292,7 @@ def test_end_of_a_frame_that_arrives_too_fast_is_computed_from_the_baud_rate() -
     assert frame.end == pytest.approx(10.013)
 
 
-def test_gap_within_a_frame_damages_it() -> None:
+def test_pause_within_a_frame_damages_it() -> None:
     receiver = receiver_rtu()
     receiver.feed(READ_FRAME[:4], 10.0)
     assert functions(receiver.feed(READ_FRAME[4:], 10.004 + GAP + 1e-4)) == []
@@ -297,7 +304,7 @@ def test_valid_frame_after_garbage_is_received() -> None:
 
 
 def test_garbage_that_looks_like_a_long_frame_does_not_hide_the_next_frame() -> None:
-    promise = bytes.fromhex("01 10 00 00 00 7B F6")  # header of a request with 246 more bytes
+    promise = bytes.fromhex("01 10 00 00 00 7B F6")  # the header of a request that announces 246 more bytes
     assert functions(receiver_rtu().feed(promise + READ_FRAME, 0.0)) == [3]
 
 
@@ -316,14 +323,14 @@ def test_valid_frame_followed_by_other_bytes_is_not_a_request(extra: bytes) -> N
     assert functions(receiver.feed(READ_FRAME, 2.0)) == [3]
 
 
-def test_a_request_in_pieces_after_another_request_leaves_both_intact() -> None:
+def test_request_in_chunks_after_another_request_leaves_both_intact() -> None:
     receiver = receiver_rtu()
     assert receiver.feed(READ_FRAME + WRITE[:5], 0.0) == []
     assert functions(receiver.feed(WRITE[5:], 0.013)) == [3, 16]
 
 
-def test_request_bytes_inside_a_longer_request_are_not_a_request() -> None:
-    """A long frame contains a valid request. The frame's first piece ends some bytes after that request."""
+def test_valid_request_inside_a_longer_request_is_not_a_request() -> None:
+    """A long frame contains a valid request. Its first chunk ends some bytes after that request."""
     whole = checksums.rtu(bytes.fromhex("01 10 00 00 00 0C 18") + READ_FRAME + bytes(16))
     receiver = receiver_rtu()
     frames = receiver.feed(whole[:20], 0.0) + receiver.feed(whole[20:], 0.02)
@@ -332,7 +339,8 @@ def test_request_bytes_inside_a_longer_request_are_not_a_request() -> None:
 
 def test_damaged_frame_is_reported_after_silence() -> None:
     receiver = receiver_rtu()
-    bad = bytes.fromhex("01 04 00 01 00 05 15 C9")  # ERMAN, section 6: misprinted
+    # the frame in section 6 of the ERMAN document, with its misprinted checksum
+    bad = bytes.fromhex("01 04 00 01 00 05 15 C9")
     assert receiver.feed(bad, 0.0) == []
     assert receiver.silent_at == pytest.approx(0.008 + GAP)
     (frame,) = receiver.silence(1.0)
@@ -340,7 +348,7 @@ def test_damaged_frame_is_reported_after_silence() -> None:
     assert receiver.silent_at is None
 
 
-def test_frame_of_unknown_function_ends_with_silence() -> None:
+def test_frame_with_an_unknown_function_ends_with_silence() -> None:
     receiver = receiver_rtu()
     assert receiver.feed(checksums.rtu("01 2B"), 0.0) == []
     assert receiver.silence(0.004 + GAP / 2) == []
@@ -349,7 +357,7 @@ def test_frame_of_unknown_function_ends_with_silence() -> None:
 
 
 @table(("framing", "text"), [(Framing.ASCII, RUN), (Framing.DELIXI, NATIVE)])
-def test_an_ascii_or_delixi_frame_is_complete_at_its_line_end(framing: Framing, text: bytes) -> None:
+def test_ascii_or_delixi_frame_is_complete_at_its_line_end(framing: Framing, text: bytes) -> None:
     receiver = Receiver(framing, CHARACTER, 1.0)
     assert receiver.feed(text[:7], 0.0) == []
     (frame,) = receiver.feed(text[7:], 0.5)
@@ -373,7 +381,7 @@ def test_incomplete_text_frames_are_ignored(text: bytes) -> None:
 
 @pytest.mark.slow
 @table("framing", list(Framing))
-def test_random_bytes_never_raise_or_exceed_the_buffer_limit(framing: Framing) -> None:
+def test_random_bytes_neither_raise_nor_exceed_the_buffer_limit(framing: Framing) -> None:
     randomness = random.Random(1)
     good = {Framing.RTU: READ_FRAME, Framing.ASCII: RUN, Framing.DELIXI: NATIVE, Framing.TCP: OVER_TCP}[
         framing
