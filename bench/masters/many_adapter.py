@@ -154,9 +154,9 @@ class Judged:
 
     exchanges: int = 0  # requests that were sent
     samples: int = 0
-    wrong: int = 0  # values that belong to another register
+    wrong: int = 0  # values that belonged to another register
     beyond: int = 0  # wrong values from requests sent more than three time-outs earlier
-    late: int = 0  # replies that were recognised after their time-out
+    late: int = 0  # late replies that were recognised as such
     misses: Counter[str] = field(default_factory=Counter)
     asked_ns: dict[tuple[str, int], int] = field(default_factory=dict)  # unanswered requests
 

@@ -23,7 +23,7 @@ from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 from multidrop.sim import EncodedDrive, Faults, FaultyWire, Simulator, Wire, proof, serve, simulated
 
-VARIANTS = (  # name, model, framing
+VARIANTS = (  # a simulated drive's name, model and framing
     ("erman", "erman-er-g-220", "rtu"),
     ("che", "invt-che", "rtu"),
     ("ibd", "innovert-ibd", "rtu"),
@@ -36,8 +36,8 @@ VARIANTS = (  # name, model, framing
 OPTIONS = {"maximum_frequency": 50}
 MOTOR = "fan"
 EVERY = 2.0  # s, period of each drive's first register; the other registers have no rate
-PATIENCE = 30.0  # s, limit for the simulator's start
-BEAT = 5e-3  # s, between two measurements of delays
+PATIENCE = 30.0  # longest wait for the simulator's start, in s
+BEAT = 5e-3  # time between two measurements of the simulator's delays, in s
 LONG = 30e-3  # s; after a longer delay of the simulator, a reply may miss its time-out
 
 

@@ -18,7 +18,7 @@ from responder import ReceivedFrame, Responder, ResponderLine
 from responder_drives import KINDS, ResponderDrive
 
 CLIENT = "bench.players.stop_client"
-PATIENCE = 150.0  # s, limit for a client's end
+PATIENCE = 150.0  # longest wait for the end of a client, in s
 
 
 @dataclass
@@ -29,7 +29,7 @@ class Counters:
     asked: int = 0
     turning: int = 0  # motors that still turn after the stop
     moved: int = 0  # frames that move a motor after its stop
-    unsent: int = 0  # stops that never reached the wire
+    unsent: int = 0  # stops of which no frame reached the line
     excused: int = 0  # motors that turn after an aborted stop that was reported
     first_ms: list[float] = field(default_factory=list)  # ms from each request to the first stop frame
     stories: list[str] = field(default_factory=list)

@@ -56,7 +56,7 @@ class Counts(NamedTuple):
     at: float
     exchanges: float
     samples: float
-    misses: Mapping[str, float]  # number by reason
+    misses: Mapping[str, float]  # number of missing values, by reason
 
 
 class Used(NamedTuple):
@@ -219,7 +219,7 @@ class Hall:
     def __init__(self, pumps: SimulatedPumps, plant: Path, place: Place, before: Sequence[str]) -> None:
         self.pumps, self.plant, self.place, self.before = pumps, plant, place, before
         self.failures: Counter[str] = Counter()
-        self.missed: Counter[str] = Counter()  # by kind of measurement and reason
+        self.missed: Counter[str] = Counter()  # number of missing values, by kind of measurement and reason
         self.counts: dict[str, float] = {}
         self.loaded_s = 0.0
 

@@ -31,7 +31,7 @@ from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, Wire, simulated
 
-PATIENCE = 30.0  # s, limit for a thread's end
+PATIENCE = 30.0  # longest wait for a thread's end, in s
 HEAD: tuple[str, ...] = (
     "exchanges",
     "a second",
@@ -207,7 +207,7 @@ def main() -> int:
                 this_round.run(60 * arguments.minutes / arguments.rounds)
                 exchanges, lost = this_round.told()
                 descriptors = len(list(Path("/proc/self/fd").iterdir()))
-                gc.collect()  # frees reference cycles
+                gc.collect()  # objects in reference cycles would count as a leak
                 seen.append((resident_kb(os.getpid()), descriptors, threading.active_count()))
                 cells = (
                     exchanges,

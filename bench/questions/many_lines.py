@@ -33,7 +33,7 @@ BAUDRATE = 115200
 DELAY_US = 2000
 SETTLE_S = 2.0  # time for the first exchanges of thousands of drives
 DESCRIPTORS = 5  # a poller's descriptors per line: port and two pipes; responders need fewer
-OTHERS = 64  # other descriptors of the process
+OTHERS = 64  # descriptors that the process needs besides its lines
 PTYS = Path("/proc/sys/kernel/pty")
 
 

@@ -30,7 +30,7 @@ from bench.support import tables
 from multidrop import InvtCHE
 
 LINES = (11, 10, 10)  # numbers of drives on each line
-SLOW = 8000  # bytes per second
+SLOW = 8000  # rate of the slow network, in bytes per second
 LOOK_MS = 10
 AGES = """async ([seconds, every]) => {
   const { store } = await import('/page/data/store.js');

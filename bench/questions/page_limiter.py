@@ -19,7 +19,7 @@ from typing import Any
 from bench.players.slow_way import slow_way
 from bench.support import tables
 
-RATES = (8000, 4000)  # bytes per second
+RATES = (8000, 4000)  # limited rates, in bytes per second
 SIZES = (0, 300, 1000, 1300, 1600, 3000)  # bytes of an answer's body; its headers have 80 more
 PAUSE_MS = 250  # longest pause between two requests
 ASK = """async ([size, pauses]) => {

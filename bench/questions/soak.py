@@ -247,7 +247,7 @@ def main() -> int:
         f"faults of {arguments.faults.name}."
     )
     with TemporaryDirectory(prefix="multidrop-soak-") as name:
-        os.environ["XDG_STATE_HOME"] = name  # folder of the EEPROM ledger
+        os.environ["XDG_STATE_HOME"] = name  # the EEPROM ledger is in a folder below this one
         directory = Path(name)
         path = plants.write_plant(directory, arguments.lines)
         with plants.running(plants.hostile_wires, path, load_faults(arguments.faults)) as simulator:

@@ -22,7 +22,7 @@ from bench.support import tables
 from bench.support.programs import busy_loops, paced_line
 
 BARE = "bare C"
-QUIET = "multidrop, quiet"  # multidrop without busy loops
+QUIET = "multidrop, quiet"  # name of the row for multidrop without busy loops
 BARE_REALTIME = "bare C, realtime"
 TCP_START_MS = 1500  # start of a run, not counted: a new connection delays single bytes
 ASLEEP = "bare C, asleep"  # sleeps until 1.5 characters before a reply's end, as multidrop does

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 OPEN_METRICS = "application/openmetrics-text"
 OPEN_METRICS_TYPE = f"{OPEN_METRICS}; version=1.0.0; charset=utf-8"
-PLAIN_TYPE = "text/plain; version=0.0.4; charset=utf-8"  # Prometheus' own form, which promtool reads
+# text format of Prometheus, which the program promtool reads
+PLAIN_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 # replacements for kinds of metrics that the plain format lacks
 PLAIN_KINDS = {"info": "gauge", "stateset": "gauge"}
 # In the plain format, the names of these kinds of metrics end in a suffix.

@@ -90,7 +90,7 @@ def _simulate(
     loaded = plant if isinstance(plant, Plant) else Plant.load(plant)
     faults = faults or Faults()
     for name in faults.drives:
-        loaded.find_drive(name)  # raises ValueError for an unknown drive
+        loaded.find_drive(name)  # called only because it raises ValueError for an unknown drive
     make = simulated if capture is None else Replay(capture, loaded).drive
     # a pty cannot be reopened under its old name
     serial = "socket://127.0.0.1:0" if faults.hang_up else "pty"

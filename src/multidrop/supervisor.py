@@ -154,7 +154,7 @@ class Supervisor:
                 settle = partial(future.set_exception, for_a_future(failure))
             try:
                 loop.call_soon_threadsafe(finish, settle)
-            except RuntimeError:  # the loop is closed
+            except RuntimeError:  # the event loop was closed while the thread worked
                 _log.warning("%s ended after the gateway: %s", name, settle.args[0])
 
         thread = threading.Thread(

@@ -48,7 +48,7 @@ _TYPES: Mapping[type, Mapping[str, Any]] = {
 }
 
 
-DRAFT = "http://json-schema.org/draft-07/schema#"  # the version of JSON Schema
+DRAFT = "http://json-schema.org/draft-07/schema#"  # the JSON Schema version that the schemas use
 
 
 def json_schema(keys: Mapping[str, Key], **more: Any) -> dict[str, Any]:
@@ -220,7 +220,7 @@ def _shown(value: Any) -> str:
 
 
 MOST_SHOWN = 60  # limit of a table's or a list's characters in an error
-_SHORTEST, _LONGEST = 100e-6, 86400.0  # limits of a duration in s
+_SHORTEST, _LONGEST = 100e-6, 86400.0  # shortest and longest duration, in s
 _DURATION = r"(\d+(?:\.\d+)?)\s*(us|ms|s|min|h)"
 _TOO_SHORT = r"0*\d{0,2}(\.\d+)?\s*us"
 _TOO_LONG = r"0*(2[5-9]|[3-9]\d|[1-9]\d{2,})(\.\d+)?\s*h"

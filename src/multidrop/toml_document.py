@@ -9,7 +9,7 @@ from typing import Any
 
 from multidrop.toml_syntax import syntax_mistake
 
-MOST_PARTS = 100  # limit of parts in a dotted key
+MOST_PARTS = 100  # most parts that a dotted key may have
 
 
 class DocumentError(ValueError):
@@ -35,7 +35,7 @@ def read_document(path: Path, what: str) -> dict[str, Any]:
     """
     try:
         if path.is_char_device():
-            raise DocumentError(f"is a device, not a {what}")
+            raise DocumentError(f"this is a device, not a {what}")
         data = path.read_bytes()
     except OSError as failure:
         raise DocumentError(f"the {what} cannot be read: {failure.strerror}") from failure
@@ -62,25 +62,25 @@ def parse_document(data: bytes) -> dict[str, Any]:
         document = tomllib.loads(f"{text}\n")
         fits = _fits(document)
     except RecursionError as failure:
-        raise DocumentError("is nested too deeply") from failure
+        raise DocumentError("the file is nested too deeply") from failure
     except tomllib.TOMLDecodeError as failure:
         line, sentence = syntax_mistake(text, str(failure))
-        raise DocumentError(f"is not TOML: {sentence}", line) from failure
+        raise DocumentError(f"the file is not TOML: {sentence}", line) from failure
     except ValueError as failure:
-        raise DocumentError(f"is not TOML: {failure}") from failure
+        raise DocumentError(f"the file is not TOML: {failure}") from failure
     if not fits:
-        raise DocumentError("is not TOML: a number does not fit into 64 bits")
+        raise DocumentError("the file is not TOML: a number does not fit into 64 bits")
     return document
 
 
 def _decoded(data: bytes) -> str:
     if data.startswith((b"\xff\xfe", b"\xfe\xff")) or data[:4].count(0) == 2:
-        raise DocumentError("is not text in UTF-8, but in UTF-16; save it as UTF-8")
+        raise DocumentError("the file is not text in UTF-8, but in UTF-16; save it as UTF-8")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as failure:
         at = failure.start
-        sentence = f"is not text in UTF-8, from byte {at} on (0x{data[at]:02X}); save it as UTF-8"
+        sentence = f"the file is not text in UTF-8, from byte {at} on (0x{data[at]:02X}); save it as UTF-8"
         raise DocumentError(sentence, 1 + data[:at].count(b"\n")) from failure
 
 

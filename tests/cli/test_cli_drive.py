@@ -287,7 +287,7 @@ def test_input_typed_before_the_question_does_not_answer_it(monkeypatch: pytest.
 
     os.write(terminal, b"y\n")
     with os.fdopen(program) as keyboard, os.fdopen(terminal, "rb"):
-        assert select.select([keyboard], [], [], 10)[0]  # the typed input has arrived
+        assert select.select([keyboard], [], [], 10)[0]  # wait until the typed input has arrived
         monkeypatch.setattr("sys.stdin", keyboard)
         monkeypatch.setattr("sys.stderr", Screen())
         with pytest.raises(WriteForbidden, match="nothing was sent"):
@@ -391,7 +391,7 @@ def test_a_damaged_reply_is_reported_in_one_sentence(run: Run, toy: SimulatedDri
         )
 
 
-def test_a_port_in_use_is_reported_and_its_stop_is_reported_as_not_sent(run: Run, port: str) -> None:
+def test_a_stop_on_a_port_in_use_is_reported_as_not_sent(run: Run, port: str) -> None:
     holder = (
         "import serial, sys; port = serial.Serial(sys.argv[1], exclusive=True);"
         "print('held', flush=True); sys.stdin.read()"

@@ -41,7 +41,7 @@ def crowded(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_plan_that_fits_returns_0_and_prints_its_rates(run: Run, fitting: Path) -> None:
+def test_plan_prints_the_rates_and_returns_0_if_the_line_can_reach_them(run: Run, fitting: Path) -> None:
     status, out, err = run("plan", fitting)
     assert (status, err) == (0, "")
     lines = out.splitlines()
@@ -74,7 +74,7 @@ def test_long_names_are_shortened_to_aligned_columns(run: Run, tmp_path: Path) -
     assert {columns_of(row) for row in (first, second, chinese)} == {columns_of(head)}
 
 
-def test_a_plan_in_json_has_the_same_figures(run: Run, fitting: Path) -> None:
+def test_plan_prints_the_same_figures_as_json(run: Run, fitting: Path) -> None:
     status, out, _ = run("plan", fitting, "--json")
     line = json.loads(out)["lines"]["hall-1"]
     assert (status, line["fits"], line["misfits"], line["remedies"], line["warnings"]) == (
@@ -100,7 +100,7 @@ def test_a_plan_in_json_has_the_same_figures(run: Run, fitting: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_plan_that_does_not_fit_returns_1_with_suggestions(run: Run, crowded: Path) -> None:
+def test_plan_prints_suggestions_and_returns_1_if_the_line_is_too_slow(run: Run, crowded: Path) -> None:
     status, out, err = run("plan", crowded)
     assert (status, err) == (1, "")
     assert max(map(len, out.splitlines())) <= 80
@@ -145,7 +145,7 @@ def test_polling_all_readings_in_single_requests_causes_a_warning(
     assert "?" not in run("plan", path)[1]
 
 
-def test_a_plan_includes_the_time_of_switching_settings(run: Run, tmp_path: Path) -> None:
+def test_plan_includes_the_time_to_switch_between_line_settings(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(
         LINE.format("hall-1", 1) + DRIVE.format("p", "yd1000", 1) + 'poll = ["output_current"]\n'
@@ -163,7 +163,7 @@ def test_a_plan_includes_the_time_of_switching_settings(run: Run, tmp_path: Path
     )
 
 
-def test_plans_with_long_names_stay_within_80_columns(run: Run, tmp_path: Path) -> None:
+def test_plan_prints_long_names_within_80_columns(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     name = "the pump behind the second door on the left of the hall with the blue floor"
     path.write_text(LINE.format(name, 1) + DRIVE.format(name, TOY, 1) + 'every = "1 ms"\n')

@@ -176,7 +176,7 @@ def test_poll_records_as_many_rows_as_its_summary_counts(run: Run, plant: Path, 
     assert summary["lines"]["hall-1"]["utilisation"] > 0
 
 
-def test_a_polls_recording_describes_its_registers(run: Run, plant: Path, tmp_path: Path) -> None:
+def test_a_recording_made_by_poll_describes_its_registers(run: Run, plant: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.arrows"
     run("poll", plant, "--seconds", 0.1, "--out", out)
     drive = open_recording(out).metadata["drives"]["pump-1"]
@@ -446,7 +446,7 @@ def test_a_killed_demo_leaves_no_simulator(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_poll_records_triggers(run: Run, plant: Path, tmp_path: Path) -> None:
+def test_poll_records_each_trigger_in_its_own_file(run: Run, plant: Path, tmp_path: Path) -> None:
     condition = "integral(pump-1.output_current >= 0) > 0.3"
     options = ("--trigger", condition, "--trigger", "fault", "--pre", "100 ms", "--post", "200 ms")
     for number in (1, 2):  # each run starts the integral of the trigger's condition at 0

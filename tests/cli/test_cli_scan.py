@@ -184,7 +184,7 @@ def test_a_failed_scan_leaves_no_plant_file(run: Run, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_every_kind_of_finding_is_printed_as_a_sentence() -> None:
+def test_every_kind_of_scan_result_is_printed_as_a_sentence() -> None:
     found = Found(5, USUAL, Framing.RTU, ("yd1000", "delixi-modbus"), 0.0051, "1 of 9 replies were damaged")
     assert sentence(found) == (
         "address 5: yd1000 or delixi-modbus at 9600 8N1 rtu, response delay 5.1 ms "
@@ -197,7 +197,7 @@ def test_every_kind_of_finding_is_printed_as_a_sentence() -> None:
     assert sentence(Untried(USUAL, Framing.RTU, "no parity")) == "not asked at 9600 8N1 rtu: no parity"
 
 
-def test_doubts_of_findings_are_comments_in_the_plant_file(tmp_path: Path) -> None:
+def test_doubts_about_a_found_drive_are_comments_in_the_plant_file(tmp_path: Path) -> None:
     families = {each.model: each for each in (InvtCHE, InnovertIBD, DelixiModbus)}
     found = [
         Found(4, USUAL, Framing.RTU, (), 0.005),
@@ -363,7 +363,7 @@ def test_ports_lists_existing_ports_with_adapter_and_driver(
     )
 
 
-def test_without_any_port_the_advice_is_to_plug_one_in(
+def test_ports_advises_to_plug_in_an_adapter_if_there_is_no_port(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(multidrop.cli.scan, "_linux_ports", lambda: iter(()))
@@ -373,7 +373,9 @@ def test_without_any_port_the_advice_is_to_plug_one_in(
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="permissions of POSIX")
-def test_advice_names_the_group_that_owns_the_port(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ports_names_the_group_whose_members_may_open_a_port(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import grp
     import pwd
 

@@ -102,7 +102,7 @@ def test_polled_values_are_sniffed_captured_and_decoded(
     assert {exchange["line"] for exchange in sniffer.exchanges} == {"hall-1"}
 
 
-def test_the_listener_has_no_way_to_send(line: tuple[str, str]) -> None:
+def test_the_listener_of_sniff_cannot_send(line: tuple[str, str]) -> None:
     with (
         closing(Listener(line[1], Settings(9600, "8N1"))) as listener,
         pytest.raises(OSError, match="Bad file"),
@@ -249,7 +249,9 @@ def delixi_plant(directory: Path) -> Path:
 
 
 @pytest.mark.parametrize("command", [["decode"], ["sniff", "--replay"]])
-def test_a_capture_is_printed_with_units(run: Run, capture: Path, command: list[str]) -> None:
+def test_decode_prints_the_values_of_a_capture_with_units(
+    run: Run, capture: Path, command: list[str]
+) -> None:
     status, out, err = run(*command, capture, "--plant", delixi_plant(capture.parent))
     assert (status, err) == (0, "")
     assert [line.partition("  ")[2] for line in out.splitlines()[:4]] == [
@@ -261,7 +263,7 @@ def test_a_capture_is_printed_with_units(run: Run, capture: Path, command: list[
     assert out.splitlines()[4:] == ["2 exchanges, 1 request without a reply, 2 unknown bytes"]
 
 
-def test_a_capture_without_a_plant_is_printed_as_raw_registers(run: Run, capture: Path) -> None:
+def test_decode_without_a_plant_file_prints_raw_registers(run: Run, capture: Path) -> None:
     out = run("decode", capture)[1]
     assert "  address 1  reads holding_register_500 = 5000  " in out
     objects = [json.loads(line) for line in run("decode", capture, "--json")[1].splitlines()]
@@ -300,7 +302,7 @@ def told(run: Run, path: Path, frames: Iterable[tuple[bytes, Side]], *words: obj
     return [line.partition("  ")[2] or line for line in out.splitlines()]
 
 
-def test_requests_other_than_reads_are_printed_too(run: Run, tmp_path: Path) -> None:
+def test_decode_prints_requests_other_than_reads(run: Run, tmp_path: Path) -> None:
     delixi = (4, 0x02, 1, 0, bytes(4))
     frames = [
         frame(False, 1, 0x03, 0, 0, b"\x13\x88"),

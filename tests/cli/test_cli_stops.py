@@ -133,7 +133,7 @@ def test_an_interrupted_stop_is_sent_once_more(run: Run, che: Che) -> None:
     status, _, err = run("stop", *words)
     assert status == 130
     until(lambda: len(received.writes) >= begun + 3)  # the last write may arrive late
-    # The last write ends a jog.
+    # The last write is the one that ends a jog.
     assert [write.data for write in received.writes[begun:]] == [b"\0\5", b"\0\5", b"\0\x08"]
     assert "the stop was sent" in err
     assert "multidrop: to stop it, type: multidrop stop " in err
@@ -265,7 +265,8 @@ def test_a_stop_from_the_monitor_continues_after_its_terminal_was_closed(
     assert received.starts == received.starts[:1]
     until(lambda: received.sim["status"] == 3)
     rows = [row for batch in open_recording(out) for row in batch]
-    assert rows[-1].register in {row.register for row in rows[:-1]}  # the recording was completed and closed
+    # the recording can be read to its end, because it was closed
+    assert rows[-1].register in {row.register for row in rows[:-1]}
 
 
 @pytest.mark.long

@@ -99,7 +99,7 @@ def test_doctor_says_that_the_adapter_of_a_pyserial_port_is_at_the_far_end(run: 
     assert "at the far end" in told
 
 
-def test_a_port_lost_during_the_echo_test_is_part_of_the_finding(run: Run) -> None:
+def test_doctor_reports_a_port_lost_during_the_echo_test(run: Run) -> None:
     port, hang_up = vanishing_pty()
     thread = threading.Thread(target=hang_up)
     thread.start()
@@ -276,7 +276,7 @@ def test_a_gateways_exception_proves_its_framing_but_noise_does_not(
 
 
 @pytest.mark.slow
-def test_a_drive_that_refuses_counts_as_present_and_its_code_is_printed(run: Run, responder: Any) -> None:
+def test_doctor_prints_the_exception_code_of_a_drive_that_refuses(run: Run, responder: Any) -> None:
     end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=6)))
     status, told = examined(run, end.path, *CHE_9)
     assert (status, "invt-che@9 answers in" in told) == (0, True)

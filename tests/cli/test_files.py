@@ -32,7 +32,7 @@ from multidrop.polling.batch import Batch
 from multidrop.recording import RecordingError, open_recording
 
 
-def test_a_page_that_does_not_fit_on_the_disk_leaves_no_file(tmp_path: Path) -> None:
+def test_a_file_that_does_not_fit_on_the_disk_is_removed(tmp_path: Path) -> None:
     page = tmp_path / "report.html"
     with full_at(100), pytest.raises(OSError, match=f"^{page}: cannot be written: File too large"):
         write_new(page, "x" * 101)

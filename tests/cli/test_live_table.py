@@ -101,7 +101,7 @@ def test_terminal_shows_the_signal_around_the_last_trigger(plant: Path, tmp_path
         terminal.wait_for("1 trigger recorded")
 
 
-def test_picture_of_a_trigger_has_its_signals_and_its_moment(
+def test_the_picture_of_a_trigger_shows_its_signals_and_its_moment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     about = {"condition": "a.i > 3", "time_ns": 2 * 10**9, "pre_s": 1.0, "post_s": 3.0}
@@ -161,7 +161,7 @@ def drawings(tmp_path: Path, encoding: str, size: list[int], *widths: int) -> li
     return found
 
 
-def test_a_table_line_that_is_cut_ends_with_a_mark(tmp_path: Path, size: list[int]) -> None:
+def test_a_line_cut_to_the_terminals_width_ends_with_a_mark(tmp_path: Path, size: list[int]) -> None:
     whole, narrow = drawings(tmp_path, "utf-8", size, 80, 40)
     head = "DRIVE   SAMPLES  MISSES  NEWEST VALUES\n"
     assert whole == f"{head}{WIDE_NAME}        1       0  output_frequency 42.50 Hz\n"

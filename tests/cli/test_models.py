@@ -249,7 +249,8 @@ def test_bash_completes_words_with_the_generated_script(run: Run, tmp_path: Path
 def test_models_lists_the_families(run: Run) -> None:
     status, out, _ = run("models")
     assert status == 0
-    lines = [line for line in out.splitlines()[1:-2] if line[0] != " "]  # indented lines continue a title
+    # leave out indented lines, which continue the title above them
+    lines = [line for line in out.splitlines()[1:-2] if line[0] != " "]
     assert [line.split()[0] for line in lines] == [*MODELS, *SHIPPED]
     assert max(map(len, out.splitlines())) <= 80
     titles = " ".join(out.split())

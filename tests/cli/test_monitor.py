@@ -211,7 +211,8 @@ def test_a_slowly_polled_value_is_current_for_three_periods(tmp_path: Path) -> N
     drive.add(row("drive-1", "output_frequency", 42.5))
     ages = [drive.is_old("output_frequency", NOW + seconds * SECOND) for seconds in (100, 170, 190)]
     assert ages == [False, False, True]
-    planned = plant.metadata()["planned"] | {"hall-1": {"cycle_ms": 100_000.0}}  # a line with many drives
+    # the line has so many drives that a bus cycle takes 100 s
+    planned = plant.metadata()["planned"] | {"hall-1": {"cycle_ms": 100_000.0}}
     (drive,) = LivePlant(plant, planned).drives
     drive.add(row("drive-1", "output_frequency", 42.5))
     assert [drive.is_old("output_frequency", NOW + seconds * SECOND) for seconds in (290, 310)] == [
@@ -223,7 +224,7 @@ def test_a_slowly_polled_value_is_current_for_three_periods(tmp_path: Path) -> N
 def test_reads_of_unpolled_registers_take_at_most_5_percent_of_a_lines_time(tmp_path: Path) -> None:
     for utilisation, share in ((0.2, 0.05), (0.97, 0.03), (1.0, 0.01), (3.0, 0.01)):
         assert 0.03 / (0.03 + pause_s(0.03, utilisation)) == pytest.approx(share)
-    assert pause_s(0.001, 0.2) == 0.1  # minimum pause, on a fast line
+    assert pause_s(0.001, 0.2) == 0.1  # a fast read is followed by the minimum pause
     plant = a_plant(tmp_path, 1)
     (drive,) = LivePlant(plant, plant.metadata()["planned"]).drives
     assert drive.line_utilisation == 1.0  # this drive is polled as fast as the line allows
@@ -266,7 +267,7 @@ def test_the_narrowest_picture_shows_the_age_and_all_keys(tmp_path: Path, name: 
     assert shown[2].split()[-1] == "AGE"
     assert shown[3].rstrip().endswith(" never")
     assert columns_of(shown[3]) <= LEAST_WIDTH
-    assert columns_of(shown[3].rstrip()) == len(shown[2].rstrip())  # the value is aligned with its heading
+    assert columns_of(shown[3].rstrip()) == len(shown[2].rstrip())  # the age ends where its heading ends
     for lines in (shown, texts(page(live.drives[0], {}, Position(), size, NOW))):
         assert lines[-1].endswith("s stop   S stop all   q quit")
 
@@ -293,7 +294,7 @@ def test_the_overview_shows_the_last_trigger_if_it_has_room(watched: LivePlant) 
         assert all(any(drive.name in line for line in lines) for drive in watched.drives)
 
 
-def test_a_drives_page_shows_every_register(watched: LivePlant) -> None:
+def test_the_page_of_a_drive_shows_every_register(watched: LivePlant) -> None:
     live = watched.drives[1]
     others = {"motor_speed": SideRead("0 rpm", NOW - 14 * SECOND)}
     lines = texts(page(live, others, Position(1, page=True), (80, 40), NOW))
@@ -329,7 +330,7 @@ def test_a_wide_overview_shows_response_delays(watched: LivePlant) -> None:
     assert " ms " not in lines[4]
 
 
-def test_a_page_shows_the_drives_response_delays(watched: LivePlant) -> None:
+def test_the_page_of_a_drive_shows_its_response_delays(watched: LivePlant) -> None:
     lines = texts(page(watched.drives[0], {}, Position(0, page=True), (100, 40), NOW))
     assert lines[1] == " running      12 missed: bad checksum 9, no reply 3"
     assert lines[2] == " 50.0 exchanges/s  delay 8.9 ms, p99 8.9, max 31.0  2 late  17 bytes skipped"
@@ -337,7 +338,7 @@ def test_a_page_shows_the_drives_response_delays(watched: LivePlant) -> None:
     assert silent[2] == " 0.0 exchanges/s"
 
 
-def test_a_page_scrolls_to_its_last_row(watched: LivePlant) -> None:
+def test_the_page_of_a_drive_scrolls_to_its_last_row(watched: LivePlant) -> None:
     at = Position(0, page=True, scrolled=1000)
     lines = texts(page(watched.drives[0], {}, at, (80, 12), NOW))
     assert lines[9].strip()
@@ -444,7 +445,8 @@ def test_without_threads_stops_are_sent_to_all_lines_before_waiting_for_one(scre
         def stop_all(self, *, seconds: float | None = None) -> dict[str, Stopped]:
             asked.append((self.line, seconds))
             if (self.line, seconds) == ("hall-2", 0.0):
-                raise OSError("the ledger cannot be kept")  # this must not delay other lines' stops
+                # this failure must not delay the stops on other lines
+                raise OSError("the ledger cannot be kept")
             return {self.line: Stopped(self.line, Seen.STOPPED, 0.1)}
 
     (line,) = monitor._plant.plant.lines
@@ -458,7 +460,7 @@ def test_without_threads_stops_are_sent_to_all_lines_before_waiting_for_one(scre
     assert monitor._at.failures == []
 
 
-def test_a_stops_failure_is_shown_until_it_is_acknowledged(screened: Screened) -> None:
+def test_the_monitor_shows_a_failed_stop_until_it_is_acknowledged(screened: Screened) -> None:
     monitor, poller = screened
     monitor._plant.tick(0.0, told(1, 1, 0.5))
     screened.press("Sy")
@@ -479,7 +481,7 @@ def test_a_stops_failure_is_shown_until_it_is_acknowledged(screened: Screened) -
     assert monitor.await_stops() == []
 
 
-def test_the_result_of_stopping_all_counts_drives_and_lines(screened: Screened) -> None:
+def test_the_monitor_counts_stopped_drives_and_lines(screened: Screened) -> None:
     monitor = screened.monitor
     (line,) = monitor._plant.plant.lines
     both = (line, replace(line, name="hall-2"))
@@ -501,7 +503,7 @@ def test_hidden_failures_are_shown_after_visible_ones_are_acknowledged(watched: 
 
 
 @pytest.mark.parametrize("failure", [OSError("the ledger cannot be kept"), KeyError("odd"), RuntimeError()])
-def test_any_exception_of_a_stop_is_shown_as_a_failure(
+def test_the_monitor_shows_any_exception_of_a_stop_as_a_failure(
     screened: Screened, monkeypatch: pytest.MonkeyPatch, failure: Exception
 ) -> None:
     monitor, poller = screened
@@ -557,7 +559,7 @@ def test_quitting_during_a_stop_asks_and_then_waits_for_it(
     "keys", ["joksy", "\u043e\u0442\u043b\u044b\u043d", "\u043e\u0442\u043b\u0456\u043d"]
 )
 def test_keys_are_the_same_in_cyrillic_layouts(screened: Screened, keys: str) -> None:
-    screened.press(keys)  # down, an unused key, up, stop, yes
+    screened.press(keys)  # the keys down, one without a function, up, stop, yes
     assert screened.poller.asked == ["drive-1 control STOP"]
 
 
@@ -571,7 +573,7 @@ def test_key_t_is_a_trigger_if_triggers_are_recorded(screened: Screened, key: st
     assert poller.asked == ["trigger: key t"]
 
 
-def test_page_keys_scroll_a_page_and_choose_in_the_overview(screened: Screened) -> None:
+def test_page_keys_scroll_a_drives_page_or_choose_a_drive(screened: Screened) -> None:
     monitor = screened.monitor
     screened.press([PAGE_DOWN])
     assert (monitor._at.chosen, monitor._at.scrolled) == (2, 0)
@@ -645,7 +647,7 @@ def test_a_stop_by_key_is_carried_out_and_reported(plant: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_page_shows_why_an_unpolled_value_is_missing(plant: Path) -> None:
+def test_the_page_of_a_drive_shows_why_an_unpolled_value_is_missing(plant: Path) -> None:
     with on_terminal("monitor", plant) as terminal:
         await_both(terminal)
         terminal.press(b"\x1b[B\r")

@@ -75,7 +75,8 @@ def test_a_refused_second_write_names_the_option_that_permits_it(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    monkeypatch.setattr(YD1000, "silence_characters", 3.5)  # the manual's silences would take 2 s
+    # shorter, because with the manual's silences the test would take 2 s
+    monkeypatch.setattr(YD1000, "silence_characters", 3.5)
     sim = with_parameters(YD1000(1))
     with Simulator([Wire([sim], unpaced=True)], speed=50) as simulator, clock.at_speed(50):
         drive = simulator.wires[0].path, "yd1000", 1

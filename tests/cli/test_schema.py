@@ -55,7 +55,8 @@ def module(path: str) -> Any:
 
 
 PLANTS, FAMILIES = module("plant/test_plant.py"), module("families/files/test_loader.py")
-OWN = ("family.py:Toy", "family.py:Fixed", "family.py:Mute")  # families of the plant files in tests
+# users' own families that plant files of the tests name
+OWN = ("family.py:Toy", "family.py:Fixed", "family.py:Mute")
 
 
 @cache
@@ -285,7 +286,7 @@ def invalid_families() -> list[str]:
         texts.append(f'{head}extends = "{base}"\n{declared}\n')
     lines = FAMILIES.TWENTY.splitlines()
     for number, line in enumerate(lines):
-        if " = " in line and number > 2:  # each of the twenty mistakes by itself
+        if " = " in line and number > 2:  # try each of the twenty mistakes in a file of its own
             section = next(one for one in lines[number::-1] if one.startswith("["))
             table = "" if section == "[family]" else f"{section}\n"
             texts.append(f"{head}{table}{line}\n{reading if section != '[reading]' else ''}")
@@ -467,7 +468,7 @@ def test_schema_checks_registers_and_integrals_of_channels(channel: str, is_acce
     ("kind", "valid", "invalid"),
     [("plant", valid_plants, invalid_plants), ("family", valid_families, invalid_families)],
 )
-def test_taplo_reports_the_same_files(
+def test_the_toml_checker_taplo_refuses_the_same_files(
     tmp_path: Path,
     kind: str,
     valid: Callable[[], list[str]],

@@ -93,7 +93,8 @@ SHORTER = (  # replacements that make long runs shorter
     (r"--seconds \d+", "--seconds 1"),
     (r"seconds=\d+", "seconds=0.5"),
     (r'dwell = "\d+ s"', 'dwell = "1 s"'),
-    (r'silence = "\d+ s"', 'silence = "30 s"'),  # for busy machines
+    # a test run tolerates a longer silence of a drive, because busy machines cause it
+    (r'silence = "\d+ s"', 'silence = "30 s"'),
     (r"--addresses 1-4", "--addresses 1-3 --quick"),
     (r"(multidrop scan /dev/ttyUSB0)", r"\1 --addresses 1-2 --baudrates 9600 --formats 8N1 --quick"),
     (r"(?m)(multidrop poll plant.toml --out run.arrows)$", r"\1 --seconds 1"),
@@ -150,7 +151,7 @@ class Session:
     def __init__(self, stack: ExitStack) -> None:
         self.space: dict[str, Any] = {"__name__": "page"}
         self._stack = stack
-        self._wires: dict[str, str] = {}  # link to the simulated line, by port
+        self._wires: dict[str, str] = {}  # port in the page's text: link to the simulated line
 
     def run(self, block: Block) -> None:
         """Run a block. Its exceptions pass through."""
@@ -195,7 +196,8 @@ class Session:
 
     def _serve(self, link: str, drives: list[Any]) -> None:
         wire = Wire([simulated(drive) for drive in drives], port=link, unpaced=True)
-        self._stack.enter_context(Simulator([wire], speed=10))  # so that motors stop soon
+        # faster than real time, so that motors stop soon
+        self._stack.enter_context(Simulator([wire], speed=10))
 
     def _run_commands(self, text: str, *, has_prompt: bool) -> None:
         commands: list[tuple[str, list[str]]] = []
@@ -392,18 +394,19 @@ def test_entry_pages_are_plain_markdown(page: str) -> None:
 def test_every_page_is_in_the_contents() -> None:
     text = (DOCS / "index.md").read_text("utf-8")
     linked = set(re.findall(r"\(([\w/-]+\.md)\)", text))
-    included = {"explanation/speed-table.md", "reference/line-states.md"}  # parts of other pages
+    # these pages are parts of other pages
+    included = {"explanation/speed-table.md", "reference/line-states.md"}
     pages = {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")} - {"index.md"}
     assert {page for page in pages - included - linked if "/walks/" not in page} == set()
 
 
-def test_every_status_is_in_the_reference() -> None:
+def test_every_status_of_a_row_is_in_the_reference() -> None:
     known = {status for status in core.STATUSES if status and not status.startswith("exception")}
     exceptions, of_channels = {"exception 01", "exception FF"}, {"input too old"}
     assert known == set(page_table("reference/statuses.md")) - exceptions - of_channels
 
 
-def test_every_column_is_in_the_reference() -> None:
+def test_every_column_of_a_recording_is_in_the_reference() -> None:
     from multidrop.polling.batch import schema
 
     assert [child.name for child in schema().children] == list(page_table("reference/recording-format.md"))
@@ -526,7 +529,9 @@ def test_translation_has_the_headings_list_items_and_code_blocks_of_its_page(
 
 
 @of_each_page
-def test_each_section_has_the_names_and_figures_of_the_english_section(language: str, page: str) -> None:
+def test_each_translated_section_has_the_names_and_figures_of_the_english_one(
+    language: str, page: str
+) -> None:
     pairs = zip(sections(translation(language, page)), sections(ENGLISH[page]), strict=True)
     assert [codes(own) ^ codes(other) for own, other in pairs if codes(own) != codes(other)] == []
 

@@ -169,7 +169,8 @@ def test_pump_example_stops_its_motor_when_the_program_ends(tmp_path: Path) -> N
 
 @pytest.mark.long
 def test_noise_hunt_example_finds_bad_checksums(tmp_path: Path) -> None:
-    printed = run(tmp_path, "noise_hunt.py", "5", through=())  # waits for lost replies, so without patient.py
+    # without patient.py, because its long timeouts would delay each lost reply
+    printed = run(tmp_path, "noise_hunt.py", "5", through=())
     assert "pump-1: " in printed
     assert "bad checksum" in printed
     capture = tmp_path / "noise" / "all.pcapng"

@@ -126,7 +126,7 @@ def offenders(found: dict[str, set[str]]) -> dict[str, set[str]]:
 
 def upwards(path: Path, modules: set[str]) -> set[str]:
     others = rooms(modules) - {"_core", room(path)}
-    if room(path) in CLIENTS:  # covered by test_clients_use_only_public_names
+    if room(path) in CLIENTS:  # these packages are checked by test_clients_use_only_public_names
         others -= set(multidrop.__all__)
     return {name for name in others if floor(name) >= floor(room(path))}
 
@@ -293,7 +293,7 @@ def test_a_cycle_of_calls_is_detected() -> None:
 
 
 @pytest.mark.long
-def test_pure_files_of_the_core_use_no_system() -> None:
+def test_pure_files_of_the_c_core_make_no_system_calls() -> None:
     code = core()
     engine = {"engine", "clock", "wakeup", "port", "rs485", "api", "row_queue", "mastership"}
     graph = calls(code)

@@ -331,7 +331,7 @@ def test_registers_above_the_limit_of_a_family_are_reported_as_not_imported(
         ("a.json", '{"device": {"channels": 5}}', "does not have the structure"),
         ("a.toml", "a = 1", "has no [[inputs.modbus]] (Telegraf): it has a"),
         ("a.toml", "[[inputs.modbus]]", "[[inputs.modbus]] has no field"),
-        ("a.toml", "\na = ", "a.toml:2: is not TOML"),
+        ("a.toml", "\na = ", "a.toml:2: the file is not TOML"),
         ("a.xls", "a", "its suffix is not one of .csv"),
     ],
 )

@@ -348,7 +348,7 @@ def test_apply_returns_its_result_if_the_journal_cannot_be_removed(monkeypatch: 
     assert [change.parameter.code for change in done.written] == ["b.003"]
 
 
-def test_refusal_of_a_ramp_time_suggests_only_existing_ways(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_second_write_suggests_the_command_that_permits_it(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, _ = attached(monkeypatch, YD1000(1), [])
     drive.write("acceleration_time", 20.0)
     with pytest.raises(WriteForbidden, match=r"params\.apply") as refusal:

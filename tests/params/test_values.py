@@ -170,11 +170,11 @@ def test_factory_values_are_those_of_the_manual() -> None:
         params.defaults(DelixiModbus)
 
 
-def test_monitors_are_not_listed_as_parameters() -> None:
+def test_monitor_values_are_not_listed_as_parameters() -> None:
     assert not any(code.startswith("P05.") for code in parameters_of(DelixiModbus))
 
 
-def test_declared_parameters_are_stored_despite_a_ram_address() -> None:
+def test_a_parameter_is_written_to_eeprom_even_if_its_register_has_a_ram_address() -> None:
     from multidrop.drive.register import Kept, setting
 
     class WithAlias(Drive):
@@ -246,7 +246,7 @@ def test_backup_files_of_the_gd20_tool_are_loaded(tmp_path: Path, quote: str) ->
         ("a.toml", 'format = "x"\n[parameters]\nA = 1', "format = 'x' is not 1"),
         ("a.toml", "[parameters]\nA = 1.5", "A = 1.5 is not a raw count"),
         ("a.toml", "[parameters]", "has no parameters"),
-        ("a.toml", "[parameters", r"a\.toml:1: is not TOML"),
+        ("a.toml", "[parameters", r"a\.toml:1: the file is not TOML"),
         ("a.csv", "x;y\n1;2", "its first row does not name the columns code and raw"),
         ("a.csv", "code;raw\nA;1\nA;2", "A is given twice"),
         ("a.csv", "code;raw\nA;one", "'one' is not a whole number"),

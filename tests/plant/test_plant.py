@@ -476,7 +476,7 @@ def test_unreadable_plant_file_is_reported_in_one_sentence(tmp_path: Path) -> No
         load_plant(tmp_path / "none.toml")
     (tmp_path / "latin.toml").write_bytes(b'name = "S\xfcd"')
     with pytest.raises(
-        PlantError, match=r"latin.toml:1: is not text in UTF-8, from byte 9 on \(0xFC\); save"
+        PlantError, match=r"latin.toml:1: the file is not text in UTF-8, from byte 9 on \(0xFC\); save"
     ):
         load_plant(tmp_path / "latin.toml")
 
@@ -504,7 +504,7 @@ def test_url_or_port_name_instead_of_a_plant_file_is_reported(name: str, expecte
 
 def test_device_path_given_as_plant_file_is_not_read() -> None:
     """Reading a serial port would block, and take bytes from its line."""
-    with pytest.raises(PlantError, match=r": is a device, not a plant file$"):
+    with pytest.raises(PlantError, match=r": this is a device, not a plant file$"):
         load_plant(os.devnull)
 
 

@@ -18,7 +18,7 @@ from multidrop.toml_lines import line_numbers
 def mistake(data: str | bytes) -> tuple[int, str]:
     with pytest.raises(DocumentError) as wrong:
         parse_document(data.encode() if isinstance(data, str) else data)
-    return wrong.value.line, str(wrong.value).removeprefix("is not TOML: ")
+    return wrong.value.line, str(wrong.value).removeprefix("the file is not TOML: ")
 
 
 @table(
@@ -114,9 +114,9 @@ def mistake(data: str | bytes) -> tuple[int, str]:
         ("a = 1\rb = 2\r", 1, "a line ends with CR alone; save the file with the line ends LF or CRLF"),
         ("a = 1\r\nb = x\r\n", 2, 'x has no quotes; write b = "x"'),
         ("\ufeffa = x\n", 1, 'x has no quotes; write a = "x"'),
-        ("a = 1".encode("utf-16"), 0, "is not text in UTF-8, but in UTF-16; save it as UTF-8"),
-        ("a = 1".encode("utf-16-be"), 0, "is not text in UTF-8, but in UTF-16; save it as UTF-8"),
-        (b"a = 1\nb = '\xe4'", 2, "is not text in UTF-8, from byte 11 on (0xE4); save it as UTF-8"),
+        ("a = 1".encode("utf-16"), 0, "the file is not text in UTF-8, but in UTF-16; save it as UTF-8"),
+        ("a = 1".encode("utf-16-be"), 0, "the file is not text in UTF-8, but in UTF-16; save it as UTF-8"),
+        (b"a = 1\nb = '\xe4'", 2, "the file is not text in UTF-8, from byte 11 on (0xE4); save it as UTF-8"),
     ],
 )
 def test_text_that_is_not_toml_is_reported_with_a_correction(

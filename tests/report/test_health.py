@@ -133,7 +133,7 @@ def test_the_response_delay_excludes_the_time_of_the_request(look: Recording) ->
     pump, fan = delays(look)
     assert pump.exact
     assert pump.seconds == pytest.approx(np.full(1000, 0.020 - REQUEST_9600))
-    assert not fan.exact  # the settings of this drive are unknown
+    assert not fan.exact  # the recording lacks the line settings of this drive
     assert fan.quantile(0.5) == pytest.approx(0.0165)
     assert fan.quantile(1.0) == pytest.approx(0.021)
 

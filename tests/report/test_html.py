@@ -159,7 +159,7 @@ def test_invalid_parts_of_metadata_are_left_out_of_a_report(
     rows = turns[:30]
     for number, metadata in enumerate(with_odd(about, odd)):
         if not isinstance(metadata, dict):
-            continue  # this copy cannot be a recording's metadata
+            continue  # recordings refuse this copy as metadata
         look = load(record(tmp_path / f"{number}.arrows", rows, metadata, pieces=1))
         assert all(
             np.isfinite([each.utilisation, each.rate("pump"), each.cycle or 0]).all()
@@ -214,7 +214,7 @@ def by_pandas(table: Any, edge: float, step: float) -> tuple[Any, ...]:
     settling = (later.index[0] if len(outside) else 0.0) if len(later) else None
     frame = known.reset_index()
     slope = frame.s.cov(frame.value) / frame.s.var()
-    mean_power = inside.value.rolling(2).mean()  # NaN beside a miss
+    mean_power = inside.value.rolling(2).mean()  # mean power between two rows; NaN if one of them is a miss
     energy = (mean_power * inside.s.diff()).sum() / 3600
     return known.count(), known.mean(), known.min(), known.max(), settling, slope, energy
 
@@ -238,7 +238,8 @@ def test_figures_of_a_step_equal_those_computed_with_pandas(tmp_path: Path) -> N
             assert numbers == pytest.approx(expected[:-1], rel=1e-9, abs=1e-12)
             assert energy == (pytest.approx(expected[-1], rel=1e-9) if values.unit == "kW" else None)
     (first, _) = values_of(recording, recording.steps[0])
-    assert first.settling == pytest.approx(0.4 * math.log(50), abs=0.3)  # time constant 0.4 s
+    # a first-order step with the time constant 0.4 s
+    assert first.settling == pytest.approx(0.4 * math.log(50), abs=0.3)
 
 
 @pytest.mark.slow

@@ -234,7 +234,7 @@ def test_a_state_that_lasts_one_row_is_drawn(tmp_path: Path) -> None:
     (axes,) = plot(states(tmp_path, rows))[0].axes
     (bars,) = axes.collections
     assert bars.get_linewidth()[0] > 0
-    assert sum(bars.get_edgecolor()[0][:3]) < 1.5  # darker than a medium grey
+    assert sum(bars.get_edgecolor()[0][:3]) < 1.5  # the edge is darker than a medium grey
 
 
 def test_each_bit_of_a_status_register_has_a_lane_of_its_own(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ class Hardware:
         self._timers = Timers()
         self._adapters: dict[str, Adapter] = {}  # by serial number, also after they were unplugged
         self._far_ends: dict[str, FarEnd] = {}
-        self._connected: dict[str, socket.socket] = {}  # by name of QEMU's port
+        self._connected: dict[str, socket.socket] = {}  # open connections to QEMU, by the name of QEMU's port
         self._selector = selectors.DefaultSelector()
         self._listener = socket.create_server(("127.0.0.1", 0))
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)

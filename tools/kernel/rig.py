@@ -28,7 +28,7 @@ from multidrop import _core
 HERE = Path(__file__).resolve().parent
 SCENARIOS = HERE.parents[1] / "tests/system/guest"
 BOOT_S = 600.0
-PATIENCE_S = 60.0  # s, added to a scenario's own limit
+PATIENCE_S = 60.0  # s that are added to a scenario's own time limit
 
 
 class ScenarioFailed(AssertionError):
@@ -69,7 +69,8 @@ def _job(file: Path) -> None:
         tar.add(package, "multidrop", filter=lambda entry: None if "__pycache__" in entry.name else entry)
         tar.add(metadata, metadata.name)
         compiled = Path(_core.__file__)
-        if compiled.parent != package:  # installed as editable
+        # the package is installed as editable, so its compiled core is elsewhere
+        if compiled.parent != package:
             tar.add(compiled, f"multidrop/{compiled.name}")
         for script in [*(HERE / "guest").glob("*.py"), *SCENARIOS.glob("*.py")]:
             tar.add(script, script.name)
@@ -132,7 +133,8 @@ def _qemu(built: Path, folder: Path, ports: str) -> list[str]:
     -trace serial_write -trace serial_update_parameters -D {folder}/registers
     """.split()
     kernel = "console=ttyS0 quiet loglevel=4 mitigations=off panic=1 no_console_suspend"
-    return [*words, "-append", f"{kernel} no_timer_check rig={ports}"]  # a busy host fails the timer check
+    # on a busy host, the kernel's timer check would fail
+    return [*words, "-append", f"{kernel} no_timer_check rig={ports}"]
 
 
 def main(words: list[str]) -> None:

@@ -12,7 +12,7 @@ from time import monotonic
 from typing import Any, NamedTuple
 
 SUBMIT, RET_SUBMIT, RET_UNLINK = 1, 3, 4
-HEAD = 48  # bytes before the data of every message
+HEAD = 48  # size of the header of every message, in bytes
 EPIPE, EPROTO, ECONNRESET = -32, -71, -104
 
 
@@ -50,7 +50,7 @@ def interface(number: int, endpoints: int, *, kind: tuple[int, int, int] = (255,
 class Connection(NamedTuple):
     """The resources of a plugged-in USB device: its connection, serial number and timers."""
 
-    sock: socket.socket  # to the guest's vhci_hcd
+    sock: socket.socket  # connection to the guest's vhci_hcd
     serial: str  # the device's serial number; "": it has none
     timers: Timers
 
@@ -64,7 +64,7 @@ class USBDevice:
 
     def __init__(self, connection: Connection) -> None:
         self.sock, self.serial, self.timers = connection
-        self.ins: deque[tuple[int, int]] = deque()  # waiting transfers to the guest
+        self.ins: deque[tuple[int, int]] = deque()  # transfers of the guest that wait for the device's data
         self.outs: deque[tuple[int, bytes]] = deque()  # transfers that the device has not taken yet
         self.taken: set[int] = set()  # transfers that the device has taken, but not completed yet
         self._interrupts: deque[tuple[int, int]] = deque()
@@ -98,7 +98,7 @@ class USBDevice:
         self._put(struct.pack(">5Iiiiii8x", RET_SUBMIT, sequence, 0, 0, 0, status, size, 0, 0, 0) + data)
 
     def _put(self, data: bytes) -> None:
-        with suppress(OSError):  # the device is unplugged
+        with suppress(OSError):  # the guest has unplugged the device
             self.sock.sendall(data)
 
     def feed(self, data: bytes) -> None:

@@ -48,7 +48,8 @@ NUMBER = re.compile(r"(?<![\w.])(?:0x[0-9A-Fa-f]+|[0-9][0-9_]*(?:\.[0-9]+)?)(?![
 FUNCTION = re.compile(r"^ *(?:def|class) (\w+)|^\w[\w \*]*?(\w+)\(", re.MULTILINE)
 
 
-Name = tuple[str, str, str, str, int]  # file, function, line before and after the edit, `nth` of equal edits
+# a mutant's name: file, function, the line before and after the edit, and `nth`
+Name = tuple[str, str, str, str, int]
 Edit = tuple[int, int, str]  # start and end offset in the source, replacement
 
 
@@ -62,7 +63,7 @@ class Mutant:
     after: str
     nth: int  # number among the equal edits in this function, from 1
     number: int  # line number
-    text: str  # text of the whole file
+    text: str  # the whole file's text after the edit
 
     @property
     def name(self) -> Name:

@@ -202,7 +202,7 @@ def _run(command: str, words: list[str]) -> int:
     module.add_arguments(parser)
     try:
         arguments, left_out = _parsed(parser, words, command)
-    except SystemExit:  # raised by argparse after --help
+    except SystemExit:  # raised by argparse, which prints --help and then exits
         return DONE
     except ValueError as mistake:
         if command in STOPS:
@@ -234,7 +234,8 @@ def _parsed(
     A stop ignores unknown options. It also ignores the word after such an option, because that may be the
     option's value instead of a drive.
     """
-    arguments, unknown = parser.parse_known_intermixed_args(words)  # options may be between positional words
+    # a user may write options between the other words
+    arguments, unknown = parser.parse_known_intermixed_args(words)
     if not unknown:
         return arguments, []
     if command not in STOPS:

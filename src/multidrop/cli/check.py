@@ -141,7 +141,7 @@ def _verdict(family: type[Drive], file: Path) -> str:
 # ---- remarks ----
 
 
-Remark = tuple[str, str]  # name of a register or key, and a sentence about it
+Remark = tuple[str, str]  # name of a register or key, and a sentence about this register or key
 
 _OF_A_MOTOR = {
     "remote": "the keypad settings that let the line command the motor",

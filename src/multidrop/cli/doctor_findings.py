@@ -58,7 +58,7 @@ def latency_finding(adapter: Adapter) -> Finding:
 
 
 # Drivers that delay received bytes unless the low-latency flag is set. Other drivers ignore the flag.
-HEEDING_LOW_LATENCY = ("", "ftdi_sio", "serial8250")  # "": the driver is unknown
+HEEDING_LOW_LATENCY = ("", "ftdi_sio", "serial8250")  # "" is an unknown driver
 
 
 def low_latency_finding(low: bool | None, driver: str = "") -> Finding:
@@ -255,7 +255,7 @@ SYSFS = Path("/sys")
 # ioctl requests from linux/serial.h and asm-generic/ioctls.h
 TIOCGSERIAL, TIOCGRS485, TIOCSRS485 = 0x541E, 0x542E, 0x542F
 SERIAL_STRUCT = 72  # upper limit of the size of struct serial_struct, in bytes
-FLAGS_AT = 4  # index of the field `flags` among the ints of struct serial_struct
+FLAGS_AT = 4  # index of the field `flags`, if the struct is read as an array of ints
 LOW_LATENCY = 1 << 13
 RS485_STRUCT = struct.Struct("=III5I")
 RS485_ENABLED, RS485_RX_DURING_TX = 1 << 0, 1 << 4
@@ -304,7 +304,7 @@ def find_adapter(device: str, sysfs: Path = SYSFS) -> Adapter:
 
 def com_description(port: str) -> str:
     """Return Windows' description of a COM port's adapter; "" if Windows lists none."""
-    with suppress(ImportError, AttributeError, OSError):  # Wine implements this only in part
+    with suppress(ImportError, AttributeError, OSError):  # Wine lacks some of these functions
         from serial.tools.list_ports import comports
 
         return next((found.description for found in comports() if of_name(found.device) == of_name(port)), "")
@@ -353,7 +353,7 @@ def _ask(fd: int, request: int, data: bytes) -> bytes | None:
     """Return the driver's answer to an ioctl with this data; None if the driver does not know the request."""
     if sys.platform != "linux":
         return None
-    import fcntl  # Windows has no fcntl
+    import fcntl  # imported here, because Windows has no fcntl
 
     answer = bytearray(data)
     try:

@@ -159,7 +159,7 @@ _REGISTER_KEYS = (  # keys of a register in JSON, in the order of output
 )
 
 
-INDENT = 16  # column at which a family's facts start
+INDENT = 16  # column at which the facts about a family start
 
 
 def sheet(family: type[Drive]) -> str:

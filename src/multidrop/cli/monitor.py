@@ -117,7 +117,8 @@ class Monitor:
         self._at = Position()
         self._on_yes: Callable[[], None] | None = None  # called if the user answers the question with y
         self._stops: list[threading.Thread] = []  # threads that carry out stops
-        self._stop_results: dict[str, tuple[int, int]] = {}  # line: (stopped drives, all drives)
+        # line's name: number of stopped drives, number of all drives
+        self._stop_results: dict[str, tuple[int, int]] = {}
         self._has_left = False
         self._side_reader = SideReader(session.poller)
         self._how = how
@@ -203,9 +204,10 @@ class Monitor:
 
     def _obey(self, key: str) -> None:
         key = key.translate(LATIN)
-        if self._on_yes and key not in _STOP_KEYS:  # a stop key is never an answer
+        # a key that stops motors never counts as the answer to a question
+        if self._on_yes and key not in _STOP_KEYS:
             on_yes, self._on_yes, self._at.question = self._on_yes, None, ""
-            if key in ("y", "Y"):  # Y is accepted for caps lock
+            if key in ("y", "Y"):  # the user may have caps lock on
                 on_yes()
             else:
                 self._at.message = "nothing was sent"

@@ -19,7 +19,8 @@ from multidrop.printable import printable
 LEAST_WIDTH, LEAST_HEIGHT = 60, 12
 WIDE, WIDEST = 100, 110  # columns needed to show delays (WIDE), and also models (WIDEST)
 LEAST_DRIVES = 3  # minimum number of drives in the overview; curves of a trigger get only the room below
-OLD_NOTE, NOT_POLLED = "old", "not polled"  # notes beside a register's value
+# notes beside a register's value, if it is old, or if the register is not polled
+OLD_NOTE, NOT_POLLED = "old", "not polled"
 NEVER = "never"
 # least width of a register's value; width of the value's age and of all blanks together
 LEAST_VALUE, AROUND = 12, 13
@@ -42,7 +43,8 @@ class Position:
     message: str = ""
     failures: list[str] = field(default_factory=list)  # unacknowledged failures of stops
     failures_shown: int = 0  # number of failures that the last picture showed
-    trigger: list[str] = field(default_factory=list)  # curves around the last trigger
+    # lines of text that draw the curves around the last trigger
+    trigger: list[str] = field(default_factory=list)
 
 
 class SideRead(NamedTuple):
@@ -101,7 +103,7 @@ def page(
     longest = max(map(len, names), default=0)
     cells = [_register(shown, name, others, now_ns) for name in names]
     notes = max((len(note) for *_, note in cells), default=0)
-    room = max(LEAST_VALUE, width - longest - notes - AROUND)  # columns left for values
+    room = max(LEAST_VALUE, width - longest - notes - AROUND)  # columns that remain for registers' values
     values = max(LEAST_VALUE, min(room, max((columns_of(value) for value, *_ in cells), default=0)))
     rows = [
         _register_row(f"{name:<{longest}}", *cell, values, width)

@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
 class _PredictedLine:
     line: PlantLine
     prediction: Prediction
-    suggestions: Suggestions | None  # None if the plan fits
+    suggestions: Suggestions | None  # None if the line can reach all rates
     misfits: list[str]  # a sentence for each polling rate that cannot be reached
     warnings: list[str]
 

@@ -261,10 +261,10 @@ class LiveTable:
         self._channels = {(one.drive.name, channel.name) for one in plant.drives for channel in one.channels}
         self._samples: Counter[str] = Counter()
         self._misses: Counter[str] = Counter()
-        self.note = ""  # shown below the table
+        self.note = ""  # a sentence that is shown below the table
         self._trigger: Path | None = None  # the recording of the trigger whose picture is shown
         self._picture: list[str] = []
-        self._drawn: list[str] = []  # lines of the previous drawing
+        self._drawn: list[str] = []  # lines of text that are on the terminal now
         self._next_draw = 0.0
         self._warnings: deque[str] = deque()  # warnings that are not shown yet; any thread may add one
 

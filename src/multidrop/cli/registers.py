@@ -119,7 +119,8 @@ def _run_write(arguments: argparse.Namespace) -> int:
     if register.never:
         raise refused(drive, register, register.never)
     value = nearest_value(register, register.parse(words[1]))
-    check_plain(drive, register, raw_count(drive, register, value))  # checked before the port is opened
+    # an invalid value is refused before the port is opened
+    check_plain(drive, register, raw_count(drive, register, value))
     confirm(f"Write {register.name} = {register.format(value)} to {drive.name} on {target.port}?", arguments)
     with reporting_interruption(drive, "write") as known, target.open_bus(arguments.audit):
         known.clear()

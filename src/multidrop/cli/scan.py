@@ -258,7 +258,7 @@ def _shown(findings: Iterator[Finding], silent: bool) -> Iterator[Finding]:
     On a terminal, progress is one line that is redrawn. Otherwise, it is a line for every setting.
     """
     redraws = sys.stderr.isatty()
-    shown = ""  # the setting in the progress line
+    shown = ""  # the line setting that the progress line shows now
     try:
         for finding in findings:
             if isinstance(finding, Progress):
@@ -274,7 +274,7 @@ def _shown(findings: Iterator[Finding], silent: bool) -> Iterator[Finding]:
             if not silent:
                 print_text(sentence(finding), flush=True)
             yield finding
-    finally:  # runs after Ctrl-C too
+    finally:  # Ctrl-C must clear the progress line too
         if shown and redraws:
             _redraw("")
 

@@ -43,7 +43,8 @@ def schema_of(kind: str, names: Sequence[str] = (), folder: Path | None = None) 
             if not beside((folder or Path()) / "family.toml", name).is_file():
                 raise ValueError(f"{name}: there is no such file")
         return family_schema(names)
-    for library in ("starlette", "uvicorn"):  # libraries that the gateway's settings import
+    # the schema of [serve] is made by modules that import these libraries
+    for library in ("starlette", "uvicorn"):
         require_extra(library, "serve", "schema plant")
     from multidrop.families.registry import find_model
     from multidrop.gateway.settings import serve_schema

@@ -142,7 +142,7 @@ def _listen(listener: Listener, printer: TrafficPrinter, seconds: float | None) 
 
 
 LISTEN_S = 0.05  # longest wait for bytes in one read, in s
-_MOST = 4096  # limit of bytes per read
+_MOST = 4096  # most bytes that one read returns
 
 
 def _open_device(port: str, settings: Settings) -> FileIO:

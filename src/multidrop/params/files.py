@@ -42,7 +42,7 @@ def load(path: Path | str) -> ParameterSet:
     path = Path(path)
     # Reading a serial port here would block, and would consume bytes from its drives.
     if path.exists() and not path.is_file():
-        raise ValueError(f"{path}: is not a file, but a directory or a device; name a parameter file")
+        raise ValueError(f"{path}: this is not a file, but a directory or a device; name a parameter file")
     try:
         data = read_bounded(path, MOST_BYTES, "parameter file")
         facts, values = _from_csv(data) if path.suffix.lower() == ".csv" else _from_toml(data)
@@ -51,7 +51,7 @@ def load(path: Path | str) -> ParameterSet:
     except ValueError as mistake:
         raise ValueError(f"{path}: {mistake}") from mistake
     if not values:
-        raise ValueError(f"{path}: has no parameters")
+        raise ValueError(f"{path}: the file has no parameters")
     return ParameterSet(values=values, source=str(path), **{"model": "", **facts})
 
 
@@ -102,10 +102,12 @@ def to_toml(found: ParameterSet, family: Any = None) -> str:
 def _from_toml(data: bytes) -> tuple[dict[str, str], dict[str, int]]:
     document = parse_document(data)
     if "line" in document:
-        raise ValueError("is a plant file, not a parameter file; name a drive of it, as PLANT.toml DRIVE")
+        raise ValueError(
+            "this is a plant file, not a parameter file; name a drive of it, as PLANT.toml DRIVE"
+        )
     values = document.get("parameters")
     if not isinstance(values, dict):
-        raise ValueError("is not a parameter file: it has no [parameters]")
+        raise ValueError("this is not a parameter file: it has no [parameters]")
     _check_format(document.get("format"))
     facts = {name: str(document[name]) for name in FACTS if name in document}
     return facts, {code: _raw(code, raw) for code, raw in values.items()}
@@ -114,7 +116,8 @@ def _from_toml(data: bytes) -> tuple[dict[str, str], dict[str, int]]:
 def _check_format(given: object) -> None:
     if isinstance(given, int) and given > FORMAT:
         raise ValueError(
-            f"has format {given}, but this version of multidrop reads format {FORMAT}: use a newer version"
+            f"the file has format {given}, but this version of multidrop reads format {FORMAT}: "
+            "use a newer version"
         )
     if given not in (None, FORMAT):
         raise ValueError(f"format = {given!r} is not {FORMAT}")
@@ -147,7 +150,7 @@ def _from_csv(data: bytes) -> tuple[dict[str, str], dict[str, int]]:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as failure:
-        raise ValueError(f"is not text in UTF-8, from byte {failure.start} on") from failure
+        raise ValueError(f"the file is not text in UTF-8, from byte {failure.start} on") from failure
     lines = text.splitlines()
     facts = {match[1]: match[2] for line in lines if (match := _FACT.match(line))}
     if "format" in facts:
@@ -162,8 +165,8 @@ def _from_csv(data: bytes) -> tuple[dict[str, str], dict[str, int]]:
         facts = {"model": GD20_MODEL, **facts}
     elif not {"code", "raw"} <= {*names}:
         if GD20_COLUMNS - {"valor_parametro"} <= {*names}:
-            raise ValueError("lists parameters without values; name the tool's backup, not its list")
-        raise ValueError("is not a parameter file: its first row does not name the columns code and raw")
+            raise ValueError("the file lists parameters without values; name the tool's backup, not its list")
+        raise ValueError("this is not a parameter file: its first row does not name the columns code and raw")
     found: dict[str, int] = {}
     try:
         for row in rows:
@@ -172,7 +175,7 @@ def _from_csv(data: bytes) -> tuple[dict[str, str], dict[str, int]]:
                 raise ValueError(f"{code} is given twice")
             found[code] = _raw(code, _whole(row[names["valor_parametro" if is_gd20 else "raw"]]))
     except csv.Error as failure:
-        raise ValueError(f"is not CSV: {failure}") from failure
+        raise ValueError(f"the file is not CSV: {failure}") from failure
     return facts, found
 
 

@@ -64,7 +64,7 @@ def text_of(family: Any, code: str, raw: int | None) -> str:
         return "-"
     try:
         return parameters_of(family)[code].text(raw)
-    except (KeyError, Unsupported, AttributeError):  # unknown model or code
+    except (KeyError, Unsupported, AttributeError):  # the model or the code is unknown
         return str(raw)
 
 
@@ -118,7 +118,7 @@ class _Reader:
     most: int = 0  # length of the longest block that the drive answers; 0 until it has refused a block
     done: int = 0
     silent: int = 0  # number of reads in a row that were not answered
-    group: str = ""  # group of the last parameter read
+    group: str = ""  # parameter group of the last parameter that was read
 
     def read(self, wanted: Sequence[Parameter]) -> None:
         found = sorted(blocks(self.drive, wanted), key=lambda block: block.start)

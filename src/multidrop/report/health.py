@@ -30,7 +30,7 @@ from multidrop.report.style import (
 MOST_REASONS = 6  # limit of reasons for misses in a picture; further reasons are drawn together
 # A bin with fewer requested values is left out, because its share of misses is not significant.
 LEAST_IN_BIN = 20
-BINS = 12  # number of bins of the output frequency
+BINS = 12  # number of bins into which output frequencies are sorted
 FREQUENCY = "output_frequency"
 ROOM = 2.0  # length of the axis of delays, as a multiple of their 99 % quantile
 SHORTEST_AXIS = 0.001  # least length of the axis of delays, in s

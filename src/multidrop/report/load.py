@@ -52,10 +52,10 @@ class Series:
 
     drive: str
     register: str
-    time: Array  # int64, ns UTC
+    time: Array  # times of the rows: int64, ns UTC
     value: Array  # float64
     uncertainty: Array  # float64, ns
-    status: Array  # int, index into `statuses`
+    status: Array  # each row's status, as an index into `statuses`
     statuses: tuple[str, ...]
     metadata: Mapping[str, Any]  # metadata of the register
 
@@ -144,7 +144,7 @@ class Recording:
     series: tuple[Series, ...]
     truncated: int  # number of skipped bytes at the recording's end
     steps: tuple[TimeSpan, ...] = ()  # steps of a test run, each with its phase's name
-    events: tuple[Event, ...] = ()  # in the order of time
+    events: tuple[Event, ...] = ()  # in the order of their times
 
     @property
     def statuses(self) -> tuple[str, ...]:

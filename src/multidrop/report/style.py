@@ -26,9 +26,10 @@ FEWEST_BINS, MOST_BINS = 10, 120  # limits of the number of bins on the time axi
 # usual width of a bin; it is changed to keep the number of bins within the limits
 BIN_NS = 2_000_000_000
 SHORTEST_NS = 1_000_000_000  # least length of the time axis
-WIDTH = 11.0  # width of a figure, in inches
+WIDTH = 11.0  # width of every figure, in inches
 DPI = 110
-LEGEND_MARK, LEGEND_LETTER, LEGEND_ROW = 0.7, 0.09, 0.21  # sizes in inches
+# legend: width of a mark and of a letter, height of a row; in inches
+LEGEND_MARK, LEGEND_LETTER, LEGEND_ROW = 0.7, 0.09, 0.21
 
 _DATES: Any = dates  # matplotlib.dates has no type hints
 

@@ -86,7 +86,7 @@ def candidate(family: type[Drive], settings: Settings, framing: Framing, address
     """
     if not family.speaks(framing) or address not in family.addresses:
         return None
-    if framing is Framing.TCP:  # only the gateway knows the serial settings
+    if framing is Framing.TCP:  # on Modbus TCP, only the gateway knows the drive's serial settings
         return family(address, framing=framing)
     if settings.baudrate not in family.baudrates:
         return None

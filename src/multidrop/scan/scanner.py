@@ -47,7 +47,7 @@ BEGUN = 2  # number of received characters after which a reply counts as started
 LATE = 8  # a reply may come this many requests late, and is still matched to its request
 MOST_TIMEOUT = 1.0  # limit of the timeout in s, used only for an address at which a drive has answered
 TRIES = 3
-LATE_NS = 500_000_000  # maximum wait for late replies
+LATE_NS = 500_000_000  # longest wait for late replies, in ns
 SHORTEST_REPLY = 5  # size of an exception reply in bytes; fewer bytes are noise
 
 SILENT = (Failure.NO_REPLY, Failure.STALLED)  # results of exchanges in which no byte was received

@@ -22,8 +22,8 @@ Setting = tuple[Settings, Framing]
 
 # maximum time in s that a Modbus TCP gateway takes to report that a drive does not answer
 GATEWAY_PATIENCE = 1.0
-ADDRESSES = range(1, 32)  # scanned by default
-_ILLEGAL_ADDRESS = 2  # exception code: illegal data address
+ADDRESSES = range(1, 32)  # the addresses that a scan tries by default
+_ILLEGAL_ADDRESS = 2  # code of the Modbus exception "illegal data address"
 # In tables with these carriers, a reply with the value 0 is the same as an echo of the request. So a sweep
 # prefers registers of other tables, or the register with the drive's own address, which never holds 0.
 _ECHOED = (Carrier.LONG, Carrier.NUMBER)

@@ -344,7 +344,7 @@ WRONG_TEXTS = [  # each text is wrong and stands after HEAD
 ]
 WRONG_FILES = [  # each text is a whole family file with a mistake
     ("", "t.toml: has no [family]; add it, with the title and the manual"),
-    ("[family", "t.toml: is not TOML: a header lacks a bracket"),
+    ("[family", "t.toml: the file is not TOML: a header lacks a bracket"),
     (
         '[[line]]\nname = "L"\n',
         "is a plant file, as its [[line]] says; name a drive of it, as PLANT.toml DRIVE",

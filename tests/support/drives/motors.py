@@ -84,7 +84,7 @@ class ReceivedRequests:
 # ---- drives of every family in each of its framings, for one line ----
 
 
-VARIANTS = (  # family, framing, and baud rate for `fast_drives`
+VARIANTS = (  # for `fast_drives`: family, framing, baud rate
     (ErmanERG220, Framing.RTU, 1_000_000),
     (InvtCHE, Framing.RTU, 500_000),
     (InnovertIBD, Framing.RTU, 500_000),

@@ -38,10 +38,11 @@ class Kind:
     turning: Mapping[int, int]  # replaces entries of `memory` while the motor turns
     mark: str  # name of a register that tests read to mark a place in the log: no verb reads it
     protocol: str = STANDARD
-    makes: Mapping[str, Any] = field(default_factory=dict)  # keyword arguments for the class
+    # keyword arguments with which a drive of this family is made
+    makes: Mapping[str, Any] = field(default_factory=dict)
     halts: tuple[str, ...] = ("stop",)
     own_address: int | None = None  # address of the register that holds the drive's own address
-    live: int = 3  # function code whose reads show `turning`
+    live: int = 3  # function code whose replies change while the motor turns
 
 
 def _writes(function: int, start: int, judge: Callable[[int], bool]) -> Judge:
@@ -162,7 +163,7 @@ class ResponderDrive:
         self._memory = dict(self.kind.memory)
         if self.kind.own_address is not None:
             self._memory[self.kind.own_address] = self.address
-        self._coils = {0: 0, 1: 0, 2: 0}  # ERMAN's START, STOP and EMERGENCY STOP
+        self._coils = {0: 0, 1: 0, 2: 0}  # coils of ERMAN's START, STOP and EMERGENCY STOP
 
     def turn(self) -> None:
         """Start the motor as if on the panel."""

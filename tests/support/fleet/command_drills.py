@@ -39,7 +39,7 @@ class CommandRecord(NamedTuple):
     drive: str
     raw: int | None
     way: str
-    offered_s: float  # monotonic time of the offer, in s
+    offered_s: float  # time at which the command was offered, monotonic, in s
     told: CommandOutcome
     sent: int  # how often the drive received the command
 
@@ -135,7 +135,7 @@ class CommandDrill(FleetProcesses):
         finally:
             attack.cancel()
             deeds = (await asyncio.gather(attack, return_exceptions=True))[0]
-        await asyncio.sleep(3.0)  # let late messages arrive
+        await asyncio.sleep(3.0)  # late messages may arrive in this time
         assert isinstance(deeds, Counter), deeds
         return self._judge(asked, deeds)
 
@@ -184,7 +184,7 @@ class CommandDrill(FleetProcesses):
         twice = wrongly = unknown_sent = unnoted = 0
         oldest = 0.0
         for one in asked:
-            if one.raw is None:  # a stop may be sent repeatedly
+            if one.raw is None:  # the command is a stop, which may be sent repeatedly
                 wrongly += (one.told in SENT and not one.sent) or (one.told in UNSENT and bool(one.sent))
                 continue
             sent = seen[one.drive][one.raw]

@@ -32,8 +32,8 @@ from multidrop.fleet.servers.connections import ServerPath
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
 PATIENCE_S = 120.0
-JUDGED_S = 11.0  # s; an election may start 9 s after a process died
-SOON_S = 2.0  # s; for a drill before the next `settle`, which waits for elections
+JUDGED_S = 11.0  # s for which lines are watched after an attack, because an election may start 9 s after it
+SOON_S = 2.0  # s for which lines are watched if `settle` follows, which waits for elections itself
 
 
 class CommandEnd(NamedTuple):
@@ -156,7 +156,7 @@ class FleetDrill(FleetProcesses):
                 self.start(name)
 
     def are_leaders_home(self) -> bool:
-        """Return True if each node leads one bucket of each group, so that no node's loss affects several."""
+        """Return True if each node leads one bucket of each group: a lost node then takes one leader."""
         leads = [node.leads() for node in self.nats.nodes]
         return all(
             sum(f"KV_{bucket}" in found for bucket in group) == 1
@@ -267,7 +267,7 @@ async def _make_leader(node: Node, buckets: Sequence[str]) -> None:
     path = ServerPath([node.url])
     await path.open()
     for bucket in buckets:
-        with suppress(FleetError):  # the caller retries
+        with suppress(FleetError):  # the caller of this function tries again
             await ask(path, f"STREAM.LEADER.STEPDOWN.KV_{bucket}", {"placement": {"preferred": node.name}})
     await path.close()
 

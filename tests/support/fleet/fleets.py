@@ -59,7 +59,7 @@ class MemoryBucket:
         self.asked = 0  # how often `newest` was called
         self.is_down = False
         self.loses_answers = False
-        self.before_put: Callable[[str], object] = lambda key: None  # called before each put
+        self.before_put: Callable[[str], object] = lambda key: None  # called with the key before each put
 
     async def put(self, key: str, value: Any, revision: int) -> int:
         self.before_put(key)
@@ -199,7 +199,7 @@ class Hall:
     def __init__(self) -> None:
         self.gateways: list[RecordingLines] = []
         self.overlaps: list[str] = []
-        self.at: dict[str, float] = {}  # s, time of each line's last claim
+        self.at: dict[str, float] = {}  # line: time of its last claim, in s
 
     def add(self, name: str, mastership: RecordingMastership) -> RecordingLines:
         lines = RecordingLines(name, mastership, self)

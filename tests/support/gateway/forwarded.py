@@ -31,7 +31,7 @@ from multidrop.gateway.parts import PARTS
 from multidrop.printable import parse_time
 from multidrop.samples import ROWS, Spool
 
-Key = tuple[int, str, str]  # a row: time in ns, drive, register
+Key = tuple[int, str, str]  # the fields that identify a row: time in ns, drive, register
 DRAIN = -1
 
 

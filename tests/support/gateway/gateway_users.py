@@ -58,7 +58,7 @@ class Place(NamedTuple):
     broker: int
     drives: int
     first: int  # first address of the polled registers
-    unpolled: int  # address of an unpolled register
+    unpolled: int  # address of a register that is not polled
     series: list[str]
 
 
@@ -269,7 +269,7 @@ async def _live(place: Place) -> None:
 
     def tell() -> None:
         if not sys.stdin.readline():
-            loop.remove_reader(sys.stdin)  # the parent process ended
+            loop.remove_reader(sys.stdin)  # standard input has ended, because the parent process has
             task.cancel()
             return
         print(json.dumps([users.counts, users.failures]), flush=True)

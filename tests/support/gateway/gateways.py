@@ -67,7 +67,7 @@ class Served:
         self._loop = loop
         self.sims = sims
         self.secrets = secrets
-        self._seen = -1  # newest frame number returned by `frame_number`
+        self._seen = -1  # number of the newest frame that `frame_number` has returned
 
     @property
     def loop(self) -> asyncio.AbstractEventLoop:

@@ -22,7 +22,7 @@ from multidrop.gateway.modbus_server.server import ModbusServer
 from multidrop.gateway.modbus_server.settings import MAIN, ModbusSettings
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 
-PATIENCE = 30.0  # s, longest wait for an expected event
+PATIENCE = 30.0  # longest wait for an expected event, in s
 
 
 class FakeHub:
@@ -30,7 +30,7 @@ class FakeHub:
 
     def __init__(self) -> None:
         self.values: dict[tuple[str, str], float | None] = {}
-        self.ages: dict[tuple[str, str], float] = {}  # s, age of each row
+        self.ages: dict[tuple[str, str], float] = {}  # age of each row in s, by drive and register
         self.states: dict[str, str] = {}
         self.woken_ns = 0
 
@@ -63,7 +63,7 @@ class FakeCommands:
         self.told: CommandResult | Callable[[], Awaitable[CommandResult]] = DONE
         self.written: list[tuple[str, str, float, Caller]] = []
         self.stopped: list[tuple[Sequence[str] | None, Caller]] = []
-        self.refused: list[tuple[str, str, str]] = []  # drive, request, reason
+        self.refused: list[tuple[str, str, str]] = []  # refused commands: drive, request, reason
         self.ended: dict[str, int] = {}
 
     async def _end(self, *drives: str) -> CommandResult:

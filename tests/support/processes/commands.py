@@ -24,7 +24,7 @@ def multidrop(*words: object, most_bytes: int | None = None) -> subprocess.Compl
     """Run a command to its end; with `most_bytes`, files are limited to this size, like on a full disk."""
 
     def limit() -> None:
-        import resource  # not on Windows
+        import resource  # imported here, because Windows has no such module
 
         assert most_bytes is not None
         resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))

@@ -24,10 +24,10 @@ from pathlib import Path
 from checksums import rtu
 
 CLIENT = Path(__file__).with_name("fenced_client.py")
-REQUEST = 8  # bytes of a request
+REQUEST = 8  # number of bytes of a request
 REPLY = rtu("01 03 02 00 07")
 IDLE_S = 0.005  # s after which everything sent on this machine has arrived
-WATCHED_S = 0.08  # s to watch after the master continues
+WATCHED_S = 0.08  # how long lines are watched after the suspended master continues, in s
 PATIENCE_S = 60.0
 
 

@@ -16,7 +16,7 @@ from peers import build_with_libmodbus, require_module
 
 from multidrop.core import Framing, Message
 
-Verdict = Message | str  # a message, or the reason for rejection
+Verdict = Message | str  # a decoded message, or the reason why the frame was rejected
 
 JUDGE = Path(__file__).parents[2] / "c" / "libmodbus_judge.c"
 EXCEPTIONS = range(12)  # libmodbus' errno offsets for exceptions 00 to 0B; larger ones are its own errors
@@ -260,7 +260,8 @@ def _octets(said: Any) -> bytes:
 READS = (0x01, 0x02, 0x03, 0x04)
 FUNCTIONS = (*READS, 0x05, 0x06, 0x08, 0x0F, 0x10)
 BITS = (0x01, 0x02, 0x0F)
-MOST = {0x01: 2000, 0x02: 2000, 0x03: 125, 0x04: 125, 0x0F: 1968, 0x10: 123}  # limit of values per request
+# function code: most values in a request
+MOST = {0x01: 2000, 0x02: 2000, 0x03: 125, 0x04: 125, 0x0F: 1968, 0x10: 123}
 ECHOES = (0x05, 0x06, 0x08)
 COIL_VALUES = (b"\xff\x00", b"\x00\x00")
 
@@ -402,7 +403,7 @@ REPAIRED: dict[str, Change] = {
     "start": partial(_put, 3, _near),
     "value": partial(_put, 5, _near),
     "count": _another_count,
-    "byte count": partial(_put, 6, _near),  # byte count of a request
+    "byte count": partial(_put, 6, _near),  # damages the byte count of a request
     "shorter": lambda chance, body: body[: chance.randrange(1, len(body))],
     "longer": lambda chance, body: body + chance.randbytes(chance.choice((1, 2, 8))),
     "exception": lambda chance, body: bytes([body[0], body[1] | 0x80, chance.choice((0, 1, 2, 9, 0x20))]),
@@ -438,7 +439,7 @@ def frames(seed: int, framing: Framing, number: int, *, replies: bool) -> list[S
     while len(found) < number:
         request = random_request(chance)
         if replies and request.address == 0:
-            continue  # this request has no reply
+            continue  # a broadcast, to which no drive replies
         body = reply_body(random_reply(chance, request)) if replies else request_body(request)
         damage = chance.choice(("", "repaired", "left"))
         if replies and chance.random() < 0.1:

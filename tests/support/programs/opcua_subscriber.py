@@ -12,7 +12,7 @@ from typing import Any
 
 from asyncua import Client, ua
 
-TOGETHER = 500  # variables per request
+TOGETHER = 500  # variables in one subscription request
 
 
 class Counter:

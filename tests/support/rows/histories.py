@@ -61,7 +61,8 @@ def random_rows(seed: int, begin: int, count: int, step: int = SECOND // 5) -> l
             Row(
                 time,
                 time - NOON + 10 * DAY,
-                None if is_miss else 1 << dice.randrange(10, 24),  # exactly representable in a float
+                # a power of two, which a float represents exactly
+                None if is_miss else 1 << dice.randrange(10, 24),
                 f"pump-{dice.randrange(3)}",
                 ("speed", "current")[dice.randrange(2)],
                 None if is_miss else dice.uniform(-50, 50),

@@ -140,7 +140,7 @@ class Listener:
         self._probe, self._hears = topic.replace("#", "probe"), threading.Event()
         self._thread = threading.Thread(target=self._read)
         self._thread.start()
-        while not self._hears.wait(0.01):  # until the broker has confirmed the subscription
+        while not self._hears.wait(0.01):  # wait until the broker has confirmed the subscription
             publish(broker, self._probe, b"probe")
 
     def _read(self) -> None:
@@ -243,7 +243,7 @@ class RecordedCommands:
     def __init__(self) -> None:
         self.may = May(write=frozenset({"pump-1.setpoint"}), verbs=frozenset({"pump-1.start"}))
         self.noted: list[tuple[Any, ...]] = []
-        self.stopped_at: dict[str, int] = {}  # ns of CLOCK_MONOTONIC, by drive
+        self.stopped_at: dict[str, int] = {}  # time of each drive's stop, in ns of CLOCK_MONOTONIC
         self.plant_ns: int | None = None
 
     async def stop(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, CommandResult]:

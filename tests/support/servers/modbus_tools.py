@@ -10,9 +10,9 @@ from lines import PATIENCE
 from peers import build_with_libmodbus, require_program
 
 SOURCE = Path(__file__).parents[1] / "programs" / "libmodbus_client.c"
-TYPES = {1: "0", 2: "1", 3: "4", 4: "3", 5: "0", 6: "4"}  # mbpoll's option -t by function code
+TYPES = {1: "0", 2: "1", 3: "4", 4: "3", 5: "0", 6: "4"}  # value of mbpoll's option -t, by function code
 NO_REPLY = -1
-CODES = {  # exception codes by libmodbus's texts for them
+CODES = {  # exception code by the text that libmodbus has for it
     "Illegal function": 1,
     "Illegal data address": 2,
     "Illegal data value": 3,

@@ -16,7 +16,7 @@ import pytest
 
 NOBODYS_CARD = "02:00:00:00:00:00"
 BRIDGES_CARD = "02:00:00:00:02:00"
-_BRIDGES = itertools.count()  # numbers for this process's bridges
+_BRIDGES = itertools.count()  # makes the names of this process's bridges different
 
 
 def _ip(*words: str) -> None:

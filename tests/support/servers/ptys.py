@@ -48,7 +48,7 @@ def _copy(masters: tuple[int, ...], stop: int) -> None:
                     os.write(masters[1 - masters.index(key.fd)], os.read(key.fd, 1024))
 
 
-PATIENCE = 60.0  # s to wait for a required reply
+PATIENCE = 60.0  # longest wait for a reply that must come, in s
 
 
 @contextmanager

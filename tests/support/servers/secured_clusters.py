@@ -26,7 +26,7 @@ from multidrop.fleet.servers.rights import ROUTE_PORTS, STORE, TlsFiles, write_f
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
 PATIENCE_S = 120.0
-Change = Callable[[str], str]  # edits the text of rights.conf
+Change = Callable[[str], str]  # a function that edits the text of rights.conf
 
 
 def _as_written(rights: str) -> str:
@@ -161,7 +161,8 @@ class SecuredFleet:
         self.servers = servers
         self.hall = SerialHall(6)
         self.running: dict[str, subprocess.Popen[bytes]] = {}
-        self._started: dict[str, tuple[tuple[str, str], dict[str, str]]] = {}  # arguments of `start`
+        # gateway: arguments with which `start` was called
+        self._started: dict[str, tuple[tuple[str, str], dict[str, str]]] = {}
         self._folder = folder
         (folder / "plant.toml").write_text(self.hall.plant())
         made = multidrop(servers, "operator", "fleet", "init", str(folder / "plant.toml"))

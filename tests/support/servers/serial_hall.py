@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-REQUEST = 8  # bytes of a Modbus RTU read
+REQUEST = 8  # number of bytes of a Modbus RTU read request
 MAKE = {0x02BC: 1, 0x02BE: 1}  # INNOVERT IBD: baud rate (1: 9600) and address, which identify it
 
 
@@ -167,7 +167,7 @@ def _answer(client: socket.socket, request: bytes, *, takes_writes: bool) -> Non
     try:
         client.sendall(body + _crc(body))
     except OSError:
-        return  # the connection is closed
+        return  # the client has closed the connection
 
 
 def _crc(data: bytes) -> bytes:

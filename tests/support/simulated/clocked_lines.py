@@ -48,7 +48,7 @@ def transactions_of(line: Any) -> Transactions:
 class ClockedWire(FaultyWire):
     """A faulty wire without a port of the operating system."""
 
-    ids = TransactionIds.MATCH  # as for a tcp:// port
+    ids = TransactionIds.MATCH  # requests and replies have transaction ids, as on a tcp:// port
     chunk = 1.0  # s; characters within this time arrive together, so the line receives a reply in one piece
 
     def open(self) -> None:
@@ -101,7 +101,7 @@ class ClockedPort:
         self._urgent: Any = None
         self._kept: list[object] = []  # keeps objects alive that the core may read
         self._received = b""
-        self._guard = threading.RLock()  # like the engine's mutex
+        self._guard = threading.RLock()  # locks the port, as the engine's mutex does
         self._is_closed = False
         lib.md_turn_init(self._turn, self._slots, self.room, clocked.now)
         self._turn.line.transactions = transactions
@@ -222,7 +222,7 @@ class ClockedPort:
 class ClockedLine:
     """Replaces line.Line: the interface that the bus uses."""
 
-    only_settings = None  # drives may have any settings
+    only_settings = None  # None: drives of any line settings are allowed
     why_closing = ""
     mastership = None
     may_send = True
@@ -322,7 +322,7 @@ class ClockedLines:
         self._beside: set[threading.Thread] = set()
         patch = self._patch = pytest.MonkeyPatch()
         patch.setattr(bus, "Line", self._line)
-        patch.setattr(peers, "_former", {})  # forget peers from another clock
+        patch.setattr(peers, "_former", {})  # forget timing that was learnt on another clock
         patch.setattr(clock, "now_ns", lambda: self.now)
         patch.setattr(clock, "boottime_ns", lambda: self.now)
         patch.setattr(clock, "sleep", self._sleep)
@@ -413,7 +413,8 @@ class ClockedLines:
 
     def _pass_time(self, seconds: float) -> None:
         for thread in threading.enumerate():
-            if thread.name == "multidrop reopening":  # reopening takes no time on this clock
+            # the thread would take real time; reopening takes none on this clock
+            if thread.name == "multidrop reopening":
                 thread.join()
         try:
             with self._turn:

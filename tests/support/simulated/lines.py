@@ -21,7 +21,7 @@ from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.sim import SimulatedDrive, Simulator, Wire, proof, serve
 
-ANY_PORT = "socket://127.0.0.1:0"  # a free port; works without pseudo-terminals
+ANY_PORT = "socket://127.0.0.1:0"  # any free TCP port; needs no pseudo-terminals
 PATIENCE = 120.0  # s, longest wait for events that are immediate on an idle machine
 # Statuses of misses that a delay of the test machine alone can cause.
 HOST_LATE = {
@@ -68,7 +68,7 @@ class LateWire(Wire):
 
     def __init__(self, drives: Sequence[SimulatedDrive], **details: Any) -> None:
         super().__init__(drives, **details)
-        self._late: list[tuple[float, bytes]] = []  # heap of (time, reply)
+        self._late: list[tuple[float, bytes]] = []  # heap of delayed replies: time at which to send it, reply
         self._now = 0.0
 
     def hold_up(self, reply: bytes, seconds: float) -> bytes:

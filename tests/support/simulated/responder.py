@@ -263,7 +263,7 @@ LENGTHS = dict.fromkeys((*READS, 5, 6, 8), 8)
 class ReceivedFrame:
     """A received frame; `what` is "moves", "stops", "writes", "reads" or "damaged"."""
 
-    at: int  # time of reading, CLOCK_MONOTONIC in ns
+    at: int  # time at which the frame was read, CLOCK_MONOTONIC in ns
     connection: int  # number of the connection; increases each time the port comes back
     frame: bytes
     what: str
@@ -350,17 +350,17 @@ class ResponderLine:
         self.drives = {drive.address: drive for drive in drives}
         self.log: list[ReceivedFrame] = []
         self.troubles: list[str | int] = []
-        self.deaf_until = 0.0  # ignore requests until then, s of CLOCK_MONOTONIC
+        self.deaf_until = 0.0  # requests before this time are ignored, s of CLOCK_MONOTONIC
         self.delay = 0.0
         self.connection = 0
-        self.mangle: Callable[[bytes], bytes] = lambda said: said  # applied to each reply
+        self.mangle: Callable[[bytes], bytes] = lambda said: said  # changes each reply before it is sent
         self.held = threading.Event()  # set once replies are held back
-        self._hold_in = 0  # requests until replies are held back
+        self._hold_in = 0  # number of requests after which replies are held back
         self._is_holding = False
-        self._kept: list[bytes] = []  # replies held back
+        self._kept: list[bytes] = []  # the replies that are held back
         self._late = b""
         self._buffer = b""
-        self._last = 0.0  # time of the latest bytes in s
+        self._last = 0.0  # time in s at which the latest bytes came
 
     def hold(self, requests: int) -> None:
         """Answer this many more requests; then hold back all replies until `release` is called."""

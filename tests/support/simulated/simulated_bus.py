@@ -25,7 +25,7 @@ from multidrop.drive import Drive
 from multidrop.sim import MotorDrive, SimulatedDrive, simulated
 from multidrop.transport import clock, peers
 
-EXCHANGE_TIME = 0.02  # s that an exchange takes
+EXCHANGE_TIME = 0.02  # duration of an exchange in s
 TIMEOUT = 0.3
 
 READING = {1, 2, 3, 4}
@@ -50,13 +50,14 @@ class SimulatedBus:
         self.frames: list[tuple[Message, str]] = []
         self.loses: Callable[[Message], bool] = lambda request: False
         self.deafens: Callable[[Message], bool] = lambda request: False
-        self.answers: Callable[[Message], bytes | None] = lambda request: None  # overrides drives' replies
+        # returns a reply that replaces the drives' reply, or None
+        self.answers: Callable[[Message], bytes | None] = lambda request: None
         self.queue_time = 0.0  # s that each exchange waits for its turn
-        self.queue = object()  # not None: the port is open
+        self.queue = object()  # as long as this is not None, the port counts as open
         self.has_echo = False
         self.port = self.identity = "hall"
         monkeypatch.setattr(bus, "Line", lambda port, *facts: self)
-        monkeypatch.setattr(peers, "_former", {})  # forget peers from another clock
+        monkeypatch.setattr(peers, "_former", {})  # forget timing that was learnt on another clock
         monkeypatch.setattr(clock, "sleep", self.sleep)
         monkeypatch.setattr(clock, "now_ns", lambda: round(self.seconds * 1e9))
         monkeypatch.setattr(clock, "boottime_ns", lambda: round((self.seconds + self.slept) * 1e9))
@@ -68,7 +69,7 @@ class SimulatedBus:
 
     is_lost = is_stalled = is_tcp = False
     why_closing = ""
-    may_send = True  # no mastership is needed
+    may_send = True  # True, because this bus has no mastership that could be lost
 
     def open(self) -> SimulatedBus:
         return self
@@ -146,7 +147,7 @@ class SimulatedBus:
 
 
 def is_write(request: Message) -> bool:
-    if len(request.data) == 4:  # a frame of Delixi's own protocol
+    if len(request.data) == 4:  # the request is in Delixi's own protocol
         return request.function not in QUERYING
     return request.function not in READING
 

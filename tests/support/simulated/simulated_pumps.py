@@ -76,9 +76,10 @@ POLLED = (
     "motor_speed",
     "heatsink_temperature",
 )
-FIRST_READING, UNPOLLED = 0x2100, 0x0900  # addresses: first polled reading, an unpolled register
+# addresses of the first polled reading, and of a register that is not polled
+FIRST_READING, UNPOLLED = 0x2100, 0x0900
 RAMP_S = 0.2  # deceleration time in s; short, because `stop` returns only when the motor is at rest
-WAVE_S = 0.1  # s between changes of load and speed
+WAVE_S = 0.1  # time between two changes of load and speed, in s
 
 
 def write_plant(folder: Path, drives: Sequence[int], serve: str = "", every: str = "100 ms") -> Path:
@@ -194,7 +195,7 @@ def main(path: str) -> None:
             sim.motor.deceleration_time = RAMP_S
             sims[sim.drive.name] = sim
         wires.append(Wire(here, name=line.name, port=str(line.port)))
-    late = [0.0]  # s, longest time without running
+    late = [0.0]  # longest time for which the process did not run, in s
     for work in (_serve_words, _make_waves):
         threading.Thread(target=work, args=(sims, late), daemon=True).start()
     serve(wires, lambda simulator: print("ready", flush=True))

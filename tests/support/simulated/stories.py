@@ -81,7 +81,7 @@ class Story:
             self.wire.faults = faults
             self.run_motor(FAULTY)
             self.wire.faults = Faults()
-            self.run(2 * faults.late)  # until delayed replies have arrived
+            self.run(2 * faults.late)  # long enough for all delayed replies to arrive
             begin = self.back_off_is_over() + round(cycle * S)
             end = begin + round(CYCLES * cycle * S)
             self.run((end - self.clocked.now) / S)
@@ -200,7 +200,7 @@ def stalling(longest: float) -> Delay:
     stalls = [(begin, begin + random.uniform(0.5, 1.0) * longest) for begin in begins]
 
     def delay(now: float) -> float:
-        now -= 1000.0  # clocked lines start at 1000 s
+        now -= 1000.0  # clocked lines start at 1000 s, delays at 0
         return max((end - now for begin, end in stalls if begin <= now < end), default=0.0)
 
     return delay
@@ -229,7 +229,7 @@ class PathLine:
         self.now = BEGIN_NS
         self.wire = wire
         self.has_echo = self.is_lost = self.is_stalled = False
-        self.may_send = True  # has no mastership
+        self.may_send = True  # True, because this line has no mastership that could be lost
         self.is_tcp, self.ids = speaks_tcp(self.port), wire.ids
         self.queue = ClockedPort(self, transactions_of(self))
 
@@ -283,7 +283,7 @@ def bus_over(
     wire.open()
     line = PathLine(wire)
     monkeypatch.setattr(bus, "Line", lambda port, *facts: line)
-    monkeypatch.setattr(peers, "_former", {})  # earlier peers belong to another clock
+    monkeypatch.setattr(peers, "_former", {})  # forget timing that was learnt on another clock
     monkeypatch.setattr(clock, "now_ns", lambda: line.now)
     monkeypatch.setattr(clock, "boottime_ns", lambda: line.now)
     monkeypatch.setattr(clock, "sleep", line.sleep)

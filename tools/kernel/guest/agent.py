@@ -45,7 +45,8 @@ def run(call: Any, arguments: dict[str, Any], limit: float) -> dict[str, Any]:
     os.close(writing)
     with os.fdopen(reading, "rb") as pipe, selectors.DefaultSelector() as selector:
         selector.register(pipe, selectors.EVENT_READ)
-        said = pipe.readline() if selector.select(limit) else b""  # not read(): the pipe may stay open
+        # read() would block, because other processes may keep the pipe open
+        said = pipe.readline() if selector.select(limit) else b""
     os.killpg(child, signal.SIGKILL)
     os.waitpid(child, 0)
     plug.unplug_all()

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-HOST = "10.0.2.2"  # QEMU's name of the host
+HOST = "10.0.2.2"  # address of the host, as seen from QEMU's guest
 HARDWARE = (HOST, 0)  # address of hardware.py; the agent sets the port
 HUB = Path("/sys/devices/platform/vhci_hcd.0")
 FREE, USB_2 = "004", "hs"

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 _DIRECTIONS = ("forward", "reverse")
 _DIRECTED = ("start", "jog")
-_FURTHER = {"write": ("REGISTER", "VALUE"), "set-frequency": ("HZ",)}  # command: arguments after the drive
+# command: the words that follow the drive's name
+_FURTHER = {"write": ("REGISTER", "VALUE"), "set-frequency": ("HZ",)}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

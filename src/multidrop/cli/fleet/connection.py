@@ -71,7 +71,8 @@ def _named(variable: str) -> Path | None:
 if TYPE_CHECKING:
     from multidrop.fleet.servers.connections import ServerPath
 
-STATE = "~/.local/state/multidrop/fleet"  # state_folder() without XDG_STATE_HOME, for help texts
+# the result of state_folder() if XDG_STATE_HOME is not set; for help texts
+STATE = "~/.local/state/multidrop/fleet"
 
 
 def add_server_arguments(parser: argparse.ArgumentParser) -> None:

@@ -46,7 +46,7 @@ class Stage:
 
     def __init__(self) -> None:
         self.notes: list[str] = []
-        self.draw: Callable[[Fleet], object] | None = None  # None without a terminal
+        self.draw: Callable[[Fleet], object] | None = None  # draws the fleet's state; None without a terminal
         self.fleet: Fleet = {"gateways": {}, "lines": {}}
         self.updated = asyncio.Event()
         self._started = time.monotonic()

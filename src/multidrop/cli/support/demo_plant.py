@@ -52,10 +52,11 @@ DRIVES = [name for drives in LINES.values() for name, *_ in drives]
 POLLED = ("status", "terminals", "output_frequency", "output_current", "fault", "last_fault")
 # By model: the registers to poll instead of POLLED. At 9600 bit/s, a YD1000 has time for two requests.
 POLLED_OF = {"yd1000": ("status", "output_frequency")}
-SLOWLY = ("output_m01", "output_m02", "output_yabc", "output_virtual")  # settings of output terminals
+# settings of output terminals, which are polled with the period SLOW
+SLOWLY = ("output_m01", "output_m02", "output_yabc", "output_virtual")
 EVERY, SLOW = "450 ms", "2 s"
 MAXIMUM_HZ = 50
-TROUBLE = {  # faults that are simulated for some drives
+TROUBLE = {  # the faults that some drives of the demo simulate
     "fan-1": 'trip = "30 s"\nfirst = "3 s"',
     "belt-5": 'trip = "50 s"',
     "belt-6": 'silence = "40 s"\nsilent_for = "3 s"\nfirst = "2 s"',

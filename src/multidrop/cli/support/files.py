@@ -36,7 +36,7 @@ def write_new(path: Path, content: str | bytes) -> None:
         try:
             file.append(content.encode() if isinstance(content, str) else content)
         except BaseException:
-            if path.is_file():  # a device must not be removed
+            if path.is_file():  # only a file is removed, not a device
                 path.unlink()
             raise
         finally:

@@ -33,7 +33,7 @@ from multidrop.transport.statistics import LineStatistics, Statistics, line_stat
 
 
 class PollingSession(NamedTuple):
-    poller: Poller  # not started yet
+    poller: Poller  # the poller, which is not started yet
     interruption: Interruption
     hand_out: Callable[[], None]  # passes the newest rows to the recording and to all other consumers
     writer: RecordingWriter | None = None  # the recording
@@ -50,10 +50,11 @@ class Rotation(NamedTuple):
 class Triggering(NamedTuple):
     """How triggers are recorded, each in its own file."""
 
-    pre: float  # s recorded before a trigger
-    post: float  # s recorded after it
-    conditions: Mapping[TriggerSeries, str]  # condition's channel: the condition's text
-    signals: Mapping[str, Sequence[TriggerSeries]]  # condition's text: the registers to draw
+    pre: float  # s before a trigger that are recorded
+    post: float  # s after a trigger that are recorded
+    # trigger channel that is computed from a condition: the condition's text
+    conditions: Mapping[TriggerSeries, str]
+    signals: Mapping[str, Sequence[TriggerSeries]]  # condition's text: registers whose curves are drawn
 
 
 def _open(out: Path, metadata: Metadata, how: Rotation | Triggering | None) -> RecordingWriter:
@@ -118,7 +119,7 @@ class LiveDrive:
     polled: PolledDrive
     cycle: float = 0.0  # planned cycle time of the drive's line, in s
     line_utilisation: float = 1.0  # planned utilisation; at 1 and above, polling leaves no spare line time
-    newest: dict[str, Row] = field(default_factory=dict)  # newest sample of each register
+    newest: dict[str, Row] = field(default_factory=dict)  # register: its newest sample
     missed: dict[str, Row] = field(default_factory=dict)  # register: its last miss, if newer than its sample
     last_miss: str = ""  # status of the last miss whose request was sent
     so_far: Statistics = _NOTHING

@@ -202,7 +202,7 @@ def terminal_keys() -> Iterator[Callable[[float], str]]:
     try:
         yield wait_for_key
     finally:
-        with suppress(termios.error):  # fails if the terminal is closed
+        with suppress(termios.error):  # the terminal may be closed by now
             termios.tcsetattr(fd, termios.TCSADRAIN, before)
 
 
