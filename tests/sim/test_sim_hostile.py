@@ -308,7 +308,7 @@ def test_drive_tables_of_a_faults_file_set_the_drives_faults(tmp_path: Path) -> 
     [
         ("drive = 1", "drive is not a table"),
         (None, r"the faults' file cannot be read: No such file"),
-        ("drop =", "is not TOML: "),
+        ("drop =", "the file is not TOML: "),
     ],
 )
 def test_invalid_faults_file_is_refused(text: str | None, sentence: str, tmp_path: Path) -> None:
