@@ -1,4 +1,4 @@
-"""Real NATS servers for each module, with or without a fleet's buckets."""
+"""Real NATS servers, shared by the tests of a module, with or without a fleet's buckets."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ async def _init(servers: Cluster) -> None:
 
 @pytest.fixture
 def desk(tmp_path: Path) -> Iterator[Desks]:
-    """Return the desks of a gateway with a simulated drive."""
+    """Return the command desk and stop desk of a gateway with a simulated drive."""
     from fleets import desks
 
     with desks(tmp_path) as made:

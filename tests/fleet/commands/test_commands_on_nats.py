@@ -1,4 +1,4 @@
-"""Commands on real servers: they arrive on three paths, and only the master carries them out, once."""
+"""Commands over real NATS servers: only a line's master carries out a command, and only once."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ ATTEMPTS = 20
 
 
 class OnNats:
-    """One gateway's desks, subscribed at real servers."""
+    """The command desk and stop desk of one gateway, subscribed at real servers."""
 
     def __init__(self, cluster: Cluster, name: str, made: Desks) -> None:
         self.made = made
@@ -71,7 +71,7 @@ class OnNats:
 
 
 class Fleet:
-    """Two gateways, and a client that sends commands."""
+    """Two gateways that may poll the same line, and a client that sends commands."""
 
     def __init__(self, cluster: Cluster, folder: Path, gateways: list[OnNats]) -> None:
         self.one, self.other = gateways
@@ -122,7 +122,9 @@ def tell(fleet: Cluster, tmp_path: Path, gateways: list[OnNats]) -> Callable[[St
     return lambda story: asyncio.run(main(story))
 
 
-def test_a_command_received_on_three_paths_is_sent_once(tell: Callable[[Story], None]) -> None:
+def test_a_command_that_arrives_over_three_servers_is_sent_to_the_drive_once(
+    tell: Callable[[Story], None],
+) -> None:
     async def story(fleet: Fleet) -> None:
         await fleet.one.open()
         answer = await fleet.asker.write("pump", "frequency", 20.0)
@@ -136,7 +138,7 @@ def test_a_command_received_on_three_paths_is_sent_once(tell: Callable[[Story], 
     tell(story)
 
 
-def test_without_a_master_a_command_is_reported_as_not_sent(
+def test_a_command_to_a_line_without_a_master_is_reported_as_not_sent(
     tell: Callable[[Story], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fleet_commands, "NO_MASTER_S", 0.5)
@@ -175,7 +177,7 @@ async def _is_unheard(path: ServerPath, subject: str) -> bool:
 
 
 async def _died(fleet: Fleet) -> None:
-    """Kill the first gateway, wait until all servers have noticed, and open the line on the other gateway."""
+    """Kill the first gateway, wait until all servers notice, and open the line on the second gateway."""
     await fleet.one.die()
     async with asyncio.timeout(PATIENCE_S):
         for path in fleet.asker._paths:
@@ -203,7 +205,7 @@ def test_a_command_is_not_sent_if_its_line_moves_after_the_offer(
     tell(story)
 
 
-def test_a_confirmation_duplicated_on_all_paths_is_carried_out_once(tell: Callable[[Story], None]) -> None:
+def test_copies_of_a_confirmation_carry_out_the_command_once(tell: Callable[[Story], None]) -> None:
     async def story(fleet: Fleet) -> None:
         await fleet.one.open()
         offered = await fleet.offered()
@@ -221,7 +223,7 @@ def test_a_confirmation_duplicated_on_all_paths_is_carried_out_once(tell: Callab
     tell(story)
 
 
-def test_a_gateway_rejects_the_offer_of_another_gateway(tell: Callable[[Story], None]) -> None:
+def test_a_gateway_rejects_the_confirmation_of_another_gateways_offer(tell: Callable[[Story], None]) -> None:
     async def story(fleet: Fleet) -> None:
         await fleet.one.open()
         offered = await fleet.offered()
@@ -235,7 +237,7 @@ def test_a_gateway_rejects_the_offer_of_another_gateway(tell: Callable[[Story], 
     tell(story)
 
 
-async def test_subscriptions_move_with_their_path_to_another_server(fleet: Cluster) -> None:
+async def test_subscriptions_continue_after_a_connection_moves_to_another_server(fleet: Cluster) -> None:
     path, asker = (ServerPath(fleet.urls[number:]) for number in (0, 1))
     heard: list[str] = []
 
@@ -284,7 +286,8 @@ def test_the_fleet_command_line_can_write_a_setpoint_and_stop_a_drive(drill: Com
     for _ in range(ATTEMPTS):
         done = drill.run("write", "drive-0", "frequency", "49.99", "--yes", "--json", "--by", "anna")
         answer = json.loads(done.stdout)
-        if answer["outcome"] != "not sent":  # on a busy machine the confirmation may come too late
+        # on a busy machine the confirmation may come too late; then the command is not sent
+        if answer["outcome"] != "not sent":
             break
     assert done.returncode == 0, done.stderr
     assert (answer["outcome"], answer["held"]) == ("done", "49.99 Hz")
@@ -308,12 +311,12 @@ def test_the_fleet_command_line_can_write_a_setpoint_and_stop_a_drive(drill: Com
         stopped = drill.run("stop", *words)
         assert stopped.returncode == 0, stopped.stderr
     stops = [drill.stops(drive) for drive in drill.sims]
-    # A stop may be sent repeatedly.
+    # the client may send a stop more than once
     assert all(got >= asked for got, asked in zip(stops, (3, 2, 1, 1), strict=True)), stops
 
 
-def test_commands_are_carried_out_once_and_answers_are_true(drill: CommandDrill) -> None:
-    """`python -m bench.questions.fleet_commands --commands 6000` is the long version."""
+def test_80_commands_are_carried_out_once_and_get_true_answers(drill: CommandDrill) -> None:
+    """The long version of this test is `python -m bench.questions.fleet_commands --commands 6000`."""
     before = {drive: drill.setpoints(drive) for drive in drill.sims}
     found = asyncio.run(drill.ask(80, 10.0))
     assert (found.twice, found.wrongly, found.unnoted) == (0, 0, 0)
@@ -335,7 +338,7 @@ def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecuredCluster
 
 @asynccontextmanager
 async def commanded(servers: SecuredCluster, made: Desks) -> AsyncIterator[CommandSubjects]:
-    """Subscribe to commands with the rights of a gateway."""
+    """Let one gateway subscribe to commands with only the rights of a gateway."""
     operator = paths_of(servers.urls, servers.options("operator"))
     await set_up(operator)
     await store(Bucket(names.PLANT, lambda: operator[0]), PLANT)
@@ -375,7 +378,7 @@ def test_a_commander_may_command_and_a_viewer_may_not(servers: SecuredCluster, t
 
 
 async def nobody_is_asked(asker: Client) -> bool:
-    """Return True if a server reports that no gateway subscribes to the line's commands."""
+    """Return True if the server reports that no gateway subscribes to the line's commands."""
     while True:
         try:
             await asker.request(names.command_subject(LINE), b"{}", 1.0)
@@ -386,8 +389,8 @@ async def nobody_is_asked(asker: Client) -> bool:
         return False
 
 
-def test_servers_report_a_line_without_gateway(servers: SecuredCluster, tmp_path: Path) -> None:
-    """Servers report this although commander and gateway are in different accounts."""
+def test_servers_report_that_no_gateway_polls_a_line(servers: SecuredCluster, tmp_path: Path) -> None:
+    """Servers report a missing gateway although the commander and gateways are in different NATS accounts."""
 
     async def main(made: Desks) -> None:
         async with commanded(servers, made) as subjects:

@@ -1,4 +1,4 @@
-"""Commands at a gateway: the line's master sends each command once and in time, or not at all."""
+"""Command and stop desks: the line's master sends each command once and in time, or not at all."""
 
 from __future__ import annotations
 
@@ -52,7 +52,9 @@ def setpoints(desk: Desks) -> list[int]:
 
 
 @patient
-def test_a_command_is_offered_carried_out_and_logged_before_and_after(desk: Desks, tmp_path: Path) -> None:
+def test_a_confirmed_command_is_logged_before_and_after_it_is_carried_out(
+    desk: Desks, tmp_path: Path
+) -> None:
     token = desk.offered(20.0)
     assert desk.writes == []
     answer = asyncio.run(desk.do(token))
@@ -81,7 +83,7 @@ def test_a_duplicated_confirmation_is_carried_out_once_with_one_answer(desk: Des
 
 
 @patient
-def test_copies_of_a_request_get_the_same_offer(desk: Desks) -> None:
+def test_copies_of_a_command_request_get_the_same_offer(desk: Desks) -> None:
     same = {"id": "one", "register": SETPOINT, "value": 20.0}
     assert desk.offered(**same) == desk.offered(**same)
     assert desk.offered(**same) != desk.offered(**(same | {"id": "two"}))
@@ -89,7 +91,9 @@ def test_copies_of_a_request_get_the_same_offer(desk: Desks) -> None:
 
 @patient
 @pytest.mark.parametrize(("seconds", "outcome"), [(0.5, DONE), (1.0, NOT_SENT), (60.0, NOT_SENT)])
-def test_a_late_confirmation_sends_nothing(desk: Desks, seconds: float, outcome: CommandOutcome) -> None:
+def test_a_confirmation_more_than_a_second_after_the_offer_sends_nothing(
+    desk: Desks, seconds: float, outcome: CommandOutcome
+) -> None:
     token = desk.offered()
     desk.clock.pass_s(seconds)
     answer = asyncio.run(desk.do(token))
@@ -99,7 +103,10 @@ def test_a_late_confirmation_sends_nothing(desk: Desks, seconds: float, outcome:
 
 
 def do_after(desk: Desks, deed: Callable[[], object], waited_s: float = 0.0) -> CommandAnswer:
-    """Let `waited_s` pass, then carry out an offer; its thread calls `deed` before it sends the command."""
+    """Let `waited_s` pass, then confirm an offer.
+
+    Call `deed` in the command's thread, right before it is sent.
+    """
     token = desk.offered()
     offer = desk.desk.offers.find(token)
     work = offer.prepared.work
@@ -114,8 +121,8 @@ def do_after(desk: Desks, deed: Callable[[], object], waited_s: float = 0.0) -> 
 
 
 @patient
-def test_a_command_delayed_in_its_thread_is_not_sent(tmp_path: Path) -> None:
-    """The bus waits only for the rest of the second within which the command may be sent."""
+def test_a_command_whose_thread_is_slow_is_not_sent_after_a_second(tmp_path: Path) -> None:
+    """The bus waits only for the rest of the second in which an offered command may be sent."""
     with desks(tmp_path, patience_s=0) as desk:
         answer = do_after(desk, lambda: time.sleep(0.2), waited_s=0.95)
         assert answer.outcome is NOT_SENT
@@ -124,8 +131,8 @@ def test_a_command_delayed_in_its_thread_is_not_sent(tmp_path: Path) -> None:
 
 
 @patient
-def test_a_command_voided_by_a_stop_in_its_thread_is_not_sent(desk: Desks) -> None:
-    """The bus checks again, right before it sends, whether the command is void."""
+def test_a_stop_cancels_a_command_until_it_is_sent(desk: Desks) -> None:
+    """Right before it sends a command, the bus checks again whether a stop has cancelled the offer."""
     answer = do_after(desk, lambda: desk.desk.offers.void(LINE, ["pump"], "a stop was called"))
     assert answer.outcome is NOT_SENT
     assert desk.writes == []
@@ -134,7 +141,8 @@ def test_a_command_voided_by_a_stop_in_its_thread_is_not_sent(desk: Desks) -> No
 @patient
 def test_a_command_is_on_the_disk_before_it_is_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with desks(tmp_path) as desk:
-        synced: list[tuple[int, int]] = []  # per sync: lines in the log, writes to the drive
+        # at each sync: number of lines in the log, and of writes to the drive
+        synced: list[tuple[int, int]] = []
 
         def sync(file: int) -> None:
             os.fsync(file)
@@ -146,7 +154,7 @@ def test_a_command_is_on_the_disk_before_it_is_sent(tmp_path: Path, monkeypatch:
 
 
 def while_noted(desk: Desks, deed: Callable[[], object]) -> CommandAnswer:
-    """Call `deed` while a command's first record is logged, the last moment before the command is sent."""
+    """Call `deed` while the first record of a command is logged, right before the command is sent."""
 
     def before(record: dict[str, Any]) -> None:
         if record["step"] == "begun":
@@ -174,8 +182,10 @@ MEANWHILE: dict[str, Callable[[Desks], object]] = {
 @patient
 @pytest.mark.parametrize("deed", MEANWHILE)
 @pytest.mark.parametrize("is_late", [False, True])
-def test_a_command_is_not_sent_after_a_change_since_its_offer(desk: Desks, deed: str, is_late: bool) -> None:
-    """The change comes before the confirmation, or between the confirmation and the write."""
+def test_a_command_is_not_sent_once_its_offer_has_become_invalid(
+    desk: Desks, deed: str, is_late: bool
+) -> None:
+    """The offer becomes invalid before it is confirmed, or between its confirmation and the write."""
     if is_late:
         answer = while_noted(desk, lambda: MEANWHILE[deed](desk))
     else:
@@ -187,7 +197,7 @@ def test_a_command_is_not_sent_after_a_change_since_its_offer(desk: Desks, deed:
 
 
 @patient
-def test_a_stop_of_another_drive_does_not_void_the_offer(desk: Desks) -> None:
+def test_a_stop_of_another_drive_does_not_cancel_a_command(desk: Desks) -> None:
     token = desk.offered()
     desk.desk.offers.void(LINE, ["fan"], "a stop was called")
     desk.desk.offers.void("hall-2", None, "a stop was called")
@@ -195,7 +205,7 @@ def test_a_stop_of_another_drive_does_not_void_the_offer(desk: Desks) -> None:
 
 
 @patient
-def test_a_restarted_master_rejects_earlier_tokens(desk: Desks, tmp_path: Path) -> None:
+def test_a_restarted_gateway_rejects_confirmations_of_earlier_offers(desk: Desks, tmp_path: Path) -> None:
     token = desk.offered()
     with desks(tmp_path) as after:
         assert asyncio.run(after.do(token)).outcome is UNKNOWN
@@ -206,7 +216,7 @@ def test_a_restarted_master_rejects_earlier_tokens(desk: Desks, tmp_path: Path) 
 
 @patient
 def test_only_the_master_answers_a_command_or_a_stop(desk: Desks) -> None:
-    """A gateway that is not the master stays silent, because the sender uses the first answer."""
+    """A gateway that does not poll the line must stay silent, because the sender uses the first answer."""
     desk.is_master = False
     assert desk.ask(register=SETPOINT, value=20.0) is None
     assert asyncio.run(desk.stop()) is None
@@ -215,8 +225,8 @@ def test_only_the_master_answers_a_command_or_a_stop(desk: Desks) -> None:
 
 
 @patient
-def test_a_command_waits_for_the_guard_and_a_stop_does_not(desk: Desks) -> None:
-    """A new master accepts only stops until the guard time has passed."""
+def test_a_new_master_accepts_stops_but_no_commands_during_the_guard_time(desk: Desks) -> None:
+    """During the guard time, frames of the line's previous master may still be on the line."""
     desk.is_guarded = True
     assert desk.ask(register=SETPOINT, value=20.0) is None
     assert asyncio.run(desk.stop()).outcome is DONE
@@ -224,7 +234,7 @@ def test_a_command_waits_for_the_guard_and_a_stop_does_not(desk: Desks) -> None:
 
 
 @patient
-def test_asking_for_the_result_withdraws_the_offer(desk: Desks) -> None:
+def test_a_request_for_the_result_withdraws_an_unconfirmed_offer(desk: Desks) -> None:
     token = desk.offered()
 
     async def main() -> list[CommandAnswer]:
@@ -259,7 +269,7 @@ def test_a_damaged_permission_list_allows_nothing(tmp_path: Path, may: Any) -> N
 
 @patient
 @pytest.mark.slow
-def test_a_start_runs_the_motor_and_a_stop_stops_it(desk: Desks) -> None:
+def test_a_start_command_runs_the_motor_and_a_stop_stops_it(desk: Desks) -> None:
     async def main() -> list[CommandOutcome]:
         found = [(await desk.do(desk.offered(20.0))).outcome]
         found.append((await desk.do(desk.offered(verb="start", options={"direction": "forward"}))).outcome)
@@ -273,7 +283,7 @@ def test_a_start_runs_the_motor_and_a_stop_stops_it(desk: Desks) -> None:
 @patient
 @pytest.mark.slow
 def test_a_long_stop_reports_its_progress(desk: Desks) -> None:
-    """The sender learns that the stop was sent long before the motor has stopped."""
+    """The sender must know early that the stop was sent: a motor may take long to stop."""
     desk.sim["output_frequency"] = 10.0
     data = json.dumps({"id": "one", "by": "anna", "drives": None}).encode()
     sentence = "pump: the stop was confirmed, but the motor is not yet seen to stand"
@@ -299,10 +309,10 @@ LOSSES: dict[str, Callable[[Desks], object]] = {
 
 @patient
 @pytest.mark.parametrize("loss", LOSSES)
-def test_a_gateway_that_loses_the_line_does_not_answer_its_stop(
+def test_a_gateway_that_loses_a_line_does_not_answer_the_lines_stop(
     desk: Desks, monkeypatch: pytest.MonkeyPatch, loss: str
 ) -> None:
-    """The next master may have a copy of the stop. A gateway that is master again answers the next copy."""
+    """The next master gets a copy of the stop, and answers it. So does this gateway if it is master again."""
 
     def lost(seconds: float | None) -> dict[str, Stopped]:
         LOSSES[loss](desk)
@@ -319,7 +329,7 @@ def test_a_gateway_that_loses_the_line_does_not_answer_its_stop(
 
 
 @patient
-def test_copies_of_a_stop_are_sent_once_and_void_offers(desk: Desks) -> None:
+def test_a_stop_is_sent_once_despite_copies_and_cancels_offered_commands(desk: Desks) -> None:
     token = desk.offered()
 
     async def main() -> CommandAnswer:
@@ -421,7 +431,7 @@ def test_invalid_commands_are_each_refused_in_one_sentence(desk: Desks, data: by
     assert desk.writes == []
 
 
-ODD_STOPS = [  # messages that any client may send, or that a network may damage
+ODD_STOPS = [  # stop messages that any client may send, or that a network may damage
     b"",
     b"\xff\xfe",
     b"null",
@@ -466,8 +476,11 @@ def test_a_malformed_stop_is_carried_out(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The stop is logged as printable text. If it names no drives, it stops all drives of the line."""
-    # A repeated request without an id would be a new stop.
+    """Its sender's name is logged as printable text.
+
+    If it names no drives, all drives of the line are stopped.
+    """
+    # the test must not repeat a stop that has no id, because each repetition would be a new stop
     monkeypatch.setattr(desk_module, "HOLD_S", PATIENCE_S)
     answer = asyncio.run(desk.stop_by(data))
     assert answer.drives["pump"].outcome is DONE
@@ -491,7 +504,7 @@ def test_a_malformed_stop_is_carried_out(
         ({"id": "one", "drives": ["fan"]}, {"id": "one", "drives": ["pump"]}),
     ],
 )
-def test_a_request_with_another_id_is_a_new_stop(
+def test_a_stop_message_with_another_id_is_a_new_stop(
     desk: Desks, first: dict[str, Any], then: dict[str, Any]
 ) -> None:
     asyncio.run(desk.stop_by(json.dumps(first).encode()))
@@ -508,8 +521,8 @@ def test_a_stop_with_an_unknown_drive_stops_the_others(desk: Desks) -> None:
 
 
 @patient
-def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_path: Path) -> None:
-    """Depending on the keyboard, a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
+def test_a_stop_accepts_another_unicode_spelling_of_a_drive_a_command_does_not(tmp_path: Path) -> None:
+    """Keyboards differ: a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
     fan, spelt = "L\u00fcfter", "Lu\u0308fter"
     with desks(tmp_path, {"write": [f"{spelt}.frequency"]}, name=fan) as desk:
         told = desk.ask(drive=spelt, register="frequency", value=20.0)
@@ -541,7 +554,7 @@ def test_a_command_to_a_drive_that_has_left_its_line_is_not_sent() -> None:
 
 @patient
 def test_an_offer_does_not_change_the_known_setpoint() -> None:
-    """The offered command may never be sent. A changed setpoint would affect the next start."""
+    """The command of an offer may never be sent. A changed setpoint would affect the next start."""
     drive = InvtCHE(1, name="mill", maximum_frequency=50)
     drive.commanded = 40.0
     prepare(drive, CommandRequest("1", "anna", "mill", verb="set_frequency", options={"hz": 10.0}))
@@ -583,7 +596,7 @@ asyncio.run(main())
 """
 
 
-async def test_a_killed_log_thread_blocks_commands_but_not_stops(tmp_path: Path) -> None:
+async def test_a_failed_log_thread_blocks_commands_but_not_stops(tmp_path: Path) -> None:
     with desks(tmp_path) as desk, patch.object(CommandLog, "_add", side_effect=SystemExit("killed")):
         answer = await desk.do(desk.offered())
         assert answer.outcome is NOT_SENT
@@ -594,7 +607,7 @@ async def test_a_killed_log_thread_blocks_commands_but_not_stops(tmp_path: Path)
         assert desk.written == {"control"}
 
 
-async def test_log_records_keep_the_order_of_calls_and_none_follows_the_close(tmp_path: Path) -> None:
+async def test_log_records_keep_their_order_and_are_refused_after_the_close(tmp_path: Path) -> None:
     log = CommandLog(tmp_path / "commands.jsonl")
     await asyncio.gather(*(log.note({"step": number}) for number in range(5)))
     log.close()
@@ -606,7 +619,7 @@ async def test_log_records_keep_the_order_of_calls_and_none_follows_the_close(tm
 
 @pytest.mark.slow
 @pytest.mark.parametrize("script", [HANGING_LOG, HANGING_LINE], ids=["log", "line"])
-def test_a_hanging_disk_or_port_does_not_block_the_exit(tmp_path: Path, script: str) -> None:
+def test_a_hanging_disk_or_port_does_not_block_the_gateways_exit(tmp_path: Path, script: str) -> None:
     words = [sys.executable, "-c", script, str(tmp_path / "commands.jsonl")]
     with BoundProcess(words, stderr=subprocess.PIPE, text=True) as process:
         _, errors = process.communicate(timeout=PATIENCE)
@@ -620,7 +633,10 @@ def test_a_hanging_disk_or_port_does_not_block_the_exit(tmp_path: Path, script: 
 def test_only_one_of_many_stops_of_a_silent_drive_is_repeated(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """For each call, a stop is sent after the call. All calls get the answer of the stop that is repeated."""
+    """The first stop is being repeated while eight more arrive.
+
+    All nine get the result of a repeated stop.
+    """
     repeated: list[float | None] = []
 
     are_all_called = threading.Event()
@@ -654,4 +670,4 @@ def test_only_one_of_many_stops_of_a_silent_drive_is_repeated(
     with desks(tmp_path) as desk:
         answers = asyncio.run(stopped(desk))
     assert [answer.outcome for answer in answers if answer] == [CommandOutcome.DONE] * 9
-    assert repeated == [None, 0.0, 0.0]  # seven calls got the answer of the last of these three stops
+    assert repeated == [None, 0.0, 0.0]  # three stops were sent: seven calls got the result of the last one

@@ -1,4 +1,4 @@
-"""The sender of commands sends each command only once, and reports its real outcome."""
+"""FleetCommands, the sender of commands, sends each command only once, and reports its real outcome."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def answer(outcome: str, text: str = "as it is") -> dict[str, str]:
 
 
 class Said:
-    """A message that was received."""
+    """An answer, with its bytes in `data` as in nats-py's messages."""
 
     def __init__(self, data: bytes) -> None:
         self.data = data
 
 
 class ScriptedPath:
-    """A path with a list of answers for each kind of request: "cmd", "do", "ask" or "stop".
+    """A fake server connection with a list of answers for each kind of request: "cmd", "do", "ask" or "stop".
 
     The last answer of a list is repeated.
     """
@@ -61,11 +61,11 @@ class ScriptedPath:
         return Said(found if isinstance(found, bytes) else json.dumps(found).encode())
 
     async def close(self) -> None:
-        """Do nothing, so that the same answers are given after the next connection."""
+        """Do nothing, so that the same answers are given after the client connects again."""
 
 
 class Plant:
-    """The plant's bucket. A test may let its reads fail."""
+    """A fake copy of the plant. With a `failure`, it cannot be read."""
 
     def __init__(self, failure: FleetError | None = None) -> None:
         self._failure = failure
@@ -87,7 +87,7 @@ def asked(
     plant: Plant | None = None,
     nobody_s: float = 0.01,
 ) -> CommandAnswer:
-    """Return the result of a command from a client that has only this path."""
+    """Return the result of a command or stop from a client that has only this server connection."""
 
     async def main() -> CommandAnswer:
         client = FleetCommands(["nats://nobody"], by="anna", log=folder / "asked.jsonl")
@@ -115,7 +115,7 @@ UNDER_WAY, TAKEN_BACK, IT_IS_DONE = answer("under way"), answer("not sent"), ans
 
 WRITES: dict[
     str, tuple[ScriptedPath, CommandOutcome, int]
-] = {  # path, expected outcome, number of confirmations
+] = {  # server connection, expected outcome, number of sent confirmations
     "done": (ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE]), DONE, 1),
     "no master": (ScriptedPath(cmd=[NOBODY]), NOT_SENT, 0),
     "no connection": (ScriptedPath(cmd=[CUT]), NOT_SENT, 0),
@@ -149,7 +149,7 @@ WRITES: dict[
 
 
 @pytest.mark.parametrize("case", WRITES)
-def test_a_command_is_sent_once_and_its_outcome_is_true(tmp_path: Path, case: str) -> None:
+def test_a_command_is_sent_once_and_its_real_outcome_is_reported(tmp_path: Path, case: str) -> None:
     path, outcome, sent = WRITES[case]
     told = asked(tmp_path, path, write)
     assert told.outcome is outcome
@@ -219,7 +219,7 @@ def test_progress_of_a_stop_is_reported_once_per_change(tmp_path: Path) -> None:
     assert last.outcome is DONE
 
 
-def test_a_missing_master_is_reported_once_and_immediately(tmp_path: Path) -> None:
+def test_a_stop_reports_immediately_and_once_that_its_line_has_no_master(tmp_path: Path) -> None:
     told: list[CommandAnswer] = []
     path = ScriptedPath(stop=[NOBODY, NOBODY, CUT, IT_IS_DONE])
     last = asked(tmp_path, path, lambda client: client.stop(["pump-1"], on_news=told.append), nobody_s=60.0)
@@ -250,7 +250,7 @@ def test_a_stop_without_answers_is_reported_before_the_client_gives_up(tmp_path:
 
 
 class HangingPath(ScriptedPath):
-    """A path whose server hangs."""
+    """A server connection that never answers."""
 
     async def request(self, subject: str, data: bytes) -> Said:
         self.asked.append(subject)
@@ -258,7 +258,7 @@ class HangingPath(ScriptedPath):
         raise AssertionError("it hangs")
 
 
-def test_a_stop_does_not_wait_for_a_hanging_path(tmp_path: Path) -> None:
+def test_a_stop_does_not_wait_for_a_hanging_server(tmp_path: Path) -> None:
     hanging, path = HangingPath(), ScriptedPath(stop=[IT_IS_DONE])
 
     async def stop_on_both(client: FleetCommands) -> CommandAnswer:
@@ -270,7 +270,9 @@ def test_a_stop_does_not_wait_for_a_hanging_path(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("others", [[NOBODY, NOBODY], [NOBODY, CUT], [LOST, NOBODY]])
-def test_a_stop_is_unsent_only_if_every_path_reports_it(tmp_path: Path, others: list[Given]) -> None:
+def test_a_stop_counts_as_not_sent_only_if_every_server_reports_that(
+    tmp_path: Path, others: list[Given]
+) -> None:
     paths = [ScriptedPath(stop=[given]) for given in (NOBODY, *others)]
 
     async def stop_on_all(client: FleetCommands) -> CommandAnswer:
@@ -295,7 +297,7 @@ def test_a_full_disk_blocks_commands_but_not_stops(tmp_path: Path) -> None:
     assert path.asked == ["stop"]
 
 
-def test_an_unopened_log_blocks_commands_but_not_stops(tmp_path: Path) -> None:
+def test_a_log_that_cannot_be_opened_blocks_commands_but_not_stops(tmp_path: Path) -> None:
     path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])
     (tmp_path / "asked.jsonl").mkdir()
     told = asked(tmp_path, path, write)
@@ -305,7 +307,7 @@ def test_an_unopened_log_blocks_commands_but_not_stops(tmp_path: Path) -> None:
     assert path.asked == ["stop"]
 
 
-def test_only_the_confirmed_text_is_carried_out(tmp_path: Path) -> None:
+def test_a_command_whose_preview_has_changed_is_not_sent(tmp_path: Path) -> None:
     path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE])
 
     async def agreed(client: FleetCommands) -> CommandAnswer:
@@ -332,8 +334,8 @@ def test_the_drives_of_one_line_are_stopped_by_one_message(tmp_path: Path) -> No
     assert path.asked == ["stop", "stop"]
 
 
-def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_path: Path) -> None:
-    """Depending on the keyboard, a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
+def test_a_stop_accepts_another_unicode_spelling_of_a_drive_a_command_does_not(tmp_path: Path) -> None:
+    """Keyboards differ: a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
     fan, spelt = "L\u00fcfter", "Lu\u0308fter"
     plant = Plant()
     plant.records["hall-3"] = Record("hall-3", 1, {"line": {"drive": [{"name": fan}]}})
@@ -348,12 +350,13 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_command_does_not(tmp_p
 @pytest.mark.parametrize(
     ("by", "noted"), [("\x1b[31m", r"\x1b[31m"), ("\ud800", r"\ud800"), ("", "somebody"), (None, "somebody")]
 )
-def test_a_stop_is_sent_whatever_the_senders_name(tmp_path: Path, by: Any, noted: str) -> None:
+def test_a_stop_is_sent_even_if_its_senders_name_is_invalid(tmp_path: Path, by: Any, noted: str) -> None:
     path = ScriptedPath(stop=[IT_IS_DONE])
 
     async def stopped(client: FleetCommands) -> CommandAnswer:
         client.by = by
-        return await client.stop("pump-1")  # a single name, which must not be read as a sequence of letters
+        # not in a list: the name must not be read as a sequence of letters
+        return await client.stop("pump-1")
 
     assert asked(tmp_path, path, stopped).outcome is DONE
     assert path.asked == ["stop"]
@@ -361,12 +364,12 @@ def test_a_stop_is_sent_whatever_the_senders_name(tmp_path: Path, by: Any, noted
 
 
 @pytest.mark.parametrize("what", [write, lambda client: client.stop(["pump-1"])])
-def test_without_a_readable_plant_nothing_is_sent(tmp_path: Path, what: Any) -> None:
+def test_if_the_plant_cannot_be_read_no_command_or_stop_is_sent(tmp_path: Path, what: Any) -> None:
     with pytest.raises(FleetError, match="no server"):
         asked(tmp_path, ScriptedPath(), what, Plant(FleetError("no server")))
 
 
-def test_an_older_copy_of_the_plant_is_enough_for_commands(tmp_path: Path) -> None:
+def test_commands_are_sent_with_an_older_copy_of_the_plant(tmp_path: Path) -> None:
     plant = Plant()
     plant._failure = FleetError("no server")
     path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])
@@ -385,7 +388,7 @@ def test_a_stop_of_a_named_line_needs_no_plant(tmp_path: Path) -> None:
         asked(tmp_path, path, stop, plant)
 
 
-def test_an_unknown_drive_does_not_block_other_stops(tmp_path: Path) -> None:
+def test_an_unknown_drive_does_not_prevent_the_stops_of_known_drives(tmp_path: Path) -> None:
     path = ScriptedPath(stop=[{**IT_IS_DONE, "drives": {"pump-1": IT_IS_DONE}}])
     told = asked(tmp_path, path, lambda client: client.stop(["pmp-2", "pump-1"]))
     assert path.asked == ["stop"]

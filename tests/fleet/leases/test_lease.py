@@ -20,7 +20,7 @@ from multidrop.fleet.leases.rules import SECOND, USUAL
 
 
 class Trial:
-    """Three buckets and a clock. `lease` and `observer` create gateways."""
+    """Three lease buckets and a clock. `lease` and `observer` create gateways."""
 
     def __init__(self) -> None:
         self.clock = HandClock()
@@ -40,12 +40,12 @@ class Trial:
         return [bucket.records[name].value for bucket in self.buckets]
 
     def store_ends(self, **more: int) -> None:
-        """Let another gateway end the session of gateway a on all paths."""
+        """Let another gateway end the session of gateway "a" in all three buckets."""
         for bucket in self.buckets:
             bucket.store("a", {**bucket.records["a"].value, **more, "ended": True, "by": "rogue"})
 
     def pass_lease(self) -> None:
-        """Let the time of a lease pass."""
+        """Let as much time pass as a lease is valid."""
         self.clock.pass_s(USUAL.lease / SECOND)
 
 
@@ -60,7 +60,7 @@ async def look(observer: Observer) -> None:
 
 
 async def begun() -> tuple[Trial, Lease]:
-    """Return a trial, and a lease whose first session has started."""
+    """Return a trial, and a lease whose first session has just started."""
     trial = Trial()
     lease = trial.lease()
     assert await lease.try_to_begin()
@@ -75,7 +75,7 @@ async def watched() -> tuple[Trial, Lease, Observer]:
     return trial, lease, observer
 
 
-async def test_a_session_starts_on_all_paths_and_its_lease_counts_from_the_request() -> None:
+async def test_a_session_starts_in_all_buckets_and_its_lease_counts_from_the_request() -> None:
     trial = Trial()
     for bucket in trial.buckets:
         bucket.before_put = lambda key: trial.clock.pass_s(0.25)  # the request takes 0.25 s
@@ -86,7 +86,7 @@ async def test_a_session_starts_on_all_paths_and_its_lease_counts_from_the_reque
     assert trial.masterships[0].until == lease.until
 
 
-async def test_a_renewed_lease_counts_from_the_renewals_request() -> None:
+async def test_a_renewed_lease_counts_from_the_request_not_from_the_answer() -> None:
     trial, lease = await begun()
     trial.clock.pass_s(1)
     sent = trial.clock.now
@@ -97,15 +97,15 @@ async def test_a_renewed_lease_counts_from_the_renewals_request() -> None:
     assert lease.until == trial.masterships[0].until == sent + USUAL.lease
 
 
-async def test_an_unanswered_start_counts_only_after_its_renewal() -> None:
-    """The answer was lost, so the lease does not know which of its requests stored the record."""
+async def test_a_lease_record_with_an_unanswered_start_counts_once_it_is_renewed() -> None:
+    """The answer was lost, so the lease does not know which of its requests wrote the lease record."""
     trial = Trial()
     trial.buckets[2].loses_answers = True
     lease, began = trial.lease(), trial.clock.now
     assert await lease.try_to_begin()
     trial.buckets[2].loses_answers = False
     trial.clock.pass_s(1)
-    await lease.renew_once(2)  # reads the record that was stored at the unanswered start
+    await lease.renew_once(2)  # reads the lease record, which the unanswered start has stored
     assert lease.held[2] is not None
     trial.clock.pass_s(0.5)
     await lease.renew_once(1)
@@ -114,7 +114,7 @@ async def test_an_unanswered_start_counts_only_after_its_renewal() -> None:
     assert lease.until == began + 1.5 * SECOND + USUAL.lease
 
 
-async def test_the_lease_counts_from_the_second_newest_renewal_of_its_paths() -> None:
+async def test_the_lease_counts_from_the_second_newest_of_its_three_renewals() -> None:
     trial, lease = await begun()
     began = trial.clock.now
     trial.clock.pass_s(1)
@@ -125,7 +125,7 @@ async def test_the_lease_counts_from_the_second_newest_renewal_of_its_paths() ->
     assert lease.until == began + SECOND + USUAL.lease
 
 
-async def test_the_lease_survives_one_lost_path_but_not_two() -> None:
+async def test_the_lease_survives_one_lost_server_but_not_two() -> None:
     trial, lease = await begun()
     trial.buckets[1].is_down = True
     for _ in range(20):
@@ -137,14 +137,14 @@ async def test_the_lease_survives_one_lost_path_but_not_two() -> None:
         trial.clock.pass_s(0.5)
         await renew(lease)
     assert not lease.is_valid
-    trial.buckets[1].is_down = False  # no gateway has ended this path's record, so the session continues
+    trial.buckets[1].is_down = False  # no gateway has ended this lease record, so the session continues
     await renew(lease)
     assert lease.is_valid
     assert lease.session == 1
 
 
 def test_a_failed_renewal_is_retried_soon() -> None:
-    """The path is renewed as soon as its bucket has a leader again."""
+    """A lease record is renewed as soon as its bucket has a leader again."""
 
     async def main() -> None:
         loop = asyncio.get_running_loop()
@@ -175,7 +175,7 @@ async def test_an_unanswered_renewal_does_not_extend_the_lease() -> None:
     trial.clock.pass_s(1)
     for _ in range(2):
         await renew(lease)
-        lease._extend()  # called after the renewal of each path
+        lease._extend()  # called after each successful renewal
         assert lease.until == until
     for bucket in trial.buckets:
         bucket.loses_answers = False
@@ -183,7 +183,7 @@ async def test_an_unanswered_renewal_does_not_extend_the_lease() -> None:
     assert lease.until == until + SECOND
 
 
-async def test_a_late_answer_to_an_earlier_session_is_not_counted() -> None:
+async def test_a_late_answer_to_an_earlier_session_does_not_extend_the_lease() -> None:
     trial, lease = await begun()
     trial.clock.pass_s(1)
 
@@ -199,8 +199,8 @@ async def test_a_late_answer_to_an_earlier_session_is_not_counted() -> None:
     assert not lease.is_valid
 
 
-async def test_a_session_ends_despite_renewals_stored_meanwhile() -> None:
-    """Otherwise the next gateway would wait until the lease expires."""
+async def test_a_session_ends_even_if_its_last_renewal_is_stored_late() -> None:
+    """Otherwise other gateways would wait until the lease expires."""
     trial, lease = await begun()
     for bucket, value in zip(trial.buckets, trial.values(), strict=True):
         bucket.store("a", value)
@@ -210,7 +210,7 @@ async def test_a_session_ends_despite_renewals_stored_meanwhile() -> None:
 
 
 @pytest.mark.parametrize("later", [{"nonce": "another's"}, {"ended": True, "by": "b"}])
-async def test_the_record_of_a_sessions_end_replaces_only_renewals_of_this_session(
+async def test_a_sessions_end_replaces_only_renewals_of_the_same_session(
     later: dict[str, Any],
 ) -> None:
     trial, lease = await begun()
@@ -221,7 +221,7 @@ async def test_the_record_of_a_sessions_end_replaces_only_renewals_of_this_sessi
 
 
 async def test_an_unanswered_renewal_does_not_extend_an_ended_session() -> None:
-    """Otherwise the engine might send again, and the kernel's timer would run without a session."""
+    """If the lease were extended, the engine might send again, and the kernel's timer would run."""
     trial = Trial()
     gates = [GatedBucket(f"lease_{path}", answers=True) for path in range(3)]
     trial.buckets = [*gates]
@@ -240,7 +240,7 @@ async def test_an_unanswered_renewal_does_not_extend_an_ended_session() -> None:
     assert trial.masterships[0].events == ["extend", "end"]
 
 
-async def test_a_late_answer_to_an_ended_session_gives_the_next_session_no_path() -> None:
+async def test_a_late_answer_to_an_ended_session_does_not_count_for_the_next_session() -> None:
     trial = Trial()
     late = GatedBucket("lease_2", answers=True)
     trial.buckets[2] = late
@@ -261,8 +261,8 @@ async def test_a_late_answer_to_an_ended_session_gives_the_next_session_no_path(
     assert lease.held[2] is None
 
 
-async def test_a_suspension_between_reading_the_clock_and_setting_the_timer_is_survived() -> None:
-    """A timer that is set to the past would kill the process, so the engine refuses it."""
+async def test_a_process_suspended_before_it_sets_the_timer_survives() -> None:
+    """The deadline has passed when the timer is set, so the engine refuses it: it would kill the process."""
 
     class StandingStill(RecordingMastership):
         def extend(self, until_ns: int) -> None:
@@ -278,8 +278,8 @@ async def test_a_suspension_between_reading_the_clock_and_setting_the_timer_is_s
     assert not lease.is_valid
 
 
-async def test_session_numbers_come_from_the_record_not_from_a_clock() -> None:
-    """CLOCK_BOOTTIME restarts when a computer boots."""
+async def test_session_numbers_continue_from_the_lease_record_after_a_reboot() -> None:
+    """A clock would give lower numbers after a reboot, because CLOCK_BOOTTIME restarts."""
     trial, lease = await begun()
     await lease.end()
     trial.clock.now = 3 * SECOND
@@ -289,7 +289,7 @@ async def test_session_numbers_come_from_the_record_not_from_a_clock() -> None:
     assert [value["session"] for value in trial.values()] == [2, 2, 2]
 
 
-async def test_no_session_number_is_reused_whatever_the_records_say() -> None:
+async def test_no_session_number_is_reused_even_if_lease_records_are_wrong() -> None:
     """If a number were reused, other gateways could claim lines that the new session polls."""
     trial = Trial()
     lease = trial.lease()
@@ -305,7 +305,7 @@ async def test_no_session_number_is_reused_whatever_the_records_say() -> None:
     await lease.end()
     for bucket in trial.buckets:
         bucket.store("a", None)  # an invalid record is read as None
-    after, newest = trial.lease(), trial.buckets[0].last  # a lease of another process
+    after, newest = trial.lease(), trial.buckets[0].last  # the lease of a restarted process
     assert not await after.try_to_begin()
     trial.pass_lease()
     assert await after.try_to_begin()
@@ -332,8 +332,8 @@ async def test_a_gateway_whose_name_is_in_use_waits_until_that_lease_expires() -
     assert not first.is_valid
 
 
-async def test_no_session_starts_if_only_one_path_is_free() -> None:
-    """Otherwise a waiting gateway of the same name would take one path after another."""
+async def test_no_session_starts_if_only_one_lease_record_is_free() -> None:
+    """Otherwise a waiting gateway of the same name would take one lease record after another."""
     trial, first = await begun()
     second = trial.lease()
     for _ in range(8):
@@ -345,7 +345,7 @@ async def test_no_session_starts_if_only_one_path_is_free() -> None:
     assert first.is_valid
 
 
-async def test_of_two_simultaneous_session_starts_at_most_one_is_valid() -> None:
+async def test_if_two_processes_start_the_same_session_at_most_one_is_valid() -> None:
     trial = Trial()
     first, second = trial.lease(), trial.lease()
     begun = await asyncio.gather(first.try_to_begin(), second.try_to_begin())
@@ -354,7 +354,7 @@ async def test_of_two_simultaneous_session_starts_at_most_one_is_valid() -> None
 
 
 async def test_a_starting_session_replaces_no_record_of_a_living_session() -> None:
-    """The first session renews path 0 right before the second session would take it. It renews path 2 too."""
+    """The first session renews record 2, and record 0 right before the second session would replace it."""
     trial = Trial()
     gate = trial.buckets[0] = GatedBucket("lease_0")
     first, second = trial.lease(), trial.lease()
@@ -377,7 +377,7 @@ async def test_a_starting_session_replaces_no_record_of_a_living_session() -> No
     assert not second.is_valid
 
 
-async def test_the_lock_file_proves_that_the_predecessor_is_dead(
+async def test_a_released_lock_file_proves_that_the_previous_process_is_dead(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(leases, "machine_id", lambda: "this machine")
@@ -399,10 +399,11 @@ async def test_the_lock_file_proves_that_the_predecessor_is_dead(
         ("this machine", "another machine", True),
         ("this machine", "", True),
         ("", "", True),
-        ("this machine", "this machine", False),  # another file at the same path, as in two containers
+        # the same machine, but another lock file at this path, as in two containers
+        ("this machine", "this machine", False),
     ],
 )
-async def test_a_lock_of_another_machine_or_file_does_not_prove_that_the_predecessor_is_dead(
+async def test_a_lock_of_another_machine_or_file_proves_no_death(
     before: str, after: str, is_copied: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trial = Trial()
@@ -416,10 +417,10 @@ async def test_a_lock_of_another_machine_or_file_does_not_prove_that_the_predece
         assert not await trial.lease(lock=lock).try_to_begin()
 
 
-async def test_a_copied_disk_or_a_reboot_does_not_prove_that_the_predecessor_is_dead(
+async def test_a_lock_file_on_a_copied_disk_or_after_a_reboot_proves_no_death(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A copy has the same machine id, path and lock id, but not the id of the kernel's boot."""
+    """A copied disk has the same machine id, path and lock id, but not the same boot id of the kernel."""
     trial = Trial()
     machine, boot = tmp_path / "machine-id", tmp_path / "boot_id"
     machine.write_text("copied\n", "utf-8")
@@ -436,7 +437,7 @@ async def test_a_copied_disk_or_a_reboot_does_not_prove_that_the_predecessor_is_
 
 
 @pytest.mark.parametrize("empty", [0, 1])
-def test_a_machine_without_one_of_its_ids_counts_as_unknown(
+def test_a_machine_without_a_machine_id_or_boot_id_has_no_id(
     empty: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ids = (tmp_path / "machine-id", tmp_path / "boot_id")
@@ -453,10 +454,10 @@ def test_a_machine_without_one_of_its_ids_counts_as_unknown(
 # ---- observers ----
 
 
-async def test_a_dead_gateway_is_ended_after_a_lease_on_the_observers_clock() -> None:
+async def test_a_dead_session_is_ended_after_a_lease_by_the_observers_clock() -> None:
     trial, _ = await begun()
     observer = trial.observer()
-    trial.clock.pass_s(100)  # an observer that starts late cannot know when the record was written
+    trial.clock.pass_s(100)  # an observer that starts late cannot know when the lease record was written
     await look(observer)
     assert observer.dead() == {}
     trial.pass_lease()
@@ -468,8 +469,11 @@ async def test_a_dead_gateway_is_ended_after_a_lease_on_the_observers_clock() ->
 
 
 @pytest.mark.parametrize("has_rival", [False, True])
-async def test_ending_a_dead_session_does_not_wait_for_a_path_without_a_leader(has_rival: bool) -> None:
-    """The path's server may have died with the gateway. Another observer may have ended a second path."""
+async def test_ending_a_dead_session_does_not_wait_for_a_bucket_without_a_leader(has_rival: bool) -> None:
+    """The server of the third lease record may have died with the gateway.
+
+    Another observer may end a second one.
+    """
     trial, _lease, observer = await watched()
     trial.pass_lease()
     await look(observer)
@@ -490,12 +494,12 @@ async def test_ending_a_dead_session_does_not_wait_for_a_path_without_a_leader(h
 
 
 async def test_a_record_renewed_after_the_decision_to_end_it_is_kept() -> None:
-    """The record is renewed between the decision and the write. A read in between makes no difference."""
+    """The record is renewed between the decision and the write. Reading it in between makes no difference."""
     trial, lease, observer = await watched()
     trial.pass_lease()
     await look(observer)
     judged = observer.dead()["a"]
-    await renew(lease)  # the network recovers at this moment
+    await renew(lease)  # the renewal succeeds just before the end is written
     await look(observer)
     assert lease.is_valid
     for path, record in judged.items():
@@ -506,8 +510,8 @@ async def test_a_record_renewed_after_the_decision_to_end_it_is_kept() -> None:
     assert not lease.is_over
 
 
-async def test_a_gateway_with_a_record_that_was_just_renewed_does_not_count_as_dead() -> None:
-    """The observer may decide before it has read the gateway's new records on all paths."""
+async def test_a_gateway_with_one_newly_renewed_lease_record_is_not_dead() -> None:
+    """The observer may decide before it has read the gateway's new records in all buckets."""
     trial, lease, observer = await watched()
     trial.pass_lease()
     await look(observer)
@@ -519,8 +523,8 @@ async def test_a_gateway_with_a_record_that_was_just_renewed_does_not_count_as_d
     assert not await observer.end_the_dead()
 
 
-async def test_no_gateway_writes_the_end_of_its_own_dead_session() -> None:
-    """If it did, all other gateways would treat the session as over immediately."""
+async def test_no_gateway_writes_the_end_of_its_own_expired_session() -> None:
+    """If it wrote its own end, other gateways would treat the session as over without waiting."""
     trial = Trial()
     lease, observer = trial.lease("b"), trial.observer("b")
     assert await lease.try_to_begin()
@@ -531,7 +535,7 @@ async def test_no_gateway_writes_the_end_of_its_own_dead_session() -> None:
     assert not any(value["ended"] for value in trial.values("b"))
 
 
-async def test_a_gateway_that_was_cut_off_ends_no_other_session() -> None:
+async def test_a_gateway_that_was_cut_off_does_not_end_sessions_immediately() -> None:
     """Otherwise all gateways would end each other's sessions after an outage of the servers."""
     trial, _lease, observer = await watched()
     trial.clock.pass_s(60)
@@ -545,8 +549,8 @@ async def test_a_gateway_that_was_cut_off_ends_no_other_session() -> None:
     assert observer.is_over("a", 1)
 
 
-async def test_an_ended_session_stays_ended_after_an_outage() -> None:
-    """Otherwise lines would be assigned to a dead gateway for a while."""
+async def test_a_session_that_is_over_stays_over_after_an_outage() -> None:
+    """Otherwise lines would be assigned to a dead gateway until its session is found to be over again."""
     trial, _lease, observer = await watched()
     trial.pass_lease()
     await look(observer)
@@ -558,7 +562,8 @@ async def test_an_ended_session_stays_ended_after_an_outage() -> None:
     assert observer.is_over("a", 1)
     assert observer.sessions() == {}
     second = trial.lease()
-    assert not await second.try_to_begin()  # another gateway ended the session, at an unknown time
+    # a new session must wait, because another gateway ended the old one at an unknown time
+    assert not await second.try_to_begin()
     trial.pass_lease()
     assert await second.try_to_begin()
     await look(observer)
@@ -566,13 +571,13 @@ async def test_an_ended_session_stays_ended_after_an_outage() -> None:
     assert observer.sessions().keys() == {"a"}
 
 
-async def test_an_end_written_during_an_outage_does_not_count_yet() -> None:
-    """The session may have been renewed unseen, right before another gateway recorded the session's end."""
+async def test_an_end_that_was_written_during_an_outage_counts_after_a_lease() -> None:
+    """Right before another gateway wrote the session's end, its own gateway may have renewed it unseen."""
     trial, _lease, observer = await watched()
     await observer.end_the_dead()
     trial.clock.pass_s(60)
     trial.store_ends()
-    await look(observer)  # the observer has seen no renewal for 60 s
+    await look(observer)  # this read is the first for 60 s
     observer.restart_waits()
     await observer.end_the_dead()
     assert not observer.is_over("a", 1)
@@ -580,14 +585,15 @@ async def test_an_end_written_during_an_outage_does_not_count_yet() -> None:
     assert observer.is_over("a", 1)
 
 
-async def test_a_read_reports_whether_a_session_ended_or_may_be_ended() -> None:
+async def test_look_returns_true_if_a_session_has_ended_or_may_be_ended() -> None:
     trial, lease = await begun()
     observer = trial.observer()
     assert [await observer.look(path) for path in range(3)] == [False, False, False]
     await renew(lease)
     assert [await observer.look(path) for path in range(3)] == [False, False, False]
     trial.pass_lease()
-    assert [await observer.look(path) for path in range(3)] == [False, True, True]  # two ended paths suffice
+    # the end of a second lease record makes the session over
+    assert [await observer.look(path) for path in range(3)] == [False, True, True]
     await observer.end_the_dead()
     assert [await observer.look(path) for path in range(3)] == [False, False, False]
     other = trial.observer("c")
@@ -595,7 +601,7 @@ async def test_a_read_reports_whether_a_session_ended_or_may_be_ended() -> None:
 
 
 @table(("since_s", "rests_s"), [(0.0, 0.1), (2.2, 0.1), (2.27, 0.03), (2.3, 0.1), (60.0, 0.1)])
-def test_a_possibly_dead_gateway_is_read_without_delay(since_s: float, rests_s: float) -> None:
+def test_the_observer_reads_again_when_a_lease_may_have_expired(since_s: float, rests_s: float) -> None:
     async def main() -> None:
         loop = asyncio.get_running_loop()
         trial = Trial()
@@ -611,8 +617,8 @@ def test_a_possibly_dead_gateway_is_read_without_delay(since_s: float, rests_s: 
     run_controlled(main())
 
 
-async def test_without_answers_no_gateway_counts_as_dead() -> None:
-    """The observer's server may be suspended while gateways renew their leases on other servers."""
+async def test_an_observer_without_answers_counts_no_gateway_as_dead() -> None:
+    """The observer cannot read renewals while its server is suspended; gateways renew over other servers."""
     trial, _lease, observer = await watched()
     for bucket in trial.buckets:
         bucket.is_down = True
@@ -631,7 +637,7 @@ async def test_without_answers_no_gateway_counts_as_dead() -> None:
 
 
 async def test_an_end_written_by_another_gateway_counts_once_the_lease_has_expired() -> None:
-    """The gateway that recorded the end may be wrong: until the lease expires, its owner may still send."""
+    """The end may be wrong: until the lease expires, the session's own gateway may still send."""
     trial = Trial()
     lease, observer, late = trial.lease(), trial.observer(), trial.observer("c")
     assert await lease.try_to_begin()
@@ -643,7 +649,8 @@ async def test_an_end_written_by_another_gateway_counts_once_the_lease_has_expir
     assert lease.is_valid
     assert not observer.is_over("a", 1)
     assert not observer.is_over("a", 9)
-    trial.clock.pass_s(USUAL.lease / SECOND - 1.0)  # time since the observer saw the last renewal
+    # a lease has passed since the observer saw the last renewal
+    trial.clock.pass_s(USUAL.lease / SECOND - 1.0)
     assert observer.is_over("a", 1)
     assert observer.sessions() == {}
     assert not late.is_over("a", 1)
@@ -659,7 +666,7 @@ async def test_a_session_that_its_own_gateway_has_ended_is_over_immediately() ->
     assert await trial.lease().try_to_begin()
 
 
-async def test_a_gateway_of_the_same_name_waits_although_another_gateway_wrote_the_end() -> None:
+async def test_a_gateways_next_session_waits_for_the_lease_if_others_ended_the_last() -> None:
     trial, lease = await begun()
     second = trial.lease()
     trial.store_ends()
@@ -669,8 +676,8 @@ async def test_a_gateway_of_the_same_name_waits_although_another_gateway_wrote_t
     assert await second.try_to_begin()
 
 
-async def test_a_gateway_with_only_one_stale_path_is_not_ended() -> None:
-    """If that path were ended, it would stay ended for the rest of the session."""
+async def test_a_gateway_with_only_one_stale_lease_record_is_not_ended() -> None:
+    """If its stale record were ended, the gateway could not renew it for the rest of the session."""
     trial, lease = await begun()
     observer = trial.observer()
     for _ in range(20):
@@ -682,7 +689,7 @@ async def test_a_gateway_with_only_one_stale_path_is_not_ended() -> None:
         assert observer.dead() == {}
 
 
-async def test_an_ended_path_stays_ended_for_this_session() -> None:
+async def test_an_ended_lease_record_stays_ended_for_the_rest_of_its_session() -> None:
     trial, lease = await begun()
     value = trial.values()[1]
     trial.buckets[1].store("a", {**value, "ended": True})
@@ -693,7 +700,7 @@ async def test_an_ended_path_stays_ended_for_this_session() -> None:
     assert lease.is_valid
 
 
-async def test_a_session_without_one_path_is_weak_until_the_next_session_starts() -> None:
+async def test_a_session_with_an_ended_lease_record_is_weak_until_the_next_session() -> None:
     trial, lease, observer = await watched()
     assert (lease.is_weak, observer.weak()) == (False, [])
     trial.buckets[1].store("a", {**trial.values()[1], "ended": True, "by": "b"})
@@ -714,7 +721,7 @@ async def test_a_session_without_one_path_is_weak_until_the_next_session_starts(
     assert (lease.is_weak, observer.weak()) == (False, [])
 
 
-async def test_a_session_adds_a_path_that_was_down_at_its_start() -> None:
+async def test_a_session_later_writes_the_lease_record_in_a_bucket_that_was_down() -> None:
     trial = Trial()
     trial.buckets[2].is_down = True
     lease = trial.lease()
@@ -725,8 +732,8 @@ async def test_a_session_adds_a_path_that_was_down_at_its_start() -> None:
     assert lease.held[2] is not None
 
 
-async def test_a_session_later_adds_a_path_that_a_rival_session_of_the_same_number_held() -> None:
-    """Another process of this gateway, which died when its session had only one path, left the record."""
+async def test_a_session_takes_the_lease_record_of_a_dead_rival_with_its_number() -> None:
+    """Another process of this gateway left the record, and died before it had written a second record."""
     trial = Trial()
     trial.buckets[2].is_down = True
     lease = trial.lease()
@@ -738,7 +745,7 @@ async def test_a_session_later_adds_a_path_that_a_rival_session_of_the_same_numb
     assert trial.values()[2]["nonce"] == trial.values()[0]["nonce"]
 
 
-async def test_a_session_is_weak_if_a_late_path_was_ended_by_others() -> None:
+async def test_a_session_is_weak_if_others_ended_the_record_of_a_bucket_that_was_down() -> None:
     trial = Trial()
     trial.buckets[2].loses_answers = True
     lease = trial.lease()
@@ -752,7 +759,7 @@ async def test_a_session_is_weak_if_a_late_path_was_ended_by_others() -> None:
     assert lease.is_weak
 
 
-async def test_without_two_paths_no_session_starts() -> None:
+async def test_no_session_starts_without_two_reachable_lease_buckets() -> None:
     trial = Trial()
     trial.buckets[1].is_down = trial.buckets[2].is_down = True
     lease = trial.lease()

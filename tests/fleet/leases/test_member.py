@@ -1,4 +1,4 @@
-"""Gateways' state machines on real servers, with fake lines."""
+"""Members, the state machines of gateways, on real NATS servers, with fake lines."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ from multidrop.fleet.servers.setup import open_all
 
 LINES = [f"line-{at}" for at in range(30)]
 PATIENCE_S = 120.0
-LONG = USUAL._replace(lease=60 * SECOND)  # a busy machine suspends a test for less than this
+# 60 s, because a busy machine may suspend a test for longer than the usual lease
+LONG = USUAL._replace(lease=60 * SECOND)
 
 
 @pytest.fixture(autouse=True)
@@ -65,7 +66,7 @@ async def until_leaders_are_home(cluster: Cluster) -> None:
 
 
 class Gateways:
-    """Members of one fleet, each with its own connections."""
+    """The gateways (members) of one fleet, each with its own server connections."""
 
     _names = count()
 
@@ -110,7 +111,7 @@ class Gateways:
         return sorted(line for lines in self.taken().values() for line in lines) == sorted(LINES)
 
     def are_shared(self) -> bool:
-        """Return True if all gateways are present, and each polls the lines assigned to it."""
+        """Return True if each gateway knows all gateways, and polls exactly the lines assigned to it."""
         return all(
             set(member.wanted.values()) == set(self.members)
             and {line for line, gateway in member.wanted.items() if gateway == member.name}
@@ -143,7 +144,7 @@ async def gateways(cluster: Cluster, *members: str, terms: Terms = USUAL) -> Asy
 
 @asynccontextmanager
 async def other_version(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Lease]:
-    """Yield the lease of a gateway with an incompatible protocol."""
+    """Yield the lease of a gateway with an incompatible version of the ownership rules."""
     paths = paths_of(cluster.urls)
     await open_all(paths)
     buckets = [
@@ -163,7 +164,7 @@ async def other_version(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> As
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_each_gateway_has_its_share_and_dead_gateways_are_replaced(fleet: Cluster) -> None:
+async def test_each_gateway_polls_its_share_and_others_take_a_dead_gateways_lines(fleet: Cluster) -> None:
     async with gateways(fleet, "a", "b", "c") as running:
         await until(lambda: all(5 <= len(lines) <= 11 for lines in running.taken().values()), "shares")
         dead = running.members["b"]
@@ -175,11 +176,12 @@ async def test_each_gateway_has_its_share_and_dead_gateways_are_replaced(fleet: 
         again = await running.join("b")
         assert not again.polled
         await until(lambda: len(again.polled) >= 5 and running.all_are_polled(), "it comes back")
-        assert again.lease.session >= 2  # more than 2 if the machine was suspended and the session expired
+        # more than 2 if the machine was suspended and the second session has expired
+        assert again.lease.session >= 2
 
 
 class Ports:
-    """The ports of a member's lines, which a test may cut."""
+    """The ports of a gateway's lines. All of them fail while `is_cut` is True."""
 
     def __init__(self, member: Member) -> None:
         self.is_cut = False
@@ -201,15 +203,16 @@ class Ports:
 async def test_lines_that_a_gateway_cannot_open_move_to_others_and_return_later(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The gateway is cut off from its lines but not from the servers, so its lease stays valid."""
+    """A gateway is cut off from its lines but not from the servers, so its lease stays valid."""
     monkeypatch.setattr(shares, "LOST_NS", SECOND // 2)
-    for wait in ("FIRST_WAIT_NS", "LAST_WAIT_NS"):  # longer than a failed trial, which takes up to 2 s
+    # longer than a failed attempt to open a line again, which takes up to 2 s
+    for wait in ("FIRST_WAIT_NS", "LAST_WAIT_NS"):
         monkeypatch.setattr(shares, wait, 3 * SECOND)
     monkeypatch.setattr(line_keeper, "TAKE_AGAIN_S", 0.1)
     async with gateways(fleet, "a", "b", "c", terms=LONG) as running:
         await until(running.are_shared, "shares")
         ports = {name: Ports(member) for name, member in running.members.items()}
-        a, b, c = (running.members[name] for name in "abc")  # the gateways may have joined in any order
+        a, b, c = (running.members[name] for name in "abc")  # sorted by name
         ports["a"].is_cut = True
         await until(lambda: len(b.polled) + len(c.polled) == len(LINES), "others have those of a")
         assert a.lease.is_valid
@@ -239,7 +242,7 @@ async def test_a_drained_gateway_releases_all_lines_and_claims_none(fleet: Clust
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_while_a_server_is_silent_only_a_drained_gateway_releases_lines(
+def test_while_a_server_is_silent_only_a_draining_gateway_releases_lines(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     silent = Replica("n3", is_current=False, is_offline=True, active_ns=0)
@@ -295,10 +298,10 @@ async def test_lines_are_added_changed_and_removed_with_the_plant(fleet: Cluster
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_while_an_incompatible_gateway_lives_no_line_is_claimed(
+async def test_no_line_is_claimed_while_an_incompatible_gateway_is_alive(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """This holds when a gateway starts, and also when an incompatible gateway joins later."""
+    """The incompatible gateway is alive at the start of this gateway, or joins the fleet later."""
     async with gateways(fleet, terms=LONG) as running, other_version(fleet, monkeypatch) as other:
         await other.begin()
         member = await running.join("a")
@@ -323,7 +326,7 @@ async def test_while_an_incompatible_gateway_lives_no_line_is_claimed(
 @pytest.mark.slow
 @pytest.mark.long
 async def test_no_line_moves_when_a_server_dies(fleet: Cluster) -> None:
-    """Two of three paths are renewed as before. The third waits 4 to 9 s for another leader."""
+    """Two of three lease records are renewed as before. The third waits 4 to 9 s for another leader."""
     async with gateways(fleet, "a", "b", terms=LONG) as running:
         member = running.members["a"]
         await until(running.are_shared, "shares")
@@ -355,17 +358,20 @@ async def test_no_line_moves_when_a_server_dies(fleet: Cluster) -> None:
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_weak_sessions_are_given_up_one_after_another(
+async def test_sessions_without_a_third_lease_record_are_given_up_one_after_another(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Otherwise the next server that dies would end all weak sessions."""
+    """A session is weak if it has lost a lease record.
+
+    One more dead server would end all weak sessions at once.
+    """
     monkeypatch.setattr(member_module, "WEAK_NS", 3600 * SECOND)
 
     async def lose_a_path(member: Member) -> None:
         other = LeaseBucket(names.LEASES[1], member.best, "other")
         while not member.lease.is_weak:
             record = await other.get(member.name)
-            with suppress(Conflict):  # the record was renewed after it was read
+            with suppress(Conflict):  # raised if the record was renewed after it was read
                 await other.put(member.name, {**record.value, "ended": True}, record.revision)
             await member.lease.renew_once(1)
 
@@ -390,9 +396,9 @@ async def test_weak_sessions_are_given_up_one_after_another(
 async def test_without_servers_all_lines_are_closed_and_no_gateway_is_killed(
     fleet: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The kernel's timer is cancelled when the lines are closed, and is never set to a time in the past."""
+    """The kernel's timer is cancelled when the lines are closed, and never set to a time in the past."""
     async with gateways(fleet, "a", "b") as running:
-        await until(running.are_shared, "shares")  # waits until each gateway has had a lease and a timer
+        await until(running.are_shared, "shares")  # until each gateway has had a lease and a timer
         with fleet.paused():
             await until(lambda: not any(running.taken().values()), "silence")
             masterships = [lines.mastership for lines in running.hall.gateways]
@@ -412,7 +418,7 @@ SENTENCE = "incompatible version of multidrop in this fleet: no line is taken wh
 
 
 class Trial:
-    """A gateway called "me" that watches other gateways, whose sessions are in memory."""
+    """A gateway called "me" that watches other gateways. Their sessions are in memory."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.clock = HandClock()
@@ -422,7 +428,7 @@ class Trial:
         self._monkeypatch = monkeypatch
 
     def begin(self, name: str, rules: int) -> Lease:
-        """Start a session of a gateway with this version of the rules."""
+        """Start a session of a gateway with this version of the ownership rules."""
         lease = Lease(name, self.buckets, RecordingMastership(self.clock), clock=self.clock)
         with self._monkeypatch.context() as patch:
             patch.setattr(lease_rules, "RULES", rules)
@@ -431,7 +437,7 @@ class Trial:
 
     @property
     def trouble(self) -> str:
-        """Read all paths, and return the sentence about incompatible gateways."""
+        """Read all lease records, and return the sentence about incompatible gateways."""
         for path in range(3):
             asyncio.run(self.observer.look(path))
         self.incompatible.look(self.observer.sessions())
@@ -443,7 +449,7 @@ def trial(monkeypatch: pytest.MonkeyPatch) -> Trial:
     return Trial(monkeypatch)
 
 
-def test_an_incompatible_gateway_is_named_until_it_ends(trial: Trial) -> None:
+def test_status_names_an_incompatible_gateway_until_its_session_ends(trial: Trial) -> None:
     trial.begin("alike", RULES)
     older, newer = trial.begin("older", RULES - 1), trial.begin("newer", RULES + 1)
     assert trial.trouble == SENTENCE.format("newer, older")
@@ -453,7 +459,7 @@ def test_an_incompatible_gateway_is_named_until_it_ends(trial: Trial) -> None:
     assert trial.trouble == ""
 
 
-def test_a_record_without_a_rules_version_is_incompatible(trial: Trial) -> None:
+def test_a_gateway_whose_lease_record_has_no_rules_version_is_incompatible(trial: Trial) -> None:
     trial.begin("first", RULES)
     for bucket in trial.buckets:
         bucket.store(
@@ -480,7 +486,7 @@ def test_our_own_earlier_session_is_never_incompatible(trial: Trial) -> None:
 
 
 def a_member() -> Member:
-    """Return a gateway with a session, and without a server."""
+    """Return a gateway that has a session but no server."""
     mastership = RecordingMastership(boottime_ns)
     lines = Hall().add("a", mastership)
     member = Member("a", paths_of(["nats://nowhere.invalid:4222"]), lines, mastership)
@@ -489,7 +495,10 @@ def a_member() -> Member:
 
 
 def steps(wake: Callable[[Member], object]) -> list[float]:
-    """Return the times of the steps in s, during 0.12 s from the first one; `wake` is called at 0.06 s."""
+    """Return the times (s) of the state machine's steps, from the first one until 0.12 s later.
+
+    `wake` is called at 0.06 s.
+    """
 
     async def main() -> list[float]:
         loop = asyncio.get_running_loop()
@@ -509,12 +518,12 @@ def steps(wake: Callable[[Member], object]) -> list[float]:
     return run_controlled(main())
 
 
-def test_steps_are_taken_periodically() -> None:
+def test_the_state_machine_takes_a_step_every_50_ms() -> None:
     assert steps(lambda member: None) == pytest.approx([0.0, 0.05, 0.1])
 
 
 @pytest.mark.parametrize("times", [1, 100])
-def test_changed_records_cause_an_immediate_step(times: int) -> None:
+def test_a_changed_record_causes_an_immediate_step_of_the_state_machine(times: int) -> None:
     def wake(member: Member) -> None:
         for _ in range(times):
             member.records._on_change()
@@ -522,7 +531,7 @@ def test_changed_records_cause_an_immediate_step(times: int) -> None:
     assert steps(wake) == pytest.approx([0.0, 0.05, 0.06, 0.11])
 
 
-def test_steps_are_never_taken_without_a_pause() -> None:
+def test_there_is_a_pause_of_10_ms_between_steps_however_often_records_change() -> None:
     def wake(member: Member) -> None:
         member.records._on_change()
         if len(asyncio.all_tasks()) > 1:
@@ -534,15 +543,15 @@ def test_steps_are_never_taken_without_a_pause() -> None:
 
 
 @pytest.mark.parametrize(("left_s", "ends"), [(2.0, True), (0.9, False), (-1.0, False)])
-def test_a_gateway_with_an_expiring_lease_ends_no_other_session(left_s: float, ends: bool) -> None:
-    """The servers may be failing for all gateways. A session that was ended could not continue later."""
+def test_a_gateway_whose_own_lease_expires_soon_ends_no_other_session(left_s: float, ends: bool) -> None:
+    """Then the servers may be failing for all gateways. A session that was ended could not continue."""
 
     async def main() -> bool:
         member = a_member()
         clock = HandClock()
         member.lease.clock = clock
         member.lease.until = clock.now + 2 * SECOND
-        await member.step()  # the waiting times of earlier observations restart
+        await member.step()  # the first step restarts the waiting times for all sessions
         asked: list[object] = []
 
         async def note(present: object) -> bool:

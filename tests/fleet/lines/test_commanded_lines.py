@@ -36,7 +36,7 @@ from multidrop.supervisor import supervisor
 
 
 class HeardPath:
-    """A path without a server, which records the subscribed functions by subject."""
+    """A fake server connection, which records the function for each subscribed subject."""
 
     def __init__(self) -> None:
         self.heard: dict[str, Callable[[Any], Any]] = {}
@@ -48,7 +48,7 @@ class HeardPath:
         self.heard.pop(subject, None)
 
     async def ask(self, subject: str, **what: Any) -> dict[str, Any]:
-        """Send a request to a subscribed function, and return the answer."""
+        """Send a request to the function subscribed to a subject, and return the answer."""
         answered: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
 
         class Asked:
@@ -107,7 +107,7 @@ async def test_a_closing_line_answers_its_stops_until_it_is_closed(desk: Desks) 
 
 
 async def test_a_stop_is_answered_only_on_an_inbox(desk: Desks) -> None:
-    """A requester may name a record of the plant as reply subject: the answer would overwrite the record."""
+    """If a requester names a plant record's subject for the answer, the answer would replace the record."""
     answered: list[str] = []
 
     path = HeardPath()
@@ -129,10 +129,10 @@ async def test_a_stop_is_answered_only_on_an_inbox(desk: Desks) -> None:
 
 
 @pytest.mark.parametrize("may_wait", [True, False])
-async def test_closing_a_line_waits_for_its_command_if_the_lease_leaves_time(
+async def test_closing_a_line_waits_for_its_running_command_if_the_lease_allows(
     desk: Desks, monkeypatch: pytest.MonkeyPatch, may_wait: bool
 ) -> None:
-    """The sender gets the result before the line is closed."""
+    """The sender must get the command's result before the line is closed."""
     begun, go_on = threading.Event(), threading.Event()
 
     monkeypatch.setattr(command_desk, "AWAITED_S", PATIENCE_S)
@@ -167,7 +167,7 @@ async def test_closing_a_line_waits_for_its_command_if_the_lease_leaves_time(
 
 
 class ClosedLines(SlowLines):
-    """Lines whose buses are closed, although their gateway does not know it yet."""
+    """Lines whose buses are closed already, while their gateway still counts them as polled."""
 
     def __init__(self, close: Callable[[], None]) -> None:
         super().__init__()
@@ -181,10 +181,10 @@ class ClosedLines(SlowLines):
 
 
 @pytest.mark.parametrize("drives", [None, ["pump"]])
-async def test_a_stop_on_a_closed_line_is_left_to_the_next_master(
+async def test_a_gateway_does_not_answer_a_stop_if_the_lines_bus_is_closed(
     desk: Desks, drives: list[str] | None
 ) -> None:
-    """If this gateway refused the stop, the sender would ask no other gateway."""
+    """If this gateway refused the stop, the sender would not try another gateway."""
 
     lines = ClosedLines(desk.bus.close)
     subjects = CommandSubjects("gw-1", [HeardPath()], desk.lines, desk.log)
@@ -201,11 +201,11 @@ async def test_a_stop_on_a_closed_line_is_left_to_the_next_master(
 # ---- requests in flight while a line is handed over: each of them gets its row ----
 
 
-NUMBERED = "motor_speed"  # a register without a scale: its value is the raw count
+NUMBERED = "motor_speed"  # this register has no scale, so its value is the raw count
 
 
 class NumberedDrive(SimulatedDrive):
-    """A drive whose motor speed register counts its own reads."""
+    """A drive whose register `motor_speed` counts how often it was read."""
 
     answers = 0
 
@@ -217,7 +217,7 @@ class NumberedDrive(SimulatedDrive):
 
 
 class Verdict(NamedTuple):
-    """How many of a drive's replies have no row, have two rows, or came after their request got a row."""
+    """Counts of a drive's replies: without a row, with two rows, or later than their request's row."""
 
     lost: int = 0
     doubled: int = 0
@@ -225,9 +225,13 @@ class Verdict(NamedTuple):
 
 
 def judge_drive(numbers: Sequence[int | None], answered: int) -> Verdict:
-    """Judge the numbers in a drive's rows, in the order of their requests; None is a miss."""
+    """Compare the numbers that a drive has sent with the numbers in its rows.
+
+    `numbers` is in the order of the requests; None is a row without a value. `answered` is the number of
+    replies.
+    """
     late = lost = doubled = misses = last = 0
-    for number in (*numbers, answered + 1):  # the appended number shows if rows are missing at the end
+    for number in (*numbers, answered + 1):  # the appended number reveals rows that are missing at the end
         if number is None:
             misses += 1
         elif number <= last:
@@ -267,7 +271,7 @@ def simulated_line(folder: Path, delay: float) -> Iterator[tuple[list[NumberedDr
 
 
 class Gateway:
-    """A poller with a valid mastership, and its rows for requests that were sent."""
+    """A gateway's poller, and its rows of requests that were really sent."""
 
     def __init__(self, folder: Path) -> None:
         self.mastership = Mastership(guard_s=0.01)
@@ -323,7 +327,7 @@ def test_no_row_is_lost_when_a_line_moves_between_gateways(tmp_path: Path, gatew
     assert [(one.lost, one.doubled) for one in judged] == [(0, 0), (0, 0)]
 
 
-def test_an_abandoned_request_has_a_row_with_its_status(
+def test_a_request_abandoned_when_polling_ends_has_a_row_with_that_status(
     tmp_path: Path, gateways: list[Gateway], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("multidrop.polling.line_set.ENDING_NS", 0)
@@ -348,14 +352,16 @@ def test_an_abandoned_request_has_a_row_with_its_status(
         ((1, 2, 2, 3), 3, Verdict(doubled=1)),
     ],
 )
-def test_the_judge_finds_lost_and_doubled_answers(
+def test_judge_drive_counts_lost_doubled_and_late_replies(
     numbers: Sequence[int | None], answered: int, expected: Verdict
 ) -> None:
     assert judge_drive(numbers, answered) == expected
 
 
 @pytest.mark.long
-def test_late_answers_have_a_row_marked_as_late(tmp_path: Path, gateways: list[Gateway]) -> None:
+def test_a_reply_that_comes_too_late_has_a_row_marked_as_late(
+    tmp_path: Path, gateways: list[Gateway]
+) -> None:
     with simulated_line(tmp_path, delay=0.02) as (drives, line):
         gateways[0].poller.add_line(line)
         for delay in (0.02, 0.45, 0.02, 0.9, 0.02):

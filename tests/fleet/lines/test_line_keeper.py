@@ -1,4 +1,4 @@
-"""A gateway claims, opens and releases lines, with records in memory."""
+"""LineKeeper: a gateway claims, opens and releases lines, with ownership records in memory."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 
 class Trial:
-    """A gateway with a lease, and a plant with one line."""
+    """Gateway "a" with a lease, and a plant with the line "hall"."""
 
     def __init__(self) -> None:
         self.clock = HandClock()
@@ -51,7 +51,7 @@ class Trial:
         return owner_of(record) == ("a", self.lease.session)
 
     async def read(self) -> None:
-        """Read the line's records from the buckets."""
+        """Read the line's ownership records from the buckets."""
         self.records.want(["hall"])
         for follower in self.records.owners.values():
             await follower.look()
@@ -76,7 +76,10 @@ class Trial:
             await asyncio.sleep(0.001)
 
     async def let_the_first_lag(self) -> None:
-        """Let a second pass; then renew the lease on all paths except that of the line's first bucket."""
+        """Let a second pass, and renew two lease records.
+
+        The third has the same home server as the line's first bucket.
+        """
         self.clock.pass_s(1.001)
         for path, name in enumerate(names.OWNERS):
             if name != self.buckets[0].name:
@@ -86,7 +89,7 @@ class Trial:
         await until(lambda: "hall" in self.keeper.polled and not self.keeper._at_work)
 
     async def reconcile(self) -> None:
-        """Reconcile, and wait until no line is open or being opened."""
+        """Reconcile the line with its records, and wait until it is neither open nor being opened."""
         self.keeper.reconcile()
         await until(lambda: self.keeper.is_silent)
 
@@ -100,12 +103,12 @@ class Trial:
         self.keeper.claim({"hall": claim})
 
     def owner(self) -> tuple[str, int] | None:
-        """Return the line's owner according to the records that the gateway has read."""
+        """Return the line's owner according to the ownership records that the gateway has read."""
         record = self.records.owner("hall")
         return owner_of(record) if record else None
 
     def is_taken_by_another(self, *places: int) -> None:
-        """Let the gateway read records of these buckets that name another gateway."""
+        """Let the gateway read ownership records in these buckets that name gateway "b"."""
         for place in places:
             bucket = names.owner_buckets("hall")[place]
             known = self.records.of("hall")[bucket]
@@ -121,7 +124,7 @@ async def claimed() -> Trial:
 
 
 class DeadTrial(Trial):
-    """A trial with a line whose last master has ended."""
+    """A trial whose line had a master, which has ended."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -153,7 +156,7 @@ async def test_a_new_master_accepts_stops_immediately_and_commands_after_the_gua
 
 
 async def test_a_line_of_another_gateway_accepts_neither_stops_nor_commands() -> None:
-    """The line is about to be closed, and its new master answers."""
+    """The gateway is about to close the line. The line's new master answers instead."""
     trial = await claimed()
     trial.clock.pass_s(1)
     assert trial.keeper.may_command("hall")
@@ -163,7 +166,7 @@ async def test_a_line_of_another_gateway_accepts_neither_stops_nor_commands() ->
     assert not trial.keeper.may_command("hall")
 
 
-async def test_lines_are_released_only_while_there_is_time_to_close_them() -> None:
+async def test_lines_are_closed_half_a_second_before_the_lease_expires() -> None:
     trial = await claimed()
     trial.clock.pass_s(USUAL.lease / SECOND - line_keeper.SILENT_S - 0.001)
     trial.keeper.reconcile()
@@ -175,7 +178,7 @@ async def test_lines_are_released_only_while_there_is_time_to_close_them() -> No
     assert trial.lines.taken == set()
 
 
-async def test_after_the_lease_expires_waiting_tasks_neither_open_nor_write() -> None:
+async def test_tasks_that_wait_past_the_lease_open_no_line_and_write_no_record() -> None:
     trial = Trial()
     bucket = trial.buckets[0]
     writing = trial.keeper._owners._writing[bucket.name] = asyncio.Semaphore(0)
@@ -230,7 +233,7 @@ async def test_a_line_is_closed_before_it_is_released() -> None:
 
 
 async def test_a_line_is_not_polled_while_its_release_may_be_stored() -> None:
-    """The unanswered write may be stored at any later time, until a newer record rules that out."""
+    """The unanswered write of the release may be stored at any later time, until a newer record exists."""
     trial = await claimed()
     bucket = trial.buckets[0]
     trial.keeper.releasing = {"hall"}
@@ -250,7 +253,7 @@ async def test_a_line_is_not_polled_while_its_release_may_be_stored() -> None:
 
 
 def owners(trial: Trial) -> list[tuple[str, int]]:
-    """Return the owners that the stored records name, in the order in which records are written."""
+    """Return the owner in each stored ownership record, in the order in which records are written."""
     return [owner_of(bucket.records.get("hall")) for bucket in trial.buckets]
 
 
@@ -293,7 +296,7 @@ async def test_a_slow_bucket_does_not_delay_a_claim(monkeypatch: pytest.MonkeyPa
 
 
 async def test_a_refused_claim_does_not_wait_for_a_late_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The claim is repeated immediately, with newer records. A server that is cut off may answer late."""
+    """A server that is cut off may answer late. The claim must be repeated with newer records before that."""
     monkeypatch.setattr(line_keeper, "SPARE_S", 100.0)
     trial = DeadTrial()
     await trial.read_and_begin()
@@ -310,7 +313,7 @@ async def test_a_refused_claim_does_not_wait_for_a_late_answer(monkeypatch: pyte
     assert owners(trial) == [ME, ME, NOBODY]
 
 
-async def test_a_bucket_that_may_have_lost_its_home_server_is_written_last() -> None:
+async def test_a_bucket_whose_home_server_may_have_failed_is_written_last() -> None:
     trial = DeadTrial()
     await trial.read_and_begin()
     await trial.let_the_first_lag()
@@ -319,8 +322,8 @@ async def test_a_bucket_that_may_have_lost_its_home_server_is_written_last() -> 
     assert owners(trial) == [NOBODY, ME, ME]
 
 
-async def test_if_all_leases_lag_no_bucket_is_written_last() -> None:
-    """If servers are busy, all their buckets are slow."""
+async def test_if_all_lease_records_are_renewed_late_buckets_keep_their_order() -> None:
+    """Then the servers are busy, and no single home server has failed."""
     trial = DeadTrial()
     await trial.read_and_begin()
     trial.clock.pass_s(1.5)
@@ -330,10 +333,10 @@ async def test_if_all_leases_lag_no_bucket_is_written_last() -> None:
     assert owners(trial) == [ME, ME, NOBODY]
 
 
-async def test_a_bucket_that_lost_its_home_server_does_not_delay_claims(
+async def test_a_claim_soon_gives_up_on_a_bucket_whose_home_server_may_have_failed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A new line is first written in this bucket, so the gateway cannot use another bucket instead."""
+    """The gateway must write a new line's first record in this bucket. It cannot use another bucket."""
     monkeypatch.setattr(line_keeper, "SPARE_S", 0.0)
     trial = Trial()
     await trial.read_and_begin()
@@ -346,7 +349,7 @@ async def test_a_bucket_that_lost_its_home_server_does_not_delay_claims(
     await asyncio.wait_for(trial.is_polled(), 10)
 
 
-async def test_a_claim_ends_when_another_gateway_was_faster() -> None:
+async def test_a_claim_fails_if_another_gateway_has_written_a_record_first() -> None:
     trial = DeadTrial()
     await trial.read_and_begin()
     trial.buckets[1].store("hall", owner_value(("b", 1), 2, 0))
@@ -356,8 +359,10 @@ async def test_a_claim_ends_when_another_gateway_was_faster() -> None:
     assert not trial.keeper.polled
 
 
-async def test_a_late_answer_does_not_reclaim_a_line_being_released(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Otherwise the line would be opened between the writes of its release."""
+async def test_a_late_answer_to_a_claim_does_not_reopen_a_line_being_released(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Otherwise the line would be opened while the records of its release are being written."""
     monkeypatch.setattr(line_keeper, "SPARE_S", 0.0)
     trial = DeadTrial()
     await trial.claim_without_the_first()
@@ -365,7 +370,7 @@ async def test_a_late_answer_does_not_reclaim_a_line_being_released(monkeypatch:
     trial.keeper.reconcile()
     await until(lambda: not trial.keeper.polled and not trial.keeper._at_work)
     writers = trial.keeper._owners._writing[trial.buckets[1].name]
-    async with writers, writers:  # all writers of this bucket are busy
+    async with writers, writers:  # takes both permits to write in this bucket
         trial.keeper.reconcile()
         await until(lambda: owners(trial) == [NOBODY, ME, NOBODY])
         trial.buckets[0].open()
@@ -381,8 +386,8 @@ async def test_a_late_answer_does_not_reclaim_a_line_being_released(monkeypatch:
     await until(lambda: owners(trial) == [NOBODY] * 3)
 
 
-async def test_a_late_answer_does_not_undo_a_release() -> None:
-    """The gateway reads its stored claim, releases the line, and only then gets the answer to the claim."""
+async def test_a_late_answer_to_a_claim_does_not_undo_the_lines_release() -> None:
+    """The gateway reads its stored claim, then releases the line, and gets the answer to its claim last."""
     trial = Trial()
     await trial.read_and_begin()
     bucket = trial.buckets[0] = GatedBucket(trial.buckets[0].name, answers=True)
@@ -401,7 +406,7 @@ async def test_a_late_answer_does_not_undo_a_release() -> None:
     assert trial.lines.taken == set()
 
 
-async def test_a_line_with_an_uncertain_release_is_claimed_like_any_other() -> None:
+async def test_a_line_whose_release_is_uncertain_is_claimed_only_if_may_claim() -> None:
     trial = await claimed()
     trial.are_down()
     trial.keeper.releasing = {"hall"}
@@ -420,7 +425,7 @@ async def test_a_line_with_an_uncertain_release_is_claimed_like_any_other() -> N
 
 
 async def test_a_line_that_cannot_be_closed_ends_the_gateway() -> None:
-    """The gateway does not end its session, so other gateways wait as long as after its death."""
+    """The line may still be open, so the gateway does not end its session. Others wait for its lease."""
     trial = await claimed()
 
     async def fail(line: str) -> None:
@@ -436,7 +441,10 @@ async def test_a_line_that_cannot_be_closed_ends_the_gateway() -> None:
 
 
 async def test_a_failure_on_one_line_affects_only_that_line(caplog: pytest.LogCaptureFixture) -> None:
-    """An exception, such as in a user's own class, is logged with its cause, and the line is retried."""
+    """The failure is an exception, as from a user's drive class.
+
+    It is logged, and the line is opened again later.
+    """
     trial = Trial()
     take, failures = trial.lines.take, [ZeroDivisionError("of a user's class")]
 
@@ -460,7 +468,7 @@ async def test_a_failure_on_one_line_affects_only_that_line(caplog: pytest.LogCa
 
 
 class BrokenLines(RecordingLines):
-    """Lines whose ports cannot be opened. `why` is the reason; "" lets them open."""
+    """Lines whose ports cannot be opened for the reason `why`; "" allows opening them."""
 
     why = "nothing listens there"
 
@@ -517,7 +525,7 @@ async def test_a_line_that_cannot_be_opened_is_logged_once_per_reason(
     ]
 
 
-async def test_the_problem_of_a_line_is_forgotten_when_another_gateway_polls_it(
+async def test_the_error_of_a_line_is_forgotten_when_another_gateway_polls_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     trial = BrokenTrial(monkeypatch)
@@ -538,7 +546,7 @@ async def test_the_problem_of_a_line_is_forgotten_when_another_gateway_polls_it(
         (PortLoss("no route to host", SECOND), "no route to host"),
     ],
 )
-async def test_a_lost_port_is_reported_before_a_slow_reopening_fails(
+async def test_a_lost_port_is_reported_before_the_attempt_to_reopen_it_has_failed(
     loss: PortLoss, reported: str | None
 ) -> None:
     trial = await claimed()

@@ -28,7 +28,7 @@ BUCKETS = ("first", "second", "third")
 
 
 def records_of(*owners: tuple[str, int] | None, alone: bool = False) -> dict[str, Record | None]:
-    """Return a line's records with these owners and revisions from 11 on.
+    """Return a line's ownership records, which name these owners and have revisions from 11 on.
 
     With `alone`, the first record has two votes.
     """
@@ -105,7 +105,7 @@ CASES = {
 
 
 @table("case", CASES)
-def test_claims_and_releases_are_as_expected_in_each_case(case: str) -> None:
+def test_a_gateway_claims_and_releases_the_expected_lines_in_each_case(case: str) -> None:
     found, wanted = CASES[case]
     assert found == wanted
 
@@ -117,7 +117,7 @@ def test_a_line_is_not_claimed_before_its_first_record_was_read() -> None:
     assert claim_of(ME, {}, is_over) is None
 
 
-def test_a_record_that_was_not_read_is_not_written() -> None:
+def test_a_claim_writes_no_ownership_record_that_was_not_read() -> None:
     records = records_of(DEAD, DEAD, DEAD)
     records["second"] = None
     assert claim_of(ME, records, is_over) == Claim({"first": 11, "third": 13}, {}, 6)
@@ -125,7 +125,7 @@ def test_a_record_that_was_not_read_is_not_written() -> None:
     assert claim_of(ME, records, is_over) is None
 
 
-def test_a_bucket_that_may_have_no_leader_is_written_last() -> None:
+def test_a_claim_writes_last_in_a_bucket_that_may_have_no_leader() -> None:
     records = records_of(DEAD, DEAD, DEAD)
     assert claim_of(ME, records, is_over) == Claim({"first": 11, "second": 12}, {"third": 13}, 6)
     claim = claim_of(ME, records, is_over, leaderless=["first"])
@@ -135,7 +135,7 @@ def test_a_bucket_that_may_have_no_leader_is_written_last() -> None:
     assert claim == Claim({"second": 12, "first": 11}, {}, 6)
 
 
-def test_a_line_with_an_uncertain_release_is_claimed_at_that_revision() -> None:
+def test_a_claim_after_an_uncertain_release_replaces_the_released_records() -> None:
     records = records_of(ME, ME, LIVING)
     assert claim_of(ME, records, is_over) is None
     assert claim_of(ME, records, is_over, ["second"]) == Claim({"second": 12}, {}, 6)
@@ -147,7 +147,7 @@ def owner_by_records(*owners: tuple[str, int] | None, alone: bool = False) -> tu
     return record and (record.value["gateway"], record.value["session"])
 
 
-def test_the_owner_of_a_line_needs_two_votes() -> None:
+def test_a_gateway_owns_a_line_only_with_two_votes_in_its_records() -> None:
     assert owner_by_records(LIVING, DEAD, LIVING) == LIVING
     assert owner_by_records(LIVING, NEVER, NEVER, alone=True) == LIVING
     assert owner_by_records(GIVEN, ME, GIVEN) == GIVEN
@@ -155,8 +155,8 @@ def test_the_owner_of_a_line_needs_two_votes() -> None:
     assert owner_by_records(LIVING, NEVER, NEVER) is None
 
 
-def test_the_newer_of_two_owners_is_shown() -> None:
-    """The first record still has two votes for a dead session: without a leader it was not replaced."""
+def test_if_two_owners_have_two_votes_each_the_newer_one_is_shown() -> None:
+    """The first record still has two votes for a dead session: its bucket had no leader for a while."""
     records = records_of(DEAD, ME, ME, alone=True)
     for bucket in ("second", "third"):
         records[bucket] = Record("x", 20, owner_value(ME, 6, 0))
@@ -172,13 +172,13 @@ def test_the_newer_of_two_owners_is_shown() -> None:
         *[("a/b", "a-b"), ("x\n", "x"), ("", "line-1"), ("*", "line-1"), (">", "line-1")],
     ],
 )
-def test_a_name_that_is_invalid_in_a_subject_is_rejected_with_a_suggestion(name: str, better: str) -> None:
+def test_a_line_name_that_nats_subjects_do_not_allow_gets_a_suggestion(name: str, better: str) -> None:
     with pytest.raises(ValueError, match=f"may have only letters, digits, _ and -: write {better}$"):
         names.checked_name("line", name)
     assert names.is_name(better)
 
 
-def test_first_records_are_spread_over_all_three_buckets() -> None:
+def test_the_first_records_of_lines_are_spread_over_all_three_buckets() -> None:
     lines = [f"hall-{hall}-line-{line}" for hall in range(20) for line in range(50)]
     places = [names.owner_buckets(line) for line in lines]
     assert all(sorted(place) == sorted(names.OWNERS) for place in places)
@@ -189,12 +189,16 @@ def test_first_records_are_spread_over_all_three_buckets() -> None:
 # ---- a line is released only while other gateways can claim it, now and immediately afterwards ----
 
 
-FIRST = {names.owner_buckets(line)[0]: line for line in (f"line-{at}" for at in range(30))}  # by first bucket
+# one line for each first bucket
+FIRST = {names.owner_buckets(line)[0]: line for line in (f"line-{at}" for at in range(30))}
 FIRST_LINES = set(FIRST.values())
 
 
 class Releasing:
-    """The releases of a gateway, the buckets with a leader, and the buckets with a silent server."""
+    """A gateway's `Releases`, with fake servers:
+
+    `led` are buckets with a leader, `maimed` those with a silent server.
+    """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.led = set(names.OWNERS)
@@ -244,7 +248,7 @@ def test_servers_are_checked_only_while_lines_wait_for_release(monkeypatch: pyte
     assert trial.releases.due(FIRST_LINES) == set()
 
 
-def test_lines_are_not_released_while_two_ownership_buckets_do_not_answer(
+def test_lines_are_not_released_while_two_buckets_have_a_silent_server(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     trial = Releasing(monkeypatch)
@@ -258,7 +262,7 @@ def test_lines_are_not_released_while_two_ownership_buckets_do_not_answer(
     assert trial.releases.due(FIRST_LINES) == FIRST_LINES - {FIRST["own_1"]}
 
 
-def test_releases_ignore_a_long_silent_server(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_are_released_although_a_server_is_silent_for_60_s(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Releasing(monkeypatch)
     trial.maimed = {"own_0", "own_1"}
     trial.releases.due(FIRST_LINES)
@@ -269,14 +273,14 @@ def test_releases_ignore_a_long_silent_server(monkeypatch: pytest.MonkeyPatch) -
     trial.now_s = SILENT_SERVER_S
     trial.look()
     assert trial.releases.due(FIRST_LINES) == FIRST_LINES
-    trial.maimed.clear()  # the server answered once and is silent again, so the wait restarts
+    trial.maimed.clear()  # the server has answered and is silent again, so the 60 s restart
     trial.look()
     trial.maimed = {"own_0", "own_1"}
     trial.look()
     assert trial.releases.due(FIRST_LINES) == set()
 
 
-def test_a_drained_gateway_releases_lines_as_soon_as_buckets_have_leaders(
+def test_a_draining_gateway_does_not_wait_for_silent_servers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     trial = Releasing(monkeypatch)

@@ -1,4 +1,4 @@
-"""Records of the lines in a gateway's share: they are read when needed, and no change is missed."""
+"""Ownership records of the lines that a gateway should poll: when it reads them again."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def is_mine(record: Record) -> bool:
 
 
 class Trial:
-    """A bucket in memory, and what gateway a, in its session 2, has read from it."""
+    """A bucket in memory, and the records that gateway "a" has read from it in its session 2."""
 
     def __init__(self) -> None:
         self.bucket = MemoryBucket()
@@ -34,7 +34,7 @@ class Trial:
         self.follower = ShareFollower(made, self.note, is_mine, self.had.__contains__)
 
     def note(self, *_: object) -> None:
-        """Recompute which records may change, as ShareRecords does after each record."""
+        """Determine again which records may change, as ShareRecords does after each record."""
         self.follower.recompute()
 
     def looked(self) -> list[str]:
@@ -42,13 +42,13 @@ class Trial:
         return [record.key for record in asyncio.run(self.follower.look())]
 
     def asks(self) -> bool:
-        """Return True if a read sends a request."""
+        """Return True if a call of `look` sends a request."""
         before = self.bucket.asked
         self.looked()
         return self.bucket.asked > before
 
 
-def test_records_of_free_and_own_lines_are_read_once() -> None:
+def test_ownership_records_of_free_lines_and_of_own_lines_are_read_once() -> None:
     trial = Trial()
     trial.bucket.store("mine", ME)
     trial.bucket.store("free", NOBODY)
@@ -62,7 +62,7 @@ def test_records_of_free_and_own_lines_are_read_once() -> None:
 
 
 @pytest.mark.parametrize("value", [OTHER, owner_value(("a", 1), 1, 0)])
-def test_a_line_of_another_session_is_read_until_it_is_free(value: Any) -> None:
+def test_an_ownership_record_of_another_session_is_read_until_it_is_free(value: Any) -> None:
     trial = Trial()
     trial.bucket.store("line", value)
     trial.follower.want(["line"])
@@ -73,7 +73,7 @@ def test_a_line_of_another_session_is_read_until_it_is_free(value: Any) -> None:
     assert not trial.asks()
 
 
-def test_lines_that_two_other_records_show_as_ours_are_not_read() -> None:
+def test_records_of_a_line_that_this_gateway_owns_already_are_not_read() -> None:
     trial = Trial()
     trial.bucket.store("line", OTHER)
     trial.follower.want(["line"])
@@ -84,10 +84,10 @@ def test_lines_that_two_other_records_show_as_ours_are_not_read() -> None:
     assert not trial.asks()
 
 
-def test_a_line_with_an_unanswered_write_is_read_again_outside_the_share(
+def test_a_record_with_an_unanswered_write_is_read_again_for_30_s(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The write may still be stored when the bucket has a leader again."""
+    """The write may still be stored once the bucket has a leader again."""
     now = 1000.0
     monkeypatch.setattr(line_records.time, "monotonic", lambda: now)
     trial = Trial()
@@ -115,13 +115,13 @@ def test_an_older_record_from_a_lagging_server_is_ignored() -> None:
     assert is_mine(trial.follower.records["line"])
 
 
-async def test_an_added_line_is_read_without_delay() -> None:
+async def test_the_record_of_an_added_line_is_read_without_delay() -> None:
     trial = Trial()
     trial.follower.want(["line"])
     await trial.follower.look()
     resting = asyncio.create_task(trial.follower.rest())
     trial.follower.want(["line", "another"])
-    for _ in range(5):  # lets the event loop run; no time passes
+    for _ in range(5):  # lets other tasks of the event loop run, while no time passes
         await asyncio.sleep(0)
     assert resting.done()
 
@@ -153,7 +153,7 @@ def test_a_move_names_the_former_master_if_two_records_agree_on_it() -> None:
     assert moves_of(records) == [("b", "a"), ("", "b")]
 
 
-def test_a_single_first_record_is_enough_to_own_a_line() -> None:
+def test_a_line_with_one_record_for_each_of_two_gateways_is_listed_for_both() -> None:
     records = followed()
     take(records, 1, OTHER, FIRST_BUCKET, SECOND_BUCKET)
     take(records, 2, ME, FIRST_BUCKET)
@@ -163,19 +163,20 @@ def test_a_single_first_record_is_enough_to_own_a_line() -> None:
     assert records.owned_by("b", 1) == set()
 
 
-def test_a_line_read_long_ago_has_no_known_former_master() -> None:
-    """The line was last read in a cold start or an hour ago, and has had other masters since then."""
+def test_a_move_has_no_former_master_if_earlier_records_were_not_read() -> None:
+    """Gateways have claimed the line in the meantime, and this gateway has not read their records."""
     records = followed()
     take(records, 8, owner_value(("b", 1), 8, 0), FIRST_BUCKET, SECOND_BUCKET)
     assert moves_of(records) == [(None, "b")]
     take(records, 11, owner_value(("a", 2), 11, 0), FIRST_BUCKET, SECOND_BUCKET)
     assert moves_of(records)[0] == (None, "a")
-    take(records, 12, owner_value(("", 0), 12, 0), FIRST_BUCKET, SECOND_BUCKET)  # we have released the line
+    # this gateway has released the line
+    take(records, 12, owner_value(("", 0), 12, 0), FIRST_BUCKET, SECOND_BUCKET)
     assert moves_of(records)[0] == ("a", "")
 
 
 def test_a_line_claimed_again_by_its_master_is_not_reported_as_moved() -> None:
-    """The master claims the line again because the outcome of its own release was unknown."""
+    """The master claims its own line again because the outcome of the line's release was unknown."""
     records = followed()
     take(records, 1, owner_value(("a", 2), 1, 0), FIRST_BUCKET, SECOND_BUCKET)
     take(records, 2, owner_value(("a", 2), 2, 0), FIRST_BUCKET, SECOND_BUCKET)
@@ -184,7 +185,7 @@ def test_a_line_claimed_again_by_its_master_is_not_reported_as_moved() -> None:
     assert moves_of(records) == [("a", "b"), ("", "a")]
 
 
-def test_sessions_without_lines_are_forgotten() -> None:
+def test_a_session_that_owns_no_line_any_longer_is_forgotten() -> None:
     records = followed()
     for session in range(1, 1000):
         take(records, session, owner_value(("b", session), session, 0), FIRST_BUCKET, SECOND_BUCKET)
@@ -193,8 +194,8 @@ def test_sessions_without_lines_are_forgotten() -> None:
     assert len(records._owned) == 1
 
 
-def test_lines_read_before_a_failure_stay_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The lines fill whole batches exactly. The next read, which would return no more lines, fails."""
+def test_plant_lines_that_were_read_before_a_failed_read_stay_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two reads return all lines. The last read, which would return no further lines, fails."""
     monkeypatch.setattr(buckets, "BATCH", 2)
     path: Any = None
     records = ShareRecords("a", lambda: path, USUAL, lambda: None, is_mine)
@@ -216,7 +217,7 @@ def test_lines_read_before_a_failure_stay_known(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.long
-async def test_servers_give_the_newest_records_of_many_lines(one: Cluster) -> None:
+async def test_real_servers_return_the_newest_records_of_many_lines(one: Cluster) -> None:
     async with connected_path(one) as path:
         bucket = Bucket("own_0", lambda: path)
         lines = [f"line-{at}" for at in range(1200)]
@@ -237,7 +238,7 @@ async def test_servers_give_the_newest_records_of_many_lines(one: Cluster) -> No
 
 
 def told(*moves: Move) -> list[tuple[str | None, str]]:
-    """Return the moves that are shown after these reports, each as former and new master."""
+    """Return the former and new master of each move that is shown after these reports."""
     found = Moves()
     found.add(moves)
     return [(move.before, move.after) for move in found.newest(100)]
@@ -250,26 +251,26 @@ def move(turn: int, before: str | None, after: str, line: str = "hall-1") -> Mov
 OWNER_1 = move(1, "", "gw-1")
 
 
-def test_the_newest_move_is_listed_first() -> None:
+def test_the_newest_move_of_a_line_is_listed_first() -> None:
     assert told(OWNER_1, move(2, "gw-1", "gw-2")) == [("gw-1", "gw-2"), ("", "gw-1")]
 
 
-def test_a_line_that_was_released_and_claimed_has_moved_once() -> None:
+def test_a_release_and_the_following_claim_of_a_line_are_one_move() -> None:
     moves = [OWNER_1, move(2, "gw-1", ""), move(3, "", "gw-2")]
     assert told(*moves) == told(*reversed(moves)) == [("gw-1", "gw-2"), ("", "gw-1")]
 
 
-def test_a_released_line_has_no_master() -> None:
+def test_the_move_of_a_released_line_has_no_new_master() -> None:
     assert told(OWNER_1, move(2, "gw-1", "")) == [("gw-1", ""), ("", "gw-1")]
 
 
-def test_a_more_complete_report_of_a_move_replaces_another() -> None:
+def test_a_report_with_the_former_master_replaces_one_without_it() -> None:
     assert told(move(2, None, "gw-2"), move(2, "gw-1", "gw-2")) == [("gw-1", "gw-2")]
     assert told(move(2, "gw-1", "gw-2"), move(2, None, "gw-2")) == [("gw-1", "gw-2")]
 
 
 def test_a_release_and_a_claim_by_two_gateways_are_one_move() -> None:
-    """Each gateway reports half of the move: one has seen only the release, the other only the claim."""
+    """One gateway reports only the release, the other only the claim."""
     giver, taker = [OWNER_1, move(2, "gw-1", "")], [move(2, None, ""), move(3, "", "gw-2")]
     back = [move_of(one.as_json()) for one in (*giver, *taker, *giver)]
     assert told(*back) == [("gw-1", "gw-2"), ("", "gw-1")]
@@ -287,7 +288,8 @@ def test_a_move_is_read_back_unchanged_from_json() -> None:
 
 def test_only_the_newest_moves_are_kept() -> None:
     moves = Moves(most=10)
-    for turn in range(1000, 0, -1):  # buckets are read independently, so moves may be added in any order
+    # in descending order: buckets are read independently, so older moves may be added later
+    for turn in range(1000, 0, -1):
         moves.add([move(turn, None, "gw-1", f"line-{turn}")])
     assert [one.turn for one in moves.newest(10)] == list(range(1000, 990, -1))
     assert len(moves.newest(1000)) <= 40

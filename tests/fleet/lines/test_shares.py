@@ -1,4 +1,4 @@
-"""Shares of lines: which gateway each line is assigned to, and lines that a gateway cannot open."""
+"""Shares: which gateway each line is assigned to, and how a gateway reports lines that it cannot open."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_the_assignment_does_not_depend_on_the_order_of_names() -> None:
 
 
 def weight(line: str, gateway: str, number: int) -> int:
-    """Return the weight of a line and a gateway by the first version's formula, with Python's integers."""
+    """Compute the weight of a line and a gateway with Python's integers, as the first version did."""
     own, other = (
         int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
         for name in (line, gateway)
@@ -70,7 +70,7 @@ def weight(line: str, gateway: str, number: int) -> int:
 def test_each_line_is_assigned_to_the_gateway_of_greatest_weight_that_has_room(
     lines: int, number: int
 ) -> None:
-    """Gateways of versions with different weights would move lines back and forth."""
+    """All versions must use the same weights; otherwise they would move lines back and forth."""
     room = dict.fromkeys(GATEWAYS[:number], -(-lines * 110 // (100 * number)))
     wanted = {}
     for line in sorted(LINES[:lines]):
@@ -92,7 +92,7 @@ FEW_LINES = tuple(f"line-{at}" for at in range(40))
 
 
 class Trial:
-    """Gateway a at the start of its session, with its own clock and without a server."""
+    """Gateway "a" at the start of its session, with its own clock and without a server."""
 
     def __init__(self) -> None:
         self.clock = HandClock()
@@ -104,11 +104,11 @@ class Trial:
         self.member.records._lines = FEW_LINES
 
     def sees(self, *others: str) -> None:
-        """Note these other gateways, as gateway a does before its session starts."""
+        """Let gateway "a" note these other gateways, as it does before its session starts."""
         self.member._note_others(dict.fromkeys(others, VALUE))
 
     def shared_among(self, *others: str) -> set[str]:
-        """Take a step while these other gateways are present; return the gateways that have lines now."""
+        """Assign lines while these other gateways are present; return the gateways that have lines now."""
         asyncio.run(self.member._share_out(dict.fromkeys(others, VALUE)))
         return set(Counter(self.member.wanted.values()))
 
@@ -116,15 +116,15 @@ class Trial:
         return self.shared_among(*others) == {"a", *others}
 
 
-def test_a_returning_gateway_gets_its_share_immediately() -> None:
+def test_a_gateway_that_rejoins_a_running_fleet_gets_its_share_immediately() -> None:
     trial = Trial()
     trial.sees("b", "c")
     trial.clock.pass_s(QUIET_NS / SECOND)
     assert trial.is_shared_with("b", "c")
 
 
-def test_a_cold_start_assigns_lines_once_no_gateway_joins() -> None:
-    """Otherwise the first gateway would read the records of all lines, and the second those of half."""
+def test_at_a_cold_start_lines_are_assigned_once_no_more_gateways_join() -> None:
+    """Otherwise the first gateway would read all lines' records, and the second those of half the lines."""
     trial = Trial()
     assert trial.shared_among("b") == set()
     trial.clock.pass_s(QUIET_NS / SECOND - 0.01)
@@ -136,7 +136,7 @@ def test_a_cold_start_assigns_lines_once_no_gateway_joins() -> None:
     assert trial.is_shared_with("b", "c")
 
 
-def test_a_settled_gateway_reassigns_lines_immediately() -> None:
+def test_after_3_s_lines_are_assigned_again_whenever_a_gateway_joins_or_ends() -> None:
     trial = Trial()
     trial.clock.pass_s(SETTLE_S)
     assert trial.is_shared_with("b", "c")
@@ -184,10 +184,10 @@ def test_a_polled_line_is_reported_when_its_port_is_lost_for_6_s() -> None:
 
 @table(
     ("silent_s", "named_after_s"),
-    [(2.0, 4.0), (REPLY_NS / SECOND, 3.0), (60.0, 6.0), (None, 6.0)],  # None: no reply at all
+    [(2.0, 4.0), (REPLY_NS / SECOND, 3.0), (60.0, 6.0), (None, 6.0)],  # None: the line never had a reply
 )
-def test_a_loss_counts_from_the_last_reply(silent_s: float | None, named_after_s: float) -> None:
-    """The port's loss and the failure of reopening are noticed only some seconds after the line was cut."""
+def test_a_port_counts_as_lost_from_its_last_reply(silent_s: float | None, named_after_s: float) -> None:
+    """A gateway notices a cut line only after seconds, so the 6 s start at the last reply before the cut."""
     clock = HandClock()
     unopened = UnopenedLines(clock)
 
@@ -202,7 +202,7 @@ def test_a_loss_counts_from_the_last_reply(silent_s: float | None, named_after_s
     assert lost_after(0.1)
 
 
-def test_one_line_is_tried_at_a_time_with_increasing_pauses() -> None:
+def test_one_reported_line_is_tried_at_a_time_with_increasing_pauses() -> None:
     clock = HandClock()
     unopened = UnopenedLines(clock)
     for line in "abc":
@@ -233,7 +233,7 @@ def test_lines_reported_by_all_gateways_are_tried_first_and_regularly() -> None:
     assert unopened.named() == {"a", "b", "c"}
 
 
-def test_after_a_successful_trial_the_other_lines_are_tried_at_once() -> None:
+def test_after_a_successful_trial_the_other_reported_lines_are_tried_at_once() -> None:
     clock = HandClock()
     unopened = UnopenedLines(clock)
     for line in "abc":
@@ -244,8 +244,8 @@ def test_after_a_successful_trial_the_other_lines_are_tried_at_once() -> None:
         unopened.opened(line)
 
 
-def test_a_trial_prefers_assigned_lines_and_its_success_clears_the_rest() -> None:
-    """A line that is assigned to another gateway would not come back after a trial."""
+def test_a_gateway_tries_its_own_reported_lines_first() -> None:
+    """A trial of a line that is assigned to another gateway would not bring the line back."""
     clock = HandClock()
     unopened = UnopenedLines(clock)
     for line in "abcd":
@@ -254,12 +254,12 @@ def test_a_trial_prefers_assigned_lines_and_its_success_clears_the_rest() -> Non
     clock.pass_s(FIRST_WAIT_NS / SECOND)
     assert unopened.named() == {"a", "c", "d"}
     unopened.opened("b")
-    assert unopened.named() == frozenset()  # the trial of d starts immediately
+    assert unopened.named() == frozenset()  # d is tried immediately, so it is not reported now
     unopened.opened("d")
     assert unopened.named() == frozenset()
 
 
-def test_a_trial_ends_after_a_minute_if_the_line_does_not_come_back() -> None:
+def test_a_trial_of_a_reported_line_ends_if_the_line_does_not_come_back() -> None:
     clock = HandClock()
     unopened = UnopenedLines(clock)
     failed(unopened, "a")
@@ -284,7 +284,7 @@ SHARED = assign(SIXTY, ["a", "b", "c"])
 OF_A = {line for line, name in SHARED.items() if name == "a"}
 
 
-def test_only_reported_lines_move_and_all_gateways_agree_where() -> None:
+def test_only_reported_lines_move_and_each_gateway_computes_the_same_moves() -> None:
     found = hand_over(SHARED, {"a": OF_A, "b": [], "c": []})
     assert set(found.values()) == {"b", "c"}
     assert {line for line in SIXTY if found[line] != SHARED[line]} == OF_A
@@ -295,12 +295,12 @@ def test_a_line_that_no_gateway_can_open_is_not_moved() -> None:
     assert hand_over(SHARED, {"a": SIXTY, "b": SIXTY, "c": SIXTY}) == SHARED
 
 
-def test_a_reported_line_moves_to_a_gateway_that_has_not_tried_it() -> None:
+def test_a_reported_line_moves_to_a_gateway_that_has_not_reported_it() -> None:
     found = hand_over(SHARED, {"a": OF_A, "b": OF_A, "c": []})
     assert {found[line] for line in OF_A} == {"c"}
 
 
-def test_a_gateway_without_a_list_of_unopened_lines_gets_no_lines_of_others() -> None:
-    """A gateway without a list has another version, which would not take lines that are handed over."""
+def test_a_gateway_that_reports_no_list_gets_no_lines_that_others_reported() -> None:
+    """A gateway of another version reports no list, and would not take lines that others could not open."""
     assert hand_over(SHARED, {"a": OF_A}) == SHARED
     assert set(hand_over(SHARED, {"a": OF_A, "c": []}).values()) == {"b", "c"}
