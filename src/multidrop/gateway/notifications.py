@@ -1,7 +1,10 @@
-"""The part `notify`: a message for each alarm that begins or ends, to webhooks and to Apprise's services.
+"""The gateway's part `notify`: sends a message for each alarm that starts or ends, to webhooks and to
+Apprise's services.
 
-Each target has its own thread, so a target that hangs delays nothing else. Addresses of targets contain
-secrets. Logs and errors show only the scheme of an address, and the host of a webhook.
+Each target has its own thread, so that a target that hangs delays nothing else.
+
+Addresses of targets contain secrets. Logs and errors show only the scheme of an address, and the host of a
+webhook.
 """
 
 from __future__ import annotations
@@ -32,8 +35,8 @@ from multidrop.gateway.settings import input_file, refuse
 from multidrop.supervisor import supervisor
 
 MOST_TARGETS = 20
-MOST_BYTES = 65_536  # limit of the size of the file of targets in bytes
-MOST_WAITING = 1000  # limit of alarms that wait for a target
+MOST_BYTES = 65_536  # limit, in bytes, of the file of targets
+MOST_WAITING = 1000  # limit of alarms that wait to be sent to one target
 MOST_AN_HOUR = 1000
 CLOSE_S = 2.0
 SCHEME = re.compile(r"[a-z][a-z0-9+.-]*")
@@ -42,7 +45,7 @@ _log = logging.getLogger("multidrop.gateway.notify")
 
 
 class AlarmTarget(NamedTuple):
-    """A target of messages, with a name that shows no secret part of its URL."""
+    """A target of messages. Its `name` shows no secret part of its URL."""
 
     name: str
     url: str
@@ -57,9 +60,9 @@ class NotifySettings:
     """The settings in the table `[serve.notify]`. Raises ValueError with a line for each mistake."""
 
     targets: str = "targets"  # path of a file with a URL on each line
-    # Kinds of alarms that are sent.
+    # Kinds of alarms about which messages are sent.
     on: tuple[str, ...] = field(default=KINDS, metadata={"items": {"enum": [*KINDS]}})
-    # Limit of messages an hour to each target.
+    # Limit of messages per hour to each target.
     most: int = field(default=60, metadata={"minimum": 1, "maximum": MOST_AN_HOUR})
 
     def __post_init__(self) -> None:
@@ -73,7 +76,7 @@ class NotifySettings:
         refuse(wrong)
 
     def check(self, plant: Plant) -> list[str]:
-        """Return a sentence for each mistake in the file of targets, and for a missing library."""
+        """Return an error sentence for each mistake in the file of targets, and for a missing library."""
         path = input_file(self.targets, plant)
         try:
             targets, wrong = read_targets(path)
@@ -88,7 +91,7 @@ Settings = NotifySettings
 
 
 def read_targets(path: Path) -> tuple[list[AlarmTarget], list[str]]:
-    """Return the targets in a file, and a sentence for each mistake. Raises OSError."""
+    """Return the targets in a file, and an error sentence for each mistake. Raises OSError."""
     with path.open("rb") as file:
         text = file.read(MOST_BYTES).decode("utf-8", "replace")
     found, wrong = [], []
@@ -127,7 +130,10 @@ def _shown(url: str) -> str:
 
 
 def build(settings: NotifySettings, context: PartContext) -> Notifications:
-    """Return the part. Raises ImportError without a needed Apprise, OSError if the targets are unreadable."""
+    """Return the sender of alarms.
+
+    Raises ImportError if Apprise is needed but missing, OSError if the file of targets is unreadable.
+    """
     targets, _ = read_targets(input_file(settings.targets, context.plant))
     describe = partial(message_of, context.plant.path.stem, context.page)
     senders = [
@@ -143,7 +149,7 @@ def build(settings: NotifySettings, context: PartContext) -> Notifications:
 def message_of(plant: str, page: str, alarm: Alarm, left_out: int) -> dict[str, Any]:
     """Return the message about an alarm as a JSON object.
 
-    `left_out` is the number of earlier messages that were not sent.
+    `left_out` is the number of earlier messages that were not sent because of the hourly limit.
     """
     where = alarm.drive or f"line {alarm.line}"
     over = " is over" if alarm.ended is not None else ""
@@ -167,10 +173,10 @@ def message_of(plant: str, page: str, alarm: Alarm, left_out: int) -> dict[str, 
 
 
 class AlarmQueue:
-    """The alarms that wait for one target, the oldest first, and the target's hourly limit of messages.
+    """The alarms that wait to be sent to one target, the oldest first, and the target's hourly limit.
 
-    `most` messages an hour are allowed. Above that rate, only the newest message of each alarm waits. The
-    next message that is sent states how many messages were left out.
+    `most` messages an hour are allowed. At the limit, only the newest message about each alarm waits. The
+    next message states how many messages were left out.
     """
 
     def __init__(self, most: int, now_s: float) -> None:
@@ -192,7 +198,10 @@ class AlarmQueue:
             self.left_out += excess
 
     def next(self, now_s: float) -> tuple[Alarm | None, float]:
-        """Return the alarm to send now and 0; else None and how long to wait, in s (inf: no alarm waits)."""
+        """Return the alarm to send now, and 0.
+
+        If there is none, return None and how long to wait, in s (inf: no alarm waits).
+        """
         rate = self._most / 3600
         self._allowed = min(self._most, self._allowed + (now_s - self._filled_s) * rate)
         self._filled_s = now_s
@@ -204,7 +213,7 @@ class AlarmQueue:
         return self._waiting[0], 0.0
 
     def note_sent(self, alarm: Alarm) -> None:
-        """Remove an alarm that `next` returned: its message was sent."""
+        """Remove an alarm that `next` returned, because its message was sent."""
         self._remove(alarm)
         self._allowed -= 1
         self.left_out = 0
@@ -227,11 +236,11 @@ class AlarmQueue:
 
 
 def sender_to(target: AlarmTarget) -> Callable[[dict[str, Any]], None]:
-    """Return a function that sends a message to this target; it raises OSError if that fails."""
+    """Return a function that sends a message to this target. The function raises OSError if that fails."""
     if target.is_webhook:
         return partial(_post, target.url)
     apprise: Any = import_module("apprise")
-    # the library's log lines may contain addresses, which are secret
+    # Apprise's log lines may contain addresses of targets, which are secret
     logging.getLogger("apprise").propagate = False
     service = apprise.Apprise()
     if not service.add(target.url):
@@ -274,11 +283,11 @@ class Sender(RetryingSender):
         self.announce()
 
     def _may_end(self, pause_s: float) -> bool:
-        # first send the messages that the hourly limit still allows
+        # do not end before the messages that the hourly limit still allows are sent
         return pause_s > 0 and not self._has_news
 
     def step(self) -> float:
-        """Send the next message. Return the seconds until the next attempt (inf: until a new message)."""
+        """Send the next message. Return the seconds until the next attempt; inf if no message waits."""
         with self._changed:
             self._has_news = False
             alarm, wait_s = self._queue.next(self._clock())
@@ -288,13 +297,13 @@ class Sender(RetryingSender):
         with self._changed:
             alarm, wait_s = self._queue.next(self._clock())
             left_out = self._queue.left_out
-        if alarm is None:  # a later alarm has replaced it
+        if alarm is None:  # a newer alarm has replaced the one of this message
             return wait_s
         try:
             self._send(self._describe(alarm, left_out))
         except (ValueError, Refused):
             with self._changed:
-                self._queue.drop(alarm)  # it would block all later messages
+                self._queue.drop(alarm)  # an alarm that the target refuses would block all later messages
             raise
         self.sent += 1
         with self._changed:
@@ -303,7 +312,7 @@ class Sender(RetryingSender):
 
 
 class Notifications:
-    """The part of the gateway: passes alarms on to all targets."""
+    """The gateway's part `notify`: passes alarms on to all targets."""
 
     def __init__(self, senders: list[Sender], kinds: Collection[str]) -> None:
         self._senders = senders
@@ -311,7 +320,7 @@ class Notifications:
         self._threads: list[asyncio.Future[None]] = []
 
     def note_alarm(self, alarm: Alarm, change: AlarmChange) -> None:
-        """Queue a message for an alarm that began or ended, but none for an acknowledgement or a new text."""
+        """Queue a message if an alarm started or ended, but not if it was acknowledged or got a new text."""
         if alarm.kind in self._kinds and change is not AlarmChange.CHANGED:
             for sender in self._senders:
                 sender.put(alarm)

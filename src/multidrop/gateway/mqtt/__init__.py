@@ -1,1 +1,1 @@
-"""The gateway's MQTT interface: JSON topics, Home Assistant and Sparkplug."""
+"""The gateway's MQTT interface: JSON topics, Home Assistant's discovery, and Sparkplug."""

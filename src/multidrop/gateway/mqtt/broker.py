@@ -1,4 +1,4 @@
-"""Broker: one connection to an MQTT broker, re-established after each loss."""
+"""A connection to an MQTT broker, re-established after each loss."""
 
 from __future__ import annotations
 
@@ -15,19 +15,21 @@ from urllib.parse import urlsplit
 from multidrop.printable import masked
 from multidrop.supervisor import Hung, supervisor
 
-MOST_UNDER_WAY = 64  # limit of unacknowledged messages in flight: enough for the drives of two lines
-MOST_WAITING = 4096  # limit of pending messages, one per topic; no plant needs more topics
+# limit of messages in flight that the broker has not acknowledged: enough for the drives of two lines
+MOST_UNDER_WAY = 64
+# limit of messages that wait to be sent, at most one per topic; no plant needs more topics
+MOST_WAITING = 4096
 PORTS = {"mqtt": 1883, "mqtts": 8883}
-RETRY_S = (1, 30)  # first and longest pause before reconnecting
+RETRY_S = (1, 30)  # in s: the first and the longest pause before reconnecting
 KEEP_ALIVE_S = 15
-FAREWELL_S = 1.0  # time limit for the last messages
-CONFIRM_S = 10.0  # time limit for the broker to confirm messages
-CONFIRMED = "multidrop/confirmed"  # a topic to which this client does not subscribe
+FAREWELL_S = 1.0  # time limit, in s, for sending the last messages before a disconnect
+CONFIRM_S = 10.0  # time limit, in s, for the broker's confirmation of messages
+CONFIRMED = "multidrop/confirmed"  # a topic to which this client never subscribes; see `Broker.confirm`
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
 
 
 class Publication(NamedTuple):
-    """A topic, and a function that makes its payload when it is sent."""
+    """The topic of a message, and a function that makes its payload when the message is sent."""
 
     topic: str
     make: Callable[[], bytes]
@@ -36,9 +38,10 @@ class Publication(NamedTuple):
 
 
 class Outbox:
-    """Pending messages, one per topic, and a limited number of messages that the broker has not acknowledged.
+    """Messages that wait to be sent, at most one per topic, and the messages that await acknowledgement.
 
-    `send` takes a message and returns its number, or None if it cannot be sent now.
+    The second number is limited. `send` takes a message and returns its number, or None if it cannot be sent
+    now.
     """
 
     def __init__(self, send: Callable[[Publication], int | None]) -> None:
@@ -46,10 +49,10 @@ class Outbox:
         self._waiting: dict[str, Publication] = {}
         self._under_way: set[int] = set()
         self.sent = 0
-        self.dropped = 0  # messages replaced by a newer one, or lost with the connection
+        self.dropped = 0  # number of messages that were replaced by a newer one, or lost with the connection
 
     def put(self, message: Publication) -> None:
-        """Queue the message; it replaces a pending message of the same topic."""
+        """Queue a message. It replaces a waiting message on the same topic."""
         if message.topic in self._waiting or len(self._waiting) >= MOST_WAITING:
             self.dropped += 1
         if message.topic in self._waiting or len(self._waiting) < MOST_WAITING:
@@ -57,16 +60,16 @@ class Outbox:
         self.flush()
 
     def withdraw(self, topic: str) -> None:
-        """Drop the pending message of a topic, if any."""
+        """Drop the message that waits to be sent on a topic, if any."""
         self.dropped += self._waiting.pop(topic, None) is not None
 
     def flush(self) -> None:
-        """Send pending messages, as long as fewer than MOST_UNDER_WAY are unacknowledged."""
+        """Send waiting messages, while fewer than MOST_UNDER_WAY await acknowledgement."""
         while self._waiting and len(self._under_way) < MOST_UNDER_WAY:
             topic = next(iter(self._waiting))
             try:
                 number = self._send(self._waiting[topic])
-            except Exception as failure:  # no broker would accept this message: drop it, and send the others
+            except Exception as failure:  # the message itself cannot be sent: drop it, and send the others
                 del self._waiting[topic]
                 self.dropped += 1
                 _log.warning("the message on %.100r cannot be sent: %r", topic, failure)
@@ -78,12 +81,12 @@ class Outbox:
             self.sent += 1
 
     def acknowledge(self, numbers: Iterable[int]) -> None:
-        """Record that the broker has received the messages with these numbers."""
+        """Note that the broker has acknowledged the messages with these numbers."""
         self._under_way.difference_update(numbers)
         self.flush()
 
     def forget(self) -> None:
-        """Drop all messages, because the connection was lost."""
+        """Drop all messages. Called when the connection is lost."""
         self.dropped += len(self._waiting) + len(self._under_way)
         self._waiting.clear()
         self._under_way.clear()
@@ -102,7 +105,10 @@ class Address(NamedTuple):
 
 
 def parse_broker(text: str) -> Address:
-    """Return the parts of `mqtt://host:port`. Raises ValueError for other texts, with passwords masked."""
+    """Return the address in a URL of the form `mqtt://host:port`.
+
+    Raises ValueError for other texts, with passwords masked.
+    """
     try:
         parts = urlsplit(text)
         port = parts.port
@@ -121,15 +127,16 @@ def parse_broker(text: str) -> Address:
 
 
 class Login(NamedTuple):
-    """User name, password, and certificates that verify the broker."""
+    """User name and password for the broker, and certificates that verify the broker."""
 
     user: str = ""
     password: str = ""
-    authorities: str | None = None  # file of trusted certificates; None: those of the system
+    # path of a file with trusted certificates; None: those of the operating system
+    authorities: str | None = None
 
 
 def make_client(address: Address, login: Login, name: str) -> Any:
-    """Return a paho client with this login, which is not connected yet."""
+    """Return an MQTT client of the library paho with this login. It is not connected yet."""
     from paho.mqtt.client import Client
     from paho.mqtt.enums import CallbackAPIVersion
 
@@ -142,10 +149,13 @@ def make_client(address: Address, login: Login, name: str) -> Any:
 
 
 class Speaker(Protocol):
-    """A message format on one connection, such as JsonTopics. Its methods run in the event loop."""
+    """The messages that one connection sends and handles, in one format, such as JsonTopics.
+
+    The methods run in the event loop.
+    """
 
     def will(self) -> Publication:
-        """Return the message that the broker publishes when this connection breaks."""
+        """Return the message that the broker must publish when this connection breaks."""
 
     def topics(self) -> list[tuple[str, int]]:
         """Return the topics to subscribe to, with their QoS."""
@@ -157,40 +167,46 @@ class Speaker(Protocol):
         """Handle a received message."""
 
     def publish(self) -> None:
-        """Send new values."""
+        """Send values that are new since the previous call."""
 
     def leave(self) -> None:
         """Send the last messages before a disconnect."""
 
 
 class Broker:
-    """A speaker's connection to a broker. Paho's thread sends; only `close` waits for that thread."""
+    """A connection to a broker, over which a `Speaker` publishes messages.
+
+    A thread of the library paho sends them. Only `close` waits for that thread.
+    """
 
     def __init__(self, address: Address, login: Login, name: str, speaker: Speaker) -> None:
         self._address = address
         self._name = name
-        self._thread: threading.Thread | None = None  # the thread of the paho client for this connection
+        self._thread: threading.Thread | None = None  # paho's thread for this connection
         self._speaker = speaker
         self.loop: asyncio.AbstractEventLoop | None = None
         self.outbox = Outbox(self._send)
         self.is_connected = False
-        self.failure = ""  # why the speaker cannot publish now
+        self.failure = ""  # why publishing fails now; "" if it works
         self._connections = 0
-        self._confirming: dict[int, asyncio.Future[None]] = {}  # by number of the packet
+        # futures of `confirm` that wait for the broker's answer, by packet number
+        self._confirming: dict[int, asyncio.Future[None]] = {}
         self._client = make_client(address, login, name)
         self._client.reconnect_delay_set(*RETRY_S)
-        self._client.max_inflight_messages_set(0)  # the outbox sets the limit
+        # no limit in paho, because the outbox limits the messages in flight
+        self._client.max_inflight_messages_set(0)
         self._client.on_connect = self._on_connect
         self._client.on_connect_fail = lambda *_: self._call(self._failed, "no answer")
         self._client.on_disconnect = lambda *given: self._call(self._lost, str(given[3]))
         self._client.on_publish = self._on_publish
         self._client.on_message = self._on_message
         self._client.on_unsubscribe = lambda *given: self._call(self._confirm, given[2])
-        self._arrived: deque[int] = deque()  # numbers of acknowledged messages, which the loop must handle
+        # numbers of acknowledged messages, appended in paho's thread and handled in the event loop
+        self._arrived: deque[int] = deque()
         self._why = ""
 
     def open(self) -> None:
-        """Start to connect, and retry after each failure."""
+        """Start to connect. paho retries after each failure."""
         self.loop = asyncio.get_running_loop()
         self._set_will()
         self._client.connect_async(self._address.host, self._address.port, KEEP_ALIVE_S)
@@ -198,7 +214,7 @@ class Broker:
         self._thread = next((one for one in threading.enumerate() if one.name.endswith(self._name)), None)
 
     async def close(self) -> None:
-        """Send pending messages for at most FAREWELL_S seconds, then disconnect."""
+        """Send waiting messages for at most FAREWELL_S seconds, then disconnect."""
         begun = asyncio.get_running_loop().time()
         while self.is_connected and not self.outbox.is_idle:
             if asyncio.get_running_loop().time() - begun > FAREWELL_S:
@@ -206,15 +222,16 @@ class Broker:
             await asyncio.sleep(0.01)
         self.loop = None
         self._client.disconnect()
-        with suppress(Hung):  # paho's daemon thread may wait for a name server
+        with suppress(Hung):  # paho's daemon thread may hang in a DNS query
             await supervisor().within("mqtt", FAREWELL_S, self._client.loop_stop)
         self.is_connected = False
-        self._client = None  # frees the sockets by which paho wakes its thread
+        self._client = None  # frees the sockets that paho uses to wake its thread
 
     def publish(self) -> None:
-        """Let the speaker publish. Without a connection, the newest message of each topic waits.
+        """Let the speaker publish its new values.
 
-        Raises RuntimeError if paho's thread has ended.
+        Without a connection, the newest message of each topic waits. Raises RuntimeError if paho's thread has
+        ended.
         """
         if self._thread is not None and not self._thread.is_alive():
             raise RuntimeError("the thread of the broker's connection has ended")
@@ -224,13 +241,14 @@ class Broker:
             self.publish_all()
 
     def publish_all(self) -> None:
-        """Publish all current messages, as on a new connection."""
+        """Publish all current messages again, as after a new connection."""
         self._let(self._speaker.connected)
 
     def _let(self, say: Callable[[], None]) -> None:
-        """Call `say`, which publishes messages. If it fails, publish "offline", but keep receiving commands.
+        """Call a method of the speaker that publishes messages.
 
-        Without "offline", retained values at the broker would look current.
+        If it fails, publish "offline", but keep receiving commands. Without "offline", the values that the
+        broker retains would look current.
         """
         try:
             say()
@@ -244,7 +262,7 @@ class Broker:
             self.failure = ""
 
     async def confirm(self) -> None:
-        """Wait until the broker has received all messages put into the outbox so far. Raises OSError.
+        """Wait until the broker has received all messages that are in the outbox now. Raises OSError.
 
         A message of QoS 0 is not acknowledged, but a broker handles packets in their order. So the
         broker's answer to a later packet confirms all messages before that packet. The later packet used
@@ -267,7 +285,7 @@ class Broker:
 
     @property
     def trouble(self) -> str:
-        """The sentence for a missing connection, with the reason if it is known."""
+        """A sentence about the missing connection, with the reason if it is known."""
         return f"no connection to {self._address.host}:{self._address.port}" + (
             self._why and f": {self._why}"
         )
@@ -291,8 +309,8 @@ class Broker:
         _log.info("connected to %s:%d", self._address.host, self._address.port)
         for topic, qos in self._speaker.topics():
             self._client.subscribe(topic, qos)
-        self.failure = ""  # forget the failure of the previous connection
-        self.outbox.forget()  # drop old messages: the speaker's birth must be sent first
+        self.failure = ""  # a failure of the previous connection does not matter now
+        self.outbox.forget()  # drop old messages, because the speaker's first message must be its birth
         self.publish_all()
 
     def _acknowledge(self) -> None:
@@ -331,7 +349,7 @@ class Broker:
 
     def _on_publish(self, _client: Any, _data: Any, number: int, *_more: Any) -> None:
         self._arrived.append(number)
-        if len(self._arrived) == 1:  # else the loop was woken already: acknowledgements arrive in bursts
+        if len(self._arrived) == 1:  # if there are more, the event loop was woken for the first one already
             self._call(self._acknowledge)
 
     def _on_message(self, _client: Any, _data: Any, message: Any) -> None:

@@ -1,8 +1,9 @@
-"""BrokerCommands: check commands from a broker, which may delay, retain and duplicate messages.
+"""BrokerCommands: check the commands that a broker delivers. A broker may delay, retain and duplicate
+messages.
 
-A write or a verb is carried out only if it is not a copy and was sent at most MOST_AGE_S ago. It must
-also have been sent after the latest stop of its drive and the latest reload of the plant. A verb that
-stops the motor is always carried out.
+A write or a verb is carried out only if it is not a copy and was sent at most MOST_AGE_S ago. It must also
+have been sent after the latest stop of its drive and the latest reload of the plant file. A verb that stops
+the motor is always carried out.
 """
 
 from __future__ import annotations
@@ -18,18 +19,19 @@ from multidrop.gateway.commands import MOST_AGE_S, Commands
 from multidrop.gateway.http.rights import Caller
 from multidrop.supervisor import supervisor
 
-# age limit of commands: a broker that was suspended delivers all delayed messages together
+# age limit of commands, in ms: a broker that was suspended delivers many old messages when it resumes
 MOST_AGE_MS = round(MOST_AGE_S * 1e3)
-MOST_AHEAD_MS = 2_000  # how far a sender's clock may be ahead
+MOST_AHEAD_MS = 2_000  # in ms: how far a sender's clock may be ahead of the gateway's
 MOST_UNDER_WAY = 16  # limit of concurrent commands; stops are not counted
-REMEMBERED = 1_000  # number of newest commands that are kept, to recognise copies
+REMEMBERED = 1_000  # number of newest commands that are remembered, to recognise copies
 
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
-Report = Callable[[str, str, CommandResult, str], None]  # the drive, the command's text, its result, its id
+# a function that is called with the drive, the command's text, its result and its id
+Report = Callable[[str, str, CommandResult, str], None]
 
 
 class BrokerCommands:
-    """Checks commands and carries them out; calls `report` with each result.
+    """Checks commands and carries them out. `report` is called with each result.
 
     `utc_ms` returns the present time (UTC) in ms.
     """
@@ -47,12 +49,12 @@ class BrokerCommands:
         self._begin(self._stop(drives, self._caller.stopping(given_id)))
 
     def stop_by(self, drive: str, verb: str, options: Mapping[str, object], given_id: object = None) -> None:
-        """Carry out a verb that stops the motor, whatever its age."""
+        """Carry out a verb that stops the motor, however old the command is."""
         caller = self._caller.stopping(given_id)
         self._begin(self._do(drive, verb, caller, self._commands.act(drive, verb, options, caller)))
 
     def write(self, drive: str, register: str, value: float, time_ms: int, given_id: object = None) -> None:
-        """Write a register if the rules in the module's docstring allow it; else report why not.
+        """Write a register if the rules in this module's docstring allow it; else report why not.
 
         Raises ValueError for an invalid id.
         """
@@ -64,7 +66,7 @@ class BrokerCommands:
     def act(
         self, drive: str, verb: str, options: Mapping[str, object], time_ms: int, given_id: object = None
     ) -> None:
-        """Carry out a verb if the rules in the module's docstring allow it; else report why not.
+        """Carry out a verb if the rules in this module's docstring allow it; else report why not.
 
         Raises ValueError for an invalid id.
         """
@@ -74,14 +76,14 @@ class BrokerCommands:
             self._begin(self._counted(self._do(drive, verb, caller, work)))
 
     def refuse(self, drive: str, what: str, why: str, given_id: object = None) -> None:
-        """Report that a command was not carried out."""
+        """Report that a command was not carried out, and why."""
         command = self._caller.stopping(given_id).command
         _log.warning("%s of %s (command %s) was not carried out: %s", what, drive, command, why)
         self._report(drive, what, CommandResult(CommandOutcome.FAILED, f"not sent: {why}"), command)
 
     @staticmethod
     def _may_be_before(at_ns: int | None, age_ms: int) -> bool:
-        """Return True if a command of this age may have been sent before `at_ns`.
+        """Return True if a command with this age may have been sent before the time `at_ns`.
 
         The sender's clock may be ahead by MOST_AHEAD_MS. If `at_ns` is None, return False.
         """
@@ -95,11 +97,11 @@ class BrokerCommands:
             self.refuse(drive, what, why, caller.command)
             return False
         self._came.append(command)
-        self._under_way += 1  # counted here, because many commands may arrive before the first task starts
+        self._under_way += 1  # counted before the task starts, because many commands may arrive at once
         return True
 
     def _why_not(self, drive: str, command: object, age_ms: int) -> str:
-        """Return why a command of this age must not be carried out; "" if it may be carried out."""
+        """Return why a command with this age must not be carried out; "" if it may be carried out."""
         if not -MOST_AHEAD_MS <= age_ms <= MOST_AGE_MS:
             clocks = "by the clocks of sender and gateway"
             return f"it was sent {age_ms / 1000:.1f} s ago {clocks}"

@@ -1,7 +1,8 @@
-"""Discovery messages for Home Assistant (homeassistant/device/ID/config), one for each drive.
+"""Discovery messages, which tell Home Assistant what a drive publishes and accepts (topic
+homeassistant/device/ID/config).
 
-Each component has its own state topic, because a state topic of the device would also apply to numbers
-and buttons.
+There is one message for each drive. Each component, such as a sensor or a button, has its own state topic,
+because a state topic of the whole device would also apply to numbers and buttons.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from multidrop.drive import Access
 from multidrop.gateway.live.hub import FAULT, RUNS, SILENT, STANDS, UNKNOWN, digits_of
 
 DISCOVERY = "homeassistant"
-CLASSES = {  # Home Assistant's device_class by unit
+CLASSES = {  # by unit: the device_class of a sensor in Home Assistant
     "Hz": "frequency",
     "A": "current",
     "V": "voltage",
@@ -29,11 +30,13 @@ CLASSES = {  # Home Assistant's device_class by unit
     "s": "duration",
 }
 STATES = (RUNS, STANDS, FAULT, SILENT, UNKNOWN)
-OWN = ("problem", "running", "set", "value")  # ids of other components end in these words
-MOST = 1e12  # limit of a number's range in Home Assistant
+# ids of the other components end with these words, so a register with such a name gets another id
+OWN = ("problem", "running", "set", "value")
+MOST = 1e12  # largest absolute value in the range of a number
 LEAST_STEP = 0.001  # smallest step of a number that Home Assistant accepts
-STALE_PERIODS = 3  # a sensor becomes unavailable after this many publishing periods without a value
-# Commands carry the time of Home Assistant's clock, so the gateway can refuse delayed commands.
+STALE_PERIODS = 3  # a sensor becomes unavailable if no value is published for this many publishing periods
+# Template of the commands that Home Assistant sends. They contain the time of its clock, so that the gateway
+# can refuse delayed commands.
 COMMAND = '{{"value": {{{{ {} }}}}, "time": {{{{ (now().timestamp() * 1000) | int }}}}}}'
 
 
@@ -42,10 +45,10 @@ def discovery_topic(prefix: str, drive: str) -> str:
 
 
 def object_id(prefix: str, drive: str) -> str:
-    """Return an id with only the characters that Home Assistant allows; other characters are replaced by
-    their code points.
+    """Return an id with only the characters that Home Assistant allows.
 
-    The first "-" ends the prefix, so ids of different prefixes and drives differ.
+    Other characters are replaced by their code points. The first "-" ends the prefix, so that ids of
+    different prefixes and drives differ.
     """
     return f"{_escaped(r'[^A-Za-z0-9]', prefix)}-{_escaped(r'[^A-Za-z0-9-]', drive)}"
 
@@ -68,7 +71,7 @@ def discovery(
 ) -> bytes:
     """Return the discovery message of a drive: its state, a sensor for each polled register, and commands.
 
-    `topics` are the drive's topics by purpose, `page` is the address of the gateway's page.
+    `topics` has the drive's topics by purpose, and `page` is the address of the gateway's page.
     """
     name = object_id(prefix, drive.name)
     polled = list(polled)
@@ -90,7 +93,8 @@ def discovery(
             "name": "Stop",
             "command_topic": topics["stop"],
             "payload_press": "stop",
-            "availability": [{"topic": topics["gateway"]}],  # available also while the drive is silent
+            # the stop button is available even while the drive is silent
+            "availability": [{"topic": topics["gateway"]}],
         }
     maker, space, _ = drive.title.partition(" ")
     device = {"ids": name, "name": drive.name, "mdl": drive.title or type(drive).__name__}
@@ -108,12 +112,12 @@ def discovery(
     ).encode()
 
 
-# The value of each binary sensor by the drive's state; in all other states the value is unknown.
+# By name of a binary sensor: its value in each state of the drive. In other states the value is unknown.
 BINARY = {"problem": {RUNS: "OFF", STANDS: "OFF", FAULT: "ON"}, "running": {RUNS: "ON", STANDS: "OFF"}}
 
 
 def _unused(key: str, parts: Mapping[str, Any]) -> str:
-    """Return an unused key for a component, because a register may also be named "running"."""
+    """Return `key`, or a variant of it if a component has this key, as when a register is named "running"."""
     return _unused(f"{key}_", parts) if key in parts else key
 
 
@@ -160,7 +164,7 @@ def _sensor(name: str, register: Register[Any]) -> dict[str, Any]:
 
 
 def _written(name: str, register: Register[Any], topic: str) -> dict[str, Any]:
-    """Return the component that writes a register: a choice of names, or a number with its range."""
+    """Return the component that writes a register: a choice between names, or a number with its range."""
     found: dict[str, Any] = {
         "unique_id": f"{name}-{register.name}-set",
         "name": f"{register.name.replace('_', ' ')} (set)",
@@ -181,16 +185,16 @@ def _written(name: str, register: Register[Any], topic: str) -> dict[str, Any]:
 
 
 def _choices(register: Register[Any]) -> dict[str, int]:
-    """Return the raw counts of a register's choices by name; empty for numbers and bits."""
+    """Return the raw counts that the register names, by name; empty for numbers and bits."""
     if register.values is None or issubclass(register.values, Flag):
         return {}
     return {member.name: member.value for member in register.values}
 
 
 def _value_template(register: Register[Any]) -> str:
-    """Return the template of a polled register's value.
+    """Return the template by which Home Assistant reads a polled register's value.
 
-    If the register's values have names, a raw count without a name becomes the state `unknown`.
+    If the register's values have names, a raw count without a name is shown as `unknown`.
     """
     value = f"value_json['values']['{register.name}']"
     if names := list(_choices(register)):
@@ -199,7 +203,10 @@ def _value_template(register: Register[Any]) -> str:
 
 
 def _span(register: Register[Any]) -> tuple[float, float]:
-    """Return the range of a register; Home Assistant assumes 1 to 100 for a number without a range."""
+    """Return the range of values that may be written to a register.
+
+    Home Assistant assumes 1 to 100 for a number without a range.
+    """
     if register.span is not None:
         return register.span
     coding = register.coding

@@ -1,6 +1,6 @@
-"""JSON topics: PREFIX/DRIVE has a drive's newest values, and null for each value that is not fresh.
+"""JSON topics: the topic PREFIX/DRIVE has a drive's newest values, and null for each value that is not fresh.
 
-PREFIX/DRIVE/available and PREFIX/gateway have "online" or "offline"; PREFIX/DRIVE/told has results of
+PREFIX/DRIVE/available and PREFIX/gateway have "online" or "offline". PREFIX/DRIVE/told has the results of
 commands.
 """
 
@@ -25,29 +25,29 @@ from multidrop.plant import drive_meant
 from multidrop.printable import is_number, is_whole
 
 ONLINE, OFFLINE = b"online", b"offline"
-MOST_KEPT = 256  # limit of retained messages examined on one connection; the next connection examines others
-MOST_DISCOVERY = 1 << 18  # limit of the length of a discovery message in bytes
+MOST_KEPT = 256  # limit of retained messages that are examined on one connection
+MOST_DISCOVERY = 1 << 18  # limit, in bytes, of a discovery message that is read
 EXAMPLES = {
     "set": '{"value": 25.0, "time": UTC in ms}',
     "act": '{"verb": "start", "drive": "pump-1", "time": UTC in ms}',
 }
-MOST_BYTES = 65_536  # limit of the payload of a write or a verb in bytes
-NOTHING = b""  # payload that deletes the topic's retained message
+MOST_BYTES = 65_536  # limit, in bytes, of the message with a write or a verb
+NOTHING = b""  # the payload of a message that deletes the topic's retained message
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
 
 
 class KeptTopic(NamedTuple):
-    """A topic with a retained message, and its drive."""
+    """A topic with a retained message, and the drive that the message is about."""
 
     drive: str
     topic: str
 
 
 class RetainedTopics:
-    """Finds retained MQTT messages of drives that were removed from the plant.
+    """Finds retained MQTT messages about drives that were removed from the plant.
 
-    Such messages remain if a gateway is killed, and a drive is removed from its plant file before the
-    next start. The methods return only topics under the gateway's own prefix, and at most MOST_KEPT.
+    Such messages remain if a gateway is killed, and a drive is removed from its plant file before the next
+    start. The methods return only topics under the gateway's own prefix, and at most MOST_KEPT of them.
     """
 
     def __init__(self, prefix: str, *, home_assistant: bool) -> None:
@@ -56,7 +56,7 @@ class RetainedTopics:
         self.begin()
 
     def begin(self) -> None:
-        """Forget the messages of the previous connection. Called when a new connection starts."""
+        """Forget the messages that the previous connection brought. Called when a new connection starts."""
         self._is_alone = False  # True: no other gateway is online under this prefix
         self._found: list[KeptTopic] = []
         self._looked_at = 0
@@ -66,7 +66,7 @@ class RetainedTopics:
         return [*kept, f"{DISCOVERY}/device/+/config"] if self._home_assistant else kept
 
     def hear(self, topic: str, payload: bytes, there: Collection[str]) -> list[str]:
-        """Process a retained message; return the topics to delete now.
+        """Process a retained message, and return the topics whose retained messages must be deleted now.
 
         `there` has the names of the plant's drives.
         """
@@ -80,7 +80,7 @@ class RetainedTopics:
         return [one.topic for one in found if one.drive not in there]
 
     def _topics_of(self, topic: str, payload: bytes, there: Collection[str]) -> list[KeptTopic]:
-        """Return the topics to delete if this message belongs to a removed drive."""
+        """Return the topics of a removed drive if this message is about one; else an empty list."""
         if payload in (ONLINE, OFFLINE):
             drive = self._drive_in(topic.removesuffix("/available"))
             if drive is None or drive in there or topic != f"{self._prefix}/{drive}/available":
@@ -92,7 +92,7 @@ class RetainedTopics:
         self._looked_at += 1
         drive = self._drive_in(_state_topic(payload))
         if drive is None or drive in there or topic != discovery_topic(self._prefix, drive):
-            return []  # from another gateway, whose prefix starts with ours
+            return []  # the message is from another gateway, whose prefix starts with this gateway's prefix
         return [KeptTopic(drive, topic)]
 
     def _drive_in(self, topic: str) -> str | None:
@@ -102,7 +102,7 @@ class RetainedTopics:
 
 
 def _state_topic(payload: bytes) -> str:
-    """Return the state topic in a discovery message; "" if it has none."""
+    """Return the topic of a drive's values that a discovery message contains; "" if there is none."""
     if len(payload) > MOST_DISCOVERY:
         return ""
     try:
@@ -110,14 +110,14 @@ def _state_topic(payload: bytes) -> str:
     except (ValueError, RecursionError):
         return ""
     parts = message.get("cmps") if isinstance(message, dict) else None
-    # older messages have the state topic at the top level
+    # in messages of earlier versions, the state topic is at the top level
     state = parts.get("state") if isinstance(parts, dict) else message
     found = state.get("state_topic") if isinstance(state, dict) else None
     return found if isinstance(found, str) else ""
 
 
 class JsonTopics:
-    """Messages in JSON, and Home Assistant's discovery of them."""
+    """Publishes values as JSON, and their description for Home Assistant's discovery."""
 
     kind = "json"
 
@@ -137,7 +137,7 @@ class JsonTopics:
 
     @staticmethod
     def _kept(topic: str, payload: bytes) -> Publication:
-        """Return a message that the broker retains."""
+        """Return a message that the broker is asked to retain."""
         return Publication(topic, lambda: payload, is_retained=True)
 
     # ---- the methods of Speaker ----
@@ -156,7 +156,7 @@ class JsonTopics:
         self._available.clear()
         self._retained_topics.begin()
         self.outbox.put(self._kept(self._topic("gateway"), ONLINE))
-        # delete again: the previous connection may have broken before the broker got the deletions
+        # repeat the deletions, because the previous connection may have broken before the broker got them
         self._take_back()
         if self._settings.home_assistant:
             for drive in self._hub.drives:
@@ -179,7 +179,7 @@ class JsonTopics:
 
     def _look_back(self, topic: str, payload: bytes) -> None:
         """If this retained message belongs to a removed drive, delete the drive's retained messages."""
-        if not self._plant.lines:  # a fleet's lines are not read yet
+        if not self._plant.lines:  # the plant of a fleet has no lines until the fleet's files are read
             return
         for left in self._retained_topics.hear(topic, payload, drives_of(self._plant)):
             self.outbox.put(self._kept(left, NOTHING))
@@ -198,9 +198,9 @@ class JsonTopics:
         try:
             if what[0] == "act" and str(given.get("verb")) in STOPPING:
                 for one in self._to_stop(drive, given):
-                    # options are ignored: wrong ones must not prevent a stop
+                    # wrong options must not prevent a stop, so options are ignored
                     self._commands.stop_by(one, given["verb"], {}, named)
-            elif is_retained:  # a retained command would be carried out again on every connection
+            elif is_retained:  # the broker would deliver a retained command again on every connection
                 kept = "it was retained; publish it without retain"
                 self._commands.refuse(drive, "/".join(what), kept, named)
             elif what[0] == "set":
@@ -215,7 +215,8 @@ class JsonTopics:
         self._commands.refuse(drive, "/".join(what), why, named)
 
     def _to_stop(self, drive: str, given: Mapping[str, Any]) -> list[str]:
-        """Return the topic's drive, and the drive named in the message if that is a different drive.
+        """Return the drive that the topic names, and also the drive that the message names if it is another
+        one.
 
         Stopping too many drives is harmless, stopping none is not.
         """
@@ -255,9 +256,9 @@ class JsonTopics:
                 self.outbox.put(self._kept(self._topic(drive, "available"), available))
 
     def leave(self) -> None:
-        """Publish the gateway and each drive as offline.
+        """Publish that the gateway and all drives are offline.
 
-        A drive removed from the plant file before the next start would otherwise stay online.
+        Otherwise a drive that is removed from the plant file before the next start would stay "online".
         """
         self.outbox.put(self.will())
         for drive in self._available:
@@ -306,7 +307,10 @@ class JsonTopics:
 
 
 def _read_write(given: Mapping[str, Any]) -> tuple[float, int]:
-    """Return value and time of a write. Raises ValueError for an invalid message."""
+    """Return the value and the time (UTC, ms) in the message of a write.
+
+    Raises ValueError for an invalid message.
+    """
     _check_keys(given, "value", "time")
     value = given["value"]
     if not is_number(value):
@@ -315,7 +319,10 @@ def _read_write(given: Mapping[str, Any]) -> tuple[float, int]:
 
 
 def _read_act(drive: str, given: Mapping[str, Any]) -> tuple[str, dict[str, object], int]:
-    """Return verb, options and time. Raises ValueError if the message is invalid or names another drive."""
+    """Return the verb, its options and the time (UTC, ms) in the message of a verb.
+
+    Raises ValueError if the message is invalid, or names another drive than the topic.
+    """
     _check_keys(given, "verb", "drive", "time")
     return str(given["verb"]), _options(drive, given), _time(given)
 
@@ -349,7 +356,7 @@ def _read(payload: bytes) -> dict[str, Any]:
 
 
 def _id_in(payload: bytes) -> object:
-    """Return the id in a stop's payload; None if the payload is invalid or has no id."""
+    """Return the command's id in the message of a stop; None if the message is invalid or has no id."""
     try:
         return _read(payload).get("id")
     except ValueError:

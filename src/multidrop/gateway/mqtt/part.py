@@ -1,4 +1,6 @@
-"""The part `mqtt`: publishes values to a broker, and accepts its commands if the plant file allows them."""
+"""The gateway's part `mqtt`: publishes values to a broker, and accepts commands from it if the plant
+file allows them.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ Settings = MqttSettings
 
 
 def build(settings: MqttSettings, context: PartContext) -> Mqtt:
-    """Return the part. Raises ImportError without paho."""
+    """Return the MQTT interface. Raises ImportError without the library paho."""
     topics = JsonTopics(settings, context, utc_ms)
     speakers: list[Any] = [topics]
     if settings.sparkplug:
@@ -37,8 +39,9 @@ def build(settings: MqttSettings, context: PartContext) -> Mqtt:
 
 
 class Mqtt:
-    """The MQTT part. Each message format (`Speaker`) has its own connection, because a connection has only
-    one will.
+    """The gateway's MQTT interface.
+
+    Each message format (`Speaker`) has its own connection, because a connection can have only one last will.
     """
 
     def __init__(
@@ -51,13 +54,14 @@ class Mqtt:
         self._brokers = []
         self._forwarded: list[Forwarding] = []
         for speaker in speakers:
-            name = f"{settings.prefix}/{context.plant.path.stem}/{speaker.kind}"  # unique among gateways
+            # the client id, which must differ from that of every other gateway at the broker
+            name = f"{settings.prefix}/{context.plant.path.stem}/{speaker.kind}"
             broker = Broker(address, login, name, speaker)
             speaker.outbox = broker.outbox
             self._brokers.append(broker)
 
     def forward_rows(self, settings: MqttSettings, context: PartContext) -> None:
-        """Also publish every row, besides each register's newest value.
+        """Publish every polled value, in addition to each register's newest value.
 
         Raises ImportError without pyarrow, ValueError for an invalid spool.
         """
@@ -74,7 +78,7 @@ class Mqtt:
             raise
 
     def take(self, batch: Batch) -> None:
-        """Store the rows if the setting `rows` is on. The newest rows come from the hub."""
+        """Store the batch for `forward_rows`, if that was called. The newest values come from the hub."""
         for one in self._forwarded:
             one.take(batch)
 
@@ -83,7 +87,7 @@ class Mqtt:
             self._topics.publish_alarms()
 
     def adopt(self, plant: Plant) -> None:
-        """Use another plant, and announce all drives again."""
+        """Use another plant, and announce all its drives."""
         for broker, speaker in zip(self._brokers, self._speakers, strict=True):
             speaker.adopt(plant)
             if broker.is_connected:
@@ -92,7 +96,7 @@ class Mqtt:
             one.adopt(plant)
 
     async def run(self, sleep: Callable[[float], Awaitable[object]] = asyncio.sleep) -> None:
-        """Publish new values to all brokers periodically, until cancelled."""
+        """Publish new values to the broker periodically, until cancelled."""
         for broker in self._brokers:
             broker.open()
         forwarding = [supervisor().start("mqtt rows", one.run()) for one in self._forwarded]
@@ -109,7 +113,7 @@ class Mqtt:
                 task.cancel()
 
     async def close(self) -> None:
-        """Send the last messages and disconnect; write the last rows to the disk."""
+        """Send the last messages, disconnect, and write unpublished values to the disk."""
         closing = [self._leave(), *(one.close() for one in self._forwarded)]
         for failure in await asyncio.gather(*closing, return_exceptions=True):
             if failure is not None:

@@ -1,5 +1,6 @@
-"""Publish all rows over MQTT, as JSON and in Sparkplug. Rows polled while the broker was not connected are
-published later.
+"""Publish all polled values over MQTT, as JSON and in Sparkplug.
+
+Values polled while the broker was not connected are published later.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ from multidrop.gateway.mqtt.sparkplug_node import PastValue, SparkplugNode
 from multidrop.gateway.parts import PartContext
 from multidrop.samples import unit_of
 
-ANSWER_S = 10.0  # time limit for the broker's answer
-KEEP_ALIVE_S = 60  # longer than the time between two messages
-LOOP_S = 0.1  # longest wait for one packet
+ANSWER_S = 10.0  # time limit, in s, for an answer of the broker
+KEEP_ALIVE_S = 60  # in s; longer than the time between two messages
+LOOP_S = 0.1  # longest wait, in s, for one MQTT packet
 
 
 def json_rows(settings: MqttSettings, context: PartContext, address: Address, login: Login) -> Forwarding:
-    """Return the forwarder of all rows to the topics PREFIX/DRIVE/rows."""
+    """Return the forwarder that publishes all polled values to the topics PREFIX/DRIVE/rows."""
     name = f"{settings.prefix}/{context.plant.path.stem}/rows"
     publisher = RowPublisher(settings.prefix, address, login, name)
     return _forwarding("mqtt", f"the broker {address.host}", settings, context, publisher.publish)
@@ -41,7 +42,7 @@ def json_rows(settings: MqttSettings, context: PartContext, address: Address, lo
 def sparkplug_rows(
     settings: MqttSettings, context: PartContext, broker: Broker, node: SparkplugNode
 ) -> Forwarding:
-    """Return the forwarder of all rows' values, as historical values of a Sparkplug node."""
+    """Return the forwarder that publishes all polled values as historical values of a Sparkplug node."""
 
     def deliver(message: Outgoing) -> None:
         if broker.loop is None or not broker.is_connected:
@@ -62,8 +63,9 @@ def _forwarding(
 
 
 def _past_values(rows: Any, node: SparkplugNode) -> list[PastValue]:
-    """Return the values of registers that still exist with the same unit. Leave out misses, which Sparkplug
-    cannot represent.
+    """Return the values of the registers that the plant still has with the same unit.
+
+    Failed reads are left out, because Sparkplug cannot represent them.
     """
     found = []
     find = cache(node.find)
@@ -76,9 +78,9 @@ def _past_values(rows: Any, node: SparkplugNode) -> list[PastValue]:
 
 
 class RowPublisher:
-    """Publishes rows with QoS 1, and waits for the acknowledgements.
+    """Publishes messages with QoS 1, and waits for their acknowledgements.
 
-    It has a connection of its own, which only the forwarder's thread uses.
+    It has its own connection, which only the forwarder's thread uses.
     """
 
     def __init__(self, prefix: str, address: Address, login: Login, name: str) -> None:
@@ -86,15 +88,15 @@ class RowPublisher:
         self._client: Any = None
 
     def publish(self, message: Outgoing) -> None:
-        """Publish a message of rows, one MQTT message per drive. Raises OSError."""
+        """Publish the rows of a message, as one MQTT message per drive. Raises OSError."""
         try:
             if self._client is None:
                 self._connect()
             sent = [self._client.publish(*one, qos=1) for one in self._messages(message)]
-            for one in sent:  # each has its own time limit, because links may be slow
+            for one in sent:  # each MQTT message has its own time limit, because the network may be slow
                 self._wait(one.is_published)
         except (OSError, ValueError, RuntimeError) as failure:
-            self._client = None  # unacknowledged messages are sent again by the next client
+            self._client = None  # the forwarder sends unacknowledged messages again, with a new client
             raise ConnectionError(str(failure)) from failure
 
     def _messages(self, message: Outgoing) -> list[tuple[str, bytes]]:
@@ -120,7 +122,10 @@ class RowPublisher:
             raise ConnectionError(f"the broker refuses the connection: {answers[0]}")
 
     def _wait(self, is_done: Any) -> None:
-        """Handle the broker's packets until `is_done()` is true; after ANSWER_S, raise ConnectionError."""
+        """Handle packets from the broker until `is_done()` is true.
+
+        Raises ConnectionError after ANSWER_S.
+        """
         from paho.mqtt.client import MQTT_ERR_SUCCESS, error_string
 
         ends = time.monotonic() + ANSWER_S

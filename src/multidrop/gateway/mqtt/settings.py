@@ -18,7 +18,8 @@ from multidrop.recording import parse_size
 from multidrop.toml_check import DURATION, SIZE, parse_duration
 
 LEVEL = re.compile(r"[^+#/\x00]+")  # one level of a topic
-OTHERS = ("homeassistant", "spBv1.0")  # first topic levels that discovery and Sparkplug use
+# topics that start with these levels are reserved for Home Assistant's discovery and Sparkplug
+OTHERS = ("homeassistant", "spBv1.0")
 LEAST_EVERY_S, MOST_EVERY_S = 0.1, 3600.0
 BROKER = r"^[Mm][Qq][Tt][Tt][Ss]?://(\[[0-9A-Fa-f:.]+\]|[^@:/?#\[\]]+)(:[0-9]{1,5})?/*$"
 PREFIX = rf"^(?!\$)(?!({'|'.join(OTHERS)})(/|$)){LEVEL.pattern}(/{LEVEL.pattern})*$"
@@ -26,23 +27,26 @@ PREFIX = rf"^(?!\$)(?!({'|'.join(OTHERS)})(/|$)){LEVEL.pattern}(/{LEVEL.pattern}
 
 @dataclass(frozen=True)
 class MqttSettings:
-    """The settings of MQTT. Raises ValueError with a line for each mistake."""
+    """The settings in the table `[serve.mqtt]`. Raises ValueError with a line for each mistake."""
 
     broker: str = field(default="mqtt://localhost:1883", metadata={"pattern": BROKER})
     prefix: str = field(default="multidrop", metadata={"pattern": PREFIX})
-    every: str = field(default="1 s", metadata=DURATION)  # time between two messages of a drive
+    every: str = field(default="1 s", metadata=DURATION)  # interval of publishing a drive's values
     user: str = ""
-    password: str = ""  # path of the file with the password
-    authorities: str = ""  # path of a file of certificates that verify the broker, for mqtts://
+    password: str = ""  # path of the file that contains the password
+    # for mqtts://: path of a file with certificates that verify the broker; "": those of the operating system
+    authorities: str = ""
     home_assistant: bool = False
-    # Group of the Sparkplug edge node; "": Sparkplug is off.
+    # Group id of the Sparkplug edge node; "": Sparkplug is off.
     sparkplug: str = field(default="", metadata={"pattern": rf"^(?!STATE$){LEVEL.pattern}$"})
     # Name of the Sparkplug edge node; default: the plant file's name.
     node: str = field(default="", metadata={"pattern": rf"^{LEVEL.pattern}$"})
-    commands: bool = False  # allow publishers to write the registers and verbs listed in [serve.may]
-    rows: bool = False  # publish all rows, also rows polled while there was no connection to the broker
-    spool: str = "spool"  # folder of the rows that are not published yet
-    most: str = field(default="1 GB", metadata=SIZE)  # limit of the size of the spool on the disk
+    # True: publishers may write the registers and send the verbs that [serve.may] lists
+    commands: bool = False
+    # True: publish all polled values, also those polled while there was no connection to the broker
+    rows: bool = False
+    spool: str = "spool"  # folder for the polled values that are not published yet
+    most: str = field(default="1 GB", metadata=SIZE)  # limit of the size of the folder
 
     def __post_init__(self) -> None:
         wrong = []
@@ -80,7 +84,7 @@ class MqttSettings:
 
     @property
     def libraries(self) -> tuple[str, ...]:
-        """The names of the libraries that MQTT needs with these settings."""
+        """The names of the Python libraries that these settings need."""
         return ("paho", "pyarrow") if self.rows else ("paho",)
 
     def check(self, plant: Plant) -> list[str]:
@@ -98,7 +102,7 @@ class MqttSettings:
             if not LEVEL.fullmatch(name):
                 yield f"drive {name!r} cannot be a topic: choose a name without + # and /"
             try:
-                check_drive_name(name)  # a plant made without a file was not checked before
+                check_drive_name(name)  # a plant that was not read from a file has unchecked names
             except ValueError as mistake:
                 yield f"drive {name!r}: {mistake}"
         if self.sparkplug and not self.node and not LEVEL.fullmatch(plant.path.stem):
@@ -106,7 +110,10 @@ class MqttSettings:
             yield f'the plant file\'s name {name!r} cannot be an edge node; add node = "hall-1"'
 
     def login(self, plant: Plant) -> Login:
-        """Return user, password and certificates. Raises OSError if the password cannot be read."""
+        """Return the user, password and certificates for the broker.
+
+        Raises OSError if the password cannot be read.
+        """
         password = _beside(plant, self.password).read_text("utf-8").strip() if self.password else ""
         return Login(self.user, password, str(_beside(plant, self.authorities)) if self.authorities else None)
 
@@ -114,11 +121,11 @@ class MqttSettings:
 def _has_certificates(path: Path) -> bool:
     try:
         ssl.create_default_context(cafile=str(path))
-    except OSError:  # also raised if the file has no certificates
+    except OSError:  # OSError is also raised if the file has no certificates
         return False
     return True
 
 
 def _beside(plant: Plant, name: str) -> Path:
-    """Return the path of a file named relative to the plant file."""
+    """Return the path of a file whose name is relative to the plant file."""
     return plant.path.parent / name

@@ -13,21 +13,21 @@ from typing import NamedTuple
 NAMESPACE = "spBv1.0"
 REBIRTH = "Node Control/Rebirth"
 BIRTH_DEATH = "bdSeq"
-SEQUENCES = 256  # seq and bdSeq count from 0 to 255 and start again
+SEQUENCES = 256  # the counters seq and bdSeq run from 0 to 255, and then start again
 
-# Field numbers of Payload and Metric (section 6.4.1).
+# Field numbers in the messages Payload and Metric (section 6.4.1).
 _TIMESTAMP, _METRICS, _SEQ = 1, 2, 3
 _NAME, _ALIAS, _METRIC_TIME, _DATATYPE, _IS_HISTORICAL, _IS_NULL, _PROPERTIES = 1, 2, 3, 4, 5, 7, 9
 _INT, _LONG, _FLOAT, _DOUBLE, _BOOLEAN, _STRING = 10, 11, 12, 13, 14, 15
 
-# Field numbers of PropertySet and PropertyValue.
+# Field numbers in the messages PropertySet and PropertyValue.
 _KEYS, _VALUES = 1, 2
 _TYPE, _TEXT = 1, 8
-ENGINEERING_UNIT = "engUnit"  # the property that Sparkplug hosts show as a metric's unit
+ENGINEERING_UNIT = "engUnit"  # name of the property that Sparkplug hosts show as a metric's unit
 
 _VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5  # wire types
-MOST_PAYLOAD = 65_536  # limit of the length of a command in bytes
-_MOST_VARINT = 10  # limit of the length of a varint in bytes
+MOST_PAYLOAD = 65_536  # limit, in bytes, of a received command
+_MOST_VARINT = 10  # limit, in bytes, of a varint (an integer of variable length)
 
 
 class DataType(IntEnum):
@@ -40,15 +40,18 @@ class DataType(IntEnum):
 
 
 class Metric(NamedTuple):
-    """A metric. A birth has the metric's name and alias; later messages have only the alias."""
+    """A metric to be sent.
+
+    Only in a birth message does it have a name; later messages have only its alias.
+    """
 
     datatype: DataType
-    value: float | str | None  # None: a null value
+    value: float | str | None  # None is sent as a null value
     time_ms: int
     name: str = ""
     alias: int | None = None
-    unit: str = ""  # only in a birth
-    is_historical: bool = False  # not the present value
+    unit: str = ""  # the value's unit, sent only in a birth message
+    is_historical: bool = False  # True: this is not the present value
 
 
 class ReceivedMetric(NamedTuple):
@@ -60,7 +63,7 @@ class ReceivedMetric(NamedTuple):
 
 
 def payload(time_ms: int, metrics: Iterable[Metric], seq: int | None) -> bytes:
-    """Return an encoded payload; an NDEATH has no `seq`."""
+    """Return an encoded payload. The payload of an NDEATH has no `seq`, so `seq` is None."""
     parts = [_number(_TIMESTAMP, time_ms), *(_bytes(_METRICS, _metric(metric)) for metric in metrics)]
     if seq is not None:
         parts.append(_number(_SEQ, seq))
@@ -115,7 +118,7 @@ def _varint(value: int) -> bytes:
 
 
 def read_command(data: bytes) -> tuple[int, list[ReceivedMetric]]:
-    """Return time (UTC in ms; 0 if missing) and metrics of an NCMD or a DCMD.
+    """Return the time (UTC in ms; 0 if missing) and the metrics of a received NCMD or DCMD payload.
 
     Raises ValueError for an invalid payload.
     """
@@ -163,7 +166,7 @@ def _text(found: bytes) -> str:
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
-    """Yield each field's number and value: int for a varint, else bytes."""
+    """Yield the number and value of each field: an int for a varint, else bytes."""
     at = 0
     while at < len(data):
         key, at = _read_varint(data, at)

@@ -1,4 +1,4 @@
-"""Edge node of Sparkplug B: births, deaths, rebirth on request, and data on change."""
+"""A Sparkplug B edge node: births, deaths, rebirth on request, and data when values change."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from multidrop.gateway.mqtt.sparkplug import (
 from multidrop.gateway.parts import PartContext
 
 STATE, FAULT, STOP = "state", "fault", "Device Control/Stop"
-OWN = (STATE, FAULT)  # names of the text metrics that every drive has
-REGISTERS = "registers/"  # prefix of the metric's name if a register's name is in OWN
+OWN = (STATE, FAULT)  # names of the two text metrics that every drive has
+REGISTERS = "registers/"  # prefix of a metric's name if its register has one of the names in OWN
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
-MOST_PAST = 500  # limit of historical values that are sent together
+MOST_PAST = 500  # limit of historical values in flight
 Value = float | str | None
 
 
 class PastValue(NamedTuple):
-    """A register's value and its time, to be sent as a historical value."""
+    """A register's earlier value and its time, to be sent as a historical value."""
 
     drive: str
     register: str
@@ -44,7 +44,7 @@ class PastValue(NamedTuple):
 
 
 class SparkplugNode:
-    """An edge node whose devices are drives; values are sent when they change."""
+    """A Sparkplug edge node whose devices are the drives. Values are sent when they change."""
 
     kind = "sparkplug"
 
@@ -59,9 +59,11 @@ class SparkplugNode:
         self._commands = BrokerCommands(context.commands, settings.caller, utc_ms, self._report)
         self._birth = -1  # the node's bdSeq (birth/death sequence number)
         self._seq = 0
-        self._sent: dict[str, dict[str, Value]] = {}  # values last sent, of drives whose birth was sent
-        self._changed: dict[str, dict[str, tuple[Value, int]]] = {}  # new values and their times in ms
-        self._past: dict[str, list[PastValue]] = {}  # historical values for the next messages
+        # values sent last, by drive; only for drives whose birth was sent and whose death was not
+        self._sent: dict[str, dict[str, Value]] = {}
+        # values that changed since the last message, and their times in ms
+        self._changed: dict[str, dict[str, tuple[Value, int]]] = {}
+        self._past: dict[str, list[PastValue]] = {}  # historical values to be sent with the next messages
         self._aliases: dict[tuple[str, str], int] = {}
 
     def _topic(self, kind: str, *device: str) -> str:
@@ -103,14 +105,14 @@ class SparkplugNode:
             self._command(levels[-1], given, sent_ms, is_retained=is_retained)
 
     def adopt(self, plant: Plant) -> None:
-        """Use another plant, and send deaths of removed devices."""
+        """Use another plant, and send the deaths of drives that it lacks."""
         self._plant = plant
         for drive in self._sent.keys() - drives_of(plant).keys():
             del self._sent[drive]
             self._replace_pending(drive, "DDEATH", self._device_death)
 
     def publish(self) -> None:
-        """Send changed values, births and deaths."""
+        """Send changed values, and births and deaths of drives."""
         for drive in self._hub.drives:
             if self._hub.state(drive) == SILENT:
                 if self._sent.pop(drive, None) is not None:
@@ -137,16 +139,20 @@ class SparkplugNode:
     # ---- historical values ----
 
     def find(self, drive: str, register: str) -> tuple[Drive | None, Register[Any] | None]:
-        """Return the drive, and its register or channel, of these names; None for one that has no metric."""
+        """Return the drive with this name, and its register or channel with this name.
+
+        Either is None if the node publishes no metric for it.
+        """
         known = drives_of(self._plant).get(drive) if drive in {*self._hub.drives} else None
         metrics = {one.name: one for one, *_ in self._hub.known(drive)} if known else {}
         return known, metrics.get(register)
 
     async def send_past(self, values: Sequence[PastValue], confirm: Callable[[], Awaitable[None]]) -> None:
-        """Send values as historical ones. Raises OSError if `confirm` does, or if values are not sent.
+        """Send values as historical values, and wait for them.
 
-        Values of drives and registers without a metric are left out. If a drive is silent, its birth is
-        sent first, and its death follows when `publish` is called.
+        `confirm` waits until the broker has received them. Raises OSError if `confirm` does, or if values are
+        not sent. Values of drives and registers without a metric are left out. If a drive is silent, its
+        birth is sent first, and its death at the next call of `publish`.
         """
         metrics = {drive: self._values(drive).keys() for drive in self._hub.drives}
         for begin in range(0, len(values), MOST_PAST):
@@ -171,7 +177,7 @@ class SparkplugNode:
     # ---- payloads; each has a sequence number, so it is made when it is sent ----
 
     def _replace_pending(self, drive: str, kind: str, make: Any) -> None:
-        """Send a birth or death, and drop the drive's other pending messages."""
+        """Send a drive's birth or death, and drop the drive's other waiting messages."""
         for other in {"DBIRTH", "DDATA", "DDEATH"} - {kind}:
             self.outbox.withdraw(self._topic(other, drive))
         self._put(drive, kind, make)
@@ -232,7 +238,9 @@ class SparkplugNode:
         return found
 
     def _times(self, drive: str) -> dict[str, int]:
-        """Return the time of each metric, UTC in ms: when its current value was polled; without one, now."""
+        """Return the time of each metric (UTC in ms): when its current value was polled, or now if there
+        is none.
+        """
         now = self._utc_ms()
         times = dict.fromkeys(self._values(drive), now)
         for register, newest, good, is_current in self._hub.known(drive):
