@@ -1,7 +1,7 @@
 """The optional parts of the gateway, such as the history, MQTT, databases and the OPC UA server.
 
-Each part has a table in `[serve]`. If a part fails, the failure is counted and logged, and the other parts
-continue.
+Each part has a table in `[serve]` of the plant file. If a part fails, the failure is counted and logged, and
+the other parts continue.
 """
 
 from __future__ import annotations
@@ -22,11 +22,14 @@ from multidrop.gateway.live.hub import Hub
 from multidrop.printable import install_command
 from multidrop.supervisor import supervisor
 
-BUILD_S = 3.0  # how long a start or a reload waits for parts whose disks do not answer
-END_S = 3.0  # time limit for closing a part
+# in s: how long a start or a reload waits for parts that are still being built because their disks do not
+# answer
+BUILD_S = 3.0
+END_S = 3.0  # time limit, in s, for closing one part, such as MQTT
 
-# Module of each part, imported when its table is used. The module has `Settings`, a frozen dataclass of the
-# table's keys and their defaults, and `build(settings, context)`, which returns a Part.
+# By part: the Python module, which is imported if the plant file has the part's table. The module has
+# `Settings`, a frozen dataclass of the table's keys and their defaults, and `build(settings, context)`, which
+# returns a Part.
 PARTS: Mapping[str, str] = {
     "fleet": "multidrop.fleet.page_part",
     "history": "multidrop.gateway.historian",
@@ -40,11 +43,11 @@ PARTS: Mapping[str, str] = {
     "trigger": "multidrop.gateway.live.triggers",
     "upload": "multidrop.gateway.forward.upload",
 }
-# by library: the extra of multidrop that installs it; lists only libraries that several parts need
+# by library that several parts need: the extra of multidrop that installs it
 EXTRAS = {"pyarrow": "parquet", "psycopg": "postgres"}
 
-# A function that reads any registers of a drive, declared or not. Its arguments: drive, Modbus function,
-# first address, count, expiry in s.
+# A function that reads any registers of a drive, whether the drive declares them or not. Its arguments are
+# the drive, the Modbus function, the first address, the count, and the expiry in s.
 Ask = Callable[[str, int, int, int, float], Awaitable[list[int]]]
 
 _log = logging.getLogger("multidrop.gateway")
@@ -57,7 +60,7 @@ class PartContext(NamedTuple):
     hub: Hub
     commands: Commands
     ask: Ask
-    folder: Path  # base of relative paths in the settings
+    folder: Path  # folder to which paths in the settings are relative
     version: str
     alarms: Alarms
     tokens: Tokens
@@ -65,23 +68,24 @@ class PartContext(NamedTuple):
 
 
 class Part(Protocol):
-    """The methods of a part, which is one interface of the gateway, such as MQTT.
+    """A part of the gateway, which is an optional interface or service, such as MQTT.
 
-    Five more methods are optional. `take(batch)` is called with each batch of rows, in the event loop, and
-    must return within 1 ms. `adopt(plant)` is called after a reload, and `note_alarm(alarm, change)` when an
-    alarm starts, changes or ends. `health()` returns a problem or "", and `figures()` returns metric
-    families. The part `fleet` may have the attribute `source`, which the gateway uses instead of a poller.
+    Five more methods are optional. `take(batch)` is called with each batch of polled values, in the event
+    loop, and must return within 1 ms. `adopt(plant)` is called after a reload, and `note_alarm(alarm,
+    change)` when an alarm starts, changes or ends. `health()` returns a problem or "", and `figures()`
+    returns metric families. The part `fleet` may have the attribute `source`, from which the gateway then
+    gets values instead of polling lines.
     """
 
     async def run(self) -> None:
-        """Do the part's work until this task is cancelled."""
+        """Do the work of the part until this task is cancelled."""
 
     async def close(self) -> None:
-        """Close the part. Called after the last batch."""
+        """Close the part. Called after the last batch of polled values."""
 
 
 class PartHost(Protocol):
-    """The methods of the gateway that LiveParts uses."""
+    """The methods and attributes of the gateway that LiveParts uses."""
 
     plant: Plant
 
@@ -91,7 +95,7 @@ class PartHost(Protocol):
 
 
 def build(name: str, settings: object, context: PartContext) -> Part:
-    """Build and return the part of this table.
+    """Build the part with this table and settings, and return it.
 
     If a library is missing, raises ValueError with the name of the extra that installs it.
     """
@@ -103,49 +107,55 @@ def build(name: str, settings: object, context: PartContext) -> Part:
 
 
 def missing_library(name: str, missing: ImportError) -> str:
-    """Return the error message for this part: a library that it needs is not installed."""
+    """Return the error message if a library that this part needs is not installed."""
     library = missing.name or str(missing)
     extra = EXTRAS.get(library.partition(".")[0], name)
     return f"it needs {library}, which is not installed: {install_command(extra)}"
 
 
 class Building(NamedTuple):
-    """A part that a thread builds, because the part's files may be on a disk that does not answer."""
+    """A part that a thread is building or has built. Building may take long if a disk does not answer."""
 
     settings: Any
     part: asyncio.Future[Part]
 
 
 class LiveParts:
-    """The running parts, in `feeds` by the name of their table.
+    """The parts of the gateway that run, in `feeds` by the name of their table.
 
-    If a part's files are on a disk that does not answer, the gateway starts without that part. The part
-    stays in `pending` until it is built.
+    If a part's files are on a disk that does not answer, the gateway starts without the part. The part is in
+    `pending` until it is built.
     """
 
     def __init__(self, host: PartHost) -> None:
         self.feeds: dict[str, Part] = {}
-        self.dead: dict[str, str] = {}  # parts that could not start, and why
+        self.dead: dict[str, str] = {}  # by part that could not start: the reason
         self.pending: dict[str, Building] = {}
         self._host = host
         self._settings: dict[str, Any] = {}
-        self._built: dict[str, Building] = {}  # parts that are not started yet
-        self._replaced: dict[str, Any] = {}  # settings of the parts that the reload in progress closed
+        self._built: dict[str, Building] = {}  # parts that are being built, or are built but not started
+        # by part that the present reload has closed: its previous settings
+        self._replaced: dict[str, Any] = {}
 
     def source(self) -> Any:
-        """Return the attribute `source` of a new part; None if no new part has it."""
+        """Return the attribute `source` of a part that is built but not started; None if no such part
+        has one.
+        """
         built = [one.part.result() for one in self._built.values() if one.part.done()]
         sources = (getattr(part, "source", None) for part in built)
         return next((source for source in sources if source is not None), None)
 
     def call(self, method: str, *arguments: object) -> None:
-        """Call this method of each running part that has it. If a part's method fails, continue."""
+        """Call this method of each running part that has it.
+
+        If the call fails for one part, continue with the others.
+        """
         for name, part in self.feeds.items():
             if hasattr(part, method):
                 self._host.guarded(name, getattr(part, method), *arguments)
 
     def take_up(self) -> None:
-        """Start the new parts, because the plant for which they were built is in effect now."""
+        """Start the new parts. Called when the plant for which they were built is in effect."""
         built, self._built, self._replaced = self._built, {}, {}
         for name, building in built.items():
             self._settings[name] = building.settings
@@ -158,14 +168,15 @@ class LiveParts:
                 supervisor().start(f"{name} pending", self._start_when_built(name, building))
 
     async def close(self, seconds: float) -> None:
-        """Close all parts together within `seconds`, after the last batch."""
+        """Close all parts concurrently within `seconds`. Call this after the last batch of polled values."""
         await self._discard()
         await self._drop([*self._settings], seconds)
 
     # ---- reload ----
 
     async def replace(self, wanted: Mapping[str, Any], plant: Plant) -> None:
-        """Close the parts whose tables were changed or removed, and build the new parts.
+        """Close the parts whose tables were changed or removed, and build the parts of new and changed
+        tables.
 
         If a new part cannot be opened, the previous parts are started again, and ValueError is raised.
         """
@@ -179,19 +190,22 @@ class LiveParts:
             raise
 
     async def take_back(self) -> None:
-        """Discard the new parts and start the previous ones again."""
+        """Close the new parts, and start the previous ones again."""
         replaced = self._replaced
         await self._discard()
         for name, settings in replaced.items():
             try:
                 await self.build({name: settings}, self._host.plant)
                 self.take_up()
-            except Exception as failure:  # for example, another program uses the part's port now
+            except Exception as failure:  # for example, another program has opened the part's port meanwhile
                 self.dead[name] = str(failure)
                 _log.error("%s did not start again: %s", name, failure)
 
     async def build(self, wanted: Mapping[str, Any], plant: Plant) -> None:
-        """Build parts concurrently, waiting up to BUILD_S. Raises ValueError if a part cannot be opened."""
+        """Build these parts concurrently, and wait up to BUILD_S.
+
+        Raises ValueError if a part cannot be opened.
+        """
         context, threads = self._host.part_context(plant), supervisor()
         self._built = {
             name: Building(settings, threads.thread(name, BUILD_S, partial(build, name, settings, context)))
@@ -208,7 +222,10 @@ class LiveParts:
                 raise failure
 
     async def _discard(self) -> None:
-        """Close the parts that were not started; a part still under construction is closed later."""
+        """Close the parts that were not started.
+
+        Those that are still being built are closed when they are built.
+        """
         built, self._built = self._built, {}
         await _close_when_built(built)
 
@@ -223,7 +240,7 @@ class LiveParts:
         failure = building.part.exception()
         if failure is None:
             part: Any = building.part.result()
-            if hasattr(part, "adopt"):  # the plant may have been reloaded in the meantime
+            if hasattr(part, "adopt"):  # a reload may have changed the plant while the part was built
                 self._host.guarded(name, part.adopt, self._host.plant)
             self._start(name, part)
             return
@@ -253,7 +270,7 @@ class LiveParts:
 
 
 async def _close_when_built(built: Mapping[str, Building]) -> None:
-    """Close the parts that are built; let each part that is still being built be closed afterwards."""
+    """Close the parts that are built. Those that are still being built are closed when they are built."""
 
     async def close(name: str, part: asyncio.Future[Part]) -> None:
         await asyncio.wait([part])
@@ -269,5 +286,5 @@ async def _close_when_built(built: Mapping[str, Building]) -> None:
 async def _close(name: str, part: Part, seconds: float) -> None:
     try:
         await asyncio.wait_for(part.close(), seconds)
-    except Exception:  # continue: the other parts must be closed too
+    except Exception:  # the other parts must be closed too
         _log.exception("closing %s failed", name)

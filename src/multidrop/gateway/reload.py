@@ -1,4 +1,4 @@
-"""Reload: read the plant file again during polling. A file with mistakes changes nothing."""
+"""Reload: read the plant file again while polling continues. A file with mistakes changes nothing."""
 
 from __future__ import annotations
 
@@ -22,11 +22,14 @@ if TYPE_CHECKING:
     from multidrop.gateway.settings import ServeSettings
 
 Read = Callable[[], "tuple[Plant, ServeSettings]"]
-AT_ONCE = ("names", "tokens", "may", "limit", *PARTS)  # keys of [serve] that need no restart
-READ_S = 10.0  # time limit for reading the file
-QUICK_S = 1.0  # a later reload cancels a read of the file only after this time
-MOST_READS = 8  # limit of concurrent reads, because reads may hang
-ADOPTION_S = 60.0  # time limit for adopting a plant, which opens ports and stops drives
+# keys of the table [serve] that a reload can change without a restart
+AT_ONCE = ("names", "tokens", "may", "limit", *PARTS)
+READ_S = 10.0  # time limit, in s, for reading the plant file
+# in s: a later reload cancels the reading of the plant file only if it has taken longer than this
+QUICK_S = 1.0
+MOST_READS = 8  # limit of concurrent reads of the plant file, because each may hang
+# time limit, in s, for putting a plant into effect, which opens ports and stops removed drives
+ADOPTION_S = 60.0
 RESTART = "takes effect after a restart"
 NO_FILE = "this plant has no file to be read again"
 
@@ -34,7 +37,9 @@ _log = logging.getLogger("multidrop.gateway")
 
 
 class ReloadResult(NamedTuple):
-    """The result of a reload: the file's mistakes, or sentences about changes that need a restart."""
+    """The result of a reload: the mistakes in the plant file, or sentences about changes that need a
+    restart.
+    """
 
     is_done: bool
     text: str
@@ -43,9 +48,10 @@ class ReloadResult(NamedTuple):
 
 
 class Reload:
-    """Reloads the plant file with `read`, which raises ValueError or OSError for a file with mistakes.
+    """Reloads the plant file.
 
-    `read` runs in a thread, so a file system that hangs makes only this reload fail.
+    `read` reads it, and raises ValueError or OSError for a file with mistakes. `read` runs in a thread, so a
+    file system that hangs makes only this reload fail.
     """
 
     def __init__(self, gateway: Gateway, read: Read | None) -> None:
@@ -57,17 +63,17 @@ class Reload:
         self._turn = asyncio.Lock()
         self._soon: asyncio.Task[None] | None = None
         self._is_wanted = False
-        self._by = ""  # who started the newest reload
+        self._by = ""  # who asked for the newest reload
         self._is_overtaken = asyncio.Event()  # set when a later reload was requested
-        self.coming: Plant | None = None  # the plant that is being adopted; None otherwise
-        self._changed: frozenset[str] = frozenset()  # drives that the adoption changes
+        self.coming: Plant | None = None  # the new plant while a reload is putting it into effect, else None
+        self._changed: frozenset[str] = frozenset()  # drives that the reload in progress changes
 
     @property
     def has_file(self) -> bool:
         return self._read is not None
 
     def begin(self, by: str = "a signal") -> None:
-        """Start a reload. If one is in progress, start another when it has ended. Call this in the loop."""
+        """Start a reload. If one is in progress, start another after it. Call this in the event loop."""
         self._is_wanted = True
         self._by = by
         self._is_overtaken.set()
@@ -85,7 +91,10 @@ class Reload:
             await asyncio.gather(self._soon, return_exceptions=True)
 
     async def carry_out(self, by: str) -> ReloadResult:
-        """Read the file and poll its plant. If that fails, keep the old plant and return the reason."""
+        """Read the plant file and poll its plant.
+
+        If that fails, keep the old plant; the result has the reason.
+        """
         self._is_overtaken.set()
         async with self._turn:
             _log.info("reload, asked for by %s", by)
@@ -98,7 +107,7 @@ class Reload:
             return result
 
     async def _read_within(self, read: Read) -> tuple[Plant, ServeSettings, Mapping[str, Any]]:
-        """Return the plant, its settings and the plan of its lines.
+        """Return the plant in the file, its settings, and the plan of its lines.
 
         Raises Hung if reading takes too long, or if a later reload is waiting to read the file.
         """
@@ -126,7 +135,7 @@ class Reload:
         is_followed = not isinstance(poller, Poller)
         if is_followed and (plant.lines or settings.parts.get("fleet") != gateway.settings.parts["fleet"]):
             raise ValueError(f"[serve.fleet] and [[line]]: a change of either {RESTART}")
-        if gateway.audit:  # adopting the plant opens this log
+        if gateway.audit:  # the poller opens the audit log when it gets the plant
             await supervisor().within("audit log", AUDIT_S, partial(check_writable, gateway.audit))
         await gateway.parts.replace(settings.parts, plant)
         gateway.hand_out(poller)
@@ -134,12 +143,12 @@ class Reload:
         self.coming = plant
         try:
             unopened = await supervisor().thread("adoption", ADOPTION_S, partial(poller.adopt, plant))
-            if is_followed:  # the plant file has no lines, but the fleet does
+            if is_followed:  # a plant whose lines come from a fleet: the file has no lines
                 planned = await supervisor().thread("plan", ADOPTION_S, partial(_planned, poller.plant))
             self._take_up(poller, settings, planned)
             gateway.parts.take_up()
         except Exception:
-            # The poller may have changed some lines already: show the lines that it polls.
+            # The poller may have changed some lines before it failed: show the plant that it polls.
             if poller.plant.lines != gateway.plant.lines:
                 self._take_up(poller, gateway.settings, None)
             await gateway.parts.take_back()
@@ -155,9 +164,9 @@ class Reload:
         return ReloadResult(True, f"{plant.path.name} is in effect", (), self.restart)
 
     def _take_up(self, poller: Poller, settings: ServeSettings, planned: Mapping[str, Any] | None) -> None:
-        """Show the plant that is polled now, and apply those of its settings that need no restart."""
+        """Show the plant that is polled now, and apply its settings, except those that need a restart."""
         gateway, plant = self._gateway, poller.plant
-        gateway.hand_out(poller)  # remaining rows of the previous plant
+        gateway.hand_out(poller)  # hand out the values that were polled under the previous plant
         lines = {line.name for line in gateway.plant.lines} - {line.name for line in plant.lines}
         for name in {*gateway.hub.drives} - drives_of(plant).keys() | lines:
             gateway.alarms.forget(name, utc_ms())
@@ -173,9 +182,9 @@ class Reload:
         gateway.guarded("frames", gateway.frames.note_news)
 
     def without_changed_drives(self, batch: Batch) -> Batch:
-        """Return the batch without the rows of drives that the reload in progress changes.
+        """Return the batch without values of drives that the reload in progress changes.
 
-        It is unknown whether such a row was polled under the old plant or the new one.
+        It is unknown whether such a value was polled under the old plant or under the new one.
         """
         columns = batch.columns() if self._changed else None
         if columns is None or self._changed.isdisjoint(columns.drives):
@@ -188,7 +197,7 @@ class Reload:
         before, now = self._begun_with, plant.serve
         for key in dict.fromkeys((*before, *now)):
             is_other = before.get(key) != now.get(key)
-            if key == "certificate":  # the file may have changed under the same name
+            if key == "certificate":  # certificate or key may have changed in a file of the same name
                 is_other |= settings.certificate != self._gateway.settings.certificate
             if is_other and key not in AT_ONCE:
                 yield f"{key} of [serve] {RESTART}"
@@ -197,7 +206,8 @@ class Reload:
         gateway, may = self._gateway, settings.may
         now = gateway.settings
         if (settings.behind_proxy, settings.host) != (now.behind_proxy, now.host):
-            # The gateway still listens on the old address: give its clients without a token no new rights.
+            # The gateway still listens on the old address, so clients without a token there get no new
+            # rights.
             may = may.bounded_by(now.may)
         gateway.settings = replace(
             gateway.settings, names=settings.names, tokens=settings.tokens, may=may, limits=settings.limits
@@ -218,8 +228,10 @@ class Reload:
 
 
 def changed_drives(before: Plant, coming: Plant) -> frozenset[str]:
-    """Return the names of drives that only one of the plants has, or that differ in type, address, polled
-    registers or channels.
+    """Return the names of the drives that differ between two plants.
+
+    These are drives that only one of the plants has, and drives with another type, address, polled registers
+    or channels.
     """
     meanings = [
         {

@@ -1,4 +1,4 @@
-"""Send messages to other servers: by POST, and in a thread that repeats failed attempts."""
+"""Send messages to other servers: a POST over HTTP, and a thread that repeats failed attempts."""
 
 from __future__ import annotations
 
@@ -18,15 +18,17 @@ from urllib.parse import parse_qs, urlsplit
 
 from multidrop.printable import masked, printable
 
-SEND_S = 20.0  # time limit of each step: connecting, sending the request, and receiving the whole answer
-REFUSED = (400, 413, 422)  # HTTP statuses of a body that the server does not accept
-MOST_ANSWER = 300  # an error reports at most this many bytes of the server's answer
-SECRETS = ("p", "u", "token", "password", "api_key", "apikey", "key")  # query parameters with secrets
+# time limit, in s, of each step: to connect, to send the request, and to receive the whole answer
+SEND_S = 20.0
+REFUSED = (400, 413, 422)  # HTTP statuses with which a server refuses the contents of a message
+MOST_ANSWER = 300  # limit, in bytes, of a server's answer in an error message
+# names of query parameters that contain secrets
+SECRETS = ("p", "u", "token", "password", "api_key", "apikey", "key")
 USER_AGENT = "multidrop"
 
 
 def url_mistakes(url: str, example: str) -> Iterator[str]:
-    """Yield a sentence if this is not an http:// or https:// URL, or if the URL contains a secret."""
+    """Yield an error sentence if this is not an http:// or https:// URL, or if it contains a secret."""
     try:
         parts = urlsplit(url)
         host, user = parts.hostname, parts.username
@@ -40,13 +42,16 @@ def url_mistakes(url: str, example: str) -> Iterator[str]:
 
 
 def host_of(url: str) -> str:
-    """Return the scheme and host of a URL, for logs."""
+    """Return the scheme and the host of a URL, which logs may show."""
     parts = urlsplit(url)
     return f"{parts.scheme}://{parts.hostname}"
 
 
 class Refused(OSError):
-    """The receiver rejected this message; it may reject every other message too."""
+    """The receiver has refused this message.
+
+    It may refuse all other messages too, for example because of a setting.
+    """
 
 
 class _NoRedirects(urllib.request.HTTPRedirectHandler):
@@ -57,7 +62,9 @@ class _NoRedirects(urllib.request.HTTPRedirectHandler):
 
 
 class _Answer(HTTPResponse):
-    """An answer that must arrive within SEND_S. Else a server that sends single bytes could take days."""
+    """An answer that must arrive completely within SEND_S. A server that sends single bytes could take
+    days.
+    """
 
     def __init__(self, sock: socket.socket, *arguments: Any, **more: Any) -> None:
         super().__init__(sock, *arguments, **more)
@@ -65,7 +72,10 @@ class _Answer(HTTPResponse):
 
 
 class _TimedBytes(io.RawIOBase):
-    """The bytes of a socket. Reading raises TimeoutError once this object is older than SEND_S."""
+    """The bytes that arrive at a socket.
+
+    Reading raises TimeoutError later than SEND_S after this object was made.
+    """
 
     def __init__(self, raw: io.RawIOBase, sock: socket.socket) -> None:
         self._raw, self._sock = raw, sock
@@ -87,7 +97,7 @@ class _TimedBytes(io.RawIOBase):
 
 
 class _AnswerOpener(urllib.request.HTTPSHandler, urllib.request.HTTPHandler):
-    """Opens connections whose answers are `_Answer`."""
+    """Opens HTTP connections whose answers have the time limit of `_Answer`."""
 
     def do_open(self, http_class: Any, req: urllib.request.Request, **options: Any) -> HTTPResponse:
         def connection(host: str, **more: Any) -> Any:
@@ -102,8 +112,9 @@ _opener = urllib.request.build_opener(_NoRedirects, _AnswerOpener)
 
 
 def post(url: str, body: bytes, headers: Mapping[str, str]) -> None:
-    """Send this body. Raises Refused if the server will never accept the body, and OSError after any other
-    failure.
+    """Send this body by POST.
+
+    Raises Refused if the server will never accept the body, and OSError after any other failure.
     """
     request = urllib.request.Request(url, body, {"user-agent": USER_AGENT, **headers})
     try:
@@ -127,28 +138,30 @@ def post(url: str, body: bytes, headers: Mapping[str, str]) -> None:
 class RetryingSender(ABC):
     """Sends messages to one receiver, with growing pauses after failures.
 
-    `name` is the receiver's name in logs and in /health, without secrets. Only `run`, which has its own
-    thread, waits for the receiver.
+    `name` is the receiver's name in logs and in the gateway's health, without secrets. Only `run`, which has
+    its own thread, waits for the receiver.
     """
 
     log = logging.getLogger("multidrop.gateway")
     what = "messages"
-    slow_s = 2 * SEND_S  # a receiver that takes longer than this for one message is reported
-    first_pause_s, most_pause_s = 1.0, 30.0  # pause after the first failed attempt, and the longest pause
+    # in s: if the receiver takes longer than this for one message, that is reported as a problem
+    slow_s = 2 * SEND_S
+    # in s: the pause after the first failed attempt, and the longest pause
+    first_pause_s, most_pause_s = 1.0, 30.0
 
     def __init__(self, name: str, clock: Callable[[], float]) -> None:
         self.name = name
         self._clock = clock
-        self._trouble = ""  # why the receiver takes no messages now
+        self._trouble = ""  # why the receiver accepts no messages now
         self._pause_s = self.first_pause_s
         self._sending_since_s = inf
         self._changed = threading.Condition()
-        self._has_news = False  # True: messages were added since the last attempt began
+        self._has_news = False  # True: messages were added since the last attempt started
         self._is_closed = False
 
     @property
     def problem(self) -> str:
-        """Why the receiver takes no messages now; "" if it takes them."""
+        """Why the receiver accepts no messages now; "" if it accepts them."""
         if self._clock() - self._sending_since_s > self.slow_s:
             return f"{self.name} has not answered for {self.slow_s:g} s"
         return self._trouble
@@ -160,13 +173,13 @@ class RetryingSender(ABC):
             self._changed.notify()
 
     def close(self) -> None:
-        """Make `run` return, as soon as `_may_end` allows it."""
+        """Make `run` return as soon as `_may_end` allows it."""
         with self._changed:
             self._is_closed = True
             self._changed.notify()
 
     def run(self) -> None:
-        """Send messages until `close`."""
+        """Send messages until `close` is called."""
         pause_s = 0.0
         while not (self._is_closed and self._may_end(pause_s)):
             pause_s = self.step()
@@ -177,7 +190,7 @@ class RetryingSender(ABC):
                     self._changed.wait_for(lambda: self._is_closed, pause_s)
 
     def step(self) -> float:
-        """Send the next message. Return the seconds until the next attempt (inf: until a new message)."""
+        """Send the next message. Return the seconds until the next attempt; inf if no message waits."""
         self._has_news = False
         self._sending_since_s = self._clock()
         try:
@@ -202,8 +215,11 @@ class RetryingSender(ABC):
 
     @abstractmethod
     def _send_next(self) -> float:
-        """Send the next message, if any. Return what `step` returns; raise any exception after a failure."""
+        """Send the next message, if any.
+
+        Return the seconds until the next attempt; raise an exception after a failure.
+        """
 
     @abstractmethod
     def _may_end(self, pause_s: float) -> bool:
-        """Return True if `run` may return after `close`; `pause_s` is the result of the last step."""
+        """Return True if `run` may end after `close`. `pause_s` is the result of the latest `step`."""

@@ -1,4 +1,7 @@
-"""The table `[serve]` of a plant file, and the files that it names. All mistakes are found at the start."""
+"""The table `[serve]` of a plant file, and the files that the table names.
+
+All mistakes are found at the start.
+"""
 
 from __future__ import annotations
 
@@ -25,10 +28,10 @@ from multidrop.supervisor import Hung, in_time
 from multidrop.toml_check import ADDRESS, Key, TomlPlace, json_schema, parse_address
 
 LISTEN = "127.0.0.1:8750"
-MOST_SECRET = 4096  # limit, in bytes, of the size of a file with a secret
-AUDIT_S = 2.0  # how long to wait for the disk of the audit log
+MOST_SECRET = 4096  # limit, in bytes, of a file that contains a secret
+AUDIT_S = 2.0  # time limit, in s, for checking the disk of the audit log
 HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
-EXAMPLES = {  # example values in error messages, by type
+EXAMPLES = {  # by type: an example value for error messages
     bool: "true",
     int: "10",
     float: "1.5",
@@ -66,7 +69,7 @@ _SERVE = {
 } | {name: Key(dict, f"[serve.{name}], a table") for name in PARTS}
 
 
-NOT_FOLLOWED = {  # parts that a gateway without lines of its own cannot have, and why
+NOT_FOLLOWED = {  # by part that a gateway for a fleet's lines cannot have: the reason
     **dict.fromkeys(
         ("history", "influx", "postgres", "upload"), "`multidrop hub` stores the samples of a fleet"
     ),
@@ -81,13 +84,14 @@ ListenAddress = tuple[str, int]  # host and port
 
 @dataclass(frozen=True)
 class ServeSettings:
-    """The checked settings of `[serve]`."""
+    """The settings in the table `[serve]`, after all checks."""
 
     host: str = "127.0.0.1"
     port: int = 8750
     names: tuple[str, ...] = ()
     tls: ssl.SSLContext | None = None
-    certificate: str = ""  # digest of certificate and key, because these files may be renewed in place
+    # digest of the files of certificate and key, because their contents may change under the same names
+    certificate: str = ""
     behind_proxy: bool = False
     tokens: tuple[Token, ...] = ()
     may: May = May()  # noqa: RUF009 (it cannot change)
@@ -109,9 +113,9 @@ class ServeSettings:
 
 
 class Folders:
-    """Finds the files that `[serve]` names: first among the service's credentials, then beside the plant
-    file.
+    """Finds the files that `[serve]` names.
 
+    Input files are looked for among the systemd service's credentials first, then beside the plant file.
     Output files are in the service's state folder; without a service, beside the plant file.
     """
 
@@ -130,7 +134,9 @@ class Folders:
 
 
 def input_file(name: str, plant: Plant) -> Path:
-    """Return the path of an input file of a plant, by the environment of this process; see `Folders`."""
+    """Return the path of a plant's input file, with the folders in this process's environment; see
+    `Folders`.
+    """
     return Folders(plant.path, os.environ).find(name)
 
 
@@ -146,7 +152,7 @@ def secret_in(name: str, plant: Plant) -> str:
 
 
 def secret_mistakes(key: str, name: str, plant: Plant) -> Iterator[str]:
-    """Yield a sentence if the file with a secret cannot be read, or does not have exactly one line."""
+    """Yield an error sentence if a file with a secret cannot be read, or does not have exactly one line."""
     try:
         secret = secret_in(name, plant)
         if name and len(secret.splitlines()) != 1:
@@ -156,13 +162,13 @@ def secret_mistakes(key: str, name: str, plant: Plant) -> Iterator[str]:
 
 
 def refuse(mistakes: Iterable[str]) -> None:
-    """Raise ValueError with a line for each mistake, if there are any."""
+    """Raise ValueError with a line for each mistake; return None if there are no mistakes."""
     if wrong := "\n".join(mistakes):
         raise ValueError(wrong)
 
 
 def parsing_mistakes(settings: object, **parsers: Callable[[str], object]) -> Iterator[str]:
-    """Yield a sentence for each of these settings whose text its parser refuses with ValueError."""
+    """Yield an error sentence for each setting whose text its parser refuses with ValueError."""
     for key, parse in parsers.items():
         try:
             parse(getattr(settings, key))
@@ -171,7 +177,10 @@ def parsing_mistakes(settings: object, **parsers: Callable[[str], object]) -> It
 
 
 def read_plant(load: Callable[[], Plant], environment: Mapping[str, str]) -> tuple[Plant, ServeSettings]:
-    """Return a plant and its `[serve]` settings. Raises PlantError with all mistakes in the file."""
+    """Return a plant and the settings in its table `[serve]`.
+
+    Raises PlantError with all mistakes in the file.
+    """
     try:
         plant = load()
     except PlantError as wrong:
@@ -189,9 +198,9 @@ def read_plant(load: Callable[[], Plant], environment: Mapping[str, str]) -> tup
 
 
 def _check_followed(plant: Plant, settings: ServeSettings) -> None:
-    """Check the settings of a plant file without lines: its drives are those of a fleet.
+    """Check the settings of a plant file without lines. Its gateway shows a fleet's drives.
 
-    Raises PlantError for settings that need lines in the file.
+    Raises PlantError for settings that need lines in the plant file.
     """
     place = replace(TomlPlace.in_file(plant.path), steps=(("serve", 1),))
     for name, other in NOT_FOLLOWED.items():
@@ -207,9 +216,9 @@ def _check_followed(plant: Plant, settings: ServeSettings) -> None:
 
 
 def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings:
-    """Return the `[serve]` settings of a plant. Raises PlantError with all mistakes.
+    """Return the settings in the table `[serve]` of a plant. Raises PlantError with all mistakes.
 
-    In a plant without lines, names of drives and lines are not checked.
+    If the plant has no lines, names of drives and lines are not checked.
     """
     root = TomlPlace.in_file(plant.path)
     place = root.within("[serve]", "serve")
@@ -228,7 +237,8 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
     behind_proxy = given.get("behind_proxy", False)
     if may.look == "token" and not tokens and "tokens" not in given:
         place.wrong('look = "token" of [serve.may] needs a file of tokens; add tokens = "tokens"', "may")
-    is_safe = behind_proxy or {"tokens", "certificate", "key"} <= given.keys()  # files are checked above
+    # the files of tokens, certificate and key are checked above
+    is_safe = behind_proxy or {"tokens", "certificate", "key"} <= given.keys()
     if not is_loopback(host) and not is_safe and "listen" in given:
         place.wrong(
             f'listen = "{given["listen"]}" is open to other machines: that needs tokens, certificate and '
@@ -314,7 +324,7 @@ def _tokens(given: Mapping[str, Any], folders: Folders, place: TomlPlace) -> lis
 
 
 def _may(table: Any, look: str, plant: Plant, place: TomlPlace) -> May:
-    """Return the rights in [serve.may]; the argument `look` is the default of the key `look`."""
+    """Return the rights in the table [serve.may]. `look` is the default of the key `look`."""
     given = place.check(table, _MAY)
     for key in ("look", "stop"):
         if given.get(key, "anyone") not in ("anyone", "token"):
@@ -325,7 +335,7 @@ def _may(table: Any, look: str, plant: Plant, place: TomlPlace) -> May:
 
 
 def _part(name: str, table: Mapping[str, Any], plant: Plant, place: TomlPlace) -> Any:
-    """Return a part's settings, checked by its dataclass of settings; None if there are mistakes."""
+    """Return the settings in a part's table, checked by the part's dataclass; None if there are mistakes."""
     try:
         made, keys = _settings_of(name)
     except ImportError as missing:
@@ -333,7 +343,8 @@ def _part(name: str, table: Mapping[str, Any], plant: Plant, place: TomlPlace) -
         return None
     before = len(place.config_errors)
     given = place.check(dict(table), keys)
-    refused = tuple(table.keys() - given.keys())  # these values are not passed on, so not missing either
+    # keys with an invalid value: a value that is left out here must not be reported as missing too
+    refused = tuple(table.keys() - given.keys())
     try:
         found = made(**given)
     except (ValueError, TypeError) as mistakes:
@@ -351,7 +362,7 @@ def _part(name: str, table: Mapping[str, Any], plant: Plant, place: TomlPlace) -
 
 
 def _check_ports(page: ListenAddress, parts: Mapping[str, Any], place: TomlPlace) -> None:
-    """Add a mistake for each address of a part that the web server or another part listens on too."""
+    """Add a mistake for each part that listens on the same address as the web server or another part."""
     taken = {"listen of [serve]": page}
     for name, part in parts.items():
         own: Mapping[str, ListenAddress] = getattr(part, "addresses", {})
@@ -364,7 +375,10 @@ def _check_ports(page: ListenAddress, parts: Mapping[str, Any], place: TomlPlace
 
 
 def _are_one_port(one: ListenAddress, other: ListenAddress) -> bool:
-    """Return True if only one socket can listen on these two addresses; port 0 means any free port."""
+    """Return True if these two addresses exclude each other, so that only one socket can listen on them.
+
+    Port 0 means any free port.
+    """
     hosts = {"127.0.0.1" if host == "localhost" else host for host, _ in (one, other)}
     is_ipv4 = not any(":" in host for host in hosts)
     overlap = len(hosts) == 1 or "::" in hosts or ("0.0.0.0" in hosts and is_ipv4)
@@ -372,9 +386,9 @@ def _are_one_port(one: ListenAddress, other: ListenAddress) -> bool:
 
 
 def _settings_of(part: str) -> tuple[Any, dict[str, Key]]:
-    """Return the dataclass of a part's settings, and the keys of its table.
+    """Return the dataclass of a part's settings, and the keys of the part's table.
 
-    The metadata of a dataclass field are the JSON Schema keywords of the field's key.
+    The metadata of each field of the dataclass are JSON Schema keywords for its key.
     """
     made = import_module(PARTS[part]).Settings
     return made, {one.name: _key_of(one) for one in fields(made) if one.init}
@@ -391,7 +405,7 @@ def _key_of(one: Field[Any]) -> Key:
 
 
 def serve_schema() -> dict[str, Any]:
-    """Return the JSON Schema of `[serve]`, made from the table's own keys and from the keys of the parts."""
+    """Return the JSON Schema of the table `[serve]`: the table's own keys, and the tables of the parts."""
     is_private = {"pattern": r"^(localhost|127\.[0-9.]+|\[?::1\]?):"}
     is_public = {"required": ["listen"], "properties": {"listen": {"not": is_private}}}
     is_protected = [
@@ -409,7 +423,7 @@ def serve_schema() -> dict[str, Any]:
         ],
     )
     for name in PARTS:
-        with suppress(ImportError):  # if a part's library is missing, the schema lacks the part's keys
+        with suppress(ImportError):  # without its library, a part's keys are left out of the schema
             schema["properties"][name] |= json_schema(_settings_of(name)[1])
     return schema
 
@@ -430,14 +444,17 @@ def _digest(paths: Iterable[Path]) -> str:
 
 
 def _check_audit(path: Path) -> bool:
-    """Raise ValueError if the file cannot be written; return True if it can, or if its disk hangs."""
+    """Raise ValueError if the audit log cannot be written.
+
+    Return True if it can be written, or if its disk hangs.
+    """
     with suppress(Hung):
         in_time("audit log", AUDIT_S, partial(check_writable, path))
     return True
 
 
 def check_writable(path: Path) -> bool:
-    """Return True if this audit log can be written. Raises ValueError."""
+    """Return True if this audit log can be written. Raises ValueError if it cannot."""
     is_new = not path.exists()
     try:
         with path.open("ab"):

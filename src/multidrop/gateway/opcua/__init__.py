@@ -1,4 +1,4 @@
-"""OPC UA server: the drives of a plant as objects with values, units and a method that stops them."""
+"""OPC UA server: each drive is an object with its values, their units, and a method that stops the drive."""
 
-# names of the nodes that each drive has besides its registers
+# names of the nodes that each drive has in addition to its registers
 STATE, FAULT, STOP = MEMBERS = ("State", "Fault", "Stop")

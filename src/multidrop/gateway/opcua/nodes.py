@@ -1,4 +1,4 @@
-"""The nodes of a plant in the address space of an OPC UA server."""
+"""The address space of the OPC UA server: the nodes of a plant's drives and values."""
 
 from __future__ import annotations
 
@@ -19,12 +19,14 @@ from multidrop import Plant, PolledDrive, Register
 from multidrop.gateway.live import hub
 from multidrop.gateway.opcua import FAULT, STATE, STOP
 
-INDEX = 2  # index of the namespace of all nodes below
+INDEX = 2  # index of the namespace of all nodes of this module
 PLANT, PLANT_STOP = ua.NodeId(1, INDEX), ua.NodeId(2, INDEX)
-SOME = 64  # number of values written before waiting requests are served
-MOST_REMOVED = 500  # once reloads have removed more drives, their memory is freed: 10 kB each
+SOME = 64  # number of values that are written before clients' requests are served again
+# limit of removed drives whose memory (10 kB each) is not freed yet; above it, the memory is freed
+MOST_REMOVED = 500
 UNITS_OF = "http://www.opcfoundation.org/UA/units/un/cefact"
-# Common codes of UNECE Recommendation 20 by unit. A unit id is the bytes of such a code (OPC 10000-8, 5.6.3).
+# Code of a unit in UNECE Recommendation 20, by unit. The unit's id in OPC UA is made of the code's bytes (OPC
+# 10000-8, 5.6.3).
 UNITS = {
     "Hz": "HTZ",
     "kHz": "KHZ",
@@ -58,7 +60,8 @@ DAMAGED = (
     *("reply from another address", "reply to another function", "reply of another length"),
     "maybe the adapter's echo",
 )
-# OPC UA's status code by the status of a miss. Misses with another status mean an unreachable drive.
+# OPC UA's status code by the status of a failed read. All other statuses mean that the drive cannot be
+# reached.
 CODES = {"no valid value": _Codes.BadSensorFailure} | dict.fromkeys(DAMAGED, _Codes.BadCommunicationError)
 REFUSED = "exception "
 NOTHING = ua.Variant(None, ua.VariantType.Null)
@@ -68,11 +71,11 @@ _log = logging.getLogger("multidrop.gateway")
 
 @contextmanager
 def lasting() -> Iterator[None]:
-    """Exclude the objects made in the `with` block from garbage collection, because they last.
+    """Exclude the objects that are made in the `with` block from garbage collection.
 
-    A garbage collection stops all threads: with the 400,000 objects of the address space, for 0.2 s. An
-    excluded object is still freed when its last reference ends. But objects in a reference cycle, such as the
-    drives of an old plant, are freed only by `free_excluded`.
+    They last, and the 400,000 objects of the address space would make each garbage collection stop all
+    threads for 0.2 s. An excluded object is still freed when its last reference ends. But objects in a
+    reference cycle, such as the drives of an old plant, are freed only by `free_excluded`.
     """
     was_enabled = gc.isenabled()
     gc.disable()
@@ -91,10 +94,10 @@ def free_excluded() -> None:
 
 
 class VariableState(NamedTuple):
-    """The state of a variable: its value, status code and time. If the code is bad, the value is None."""
+    """The value, status code and time of one variable. If the status code is bad, the value is None."""
 
     drive: str
-    name: str  # a register's name, STATE or FAULT
+    name: str  # the register's name, or STATE or FAULT
     code: int  # OPC UA's status code
     value: float | str | None
     time_ns: int  # when the value was requested, UTC in ns
@@ -103,11 +106,11 @@ class VariableState(NamedTuple):
 def state_of(
     drive: str, name: str, newest: hub.KeptRow | None, good: hub.KeptRow | None, is_current: bool, reason: str
 ) -> VariableState:
-    """Return the state of a register's variable from its newest row.
+    """Return the state of a register's variable from the register's newest rows (reads).
 
-    `good` is the newest row with a value; if `newest` is another row, it is a miss. If `is_current`, the
-    value of `good` is still current, and the variable keeps it even if newer rows are misses. `reason` is the
-    status of `newest`.
+    `newest` is the newest row, and `good` the newest row with a value. If they differ, the newest read has
+    failed. If `is_current`, the variable keeps the value of `good` even if later reads have failed. `reason`
+    is the status of `newest`.
     """
     if newest is None:
         return VariableState(drive, name, WAITING, None, 0)
@@ -119,9 +122,9 @@ def state_of(
 
 
 def fault_of(shown: hub.Shown) -> tuple[int, str | None]:
-    """Return status code and text of a drive's fault.
+    """Return the status code and the text of a drive's fault.
 
-    The text is "" without a fault, and None if it is unknown.
+    The text is "" if there is no fault, and None if it is unknown whether there is one.
     """
     if shown.words is None or shown.state == hub.FAULT:
         return GOOD, shown.words or ""
@@ -129,7 +132,9 @@ def fault_of(shown: hub.Shown) -> tuple[int, str | None]:
 
 
 class _Variant(ua.Variant):
-    """A number or a text with its type. The type is known to be right, so asyncua's check is skipped."""
+    """A number or a text with its OPC UA type. asyncua's check is skipped, because the type is known to
+    be right.
+    """
 
     __slots__ = ()
 
@@ -137,7 +142,10 @@ class _Variant(ua.Variant):
 
 
 class _Value(ua.DataValue):
-    """A value that never changes. So asyncua need not copy it, which would take 50 us for each subscriber."""
+    """A value that never changes, so asyncua need not copy it.
+
+    A copy would take 50 us for each subscriber.
+    """
 
     __slots__ = ()
 
@@ -150,7 +158,7 @@ class _Value(ua.DataValue):
 class _Variable:
     """A variable of the OPC UA server, and its newest state.
 
-    The value for clients is made on request, because few variables have subscribers.
+    The value that clients get is made on request, because few variables have subscribers.
     """
 
     def __init__(self, state: VariableState, register: Register[Any] | None) -> None:
@@ -166,7 +174,7 @@ class _Variable:
         return _Value(variant, _status(code), _time(time_ns))
 
 
-@lru_cache(maxsize=64)  # cached, because the registers of one request have the same time
+@lru_cache(maxsize=64)  # cached, because the registers of one request share its time
 def _time(ns: int) -> datetime | None:
     return datetime.fromtimestamp(ns / 1e9, UTC) if ns else None
 
@@ -178,13 +186,14 @@ class _Drive(NamedTuple):
 
 
 class PlantNodes:
-    """The object of the plant, and in it an object for each drive, with a variable for each polled register.
+    """The nodes of a plant: an object for the plant, in it one for each drive, in that a variable for each
+    register.
 
-    All methods must be called in the server's loop.
+    All methods must be called in the event loop of the OPC UA server.
     """
 
     def __init__(self, server: InternalServer) -> None:
-        # by id of a stop method: the drive that it stops; None: all drives
+        # by id of a stop method's node: the drive that the method stops; None: all drives
         self.stops: dict[ua.NodeId, str | None] = {PLANT_STOP: None}
         self._session = server.isession
         self._space = server.aspace
@@ -192,7 +201,7 @@ class PlantNodes:
         self._removed = 0  # number of drives removed since the last call of `free_excluded`
 
     async def make(self) -> None:
-        """Add the object of the plant, which has no drives yet."""
+        """Add the plant's object, without drives."""
         await self._add(
             _object(ua.NodeId(ua.ObjectIds.ObjectsFolder), PLANT, "Plant", "all drives"),
             *_method(PLANT, PLANT_STOP, ua.NodeId(3, INDEX), "Stop all drives of the plant."),
@@ -204,7 +213,7 @@ class PlantNodes:
         return [item.RequestedNewNodeId for item in items]
 
     async def adopt(self, plant: Plant) -> None:
-        """Remove the nodes of drives that changed or are gone, and add those of new drives."""
+        """Remove the nodes of drives that the new plant lacks or changes, and add the nodes of new drives."""
         wanted = {polled.drive.name: polled for polled in plant.drives}
         for name in [name for name, known in self._drives.items() if wanted.get(name) != known.polled]:
             await self._remove(name)
@@ -262,7 +271,10 @@ class PlantNodes:
             del space[node]
 
     async def write(self, states: Iterable[VariableState]) -> None:
-        """Write these states. After every SOME states, let the loop serve clients, who may send stops."""
+        """Take over these states, and notify their subscribers.
+
+        After every SOME states, other tasks of the event loop run, because a client may send a stop.
+        """
         for count, state in enumerate(states, 1):
             drive = self._drives.get(state.drive)
             if drive is not None and state.name in drive.variables:
@@ -280,18 +292,18 @@ async def _notify(variable: _Variable, attribute: AttributeValue) -> None:
     for handle, callback in [*attribute.datachange_callbacks.items()]:
         try:
             await callback(handle, value)
-        except Exception:  # for example if a client demands a deadband for a text
+        except Exception:  # for example, a client has demanded a deadband for a text
             drive, name, *_ = variable.state
             _log.debug("a subscriber of %s.%s failed", drive, name, exc_info=True)
 
 
 def object_of(drive: str | None) -> ua.NodeId:
-    """Return the id of a drive's object; with None, that of the plant's object."""
+    """Return the id of a drive's object; of the plant's object if `drive` is None."""
     return PLANT if drive is None else _id(drive)
 
 
 def _id(*names: str) -> ua.NodeId:
-    """Return the id of a drive's object, or of a node in it."""
+    """Return the id of a drive's object, or of a node in this object."""
     return ua.NodeId(".".join(names), INDEX)
 
 
@@ -303,7 +315,7 @@ def _status(code: int) -> ua.StatusCode:
 def _item(parent: ua.NodeId, node: ua.NodeId, name: str, attributes: Any, reference: str) -> ua.AddNodesItem:
     """Return the request to add a node with this display name.
 
-    `attributes` has the other attributes of the node.
+    `attributes` has the node's other attributes.
     """
     attributes.DisplayName = ua.LocalizedText(name)
     attributes.WriteMask = attributes.UserWriteMask = 0
@@ -331,7 +343,7 @@ def _variable(
     kind: type,
     type_of: str = "BaseDataVariableType",
 ) -> ua.AddNodesItem:
-    """Return a variable of numbers or texts, which clients may only read."""
+    """Return the request to add a variable for numbers or texts that clients may only read."""
     value = ua.Variant(0.0, ua.VariantType.Double) if kind is float else ua.Variant("", ua.VariantType.String)
     item = _item(parent, node, name, _values(value, value.VariantType.value, description), "HasComponent")
     item.NodeClass, item.BrowseName = ua.NodeClass.Variable, ua.QualifiedName(name, INDEX)
@@ -358,7 +370,7 @@ def _values(value: ua.Variant, data_type: int, description: str) -> ua.VariableA
 
 
 def unit_of(unit: str) -> ua.EUInformation:
-    """Return the description of a unit; its id is -1 if UNECE has no code for it."""
+    """Return OPC UA's description of a unit. The description's id is -1 if UNECE has no code for the unit."""
     code = UNITS.get(unit, "")
     number = int.from_bytes(code.encode(), "big") if code else -1
     return ua.EUInformation(UNITS_OF, number, ua.LocalizedText(unit), ua.LocalizedText(unit))

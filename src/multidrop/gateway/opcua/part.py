@@ -1,7 +1,7 @@
-"""The part `opcua`: serves the plant to OPC UA clients, which may read values and stop drives.
+"""The gateway's part `opcua`: serves the plant to OPC UA clients, which may read values and stop drives.
 
-The server has its own thread with its own event loop. So requests of its clients delay neither polling
-nor stops over other interfaces.
+The server has its own thread with its own event loop, so that its clients' requests delay neither polling nor
+stops over other interfaces.
 """
 
 from __future__ import annotations
@@ -35,23 +35,29 @@ if TYPE_CHECKING:
     from multidrop.gateway.opcua.server import Identity, Visitor
 
 EXAMPLE = "127.0.0.1:4840"
-EVERY_S = 0.1  # interval of passing new values to the server
-SWITCH_S = 0.0005  # how long a thread may run, in s, while other threads wait for their turn
-USUAL_SWITCH_S = sys.getswitchinterval()  # the interpreter's default, used without an OPC UA server: 5 ms
-STATE_TURNS = 10  # a drive's state is passed on once in this many intervals: computing it takes 50 us
-STOP_WAIT_S = 0.4  # how long a stop's answer waits for the motor; the client's other requests wait as long
-_unended: set[OpcUa] = set()  # all parts in this process whose server has not ended
+EVERY_S = 0.1  # interval, in s, of passing new values to the server
+# in s: while a server runs, a thread must let another one run after this time (sys.setswitchinterval)
+SWITCH_S = 0.0005
+# the interpreter's own interval for this, 5 ms, which is used without a server
+USUAL_SWITCH_S = sys.getswitchinterval()
+# drives' states, which take 50 us each to compute, are passed on only once in this many intervals
+STATE_TURNS = 10
+# in s: how long the answer to a stop waits for the motor; the client's other requests wait as well
+STOP_WAIT_S = 0.4
+_unended: set[OpcUa] = set()  # all OPC UA servers in this process that have not ended
 _log = logging.getLogger("multidrop.gateway")
 
 
 @dataclass(frozen=True)
 class OpcUaSettings:
-    """The settings of the OPC UA server. Raises ValueError with a line for each mistake."""
+    """The settings in the table `[serve.opcua]`. Raises ValueError with a line for each mistake."""
 
     listen: str = field(default=EXAMPLE, metadata=ADDRESS)
-    certificate: str = ""  # path of a PEM file, relative to the plant file; "": no encryption
+    # path of the server's certificate (PEM), relative to the plant file; "": no encryption
+    certificate: str = ""
     key: str = ""  # path of the certificate's RSA key
-    libraries: ClassVar[tuple[str, ...]] = ("asyncua",)  # imported when the part is built
+    # Python libraries that are imported when the server is built
+    libraries: ClassVar[tuple[str, ...]] = ("asyncua",)
 
     def __post_init__(self) -> None:
         if bool(self.certificate) != bool(self.key):
@@ -65,11 +71,11 @@ class OpcUaSettings:
 
     @property
     def addresses(self) -> dict[str, tuple[str, int]]:
-        """Host and port of the listening socket, by the key of its setting."""
+        """The host and port of the listening socket, by its setting's key."""
         return {"listen": self.address}
 
     def check(self, plant: Plant) -> list[str]:
-        """Return a sentence for each missing file, unprotected address and ambiguous name."""
+        """Return an error sentence for each missing file, unprotected address and ambiguous name."""
         return [*self._mistakes_in(plant)]
 
     def _mistakes_in(self, plant: Plant) -> Iterator[str]:
@@ -96,9 +102,9 @@ Settings = OpcUaSettings
 
 
 def build(settings: OpcUaSettings, context: PartContext) -> OpcUa:
-    """Return the listening part. Raises ImportError without asyncua, OSError if the port cannot be opened.
+    """Return the OPC UA server, which listens already. Raises ImportError without asyncua.
 
-    Raises ValueError for an unsuitable certificate or key.
+    Raises OSError if the port cannot be opened, and ValueError for an unsuitable certificate or key.
     """
     server, folder = import_module("multidrop.gateway.opcua.server"), context.plant.path.parent
     files = [folder / name for name in (settings.certificate, settings.key) if name]
@@ -114,21 +120,25 @@ class OpcUa:
         self._listener = listen(*settings.address)
         self.port: int = self._listener.getsockname()[1]
         self._plant = context.plant
-        self._adopted: Plant | None = None  # the plant whose nodes the server has
+        self._adopted: Plant | None = None  # the plant whose nodes the server shows
         self._turn = 0  # number of intervals so far
-        self._seen: dict[str, dict[str, Any]] = {}  # states that the server has, by drive and name
-        self._wrong = Tokens()  # wrong tokens, to limit their log lines; used in the server's thread only
-        self._stopping: Counter[str | None] = Counter()  # stops in progress by drive; None: of all drives
-        self._loop: asyncio.AbstractEventLoop | None = None  # event loop of the gateway
+        # by drive and variable: the state that was passed to the server last
+        self._seen: dict[str, dict[str, Any]] = {}
+        # wrong tokens that were logged, so that each is logged once; used only in the server's thread
+        self._wrong = Tokens()
+        # number of stops in progress, by drive; None: stops of all drives
+        self._stopping: Counter[str | None] = Counter()
+        self._loop: asyncio.AbstractEventLoop | None = None  # the event loop of the gateway
         self._serving: asyncio.Future[None] | None = None  # done when the server's thread has ended
         self._opened: tuple[asyncio.AbstractEventLoop, asyncio.Event, PlantNodes] | None = None
         self._is_over = False  # True: the server must end now, or as soon as it is open
-        self._writing: Future[None] | None = None  # pending while the server takes over values
+        # pending while the server takes over a new plant or new values
+        self._writing: Future[None] | None = None
 
     # ---- in the gateway's loop ----
 
     def adopt(self, plant: Plant) -> None:
-        """Use another plant; the server gets it before the next values."""
+        """Use another plant. The server gets the plant before the plant's values."""
         self._plant = plant
 
     async def run(self) -> None:
@@ -143,7 +153,7 @@ class OpcUa:
                 await asyncio.wait([self._serving], timeout=due - self._loop.time())
             self._serving.result()
         finally:
-            self._end_server()  # otherwise clients would still read the last values as current ones
+            self._end_server()  # without this, clients would still read the last values as current ones
 
     async def close(self) -> None:
         """Disconnect all clients; stops in progress continue."""
@@ -161,11 +171,11 @@ class OpcUa:
         self._is_over = True
         if self._opened is not None:
             loop, ended, _ = self._opened
-            with suppress(RuntimeError):  # the server's loop is closed already
+            with suppress(RuntimeError):  # the server's event loop is closed already
                 loop.call_soon_threadsafe(ended.set)
 
     def _hand_over(self) -> None:
-        """Pass changed states to the server, unless the server is still taking over earlier ones."""
+        """Pass a new plant or changed states to the server, unless it still takes over the previous ones."""
         if self._opened is None or (self._writing is not None and not self._writing.done()):
             return
         loop, _, nodes = self._opened
@@ -201,9 +211,9 @@ class OpcUa:
         return states
 
     async def _stop(self, drive: str | None, caller: Caller) -> CommandResult:
-        """Stop a drive, or with None all drives.
+        """Stop a drive, or all drives if `drive` is None.
 
-        Return the drive's result, or for all drives the first failure.
+        Return the drive's result; for all drives, return the first failure if there is one.
         """
         try:
             results = await self._context.commands.stop(None if drive is None else [drive], caller)
@@ -234,9 +244,10 @@ class OpcUa:
 
     @contextmanager
     def _quick_process(self) -> Iterator[None]:
-        """Make threads take turns quickly while a server runs. After the last server, undo `lasting` too.
+        """Make threads take turns quickly while a server runs.
 
-        There may be two servers: during a reload, the next server may start before this server has ended.
+        After the last server has ended, objects excluded by `lasting` are collected again. There may be two
+        servers: during a reload, a new server may start before the old one has ended.
         """
         _unended.add(self)
         sys.setswitchinterval(SWITCH_S)
@@ -249,10 +260,12 @@ class OpcUa:
                 gc.unfreeze()
 
     def _caller(self, visitor: Visitor) -> Caller | None:
-        """Return a session's user as a caller with its present rights; None if the user may not read."""
+        """Return a session's user as a caller with the user's present rights; None if the user may not
+        read.
+        """
         tokens, may, address = self._context.tokens, self._context.commands.may, visitor.address
         token = None
-        if visitor.secret and tokens:  # without tokens of its own, the gateway ignores any token
+        if visitor.secret and tokens:  # a gateway without tokens ignores the token that a user sends
             token = tokens.find(visitor.secret)
             if token is None:
                 self._note_wrong(visitor)
@@ -265,10 +278,11 @@ class OpcUa:
             _log.warning("wrong token by opcua from %s", address)
 
     async def _call(self, call: Any, visitor: Visitor) -> Any:
-        """Carry out a method, which is always a stop. Answer within STOP_WAIT_S, even if it takes longer.
+        """Call a method, which is always a stop. Answer within STOP_WAIT_S, even if the stop takes longer.
 
-        If the method belongs to another object than the one in the request, it is carried out, but the answer
-        is BadMethodInvalid: otherwise the client could believe that the object's drive was stopped.
+        If the method belongs to another object than the one in the request, the stop is carried out, but the
+        answer is BadMethodInvalid. Otherwise the client could believe that the drive of the object in the
+        request was stopped.
         """
         from asyncua import ua
 

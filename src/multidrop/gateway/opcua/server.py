@@ -1,7 +1,7 @@
 """An OPC UA server on asyncua, with limits for clients that are greedy, hostile or do not read.
 
-A client of asyncua's own server could use unlimited memory and time. Each limit below prevents one such
-case.
+A client of asyncua's own server could make it use unlimited memory and time. Each limit below prevents one
+such case.
 """
 
 from __future__ import annotations
@@ -37,13 +37,14 @@ MOST_REQUEST = 1 << 18  # limit of a request in bytes
 MOST_UNREAD = 1 << 23  # a client is disconnected if it leaves more than this many bytes unread
 MOST_CLIENTS = 64
 MOST_WAITING = 64  # a client is disconnected if more than this many of its requests wait
-MOST_OPERATIONS = 1000  # limit of nodes in one request
-MOST_ITEMS = 20_000  # limit of all subscribed values of all clients
-MOST_QUEUED = 10  # limit of waiting notifications of one value; at the limit, a new one replaces the oldest
-# limits of the time between two notifications of a subscription
+MOST_OPERATIONS = 1000  # limit of the nodes that one request names
+MOST_ITEMS = 20_000  # limit of subscribed values of all clients together
+# limit of notifications of one value that wait to be sent; at the limit, a new one replaces the oldest
+MOST_QUEUED = 10
+# limits, in ms, of a subscription's publishing interval
 LEAST_INTERVAL_MS, MOST_INTERVAL_MS = 50.0, 3_600_000.0
-SESSION_MS = 60_000.0  # limit of a session's time-out
-LOGIN_S = 10.0  # time limit from the connection of a client to the opening of its session
+SESSION_MS = 60_000.0  # limit of a session's timeout, in ms
+LOGIN_S = 10.0  # time limit, in s, from a client's connection to the opening of its session
 
 POLICIES = (
     ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
@@ -66,25 +67,28 @@ OPERATION_LIMITS = (
     *("MaxNodesPerTranslateBrowsePathsToNodeIds", "MaxMonitoredItemsPerCall"),
 )
 
-# asyncua logs each invalid message with a traceback, with which hostile clients could fill the log.
+# asyncua logs each invalid message with a traceback. Hostile clients could fill the log with them.
 logging.getLogger("asyncua").setLevel(logging.CRITICAL)
 
 
 @dataclass
 class Visitor(User):
-    """The user of a session: the client's address, and the token that the client gave as password."""
+    """The user of a session: the client's address, and the token that the client gave as its password."""
 
     role: UserRole = UserRole.User
     address: str = ""
     secret: str = field(default="", repr=False)
 
 
-MayRead = Callable[[Visitor], bool]  # returns whether the user may read
-Stop = Callable[[ua.CallMethodRequest, Visitor], Awaitable[ua.CallMethodResult]]  # carries out a method
+MayRead = Callable[[Visitor], bool]  # a function that returns whether the user may read values
+# a function that calls a method, which is always a stop
+Stop = Callable[[ua.CallMethodRequest, Visitor], Awaitable[ua.CallMethodResult]]
 
 
 class _Admission(UserManager, SimpleRoleRuleset):
-    """Admits users when they log in and at each request: a reload may have revoked their token."""
+    """Admits users when they log in, and again at each request, because a reload may have revoked their
+    token.
+    """
 
     def __init__(self, admit: MayRead) -> None:
         super().__init__()
@@ -108,7 +112,7 @@ class _Admission(UserManager, SimpleRoleRuleset):
 class _Items(MonitoredItemService):
     """The subscribed values of one subscription.
 
-    For usual filters, this class is three times as fast as asyncua's.
+    Without a filter by deadband, it sends a value three times as fast as asyncua's class.
     """
 
     async def datachange_callback(self, handle: int, value: Any, error: Any = None) -> None:
@@ -129,7 +133,10 @@ class _Items(MonitoredItemService):
 
 
 class _ClientSession(InternalSession):
-    """A session with limits. Its token is random: a client that guessed it could take over the session."""
+    """A client's session, with limits.
+
+    Its authentication token is random, because a client that guessed it could take over the session.
+    """
 
     def __init__(self, server: _Internal, *arguments: Any, **more: Any) -> None:
         super().__init__(server, *arguments, **more)
@@ -157,7 +164,7 @@ class _ClientSession(InternalSession):
         wanted = params.NodesToBrowse
         for params.NodesToBrowse in ([one] for one in wanted):
             found += await super().browse(params)
-            await asyncio.sleep(0)  # stops of other clients may be served here
+            await asyncio.sleep(0)  # let other tasks run, because a client may have sent a stop
         return found
 
     async def translate_browsepaths_to_nodeids(self, params: Any) -> Any:
@@ -199,7 +206,7 @@ def _check_count(operations: Any) -> None:
 
 
 class _Internal(InternalServer):
-    """asyncua's server without its network part, with limits."""
+    """asyncua's server without its network connections, with limits."""
 
     def __init__(self, admit: MayRead, stop: Stop) -> None:
         self.admission = _Admission(admit)
@@ -223,7 +230,7 @@ class _Internal(InternalServer):
         )
 
     def register_server(self, server: Any, conf: Any = None) -> None:
-        # not supported, because asyncua would store every server address that clients send
+        # asyncua would store every server address that clients send in this request
         raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
 
     @property
@@ -233,7 +240,7 @@ class _Internal(InternalServer):
 
 
 class _Protocol(OPCUAProtocol):
-    """A connection that ends if its client sends an endless message or does not read."""
+    """A client's connection. It ends if the client sends an endless message or does not read."""
 
     def connection_made(self, transport: Any) -> None:
         transport.set_write_buffer_limits(high=MOST_UNREAD)
@@ -252,12 +259,12 @@ class _Protocol(OPCUAProtocol):
             self.transport.abort()
 
     async def _process_one_msg(self, header: Any, buf: Any) -> bool:
-        await asyncio.sleep(0)  # so that clients take turns, with one message each
+        await asyncio.sleep(0)  # let other clients have their turns, after one message of this client
         return bool(await super()._process_one_msg(header, buf))
 
 
 class _Network(BinaryServer):
-    """The server's network part, on a given listening socket."""
+    """The network connections of the server, on a given listening socket."""
 
     def __init__(self, server: InternalServer, listener: socket.socket, limits: TransportLimits) -> None:
         super().__init__(server, *listener.getsockname()[:2], limits)
@@ -273,7 +280,7 @@ class _Network(BinaryServer):
 
 
 class Identity(NamedTuple):
-    """A server's certificate and key, and the application's URI in the certificate, or ""."""
+    """A server's certificate and key, and the application's URI in the certificate ("" if it has none)."""
 
     certificate: x509.Certificate
     key: RSAPrivateKey
@@ -281,7 +288,10 @@ class Identity(NamedTuple):
 
 
 def read_identity(certificate: Path, key: Path) -> Identity:
-    """Read PEM files. Raises ValueError for an unsuitable pair, OSError for an unreadable file."""
+    """Read a certificate and its key from PEM files.
+
+    Raises ValueError for an unsuitable pair, OSError for an unreadable file.
+    """
     secret: Any = None
     with suppress(ValueError, TypeError, UnsupportedAlgorithm):  # TypeError: the key has a password
         found = x509.load_pem_x509_certificate(certificate.read_bytes())
@@ -299,7 +309,10 @@ def read_identity(certificate: Path, key: Path) -> Identity:
 
 
 class PlantServer(Server):
-    """An OPC UA server. `admit` returns whether a user may read, and `stop` carries out a method."""
+    """The OPC UA server.
+
+    `admit` returns whether a user may read, and `stop` calls a method, which is a stop.
+    """
 
     def __init__(self, listener: socket.socket, admit: MayRead, stop: Stop) -> None:
         self.internal = _Internal(admit, stop)
@@ -308,7 +321,7 @@ class PlantServer(Server):
         self.limits = TransportLimits(CHUNK, CHUNK, MOST_REQUEST // CHUNK + 1, MOST_REQUEST)
 
     async def open(self, version: str, identity: Identity | None) -> None:
-        """Prepare the address space; without identity, connections are not encrypted."""
+        """Prepare the server and its address space. Without `identity`, connections are not encrypted."""
         policies, uri = [ua.SecurityPolicyType.NoSecurity], ""
         if identity is not None:
             policies, uri = [*POLICIES], identity.uri
@@ -319,7 +332,7 @@ class PlantServer(Server):
         self.name = "multidrop"
         await self.init()
         await self.set_application_uri(uri or f"urn:{socket.gethostname()}:multidrop")
-        # gets the namespace index 2, because two namespaces exist already
+        # gets the index 2, because a server has two namespaces already
         await self.register_namespace(NAMESPACE)
         await self.set_build_info(PRODUCT, "multidrop", "multidrop", version, "", datetime.now(UTC))
         for name in OPERATION_LIMITS:
@@ -334,9 +347,10 @@ class PlantServer(Server):
         await self.bserver.start()
 
     async def stop(self) -> None:
-        """Disconnect all clients, also those that do not read, and remove all nodes.
+        """Disconnect all clients, even those that do not read, and remove all nodes.
 
-        The nodes are removed one by one, because a garbage collection would stop all threads for 0.2 s.
+        The nodes are removed one by one. Left to the garbage collector, they would stop all threads for 0.2
+        s.
         """
         for transport in [*self.iserver.asyncio_transports]:
             transport.abort()

@@ -1,4 +1,4 @@
-// The page's views, keyboard shortcuts and redraw timer: it draws texts and plots five times a second,
+// Show the page's views, handle keyboard shortcuts, and redraw: texts and plots five times a second,
 // sparklines once a second.
 
 import { get } from "./data/api.js";
@@ -67,7 +67,7 @@ function showDrive(name, isOpen) {
   else if (wasOpen && !isOpen) table.focusChosen();
 }
 
-// Draw one part of the page; if that fails, the other parts are drawn nevertheless.
+// Call a function that draws one part of the page. If it fails, the other parts are drawn nevertheless.
 function safely(what) {
   try {
     what();
@@ -93,7 +93,7 @@ function tick() {
   if (view === "drives" && beat % 20 === 0) drive.refresh();
 }
 
-// Rebuild the plots after a change of size, colours or time zone.
+// Make the plots again after a change of the window's size, the colours or the time zone.
 function redraw() {
   if (view === "drives" && store.drives.has(chosen))
     safely(() => plots.begin(store.drives.get(chosen).spec));

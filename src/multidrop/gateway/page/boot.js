@@ -1,5 +1,5 @@
-// Choose the page's language, and reload the page if a script could not be fetched: a network change aborts
-// all requests.
+// Choose the page's language, and reload the page if a script could not be fetched. A network change, for
+// example, aborts all requests.
 
 const MOST_TIMES = 3,
   PAUSE_MS = 500;
@@ -15,7 +15,7 @@ function chosenLanguage() {
   }
 }
 
-// Return the texts of the viewer's language by their English wording.
+// Return the page's texts in the viewer's language, by their English wording.
 async function fetchTexts() {
   const known = tag => ["en", ...TRANSLATED].find(name => name === tag.split("-")[0]);
   const chosen = known(chosenLanguage() ?? ""),
@@ -54,7 +54,7 @@ async function translatePage() {
 globalThis.texts = fetchTexts();
 translatePage();
 
-// Do not reload while a dialog is open: the dialog may be for a stop.
+// Do not reload the page while a dialog is open, because it may be the question about a stop.
 const loadAgain = () => document.querySelector("dialog[open]") || location.reload();
 
 addEventListener(

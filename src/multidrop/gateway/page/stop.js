@@ -1,4 +1,5 @@
-// Stops of all drives and of one. This file needs only the dialog, no other part of the page.
+// Stops of one drive and of all drives. This file needs only the dialog and no other part of the page, so
+// that stops work even if the rest fails.
 
 import { pieces, said, t } from "./texts.js";
 import { STOP, confirm, send, tell } from "./ui/dialog.js";
@@ -18,7 +19,8 @@ const HARD = t("Use the hard-wired stop at the machine if a motor must stop now.
 const HARD_NOW = t("Use the hard-wired stop at the machine now. This page keeps waiting for the gateway.");
 const TAKEN_MS = 1500; // time limit for the gateway to confirm that it has accepted a stop
 
-// Return the target of "Stop all" in the present view: the button's label, the target's name, the requests.
+// Return what "Stop all" stops in the present view: the button's label, the name of what is stopped, the
+// requests.
 function target() {
   const { drives, lines, plant, fleet } = find("#stopall").dataset;
   const all = drives > 1 ? t("all {n} drives", { n: drives }) : t("all drives");
@@ -44,14 +46,14 @@ function target() {
   };
 }
 
-// Label the button with its target.
+// Write on the button "Stop all" what it stops.
 export function showTarget() {
   const { label, what } = target();
   find("#stopall").textContent = label;
   find("#stopall").title = t("Stop {what}", { what });
 }
 
-// Ask for confirmation, and stop all drives.
+// Ask for confirmation, and stop all drives that the button names.
 async function stopAll() {
   const { what, where, requests } = target();
   const contents = [make("p", {}, where ? `${where} ${HOW}` : HOW)];
@@ -67,8 +69,8 @@ export async function stopOne(name) {
     await stop([["api/stop", { drives: [name] }]], name);
 }
 
-// Show the progress of a stop, and return callbacks for its requests. A working gateway confirms within half
-// a second that it has accepted the stop.
+// Show a stop's progress in a dialog, and return callbacks for the stop's requests. A working gateway
+// confirms within half a second that it has accepted a stop.
 function showProgress(what, isShown) {
   const title = make("span"),
     words = make("p", { role: "alert" });
@@ -99,7 +101,8 @@ function showProgress(what, isShown) {
   };
 }
 
-// Return callbacks for a verb that stops a drive: they open a dialog only if the gateway does not confirm it.
+// Return callbacks for a request whose verb stops a drive. They open a dialog only if the gateway does not
+// confirm that it has accepted the request.
 export const watchStop = name => showProgress(name, false)();
 
 async function stop(requests, what) {
@@ -127,7 +130,8 @@ async function ending(path, body, watch) {
   }
 }
 
-// Return a dialog's title and contents for a stop with a failed request: the failure, and the other results.
+// Return the title and the contents of a dialog about a stop of which a request failed: the failure, and the
+// results of the other requests.
 function failure(error, ends) {
   const isRefused = error.status >= 400 && error.status < 500;
   const others = ends.filter(end => end.told).map(end => outcome(end.told));
@@ -140,7 +144,8 @@ function failure(error, ends) {
   };
 }
 
-// Return a dialog's title and contents for the gateway's answer, and true if all drives have stopped.
+// Return the title and the contents of a dialog with the gateway's answer to a stop, and true if all drives
+// have stopped.
 function outcome(told) {
   const rows = Object.entries(told),
     failed = rows.filter(([, { done }]) => done !== true);
@@ -171,7 +176,7 @@ function outcome(told) {
 
 const WHOLE_MS = 8000; // time limit for loading the other parts of the page
 
-// Show a message if other parts of the page were not loaded in time.
+// Show a message if the page's other files were not loaded in time.
 setTimeout(() => {
   if (document.body.dataset.begun) return;
   find("#notice").textContent = t(
@@ -183,7 +188,7 @@ setTimeout(() => {
 
 find("#stopall").addEventListener("click", stopAll);
 addEventListener("hashchange", showTarget);
-// Stop all also works while a dialog is open; its question then replaces the dialog's.
+// "Stop all" also works while a dialog is open. Its question then replaces that dialog.
 find("#ask").addEventListener("click", event => {
   const isIn = element => {
     const { left, right, top, bottom } = element.getBoundingClientRect();
@@ -198,15 +203,15 @@ find("#stopall").disabled = false;
 find("#notice").hidden = true;
 find("#notice").classList.remove("loading", "bad");
 
-// Return "one" for the key S, "all" for Shift+S, else null. On a keyboard layout without the letter S, the
-// key at its place counts. With caps lock on, S means "all" with or without Shift.
+// Return which stop a key asks for: "one" for S, "all" for Shift+S, else null. On a keyboard layout without
+// the letter S, the key at the same place counts. With caps lock on, S means "all" with and without Shift.
 export function stopKey({ key, code, shiftKey }) {
   const isStop = /^[a-z]$/i.test(key) ? key.toLowerCase() === "s" : code === "KeyS";
   return !isStop ? null : shiftKey || key === "S" ? "all" : "one";
 }
 
 addEventListener("keydown", event => {
-  // The key works like the button, except in text fields.
+  // The key S works like the button, except in text fields.
   const isTyped = event.target.closest?.("input, select, textarea");
   const isOther = event.ctrlKey || event.metaKey || event.altKey || event.repeat;
   if (stopKey(event) === "all" && !isOther && !isTyped) stopAll();

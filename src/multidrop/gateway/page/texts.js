@@ -1,8 +1,8 @@
 // The page's texts in the viewer's language. Code names a text by its English wording; texts.toml has the
-// other languages. If the texts could not be fetched, the page is in English, and its buttons work.
+// translations. If the translations could not be fetched, the page is in English and still works.
 
 const texts = new Map(Object.entries(await globalThis.texts));
-// Placeholders of the gateway's texts, and the values that they stand for: a number, or a register's name.
+// Placeholders in the gateway's texts, and patterns of what they stand for: a number, or a register's name.
 const VALUES = { "{n}": /\d+(\.\d+)?/, "{name}": /^\w+/ };
 
 export const LANGUAGES = [
@@ -12,19 +12,21 @@ export const LANGUAGES = [
 ];
 export const language = document.documentElement.lang;
 
-// The path of the plant's description. The browser's own languages are in each request's headers.
+// The path for requests of the plant's description, with the chosen language. Without a choice, the gateway
+// uses the languages that the browser sends.
 export const plantPath =
   document.documentElement.dataset.chosen === undefined ? "api/plant" : `api/plant?lang=${language}`;
 
-// Return the pieces of a text, with a text or an element in place of each placeholder such as {drive}.
+// Return the pieces of a translated text, with a text or an element in place of each placeholder such as
+// {drive}.
 export const pieces = (english, values = {}) =>
   (texts.get(english) ?? english).split(/\{(\w+)\}/).map((piece, i) => (i % 2 ? values[piece] : piece));
 
-// Return a text with its values.
+// Return a translated text with its values.
 export const t = (english, values) => pieces(english, values).join("");
 
-// Return a text from the gateway, such as "unconfirmed: no reply" or "undervoltage (UV)", in the viewer's
-// language. Parts that texts.toml lacks stay English.
+// Return the translation of a text from the gateway, such as "unconfirmed: no reply" or "undervoltage (UV)".
+// Pieces without a translation stay English.
 export function said(english) {
   const [head, ...rest] = String(english).split(": ");
   return texts.get(english) ?? (rest.length ? `${word(head)}: ${said(rest.join(": "))}` : word(head));
@@ -35,7 +37,8 @@ function word(english) {
   return (texts.get(plain) ?? withValue(plain) ?? plain) + code;
 }
 
-// Return the translation of a text that contains one value, such as "status is not polled"; null without one.
+// Return the translation of a text that contains one value, such as "status is not polled"; null if there is
+// none.
 function withValue(plain) {
   for (const [placeholder, pattern] of Object.entries(VALUES)) {
     const found = texts.get(plain.replace(pattern, placeholder));
@@ -47,7 +50,7 @@ function withValue(plain) {
 // Return a text with a full stop at its end.
 export const sentence = text => (/[.。]$/.test(text) ? text : `${text}.`);
 
-// Keep the choice of a language in this browser, and show the page in this language.
+// Store the choice of a language in this browser, and show the page in this language.
 export function choose(name) {
   try {
     localStorage.setItem("multidrop-language", name);

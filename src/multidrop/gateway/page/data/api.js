@@ -1,4 +1,4 @@
-// Requests to the gateway. Failures are Errors whose message is a sentence for the user.
+// Requests to the gateway. A failed request throws an Error whose message is a sentence for the user.
 
 import { said, t } from "../texts.js";
 
@@ -11,7 +11,7 @@ export class Refused extends Error {
 
 const PATIENCE_MS = 15000;
 
-// Return the sentence about a failure in an answer.
+// Return the sentence that tells the user why a request failed.
 export const errorOf = ({ status }, body) =>
   body?.error ? said(body.error) : t("The gateway answered with status {n}.", { n: status });
 
@@ -36,9 +36,9 @@ async function ask(path, options, patience, answered = () => {}) {
 
 export const get = (path, patience = PATIENCE_MS) => ask(path, {}, patience);
 
-// Browsers open at most six connections to a host for all tabs together, and tabs that wait for frames may
-// occupy all six. So a command gets a higher priority than other queued requests. `answered` is called when
-// the head of the answer has arrived.
+// Send a command. Browsers open at most six connections to a host for all tabs together, and tabs that wait
+// for frames may occupy all six. So a command gets a higher priority than other queued requests. `answered`
+// is called when the head of the answer has arrived.
 export const post = (path, body, patience = PATIENCE_MS, answered = undefined) =>
   ask(
     path,

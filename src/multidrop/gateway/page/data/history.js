@@ -1,4 +1,4 @@
-// The recorded history: series and alarms of a time range, and links to download series.
+// The recorded history: values and alarms of a time range, and links to download values.
 
 import { said, t } from "../texts.js";
 import { unit } from "../ui/values.js";
@@ -9,8 +9,9 @@ export const label = (drive, register) => `${drive}.${register}`;
 
 const COLUMNS = ["time", "least", "mean", "most", "missed"];
 
-// Return {series: {label: {time, least, mean, most}}, step_ms}. A null is a gap: a value was missed, or the
-// register was not polled for longer than a value stays current. Throws Refused if no history is kept.
+// Fetch recorded values. Return {series: {label: {time, least, mean, most}}, step_ms}. A null is a gap: a
+// read failed, or the register was not polled for longer than a value stays current. Throws Refused if the
+// gateway keeps no history.
 export async function read(labels, from, to, points) {
   if (!store.plant.history)
     throw new Refused(0, t("No history is kept: the plant file has no [serve.history]."));
@@ -30,7 +31,8 @@ export async function read(labels, from, to, points) {
   return told;
 }
 
-// A register may be polled less often than the plot has points: empty points between two values are no gap.
+// Remove empty points between two values. A register may be polled less often than the plot has points, so
+// such points are no gap unless they last longer than `longest`.
 function withoutPauses(series, longest) {
   const kept = [];
   let pause = [],
@@ -51,14 +53,15 @@ function withoutPauses(series, longest) {
   return Object.fromEntries(COLUMNS.map(column => [column, kept.map(i => series[column][i])]));
 }
 
-// Return the unit in which a series was recorded; the name may have meant another drive then.
+// Return the unit in which values were recorded. The register's name may have meant another drive's register
+// then.
 export const unitOf = (told, spec) => told.unit ?? unit(spec);
 
-// Return true if a series has the present unit of its register.
+// Return true if values were recorded in the present unit of their register.
 export const isPresent = (told, spec) => unitOf(told, spec) === unit(spec);
 
-// Return a sentence for each series that has a part in another unit, which is not drawn. If there is no such
-// part and no value at all, return a sentence that says so.
+// Return sentences about missing curves: one for each register with values in another unit, which are not
+// drawn. If there is none and no register has any value, return a sentence that says so.
 export function notes(series) {
   const found = Object.entries(series),
     mixed = found.filter(([, told]) => told.left_out?.length);
@@ -78,8 +81,9 @@ export const exportLink = (labels, from, to, format) =>
     ["format", format],
   ])}`;
 
-// Return the alarms between two times, newest first, from the gateway's memory or else from the frame. Also
-// return the time from which the gateway knows all alarms, or null if that is unknown.
+// Return the alarms between two times, newest first. They come from the gateway, or from the newest frame if
+// the request fails. Also return the time from which the gateway knows all alarms, or null if that is
+// unknown.
 export async function readAlarms(from, to) {
   try {
     const told = await get(`api/alarms?${query({ from: Math.floor(from), to: Math.ceil(to) })}`);

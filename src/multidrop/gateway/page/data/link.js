@@ -1,4 +1,5 @@
-// The connection to the gateway: one pending request for a frame, and the frame's age.
+// The page's connection to the gateway: one pending request for the next frame (the plant's state), and the
+// newest frame's age.
 
 import { plantPath, t } from "../texts.js";
 import { errorOf, get } from "./api.js";
@@ -12,9 +13,9 @@ const HIDDEN_MS = 1000; // interval of requests from a hidden tab, which holds n
 export const link = { why: "" };
 let under = null; // AbortController of the pending request
 
-// The gateway's clock minus this device's clock in ms, from the Date headers of answers. A Date header has
-// whole seconds, so the difference is only known to lie between `least` and `most`. If 0 also lies between
-// them, no correction is made.
+// The difference of the gateway's clock and this device's clock in ms, from the Date headers of answers. A
+// Date header has whole seconds, so the difference is only known to lie between `least` and `most`. If 0 lies
+// between them too, no correction is made.
 const skew = { least: -Infinity, most: Infinity };
 
 function learnSkew(date, sent, received) {
@@ -29,7 +30,8 @@ function learnSkew(date, sent, received) {
 
 export const correction = () => (skew.least > 0 ? skew.least : skew.most < 0 ? skew.most : 0);
 
-// Return the gateway's time in ms: the later one by two clocks, because this device's clock may be set back.
+// Return the present time of the gateway in ms. Of two computed times it is the later one, because this
+// device's clock may be set back.
 export const now = () => Math.max(Date.now() + correction(), store.time + performance.now() - store.came);
 
 const pause = ms => new Promise(done => setTimeout(done, ms));
@@ -48,7 +50,7 @@ pages.addEventListener("message", () => {
   under?.abort();
 });
 
-// Ask for frames until the page is closed.
+// Request one frame after the other until the page is closed.
 export async function run() {
   let n = NONE,
     isKnown = false;
@@ -78,8 +80,8 @@ export async function run() {
   }
 }
 
-// Return the changes since frame `n`, or a whole frame if the gateway has forgotten frame `n`. Return null
-// without news.
+// Return the changes since frame `n`, or a whole frame if the gateway has forgotten frame `n`. Return null if
+// there is no newer frame.
 async function newer(n) {
   const sent = Date.now();
   under = new AbortController();

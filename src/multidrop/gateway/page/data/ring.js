@@ -1,4 +1,4 @@
-// The newest samples of one register: times in ms and values, NaN for a miss.
+// The newest samples of one register in a ring buffer: times in ms, and values with NaN for a failed read.
 
 const FIRST = 64;
 
@@ -31,7 +31,7 @@ export class Ring {
     this.at = this.count % size;
   }
 
-  // Return times in ms and values since `from`, oldest first; null is a miss.
+  // Return the times in ms and the values of the samples since `from`, oldest first; null is a failed read.
   since(from) {
     const times = [],
       values = [],

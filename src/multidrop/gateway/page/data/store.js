@@ -1,5 +1,5 @@
-// The plant and its newest values, as the gateway sends them, and recent samples of each register for plots.
-// Each value has its time, so that an old value never looks new.
+// The plant's description and newest values, as the gateway sends them, and recent samples of each register
+// for plots. Each value has its time, so that an old value never looks new.
 
 import { t } from "../texts.js";
 import { Ring } from "./ring.js";
@@ -11,19 +11,20 @@ const LOOK_MS = 60000; // time in which the gateway reads all registers of a vie
 const UNSEEN_MS = 5000; // if frames are further apart than this, plots have a gap
 export const LIVE_MS = 1500; // a frame is live for this long; a new frame comes each second at least
 
-// The frame's `time` is in ms of the gateway's clock, `came` in ms of this device's monotonic clock.
+// `time` is that of the newest frame, in ms of the gateway's clock. `came` is when the frame arrived, in ms
+// of this device's monotonic clock.
 export const store = { plant: null, frame: null, time: 0, came: 0, isLost: false, drives: new Map() };
 store.lines = new Map();
 const watchers = [];
 
-// Register a function that is called when the gateway has another plant.
+// Register a function that is called when the gateway sends another plant's description.
 export function onPlant(what) {
   watchers.push(what);
   if (store.plant) what();
 }
 
-// Use a plant description. Values and samples are kept only if drive and register are unchanged: the same
-// name may mean another drive now, or a value in another unit.
+// Store a plant's description. A register's value and samples are kept only if its drive and the register are
+// unchanged, because the same name may mean another drive now, or a value in another unit.
 export function takePlant(plant) {
   const before = store.drives;
   store.plant = plant;
@@ -53,13 +54,14 @@ function sameDrive(old, { family, address }, { port }) {
   return isSame ? old : null;
 }
 
-// Return true if a register of a drive has the same unit, step and names of values as before.
+// Return true if a drive's register has the same unit, step and named values as before.
 function isSame(before, registers, name) {
   const meaning = ({ unit, step, kind, words } = {}) => JSON.stringify([unit, step, kind, words]);
   return meaning(before.registers.get(name)) === meaning(registers.get(name));
 }
 
-// Add the last minute's samples, so that sparklines are full immediately: {drive: {register: [[ms, value]]}}.
+// Add the samples of the last minute, so that sparklines are full immediately. `minute` is {drive: {register:
+// [[ms, value]]}}.
 export function takeMinute(minute) {
   for (const [name, registers] of Object.entries(minute)) {
     const pasts = store.drives.get(name)?.pasts;
@@ -72,7 +74,7 @@ export function takeMinute(minute) {
   }
 }
 
-// Process a frame, or the changes since the previous frame: store each value that is newer than before.
+// Process a frame, or the changes since the previous frame. Values that are newer than before are stored.
 export function takeFrame(told) {
   told.alarms?.forEach(withMs);
   const frame = told.since === undefined ? told : merged(store.frame, told);
@@ -91,18 +93,19 @@ export function takeFrame(told) {
   }
 }
 
-// Replace an alarm's ISO times by ms since 1970.
+// Return an alarm whose times are in ms since 1970 instead of ISO 8601 texts.
 export function withMs(alarm) {
   for (const key of ["time", "ended", "acknowledged"])
     if (alarm[key] !== null) alarm[key] = Date.parse(alarm[key]);
 }
 
-// Note that values after this time (ms) were missed, for example while the page slept: plots get a gap.
+// Mark a gap in all plots after this time (ms), because values were missed, for example while the page slept.
 function leaveGap(ms) {
   for (const { pasts } of store.drives.values()) for (const ring of pasts.values()) ring.add(ms, NaN);
 }
 
-// Return an object with the values of `changes` in place of its own, and so on in the objects in it.
+// Return `before` with the values of `changes` in place of its own. Nested objects are merged in the same
+// way.
 function merged(before, changes) {
   const result = { ...before };
   for (const [key, value] of Object.entries(changes)) {
@@ -112,7 +115,8 @@ function merged(before, changes) {
   return result;
 }
 
-// A row is [value, ms, "ok"], or [null, ms, status, last good value, its ms] if the newest request failed.
+// Store a register's entry of a frame: [value, ms, "ok"], or if the newest read failed: [null, ms, status,
+// last good value, its ms].
 function keep(drive, register, [value, ms, status, lastValue, lastMs]) {
   drive.newest.set(register, { ms, status });
   if (value !== null) drive.good.set(register, { value, ms });
@@ -128,9 +132,9 @@ function most() {
   return Math.max(120, Math.min(6000, Math.floor(SAMPLES / registers)));
 }
 
-// Return the present reading of a register: {value, ms, status, age (ms), isOld}, or null if there never was
-// one. `now` is the gateway's time. A value is old if the gateway says so, if it is a second old and the
-// newest request failed, or if the frame itself is old. A time in the future is from before the gateway's
+// Return the newest value of a register as {value, ms, status, age (ms), isOld}, or null if there never was
+// one. `now` is the gateway's time. A value is old if the gateway says so, if the newest read failed and the
+// value is more than a second old, or if the frame itself is old. If its time is in the future, the gateway's
 // clock was set back.
 export function reading(name, register, now) {
   const drive = store.drives.get(name),
@@ -150,12 +154,13 @@ export function reading(name, register, now) {
 
 let others = { drive: null, values: {} }; // values of the viewed drive's unpolled registers
 
-// Store the newest values of a drive's unpolled registers: {register: [value, ms, status]}.
+// Store the newest values of registers that are not polled: {register: [value, ms, status]}. The gateway
+// reads them while the page shows their drive.
 export function takeOthers(drive, values) {
   others = { drive, values: values ?? {} };
 }
 
-// Return the reading of a register that is polled, or that is read because its drive is viewed.
+// Return the newest value of a register, whether it is polled or only read while the page shows its drive.
 export function known(drive, register, at) {
   const polled = reading(drive, register, at),
     row = others.drive === drive ? others.values[register] : undefined;
@@ -172,35 +177,35 @@ export const holdsFor = (name, register) =>
 
 export const isLive = now => store.frame !== null && !store.isLost && now - store.time < LIVE_MS;
 
-// Return the age of the drive's newest good reply in ms, or null if there is none.
+// Return the age, in ms, of a drive's newest good reply, or null if there is none.
 export function driveAge(name, now) {
   const seen = store.drives.get(name)?.seen ?? null;
   return seen === null ? null : Math.max(0, (isLive(now) ? store.time : now) - seen);
 }
 
-// Return the number of stops of a drive that were called so far.
+// Return the number of a drive's stops so far.
 export const stops = name => store.frame?.drives[name]?.stops ?? 0;
 
-// Return a drive's state. If the state is unknown and the frequency is 0, return "still": the motor is at
-// rest, or runs at a setpoint of 0, which is no fault.
+// Return a drive's state. Return "still" if the state is unknown and the frequency is 0: the motor is at
+// rest, or it runs with setpoint 0.
 export function state(name) {
   const drive = store.frame?.drives[name],
     is = drive?.state ?? "unknown";
   return is === "unknown" && drive?.values?.[key(name, "frequency")]?.[0] === 0 ? "still" : is;
 }
 
-// Return a drive's note, or why its state is unknown.
+// Return a note about a drive's state, such as why it is unknown.
 export const noteOf = name => store.frame?.drives[name]?.note ?? "";
 
-// Return the drive's register for a purpose such as "frequency", or null.
+// Return the name of a drive's register for a purpose such as "frequency", or null.
 export const key = (name, part) => store.drives.get(name)?.spec.key?.[part] ?? null;
 
-// Return the alarms: active ones first, the most serious before the others.
+// Return the newest frame's alarms: active ones first, and the most serious kind first among them.
 export const alarms = () => store.frame?.alarms ?? [];
 
 export const lasting = () => alarms().filter(alarm => alarm.ended === null);
 
-// Return true if the page's user may write this register or send this verb of a drive.
+// Return true if the page's user may write this register of a drive, or send this verb to the drive.
 export const mayWrite = (drive, register) =>
   store.plant?.may?.write?.includes(`${drive}.${register}`) ?? false;
 export const mayAct = (drive, verb) => store.plant?.may?.verbs?.includes(`${drive}.${verb}`) ?? false;

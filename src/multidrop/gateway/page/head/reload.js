@@ -1,4 +1,4 @@
-// Reload of the plant file, with a confirmation and a list of all mistakes.
+// The dialogs for a reload of the plant file: the question, and the list of all mistakes.
 
 import { store } from "../data/store.js";
 import { pieces, t } from "../texts.js";
@@ -35,7 +35,7 @@ export async function reload() {
   await tell(...shown);
 }
 
-// Return the title and contents of a dialog that shows the gateway's answer.
+// Return the title and the contents of the dialog with the gateway's answer.
 function outcome({ done, text, mistakes = [], restart = [] }) {
   if (done === true) {
     const waits = restart.length

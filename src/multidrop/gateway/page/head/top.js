@@ -1,4 +1,5 @@
-// The head of the page: plant, views, the frame's age, clock, the user's rights, and the strip of alarms.
+// The head of the page: plant, views, the newest frame's age, clock, the user's rights, and the strip with
+// alarms.
 
 import { correction, link, now } from "../data/link.js";
 import { LIVE_MS, isLive, lasting, state, store } from "../data/store.js";
@@ -31,7 +32,7 @@ export function showPlant() {
   put(find("#role"), plant.demo ? t("simulated, {right}", { right }) : right);
 }
 
-// Update the head. Called a few times a second.
+// Update the head of the page. Called a few times a second.
 export function drawTop() {
   const at = now(),
     age = at - store.time,
@@ -92,7 +93,7 @@ function tellChange(isNow) {
   told = words || told;
 }
 
-// Show the active alarms with their full text; a click opens the drive.
+// Show the active alarms with their full texts; a click opens the alarm's drive.
 function drawStrip(at) {
   const alarms = lasting(),
     most = innerWidth < 641 ? 2 : 5;
@@ -112,7 +113,7 @@ function drawStrip(at) {
   for (const [age, alarm] of ages) put(age, `, ${clock.since(alarm, at)}`);
 }
 
-// Return the text that the strip shows without active alarms.
+// Return the text that the strip shows if there is no alarm.
 function calm() {
   if (!store.frame) return t("No values yet.");
   const unknown = [...store.drives.keys()].filter(name => state(name) === "unknown").length;

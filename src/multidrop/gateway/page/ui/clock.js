@@ -1,4 +1,4 @@
-// Times as texts: in UTC or local time, as the user chooses, and always with 24 hours.
+// Times as texts: in UTC or local time, as the user chooses, and always with 24 hours a day.
 
 import { language, t } from "../texts.js";
 
@@ -17,7 +17,7 @@ function kept() {
 
 export const isUtc = () => zone === "UTC";
 
-// Switch between UTC and local time, and keep the choice in this browser.
+// Switch between UTC and local time, and store the choice in this browser.
 export function switchZone() {
   zone = isUtc() ? "local" : "UTC";
   formats = {};
@@ -53,19 +53,19 @@ export function moment(ms) {
   return `${formatted(ms, far ? "year" : "day", far ? { ...DAY, year: "numeric" } : DAY)}, ${time(ms)}`;
 }
 
-// Return the time alone if it is of today, else date and time.
+// Return only the time of day if the time is today, else date and time.
 export const when = ms => (day(ms) === day(Date.now()) ? time(ms) : moment(ms));
 
 export const zoneName = () => (isUtc() ? "UTC" : t("local"));
 
-// Convert a time (ms) to the text of an input field of type datetime-local, and such a text to a time.
+// Convert a time (ms) to the text of an input field for date and time, and such a text to a time.
 export function field(ms) {
   const shift = isUtc() ? 0 : new Date(ms).getTimezoneOffset() * 60000;
   return new Date(ms - shift).toISOString().slice(0, 19);
 }
 export const parsed = text => Date.parse(isUtc() ? `${text}Z` : text);
 
-// Return a duration in its largest whole unit: "0.4 s", "42 s", "7 min", "3.5 h", "12 days".
+// Return a duration as text, in the largest unit that fits: "0.4 s", "42 s", "7 min", "3.5 h", "12 days".
 export function lasting(ms) {
   const s = Math.max(0, ms) / 1000;
   if (s < 10) return t("{n} s", { n: s.toFixed(1) });
@@ -75,11 +75,13 @@ export function lasting(ms) {
   return t("{n} days", { n: Math.round(s / 86400) });
 }
 
-// Return for how long an alarm has lasted; an alarm present at the gateway's start may have begun before.
+// Return for how long an alarm has lasted. An alarm that was present when the gateway started may have begun
+// earlier.
 export const since = ({ time: begin, is_before: isBefore }, now) =>
   isBefore ? t("since before {time}", { time: when(begin).slice(0, -3) }) : lasting(now - begin);
 
-// Return texts for a plot's time axis, as precise as the distance of its ticks needs. uPlot's times are in s.
+// Return the texts of a time axis, with as many digits as the distance between its ticks needs. uPlot's times
+// are in s.
 export function ticks(splits, step) {
   return splits.map(s => {
     const ms = s * 1000;
@@ -90,6 +92,7 @@ export function ticks(splits, step) {
   });
 }
 
-// Return a Date whose local fields show the chosen time zone: uPlot places its ticks by these fields.
+// Return a Date whose local fields show the time in the chosen time zone. uPlot places its ticks by these
+// fields.
 export const tickDate = s =>
   isUtc() ? globalThis.uPlot.tzDate(new Date(s * 1000), "Etc/UTC") : new Date(s * 1000);

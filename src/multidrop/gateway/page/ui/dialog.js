@@ -9,9 +9,10 @@ let answer = null, // function that resolves the open question's promise
 
 const dialog = () => find("#ask");
 
-// If the dialog opens or closes during a double click, the second click would press a button that the user
-// has not seen. So that click is ignored, unless it asks for a stop. Also ignored are clicks, Enter and Space
-// from before the change was drawn, for example on a slow page, and repetitions of held keys.
+// A click to ignore: if the dialog opens or closes during a double click, the second click would press a
+// button that the user has not seen. It is ignored, unless it asks for a stop. TWICE_MS and NEAR_PX say when
+// two clicks are a double click. Also ignored are clicks, Enter and Space from before the change was drawn,
+// for example on a slow page, and repetitions of held keys.
 const TWICE_MS = 500,
   NEAR_PX = 30,
   AT_ONCE = "#stopall, .stop";
@@ -38,7 +39,8 @@ function isOfBefore({ clientX: x, clientY: y, timeStamp: time, detail }) {
   return time < drawn || (isNear && (detail > 1 || time - Math.max(last.time, drawn) < TWICE_MS));
 }
 
-// While the dialog is open, Stop all is the only button outside it that works.
+// Return true if a click on this element is never ignored: a button for a stop, or the area outside the open
+// dialog, in which only "Stop all" works.
 const isAtOnce = target => target === dialog() || target.closest?.(AT_ONCE);
 
 addEventListener(
@@ -71,16 +73,16 @@ for (const kind of ["keydown", "keyup"])
     true,
   );
 
-// Show the dialog and return the choice, as `show` does. The question about a stop opens immediately; other
-// dialogs wait until that question is answered.
+// Show the dialog and return the user's choice, as `show` does. The question about a stop opens immediately.
+// Other dialogs wait until that question is answered.
 async function open(title, contents, buttons, { cancel = t("Cancel"), kind } = {}) {
   if (kind === STOP) return (stopAsked = show(title, contents, buttons, cancel));
   while (stopAsked) await stopAsked;
   return show(title, contents, buttons, cancel);
 }
 
-// Show the dialog and return the choice: a button's name, or null for cancelled. `buttons` are
-// [name, text, class]; Cancel comes first and has the focus, so that Enter alone does nothing.
+// Show the dialog and return the user's choice: a button's name, or null if cancelled. `buttons` are [name,
+// text, class]. "Cancel" is the first button and has the focus, so that the Enter key alone does nothing.
 function show(title, contents, buttons, cancel) {
   answer?.(null);
   const close = choice => {
@@ -130,19 +132,19 @@ function show(title, contents, buttons, cancel) {
   });
 }
 
-// Ask for confirmation. Return true if it is given.
+// Ask for confirmation. Return true if the user confirms.
 export const confirm = async (title, contents, yes, kind = DANGER) =>
   (await open(title, contents, [["yes", yes, kind]], { kind })) === "yes";
 
-// Show a form in `contents`. Return true if it is submitted.
+// Show a form with these contents. Return true if the user submits it.
 export const confirmForm = async (title, contents, yes, kind = DANGER) =>
   (await open(title, contents, [["submit", yes, kind]], { kind })) === "submit";
 
-// Show a message until it is closed. Return the name of another button if that was pressed.
+// Show a message until the user closes it. Return the name of the button if one of `buttons` was pressed.
 export const tell = (title, contents, buttons = []) =>
   open(title, contents, buttons, { cancel: t("Close") });
 
-// Ask for a token until one is right. Return true if the gateway accepted it.
+// Ask for a token until the gateway accepts one. Return false if the user cancels.
 export async function askToken(why, yes = t("Sign in"), kind = DANGER) {
   let wrong = null;
   for (;;) {
@@ -173,10 +175,10 @@ export async function askToken(why, yes = t("Sign in"), kind = DANGER) {
 const IDLE = { sent: () => {}, answered: () => {} };
 const patienceOf = kind => (kind === STOP ? STOP_PATIENCE_MS : undefined);
 
-// Send a confirmed command and return the answer. If the right to it is missing, let the user sign in and
-// confirm again, and repeat the request. `body` makes the request's body at each confirmation, `kind` is the
-// confirming button's class. `watch` has `sent` and `answered`, which are called around each request. Raises
-// Refused.
+// Send a confirmed command and return the answer. If the user lacks the right to send it, let the user sign
+// in and confirm again, and repeat the request. `body` makes the request's body at each confirmation, and
+// `kind` is the CSS class of the confirming button. `watch` has the functions `sent` and `answered`, which
+// are called before and after each request. Throws Refused.
 export async function send(path, body, { kind = DANGER, patience = patienceOf(kind), watch = IDLE } = {}) {
   dispatchEvent(new Event("command"));
   const sent = async () => {

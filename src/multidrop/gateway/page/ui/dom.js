@@ -1,9 +1,9 @@
-// Makes HTML elements. A text always becomes a text node, so no drive's name can become markup.
+// Make HTML elements. A text always becomes a text node, so that no drive's name can become markup.
 
 const SVG = "http://www.w3.org/2000/svg";
 
-// Return an element. An attribute with the prefix "on" becomes a listener; an attribute with the value null
-// or false is left out. Children are elements, texts, or null, which is ignored.
+// Return an element. An attribute whose name starts with "on" becomes a listener. An attribute with the value
+// null or false is left out. Children are elements, texts, or null, which is ignored.
 export function make(tag, attributes = {}, ...children) {
   const element = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
@@ -17,10 +17,11 @@ export function make(tag, attributes = {}, ...children) {
   return element;
 }
 
-// Return a name from outside, isolated so that its writing direction cannot reorder the text around it.
+// Return an element for a name from the plant file, isolated so that its writing direction cannot reorder the
+// text around it.
 export const named = (text, attributes = {}) => make("bdi", attributes, String(text));
 
-// Return the head of a table. Each column's head is a text, or a text and its CSS class; an empty text makes
+// Return the head of a table. Each column's heading is a text, or a text and a CSS class. An empty text makes
 // a cell without a heading.
 export const tableHead = heads =>
   make(
@@ -36,7 +37,7 @@ export const tableHead = heads =>
     ),
   );
 
-// Return one of the shapes in index.html.
+// Return one of the symbols that index.html defines.
 export function glyph(name) {
   const svg = document.createElementNS(SVG, "svg"),
     use = document.createElementNS(SVG, "use");
@@ -47,7 +48,7 @@ export function glyph(name) {
   return svg;
 }
 
-// Set an element's text only if it differs, because most cells stay the same.
+// Set an element's text, but only if it differs, because most texts stay the same.
 export function put(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
@@ -61,7 +62,7 @@ export const fill = (element, ...children) =>
 
 export const find = (selector, at = document) => at.querySelector(selector);
 
-// Return the value of a colour of base.css for a canvas, in the present theme.
+// Return the value, in the present theme, of a colour that base.css defines; canvases need it.
 export function colour(name) {
   const probe = make("i", { class: "hidden" });
   document.body.append(probe);
@@ -71,7 +72,7 @@ export function colour(name) {
   return found;
 }
 
-// Announce a sentence to screen readers.
+// Make screen readers say a sentence.
 export function say(text) {
   put(find("#said"), text);
 }

@@ -1,4 +1,5 @@
-// Plots made by uPlot: theme, axes, and one time axis for series with different sample times.
+// Plots made with the library uPlot: theme, axes, and one time axis for registers with different sample
+// times.
 
 import { t } from "../texts.js";
 import * as clock from "./clock.js";
@@ -12,14 +13,15 @@ const FONT = "11px system-ui, DejaVu Sans, sans-serif";
 
 export const isThere = () => Boolean(globalThis.uPlot);
 
-// Return the range of a value axis with a margin, and wide enough that noise does not fill the plot.
+// Return a function that gives a value axis its range, with a margin, and at least `least` wide so that noise
+// does not fill the plot.
 export const wide = least => (_, low, high) => {
   if (low === null || high === null) return [0, 1];
   const margin = Math.max((high - low) * 0.12, least);
   return [low - margin, high + margin];
 };
 
-// Return a number of an axis as the page writes all numbers: with a decimal point, without groups of digits.
+// Return an axis number as the page writes all numbers: with a decimal point, without groups of digits.
 const plain = value => (value === null ? null : String(Number(value.toPrecision(12))));
 
 // Return a plot. `options` may have series, height, bands, range, hasTimes, cursor, hooks; times are in s.
@@ -58,8 +60,8 @@ export function makePlot(
   );
 }
 
-// Return the indices of isolated values, which have a gap on both sides and so no line. They occur if a
-// register is read less often than the plot has points.
+// Return the indices of isolated values. A value with a gap on both sides has no line, so it needs a dot.
+// Such values occur if a register is read less often than the plot has points.
 export function alone({ data }, k) {
   const places = [...data[k].keys()].filter(i => data[k][i] !== undefined), // skip times of other series
     isGap = n => (data[k][places[n]] ?? null) === null;
@@ -67,7 +69,7 @@ export function alone({ data }, k) {
 }
 
 // Return the newest value of a column at a time (s), or null if that value is older than `holdMs`. Registers
-// are read one after the other, so at the time of one register's sample the others have none.
+// are read one after the other, so at the time of one register's sample the other columns have no value.
 export function heldAt({ data }, column, time, holdMs) {
   const times = data[0],
     values = data[column];
@@ -76,11 +78,11 @@ export function heldAt({ data }, column, time, holdMs) {
   return i >= 0 && (time - times[i]) * 1000 <= holdMs ? values[i] : null;
 }
 
-// Return the dash pattern of the series of this index: neighbours differ in pattern and colour, and the first
-// 24 series have different combinations.
+// Return the dash pattern of the curve with this index. Neighbours differ in pattern and colour, and the
+// first 24 curves have different combinations.
 export const dashes = index => DASHES[(index + Math.floor(index / 12)) % DASHES.length];
 
-// Return the options of a series drawn as a line, in the colour of this index.
+// Return uPlot's options of a curve, in the colour of this index.
 export const line = (index, label, dash = []) => ({
   label,
   stroke: colour(COLOURS[index % COLOURS.length]),
@@ -89,13 +91,13 @@ export const line = (index, label, dash = []) => ({
   points: { show: false, filter: alone, size: 4, fill: (u, k) => u.series[k].stroke(u, k) },
 });
 
-// Return the colour of this index for the area of a band.
+// Return the translucent colour of the area between least and largest value of the curve with this index.
 export const translucent = (index, alpha) =>
   colour(COLOURS[index % COLOURS.length])
     .replace("rgb(", "rgba(")
     .replace(")", `, ${alpha})`);
 
-// Return a short piece of the line of this index for the legend.
+// Return an element for the legend: a short piece of the curve with this index.
 export function swatch(index) {
   const mark = make("canvas", { class: "swatch", width: 28, height: 6, "aria-hidden": "true" }),
     pen = mark.getContext("2d");
@@ -114,7 +116,7 @@ export function join(tables) {
   return there.length === 1 ? there[0] : globalThis.uPlot.join(there);
 }
 
-// Return a sentence about a series for screen readers.
+// Return a sentence that describes a curve's values for screen readers.
 export function summary(what, values, unit, digits) {
   const there = values.filter(value => value !== null && value !== undefined);
   if (!there.length) return t("{what}: no values", { what });

@@ -1,4 +1,4 @@
-// Values as texts. An unknown value is a dash, never 0; an old value has its time.
+// Values as texts. An unknown value is shown as a dash, never as 0; an old value is shown with its time.
 
 import { said, t } from "../texts.js";
 import * as clock from "./clock.js";
@@ -24,10 +24,10 @@ const MOST_BITS = 32;
 
 export const words = name => name.replaceAll("_", " ");
 
-// Return a register's title in the viewer's language if the gateway has one, else its name.
+// Return a register's title in the viewer's language, or its name if the gateway has no title.
 export const registerName = ({ name, title: known }) => known || words(name);
 
-// Return a value's number, or its name if the register names its values, without a unit.
+// Return a value as text without its unit: the number, or its name if the register has named values.
 export function text(value, register) {
   if (value === null || value === undefined || Number.isNaN(value)) return UNKNOWN;
   if (register?.kind === "words")
@@ -36,7 +36,8 @@ export function text(value, register) {
   return number(Number(value), register?.digits);
 }
 
-// Return a number with this many decimals; if `digits` is null, as for a float, with all decimals it needs.
+// Return a number with this many decimals. If `digits` is null, as for a float, return all decimals that the
+// number needs.
 export function number(value, digits) {
   if (Number.isInteger(digits)) return value.toFixed(digits);
   if (Math.fround(value) === value)
@@ -60,13 +61,13 @@ export const unit = register =>
 // Return a register's unit in the viewer's language.
 export const unitName = register => said(unit(register));
 
-// Return a text with the register's unit, if any.
+// Return a value's text with the register's unit, if the register has one.
 export const withUnit = (told, register) => `${told} ${unitName(register)}`.trim();
 
 // Return a register's name with its unit, as the head of a plot or a field.
 export const title = register => [registerName(register), unitName(register)].filter(Boolean).join(", ");
 
-// Make the elements of a cell once: the number, its unit, and the time of an old value.
+// Make the elements of a table cell for a value: the number, its unit, and the time of an old value.
 export function makeValue() {
   const parts = {
     number: make("span", { class: "number" }),
@@ -77,12 +78,12 @@ export function makeValue() {
   return parts;
 }
 
-// Show a reading (see store.reading) in the elements that `makeValue` returned.
+// Show a register's newest value (see store.reading) in the elements that `makeValue` returned.
 export function showValue(parts, reading, register, isDated = true, isNamed = isDated) {
   const isThere = reading !== null && reading.value !== null;
   const isOld = isThere && reading.isOld;
   put(parts.number, isThere ? text(reading.value, register) : UNKNOWN);
-  // a number without a unit needs its name
+  // a number without a unit is shown with the register's name
   const isBare = !unit(register) && register?.kind === "number" && isNamed;
   put(parts.unit, isThere ? (isBare ? registerName(register) : unitName(register)) : "");
   put(parts.age, isOld && isDated ? t("{age} old", { age: clock.lasting(reading.age) }) : "");
@@ -91,7 +92,7 @@ export function showValue(parts, reading, register, isDated = true, isNamed = is
   if (parts.whole.title !== why) parts.whole.title = why;
 }
 
-// Return why a value is missing or old, or "" for a fresh value.
+// Return why a value is missing or old; "" for a fresh value.
 function reason(reading) {
   if (reading === null) return t("never read");
   if (reading.value === null) return t("never read: {status}", { status: said(reading.status) });
@@ -101,10 +102,10 @@ function reason(reading) {
   return t("of {time}; since then: {status}", { time: at, status: said(reading.status) });
 }
 
-// Return a number with its noun: "1 drive", "31 drives".
+// Return a number of drives as text: "1 drive", "31 drives".
 export const drives = n => t(n === 1 ? "{n} drive" : "{n} drives", { n });
 
-// Return a share in per cent, or a dash if it is unknown; a small share is never shown as 0.
+// Return a share in per cent, or a dash if it is unknown. A small share is never shown as 0.
 export function share(part) {
   if (part === null || part === undefined) return UNKNOWN;
   const percent = part * 100;
@@ -113,14 +114,15 @@ export function share(part) {
   return percent < 10 ? `${percent.toFixed(1)} %` : `${Math.round(percent)} %`;
 }
 
-// Make the elements of a line's bar once: the used share of its time, and a mark at the planned share.
+// Make the elements of a bar that shows how much of a line's time is used, with a mark at the planned share.
 export function makeUse() {
   const parts = { used: make("i"), planned: make("u") };
   parts.whole = make("span", { class: "use", role: "img" }, parts.used, parts.planned);
   return parts;
 }
 
-// Show two shares, or null for unknown ones, in the elements that `makeUse` returned. Return them as a text.
+// Show the used and the planned share (null if unknown) in the elements that `makeUse` returned. Return both
+// as a text.
 export function showUse({ used: part, planned: mark, whole }, used, planned) {
   part.style.width = `${Math.min(1, used ?? 0) * 100}%`;
   mark.style.left = `${Math.min(1, planned ?? 0) * 100}%`;

@@ -1,4 +1,5 @@
-// Active and ended alarms: faults, motors that stopped by themselves, lost ports and silent drives.
+// The view of active and ended alarms: faults, motors that stopped without a command, lost ports, silent
+// drives.
 
 import { readAlarms } from "../data/history.js";
 import { now } from "../data/link.js";
@@ -83,7 +84,7 @@ function row(alarm) {
   );
 }
 
-// Return an alarm's duration; it is frozen when the gateway is lost.
+// Return how long an alarm has lasted. The time stands still while the gateway does not answer.
 function lasted({ time, ended, is_before: isBefore }) {
   const at = now(),
     isNew = isLive(at) || store.frame === null, // before the first frame the fetched list counts as fresh
@@ -116,7 +117,7 @@ function trendLink({ drive, time, ended }) {
   );
 }
 
-// Ask the user for a note, and acknowledge an alarm.
+// Ask the user for a note, and acknowledge an alarm with it.
 async function acknowledge({ id, drive, line, text }) {
   const field = make("input", { id: "ack-note", maxlength: MOST_NOTE, "data-first": true });
   const contents = [

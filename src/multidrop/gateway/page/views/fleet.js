@@ -1,5 +1,5 @@
-// The fleet: its gateways, the gateway that is master of each line, and the latest moves of lines.
-// Old data are shown with their age, missing data as dashes.
+// The view of a fleet: its gateways, which gateway polls each line as its master, and the latest changes of
+// masters. Old data are shown with their age, missing data as dashes.
 
 import { get } from "../data/api.js";
 import { onPlant, store } from "../data/store.js";

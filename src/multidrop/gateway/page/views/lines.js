@@ -1,4 +1,5 @@
-// The lines: wire used against plan, misses by reason over the last hour, delays of each drive.
+// The view of the lines: used share of time compared with the plan, failed reads of the last hour by reason,
+// response delays of each drive.
 
 import { get } from "../data/api.js";
 import { now } from "../data/link.js";
@@ -13,7 +14,7 @@ const REASONS = ["c2", "c4", "c1", "c3", "c5", "c6"]; // colours
 
 let shown = "";
 
-// Fetch the last hour and redraw everything.
+// Fetch the data of the last hour, and draw the view again.
 export async function show() {
   if (!store.plant) return;
   let told = {},
@@ -136,7 +137,7 @@ function delays(line, told) {
   );
 }
 
-// Draw a bar for each minute, stacked by reason, and a table of the hour's sums.
+// Draw a bar of failed reads for each minute, stacked by reason, and a table with the sums of the hour.
 function misses(minutes) {
   const sums = new Map();
   let asked = 0;

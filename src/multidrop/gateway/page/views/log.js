@@ -1,4 +1,4 @@
-// The audit log: all writes with their callers and results.
+// The view of the audit log: all writes, with who asked for them and their results.
 
 import { get, query } from "../data/api.js";
 import { said, t } from "../texts.js";
@@ -49,10 +49,11 @@ async function fetchMore(before) {
   find("#older").hidden = !more;
 }
 
-// Redraw all times after a change of the time zone.
+// Draw all entries again, because the time zone has changed.
 export const redraw = () => entries.length && fill(find("#log-list"), auditRows(entries, true));
 
-// Return a table of at most `most` entries; with `isWhole` also columns for the drive and the Modbus frame.
+// Return a table of at most `most` entries. If `isWhole`, it also has columns for the drive and the Modbus
+// frame.
 export function auditRows(list, isWhole, most = Infinity) {
   const heads = [
     t("Time, {zone}", { zone: clock.zoneName() }),
@@ -76,9 +77,9 @@ export function auditRows(list, isWhole, most = Infinity) {
   );
 }
 
-// Return the entries without repetitions: a stop is repeated until the drive confirms it. Of equal successive
-// commands to a drive with equal results, only the newest is returned; `times` is their number, `since` the
-// time of the first.
+// Return the entries with repetitions merged, because a stop is repeated until the drive confirms it. If
+// successive commands to a drive and their results are equal, only the newest is returned, with their number
+// in `times` and the time of the first in `since`.
 function repeats(list) {
   const newest = new Map(),
     kept = [];

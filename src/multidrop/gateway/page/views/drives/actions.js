@@ -1,4 +1,4 @@
-// Writes and verbs of one drive: the user confirms the drive's name, the page sends the command once and
+// Writes and verbs of one drive: the user confirms the drive's name, and the page sends the command once and
 // shows the gateway's answer.
 
 import { Refused } from "../../data/api.js";
@@ -17,7 +17,7 @@ const WITH_HZ = new Set(["set_frequency"]);
 const STOPS = new Set(["coast", "emergency_stop"]); // sent even after a stop or a reload
 const TURNS = ["start", "jog", "run", "forward", "reverse"];
 
-// Make the buttons of the verbs that the page's user may send, and the list of outcomes.
+// Make the buttons of the verbs that the page's user may send, and the list of results.
 export function build(spec) {
   const verbs = (spec.verbs ?? []).filter(verb => verb !== "stop" && mayAct(spec.name, verb));
   const box = make(
@@ -66,9 +66,10 @@ function note(drive, what, done, told) {
   dispatchEvent(new Event("written"));
 }
 
-// Return a function that makes the request's body when the user confirms. Call this when the dialog opens:
-// the body names the newest frame that was seen. The function throws if the drive was stopped or the plant
-// was reloaded since: after a reload, names may mean other drives.
+// Return a function that makes the request's body when the user confirms. Call this when the dialog opens,
+// because the body contains the number of the newest frame that the user has seen. The returned function
+// throws if the drive was stopped or the plant was reloaded meanwhile. After a reload, names may mean other
+// drives.
 function seen(drive) {
   const stopped = stops(drive),
     { revision } = store.plant;
@@ -98,7 +99,7 @@ async function deliver(drive, what, path, confirmed, kind = DANGER) {
   }
 }
 
-// Ask for confirmation and send a verb, with a frequency if the verb takes one.
+// Ask for confirmation, and for a frequency if the verb takes one, and send the verb.
 async function act(drive, verb) {
   const turns = TURNS.some(word => verb.includes(word)),
     asked = WITH_HZ.has(verb) ? hertz(drive) : null,
@@ -120,8 +121,9 @@ async function act(drive, verb) {
   await deliver(drive, what, "api/act", isStop ? () => body : withSeen(body), kind);
 }
 
-// Return the input field for a frequency, with its texts. If the setpoint register has another unit than Hz,
-// its value is shown in that unit, and only the register of the maximum frequency limits the input.
+// Return an input field for a frequency in Hz, with its texts. If the setpoint register has another unit, the
+// present setpoint is shown in that unit, and the input is limited only by the register of the maximum
+// frequency.
 function hertz(drive) {
   const { registers } = store.drives.get(drive);
   const setpoint = registers.get(key(drive, "setpoint"));
@@ -138,14 +140,14 @@ function hertz(drive) {
   };
 }
 
-// Return the present value of a register, or null if it is unknown.
+// Return a register's newest value, or null if it is old or unknown.
 function held(drive, register) {
   const found = known(drive, register, now());
   return found && !found.isOld ? found.value : null;
 }
 
-// Return the least and the largest value that may be written: the stricter of the register's own limits and
-// the limits that other registers of the drive hold.
+// Return the least and the largest value that may be written to a register. These are the register's own
+// limits, or the values of other registers that limit it, whichever are stricter.
 function limits(drive, { least, most, at_least: atLeast, at_most: atMost }) {
   const ends = [
     [least, held(drive, atLeast)],
@@ -170,7 +172,7 @@ function present(drive, register) {
     : t("{register} is {value}.", { register: name, value: shown });
 }
 
-// Return a sentence with the allowed values.
+// Return a sentence about the values that may be written.
 function span([least, most], of) {
   const [from, to] = [least, most].map(end => end !== null && `${end} ${of}`.trim());
   if (least !== null && most !== null) return t("Allowed: from {from} to {to}.", { from: least, to });
@@ -205,7 +207,7 @@ export async function change(drive, register) {
 
 const FIELD = { id: "new-value", required: true, "data-first": true };
 
-// The field is empty at first, so that Enter alone sends no value.
+// Return the input field for a value. It is empty at first, so that the Enter key alone sends no value.
 function editor(register, [least, most]) {
   if (register.kind === "words" && register.words) {
     return make(

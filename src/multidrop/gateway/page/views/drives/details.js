@@ -1,4 +1,5 @@
-// Details of the chosen drive that frames lack: response delays, misses by reason, EEPROM budgets, writes.
+// Details of the chosen drive that frames do not contain: response delays, failed reads by reason, EEPROM
+// budgets, writes.
 
 import { get } from "../../data/api.js";
 import { takeOthers } from "../../data/store.js";
@@ -20,7 +21,7 @@ export function build(spec) {
   );
 }
 
-// Fetch the details and redraw; if a request fails, its error is shown in place of its data.
+// Fetch the details and show them. If a request fails, its error is shown in place of its data.
 export async function refresh() {
   const asked = name;
   const [told, log] = await Promise.allSettled([
@@ -93,7 +94,7 @@ const yearly = ({ register, year, budget }) =>
     all: budget ?? UNKNOWN,
   });
 
-// Draw a histogram of response delays: a bar for each range of delays, with the range and the number as text.
+// Draw a histogram of response delays: for each range of delays a bar, the range, and the number of replies.
 function histogram(counts) {
   const most = Math.max(...counts.map(([, n]) => n)),
     last = counts[counts.length - 1][0];

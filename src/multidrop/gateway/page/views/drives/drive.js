@@ -1,4 +1,4 @@
-// One drive: state, plots, registers, delays and results of writes.
+// The view of one drive: state, plots, registers, response delays, and results of writes.
 
 import { now } from "../../data/link.js";
 import { driveAge, isLive, known, noteOf, onPlant, state, store } from "../../data/store.js";
@@ -29,7 +29,8 @@ export function begin() {
   onPlant(() => show(chosen, false));
 }
 
-// Show this drive, or a message if no drive has this name. With `isOpen`, its panel covers a small screen.
+// Show this drive, or a message if no drive has this name. If `isOpen`, the drive's panel covers a small
+// screen.
 export function show(name, isOpen) {
   chosen = name;
   const drive = store.drives.get(name);
@@ -105,7 +106,7 @@ function build({ spec, line }) {
   plots.begin(spec);
 }
 
-// Update the texts, a few times a second.
+// Update the texts of the view. Called a few times a second.
 export function draw() {
   if (!parts) return;
   const at = now(),

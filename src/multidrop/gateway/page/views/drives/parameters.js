@@ -1,4 +1,4 @@
-// All parameters of the selected drive, read on request: as a table, and as files. No parameter is written.
+// All parameters of the chosen drive, read on request, as a table and as files. Nothing is written here.
 
 import { get, query } from "../../data/api.js";
 import { said, t } from "../../texts.js";
@@ -19,8 +19,8 @@ export function build(spec) {
 
 const path = (drive, pairs) => `api/parameters/${encodeURIComponent(drive)}?${query(pairs)}`;
 
-// Fetch and redraw the parameters, repeatedly while the gateway reads them. A failed request's error is shown
-// in place of the data.
+// Fetch the parameters and show them, again and again while the gateway reads them. If a request fails, its
+// error is shown in place of the data.
 async function ask(drive, pairs) {
   const found = await get(path(drive, pairs)).catch(error => ({ state: "failed", error: error.message }));
   if (drive !== name || !find("#parameters")) return;

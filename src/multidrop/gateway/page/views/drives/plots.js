@@ -1,4 +1,5 @@
-// The chosen drive's plots with a common cursor: frequency and setpoint, electric current, another register.
+// The plots of the chosen drive, with a common cursor: frequency and setpoint, electric current, and a
+// register of choice.
 
 import { exportLink, isPresent, label, notes, read } from "../../data/history.js";
 import { now } from "../../data/link.js";
@@ -44,8 +45,8 @@ export function clear() {
   serial++;
 }
 
-// Make the buttons for ranges, and empty elements for plots. `begin` makes the plots when these elements are
-// in the document.
+// Make the buttons for time ranges, and empty elements for the plots. `begin` makes the plots once these
+// elements are in the document.
 export function build(drive) {
   const ranges = make(
     "div",
@@ -87,7 +88,8 @@ function choose(seconds) {
   draw();
 }
 
-// Make the plots. Called when the panel is in the document, and when size, theme or times change.
+// Make the plots. Called when the drive's panel is in the document, and again when size, theme or time zone
+// change.
 export function begin(drive) {
   for (const { plot } of plots) plot?.destroy();
   spec = drive;
@@ -192,7 +194,8 @@ function under(u, specs) {
 const until = () => (isLive(now()) ? store.time : now());
 const needsHistory = () => range > FROM_HISTORY;
 
-// Fetch recorded values. In a short range, fetch only those from before this page's first frame.
+// Fetch recorded values of the shown range. In a short range, fetch only those from before this page's first
+// frame.
 async function fetchPast() {
   const mine = ++serial,
     to = until(),
@@ -224,7 +227,7 @@ function link(labels, from, to) {
   if (csv && labels.length) csv.href = exportLink(labels, from, to, "csv");
 }
 
-// Draw the newest samples of frames; fetched ranges are drawn when they arrive.
+// Draw the newest samples from frames. Longer ranges are drawn when their recorded values arrive.
 export function draw() {
   for (const { plot, specs, box } of plots) {
     const tables = specs.map(r => samples(r));
@@ -237,7 +240,7 @@ export function draw() {
   }
 }
 
-// Return [times, values, most, least] of a register over the shown range.
+// Return [times, values, largest, least] of a register over the shown range.
 function samples(register) {
   const from = until() - range * 1000;
   const kept = past?.series?.[label(spec.name, register.name)],

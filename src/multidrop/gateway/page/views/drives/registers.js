@@ -1,5 +1,5 @@
-// All registers of the selected drive, polled registers first and commands last. Each has its value, unit,
-// place in the manual, and a button to write it if allowed.
+// All registers of the chosen drive, polled ones first and command registers last. Each has its value, unit,
+// place in the manual, and a button to write it if that is allowed.
 
 import { key, known, mayWrite, store } from "../../data/store.js";
 import { said, t } from "../../texts.js";
@@ -60,11 +60,12 @@ function row({ register, value, age }) {
   );
 }
 
-// Of the command registers only the setpoint can be written; verbs write the others.
+// Return true if the register has a button to write it. Settings and the setpoint have one; verbs such as
+// start write the other registers.
 const isOffered = ({ name: register, access }) =>
   (access === "setting" || register === key(name, "setpoint")) && mayWrite(name, register);
 
-// Return the register's place in the manual, its range and period.
+// Return a text with the register's place in the manual, its range, and how often it is polled.
 function about({ place, access, least, most, step, period_s: period, ...register }) {
   const isLimited = typeof least === "number" && typeof most === "number";
   return [

@@ -1,4 +1,4 @@
-// Rows of the table: one for each drive, and one for each line above the line's drives.
+// Rows of the table of drives: one for each drive, and above the drives of each line one for the line.
 
 import { driveAge, isLive, key, noteOf, reading, state, store } from "../../data/store.js";
 import { said, t } from "../../texts.js";
@@ -10,7 +10,8 @@ export const COLUMNS = 8;
 const MANY = 0.01; // share of misses from which a warning is shown
 const FULL_HZ = [50, 60, 80, 100, 150, 200, 300, 400, 600, 1000, 2000, 4000]; // ends of a bar's scale
 
-// Return a line's row and its changing elements. A click on the line's name calls `unfold`, if not null.
+// Return a line's row and the elements in it that change. A click on the line's name calls `unfold`, unless
+// it is null.
 export function makeHead(line, unfold) {
   const name = named(line.name, { class: "linename" });
   const parts = {
@@ -43,7 +44,7 @@ export function makeHead(line, unfold) {
   return parts;
 }
 
-// Return a drive's row and the row's changing elements.
+// Return a drive's row and the elements in it that change.
 export function makeRow(drive) {
   const parts = {
     name: drive.name,
@@ -88,7 +89,7 @@ function stateWord(is, drive, age) {
   return age === null ? t("silent, never answered") : t("silent for {age}", { age: clock.lasting(age) });
 }
 
-// Return the absolute value of a drive's frequency or setpoint in hertz, or null if the value is old.
+// Return a drive's frequency or setpoint in hertz, without its sign, or null if the value is old.
 function hertz(name, part, at) {
   const register = key(name, part),
     found = register && reading(name, register, at);
@@ -98,7 +99,7 @@ function hertz(name, part, at) {
     : null;
 }
 
-// Return the frequency that a full bar means, the same for all drives, or null if no bars are drawn.
+// Return the frequency at which a bar is full. It is the same for all drives, and null if no bars are drawn.
 export function fullBar(at) {
   const shown = [...store.drives.keys()].flatMap(name => {
     const actual = hertz(name, "frequency", at);
@@ -109,7 +110,7 @@ export function fullBar(at) {
   return FULL_HZ.find(hz => hz >= most) ?? most;
 }
 
-// Draw frequency and setpoint as a bar.
+// Draw a drive's frequency and setpoint as a bar.
 function drawBar(r, at, full) {
   const actual = hertz(r.name, "frequency", at),
     set = hertz(r.name, "setpoint", at);
@@ -121,7 +122,8 @@ function drawBar(r, at, full) {
   if (!r.set.hidden) r.set.style.left = length(set);
 }
 
-// Update a drive's row; `full` is the frequency of a full bar in hertz. Return true if the state has changed.
+// Update a drive's row. `full` is the frequency, in hertz, at which a bar is full. Return true if the drive's
+// state has changed.
 export function drawRow(r, at, full) {
   const drive = store.frame?.drives[r.name],
     is = state(r.name),

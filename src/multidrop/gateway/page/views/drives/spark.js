@@ -1,9 +1,9 @@
-// Sparklines: the last minute of a register, drawn in a row of the table. A miss is a gap.
+// Sparklines: small curves of a register's last minute in the rows of the table. A failed read is a gap.
 
 const SECONDS = 60;
 const LEAST_SPAN = 1; // least range of values, so that noise of a standing motor does not look like a run
 
-// Draw samples of the last minute before `until` (ms) into a canvas.
+// Draw the samples of the minute before `until` (ms) into a canvas.
 export function spark(canvas, ring, until, colour) {
   const width = canvas.clientWidth,
     height = canvas.clientHeight,

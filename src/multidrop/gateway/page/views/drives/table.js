@@ -35,7 +35,7 @@ let rows = [],
 const opened = new Set(), // names of the lines whose drives are all shown
   none = make("p", { class: "note", id: "none", role: "status" });
 
-// Build the table and its filter for the plant.
+// Make the table, and the filter for its drives, for the present plant.
 export function begin() {
   onPlant(build);
   const filter = find("#filter");
@@ -101,7 +101,7 @@ function unfold(line) {
   drawFilter();
 }
 
-// Make the rows of lines span all columns that the window's width shows.
+// Make the rows of lines as wide as all columns that the window has room for.
 export function fit() {
   const columns = [...document.querySelectorAll("#table thead th")].filter(
     th => getComputedStyle(th).display !== "none",
@@ -109,7 +109,7 @@ export function fit() {
   for (const th of document.querySelectorAll("#table tr.head th")) th.colSpan = Math.max(1, columns);
 }
 
-// Mark the chosen drive, and make Tab focus it.
+// Mark the chosen drive's row, and let the Tab key focus it.
 export function choose(name) {
   chosen = name;
   const first = rows.find(r => r.name === name) ?? rows[0];
@@ -122,7 +122,7 @@ export function choose(name) {
   drawFilter();
 }
 
-// Return the link of the drive that is this many rows below the focused drive, or null.
+// Return the link of the drive that is `step` rows below the focused drive, or null.
 export function neighbour(step) {
   const there = rows.filter(r => !r.row.hidden);
   const focused = there.findIndex(r => r.link === document.activeElement);

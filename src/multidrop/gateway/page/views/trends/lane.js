@@ -1,4 +1,4 @@
-// Alarms as bars over the time axis of the trends.
+// Alarms as bars, drawn over the time axis of the trends.
 
 import { readAlarms } from "../../data/history.js";
 import { now } from "../../data/link.js";
@@ -45,7 +45,7 @@ export async function draw(place, from, to, drives) {
   );
 }
 
-// Return a bar over the time before the gateway's start, because the alarms of that time are unknown.
+// Return a bar for the time before the gateway's start, of which the alarms are unknown.
 function unknown(since, from, to) {
   const text = t("unknown: the gateway started later"),
     shown = make("span", { class: "unknown", title: text }, text);

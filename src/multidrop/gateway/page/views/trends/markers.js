@@ -1,5 +1,5 @@
-// Two markers in trends, A and B: the values at each marker, and the time and differences between them. A
-// third marker is at the moment of a trigger.
+// Two markers in the trends, A and B, with a table of the values at each marker and of their differences. A
+// third marker shows the moment of a trigger.
 
 import { label } from "../../data/history.js";
 import { said, t } from "../../texts.js";
@@ -13,13 +13,14 @@ const marks = { A: null, B: null, [TRIGGER]: null }; // time of each marker in m
 let plots = () => [],
   view = () => ({ from: 0, to: 0 });
 
-// `getPlots` returns the plots of the trends, `getView` the time range that they show.
+// Set up the markers. `getPlots` returns the plots of the trends, and `getView` the time range that they
+// show.
 export function begin(getPlots, getView) {
   [plots, view] = [getPlots, getView];
 }
 
-// Return the two buttons. A button puts its marker under the cursor, or into the shown range if there is no
-// cursor; arrow keys move the marker.
+// Return the buttons of the two markers. A button puts its marker at the mouse cursor, or into the shown
+// range if there is no cursor. Arrow keys move the marker.
 export const buttons = () =>
   ["A", "B"].map(name =>
     make(
@@ -36,7 +37,7 @@ export const buttons = () =>
     ),
   );
 
-// Put a marker under the cursor. The buttons and the keys a and b call this.
+// Put a marker at the mouse cursor. Called by the buttons, and by the keys a and b.
 export function place(name) {
   const { from, to } = view(),
     u = plots()[0]?.plot,
@@ -67,7 +68,7 @@ function set(name, ms) {
   draw();
 }
 
-// Put the third marker at the moment of a trigger; the next drawing of the plots shows it.
+// Put the third marker at the moment of a trigger. It is drawn when the plots are drawn next.
 export const setTrigger = ms => (marks[TRIGGER] = ms);
 
 // Draw the markers into a plot. uPlot calls this after it has drawn the plot.
@@ -91,7 +92,7 @@ export function mark(u) {
   }
 }
 
-// Return a column's value at a time, or null if the column has no current value then.
+// Return a column's value at a time (ms), or null if the column has no current value at that time.
 const at = (u, column, ms, holdMs) => (ms === null ? null : heldAt(u, column, ms / 1000, holdMs));
 
 // Write the table of the values at the markers.

@@ -1,4 +1,4 @@
-// The selection of drives and quantities for trends.
+// The choice of the drives and registers that the trends show.
 
 import { key, state, store } from "../../data/store.js";
 import { t } from "../../texts.js";
@@ -26,7 +26,7 @@ export function begin(into, what) {
 
 let wanted = null; // drive named by the page's address before the plant was known
 
-// Remove drives and quantities from the selection that this plant lacks; if none are left, select a default.
+// Deselect the drives and registers that the present plant lacks. If none are left, select a default.
 export function takePlant() {
   chosen = chosen.filter(name => store.drives.has(name));
   if (wanted !== null) choose(wanted);
@@ -51,7 +51,8 @@ export function choose(name) {
   draw();
 }
 
-// Select the drives of these signals, and the signals that are numbers, at most MOST_SIGNALS of them.
+// Select the drives of these registers, and the registers whose values are numbers, at most MOST_SIGNALS of
+// them.
 export function chooseSignals(signals) {
   chosen = [...new Set(signals.map(({ drive }) => drive))].filter(name => store.drives.has(name));
   const there = numbers().map(({ name }) => name);
@@ -62,7 +63,8 @@ export function chooseSignals(signals) {
 }
 
 export const drives = () => chosen;
-// Return the selected registers that a selected drive polls. Others have no checkbox to deselect them.
+// Return the selected registers that a selected drive polls. The others are not shown, so the user could not
+// deselect them.
 export const quantities = () => {
   const there = numbers().map(({ name }) => name);
   return registers.filter(name => there.includes(name));

@@ -1,4 +1,5 @@
-// A plot of one quantity of several drives from the history. Bands show each drive's least and largest value.
+// A plot of one register of several drives, from recorded values. A band shows each drive's least and largest
+// value.
 
 import { label } from "../../data/history.js";
 import { holdsFor, store } from "../../data/store.js";
@@ -10,7 +11,8 @@ import { number, registerName } from "../../ui/values.js";
 import * as markers from "./markers.js";
 import * as picker from "./picker.js";
 
-// Make the plot of one quantity of these drives. `set` is called with the time range of a mouse drag.
+// Make the plot of one register of these drives. `set` is called with the time range that the user drags the
+// mouse over.
 export function makeTrend(place, { register, unit, drives }, told, { view, set, count, stepMs }) {
   const spec = store.drives.get(drives[0]).registers.get(register);
   const name = registerName(spec),
@@ -71,15 +73,15 @@ export function makeTrend(place, { register, unit, drives }, told, { view, set, 
   return { plot, drives, holds, spec, register, unit };
 }
 
-// Return the number of characters of the longest value.
+// Return the length, in characters, of the longest value's text.
 function widest(values, digits) {
   const there = values.filter(value => value !== null && value !== undefined),
     ends = [there.reduce((a, b) => Math.min(a, b), 0), there.reduce((a, b) => Math.max(a, b), 0)];
   return Math.max(...ends.map(value => number(value, digits).length));
 }
 
-// Return the legend: each drive's value at the cursor. Without a cursor, the names of several drives take the
-// same space, so that the plot does not move when the cursor enters it.
+// Return the legend: each drive's value at the cursor. If there is no cursor, the drives' names take the same
+// space, so that the plot does not move when the cursor enters it.
 function under(u, { drives, marks, widths, holds, spec }) {
   const i = u.cursor.idx ?? null,
     at = i === null ? undefined : u.data[0][i];

@@ -1,4 +1,4 @@
-// Trends of recorded values over any time range: zoom, markers, a lane of faults, and export files.
+// The view of trends: recorded values over any time range, with zoom, markers, alarms, and files to export.
 
 import { exportLink, label, notes, read, unitOf } from "../../data/history.js";
 import { now } from "../../data/link.js";
@@ -83,7 +83,7 @@ export function begin() {
   );
 }
 
-// Show the view; a link to it may name a drive and a time range.
+// Show the view. Its link may name a drive and a time range.
 export function show(options) {
   isShown = true;
   if (options.get("drive")) picker.choose(options.get("drive"));
@@ -150,7 +150,7 @@ export function back() {
   ask();
 }
 
-// Fetch the selected series after SETTLE_MS; a later call replaces this one.
+// Fetch the selected registers' values after SETTLE_MS, unless this is called again before.
 function ask() {
   clearTimeout(waiting);
   showSpan();
@@ -217,7 +217,7 @@ function letGo() {
   if (isDue) draw();
 }
 
-// Draw the newest fetched data; called again after a change of size, theme or time zone.
+// Draw the data that were fetched last. Called again after a change of size, theme or time zone.
 export function draw() {
   isDue = isDragged;
   if (isDue) return;
@@ -232,7 +232,7 @@ export function draw() {
   markers.draw();
 }
 
-// Return quantity, unit and drives of each plot: drives with different units need different plots.
+// Return the register, unit and drives of each plot. Drives with different units need different plots.
 function parted() {
   const found = new Map();
   for (const register of picker.quantities())

@@ -1,4 +1,5 @@
-// The choice of a trigger in the trends: the time around the last moment at which its condition became true.
+// The choice of a trigger in the trends. A trigger is a condition in the plant file; the trends show the time
+// around the last moment at which it became true.
 
 import { get } from "../../data/api.js";
 import { now } from "../../data/link.js";
@@ -19,20 +20,21 @@ let last = [], // the gateway's last triggers, newest first
   fetchAgain = () => {};
 const choice = make("select", { id: "trigger", hidden: true, "aria-label": t("Last trigger"), onchange });
 
-// Return the choice. `set` is called with the time range around a trigger, and `ask` while its values arrive.
+// Return the element for the choice. `set` is called with the time range around the chosen trigger, and `ask`
+// repeatedly while values of that range arrive.
 export function begin(set, ask) {
   [setRange, fetchAgain] = [set, ask];
   return choice;
 }
 
-// Look for new triggers while the trends are shown.
+// Look for new triggers periodically while the trends are shown.
 export function watch(is) {
   isShown = is;
   clearTimeout(timer);
   if (is) look();
 }
 
-// Show no trigger, because another time range was chosen.
+// Forget the shown trigger, because the user has chosen another time range.
 export function leave() {
   chosen = null;
   choice.value = "";
@@ -53,13 +55,13 @@ async function look() {
     if (newest && newest.time !== chosen.time) around(newest);
     else if (newest && isArriving(newest)) fetchAgain();
   } catch {
-    // the page's head says that the gateway does not answer
+    // not reported here: the head of the page says that the gateway does not answer
   }
   clearTimeout(timer);
   if (isShown) timer = setTimeout(look, LOOK_MS);
 }
 
-// Return true if the newest values around a trigger may have come since the previous look.
+// Return true if newer values around a trigger may have arrived since the values were fetched.
 const isArriving = one => now() < Date.parse(one.to) + LATE_MS + LOOK_MS;
 
 function draw() {
@@ -80,7 +82,7 @@ function onchange() {
   else leave();
 }
 
-// Show the time around a trigger, with a marker at its moment.
+// Show the time range around a trigger, and put the third marker at its moment.
 function around(one) {
   markers.setTrigger(Date.parse(one.time));
   picker.chooseSignals(one.signals);
