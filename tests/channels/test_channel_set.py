@@ -120,7 +120,7 @@ def test_derivative_needs_two_values_without_an_outage_between_them() -> None:
 
 def test_computed_row_has_the_status_and_time_of_the_newest_missing_value() -> None:
     made = channels(Channel("power", "voltage * current", "W"), voltage="V", current="A")
-    assert made.compute([row(0, 1.0, 400.0)]) == []  # the current is not known yet
+    assert made.compute([row(0, 1.0, 400.0)]) == []  # the register with the current has no value yet
     (first,) = made.compute([row(0, 2.0, 400.0), row(1, 2.0, 2.0)])  # one request
     assert first == SlotRow(2, UTC + 2 * S, 2 * S, 1000, 800.0, Status.OK)
     (second,) = made.compute([row(1, 3.0, None, Status.BAD_CHECKSUM)])

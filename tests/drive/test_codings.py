@@ -97,7 +97,7 @@ def declared(**registers: Any) -> type[Drive]:
 
 
 def row_of(family: type[Drive], name: str, data: bytes, at: int = 0) -> Row:
-    """Return the row into which the core decodes a reply's data."""
+    """Return the polled row that the C core makes of a reply's data."""
     columns = Columns(1)
     layout = RowLayout(0, [row_field(family.register(name), at, 0)])
     assert add_rows(columns, layout, completion(5, first_ns=9, words=words_of(data)), UTC_0)

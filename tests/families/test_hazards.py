@@ -1,8 +1,8 @@
 """Hazards: dangerous frames that a naive client would send, and the frames that this library sends instead.
 
-There is a row for each address collision between families, and for each error or gap in a family's document
-that concerns a client. The frame `naive`, printed in the document if possible, must never be sent. `sends`
-has all frames that are sent instead, except reads. Both are without checksums.
+The table has a row for each address that families use differently, and for each error or omission in a
+document that concerns a client. The frame `naive`, printed in the document if possible, must never be sent.
+`sends` has all frames that are sent instead, except reads. Both are without checksums.
 """
 
 from __future__ import annotations

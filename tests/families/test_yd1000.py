@@ -288,7 +288,7 @@ def yd_word(word: int) -> str:
 @table(
     ("options", "forward", "reverse"),
     [
-        ({"setpoint_by_fnod": 1}, 0x8400, 0x8600),  # both printed in section 8.1
+        ({"setpoint_by_fnod": 1}, 0x8400, 0x8600),  # both words are printed in section 8.1
         ({"second_ramp": 1}, 0xC440, 0xC640),
         ({"second_ramp": 1, "setpoint_by_fnod": 1}, 0x8440, 0x8640),
         ({"second_ramp": 0, "setpoint_by_fnod": 0}, 0xC400, 0xC600),

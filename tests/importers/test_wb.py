@@ -46,7 +46,7 @@ def test_registers_of_a_wb_subdevice_are_shifted_for_each_channel_that_uses_it(t
     assert omissions(device) == []
 
 
-def test_shifts_of_nested_wb_subdevices_are_added(tmp_path: Path) -> None:
+def test_shifts_of_nested_wb_mqtt_serial_subdevices_are_added(tmp_path: Path) -> None:
     inner = {"device_type": "in", "device": {"channels": [VOLTAGE]}}
     used = {"name": "Inner", "device_type": "in", "shift": 3}
     document = with_subdevice(
@@ -99,7 +99,7 @@ def test_wb_subdevices_of_unknown_address_are_reported_as_not_imported(
         ({"format": "s8"}, {"number_format": "I8"}),
     ],
 )
-def test_bits_of_a_wb_register_are_imported_as_a_part_of_the_word(
+def test_bits_of_a_wb_mqtt_serial_register_are_imported_as_a_part_of_the_word(
     tmp_path: Path, keys: dict[str, Any], expected: dict[str, Any]
 ) -> None:
     device = channel(tmp_path, **keys)
@@ -107,12 +107,12 @@ def test_bits_of_a_wb_register_are_imported_as_a_part_of_the_word(
     assert gaps(device, "a") == []
 
 
-def test_bits_across_three_wb_registers_are_marked_as_a_gap(tmp_path: Path) -> None:
+def test_bits_across_three_wb_mqtt_serial_registers_are_marked_as_a_gap(tmp_path: Path) -> None:
     device = channel(tmp_path, address="5:30:4")
     assert gaps(device, "a") == ["only its count is read: its bits 30 to 33 of the format u16"]
 
 
-def test_8_bit_format_of_a_written_wb_register_selects_its_low_byte(tmp_path: Path) -> None:
+def test_8_bit_format_of_a_written_wb_mqtt_serial_register_selects_its_low_byte(tmp_path: Path) -> None:
     assert entries(channel(tmp_path, reg_type="holding", format="u8"))["a"] == {"at": 5, "part": "0-7"}
 
 
@@ -159,7 +159,7 @@ def test_wb_text_without_its_size_is_marked_as_a_gap(tmp_path: Path) -> None:
     assert gaps(channel(tmp_path, format="string8"), "a") == ["string_data_size is not stated; 1 was assumed"]
 
 
-def test_parts_of_a_composite_wb_channel_are_marked_as_gaps(tmp_path: Path) -> None:
+def test_parts_of_a_composite_wb_mqtt_serial_channel_are_marked_as_gaps(tmp_path: Path) -> None:
     parts = [{"reg_type": "input", "address": at} for at in (5, 7)]
     device = only(tmp_path, "w.json", {"device": {"channels": [{"name": "a", "consists_of": parts}]}})
     assert places(device) == [("a", 5), ("a_2", 7)]
@@ -241,7 +241,7 @@ def test_wb_configuration_gives_a_device_for_each_slave(tmp_path: Path) -> None:
         ({"device": {"channels": [{"address": 1, "word_order": "x"}]}}, "word_order = 'x' is none of"),
     ],
 )
-def test_invalid_wb_document_raises_value_error_with_the_reason(
+def test_invalid_wb_mqtt_serial_document_raises_value_error_with_the_reason(
     tmp_path: Path, document: dict[str, Any], reason: str
 ) -> None:
     with pytest.raises(ValueError, match=re.escape(reason)):
@@ -254,7 +254,7 @@ def test_import_error_names_the_file(tmp_path: Path) -> None:
         read_devices(tmp_path / "w.json")
 
 
-def test_translations_of_wb_names_become_titles(tmp_path: Path) -> None:
+def test_translations_of_wb_mqtt_serial_names_become_titles(tmp_path: Path) -> None:
     """A parameter's `title` is translated.
 
     For a channel of a subdevice, the translated names of both are joined.

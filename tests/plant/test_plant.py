@@ -197,7 +197,7 @@ def test_echo_of_a_line_is_detected_unless_the_plant_file_declares_it(load: Load
     assert load(SILENT.replace('silence = "500 us"', 'echo = "off"')).lines[0].echo is Echo.OFF
 
 
-def test_realtime_is_a_key_of_the_whole_plant_file(load: Load, mistakes: Mistakes) -> None:
+def test_key_realtime_applies_to_all_lines_of_a_plant_file(load: Load, mistakes: Mistakes) -> None:
     assert load(GOOD).realtime is False
     assert load("realtime = true\n" + GOOD).realtime is True
     assert mistakes("realtime = 1\n" + GOOD) == ["realtime = 1 is not right; write realtime = true"]

@@ -50,7 +50,7 @@ def test_each_simulated_byte_arrives_at_its_last_bit_or_slightly_later(baudrate:
         passed += len(piece)
         ends = begin + passed * character
         assert at == pytest.approx(ends)  # the last byte of each chunk arrives at its last bit
-        # the first byte of each chunk arrives at most 1 ms after its last bit
+        # the first byte of each chunk arrives at most 1 ms or one character after its last bit
         assert at - (ends - (len(piece) - 1) * character) <= max(1e-3, character) + 1e-9
     assert passed == 9
 

@@ -219,9 +219,9 @@ class ChannelSet:
         fresh.add(row.slot)
 
     def _status(self, slots: Iterable[int]) -> int:
-        """Return the status of the newest row without a value among these series.
+        """Return the status of the newest row that has no value, among these registers and channels.
 
-        If each row has a value, return UNSEEN if a series has no row yet, else OK.
+        If each row has a value, return UNSEEN if a register or channel has had no row yet, else OK.
         """
         misses = [slot for slot in slots if self._statuses[slot] not in (Status.OK, UNSEEN)]
         if misses:

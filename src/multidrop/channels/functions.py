@@ -126,7 +126,7 @@ def _is(compare: Callable[[Any, Any], bool]) -> Callable[[float, float], float]:
 
 
 class Function(NamedTuple):
-    """A pure function: its number of operands, and functions for its unit and its value."""
+    """A function without a memory: its number of operands, and functions that compute its unit and value."""
 
     arities: range
     typed: Callable[[Units], Typed]

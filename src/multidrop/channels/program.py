@@ -272,11 +272,10 @@ class Program:
                 step.memory.is_interrupted = True
 
     def run(self, values: Sequence[Value], fresh: Collection[int], now_ns: int) -> Value:
-        """Return the value, in the declared unit, computed from the newest values of all series. Return None
-        if the value is unknown.
+        """Return the value in the declared unit, computed from the newest values of registers and channels.
 
-        `fresh` has the slots of the series that got a row from the request sent at `now_ns`
-        (monotonic).
+        Return None if the value is unknown. `fresh` are the indexes of the registers and channels with a row
+        from the request that was sent at `now_ns` (monotonic).
         """
         stack: list[Value] = []
         for step in self._instructions:

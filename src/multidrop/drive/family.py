@@ -1,7 +1,7 @@
-"""Drive: the base class of all families, with facts of the manual, registers, and verbs.
+"""Drive: the base class of all families, with properties from the manual, registers and verbs.
 
-A family is a subclass that declares registers and verbs. Verbs command the motor. They are scripts, which are
-run by the bus that the drive is attached to.
+A family is a subclass that declares registers and verbs. A verb commands the motor. It is a generator, called
+a script, whose steps are carried out by the bus that the drive is attached to.
 """
 
 from __future__ import annotations
@@ -443,7 +443,7 @@ class Drive(RegisterAccess):
         raise WriteForbidden(f"{why} call set_frequency before start", advice=_SETPOINT_FIRST)
 
     def _stop_first(self, why: str) -> WriteForbidden:
-        return WriteForbidden(f"{self.name} {why} call stop() first", advice=Advice.call("stop"))
+        return WriteForbidden(f"{why} call stop() first", advice=Advice.call("stop"))
 
     def _reset_first(self, fault: str = "") -> WriteForbidden:
         shown = f"a fault, {fault}" if fault else "a fault"

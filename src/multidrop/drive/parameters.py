@@ -104,7 +104,7 @@ class Parameter(Register[Any]):
     is_line: bool = False  # True for the drive's address, baud rate, format or protocol
 
     def changed(self, **facts: Any) -> Parameter:
-        """Return a copy of the parameter with these facts changed."""
+        """Return a copy of the parameter in which these attributes have other values."""
         own = {one.name: getattr(self, one.name) for one in fields(self) if one.init}
         copy = Parameter(**own | facts)
         copy.__set_name__(self.family, self.name)

@@ -460,7 +460,7 @@ class Details(TypedDict, total=False):
     harmless: tuple[int, ...]
     never: str  #: reason why the library never writes the register
     never_together: tuple[int, ...]  #: masks of bits that are never set in one write
-    place: str  #: section of the manual
+    place: str  #: section of the manual that describes the register
     outside: str  #: source of these attributes, if it is not the family's own document
     note: str  #: further information for users
     titles: Mapping[str, str]  #: titles in other languages, by the language: `{"ru": "выходной ток"}`
@@ -508,9 +508,9 @@ def _declare(access: Access, address: int, what: Any, given: Details) -> Registe
 
 
 def row_field(register: Register[Any], at: int, code: int) -> Field:
-    """Return the Field that decodes a register at word (coils: bit) `at` of a reply.
+    """Return the Field with which the C core decodes this register, at word (coils: bit) `at` of a reply.
 
-    `code` is the number that stands for the register's name in rows.
+    `code` is the number that stands for the register's name in polled rows.
     """
     multiplier, _, divisor = register.coding.factors
     return Field(at, register.coding.core_format, code, multiplier, divisor, _extra(register, at))

@@ -144,7 +144,7 @@ def any_read(drive: Any, function: int, start: int, count: int) -> Message:
     if drive.framing is Framing.DELIXI:
         raise ValueError(f"{drive.name} speaks Delixi's own protocol, which has no Modbus functions")
     if function not in READS:
-        raise ValueError(f"function = {function} does not read; use 1, 2, 3, 4, 7, 17 or 43")
+        raise ValueError(f"function = {function} is not a function that reads; use 1, 2, 3, 4, 7, 17 or 43")
     if not 0 <= start < _ADDRESSES:
         raise ValueError(f"start = {start} is not an address from 0 to {_ADDRESSES - 1}")
     if function not in FUNCTIONS:

@@ -298,7 +298,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start at the setpoint in force. Without a direction: forward, and only from rest."""
         if self._jogged and not (yield from self._is_at_rest()):
-            raise self._stop_first("may still jog, and a start may not end the jog:")
+            raise self._stop_first(f"{self.name} may still jog, and a start may not end the jog:")
         forward = yield from self._goes_forward(direction)
         if (yield from read(self.frequency_source)) != 1:
             raise WriteForbidden(f"{self.name} takes no setpoint from P00.02: set P00.01 to 1 on the keypad")
@@ -314,7 +314,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         """Turn slowly from rest until stopped; without a direction, forward."""
         forward = yield from self._goes_forward(direction)
         if not (yield from self._is_at_rest()):
-            raise self._stop_first("turns, and may continue to turn during a jog:")
+            raise self._stop_first(f"{self.name} turns, and may continue to turn during a jog:")
         self._jogged = True
         yield from write(
             self.control, DelixiModbusControl.JOG_FORWARD if forward else DelixiModbusControl.JOG_REVERSE

@@ -297,7 +297,7 @@ class InnovertIBD(Drive):
         if word is IBDControl.RUN:
             yield from self._setpoint_in_force()
         if (yield from self._runs()):
-            raise self._stop_first("turns, and would continue to turn during a jog:")
+            raise self._stop_first(f"{self.name} turns, and would continue to turn during a jog:")
         yield from write(self.control, sent)
         yield from self._started(direction)
 

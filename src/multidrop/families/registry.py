@@ -34,7 +34,7 @@ _SHIPPED = Path(__file__).parent / "shipped"
 # names of the family files in this package; each file is read when it is needed
 SHIPPED = tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
 
-# Families from files of this package for which a scan looks: more than a status register identifies them.
+# Families from files that a scan also looks for: more than a status register identifies their drives.
 RECOGNISABLE = ("delixi-e", "invt-chf100a", "invt-goodrive", "powtran-pi130", "yaskawa-a1000")
 
 

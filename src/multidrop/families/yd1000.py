@@ -323,7 +323,7 @@ class YD1000(Drive):
         place="6.3: 1002",
     )
 
-    # Section 6.4, live
+    # Section 6.4, live values
     output_frequency = reading(0x1100, "Hz", step=0.01, place="6.4: 1100")
 
     # Section 6.5
@@ -397,7 +397,7 @@ class YD1000(Drive):
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start at the setpoint 1001H. Without a direction, a turning motor keeps its direction.
 
-        Without a direction, a motor at rest turns forward. The options `preset_speed` and `setpoint_by_fnod`
+        A motor at rest turns forward then. The options `preset_speed` and `setpoint_by_fnod`
         select another setpoint, and `second_ramp` selects the second ramp. A stop always uses the first ramp.
         """
         how = YD1000Control.RUN
@@ -421,7 +421,7 @@ class YD1000(Drive):
                 f"preset speed {number} of {self.name} is 0: set preset_speed_{number} first"
             )
         if (yield from self._without_fault()).condition is Condition.RUNNING:
-            raise self._stop_first("turns: a preset speed is started from rest, so")
+            raise self._stop_first(f"{self.name} turns: a preset speed is started from rest, so")
         yield from insist(self.control, STOP)
         if (yield from read(self.reference_frequency)) == hz:
             raise WriteForbidden(
@@ -551,7 +551,7 @@ class YD1000(Drive):
         If the motor is then seen to turn, or the drive does not answer, the stop is written again.
         """
         if not (yield from self._is_at_rest()):
-            raise self._stop_first("turns:")
+            raise self._stop_first(f"{self.name} turns:")
         yield from self._no_terminal_runs("once the line no longer commands it")
         try:
             yield from write(self.control, YD1000Control(0))

@@ -41,7 +41,7 @@ def parse_yaml(text: str) -> Any:
                 self.count_again(node)
             if self.left < 0:
                 raise ValueError(
-                    f"has more than {MOST_NODES} entries, each alias counted as what it stands for"
+                    f"has more than {MOST_NODES} entries, if each alias is replaced by its entries"
                 )
             return node
 

@@ -23,7 +23,7 @@ from multidrop.planning.blocks import Planned, planned, sending
 from multidrop.planning.bus_time import gap, in_order, kind, silence, switches
 from multidrop.planning.schedule import TURN_SHARE, Job, Schedule
 
-LATENESS = 100e-6  # s by which a typical computer delays each exchange, because it wakes up late
+LATENESS = 100e-6  # s that a typical computer adds to each exchange, to wake up and to write
 ENOUGH = 0.97  # a rate counts as reached from this fraction of the wanted rate on
 LEAST_EXCHANGES = 1000  # least number of simulated exchanges
 LEAST_ROUNDS = 3  # least number of simulated exchanges of each job

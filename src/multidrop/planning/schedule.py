@@ -3,10 +3,10 @@
 The exchanges are planned in advance, up to a horizon, so that the line never waits for Python. A job with a
 period has one slot (a time interval in which it is carried out) in each period. Slots start at multiples of
 the period and never drift. Among the started slots, the slot that ends first goes first. If there is time for
-all of them, jobs of one kind are sent one after another. A slot that ends before its turn is counted and
-skipped for good. Then, until the line has caught up, the job that has waited longest goes first, so that each
-job gets a share. Jobs without a period take turns, one round after another, in the remaining time. They have
-a minimum share of the line. Silent drives get few requests: see `BackOff`.
+all of them, jobs with equal line settings and silence are sent one after another. A slot that ends before its
+turn is counted and skipped for good. Then, until the line has caught up, the job that has waited longest goes
+first, so that each job gets a share. Jobs without a period take turns, one round after another, in the
+remaining time. They have a minimum share of the line. Silent drives get few requests: see `BackOff`.
 """
 
 from __future__ import annotations
@@ -271,7 +271,7 @@ class Schedule(Generic[J]):
     def cycle(self, now_ns: int) -> list[J]:
         """Return the jobs without a period, starting with the next one.
 
-        Return [] if any job has slots or an interval, or if any drive is silent.
+        Return [] if any job has a period, or needs pauses, or if any drive is silent.
         """
         if self.back_off.may_sleep(now_ns) or self._waiting or self._begun or self._ready:
             return []

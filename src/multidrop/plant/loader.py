@@ -359,7 +359,7 @@ def _try_each(
     settings = model(**least).settings
     right = {"baudrate": str(settings.baudrate), "format": f'"{settings.format}"'}
     for key, value in inherited.items():
-        if key not in right:  # the other keys need this one, so they cannot be tried
+        if key not in right:  # other keys cannot be tried alone
             continue
         hint = f" (the line's); add {key} = {right[key]} to this drive"
         place.attempt(partial(model, **(least | {key: value})), hint=hint)

@@ -431,12 +431,12 @@ class SimulatedYD1000(MotorDrive):
     write to a parameter marked "panel only" is confirmed but not stored (6.1). This includes 0007H, although
     section 8.1 says that writing it initialises the drive.
 
-    The notes leave some facts open; these facts come from related drives. Exception codes are those of
+    The notes do not state the following; it is taken from related drives. Exception codes are those of
     Modbus, as on the VF-S15. Fault codes are those of the VF-S11. As on the VF-S11, an emergency stop is a
     fault, and a reset restarts the drive. The drive then ignores the line for 2 s and drops its commands.
 
-    Three facts are only assumed. The bits of the preset speeds form a number. The second ramp has the times
-    of the first ramp. The brake has priority over run, and sets the frequency to 0 immediately.
+    Three properties are only assumed. The bits of the preset speeds form a number. The second ramp has the
+    times of the first ramp. The brake has priority over run, and sets the frequency to 0 immediately.
     """
 
     functions = (0x03, 0x06)

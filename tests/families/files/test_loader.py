@@ -311,7 +311,7 @@ WRONG_SECTIONS = [  # each text is a wrong section before a valid section [readi
     ("framings = ['delixi']", "'delixi' is none of rtu, ascii"),
     ("exceptions = { 300 = 'x' }", "300 = 'x' is not a code from 1 to 255"),
 ]
-WRONG_TEXTS = [  # each text is wrong and stands after HEAD
+WRONG_TEXTS = [  # each text has a mistake, and follows the valid text HEAD
     ("", "t.toml: declares no register; add [reading] and NAME = { at = 0x0010 }"),
     ("[readings]\na = { at = 1 }\n", "t.toml: unknown key 'readings'; did you mean reading?"),
     ("[reading]\na = 5\n", "t.toml: [reading] a: 5 is not a register; write { at = 0x0010"),

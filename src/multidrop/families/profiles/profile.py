@@ -1,4 +1,4 @@
-"""Profile: a drive state machine that several makes share. A family declares the registers that it uses."""
+"""Profile: a drive state machine that several makes share. A family declares the profile's registers."""
 
 from __future__ import annotations
 
@@ -195,11 +195,11 @@ RESET_TIME = 2.0  # s within which the status must no longer show a fault after 
 
 
 class Profile(Drive):
-    """Base of the profiles: the verbs use roles; a family derives from a profile and declares the roles.
+    """Base class of the profiles. A family is a subclass of a profile that declares the profile's registers.
 
-    A role is a register with a fixed name. The family declares the register's address, table, unit, step,
-    memory and place in the manual. The profile declares its bits, and which of its counts are harmless. Every
-    profile has these:
+    The verbs use registers with fixed names, called roles. The family declares a register's address, table,
+    unit, step, memory and place in the manual. The profile declares its bits, and which of its counts are
+    harmless. Every profile has these:
 
     - `control` (a command), `status` (a reading), `reference` (a setting, or a command if it cannot be
       read), in Hz, or in % of the option `maximum_frequency`; `output_frequency` (a reading);
@@ -403,7 +403,7 @@ class Profile(Drive):
         status = yield from self._status()
         yield from self._check_start(status)
         if self._turns(status):  # the manuals do not define a jog while the motor turns
-            raise self._stop_first("turns, and may continue to turn during a jog:")
+            raise self._stop_first(f"{self.name} turns, and may continue to turn during a jog:")
         return self._word(reverse if self._reverses(direction, status) else forward)
 
     def _word(self, count: int, role: str = "control") -> Any:
