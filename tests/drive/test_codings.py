@@ -163,7 +163,7 @@ def test_every_number_format_byte_order_step_and_offset_is_decoded_and_encoded(
 @settings(max_examples=examples(60), deadline=None)
 @given(numbers().filter(lambda case: case[0] in WRITTEN and case[0] not in FLOATS))
 @example((NumberFormat.U64, "BADC", 1, 0, 2**64 - 1))
-def test_whole_numbers_survive_write_and_read_back(
+def test_whole_number_written_to_a_drive_is_read_back_unchanged(
     case: tuple[NumberFormat, str, float, float, float],
 ) -> None:
     number_format, order, step, offset, raw = case
@@ -191,7 +191,7 @@ def test_whole_numbers_survive_write_and_read_back(
     max_examples=examples(30), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(data=st.data())
-def test_floats_survive_write_and_read_back(
+def test_float_written_to_a_drive_is_read_back_unchanged(
     number_format: NumberFormat, order: str, data: st.DataObject
 ) -> None:
     raw = data.draw(counts(number_format))
@@ -420,9 +420,7 @@ def test_value_is_multiplied_by_the_power_of_ten_in_its_scale_register(
     places = known.find(Framing.RTU, Message(1, 4, start, stop - start)).places
     assert [place.at for place in places if place.name == "level"] == [10 - start]
     apart = known.find(Framing.RTU, Message(1, 4, 10, size // 2)).places
-    assert "level" not in [
-        place.name for place in apart
-    ]  # a request without the scale register gives no value
+    assert "level" not in [place.name for place in apart]  # a reply without the scale register gives no value
 
 
 # ---- into a recording ----

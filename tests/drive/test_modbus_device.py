@@ -48,7 +48,9 @@ def test_modbus_device_reads_numbers_of_any_format(meter: tuple[SimulatedBus, Mo
         device.read_input(0, format="F32")
 
 
-def test_coils_and_discrete_inputs_are_returned_as_bool(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+def test_modbus_device_returns_coils_and_discrete_inputs_as_bool(
+    meter: tuple[SimulatedBus, ModbusDevice],
+) -> None:
     line, device = meter
     line.sims[0]["door"] = 1
     assert device.read_discrete(4)[0] is True
@@ -131,7 +133,9 @@ def test_device_identification_in_two_replies_is_returned_whole(
     assert [request.data.hex() for request, _ in line.frames] == ["0e0100", "0e0101"]
 
 
-def test_a_write_that_cannot_be_read_back_is_unconfirmed(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+def test_write_that_modbus_device_cannot_read_back_is_unconfirmed(
+    meter: tuple[SimulatedBus, ModbusDevice],
+) -> None:
     """The reply to a write is a copy of the request, so it may be an RS-485 adapter's echo."""
     line, device = meter
     line.loses = lambda request: request.function == 3
@@ -139,7 +143,7 @@ def test_a_write_that_cannot_be_read_back_is_unconfirmed(meter: tuple[SimulatedB
         device.write_holding(5, [7], confirm=True)
 
 
-def test_a_write_that_reads_back_another_number_raises_not_verified(
+def test_write_that_reads_back_another_number_raises_not_verified(
     meter: tuple[SimulatedBus, ModbusDevice], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     line, device = meter

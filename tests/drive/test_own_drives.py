@@ -50,7 +50,7 @@ class Pump(Fan):
 
     @verb
     def coast(self) -> Script[None]:
-        """Stop the motor with `insist`."""
+        """Stop the motor with `insist`, which repeats a write."""
         yield from insist(self.control, Word.STOP)
 
     @verb
@@ -128,7 +128,7 @@ def test_write_of_a_raw_count_declared_harmless_needs_no_confirmation(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     class Stoppable(Pump):
-        """A drive whose stop is declared harmless."""
+        """A drive whose control word has a stop that is declared harmless."""
 
         control = command(0x30, Word, harmless=(Word.STOP,))
 

@@ -210,7 +210,7 @@ def test_invalid_character_format_is_refused(format: str) -> None:
 
 
 @table("baudrate", [0, -9600, 10**9])
-def test_invalid_baud_rate_is_refused(baudrate: int) -> None:
+def test_baud_rate_outside_the_limits_is_refused(baudrate: int) -> None:
     with pytest.raises(ValueError, match="baud rate"):
         Settings(baudrate, "8N1")
 
@@ -373,7 +373,7 @@ class Known(Meter):
 
 
 @pytest.mark.parametrize("maker", ["ABB", "ABC"])
-def test_identify_can_read_a_text_register(monkeypatch: pytest.MonkeyPatch, maker: str) -> None:
+def test_identify_of_a_drive_can_read_a_text_register(monkeypatch: pytest.MonkeyPatch, maker: str) -> None:
     sim = SimulatedDrive(Known(1))
     sim["maker"] = maker
     line = SimulatedBus(monkeypatch, sim)
@@ -432,7 +432,7 @@ def test_text_register_longer_than_one_request_is_refused(details: tuple[int, in
         text(*details)
 
 
-def test_invalid_declarations_of_text_registers_are_refused() -> None:
+def test_invalid_text_register_in_a_drive_class_is_refused() -> None:
     with pytest.raises(ValueError, match="a text has order = 'CDAB'; it must be 'AB', 'BA' or 'B'"):
         text(1, 2, order="CDAB")
     with pytest.raises(

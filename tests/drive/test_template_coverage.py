@@ -68,7 +68,7 @@ def shares(coverage: Any) -> dict[str, tuple[int, int]]:
     }
 
 
-def test_every_supported_key_of_a_template_is_converted(bench: Any, tmp_path: Path) -> None:
+def test_every_supported_key_of_a_register_template_is_converted(bench: Any, tmp_path: Path) -> None:
     (tmp_path / "all.json").write_text(wb(HELD))
     coverage = covered(bench, tmp_path)
     whole = (len(HELD), len(HELD))

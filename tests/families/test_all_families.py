@@ -66,7 +66,7 @@ def test_built_in_families_are_found_by_name() -> None:
 
 
 @family
-def test_every_family_has_a_title_and_a_manual(family: type[Drive]) -> None:
+def test_every_family_has_a_title_and_names_its_manual(family: type[Drive]) -> None:
     assert family.__doc__
     assert len(family.__doc__) > 500
     assert family.manual
@@ -160,7 +160,7 @@ def test_every_verb_has_a_docstring(family: type[Drive]) -> None:
 
 
 @family
-def test_no_two_registers_have_the_same_address(family: type[Drive]) -> None:
+def test_no_two_registers_of_a_family_have_the_same_address(family: type[Drive]) -> None:
     """A command and a reading that shows its effect may share an address."""
     places = [
         (register.table, register.address + at, register.access is Access.COMMAND)

@@ -187,7 +187,7 @@ REPLY = """
 """
 
 
-def test_values_of_a_published_sunspec_reply_are_right(
+def test_values_decoded_from_a_published_sunspec_reply_are_right(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     points: list[dict[str, Any]] = [{"name": name, "type": "uint16", "size": 1} for name in ("ID", "L")]
@@ -223,7 +223,7 @@ def test_sunspec_scale_register_too_far_away_is_left_out_and_reported(tmp_path: 
     assert loaded(tmp_path, device, "a", "s")["a"].address == 40000
 
 
-def test_wb_template_becomes_a_loadable_family(tmp_path: Path) -> None:
+def test_wb_mqtt_serial_template_becomes_a_loadable_family(tmp_path: Path) -> None:
     device = only(tmp_path, "config-own.json", WB)
     found = entries(device)
     assert found["voltage"] == {

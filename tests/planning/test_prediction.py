@@ -387,7 +387,7 @@ def test_stated_read_limit_bounds_the_gain_of_readable_gaps() -> None:
     assert [len(gap) for _, gap in gain.gaps] == [1]
 
 
-def test_plan_and_models_suggest_readable_gaps_only_for_a_users_own_class(
+def test_commands_plan_and_models_suggest_readable_gaps_only_for_a_users_class(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plant = tmp_path / "hall.toml"

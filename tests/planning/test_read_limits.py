@@ -84,8 +84,8 @@ def test_a_delixi_request_reads_one_register() -> None:
     assert spans(drive) == [(500, 1), (501, 1)]
 
 
-# Requests (function, start, count) that read all readings of a family at its own settings. They were recorded
-# before families without a stated limit got the standard's limits.
+# Requests (function, start, count) that read all readings of a family at its default line settings, recorded
+# with an earlier version.
 REQUESTS = {
     "erman-er-g-220": [(4, 1, 12), (4, 1024, 4)],
     "invt-che": [(3, 0x1001, 1), (3, 0x3000, 14), (3, 0x3010, 7), (3, 0x5000, 2)],

@@ -252,7 +252,7 @@ def test_simulated_che_refuses_a_start_during_a_fault_until_a_reset(che: Bench) 
     [
         ("01 03 40 00 00 01", "01 83 02"),  # undefined address
         ("01 03 80 0B 00 01", "01 83 02"),  # the address in RAM cannot be read
-        ("01 03 30 00 00 11", "01 83 03"),  # 17 registers, one too many
+        ("01 03 30 00 00 11", "01 83 03"),  # 17 registers are one too many
         ("01 06 10 00 00 09", "01 86 12"),
         ("01 04 30 00 00 01", "01 84 01"),
     ],
@@ -607,7 +607,8 @@ def run_at(yd: Bench, setpoint: int, word: int = FORWARD) -> None:
 
 def test_simulated_yd1000_address_and_maximum_frequency_are_readable(yd: Bench) -> None:
     assert yd.exchange("01 03 08 02 00 01 27 AA")[:14] == "01 03 02 00 01"
-    assert yd.exchange("01 03 00 11 00 01 D4 0F")[:14] == "01 03 02 1F 40"  # FH, the maximum frequency: 80 Hz
+    # register 0011H (FH, the maximum frequency) is 80 Hz
+    assert yd.exchange("01 03 00 11 00 01 D4 0F")[:14] == "01 03 02 1F 40"
 
 
 def test_simulated_yd1000_refuses_to_read_two_registers_at_once(yd: Bench) -> None:

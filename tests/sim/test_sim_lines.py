@@ -253,7 +253,7 @@ def test_signal_ends_the_simulator_even_if_its_handler_has_not_run() -> None:
 
 
 class Ill(Exception):
-    """Raised by a simulated drive."""
+    """Raised by a simulated drive in a test."""
 
 
 class Brief(Toy):
@@ -395,7 +395,7 @@ def test_mbpoll_times_out_if_the_drive_does_not_reply() -> None:
     assert "timed out" in done.stderr
 
 
-def test_pymodbus_reads_and_writes_over_ascii() -> None:
+def test_pymodbus_reads_and_writes_a_simulated_drive_in_ascii_framing() -> None:
     client = require_module("pymodbus.client")
     framer = require_module("pymodbus").FramerType.ASCII
     sim = simulated(InnovertIBD(240, framing="ascii"))

@@ -483,7 +483,7 @@ def test_a_copy_of_the_request_is_not_returned_as_a_raw_reply(simulated: Simulat
 
 WRONG = {
     (6, 1, 1): "function = 6 is not a function that reads; use 1, 2, 3, 4",
-    (0, 1, 1): "function = 0 does not read",
+    (0, 1, 1): "function = 0 is not a function that reads",
     (3, -1, 1): "start = -1 is not an address from 0 to 65535",
     (3, 65536, 1): "start = 65536 is not an address",
     (3, 65535, 2): r"start \+ count = 65537: the last address is 65535",

@@ -171,7 +171,7 @@ class Curve:
             raise ValueError(f"the positions of a table must ascend: {shown}")
 
     def __call__(self, position: float) -> Value:
-        """Return the value at a position."""
+        """Return the value at this position, interpolated between the points of the table."""
         place = bisect_right(self._at, position)
         if place == 0 or place == len(self._at):
             return self._values[place - 1 if place else 0]
@@ -202,7 +202,7 @@ class StatefulFunction:
         self._last = 0.0
 
     def take(self, value: float, now_ns: int) -> None:
-        """Process a value whose request was sent at `now_ns` (monotonic)."""
+        """Add a value to the memory. Its request was sent at `now_ns` (monotonic)."""
         if self._last_ns is None:
             self._first(value)
         # rows of several lines may be out of order, so ignore older ones

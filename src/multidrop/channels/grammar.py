@@ -25,21 +25,24 @@ class ExpressionError(ValueError):
 
 
 class NumberStep(NamedTuple):
-    """A number of the expression."""
+    """A step of a parsed expression: a number."""
 
     column: int
     value: float
 
 
 class TextStep(NamedTuple):
-    """A quoted text of the expression, such as a unit."""
+    """A step of a parsed expression: a text in quotes, such as a unit."""
 
     column: int
     text: str
 
 
 class ReferenceStep(NamedTuple):
-    """A register or a channel. If the expression names no drive, `drive` is "": the channel's own drive."""
+    """A step of a parsed expression: a register or channel.
+
+    `drive` is "" if the expression names no drive.
+    """
 
     column: int
     drive: str
@@ -47,7 +50,10 @@ class ReferenceStep(NamedTuple):
 
 
 class CallStep(NamedTuple):
-    """A call of a function or operator with the last `arity` operands. A minus sign is named "-1"."""
+    """A step of a parsed expression: a call of a function or operator with the last `arity` operands.
+
+    A minus sign is the operator "-1".
+    """
 
     column: int
     name: str

@@ -39,7 +39,7 @@ from multidrop.errors import Advice, NotVerified, Unconfirmed, Unsupported, Writ
 from multidrop.printable import did_you_mean
 
 START_TIME = 5.0  # s within which a started motor must be seen to turn
-REVERSAL_TIME = 60.0  # s for the ramps of a reversal if the option `stop_time` is not given
+REVERSAL_TIME = 60.0  # s allowed for a reversal of the motor if the option `stop_time` is not given
 _SETPOINT_FIRST = Advice("call set_frequency before start", "add --frequency HZ")
 _TURNING = (Condition.RUNNING, Condition.ACCELERATING, Condition.DECELERATING)
 
@@ -571,7 +571,7 @@ def verbs_of(drive: Drive) -> list[str]:
 
 
 def check_drive(drive: Drive) -> None:
-    """Raise TypeError unless this is a drive."""
+    """Raise TypeError unless `drive` is a Drive."""
     if not isinstance(drive, Drive):
         raise TypeError(f"{drive!r} is not a drive: use the one that attach returns")
 
@@ -599,7 +599,7 @@ def check_readable(drive: Drive, register: Register[Any]) -> None:
 
 
 def check_own_text(drive: Drive, text: Text) -> None:
-    """Raise ValueError for another family's text, TypeError if `text` is not a text."""
+    """Raise ValueError for a text register of another family, TypeError if `text` is not a Text."""
     check_drive(drive)
     if not isinstance(text, Text):
         raise TypeError(

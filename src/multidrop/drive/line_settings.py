@@ -1,4 +1,4 @@
-"""Line settings: names of ports, baud rate and character format, and the durations that follow from them."""
+"""Line settings: port names, baud rate and character format, and the durations of characters and silences."""
 
 from __future__ import annotations
 

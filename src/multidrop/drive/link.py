@@ -69,7 +69,7 @@ NO_LINK = NoLink()
 
 
 class RegisterAccess:
-    """The reads and writes of a drive's registers, given as objects or by name."""
+    """Methods that read and write a drive's registers, which are given as objects or by name."""
 
     name: str
     link: Link

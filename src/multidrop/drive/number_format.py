@@ -61,7 +61,7 @@ def width(number_format: NumberFormat) -> int:
 
 
 def raw_span(number_format: NumberFormat) -> tuple[Fraction, Fraction]:
-    """Return the least and the greatest raw count of a format."""
+    """Return the smallest and the largest raw count of a format."""
     if number_format in FLOATS:
         return Fraction(-_LARGEST[number_format]), Fraction(_LARGEST[number_format])
     bits = width(number_format)
@@ -244,7 +244,7 @@ class Coding:
         return None if bits is None else self.raw_of(bits)
 
     def raw_of(self, bits: int) -> float | None:
-        """Return the raw count of a number's bits; None if it is invalid."""
+        """Return the raw count that the bits of a number encode; None if it means "no value"."""
         if any(bits & mask == pattern for mask, pattern in self.invalid_patterns):
             return None
         if self.part is None:

@@ -88,7 +88,6 @@ class Worded(IntEnum):
     words: str
 
     def __new__(cls, value: int, words: str = "") -> Self:
-        """Create the member with this number."""
         member = int.__new__(cls, value)
         member._value_ = value
         member.words = words
@@ -159,13 +158,13 @@ class Register(Generic[T]):
 
     @property
     def title(self) -> str:
-        """The English title: the name with spaces."""
+        """The English title: the register's name with spaces instead of underscores."""
         return self.name.replace("_", " ")
 
     def title_in(self, language: str) -> str:
         """Return the title in a language such as "ru".
 
-        This is the declared title, else the catalogue's, else the English one.
+        This is the declared title, else the title in the catalogue, else the English title.
         """
         return self.titles.get(language) or catalogue(language).get(self.name) or self.title
 

@@ -32,7 +32,7 @@ def stated_limit(family: Any, table: Table) -> int | None:
 
 
 def read_limit(family: Any, table: Table) -> int:
-    """Return how many registers one read of this table may have: the stated limit, or the standard's."""
+    """Return the limit of registers in one read of this table: the family's limit, else the Modbus limit."""
     stated = stated_limit(family, table)
     return STANDARD_LIMITS[table.carrier] if stated is None else stated
 

@@ -54,7 +54,7 @@ PRESET_SPEEDS = (
     YD1000Control.PRESET_SPEED_1,
     YD1000Control.PRESET_SPEED_2,
     YD1000Control.PRESET_SPEED_3,
-)  # the bits with the values 1, 2 and 4
+)  # the bits with the values 1, 2 and 4 in the number of the preset speed
 
 
 class YD1000Status(IntFlag):

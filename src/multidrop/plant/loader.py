@@ -123,7 +123,7 @@ def port_or_address(name: Path | str) -> str:
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/{1,2}(.*)", re.IGNORECASE)
 _PORTS = ("tcp", "socket", "rfc2217")
 
-# Keywords of JSON Schema.
+# JSON Schema of a name and of a port name.
 NAME = {"not": {"enum": [*RESERVED_NAMES]}, "pattern": r"^[^-\x00-\x1f\x7f][^\x00-\x1f\x7f]*$"}
 _HOST = r"(\[[0-9A-Fa-f:.%]+\]|[^@:/?#\[\]]+)"
 _NUMBER = rf":(?!0+([/?#]|$)){PORT_NUMBER}"

@@ -188,7 +188,10 @@ class Plant:
         return found or self._unknown("line", name, (line.name for line in self.lines))
 
     def find_drive(self, name: str) -> tuple[PlantLine, Drive]:
-        """Return the line and the drive of this name. Raises ValueError with the nearest names otherwise."""
+        """Return the line and the drive of this name.
+
+        Raises ValueError with the nearest names if there is none.
+        """
         drives = {polled.drive.name: (line, polled.drive) for line in self.lines for polled in line.drives}
         return drives.get(name) or self._unknown("drive", name, drives)
 

@@ -299,7 +299,7 @@ IBD_SETPOINT = 0x2001
 # addresses of Prb.00, Prb.01 and Prb.02
 IBD_STORED_SETPOINT, IBD_FREQUENCY_SOURCE, IBD_RUN_SOURCE = 100, 101, 102
 IBD_BY_PARAMETER, IBD_BY_LINE, IBD_RUN_BY_LINE = 0, 5, 2
-IBD_STOP, IBD_RUN, IBD_JOG = 1, 2, 3  # values of bits 1 and 0 of 2000H
+IBD_STOP, IBD_RUN, IBD_JOG = 1, 2, 3  # values of bits 1 and 0 of the control word 2000H
 IBD_ALWAYS_SEEN = 1 << 11 | 1 << 12  # bits without a name that are 1 in the manual's example of PrA.22
 IBD_LARGEST = {107: 36000, 108: 36000}  # assumed largest values of Prb.07 and Prb.08; the manual states none
 # address of the output's function Prd.nn, and the output's bit in PrA.22
@@ -500,7 +500,7 @@ class SimulatedYD1000(MotorDrive):
         super().pass_time(now)
 
     def trip(self, code: int) -> None:
-        """Freeze registers 1200H and 1201H, then trip."""
+        """Freeze the registers 1200H and 1201H, as the drive does in a trip, and trip the motor."""
         for address in YD_HELD:
             cell = self.memory.readable(0x03, address)
             if cell:
@@ -538,7 +538,7 @@ class SimulatedYD1000(MotorDrive):
         self.motor.coast()
         self.motor.reset()
         self.deaf_until = self.now + YD_RESTART_TIME
-        self._message_at = math.inf  # the next message restarts the timeout
+        self._message_at = math.inf  # no timeout can occur before the next message
         for address in (YD_CONTROL, YD_COMMUNICATION_FREQUENCY, YD_PANEL_FREQUENCY):
             cell = self.memory.writable(0x06, address)
             if cell:

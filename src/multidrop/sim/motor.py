@@ -37,7 +37,7 @@ class Phase(Enum):
 
 @dataclass(frozen=True)
 class Rating:
-    """The nameplate data of a motor."""
+    """The rated values on the nameplate of a motor."""
 
     frequency: float = 50.0  # Hz
     voltage: float = 400.0  # rated voltage in V, which is also the mains voltage
@@ -337,7 +337,7 @@ class MotorDrive(SimulatedDrive):
         COMMANDS[self.drive.register("control").decode(raw).name](self.motor)
 
     def word(self, address: int) -> int:
-        """Return the raw count of the writable holding register at this address; 0 if there is none."""
+        """Return the raw count of the writable holding register at this address; 0 if none is there."""
         cell = self.memory.writable(0x06, address)
         return cell.raw if cell else 0
 

@@ -67,7 +67,7 @@ def test_start_runs_the_motor_and_stop_ends_the_run(line: Line) -> None:
     line.drive.stop()
     assert not line.sim.motor.energised
     assert line.drive.state().condition is Condition.STOPPED
-    line.drive.start()  # the drive still has the setpoint
+    line.drive.start()  # the drive still has the setpoint from before
     assert len(line.starts) == 2
     assert line.sim.motor.energised
 
@@ -364,7 +364,7 @@ def test_start_of_an_optidrive_as_its_first_guide_describes_it_is_refused(
     line.drive.set_frequency(20)
     with pytest.raises(WriteForbidden, match="not ready to run"):
         line.drive.start()
-    line.sim.motor.run(1)  # started on the keypad
+    line.sim.motor.run(1)  # the motor was started on the keypad
     line.bus.sleep(2)
     assert line.drive.state().condition is not Condition.STOPPED
     line.drive.stop()

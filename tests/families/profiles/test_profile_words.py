@@ -106,7 +106,7 @@ def test_abb_start_waits_100_ms_between_its_control_words() -> None:
 
 
 @pytest.mark.parametrize("model", ["abb-acs355", "siemens-v20"])
-def test_start_of_a_running_profidrive_sends_no_off_word(model: str) -> None:
+def test_start_of_a_running_profidrive_drive_sends_no_off_word(model: str) -> None:
     found = wire(model, ABB_RUNS)
     found.drive.start()
     assert [frame[-5:] for frame in sent(found)] == ["04 7F"]
@@ -269,13 +269,13 @@ def test_optidrive_as_in_its_first_guide_is_never_reported_as_stopped() -> None:
 
 STATES = [
     ("abb-acs355", ABB_RUNS, {}, Condition.RUNNING),
-    ("abb-acs355", 0x0235, {}, Condition.DECELERATING),  # OFF1 is active
+    ("abb-acs355", 0x0235, {}, Condition.DECELERATING),  # OFF1 is active: the motor stops along the ramp
     ("abb-acs355", ABB_READY, {"output_frequency": 3.0}, Condition.DECELERATING),
     ("abb-acs355", ABB_READY, {}, Condition.STOPPED),
     ("abb-acs355", ABB_FAULT, {"fault": 7}, Condition.FAULT),
     ("danfoss-fc51", FC_LOCK, {}, Condition.FAULT),
     ("delta-vfd-el", 0x0501, {}, Condition.DECELERATING),
-    ("delta-vfd-el", 0x0502, {}, Condition.RUNNING),  # standby: running at 0 Hz
+    ("delta-vfd-el", 0x0502, {}, Condition.RUNNING),  # status "standby": the motor runs at 0 Hz
     # the high byte of the fault register is only a warning
     ("delta-vfd-el", DELTA_STOP, {"fault": 0x0500}, Condition.STOPPED),
     ("delta-vfd-el", DELTA_STOP, {"fault": 0x0031}, Condition.FAULT),
@@ -359,14 +359,16 @@ def test_start_of_an_invt_drive_after_a_jog_requires_a_stop() -> None:
         ([ATV_OFF, ATV_READY], ("00 06", "00 07"), "not switched on"),
     ],
 )
-def test_cia402_start_waits_for_each_state(status: list[int], words: tuple[str, ...], sentence: str) -> None:
+def test_start_of_a_cia402_drive_waits_for_each_state(
+    status: list[int], words: tuple[str, ...], sentence: str
+) -> None:
     found = wire("schneider-atv320", status)
     with pytest.raises(NotVerified, match=sentence):
         found.drive.start()
     assert sent(found) == [ATV + word for word in words]
 
 
-def test_profidrive_that_does_not_become_ready_is_switched_off() -> None:
+def test_profidrive_drive_that_does_not_become_ready_is_switched_off() -> None:
     found = wire("abb-acs355", [ABB_OFF, ABB_READY])
     with pytest.raises(NotVerified, match="not ready to operate"):
         found.drive.start()

@@ -399,7 +399,7 @@ class Profile(Drive):
             raise WriteForbidden(f"{self.name} {why}; {self.remote}")
 
     def _jog_word(self, direction: Direction | None, forward: int, reverse: int) -> Script[Any]:
-        """Return the word of a jog. Raises WriteForbidden as `start` does, and if the motor turns."""
+        """Return the control word of a jog. Raises WriteForbidden as `start` does, and if the motor turns."""
         status = yield from self._status()
         yield from self._check_start(status)
         if self._turns(status):  # the manuals do not define a jog while the motor turns
