@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -28,7 +29,7 @@ from multidrop.bus import Bus
 from multidrop.control import read_audit
 from multidrop.core import Completion, Exchange, Message, Names
 from multidrop.drive import Drive
-from multidrop.errors import WriteForbidden
+from multidrop.errors import Expired, WriteForbidden
 from multidrop.families import MODELS, DelixiModbus, InvtCHE
 from multidrop.families.registry import SHIPPED, find_model
 from multidrop.planning.prediction import predict
@@ -333,6 +334,28 @@ def test_a_failed_command_aborts_before_any_later_step(tmp_path: Path) -> None:
         assert "fan has a fault" in result.abort
         assert turning([fan]) == []
         assert not [write for write in fan.counters.writes if write.raw == 6000]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_real", [False, True])
+def test_a_busy_computer_aborts_only_the_run_of_a_real_drive(
+    is_real: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first three attempts of the first command are too late, as if the computer had no time for them."""
+    command, attempts = runner._command, count()
+
+    def late(drive: Drive, step: RunStep) -> None:
+        if next(attempts) < 3:
+            raise Expired(drive.name, "the setpoint", 1.0)
+        command(drive, step)
+
+    monkeypatch.setattr(runner, "_command", late)
+    with simulated_test(write_test(tmp_path), speed=SPEED) as (plan, _):
+        if is_real:
+            monkeypatch.setattr(runner, "is_simulated", lambda identity: False)
+        result = TestRun(plan, speed=1.0 if is_real else SPEED).run()
+    assert bool(result.abort) == is_real
+    assert next(attempts) == (1 if is_real else 6)  # the test has three steps
 
 
 # ---- the first stop of an abort, counted in requests at the far ends ----

@@ -17,12 +17,13 @@ from queue import SimpleQueue
 from threading import Thread
 from typing import Any, ClassVar
 
+from multidrop.bus import Bus
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.exit_hook import await_signal
 from multidrop.control.outcome import Seen, Stopped
 from multidrop.control.ramp import check_setpoint, checked_rate, ramp
 from multidrop.drive.family import Drive
-from multidrop.errors import BusError
+from multidrop.errors import BusError, Expired, NoReply, Unconfirmed
 from multidrop.plant.model import Plant, Polled, PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.batch import Rows, copied
@@ -42,6 +43,9 @@ LATE_S = 0.5  # s; if a step starts later than this, all later steps are delayed
 UNKNOWN = "the stops of its line failed; the log has the error"
 SHORTEST_S = 1e-4  # shortest period of a polled register, in s
 MOST_WAITING = 3000  # limit of batches (30 s or more) that wait for the recording or for a taker
+# A busy computer delays simulated drives, and this process, for longer than the time-outs of real drives.
+SIMULATED_ATTEMPTS = 20  # number of attempts of a command to a simulated drive
+SIMULATED_SILENCE_S = 60.0  # the default of `silence` if all lines are simulated
 ENDING_S = 10.0  # how long the end of a run waits for the recording and for each taker, in s
 
 
@@ -137,9 +141,12 @@ class TestRun:
             return _Session(self, poller, writer, takers).carry_out()
 
     def _check_speed(self, poller: Poller) -> None:
-        is_real = not all(is_simulated(bus.line.identity) for bus in poller.buses.values())
-        if self._speed != 1.0 and is_real:
+        if self._speed != 1.0 and not all(map(_is_simulated, poller.buses.values())):
             raise ValueError("speed is for simulated drives, and a port of the plant has real ones")
+
+
+def _is_simulated(bus: Bus) -> bool:
+    return is_simulated(bus.line.identity)
 
 
 def _at_speed(plant: Plant, speed: float) -> Plant:
@@ -222,7 +229,10 @@ class _Session:
         if writer:
             self._recording = _RowThread(f"the recording {writer.path}", writer.write, writer.close)
             self._row_threads.append(self._recording)
-        self._watch = LimitWatch(self._plan, round(silence_of(self._plan) * 1e9), clock.now_ns())
+        silence = silence_of(self._plan)
+        if self._plan.limits.silence is None and all(map(_is_simulated, poller.buses.values())):
+            silence = max(silence, SIMULATED_SILENCE_S)
+        self._watch = LimitWatch(self._plan, round(silence * 1e9), clock.now_ns())
         # how long, in ns, the computer had slept before the run
         self._slept_ns = clock.boottime_ns() - clock.now_ns()
         self._looked_ns = clock.boottime_ns()  # when rows were last compared with the limits
@@ -289,7 +299,8 @@ class _Session:
             self._check_standstill()  # a suspension just before this line must not delay a start
             self._mark(step.name)
             works = [
-                pool.submit(copy_context().run, _command, self._poller[name], step) for name in step.drives
+                pool.submit(copy_context().run, self._command, self._poller[name], step)
+                for name in step.drives
             ]
             at = self._follow(works, at + planned.seconds, step)
 
@@ -370,12 +381,30 @@ class _Session:
     def _check(self, name: str) -> None:
         """Check a drive's identity, and the test's frequencies and rates against the drive's own limits."""
         drive = self._poller[name]
-        drive.bus.check_identity(drive)
         steps = [step for step in self._plan.steps if name in step.frequency]
-        for hz in {step.frequency[name] for step in steps}:
-            drive.perform(check_setpoint(drive, hz))
-        for rate in {step.rate for step in steps if step.rate}:
-            drive.perform(checked_rate(drive, rate))
+
+        def check() -> None:
+            drive.bus.check_identity(drive)
+            for hz in {step.frequency[name] for step in steps}:
+                drive.perform(check_setpoint(drive, hz))
+            for rate in {step.rate for step in steps if step.rate}:
+                drive.perform(checked_rate(drive, rate))
+
+        self._insist(drive, check)
+
+    def _command(self, drive: Drive, step: RunStep) -> None:
+        self._insist(drive, lambda: _command(drive, step))
+
+    def _insist(self, drive: Drive, work: Callable[[], object]) -> object:
+        """Do the work. Repeat it if a simulated drive was late; a command to a real drive is not repeated."""
+        attempts = SIMULATED_ATTEMPTS if _is_simulated(drive.bus) else 1
+        for attempt in range(attempts):
+            try:
+                return work()
+            except (NoReply, Unconfirmed, Expired):
+                if attempt == attempts - 1 or self._is_stopping:
+                    raise
+        return None
 
     def _mark(self, phase: str) -> None:
         """Note and record the start of a phase."""
