@@ -144,18 +144,21 @@ def reset_in_poll(kind: str, names: str) -> dict[str, Any]:
     return poll.end()
 
 
-def reset_in_start(kind: str, rounds: int) -> list[dict[str, Any]]:
-    """Reset the adapter while a start is under way; return each result and the start's frames on the line."""
+def reset_in_start(kind: str, delays: list[float]) -> list[dict[str, Any]]:
+    """Reset the adapter once for each delay in s after the call of `start`.
+
+    Return each result, and the start's frames on the line.
+    """
     adapter = plug.Adapter(kind, f"hub-{kind}", family=FAMILY, addresses=[1])
     facts = []
     name = Path(adapter.by_id)  # the reset may change the tty's name
-    for number in range(rounds):
+    for delay in delays:
         plug.wait_until(name.exists)
         with Bus(str(name)) as bus:
             pump = bus.attach(ErmanERG220, address=1, name="pump")
             insist(pump.set_frequency, 30.0)
             count = len(adapter.state["requests"])
-            resetting = threading.Timer(0.01 * number, _reset, [adapter.serial])
+            resetting = threading.Timer(delay, _reset, [adapter.serial])
             resetting.start()
             result = str(attempt(pump.start))
             resetting.join()
