@@ -1,4 +1,4 @@
-"""Tasks and threads that a fleet's gateway needs: if one ends, this is logged and the gateway shuts down.
+"""If a task or thread that a fleet's gateway needs has ended, this is logged and the gateway shuts down.
 
 A failure on one line affects only that line.
 """
@@ -47,10 +47,10 @@ STARTERS = {
     *("Thread", "ThreadPoolExecutor", "TaskGroup", "Timer"),
     *("create_task", "ensure_future", "to_thread", "run_in_executor"),
 }
-WAITED_FOR = {  # modules that start tasks or threads, and wait for them themselves
+WAITED_FOR = {  # modules that start tasks or threads, and wait for them
     *("connections", "fleet_commands", "followed", "forwarder", "gateway", "hub", "leaders"),
     *("line_keeper", "member", "observer", "page_part", "shares"),
-    "spool",  # the gateway checks this thread
+    "spool",  # this module's thread is checked by the gateway
 }
 MEMBER = (
     *(f"path {at}" for at in (1, 2, 3)),
@@ -58,20 +58,20 @@ MEMBER = (
     *(f"records {at}" for at in range(1, 1 + len(names.BUCKETS))),
     *("guard", "leaders", "weak session", "releases", "steps", "lines"),
 )
-TRIED = ("forwarder", "member", "gw-1: lease 1", "gw-1: lines")  # in the short run
+TRIED = ("forwarder", "member", "gw-1: lease 1", "gw-1: lines")  # tasks that the short run tests
 TASKS = ("forwarder", "samples path", "member", "look", *(f"gw-1: {name}" for name in MEMBER))
 THREADS = ("multidrop spool", "multidrop poller", "multidrop batches")
 
 
 class Ill(Exception):
-    """An unexpected exception in the code under test."""
+    """An unexpected exception in the tested code."""
 
 
 async def fail(*details: object) -> None:
     raise Ill("a mistake")
 
 
-def test_only_known_modules_of_the_fleet_start_tasks_or_threads() -> None:
+def test_only_listed_modules_of_the_fleet_start_tasks_or_threads() -> None:
     found = set()
     for path in Path(multidrop.fleet.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
@@ -95,7 +95,8 @@ def gateway(
     def run(act: Callable[[FleetGateway], Awaitable[object]]) -> None:
         async def main() -> None:
             made = FleetGateway("gw-1", fleet.urls, tmp_path)
-            monkeypatch.setattr(made.mastership, "extend", lambda until_ns: None)  # no timer kills the test
+            # the kernel's timer would kill the process of the tests
+            monkeypatch.setattr(made.mastership, "extend", lambda until_ns: None)
             ready = asyncio.Event()
             running = asyncio.ensure_future(made.run(ready.set))
             await asyncio.wait([running, asyncio.ensure_future(ready.wait())], return_when="FIRST_COMPLETED")
@@ -105,7 +106,8 @@ def gateway(
             try:
                 await asyncio.wait_for(running, 60)
             finally:
-                assert made.member.lease.session == 0  # its session has ended: others take over immediately
+                # the session has ended, so other gateways take over immediately
+                assert made.member.lease.session == 0
                 assert [one.get_name() for one in asyncio.all_tasks() if one.get_name() in TASKS] == []
 
         asyncio.run(main())
@@ -120,7 +122,8 @@ def test_a_gateway_runs_exactly_the_listed_tasks_and_threads(gateway: Any) -> No
         assert set(supervisor().kept) == set(TASKS)
         assert supervisor().watched == ["spool"]
         names = {thread.name.rstrip("_0123456789") for thread in {*threading.enumerate()} - before}
-        assert names - {"asyncio", "multidrop log"} == set(THREADS)  # these two are started only when needed
+        # asyncio and the log start these threads only when needed
+        assert names - {"asyncio", "multidrop log"} == set(THREADS)
         made.end()
 
     gateway(look)
@@ -136,14 +139,15 @@ def test_a_task_that_is_killed_is_logged_and_ends_the_gateway(
         task = supervisor().kept[name]
         while not task.done():  # Python 3.11's wait_for may swallow one cancellation
             task.cancel()
-            await asyncio.wait([task], timeout=5)  # a second cancellation would interrupt the cleanup
+            # a second cancellation during the task's cleanup would interrupt it
+            await asyncio.wait([task], timeout=5)
 
     with pytest.raises(Ended, match=f"{name} has ended: it was cancelled"):
         gateway(kill)
     assert f"{name} has ended, and does not come back: it was cancelled" in caplog.text
 
 
-def test_the_exception_of_a_task_is_logged_with_its_cause(
+def test_the_exception_that_ended_a_task_is_logged_with_its_cause(
     gateway: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def kill(made: FleetGateway) -> None:
@@ -155,7 +159,9 @@ def test_the_exception_of_a_task_is_logged_with_its_cause(
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_the_end_of_the_spools_thread_ends_the_gateway(gateway: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_gateway_shuts_down_if_the_spools_thread_has_ended(
+    gateway: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def leave() -> bool:
         raise SystemExit
 
@@ -168,7 +174,7 @@ def test_the_end_of_the_spools_thread_ends_the_gateway(gateway: Any, monkeypatch
         gateway(kill)
 
 
-def test_failed_polling_ends_the_gateway(gateway: Any) -> None:
+def test_the_gateway_shuts_down_if_polling_has_failed(gateway: Any) -> None:
     async def kill(made: FleetGateway) -> None:
         made.lines.poller.failure = PollingFailed("polling has ended on all lines: Ill: of the poller")
 
@@ -176,8 +182,10 @@ def test_failed_polling_ends_the_gateway(gateway: Any) -> None:
         gateway(kill)
 
 
-def test_a_failed_subscription_ends_the_gateway(gateway: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Otherwise the gateway would miss stops."""
+def test_the_gateway_shuts_down_if_it_cannot_subscribe_to_commands(
+    gateway: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A gateway without the subscription would miss stops."""
 
     async def kill(made: FleetGateway) -> None:
         monkeypatch.setattr(made.paths[1], "subscribe", fail)
@@ -187,8 +195,10 @@ def test_a_failed_subscription_ends_the_gateway(gateway: Any, monkeypatch: pytes
         gateway(kill)
 
 
-async def test_a_commander_reports_the_end_of_its_connection(fleet: Cluster, tmp_path: Path) -> None:
-    """The page then connects again."""
+async def test_a_client_for_commands_reports_the_end_of_its_connection(
+    fleet: Cluster, tmp_path: Path
+) -> None:
+    """A commander is a client for commands. The page replaces one whose connection has ended."""
     async with FleetCommands(fleet.urls, by="page", log=tmp_path / "log.jsonl") as commands:
         commands._keeping[1].cancel()
         with pytest.raises(Ended, match="a connection to the fleet has ended"):
@@ -198,7 +208,7 @@ async def test_a_commander_reports_the_end_of_its_connection(fleet: Cluster, tmp
 # ---- failures after which the gateway continues ----
 
 
-async def test_a_failing_forwarder_is_logged_and_retries(
+async def test_an_unexpected_failure_of_the_forwarder_is_logged_and_it_retries(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(forwarder_module, "AGAIN_S", 0.0)
@@ -244,7 +254,7 @@ def test_a_spool_continues_to_write_after_unexpected_failures(
     assert "no memory" in caplog.text
 
 
-async def test_a_failed_start_of_compaction_is_retried(
+async def test_the_hub_retries_if_the_compaction_process_cannot_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     require_module("duckdb")
@@ -271,7 +281,9 @@ def test_an_error_while_metrics_are_computed_gives_status_500(caplog: pytest.Log
     assert "Ill: a mistake" in caplog.text
 
 
-def test_a_stop_that_raises_in_the_desk_is_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sender_gets_an_answer_if_its_stop_raises_in_the_gateway(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with desks(tmp_path) as desk:
         monkeypatch.setattr(desk.stops._repeated, "begin", lambda *details: asyncio.run(fail()))
         answer = asyncio.run(desk.stop())
@@ -283,7 +295,7 @@ def test_a_stop_that_raises_in_the_desk_is_answered(tmp_path: Path, monkeypatch:
 
 
 class Taken:
-    """The lines of a gateway, with a simulated line to take."""
+    """A gateway's `FleetLines`, and the description of a simulated line that it can poll."""
 
     def __init__(self, port: str, folder: Path) -> None:
         self.mastership = Mastership()
@@ -312,7 +324,7 @@ def taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Taken]:
 async def test_a_line_that_fails_to_open_is_not_polled(
     taken: Taken, monkeypatch: pytest.MonkeyPatch, failure: BaseException
 ) -> None:
-    """Another gateway may soon be the line's master."""
+    """The line's port must be closed again, because another gateway may soon poll the line."""
     add_line = taken.lines.poller.add_line
 
     def add(described: Any) -> None:
@@ -338,7 +350,7 @@ async def test_a_line_whose_commands_cannot_be_received_is_not_polled(
     assert taken.lines.poller.buses == {}
 
 
-async def test_lines_are_closed_after_polling_has_failed(taken: Taken) -> None:
+async def test_a_line_can_be_closed_after_polling_has_failed(taken: Taken) -> None:
     await taken.lines.take(LINE, taken.description)
     taken.lines.poller.failure = PollingFailed("polling has ended on all lines: Ill: of the poller")
     await taken.lines.let_go(LINE)
@@ -347,7 +359,9 @@ async def test_lines_are_closed_after_polling_has_failed(taken: Taken) -> None:
 
 
 @pytest.mark.long
-def test_lines_with_failing_polls_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fleet_status_counts_lines_on_which_polling_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     failures = {"hall": "Ill: of its class"}
     monkeypatch.setattr(Poller, "line_failures", property(lambda poller: failures))
 
@@ -371,7 +385,7 @@ PATIENCE_S = 60.0
 
 
 async def deaf(times: int) -> str:
-    """Ignore this many cancellations, as a path does if a pong arrives at the same moment."""
+    """Ignore this many cancellations, as `asyncio.wait_for` may do if a pong arrives at the same moment."""
     for _ in range(times):
         try:
             await asyncio.sleep(3600)
@@ -387,14 +401,14 @@ async def _begun(times: int) -> asyncio.Task[str]:
     return task
 
 
-async def test_a_task_is_cancelled_until_it_has_ended() -> None:
+async def test_end_tasks_cancels_a_task_repeatedly_until_it_has_ended() -> None:
     tasks = [await _begun(times) for times in (0, 1, 3)]
     found = await asyncio.wait_for(end_tasks(*tasks), PATIENCE_S)
     assert [type(one) for one in found] == [asyncio.CancelledError] * 3
     assert await end_tasks() == []
 
 
-async def test_the_error_of_an_ended_task_is_returned() -> None:
+async def test_end_tasks_returns_the_error_of_a_task_that_has_ended() -> None:
     async def failing() -> None:
         raise OSError("the disk is full")
 
@@ -404,7 +418,7 @@ async def test_the_error_of_an_ended_task_is_returned() -> None:
     assert str(found) == "the disk is full"
 
 
-async def test_closing_a_commander_ends_a_path_that_ignored_a_cancellation(tmp_path: Path) -> None:
+async def test_closing_a_client_for_commands_ends_tasks_that_ignore_a_cancellation(tmp_path: Path) -> None:
     fleet = FleetCommands(["nats://127.0.0.1:1"], by="anna", log=tmp_path / "commands.jsonl")
     fleet._keeping = [await _begun(1)]
     await asyncio.wait_for(fleet.close(), PATIENCE_S)

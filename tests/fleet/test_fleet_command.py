@@ -1,4 +1,4 @@
-"""`multidrop fleet`: its output about a fleet, and one sentence for each mistake of the user."""
+"""`multidrop fleet`: what it prints about a fleet, and its error for each mistake of the user."""
 
 from __future__ import annotations
 
@@ -78,14 +78,17 @@ def test_no_server_is_reported_in_one_sentence(run: Run, nobody: str, words: lis
 def test_without_a_home_folder_a_stop_is_still_sent(
     run: Run, nobody: str, monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
-    """A container's user may have no home folder. A command is then not sent, because it cannot be logged."""
+    """A container's user may have no home folder, and so no log.
+
+    Commands are then not sent, but stops are.
+    """
 
     def none() -> Path:
         raise RuntimeError("Could not determine home directory.")
 
     monkeypatch.delenv("XDG_STATE_HOME")
     monkeypatch.setattr(Path, "home", none)
-    monkeypatch.setattr(eeprom_ledger, "NO_HOME", Path("/dev/null"))  # a path that not even root can create
+    monkeypatch.setattr(eeprom_ledger, "NO_HOME", Path("/dev/null"))  # not even root can create this path
     status, out, err = run("fleet", *words, "--nats", nobody)
     assert (status, out) == (1, "")
     assert f"no NATS server answers at {nobody}: Connection refused" in err
@@ -98,7 +101,7 @@ def test_servers_without_a_fleet_are_reported_in_one_sentence(run: Run, tmp_path
             assert "has no bucket lease_0: run `multidrop fleet init` first" in said
 
 
-def test_an_old_server_is_refused(run: Run, tmp_path: Path) -> None:
+def test_a_nats_server_that_is_too_old_is_refused(run: Run, tmp_path: Path) -> None:
     with cluster(tmp_path / "old", 1, old_server_program()) as old:
         for words in (["init"], ["serve", "gw-1"], ["status"]):
             assert "a fleet needs 2.12 or newer" in one_sentence(run("fleet", *words, "--nats", old.urls[0]))
@@ -114,7 +117,9 @@ MISTAKES: dict[str, tuple[Callable[[Path], Path], str]] = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_plant_with_a_mistake_changes_nothing(run: Run, nobody: str, tmp_path: Path, mistake: str) -> None:
+def test_init_refuses_a_plant_file_with_a_mistake(
+    run: Run, nobody: str, tmp_path: Path, mistake: str
+) -> None:
     make, sentence = MISTAKES[mistake]
     assert sentence in one_sentence(run("fleet", "init", make(tmp_path), "--nats", nobody))
 
@@ -176,17 +181,19 @@ def test_mistakes_in_permission_lists_are_reported(run: Run, nobody: str, tmp_pa
         (["reset-fault", "pump-1", "--by", "\x1b[31m"], "is not 1 to 200 printable characters"),
     ],
 )
-def test_mistaken_calls_are_reported_in_one_sentence(run: Run, words: list[str], sentence: str) -> None:
+def test_each_mistake_on_the_command_line_is_reported_in_one_sentence(
+    run: Run, words: list[str], sentence: str
+) -> None:
     assert sentence in one_sentence(run("fleet", *words))
 
 
-def test_an_invalid_name_does_not_block_a_stop(run: Run, nobody: str) -> None:
+def test_a_stop_is_sent_even_if_the_name_of_its_sender_is_invalid(run: Run, nobody: str) -> None:
     _, _, said = run("fleet", "stop", "pump-1", "--by", "\x1b[31m" + "x" * 300, "--nats", nobody)
     assert "the stop was NOT sent: no NATS server answers" in said
 
 
 @pytest.mark.parametrize("action", ["stop", "coast"])
-def test_an_unknown_option_does_not_block_a_stop(run: Run, nobody: str, action: str) -> None:
+def test_a_stop_with_an_unknown_option_is_still_sent(run: Run, nobody: str, action: str) -> None:
     status, _, said = run("fleet", action, "pump-1", "--lnie=hall", "--nats", nobody)
     assert status != 0
     assert said.startswith(f"multidrop: {action}: ignored unknown options: --lnie=hall\n")
@@ -194,7 +201,7 @@ def test_an_unknown_option_does_not_block_a_stop(run: Run, nobody: str, action: 
 
 
 @pytest.mark.parametrize("library", ["nats", "pyarrow"])
-def test_a_missing_extra_is_reported_in_one_sentence(
+def test_a_missing_optional_package_is_reported_in_one_sentence(
     run: Run, monkeypatch: pytest.MonkeyPatch, library: str
 ) -> None:
     found = importlib.util.find_spec
@@ -206,7 +213,9 @@ def test_a_missing_extra_is_reported_in_one_sentence(
     )
 
 
-def test_a_second_gateway_of_a_name_on_one_machine_is_refused(run: Run, tmp_path: Path, nobody: str) -> None:
+def test_a_second_gateway_of_the_same_name_in_one_folder_is_refused(
+    run: Run, tmp_path: Path, nobody: str
+) -> None:
     from multidrop.fleet.leases.lease import LifeLock
 
     with closing(LifeLock(tmp_path / "gw-1.lock")):
@@ -216,7 +225,7 @@ def test_a_second_gateway_of_a_name_on_one_machine_is_refused(run: Run, tmp_path
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_init_creates_and_shows_the_fleet(run: Run, nats: Cluster, tmp_path: Path) -> None:
+def test_init_creates_a_fleet_and_status_shows_it(run: Run, nats: Cluster, tmp_path: Path) -> None:
     servers = ("--nats", ",".join(nats.urls))
     status, out, err = run("fleet", "init", plant(tmp_path), *servers)
     assert (status, err) == (0, "")
@@ -229,9 +238,9 @@ def test_init_creates_and_shows_the_fleet(run: Run, nats: Cluster, tmp_path: Pat
     assert lines["hall-1"]["port"] == "socket://127.0.0.1:4002"
     assert lines["hall-1"]["master"] is None
     status, out, _ = run("fleet", "status", *servers)
-    assert status == 1  # the line has no master
+    assert status == 1  # 1, because the line has no master
     assert "1 line, 1 without a master" in out
-    assert run("fleet", "status", "--json", *servers)[0] == 1  # the same status with --json
+    assert run("fleet", "status", "--json", *servers)[0] == 1  # --json gives the same exit status
     said = one_sentence(run("fleet", "drain", "gw-9", *servers))
     assert "no gateway called gw-9 answers; `multidrop fleet status` lists them" in said
 
@@ -296,7 +305,9 @@ def test_the_demo_plant_has_two_drives_on_each_line(tmp_path: Path) -> None:
     ("said", "version"),
     [("nats-server: v2.15.1", (2, 15)), ("nats-server: v2.9.10", (2, 9)), ("no idea", (0, 0))],
 )
-def test_a_servers_version_is_parsed_or_zero(tmp_path: Path, said: str, version: tuple[int, int]) -> None:
+def test_the_version_of_a_nats_server_program_is_parsed(
+    tmp_path: Path, said: str, version: tuple[int, int]
+) -> None:
     program = tmp_path / "nats-server"
     program.write_text(f"#!/bin/sh\necho '{said}'\n")
     program.chmod(0o755)
@@ -364,7 +375,9 @@ def test_the_demo_shows_a_takeover() -> None:
 @pytest.mark.slow
 @pytest.mark.long
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL)])
-def test_the_demo_removes_processes_and_files_however_it_ends(number: signal.Signals, status: int) -> None:
+def test_the_demo_removes_its_processes_and_files_when_it_is_killed(
+    number: signal.Signals, status: int
+) -> None:
     with started() as (demo, folder):
         demo.send_signal(number)
         assert demo.wait(60) == status
@@ -373,7 +386,7 @@ def test_the_demo_removes_processes_and_files_however_it_ends(number: signal.Sig
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_on_a_terminal_the_demo_draws_and_after_ctrl_c_prints_its_notes() -> None:
+def test_the_demo_draws_on_a_terminal_and_prints_its_notes_after_ctrl_c() -> None:
     with on_terminal("fleet", "demo", size=(110, 30)) as terminal:
         terminal.wait_for_match(r"in (/\S+)\r")
         folder = re.search(r"in (/\S+)\r", terminal.text)[1]

@@ -1,4 +1,4 @@
-"""One gateway of a fleet: which requests it answers, and how it shuts down."""
+"""One gateway of a fleet: answers to requests, shutdown, part of the web page, and metrics."""
 
 from __future__ import annotations
 
@@ -53,8 +53,11 @@ class Asked:
         self.answers.append(json.loads(data))
 
 
-async def test_a_gateway_that_waits_for_another_one_of_its_name_answers_no_requests(tmp_path: Path) -> None:
-    """Its namesake gets the request too. A second answer would mislead `fleet status` and `drain`."""
+async def test_a_gateway_without_a_session_answers_no_requests(tmp_path: Path) -> None:
+    """Both gateways get each request.
+
+    An answer of the waiting one would mislead `fleet status` and `drain`.
+    """
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     lease = gateway.member.lease
     for wanted in ("state", "drain"):
@@ -68,8 +71,8 @@ async def test_a_gateway_that_waits_for_another_one_of_its_name_answers_no_reque
     await gateway._close()
 
 
-async def test_a_request_with_a_foreign_reply_subject_is_ignored(tmp_path: Path) -> None:
-    """Servers would deliver the answer there, even to a record that the requester may not write."""
+async def test_a_gateway_answers_only_to_subjects_that_are_inboxes(tmp_path: Path) -> None:
+    """Servers would send the answer to that subject, even if the requester may not write there."""
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     gateway.member.lease.session = 7
     for reply in ("", "$KV.plant.line-1", "stop.line-1", "samples.gw-2.log", "_INBOX", "_INBOXES.a"):
@@ -85,13 +88,13 @@ async def test_a_request_with_a_foreign_reply_subject_is_ignored(tmp_path: Path)
 
 
 @pytest.mark.parametrize(("trouble", "is_forwarded"), [(None, True), ("the stream is full", False)])
-async def test_shutdown_waits_for_unsent_messages_unless_the_stream_fails(
+async def test_shutdown_waits_until_samples_are_forwarded_if_the_stream_works(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trouble: str | None, is_forwarded: bool
 ) -> None:
     monkeypatch.setattr(fleet_gateway, "FORWARD_S", PATIENCE_S)
     monkeypatch.setattr(fleet_gateway, "IN_TROUBLE_S", 0.0)
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
-    taken = iter([0, 0, 1])  # at each check: how many of the spool's two messages the stream has
+    taken = iter([0, 0, 1])  # at each check: how many of the spool's two messages are in the stream
     forwarder: Any = type(
         "Forwarding", (), {"trouble": trouble, "last": property(lambda _: next(taken, 2))}
     )()
@@ -105,7 +108,7 @@ async def test_shutdown_waits_for_unsent_messages_unless_the_stream_fails(
     await gateway._close()
 
 
-async def test_without_a_lease_the_margin_is_zero(tmp_path: Path) -> None:
+async def test_the_remaining_time_of_a_gateway_without_a_lease_is_zero(tmp_path: Path) -> None:
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     assert gateway.state()["margin_s"] == 0.0
     await gateway._close()
@@ -114,7 +117,10 @@ async def test_without_a_lease_the_margin_is_zero(tmp_path: Path) -> None:
 async def test_the_kernels_timer_is_cancelled_after_the_lines_are_closed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Otherwise the kernel would kill a process that continues to run after its member has failed."""
+    """The poller may run until its lines are closed.
+
+    If the timer stayed set, it would later kill the process.
+    """
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     gateway.mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 3600 * 10**9)
     held: list[bool] = []
@@ -195,10 +201,13 @@ def test_fleet_settings_name_the_missing_nats_library(
 
 
 @pytest.mark.parametrize("dying", ["path", "watch", "commander", "path of samples", "rows", "lines"])
-def test_the_part_ends_when_any_of_its_tasks_fails(
+def test_the_part_fleet_ends_if_any_of_its_tasks_fails(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, dying: str
 ) -> None:
-    """The gateway reports the part's end. Otherwise the page would show an old view of the fleet forever."""
+    """The gateway reports a part that has ended.
+
+    Otherwise the page would show an old view of the fleet forever.
+    """
 
     async def go_on(*details: object) -> None:
         await asyncio.Event().wait()
@@ -225,7 +234,7 @@ def test_the_part_ends_when_any_of_its_tasks_fails(
 
 
 class Looks(FleetView):
-    """A view whose reads succeed until the test lets them fail."""
+    """A view of a fleet. While `failure` is set, reading it fails."""
 
     failure: OSError | None = None
 
@@ -234,7 +243,7 @@ class Looks(FleetView):
             raise self.failure
 
 
-def test_an_old_view_makes_the_part_unhealthy() -> None:
+def test_a_view_older_than_5_s_makes_the_part_fleet_unhealthy() -> None:
     now = [0.0]
     view = Looks(ServerPath([]))
     watch = FleetWatch(view, lambda: now[0])
@@ -258,7 +267,7 @@ def test_an_old_view_makes_the_part_unhealthy() -> None:
     assert watch.state()["age_s"] == 6.0
 
 
-def test_a_password_in_an_address_is_never_shown() -> None:
+def test_a_password_in_a_servers_url_is_never_shown() -> None:
     view = Looks(ServerPath([]))
     view.failure = OSError("no NATS server can be reached at nats://anna:s3cret@a:4222, tls://t0ken@b:4222")
     watch = FleetWatch(view)
@@ -300,7 +309,7 @@ def secured(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 
 def fleet_table(fleet: Any, key: str, user: str) -> str:
-    """Return a page's table [serve.fleet] whose `key` names this user's file."""
+    """Return a table [serve.fleet] of a plant file. Its entry `key` is the key file of this user."""
     servers = fleet.servers
     ca = f'ca = "{servers.tls.ca}"'
     return f'[serve.fleet]\nnats = ["{servers.urls[0]}"]\n{ca}\n{key} = "{servers.key(user)}"\n'
@@ -330,7 +339,7 @@ def test_the_page_stops_the_fleet_only_with_a_commanders_key(secured: Any, tmp_p
         assert drives == {f"drive-{line}": True for line in secured.hall.lines}, told
 
 
-def test_the_page_cannot_stop_the_fleet_without_a_key_or_servers(tmp_path: Path) -> None:
+def test_the_page_cannot_stop_the_fleet_without_a_commanders_key_or_servers(tmp_path: Path) -> None:
     with served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway:
         assert gateway.get("/api/plant").json["fleet_stop"] is False
         answer = gateway.post("/api/fleet/stop", {})
@@ -355,7 +364,7 @@ def test_missing_fleet_servers_are_reported_on_the_page(tmp_path: Path) -> None:
         wanted = f"it was never read: no NATS server can be reached at nats://127.0.0.1:{port}"
         until(lambda: wanted == gateway.get("/health").json["parts"]["fleet"])
         assert gateway.get("/api/fleet").json["age_s"] is None
-        assert gateway.frame()["drives"]  # the drives of the gateway's own lines are still shown
+        assert gateway.frame()["drives"]  # the gateway's own drives are still shown
 
 
 # ---- its metrics: valid for promtool, only for this computer, robust against any request ----
@@ -405,7 +414,7 @@ def test_metrics_show_the_state_of_a_gateway() -> None:
     assert {name: value for name, value in found.items() if "{" not in name} == expected
 
 
-def test_unknown_figures_have_no_sample_in_the_metrics() -> None:
+def test_metrics_leave_out_figures_that_are_unknown() -> None:
     spool = STATE["spool"] | {"behind": None, "lag_s": None}
     found = samples(STATE | {"session": 0, "margin_s": 0.0, "state": "no lease", "spool": spool})
     missing = {"lease_margin_seconds", "session", "behind_messages", "behind_seconds"}
@@ -436,7 +445,7 @@ def asked(line: str = "GET /metrics HTTP/1.1", host: str = "localhost:9464", *mo
 
 
 def said(head: bytes) -> tuple[int, str, str]:
-    """Return status, content type and text of the response to a request."""
+    """Return the status, content type and text of the HTTP response to a request."""
     text = answer(head, lambda: families_of(STATE, "1.0")).decode()
     head_text, _, body = text.partition("\r\n\r\n")
     fields = dict(line.split(": ", 1) for line in head_text.split("\r\n")[1:])
@@ -444,7 +453,7 @@ def said(head: bytes) -> tuple[int, str, str]:
     return int(head_text.split()[1]), fields["content-type"], body
 
 
-def test_both_metrics_formats_are_served() -> None:
+def test_metrics_are_served_in_prometheus_and_openmetrics_format() -> None:
     status, kind, text = said(asked())
     assert (status, kind) == (200, "text/plain; version=0.0.4; charset=utf-8")
     assert "multidrop_fleet_lines 4.0\n" in text
@@ -468,12 +477,12 @@ def test_both_metrics_formats_are_served() -> None:
         (asked("GET /metrics?x=1 HTTP/1.0"), 200),
     ],
 )
-def test_requests_for_anything_but_metrics_are_refused(head: bytes, status: int) -> None:
+def test_the_metrics_port_refuses_requests_for_anything_but_metrics(head: bytes, status: int) -> None:
     assert said(head)[0] == status
 
 
 @given(st.binary(max_size=200))
-def test_any_bytes_get_an_http_response(data: bytes) -> None:
+def test_the_metrics_port_answers_any_bytes_with_an_http_response(data: bytes) -> None:
     assert said(data + b"\r\n\r\n")[0] in (400, 403, 404, 405)
 
 
@@ -491,7 +500,7 @@ INVALID = r"is not an address and port; write --metrics 127\.0\.0\.1:9464"
         *((one, INVALID) for one in ("9464", "127.0.0.1", "127.0.0.1:x", ":9464", "127.0.0.1:99999")),
     ],
 )
-def test_addresses_that_are_invalid_or_open_to_others_are_rejected(address: str, sentence: str) -> None:
+def test_metrics_addresses_that_are_invalid_or_not_local_are_rejected(address: str, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         listen(address)
 
@@ -503,8 +512,11 @@ def test_a_metrics_port_in_use_is_reported_in_one_sentence() -> None:
             listen(f"127.0.0.1:{port}")
 
 
-async def test_silent_clients_are_limited_and_do_not_delay_the_end() -> None:
-    """Clients beyond the limit, or with too much data, are disconnected; none delays the shutdown."""
+async def test_clients_of_the_metrics_port_are_limited_and_do_not_delay_its_end() -> None:
+    """Further clients, and clients that send too much, are disconnected.
+
+    Silent clients do not delay the shutdown.
+    """
 
     async def ask(port: int, data: bytes) -> bytes:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)

@@ -1,4 +1,4 @@
-"""Rights on a fleet's servers, from the files that `fleet rights` writes: requests that each user is refused.
+"""Rights from the files that `fleet rights` writes: requests that a fleet's servers must refuse to each user.
 
 Each attempt is made at two servers. The server with these rights must refuse it. The server on which users
 may do everything must accept it, which proves that the attempt is valid.
@@ -30,7 +30,7 @@ CONSUMERS = ("CONSUMER.CREATE.{}", "CONSUMER.CREATE.{}.c.>", "CONSUMER.DURABLE.C
 COMMANDS = ("cmd.line-1", "stop.line-1", "do.gw-b.run")
 PATIENCE_S = 30.0
 
-FORBIDDEN = {  # subjects forbidden to each user, besides those forbidden to all
+FORBIDDEN = {  # subjects that each user may not use, besides those that no user may use
     "gw-a": (
         *("samples.gw-b.log", "samples.gw-c.log", "samples.gw-a"),
         *("$KV.lease_0.gw-b.gw-b", "$KV.lease_1.gw-b.gw-c", "$KV.lease_2.gw-a.gw-b", "$KV.lease_0.gw-b"),
@@ -84,7 +84,7 @@ LISTENED = (
 class Attempt(NamedTuple):
     user: str
     deed: str  # "publish" or "subscribe"
-    subject: str  # {hub} in it, for example, stands for the inbox of the user "hub"
+    subject: str  # {hub} in a subject, for example, stands for the inbox of the user "hub"
 
 
 def attempts() -> Iterator[Attempt]:
@@ -117,7 +117,8 @@ async def refused(servers: SecuredCluster) -> set[Attempt]:
                 await client.publish(subject, b"{}")
             else:
                 await client.subscribe(subject)
-        for _ in range(2):  # the first flush may end before pending data is sent; the second cannot
+        # the server may answer the first flush before it has handled all data, but not the second
+        for _ in range(2):
             await client.flush()
         await client.close()
         for attempt, subject in mine.items():
@@ -152,7 +153,7 @@ def refusals_where_all_is_allowed(tmp_path_factory: pytest.TempPathFactory) -> s
 
 
 @pytest.mark.parametrize("user", FORBIDDEN)
-def test_a_request_without_the_right_is_refused(
+def test_the_server_refuses_each_request_that_a_user_has_no_right_to_send(
     user: str, refusals: set[Attempt], refusals_where_all_is_allowed: set[Attempt]
 ) -> None:
     wanted = {attempt for attempt in attempts() if attempt.user == user}
@@ -187,7 +188,7 @@ async def _ignore(_: Exception) -> None:
         (["hub"], "'hub' is taken"),
     ],
 )
-def test_names_that_cannot_have_rights_are_rejected(names: list[str], sentence: str) -> None:
+def test_invalid_names_of_gateways_are_rejected(names: list[str], sentence: str) -> None:
     with pytest.raises(ValueError, match=re.escape(sentence)):
         rights_of(names)
 
@@ -270,7 +271,7 @@ def test_rights_without_tls_cause_a_warning(run: Run, tmp_path: Path) -> None:
         (["gw-1", "--nats", "nats://a:port"], "nats://a:port is not an address of a NATS server"),
     ],
 )
-def test_an_invalid_rights_command_writes_no_file(
+def test_fleet_rights_with_invalid_arguments_writes_no_file(
     run: Run, tmp_path: Path, words: list[str], sentence: str
 ) -> None:
     status, out, err = run("fleet", "rights", *words, "--folder", tmp_path / "nats")
@@ -281,7 +282,7 @@ def test_an_invalid_rights_command_writes_no_file(
 
 
 def test_a_request_counts_as_unsent_only_if_this_request_was_denied() -> None:
-    """Rights may change while a connection is open, so an earlier denial does not apply to this request."""
+    """Rights may change while a connection is open, so the denial of an earlier request proves nothing."""
     denials = Denials()
     denied = Exception('nats: permissions violation for publish to "stop.line-1"')
     asyncio.run(denials.note(denied))
@@ -296,7 +297,7 @@ def test_a_request_counts_as_unsent_only_if_this_request_was_denied() -> None:
 
 
 @pytest.mark.slow
-def test_a_creds_file_is_passed_to_nats_py(tmp_path: Path) -> None:
+def test_the_path_of_a_creds_file_is_passed_to_nats_py(tmp_path: Path) -> None:
     path = tmp_path / "gw-1.creds"
     path.write_text("-----BEGIN NATS USER JWT-----\ney\n------END NATS USER JWT------\n")
     assert connect_options(["nats://a"], path) == {"user_credentials": str(path)}

@@ -1,4 +1,4 @@
-"""`fleet watch`: an old view is marked as old, and the picture fits every terminal size."""
+"""`fleet watch`: its text picture of a fleet fits every terminal size, and marks an old view as old."""
 
 from __future__ import annotations
 
@@ -65,12 +65,12 @@ def test_the_screen_shows_gateways_lines_and_moves() -> None:
 
 @pytest.mark.long
 @table("height", [*range(1, 30), 59])
-def test_the_picture_fits_each_screen_height(height: int) -> None:
+def test_the_screen_fits_each_terminal_height(height: int) -> None:
     for width in (20, 80, 200):
         drawn(told(trouble="no server", lines=100), width, height)
 
 
-def test_hidden_lines_are_counted_and_masterless_lines_come_first() -> None:
+def test_lines_without_a_master_come_first_and_hidden_lines_are_counted() -> None:
     text = drawn(told(lines=500))
     shown = len(re.findall(r"^line-\d+ ", text, re.MULTILINE))
     assert f"and {500 - shown} more lines" in text
@@ -78,14 +78,14 @@ def test_hidden_lines_are_counted_and_masterless_lines_come_first() -> None:
     assert text.count("from gw-1") >= 6
 
 
-def test_at_80_columns_and_24_rows_each_of_twelve_lines_has_its_master() -> None:
+def test_a_terminal_of_80_by_24_shows_twelve_lines_with_their_masters() -> None:
     text = drawn(told(lines=12), 80, 24)
     assert re.search(r"^line-0 +none +\| line-3", text, re.MULTILINE)
     assert len(re.findall(r"line-\d+ +(?:gw-1|none)", text)) == 12
     assert "last moves:" in text
 
 
-def test_notes_are_shown_whole_or_not_at_all() -> None:
+def test_a_note_that_does_not_fit_on_the_screen_is_left_out() -> None:
     notes = {"notes": [f"{at} " + "words " * 20 for at in range(3)]}
     shown = drawn(told() | notes, 80).splitlines()
     assert [row[0] for row in shown if re.match(r"\d words", row)] == ["1", "2"]
@@ -104,7 +104,7 @@ def test_a_narrow_terminal_drops_less_important_columns() -> None:
     ]
 
 
-def test_on_a_narrow_terminal_masters_and_moves_to_them_stay_visible() -> None:
+def test_a_narrow_terminal_still_shows_masters_and_the_last_moves() -> None:
     shown = drawn(told(), 40).splitlines()
     assert [re.sub(" +", " ", row) for row in shown if re.match("LINE|line-1 ", row)] == [
         "LINE MASTER SINCE",
@@ -126,15 +126,15 @@ def test_long_text_is_wrapped_or_marked_as_cut() -> None:
 
 
 @table("height", range(1, 60))
-def test_no_table_head_is_shown_without_rows(height: int) -> None:
+def test_the_screen_shows_no_table_head_without_a_row_below_it(height: int) -> None:
     rows = drawn(told(lines=12), 80, height).splitlines()
     for row, next_row in pairwise(rows):
         if row.startswith(("LINE ", "last moves")):
             assert re.match(r"line-|1970-", next_row), (row, next_row)
 
 
-def test_lines_of_a_silent_master_are_shown() -> None:
-    """If all gateways are dead, none of them ends the others' sessions, so the records still name masters."""
+def test_lines_whose_master_does_not_answer_are_listed_early_and_in_red() -> None:
+    """If all gateways are dead, none ends the others' sessions, so records still name them as masters."""
     found = told(lines=12)
     assert "1 without a master\n" in drawn(found)
     found["lines"]["line-7"]["master"] = "gw-2"
@@ -179,7 +179,7 @@ def test_a_missing_gateway_and_a_lost_port_are_shown(
     assert "gw-1: line line-2 cannot be opened from here; another gateway polls it" in drawn(lost)
 
 
-def test_line_10_is_listed_after_line_2() -> None:
+def test_lines_are_sorted_by_number_so_line_10_follows_line_9() -> None:
     rows = drawn(told(lines=12)).splitlines()
     assert [row.split()[0] for row in rows if row.startswith("line-")] == [f"line-{at}" for at in range(12)]
 
@@ -192,7 +192,7 @@ def test_an_old_view_is_dim_and_shows_its_age() -> None:
     assert {str(one.style) for one in picture(told(), (120, 40), "") if one.plain.startswith("gw-1")} == {""}
 
 
-def test_a_name_cannot_control_the_terminal() -> None:
+def test_control_characters_in_a_hosts_name_are_not_printed() -> None:
     found = told()
     found["gateways"]["gw-1"]["host"] = "\x1b[2J"
     assert "\x1b" not in drawn(found)
@@ -211,12 +211,12 @@ def test_moves_without_a_known_former_master_are_shown() -> None:
     ("number", "text"),
     [(0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (81234, "81 kB"), (5e9, "5.0 GB"), (3e15, "3000 TB")],
 )
-def test_sizes_have_two_digits_and_a_unit(number: float, text: str) -> None:
+def test_a_size_in_bytes_is_shown_with_a_unit(number: float, text: str) -> None:
     assert size(number) == text
 
 
 class FailingView:
-    """A view that shows a fleet at the first read and fails at later reads."""
+    """A view of a fleet that is read once. All later reads fail."""
 
     looks = 0
 
@@ -247,7 +247,7 @@ async def test_after_a_failed_read_the_last_view_is_shown_with_its_age(
 
 
 async def test_watch_ends_when_the_task_of_its_connection_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Otherwise `fleet watch` would show the last view forever."""
+    """Otherwise `fleet watch` would show an old view forever."""
     monkeypatch.setattr(views, "EVERY_S", 0.01)
     supervisor().keep("path", asyncio.sleep(0)).cancel()
     watch: Any = FleetWatch(FailingView())
@@ -275,7 +275,8 @@ def test_watch_prints_one_line_a_second_until_interrupted(fleet: Cluster) -> Non
         assert process.wait(30) == 0
         assert process.stderr.read() == ""
     assert [one["trouble"] for one in found] == [None] * 3
-    assert found[0]["at_ms"] + 900 <= found[2]["at_ms"]  # the first read may have taken long
+    # 0.9 s instead of 2 s, because the first read may have taken long
+    assert found[0]["at_ms"] + 900 <= found[2]["at_ms"]
 
 
 @pytest.mark.long
@@ -285,9 +286,9 @@ def test_on_a_terminal_watch_draws_until_interrupted(fleet: Cluster) -> None:
         terminal.process.send_signal(signal.SIGINT)
         assert terminal.process.wait(30) == 0
         terminal.written = os.read(terminal.fd, 65536)
-        assert b"\x1b[?25h" in terminal.written  # the cursor is shown again
+        assert b"\x1b[?25h" in terminal.written  # this sequence shows the cursor again
         assert b"Traceback" not in terminal.written
 
 
-def test_an_invalid_time_is_shown_as_a_question_mark() -> None:
+def test_a_time_beyond_the_calendar_is_shown_as_a_question_mark() -> None:
     assert moment(10**30) == "?"

@@ -1,4 +1,4 @@
-"""A gateway without lines of its own: it shows, exports and stops the drives of a whole fleet."""
+"""A gateway without its own lines: it shows and exports a whole fleet's values, and stops its drives."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ SERVERS = '[serve.fleet]\nnats = ["nats://127.0.0.1:1"]\n'
 
 
 def message(first: int, gateway: str = "gw-1", sequence: int = 1) -> StreamMessage:
-    """Return a message with eight exchanges of `numbered`, from exchange `first`."""
+    """Return a stream message with eight exchanges of simulated drives, from exchange number `first`."""
     rows = RowBuffer()
     rows.add(numbered(first, 8).columns())
     [packed] = rows.messages()
@@ -53,7 +53,10 @@ def message(first: int, gateway: str = "gw-1", sequence: int = 1) -> StreamMessa
 
 
 class Clocks:
-    """The clocks of the computer that reads the rows. `utc_s` is the time since the first exchange, in s."""
+    """The clocks of the computer that reads the samples.
+
+    `utc_s` is the time since the first exchange, in s.
+    """
 
     def __init__(self, utc_s: float) -> None:
         self.utc_s = utc_s
@@ -63,7 +66,7 @@ class Clocks:
 
 
 def reader_by(clocks: Callable[[], tuple[int, int]]) -> RowReader:
-    """Return a reader that knows all registers of `numbered`."""
+    """Return a reader that reads all registers of the simulated drives."""
     reader, columns = RowReader(clocks), numbered(0, 1).columns()
     reader.known = {(drive, register) for drive in columns.drives for register in columns.registers}
     return reader
@@ -72,13 +75,15 @@ def reader_by(clocks: Callable[[], tuple[int, int]]) -> RowReader:
 # ---- rows ----
 
 
-def test_rows_of_unknown_drives_are_ignored_and_not_remembered() -> None:
+def test_samples_of_unknown_drives_are_ignored_and_not_remembered() -> None:
     reader = RowReader(Clocks(1.0))
     assert reader.rows([message(0)]) is None
     assert not reader._newest
 
 
-def test_an_ok_row_without_a_value_is_not_shown_as_0(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sample_with_status_ok_but_no_value_is_shown_as_no_valid_value(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     table = unpack(message(0).data)
     at = table.schema.get_field_index("value")
     empty = table.set_column(at, table.schema.field("value"), pa.nulls(len(table), pa.float64()))
@@ -89,7 +94,7 @@ def test_an_ok_row_without_a_value_is_not_shown_as_0(monkeypatch: pytest.MonkeyP
     assert not any(columns.valid)
 
 
-def test_a_gateway_that_sends_endless_names_and_statuses_does_not_end_the_view(
+def test_a_gateway_that_sends_endless_names_and_statuses_is_tolerated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     array("H", [followed.MOST_NAMES, followed.MOST_STATUSES])  # raises OverflowError above 16 bits
@@ -108,7 +113,7 @@ def test_a_gateway_that_sends_endless_names_and_statuses_does_not_end_the_view(
     assert (len(columns.statuses), columns.statuses[-1], max(columns.status)) == (4, "other", 3)
 
 
-def test_the_newest_row_of_each_register_gets_this_computers_monotonic_time() -> None:
+def test_samples_get_monotonic_times_of_the_computer_that_shows_them() -> None:
     reader = reader_by(Clocks(1.0))
     found = reader.rows([message(0)])
     columns = found.columns()
@@ -117,14 +122,15 @@ def test_the_newest_row_of_each_register_gets_this_computers_monotonic_time() ->
     for at, (moment, monotonic, drive, register, value) in enumerate(
         zip(columns.time, columns.monotonic_ns, columns.drive, columns.register, columns.value, strict=True)
     ):
-        number = 4 + int(columns.drives[drive][5:]) - 1  # number of the second of this drive's two exchanges
+        # number of the second exchange of this drive in the message
+        number = 4 + int(columns.drives[drive][5:]) - 1
         assert moment == NOON + number * 10_000_000
         assert monotonic == 1000 * S + number * 10_000_000
         assert value == number + int(columns.registers[register][6:]) - 1
         assert columns.valid[at // 8] >> at % 8 & 1
 
 
-def test_rows_of_a_former_master_do_not_replace_newer_rows() -> None:
+def test_older_samples_of_a_former_master_do_not_replace_newer_samples() -> None:
     reader = reader_by(Clocks(1.0))
     assert reader.rows([message(8, "gw-2")]) is not None
     assert reader.rows([message(0, "gw-1")]) is None
@@ -132,7 +138,7 @@ def test_rows_of_a_former_master_do_not_replace_newer_rows() -> None:
     assert codes.columns().statuses[0] == "ok"
 
 
-def test_rows_are_shown_after_this_computers_clock_was_set_back() -> None:
+def test_new_samples_are_shown_after_the_computers_clock_was_set_back() -> None:
     times = iter([(1000 * S, NOON + S), (1001 * S, NOON - 3600 * S)])
     reader = reader_by(lambda: next(times))
     assert reader.rows([message(0)]) is not None
@@ -152,7 +158,7 @@ def test_forged_and_damaged_messages_are_ignored() -> None:
         (-40.0, "the clock of gw-1 is 40 s ahead of this computer's"),
     ],
 )
-def test_wrong_clocks_are_reported_and_never_make_rows_newer_than_now(
+def test_a_gateways_wrong_clock_is_reported_and_no_sample_is_in_the_future(
     monkeypatch: pytest.MonkeyPatch, utc_s: float, sentence: str
 ) -> None:
     clocks = Clocks(utc_s)
@@ -171,7 +177,7 @@ def test_wrong_clocks_are_reported_and_never_make_rows_newer_than_now(
 
 
 class Fleet:
-    """A fake FleetWatch, whose view of a fleet is set by the test."""
+    """A fake FleetWatch. A test sets its view of a fleet."""
 
     age_s = 0.0
 
@@ -203,7 +209,7 @@ class Fleet:
         ),
     ],
 )
-def test_line_counts_as_lost_if_its_gateway_is_silent(
+def test_a_line_without_samples_for_6_s_counts_as_lost_with_a_reason(
     monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], silent_s: float, why: str
 ) -> None:
     watch: Any = Fleet()
@@ -214,7 +220,7 @@ def test_line_counts_as_lost_if_its_gateway_is_silent(
     assert source._why_lost("hall", watch.state()) == why
 
 
-def test_plant_file_without_lines_is_only_served_and_only_with_a_fleet(tmp_path: Path) -> None:
+def test_only_multidrop_serve_with_a_fleet_accepts_a_plant_without_lines(tmp_path: Path) -> None:
     path = tmp_path / "page.toml"
     path.write_text(SERVERS)
     plant, settings = read_plant(lambda: load_served_plant(path), {})
@@ -235,7 +241,9 @@ def test_plant_file_without_lines_is_only_served_and_only_with_a_fleet(tmp_path:
         ('[serve.may]\nverbs = ["a.start"]', "[serve.may] lists need lines in this plant file; [fleet.may]"),
     ],
 )
-def test_settings_that_need_own_lines_are_refused(tmp_path: Path, more: str, sentence: str) -> None:
+def test_a_plant_file_without_lines_cannot_have_parts_that_need_lines(
+    tmp_path: Path, more: str, sentence: str
+) -> None:
     path = tmp_path / "page.toml"
     path.write_text(f"{SERVERS}{more}\n")
     with pytest.raises(PlantError) as raised:
@@ -247,7 +255,7 @@ def test_settings_that_need_own_lines_are_refused(tmp_path: Path, more: str, sen
 
 
 class Stopper:
-    """A fake part `fleet`, which answers stops as the test has chosen."""
+    """A fake part `fleet`, whose answers to stops are set by the test."""
 
     def __init__(self) -> None:
         self.stops: list[tuple[str, Sequence[str] | None]] = []
@@ -259,7 +267,7 @@ class Stopper:
 
 
 class OneLine:
-    """The lines of a plant with one drive."""
+    """Lines of a plant with one drive, without samples."""
 
     def __init__(self, folder: Path) -> None:
         path = folder / "plant.toml"
@@ -271,7 +279,7 @@ class OneLine:
         self.plant_coming = None
 
 
-async def test_stops_go_through_the_fleet_and_other_commands_are_refused(tmp_path: Path) -> None:
+async def test_the_page_of_a_fleet_sends_stops_and_refuses_other_commands(tmp_path: Path) -> None:
     lines: Any = OneLine(tmp_path)
     part = Stopper()
     commands = FleetStops(lines, May(), lambda: part)
@@ -305,7 +313,7 @@ async def test_stops_go_through_the_fleet_and_other_commands_are_refused(tmp_pat
 
 
 @pytest.mark.long
-def test_one_page_shows_exports_and_stops_a_whole_fleet(tmp_path: Path) -> None:
+def test_one_gateway_shows_exports_and_stops_a_whole_fleet(tmp_path: Path) -> None:
     from secured_clusters import secured_fleet
 
     with secured_fleet(tmp_path / "fleet", 1, GATEWAYS) as fleet, mosquitto(tmp_path) as broker:
@@ -375,7 +383,7 @@ MOVE = {"line": "line-1", "turn": 5, "at_ms": 7, "from": "gw-9", "to": "gw-1"}
 
 
 class Answering:
-    """A path on which these gateways give the answers that the test has chosen; no other gateway exists."""
+    """A fake server connection with an answer of each gateway. Other gateways do not exist."""
 
     urls = ["nats://a:4222"]
     is_open = True
@@ -395,7 +403,7 @@ def lease(session: int, *, ended: bool = False) -> dict[str, Any]:
 
 
 def view(answers: dict[str, Any] | None = None) -> FleetView:
-    """Return a view of five lines and three gateways, of which gw-3 has ended."""
+    """Return a view of five lines and three gateways. The session of gw-3 has ended."""
     made = FleetView(Answering(answers or {}))
     records, leases = made._records, [MemoryBucket(name) for name in names.LEASES]
     for follower, bucket in zip(records.observer.paths, leases, strict=True):
@@ -422,12 +430,12 @@ def looked(made: FleetView) -> dict[str, Any]:
     return made.fleet()
 
 
-def test_only_a_session_that_has_not_ended_is_shown_as_master() -> None:
+def test_a_line_owned_by_an_ended_session_is_shown_without_a_master() -> None:
     found = looked(view())
     assert {name: line["master"] for name, line in found["lines"].items()} == {
         "line-1": "gw-1",
-        "line-2": None,  # owned by an earlier session
-        "line-3": None,  # owned by a session that has ended
+        "line-2": None,  # owned by an earlier session of gw-1
+        "line-3": None,  # owned by the ended session of gw-3
         "line-4": None,  # released
         "line-5": None,  # no master yet
     }
@@ -437,31 +445,32 @@ def test_only_a_session_that_has_not_ended_is_shown_as_master() -> None:
     assert {name: gateway["lines"] for name, gateway in found["gateways"].items()} == {"gw-1": 1, "gw-2": 0}
 
 
-def test_a_silent_gateway_is_shown_without_a_state() -> None:
+def test_a_gateway_that_does_not_answer_is_shown_without_a_state() -> None:
     made = view({"gw-1": STATE | {"last_moves": [MOVE]}})
     found = looked(made)
     assert found["gateways"]["gw-1"]["says"] == STATE
     assert found["gateways"]["gw-2"]["says"] is None
     assert [move["from"] for move in found["moves"] if move["line"] == "line-1"] == ["gw-9"]
     made._path.answers.clear()
-    assert looked(made)["gateways"]["gw-1"]["says"] is None  # the gateway's earlier answer is no longer shown
+    assert looked(made)["gateways"]["gw-1"]["says"] is None  # its earlier answer is no longer shown
 
 
 @table("moves", [[{}], [5], "text", None, [MOVE | {"at_ms": "now"}]])
-def test_invalid_moves_are_ignored(moves: Any) -> None:
+def test_invalid_moves_in_a_gateways_answer_are_ignored(moves: Any) -> None:
     found = looked(view({"gw-1": STATE | {"last_moves": moves}}))
     assert found["gateways"]["gw-1"]["says"] == STATE
 
 
-def test_a_gateway_whose_session_others_ended_is_missing() -> None:
+def test_a_gateway_whose_session_was_ended_by_others_is_listed_as_missing() -> None:
     now_ms = time.time_ns() // 1_000_000
     made = view()
-    died = {  # by gateway: the newest record on each path, and whether the gateway is missing
+    died = {  # by gateway: its newest record in each lease bucket, and whether the gateway counts as missing
         "gw-4": (lease(2, ended=True) | {"by": "gw-1", "at_ms": now_ms - 60_000}, True),
-        "gw-5": (lease(2, ended=True) | {"at_ms": now_ms}, False),  # the gateway ended its session itself
+        # this gateway has ended its session itself
+        "gw-5": (lease(2, ended=True) | {"at_ms": now_ms}, False),
         "gw-6": (lease(2, ended=True) | {"by": "gw-6", "at_ms": now_ms}, False),
         "gw-7": (lease(2, ended=True) | {"by": "gw-1", "at_ms": now_ms - MISSED_MS}, False),
-        "gw-9": (lease(2), False),  # the gateway is starting, and holds one path
+        "gw-9": (lease(2), False),  # this gateway is starting, and has written only one lease record
         "gw-8": (lease(2, ended=True) | {"by": "gw-1"}, True),
     }
     clock = HandClock()
@@ -471,7 +480,7 @@ def test_a_gateway_whose_session_others_ended_is_missing() -> None:
             if name != "gw-9" or at == 0:
                 follower.bucket.store(name, record)
     asyncio.run(made.look())
-    clock.pass_s(60)  # the view accepts an end that another gateway wrote once the lease has expired
+    clock.pass_s(60)  # a lease later, the view accepts an end that another gateway has written
     found = looked(made)["missing"]
     assert found.keys() == {name for name, (_, is_missing) in died.items() if is_missing}
     assert found["gw-4"] == {"host": "pc", "session": 2, "seen_ms": now_ms - 60_000}
@@ -490,7 +499,7 @@ def test_without_a_connection_the_error_names_the_servers() -> None:
         looked(made)
 
 
-def test_a_gateways_silence_counts_from_the_time_when_two_paths_were_renewed() -> None:
+def test_a_gateway_counts_as_seen_only_if_two_lease_records_were_renewed() -> None:
     made = view()
     now = [10 * 10**9]
     observer = made._records.observer
@@ -498,7 +507,7 @@ def test_a_gateways_silence_counts_from_the_time_when_two_paths_were_renewed() -
     looked(made)
     now[0] += 2 * 10**9
     observer.paths[0].bucket.store("gw-1", lease(2))
-    found = looked(made)  # a renewal on only one of three paths is not enough
+    found = looked(made)  # one renewed lease record of three is not enough
     assert found["gateways"]["gw-1"]["unseen_s"] == 2.0
     observer.paths[1].bucket.store("gw-1", lease(2))
     assert looked(made)["gateways"]["gw-1"]["unseen_s"] == 0.0

@@ -1,4 +1,4 @@
-"""`multidrop hub`: stores a stream in files, and reports each mistake in one sentence."""
+"""`multidrop hub` stores a stream of samples in files, and reports each mistake in one sentence."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ PATIENCE_S = 60.0
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    """Servers whose stream has 40 exchanges in 4 messages, from one gateway's spool."""
+    """A server whose stream has 40 exchanges in 4 messages, from one gateway's spool."""
     folder = tmp_path_factory.mktemp("nats")
 
     async def forward(urls: list[str]) -> None:
@@ -84,7 +84,7 @@ def test_hub_once_stores_every_row_of_the_stream_once(
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("end", ["terminal closed", "SIGTERM"])
-def test_stored_rows_survive_any_end_of_the_hub(
+def test_stored_rows_survive_a_closed_terminal_or_sigterm(
     running: Cluster, tmp_path: Path, capsys: pytest.CaptureFixture[str], end: str
 ) -> None:
     words = ["hub", running.urls[0], "--parquet", str(tmp_path), "--every", "0.2"]
@@ -107,10 +107,10 @@ def test_stored_rows_survive_any_end_of_the_hub(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_hub_only_between_steps_of_its_task(
+def test_a_signal_cancels_the_hubs_task_and_raises_no_exception_elsewhere(
     running: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
-    """An exception raised inside nats-py's own tasks would leave pending futures."""
+    """An exception that a signal handler raises inside nats-py's own tasks would leave pending futures."""
     done: list[str] = []
 
     async def read(hub: SampleHub, *, once: bool) -> None:
@@ -135,7 +135,7 @@ def test_the_hub_fails_if_compaction_ends(
     monkeypatch.setattr(parquet_sink, "compact_for_ever", end)
     assert main(["hub", running.urls[0], "--parquet", str(tmp_path)]) == 1
     said = capsys.readouterr().err
-    assert "Traceback" in said  # the log is on stderr too
+    assert "Traceback" in said  # the log is also printed on stderr
     assert said.endswith("multidrop: compaction has ended: ZeroDivisionError: a mistake\n")
 
 
@@ -171,7 +171,7 @@ def test_the_hubs_servers_may_come_from_the_environment(
     )
 
 
-def test_the_hub_refuses_a_foreign_folder_in_one_sentence(
+def test_the_hub_refuses_a_folder_of_another_program_in_one_sentence(
     running: Cluster, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "report.txt").write_text("mine")
@@ -181,7 +181,7 @@ def test_the_hub_refuses_a_foreign_folder_in_one_sentence(
     )
 
 
-def test_the_hub_requires_exactly_one_sink(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_hub_requires_either_a_folder_or_a_database(capsys: pytest.CaptureFixture[str]) -> None:
     status, told = refused(capsys, "nats://127.0.0.1:4222")
     assert status == 2
     assert "one of the arguments --parquet --postgres is required" in told
@@ -211,7 +211,7 @@ def test_a_missing_stream_is_reported_in_one_sentence(
 # ---- compaction of a hub's files: readers get each row exactly once before, during and after it ----
 
 
-HOUR = 360_000  # exchanges in an hour, one every STEP
+HOUR = 360_000  # number of exchanges in an hour; there is one per STEP
 FILES, EXCHANGES = 12, 10  # four files per hour
 
 
@@ -228,7 +228,7 @@ def first_of(file: int) -> int:
 
 
 def write(sink: ParquetSink, files: range) -> None:
-    """Write these files, with two messages each."""
+    """Write these files into the hub's folder, with two messages in each file."""
     for file in files:
         buffer = RowBuffer()
         assert buffer.add(numbered(first_of(file), EXCHANGES).columns())
@@ -276,17 +276,17 @@ def test_the_files_of_a_past_hour_are_merged_into_one(sink: ParquetSink, tmp_pat
     assert names(tmp_path, "rows")[-1] == "00000017-00000024"
     assert sink.begin("made") == StoredPosition(
         24, {"a.x": 24}
-    )  # a merged file also contains the hub's position
+    )  # the hub's stored position is also in merged files
 
 
 USUAL_PRIORITY = """
 import os
 os.nice = os.sched_setscheduler = lambda *details: 0
-"""  # keep the normal priority: with the lowest one, the process takes minutes on a busy machine
+"""  # with the lowest priority, the process takes minutes on a busy machine
 
 
 class Broken(Exception):
-    """Simulates the end of the process."""
+    """Raised in place of the end of the process."""
 
 
 @pytest.mark.long
@@ -294,7 +294,7 @@ class Broken(Exception):
 def test_compaction_interrupted_before_any_step_loses_no_row(
     sink: ParquetSink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Compaction is interrupted after each possible number of written or removed files, then repeated."""
+    """It is interrupted after each possible number of written or removed files, and then repeated."""
     write(sink, range(FILES))
     steps = {"replace": Path.replace, "unlink": Path.unlink}
     left = 0
@@ -328,7 +328,7 @@ def test_compaction_interrupted_before_any_step_loses_no_row(
 
 
 @pytest.mark.long
-def test_a_reader_of_files_being_merged_fails_or_gets_every_row_once(
+def test_reading_files_while_they_are_merged_fails_or_gives_every_row_once(
     sink: ParquetSink, tmp_path: Path
 ) -> None:
     write(sink, range(FILES))
@@ -354,7 +354,7 @@ def test_a_reader_of_files_being_merged_fails_or_gets_every_row_once(
 
 
 @pytest.mark.long
-def test_merged_files_keep_the_size_limit(
+def test_compaction_merges_files_only_up_to_the_size_limit(
     sink: ParquetSink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write(sink, range(FILES))
@@ -403,7 +403,7 @@ def with_path(servers: Cluster, work: Callable[[ServerPath], Awaitable[object]])
 
 @pytest.mark.usefixtures("_small_servers")
 @pytest.mark.long
-def test_a_stream_that_is_full_leaves_room_for_records(run: Run, tmp_path: Path) -> None:
+def test_a_full_stream_of_samples_leaves_disk_space_for_records(run: Run, tmp_path: Path) -> None:
     async def fill(path: ServerPath) -> None:
         for _ in range(60):
             await publish(path, "samples.gw-1.log", bytes(MESSAGE), {})
@@ -423,7 +423,7 @@ def test_a_stream_that_is_full_leaves_room_for_records(run: Run, tmp_path: Path)
 @pytest.mark.usefixtures("_small_servers")
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [1, pytest.param(3, marks=pytest.mark.long)])
-def test_servers_with_too_little_room_are_reported_in_one_sentence(
+def test_servers_with_too_little_disk_space_are_reported_in_one_sentence(
     run: Run, tmp_path: Path, number: int
 ) -> None:
     with cluster(tmp_path / "nats", number) as small:
@@ -434,7 +434,7 @@ def test_servers_with_too_little_room_are_reported_in_one_sentence(
 
 @pytest.mark.usefixtures("_small_servers")
 @pytest.mark.long
-def test_an_existing_stream_is_kept_and_reported(run: Run, tmp_path: Path) -> None:
+def test_init_keeps_and_reports_an_existing_stream(run: Run, tmp_path: Path) -> None:
     with cluster(tmp_path / "nats", 1) as one:
         with_path(one, lambda path: create_stream(path, replicas=1))
         _, out, err = run("fleet", "init", "--nats", one.urls[0], "--json")

@@ -1,4 +1,4 @@
-"""Drills in network namespaces: cables are cut and whole machines die, but no line ever has two masters."""
+"""Drills in network namespaces: cables are cut and whole machines die, and no line ever has two masters."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def cut_drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetDrill]:
 
 
 @pytest.mark.parametrize("name", CUT)
-def test_no_network_cut_gives_a_line_two_masters(cut_drill: FleetDrill, name: str) -> None:
+def test_no_line_has_two_masters_while_cables_are_cut(cut_drill: FleetDrill, name: str) -> None:
     cut_drill.settle()
     cut_drill.judge(lambda: cut(cut_drill, name), SOON_S)
     assert cut_drill.hall.overlaps() == 0
 
 
-def test_a_gateway_cut_off_from_its_lines_hands_them_over(cut_drill: FleetDrill) -> None:
+def test_a_gateway_that_is_cut_off_from_its_lines_hands_them_over(cut_drill: FleetDrill) -> None:
     cut_drill.settle()
     place, host = cut_drill.places["gw-a"], cut_drill.hall.host
 
@@ -55,7 +55,8 @@ def test_a_gateway_cut_off_from_its_lines_hands_them_over(cut_drill: FleetDrill)
         assert gateway()["session"] == session
     finally:
         place.heal_to_here(host)
-        cut_drill.gateways["gw-a"].kill()  # a restarted gateway tries to open all lines immediately
+        # a restarted gateway has reported no line, so it tries to open all its lines immediately
+        cut_drill.gateways["gw-a"].kill()
         cut_drill.gateways["gw-a"].wait()
     assert cut_drill.hall.overlaps() == 0
 
@@ -69,8 +70,10 @@ def machine_drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MachineD
         yield found
 
 
-def test_takeover_from_a_dead_machine_waits_for_no_election(machine_drill: MachineDrill) -> None:
-    """The buckets with the dead gateway's lines have leaders on other machines: `settle` waits for that."""
+def test_lines_of_a_dead_machine_are_taken_over_without_waiting_for_an_election(
+    machine_drill: MachineDrill,
+) -> None:
+    """The drill has waited until other machines lead the ownership buckets of the dead gateway's lines."""
     machine_drill.settle()
     before = machine_drill.status()["lines"]
     machine_drill.judge(machine_drill.kill_machine, SOON_S)
@@ -82,7 +85,7 @@ def test_takeover_from_a_dead_machine_waits_for_no_election(machine_drill: Machi
     machine_drill.wait(has_moved, "lines of the dead machine have moved")
 
 
-def test_no_network_cut_of_a_whole_machine_gives_a_line_two_masters(machine_drill: MachineDrill) -> None:
+def test_no_line_has_two_masters_while_whole_machines_are_cut_off(machine_drill: MachineDrill) -> None:
     machine_drill.settle()
     machine_drill.judge(machine_drill.cut_machine, SOON_S)
     assert machine_drill.hall.overlaps() == 0

@@ -1,4 +1,4 @@
-"""All possible orders of the steps in which gateways claim and release a line, with the code's own rules."""
+"""All possible orders of the steps in which gateways claim and release a line, by the rules in the code."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BUCKETS = 3
 
 
 class Stored(NamedTuple):
-    """A bucket's record of the line."""
+    """The ownership record of the line in one bucket."""
 
     owner: str = NOBODY
     votes: int = 0
@@ -27,7 +27,7 @@ class Stored(NamedTuple):
 
 
 class Write(NamedTuple):
-    """A record that is being sent to a bucket. It replaces only the revision `after`."""
+    """An ownership record on its way to a bucket. It replaces only a record of the revision `after`."""
 
     writer: str
     bucket: int
@@ -40,7 +40,10 @@ Records = tuple[Stored, ...]
 
 
 class Session(NamedTuple):
-    """The records that one gateway's session has read. `given` has those that it is releasing."""
+    """The ownership records that a gateway's session has read.
+
+    `given` has the records that it is releasing.
+    """
 
     known: Records = (Stored(),) * BUCKETS
     given: frozenset[tuple[int, int]] = frozenset()
@@ -59,7 +62,10 @@ def owner_called(name: str) -> Owner:
 
 @lru_cache(1 << 16)
 def as_read(records: Records) -> LineRecords:
-    """Return the records as the code under test reads them. The turn is always 1: it is only for display."""
+    """Return the records in the form that the tested code reads.
+
+    The turn is always 1, because it is only for display.
+    """
     return {
         f"bucket {at}": Record(
             "line",
@@ -72,7 +78,7 @@ def as_read(records: Records) -> LineRecords:
 
 @dataclass(frozen=True)
 class Model:
-    """Sessions that may claim and release the line and end at any time, by the records that they have read.
+    """Sessions that claim and release one line by the records that they have read, and end at any time.
 
     Writes are stored late, in any order, or never. A session learns the outcome of a write when it reads the
     record. At most `most` records are stored. Every session knows which sessions have ended. If it did not,
@@ -83,13 +89,16 @@ class Model:
     most: int = 5
     needed: int = NEEDED
     has_cas: bool = True
-    gives_up_first: bool = True  # a session treats a line as lost before it sends the line's release
-    looks_home: bool = True  # a session reads the line's first bucket before it writes in others
+    gives_up_first: bool = True  # a session counts the line as lost before it sends the line's release
+    looks_home: bool = True  # a session reads the line's first bucket before it writes in another one
     minds_two_votes: bool = True
     minds_who_lives: bool = True
 
     def search(self) -> tuple[int, State | None]:
-        """Return the number of states, and a state with two masters or a lost line, if there is one."""
+        """Try all orders of steps.
+
+        Return the number of states, and a state with two masters or a lost line (or None).
+        """
         nothing = (Stored(),) * BUCKETS
         first = State(nothing, (Session(),) * len(self.sessions), frozenset())
         known, layer = {first}, [first]
@@ -116,7 +125,7 @@ class Model:
         return votes >= self.needed
 
     def survivors(self, state: State) -> Iterator[tuple[int, Session]]:
-        """Yield each living session as if all other sessions had ended and it had read all records."""
+        """Yield each living session as if it had read all records, and all other sessions had ended."""
         for at, session in enumerate(state.sessions):
             if not session.is_over:
                 for bucket, record in enumerate(state.records):
@@ -124,7 +133,7 @@ class Model:
                 yield at, session
 
     def is_lost(self, survivor: tuple[int, Session]) -> bool:
-        """Return True if the session is not the master and, with one bucket down, cannot become it."""
+        """Return True if the session is not the line's master, and cannot become it with one bucket down."""
         at, session = survivor
         if self.is_mine(at, session) or not session.known[0].revision:
             return False
@@ -158,7 +167,7 @@ class Model:
         return state._replace(sessions=tuple(sessions))
 
     def with_write(self, state: State, write: Write) -> State:
-        """Return the state after this write is stored. Later writes that replace the same record fail."""
+        """Return the state after this write is stored. Other writes to the same revision then fail."""
         revision = state.records[write.bucket].revision + 1
         records = list(state.records)
         records[write.bucket] = Stored(write.owner, write.votes, revision)
@@ -171,7 +180,7 @@ class Model:
         )
 
     def acts(self, name: str, session: Session, over: set[str]) -> Iterator[tuple[Session, frozenset[Write]]]:
-        """Yield each action that a session may start: what the session then knows, and its writes."""
+        """Yield each action that a session may start: its knowledge after the action, and its writes."""
         ours = [bucket for bucket, one in enumerate(session.known) if one.owner == name]
         if ours:
             given = frozenset((bucket, session.known[bucket].revision) for bucket in ours)
@@ -196,7 +205,7 @@ class Model:
     def claims(
         self, name: str, known: Records, over: frozenset[str], doubted: tuple[int, ...]
     ) -> list[tuple[tuple[int, int], ...]]:
-        """Return the sets of (bucket, votes) that a claim may write: without or with the spare buckets."""
+        """Return the sets of (bucket, votes) that a claim may write, with and without the spare buckets."""
         records = as_read(known)
         buckets = list(records)
         if not self.looks_home and not known[0].revision:
@@ -220,7 +229,7 @@ class Model:
 
 
 def read(session: Session, bucket: int, record: Stored) -> Session:
-    """Return the session after it has read this record. An older record is ignored."""
+    """Return the session after it has read this record; ignore a record older than the known one."""
     if session.known[bucket].revision >= record.revision:
         return session
     known = list(session.known)
@@ -231,10 +240,10 @@ def read(session: Session, bucket: int, record: Stored) -> Session:
 
 @pytest.mark.long
 @table("sessions, most, least", [("ab", 4, 50_000), ("abc", 2, 10_000)])
-def test_no_line_has_two_masters_or_gets_lost_in_any_interleaving(
+def test_no_order_of_claims_and_releases_gives_two_masters_or_loses_a_line(
     sessions: str, most: int, least: int
 ) -> None:
-    """Two sessions with five records, and three with three records, were checked manually: 553,000 states."""
+    """Two sessions with five records, and three with three records, were also checked: 553,000 states."""
     states, wrong = Model(sessions, most).search()
     assert wrong is None
     assert states > least
@@ -252,7 +261,7 @@ MUTATIONS = {
 
 @pytest.mark.slow
 @table("mutation", MUTATIONS)
-def test_each_mutation_of_the_rules_has_two_masters_or_a_lost_line(mutation: str) -> None:
+def test_each_changed_ownership_rule_gives_two_masters_or_loses_a_line(mutation: str) -> None:
     _, wrong = MUTATIONS[mutation].search()
     assert wrong is not None
 
@@ -265,30 +274,31 @@ WHOLE = Terms(lease=2, guard=2)
 
 
 def killed_at(until: int, terms: Terms) -> int:
-    """Return when the kernel kills a holder that has not closed its lines (csrc/mastership.c)."""
+    """Return when the kernel kills a lease's holder that has not closed its lines (csrc/mastership.c)."""
     return until + terms.guard // 2
 
 
 class PathState(NamedTuple):
-    """The state of one path: its record, the messages in flight, and what holder and taker know.
+    """One lease record, the messages in flight to it, and what its holder and the taker know about it.
 
-    Times are ages, in ticks of the model.
+    The taker is the gateway that takes over. Times are ages, in ticks of the model.
     """
 
-    ended: int | None = None  # how long ago the taker ended this path; None: not ended
+    ended: int | None = None  # how long ago the taker ended this record; None: not ended
     request: int | None = None  # age of the renewal that is on its way to the server
     ack: int | None = None  # age of the renewal whose acknowledgement is on its way back
-    renewed: int | None = 0  # age of the newest renewal that the holder knows to be stored
-    seen: tuple[bool, int] | None = None  # record that the taker has read: (is it the newest, its age)
-    ending: bool | None = None  # the taker's write in flight: True if it replaces the present revision
+    renewed: int | None = 0  # age of the newest renewal whose success the holder knows
+    # the record that the taker has read: whether it is still the newest, and how long ago it was first read
+    seen: tuple[bool, int] | None = None
+    ending: bool | None = None  # the taker's write in flight; True if it would replace the present revision
 
 
 @dataclass(frozen=True)
 class LeaseModel:
     """A lease's holder, a gateway that takes over (the taker), and a network that delays and loses messages.
 
-    The holder may be suspended at any point. The taker sends to drives when it has ended enough paths, and
-    the guard time has passed since then.
+    The holder may be suspended at any point. The taker sends requests to drives once it has ended enough
+    lease records, and the guard time has passed since then.
     """
 
     terms: Terms
@@ -297,20 +307,20 @@ class LeaseModel:
     has_cas: bool = True
     has_timer: bool = True
     waits: bool = True
-    listens: bool = True  # the taker only listens during the guard time
+    listens: bool = True  # during the guard time, the taker only listens
     lateness: int = 0  # delay of the kernel's timer, in ticks
 
     # ---- one path ----
 
     def path_steps(self, path: PathState) -> Iterator[PathState]:
-        """Yield all possible next states of one path."""
+        """Yield all possible next states of one lease record."""
         if path.request is None and path.ack is None:
             yield path._replace(request=0)
         if path.ack is not None:
             yield path._replace(ack=None, renewed=0 if self.counts_from_ack else path.ack)
             yield path._replace(ack=None)  # the acknowledgement is lost
         if path.request is not None:
-            yield path._replace(request=None)  # the renewal is lost, or refused because the path was ended
+            yield path._replace(request=None)  # the renewal is lost, or refused because the record was ended
             if path.ended is None:
                 seen = None if path.seen is None else (False, path.seen[1])
                 ending = None if path.ending is None else False
@@ -330,7 +340,7 @@ class LeaseModel:
         return not self.waits or lease_rules.is_stale(SeenRevision(1, -seen[1]), 0, self.terms)
 
     def grown_older(self, path: PathState) -> PathState:
-        """Return the path's state one tick later."""
+        """Return the state of a lease record one tick later."""
 
         def older(age: int | None, most: int) -> int | None:
             return None if age is None else min(age + 1, most)
@@ -346,7 +356,7 @@ class LeaseModel:
         )
 
     def normal(self, path: PathState) -> PathState:
-        """Return the representative of all path states that have the same future."""
+        """Return a state that stands for all states with the same future."""
         if not self.has_cas:
             return path
         seen = (
@@ -358,15 +368,19 @@ class LeaseModel:
     # ---- all interleavings ----
 
     def deadline(self, renewed: Iterable[int | None]) -> int:
-        """Return until when the holder may send (relative to now), from the ages of the paths' renewals."""
+        """Return until when the holder may send, relative to now.
+
+        `renewed` has the ages of the records' renewals.
+        """
         sent = [None if age is None else -age for age in renewed]
         return lease_rules.deadline(sent, self.terms)
 
     def search(self, most: int | None = None) -> tuple[int, tuple[PathState, ...] | None]:
-        """Return the number of reachable states, and one in which two masters could write, if there is one.
+        """Try all orders of steps until two masters could write.
 
-        A state has a flag and its sorted paths. The flag is True after the holder has checked the clock and
-        before it writes. States in which the holder is dead are left out.
+        Return the number of reachable states, and a state with two masters (or None). A state has a flag and
+        its sorted lease records. The flag is True after the holder has checked the clock and before it
+        writes. States in which the holder is dead are left out.
         """
         table = _PathTable(self)
         first = (False, *(table.number(PathState()),) * self.paths)
@@ -402,7 +416,7 @@ class LeaseModel:
             yield (True, *numbers)
         for place, number in enumerate(numbers):
             if number in numbers[:place]:
-                continue  # a path in the same state was handled already
+                continue  # a lease record in the same state was already handled
             others = numbers[:place] + numbers[place + 1 :]
             for after in table.steps[number]:
                 yield (has_looked, *sorted([*others, after]))
@@ -412,7 +426,7 @@ class LeaseModel:
 
 
 class _PathTable:
-    """All states that a path may have, numbered, and the possible next states of each."""
+    """Numbers all states that a lease record may have, and stores the possible next states of each."""
 
     def __init__(self, model: LeaseModel) -> None:
         self.paths: list[PathState] = []
@@ -422,13 +436,13 @@ class _PathTable:
         self.later: list[int] = []
         self._deadlines: dict[tuple[int | None, ...], int] = {}  # by the ages of the newest renewals
         self.number(PathState())
-        for path in self.paths:  # this list grows during the loop
+        for path in self.paths:  # the loop itself makes this list longer
             after = {self.number(following) for following in model.path_steps(path)}
             self.steps.append(sorted(after - {self.number(path)}))
             self.later.append(self.number(model.grown_older(path)))
 
     def deadline(self, numbers: list[int]) -> int:
-        """Return until when the holder may send. `numbers` are the numbers of its paths' states."""
+        """Return until when the holder may send. `numbers` are the numbers of its lease records' states."""
         renewed = tuple([self.paths[number].renewed for number in numbers])
         if renewed not in self._deadlines:
             self._deadlines[renewed] = self._model.deadline(renewed)
@@ -457,14 +471,14 @@ LEASE_MUTATIONS = {
 
 
 @pytest.mark.long
-def test_no_interleaving_has_two_masters() -> None:
+def test_no_order_of_renewals_and_takeovers_gives_two_masters() -> None:
     states, wrong = LeaseModel(SMALL).search()
     assert wrong is None
     assert states > 100_000
 
 
 @pytest.mark.nightly
-def test_no_interleaving_has_two_masters_with_a_longer_lease() -> None:
+def test_no_order_of_steps_gives_two_masters_with_a_longer_lease() -> None:
     states, wrong = LeaseModel(WHOLE).search()
     assert wrong is None
     assert states > 500_000
@@ -478,13 +492,13 @@ LARGE = ("deadline from the acknowledgement", "guard shorter than the timer's la
     "mutation",
     [pytest.param(name, marks=pytest.mark.long if name in LARGE else ()) for name in LEASE_MUTATIONS],
 )
-def test_each_mutation_of_the_rules_allows_two_masters(mutation: str) -> None:
+def test_each_changed_lease_rule_allows_two_masters(mutation: str) -> None:
     _, wrong = LEASE_MUTATIONS[mutation].search(most=500_000)
     assert wrong is not None
 
 
-def test_the_rules_in_use_are_those_of_the_model() -> None:
-    """Both quorums are more than half of the paths, and the kernel kills before the guard time ends."""
+def test_the_lease_terms_in_use_have_the_properties_of_the_model() -> None:
+    """Two quorums always share a lease record, and the kernel kills the holder before the guard time ends."""
     terms = Terms()
     assert terms.needed + terms.ended > lease_rules.PATHS
     assert killed_at(0, terms) < terms.guard

@@ -1,4 +1,4 @@
-"""Damaged or hostile records: each is skipped with a warning, and affects no other record."""
+"""Damaged or hostile records in buckets: each is ignored with a warning, and affects no other record."""
 
 from __future__ import annotations
 
@@ -74,11 +74,13 @@ def test_invalid_records_are_rejected(name: str) -> None:
 @table(
     ("bucket", "key", "value"), [("lease_2", "gw-1", LEASE), ("own_0", "l", OWNER), ("plant", "line-1", LINE)]
 )
-def test_a_valid_record_may_have_further_fields(bucket: str, key: str, value: dict[str, Any]) -> None:
+def test_a_valid_record_may_have_fields_of_a_newer_version(
+    bucket: str, key: str, value: dict[str, Any]
+) -> None:
     assert parsed(bucket, key, json.dumps(value).encode()) == (value, "")
     more = {**value, "of another version": [1, 2]}
     assert parsed(bucket, key, json.dumps(more).encode()) == (more, "")
-    assert parsed(bucket, key, b"") == (None, "")  # the record was removed
+    assert parsed(bucket, key, b"") == (None, "")  # empty: the record was removed
 
 
 async def test_an_invalid_record_is_logged_once_and_others_are_read(
@@ -112,7 +114,7 @@ async def test_a_lease_record_written_by_another_gateway_counts_as_an_end(one: C
     async with connected_path(one) as path:
         own, rogue = (LeaseBucket("lease_0", lambda: path, name) for name in ("gw-1", "gw-2"))
         revision = await own.put("gw-1", {**LEASE, "by": "me"}, 0)
-        assert (await rogue.get("gw-1")).value == LEASE  # without "by": gw-1 itself has written it
+        assert (await rogue.get("gw-1")).value == LEASE  # without "by", as a gateway writes its own record
         await rogue.put("gw-1", {**LEASE, "session": 8, "ended": False}, revision)
         ended = {**LEASE, "session": 8, "ended": True, "by": "gw-2"}
         assert (await own.get("gw-1")).value == ended
@@ -121,7 +123,7 @@ async def test_a_lease_record_written_by_another_gateway_counts_as_an_end(one: C
 
 @pytest.mark.long
 async def test_a_gateway_survives_invalid_records(one: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each bucket has an invalid record of each kind before the gateway starts, and gets more later."""
+    """Before the gateway starts, each bucket has an invalid record of each kind; it gets more later."""
     monkeypatch.setattr(member_module, "SETTLE_S", 1.0)
 
     async def strew(path: ServerPath, suffix: str) -> None:
@@ -136,7 +138,7 @@ async def test_a_gateway_survives_invalid_records(one: Cluster, monkeypatch: pyt
         await strew(path, "-before")
         await store(Bucket(names.PLANT, lambda: path), {"line-1": LINE})
         mastership = RecordingMastership(boottime_ns)
-        terms = USUAL._replace(lease=10 * SECOND)  # long enough for a busy machine
+        terms = USUAL._replace(lease=10 * SECOND)  # longer than a busy machine may suspend the test
         member = Member("gw-a", paths, Hall().add("gw-a", mastership), mastership, terms=terms)
         task = asyncio.create_task(member.run())
 
@@ -149,7 +151,8 @@ async def test_a_gateway_survives_invalid_records(one: Cluster, monkeypatch: pyt
         await strew(path, "-again")
         await asyncio.wait([task], timeout=1.0)
         await until_polled(is_first=True)
-        for bucket in names.LEASES[:2]:  # the gateway's own records: losing them ends only its session
+        # these records belong to the gateway itself, so only its session ends
+        for bucket in names.LEASES[:2]:
             await path.request(f"$KV.{bucket}.gw-a.rogue", b"{")
         await until_polled(is_first=False)
         task.cancel()
@@ -162,7 +165,7 @@ async def test_a_gateway_survives_invalid_records(one: Cluster, monkeypatch: pyt
 async def test_an_early_end_written_by_another_gateway_counts_once_the_lease_has_expired(
     one: Cluster,
 ) -> None:
-    """The gateway may hang, and not notice the end of its session, while its engine continues to poll."""
+    """The gateway's process may hang. Its engine then continues to poll until the lease expires."""
     async with connected_path(one) as path:
         await store(Bucket(names.PLANT, lambda: path), {"line-1": LINE})
         hall, members, tasks = Hall(), {}, {}
@@ -228,7 +231,9 @@ async def test_an_invalid_gateway_state_is_reported(one: Cluster, answer: bytes,
 
 
 @pytest.mark.slow
-async def test_a_refusal_by_the_servers_is_reported_in_one_sentence(one: Cluster, tmp_path: Path) -> None:
+async def test_a_request_that_servers_refuse_is_reported_in_one_sentence(
+    one: Cluster, tmp_path: Path
+) -> None:
     async with connected_path(one) as path:
         with pytest.raises(ServerError, match="NATS refuses: "):
             await Bucket("nothing", lambda: path).get("gw-1")
@@ -276,7 +281,7 @@ TIMES = {
 
 
 class Liar:
-    """A path or connection that gives this answer to every request."""
+    """A server connection or client that gives the answer `said` to every request."""
 
     url = "nats://liar"
     server_name = "liar"
@@ -294,7 +299,7 @@ class Liar:
 
 
 @pytest.mark.parametrize("name", [*STRANGE_ANSWERS, *PARTS])
-async def test_invalid_answers_leave_the_outcome_unknown_and_are_reported(name: str) -> None:
+async def test_an_invalid_answer_of_a_server_raises_a_fleet_error(name: str) -> None:
     """Gateway, forwarder and hub retry after a FleetError. Any other exception would end them."""
     path: Any = Liar({**STRANGE_ANSWERS, **PARTS}[name])
     bucket = Bucket("own_0", lambda: path)
@@ -312,11 +317,11 @@ async def test_invalid_answers_leave_the_outcome_unknown_and_are_reported(name: 
 
 
 @pytest.mark.parametrize("name", CLUSTERS)
-async def test_invalid_cluster_states_are_reported_and_move_no_leader(
+async def test_an_invalid_state_of_a_cluster_moves_no_bucket_leader(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The gateway's tasks that read cluster states must not end."""
-    monkeypatch.setattr(setup, "WAIT_S", 0.0)  # do not wait for an election
+    """Exceptions would end the gateway's tasks that read the states of clusters."""
+    monkeypatch.setattr(setup, "WAIT_S", 0.0)  # the test does not wait for an election
     path: Any = Liar(CLUSTERS[name])
     with pytest.raises(FleetError, match="the answer of NATS about a bucket's servers is invalid"):
         await check_buckets(path)
@@ -326,7 +331,7 @@ async def test_invalid_cluster_states_are_reported_and_move_no_leader(
 
 
 @pytest.mark.parametrize("name", TIMES)
-async def test_an_invalid_server_time_is_reported(name: str) -> None:
+async def test_an_invalid_time_in_a_servers_answer_is_reported(name: str) -> None:
     path: Any = Liar(TIMES[name])
     with pytest.raises(
         OutcomeUnknown, match="the answer of nats://liar about a bucket has no valid time stamp"
@@ -337,8 +342,8 @@ async def test_an_invalid_server_time_is_reported(name: str) -> None:
 LONG = {**STATE, "trouble": "x" * 10**6, "troubles": {"hall": "y" * 10**6}}
 
 
-async def test_long_texts_of_a_gateway_s_state_are_cut_by_sender_and_receiver() -> None:
-    """NATS does not send an answer beyond its size limit, and the page shows the whole text of an answer."""
+async def test_long_texts_in_a_gateways_state_are_cut_by_sender_and_receiver() -> None:
+    """NATS limits the size of an answer, and the page shows each text of an answer without shortening it."""
     answers: list[bytes] = []
 
     async def respond(data: bytes) -> None:

@@ -36,7 +36,7 @@ def test_rows_are_read_back_unchanged_from_a_message() -> None:
 
 @pytest.mark.slow
 def test_pyarrow_opens_a_message() -> None:
-    """The test uses the table in the module's docstring, and none of our functions."""
+    """The test has its own copy of the table in the module's docstring, and uses none of our functions."""
     (message,) = packed(example())
     with pa.ipc.open_stream(message.data) as reader:
         table = reader.read_all()
@@ -101,7 +101,7 @@ def test_a_message_has_at_most_65536_rows() -> None:
     assert [message.rows for message in found] == [MOST_ROWS, 70_000 - MOST_ROWS]
 
 
-def test_rows_of_another_poller_are_not_mixed_in() -> None:
+def test_a_row_buffer_refuses_rows_of_another_poller() -> None:
     buffer = RowBuffer()
     assert buffer.add(numbered(0, 10).columns())
     assert not buffer.add(numbered(10, 10, Names(["fan-1", "fan-2", "fan-3", "fan-4"])).columns())
@@ -111,7 +111,7 @@ def test_rows_of_another_poller_are_not_mixed_in() -> None:
 
 
 @pytest.mark.long
-def test_damaged_bytes_raise_message_errors_only() -> None:
+def test_damaged_messages_raise_no_other_error_than_message_error() -> None:
     (message,) = packed(numbered(0, 40))
     whole = unpack(message.data)
     dice = random.Random(7)
@@ -119,7 +119,7 @@ def test_damaged_bytes_raise_message_errors_only() -> None:
         damaged = bytearray(message.data)
         for _ in range(dice.randrange(1, 4)):
             damaged[dice.randrange(len(damaged))] = dice.randrange(256)
-        with suppress(MessageError):  # any other error fails the test
+        with suppress(MessageError):  # any other exception fails the test
             assert unpack(bytes(damaged)).schema == whole.schema
     for length in range(0, len(message.data) - 8, 7):
         with pytest.raises(MessageError, match=f"^{length} bytes are not a message of samples"):
@@ -140,7 +140,7 @@ NAMELESS = pa.DictionaryArray.from_arrays(pa.array([0, 1], pa.int32()), pa.array
 
 
 def written(options: pa.ipc.IpcWriteOptions | None = None, **other: pa.Array) -> bytes:
-    """Return a message of two rows with these columns, as another program might write it."""
+    """Return a message of two rows with these columns, as if another program had written it."""
     columns = {
         "time": times(UTC_0, UTC_0),
         "clock_ns": pa.array([5, 5], pa.int64()),
@@ -179,18 +179,18 @@ def written(options: pa.ipc.IpcWriteOptions | None = None, **other: pa.Array) ->
     ],
 )
 def test_rows_that_no_store_accepts_are_rejected(column: str, rows: pa.Array, said: str) -> None:
-    """A message with such rows would block all later messages of all gateways."""
+    """The hub could not store a message with such rows, nor all later messages of all gateways."""
     with pytest.raises(MessageError, match=f"bytes are not a message of samples: {said}"):
         unpack(written(**{column: rows}))
 
 
-def test_rows_of_another_arrow_writer_are_accepted() -> None:
+def test_a_message_written_by_another_arrow_program_is_accepted() -> None:
     assert rows_of(unpack(written()))[0][3:] == ("fan", "speed", 1.0, "ok", "Hz")
     assert len(unpack(written(drive=named("ü" * 500, "fan")))) == 2
 
 
 def alike(rows: int) -> dict[str, Any]:
-    """Return columns of this many equal rows."""
+    """Return the columns of this many equal rows."""
     names = ("drive", "register", "status", "unit")
     return {
         "time": pa.repeat(times(UTC_0)[0], rows),
@@ -211,18 +211,20 @@ def test_a_message_with_too_many_rows_is_rejected() -> None:
 
 BOMB = 1 << 28  # bytes
 ZSTD = pa.ipc.IpcWriteOptions(compression="zstd")
-OF_ONE_TEXT = {  # columns of this many rows: small, but large after a conversion to the right type
+# each: columns of this many rows, which are small, but large after conversion to the right type
+OF_ONE_TEXT = {
     "unit": lambda rows: pa.RunEndEncodedArray.from_arrays([rows], pa.array(["f" * 9000])),
     "value": lambda rows: pa.DictionaryArray.from_arrays(pa.repeat(0, rows), pa.array(["1" * 9000])),
     "clock_ns": lambda rows: pa.RunEndEncodedArray.from_arrays([rows], pa.array([5])),
 }
 
-POOLS: list[pa.MemoryPool] = []  # pools are kept alive, because memory of a test may be freed after the test
+# keeps memory pools alive, because memory of a test may be freed after the test
+POOLS: list[pa.MemoryPool] = []
 
 
 @pytest.fixture
 def most_allocated() -> Iterator[Callable[[], int]]:
-    """Yield a function that returns pyarrow's peak memory since this call."""
+    """Yield a function that returns the peak of memory that pyarrow has allocated since this call."""
     before = pa.default_memory_pool()
     pool = pa.proxy_memory_pool(pa.system_memory_pool())
     POOLS.append(pool)
@@ -232,7 +234,7 @@ def most_allocated() -> Iterator[Callable[[], int]]:
 
 
 def bomb(compression: str) -> bytes:
-    """Return a message with a large name, most of whose bytes are missing."""
+    """Return a message that declares a large name, but lacks most of the name's bytes."""
     options = pa.ipc.IpcWriteOptions(compression=compression)
     data = written(options, drive=named("f" * BOMB, "fan"))
     assert len(data) < BOMB / 200
@@ -241,7 +243,9 @@ def bomb(compression: str) -> bytes:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
-def test_decompression_bombs_are_not_unpacked(compression: str, most_allocated: Callable[[], int]) -> None:
+def test_a_small_message_that_declares_a_huge_size_is_not_unpacked(
+    compression: str, most_allocated: Callable[[], int]
+) -> None:
     data = bomb(compression)
     before = most_allocated()
     with pytest.raises(MessageError, match=r"2684\d{5} bytes unpacked; the limit is 4194304"):
@@ -263,7 +267,7 @@ def test_columns_that_a_conversion_would_make_much_larger_are_rejected(
     assert most_allocated() - before < 8 << 20
 
 
-def test_rows_that_need_no_bytes_are_limited_too(most_allocated: Callable[[], int]) -> None:
+def test_the_limit_of_rows_applies_to_columns_that_need_no_bytes(most_allocated: Callable[[], int]) -> None:
     schema = pa.schema([("time", pa.null())])
     rows = pa.RecordBatch.from_arrays([pa.Array.from_buffers(pa.null(), 1 << 30, [None])], schema=schema)
     sink = pa.BufferOutputStream()
@@ -274,8 +278,8 @@ def test_rows_that_need_no_bytes_are_limited_too(most_allocated: Callable[[], in
     assert most_allocated() < 1 << 20
 
 
-def test_an_older_format_version_is_rejected() -> None:
-    """The older version marks compressed buffers differently."""
+def test_a_message_in_an_older_arrow_format_is_rejected() -> None:
+    """In the older format, compressed buffers are marked differently."""
     options = pa.ipc.IpcWriteOptions(metadata_version=pa.ipc.MetadataVersion.V4)
     with pytest.raises(MessageError, match="the Arrow metadata version is not 5"):
         unpack(written(options))
@@ -283,7 +287,7 @@ def test_an_older_format_version_is_rejected() -> None:
 
 @pytest.mark.parametrize("options", [None, ZSTD, pa.ipc.IpcWriteOptions(compression="lz4")])
 def test_the_unpacked_size_equals_that_of_pyarrows_buffers(options: pa.ipc.IpcWriteOptions | None) -> None:
-    """Equal texts are stored compressed, random numbers uncompressed, and empty lists have no bytes."""
+    """Equal texts are stored compressed, and random numbers uncompressed. Empty lists have no bytes."""
     dice = random.Random(3)
     data = written(
         options,
@@ -303,7 +307,7 @@ def test_the_unpacked_size_equals_that_of_pyarrows_buffers(options: pa.ipc.IpcWr
 
 
 def test_a_message_is_split_before_it_is_too_large_to_be_unpacked() -> None:
-    """Long names of many drives compress well, so a small message may be large when unpacked."""
+    """Long names of many drives compress well, so a small message may be too large when unpacked."""
     drives = Names([f"{number:0900d}" for number in range(6000)])
     columns = Columns(6000)
     for number in range(6000):

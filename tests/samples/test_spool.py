@@ -42,20 +42,20 @@ def spool(folder: Path) -> Iterator[Spool]:
 
 
 def store(spool: Spool, first: int, exchanges: int) -> None:
-    """Append exchanges, and wait until they are on the disk."""
+    """Append exchanges to the spool, and wait until they are on the disk."""
     spool.append(numbered(first, exchanges))
     assert spool.sync(30.0)
 
 
 def filled(folder: Path, messages: int, exchanges: int = 5) -> None:
-    """Write this many messages, with this many exchanges each."""
+    """Fill a spool's folder with this many messages, each with this many exchanges."""
     spool = Spool(folder, GATEWAY)
     for number in range(messages):
         store(spool, number * exchanges, exchanges)
     spool.close()
 
 
-def test_rows_are_in_files_when_sync_returns(spool: Spool, folder: Path) -> None:
+def test_appended_rows_are_in_the_spools_files_when_sync_returns(spool: Spool, folder: Path) -> None:
     store(spool, 0, 30)
     assert exchanges_in(rows_in(folder)) == list(range(30))
     state = spool.state()
@@ -64,13 +64,13 @@ def test_rows_are_in_files_when_sync_returns(spool: Spool, folder: Path) -> None
 
 
 @pytest.mark.slow
-def test_rows_are_written_as_a_message_after_a_second(spool: Spool, folder: Path) -> None:
+def test_the_spool_writes_waiting_rows_as_a_message_after_a_second(spool: Spool, folder: Path) -> None:
     spool.append(numbered(0, 3))
     until(lambda: spool.state().written == 30)
     assert [file.name for file in folder.glob("*.arrows")] == ["000000000001-30.arrows"]
 
 
-def test_16384_rows_are_written_as_a_message_immediately(
+def test_the_spool_writes_16384_waiting_rows_as_a_message_immediately(
     spool: Spool, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(spool_module, "ENOUGH_S", 3600.0)
@@ -81,7 +81,7 @@ def test_16384_rows_are_written_as_a_message_immediately(
     assert len(list(folder.glob("*.arrows"))) == 1
 
 
-def test_a_reopened_log_continues_after_its_newest_message(folder: Path) -> None:
+def test_a_reopened_spool_numbers_messages_after_the_newest_one(folder: Path) -> None:
     filled(folder, 3)
     log = json.loads((folder / "spool.json").read_text())["log"]
     spool = Spool(folder, GATEWAY)
@@ -92,7 +92,7 @@ def test_a_reopened_log_continues_after_its_newest_message(folder: Path) -> None
     assert exchanges_in(rows_in(folder)) == list(range(20))
 
 
-def test_a_new_folder_starts_a_new_log(tmp_path: Path) -> None:
+def test_a_spool_in_a_new_folder_has_a_new_log_id(tmp_path: Path) -> None:
     logs = set()
     for name in ("a", "b"):
         filled(tmp_path / name, 1)
@@ -108,14 +108,15 @@ def test_a_new_folder_starts_a_new_log(tmp_path: Path) -> None:
 def test_a_newest_file_cut_at_any_byte_loses_no_earlier_message(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, step: int
 ) -> None:
-    """A power cut may leave a file without some of its bytes. It may also leave a temporary file."""
+    """A power cut may leave a file without some of its last bytes, or leave a temporary file."""
     whole = tmp_path / "whole"
     filled(whole, 3, exchanges=2)
     newest = max(whole.glob("*.arrows"))
     data = newest.read_bytes()
     before = rows_in(whole)
     ends = [size for size in range(0, len(data), step) if _is_whole(data[:size])]
-    assert all(size >= len(data) - 8 for size in ends)  # cutting only the end marker loses no row
+    # only the last 8 bytes, the end marker, can be lost without losing a row
+    assert all(size >= len(data) - 8 for size in ends)
     for size in range(0, len(data), step):
         folder = tmp_path / "cut"
         shutil.copytree(whole, folder)
@@ -129,7 +130,8 @@ def test_a_newest_file_cut_at_any_byte_loses_no_earlier_message(
         assert [row for row in before if row not in found] == lost
         assert exchanges_in(found)[-2:] == [6, 7]
         assert not list(folder.glob(".*.tmp"))
-        assert (folder / "000000000004-20.arrows").exists()  # the number of the cut file is not reused
+        # the next message does not reuse the cut file's number, 3
+        assert (folder / "000000000004-20.arrows").exists()
         assert list(folder.glob("*.damaged")) == (
             [] if size in ends else [folder / "000000000003-20.damaged"]
         )
@@ -139,7 +141,7 @@ def test_a_newest_file_cut_at_any_byte_loses_no_earlier_message(
 
 
 def test_the_number_of_a_damaged_message_is_not_reused(folder: Path) -> None:
-    """The stream may have the whole message, and would refuse another message of this number as a copy."""
+    """The stream may have the undamaged message, and would refuse a new one of this number as a copy."""
     filled(folder, 2, exchanges=2)
     newest = max(folder.glob("*.arrows"))
     newest.write_bytes(newest.read_bytes()[:100])
@@ -163,7 +165,7 @@ def _is_whole(data: bytes) -> bool:
         return False
 
 
-def test_files_are_synced_before_they_are_renamed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_spool_file_is_synced_before_it_is_renamed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise a power cut could leave an incomplete file."""
     calls: list[str] = []
     fsync, replace = os.fsync, os.replace
@@ -190,7 +192,9 @@ def test_files_are_synced_before_they_are_renamed(folder: Path, monkeypatch: pyt
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(("kills", "longest_s"), first_in_ci((3, 0.2), (12, 0.6)))
-def test_kills_at_any_moment_lose_no_reported_row(folder: Path, kills: int, longest_s: float) -> None:
+def test_a_process_killed_at_any_moment_loses_no_row_that_it_reported_as_stored(
+    folder: Path, kills: int, longest_s: float
+) -> None:
     """Each run starts at another number. All reported rows are stored once, in order, without gaps."""
     dice = random.Random(kills)
     support = os.pathsep.join(map(str, Path(spooled.__file__).parents[1].iterdir()))
@@ -200,7 +204,8 @@ def test_kills_at_any_moment_lose_no_reported_row(folder: Path, kills: int, long
         here = {**os.environ, "PYTHONPATH": support}
         with BoundProcess(words, stdout=subprocess.PIPE, text=True, env=here) as child:
             child.stdout.readline()
-            least = int(child.stdout.readline())  # the second report: more than 0 rows are on the disk
+            # the child's second report: more than 0 rows are on the disk
+            least = int(child.stdout.readline())
             time.sleep(dice.uniform(0, longest_s))
             child.kill()
             said = child.stdout.read().split("\n")[:-1]
@@ -217,7 +222,7 @@ def test_kills_at_any_moment_lose_no_reported_row(folder: Path, kills: int, long
 # ---- limits ----
 
 
-def test_the_oldest_messages_are_removed_at_the_limit_and_unsent_ones_counted(
+def test_a_full_spool_removes_its_oldest_messages_and_counts_unsent_rows(
     folder: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     filled(folder, 1)
@@ -234,14 +239,15 @@ def test_the_oldest_messages_are_removed_at_the_limit_and_unsent_ones_counted(
     left = sorted(int(file.name[:12]) for file in folder.glob("*.arrows"))
     assert left == list(range(state.oldest, 13))
     assert state.oldest >= 7
-    assert state.lost == (state.oldest - 1 - 3) * 50  # the first three messages were forwarded
+    # the first three messages were sent, so their rows are not lost
+    assert state.lost == (state.oldest - 1 - 3) * 50
     assert [record.levelno for record in caplog.records] == [logging.ERROR]
     assert "the spool is full at" in caplog.text
 
 
-def test_removals_before_the_streams_first_answer_are_counted_later(folder: Path) -> None:
+def test_rows_removed_before_the_streams_first_answer_are_counted_later(folder: Path) -> None:
     filled(folder, 6)
-    spool = Spool(folder, GATEWAY, most=1)  # the newest message is always kept
+    spool = Spool(folder, GATEWAY, most=1)  # the newest message is kept even beyond the limit
     store(spool, 30, 5)
     until(lambda: spool.state().oldest == 7)
     assert spool.state().lost == 0
@@ -350,19 +356,19 @@ def test_a_hanging_disk_does_not_delay_the_poller(spool: Spool, monkeypatch: pyt
 # ---- mistakes ----
 
 
-def test_two_processes_do_not_write_one_spool(spool: Spool, folder: Path) -> None:
+def test_a_second_process_cannot_open_the_same_spool(spool: Spool, folder: Path) -> None:
     with pytest.raises(SpoolError, match=f"the spool {folder} is in use by another process"):
         Spool(folder, GATEWAY)
 
 
-def test_a_foreign_folder_is_refused(tmp_path: Path) -> None:
+def test_a_spool_refuses_a_folder_with_other_files(tmp_path: Path) -> None:
     (tmp_path / "report.txt").write_text("mine")
     with pytest.raises(SpoolError, match=r"is not a spool: it holds 'report.txt' and no spool.json"):
         Spool(tmp_path, GATEWAY)
     assert {path.name for path in tmp_path.iterdir()} == {"report.txt", ".spool.lock"}
 
 
-def test_another_gateways_spool_is_refused(folder: Path) -> None:
+def test_a_spool_refuses_the_folder_of_another_gateway(folder: Path) -> None:
     filled(folder, 1)
     with pytest.raises(SpoolError, match="is the spool of gateway 'gateway-1', not of 'gateway-2'"):
         Spool(folder, "gateway-2")
@@ -371,14 +377,14 @@ def test_another_gateways_spool_is_refused(folder: Path) -> None:
 @pytest.mark.parametrize(
     "text", ["", "[]", "{", '{"format": "multidrop spool 9"}', '{"format": "multidrop spool 1"}']
 )
-def test_an_invalid_head_is_refused(folder: Path, text: str) -> None:
+def test_a_spool_refuses_a_folder_with_an_invalid_spool_json(folder: Path, text: str) -> None:
     folder.mkdir()
     (folder / "spool.json").write_text(text)
     with pytest.raises(SpoolError, match=r"spool.json is not the head file of a spool of this version"):
         Spool(folder, GATEWAY)
 
 
-def test_an_unwritable_folder_is_refused() -> None:
+def test_a_spool_refuses_a_folder_that_it_cannot_write() -> None:
     with (
         read_only_directory() as path,
         pytest.raises(SpoolError, match=f"the spool {path} cannot be written: Permission denied"),

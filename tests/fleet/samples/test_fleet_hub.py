@@ -1,4 +1,4 @@
-"""The hub: a sink gets each row of the stream once, with its position; errors raise alarms."""
+"""The hub stores each row of the stream once, together with its stream position, and reports errors."""
 
 from __future__ import annotations
 
@@ -65,13 +65,16 @@ async def say(
 
 
 async def say_all(path: ServerPath, first: int, end: int) -> None:
-    """Publish the messages `first` to `end` - 1, each with five exchanges."""
+    """Publish the messages number `first` to `end` - 1, each with five exchanges."""
     for number in range(first, end):
         await say(path, number, message(number * 5))
 
 
 class Memory:
-    """A sink in memory that stores commits. On request it fails before or after storing one."""
+    """A sink that keeps its commits in memory.
+
+    In `fates`, "b" fails before and "a" after storing a commit.
+    """
 
     def __init__(self, fates: str = "") -> None:
         self.commits: list[Commit] = []
@@ -103,7 +106,7 @@ class Memory:
 
 
 async def read_all(path: ServerPath, sink: SampleSink, place: int, every: float = 0.02) -> HubState:
-    """Run a hub until it has stored the message at this position; return its state."""
+    """Run a hub until it has stored the message at stream position `place`; return its state."""
     hub = SampleHub(path, sink, every=every)
     task = asyncio.create_task(hub.run())
     try:
@@ -119,7 +122,7 @@ async def read_all(path: ServerPath, sink: SampleSink, place: int, every: float 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("is_behind_for", [3, 10_000], ids=["looks", "ever"])
-def test_a_lagging_server_does_not_end_a_read_early(
+def test_the_hub_waits_for_a_server_without_the_streams_newest_messages(
     running: Cluster, monkeypatch: pytest.MonkeyPatch, is_behind_for: int
 ) -> None:
     looks = itertools.count()
@@ -147,7 +150,9 @@ def test_a_lagging_server_does_not_end_a_read_early(
 
 @pytest.mark.long
 @pytest.mark.parametrize("fates", ["", "bababb", "aaaa"])
-async def test_after_any_failure_each_row_is_stored_once(running: Cluster, fates: str) -> None:
+async def test_the_hub_stores_each_row_once_despite_failures_of_the_sink(
+    running: Cluster, fates: str
+) -> None:
     async with empty_stream(running) as path:
         await say_all(path, 1, 31)
         sink = Memory(fates)
@@ -158,7 +163,7 @@ async def test_after_any_failure_each_row_is_stored_once(running: Cluster, fates
 
 
 @pytest.mark.slow
-async def test_messages_from_several_answers_are_stored_once(
+async def test_messages_that_need_several_reads_are_stored_once(
     running: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(hub_module, "MOST_READ", 3)
@@ -173,10 +178,10 @@ async def test_messages_from_several_answers_are_stored_once(
 
 @pytest.mark.long
 @pytest.mark.parametrize("is_good", [True, False], ids=["rows", "garbage"])
-async def test_a_commit_ends_at_its_memory_limit(
+async def test_the_hub_limits_the_memory_of_a_commit(
     running: Cluster, monkeypatch: pytest.MonkeyPatch, is_good: bool
 ) -> None:
-    """Even few rows need much memory if names are long, and ignored messages need memory too."""
+    """Even few rows need much memory if their names are long. Ignored messages need memory too."""
     monkeypatch.setattr(hub_module, "MOST_READ", 1)
     monkeypatch.setattr(hub_module, "MOST_BYTES", 1000)
     sink = Memory()
@@ -189,7 +194,7 @@ async def test_a_commit_ends_at_its_memory_limit(
 
 
 @pytest.mark.slow
-def test_missing_and_duplicated_messages_are_logged_and_counted(
+def test_the_hub_logs_and_counts_missing_and_duplicated_messages(
     running: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def live() -> HubState:
@@ -222,7 +227,7 @@ def test_missing_and_duplicated_messages_are_logged_and_counted(
     ]
 
 
-async def test_messages_that_the_stream_removed_are_reported(
+async def test_the_hub_reports_messages_that_the_stream_has_removed(
     running: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with empty_stream(running) as path:
@@ -234,7 +239,7 @@ async def test_messages_that_the_stream_removed_are_reported(
     assert f"gateway-1.{LOG}: messages 1 to 3 are missing" in caplog.text
 
 
-async def test_a_stream_that_lost_its_end_is_refused(running: Cluster) -> None:
+async def test_the_hub_refuses_a_stream_that_has_lost_its_newest_messages(running: Cluster) -> None:
     async with empty_stream(running) as path:
         await say(path, 1, message(0))
         sink = Memory()
@@ -290,8 +295,10 @@ async def test_hub_files_are_read_by_history_and_duckdb(running: Cluster, tmp_pa
     assert told == (len(one_drive), sum(v is not None for v in one_drive), sum(filter(None, one_drive)))
 
 
-async def test_an_unfinished_file_is_not_a_commit(running: Cluster, tmp_path: Path) -> None:
-    """A killed hub leaves an unfinished file. The next hub reads its rows again from the stream."""
+async def test_the_hub_ignores_a_file_that_a_killed_hub_left_unfinished(
+    running: Cluster, tmp_path: Path
+) -> None:
+    """A killed hub leaves an unfinished file. The next hub reads the file's rows again from the stream."""
     async with empty_stream(running) as path:
         await say(path, 1, message(5))
         await kept_in_files(path, tmp_path, 1)
@@ -310,7 +317,9 @@ def commit_of(
     return Commit(stream, first, last, sources or {"a.x": last}, [table], len(table))
 
 
-def test_a_file_is_renamed_after_its_sync(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_parquet_file_is_synced_before_it_is_renamed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Otherwise a power cut could leave an incomplete file."""
     calls: list[str] = []
     really_synced, really_renamed = os.fsync, Path.replace
@@ -331,7 +340,7 @@ def test_a_file_is_renamed_after_its_sync(tmp_path: Path, monkeypatch: pytest.Mo
     assert calls == ["fsync .00000001", "rename .00000001", "fsync rows"]
 
 
-def test_a_folder_of_another_stream_or_program_is_refused(tmp_path: Path) -> None:
+def test_the_hub_refuses_a_folder_of_another_stream_or_program(tmp_path: Path) -> None:
     sink = ParquetSink(tmp_path)
     assert sink.begin("then") == StoredPosition(0, {})
     sink.write(commit_of())
@@ -348,7 +357,7 @@ def test_a_folder_of_another_stream_or_program_is_refused(tmp_path: Path) -> Non
         ParquetSink(tmp_path)
 
 
-def test_an_unwritable_folder_is_refused(tmp_path: Path) -> None:
+def test_the_hub_refuses_a_folder_that_it_cannot_write(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(SinkError, match="cannot be written: Not a directory"):
         ParquetSink(tmp_path / "file")
@@ -361,7 +370,7 @@ extract(epoch from time) * 1000000 from multidrop.samples order by time_ns, driv
 
 
 @pytest.mark.long
-async def test_rows_in_postgresql_equal_those_in_the_stream(running: Cluster, empty: Postgres) -> None:
+async def test_postgresql_stores_the_same_rows_as_the_stream(running: Cluster, empty: Postgres) -> None:
     async with empty_stream(running) as path:
         await say_all(path, 1, 6)
         sink = PostgresSink(empty.where)
@@ -379,7 +388,7 @@ async def test_rows_in_postgresql_equal_those_in_the_stream(running: Cluster, em
 
 
 @pytest.mark.long
-def test_partly_missing_values_are_read_back_from_postgresql(empty: Postgres) -> None:
+def test_exchanges_with_some_missing_values_are_read_back_from_postgresql(empty: Postgres) -> None:
     sink = PostgresSink(empty.where)
     sink.begin("then")
     table = unpack(message(0, 1))
@@ -425,7 +434,7 @@ def test_a_second_hub_of_a_database_waits_until_the_first_ends(empty: Postgres) 
     with pytest.raises(SinkError, match="another hub writes into this database; waiting until it ends"):
         other.begin("then")
     one.write(commit_of())
-    assert one.begin("then") == StoredPosition(1, {"a.x": 1})  # as after a failure
+    assert one.begin("then") == StoredPosition(1, {"a.x": 1})  # the stored position, as after a failure
     one.close()
     assert other.begin("then") == StoredPosition(1, {"a.x": 1})
     with pytest.raises(
@@ -437,11 +446,11 @@ def test_a_second_hub_of_a_database_waits_until_the_first_ends(empty: Postgres) 
 
 @pytest.mark.slow
 def test_writing_fails_if_another_hub_has_changed_the_stored_position(empty: Postgres) -> None:
-    """Behind a connection pooler, several hubs may share one lock."""
+    """Behind a connection pooler, several hubs may share one lock, so the database checks the position."""
     sink = PostgresSink(empty.where)
     sink.begin("then")
     empty.ask("update multidrop.hub set place = 7 returning place")
-    for first in (1, 7, 9):  # 1 and 7 are stored already; 9 would skip message 8
+    for first in (1, 7, 9):  # 1 and 7 are stored already, and 9 would skip message 8
         with pytest.raises(SinkError, match="another hub writes into this database: stop one of them"):
             sink.write(commit_of(first=first, last=first))
     sink.close()

@@ -1,4 +1,4 @@
-"""The forwarder with real servers: it stores each message once and in order, whatever the network loses."""
+"""The forwarder stores each message once and in order in real NATS servers, even if the network loses it."""
 
 from __future__ import annotations
 
@@ -86,20 +86,23 @@ def filled(folder: Path, messages: int) -> Spool:
 
 
 async def store(spool: Spool, first: int) -> None:
-    """Append five exchanges to the spool, and wait until they are on the disk as a message."""
+    """Append five exchanges to the spool, and wait until they are on the disk as one message."""
     spool.append(numbered(first, 5))
     assert await asyncio.to_thread(spool.sync, PATIENCE_S)
 
 
 @table("name", ["", "a.b", "a b", "*", ">", "ä", "a/b"])
-def test_names_invalid_in_subjects_are_rejected(name: str) -> None:
+def test_a_gateway_name_that_nats_subjects_do_not_allow_is_rejected(name: str) -> None:
     spool: Any = SimpleNamespace(gateway=name, log="00112233aabbccdd")
     with pytest.raises(ValueError, match="may have only letters, digits, _ and -"):
         Forwarder(spool, spool)
 
 
 class SwallowingPath:
-    """A path whose answer arrives at the moment of a cancellation, which `asyncio.wait_for` may swallow."""
+    """A server connection whose answer arrives just when the request is cancelled.
+
+    `asyncio.wait_for` may swallow that cancellation.
+    """
 
     async def request(self, *_: object, **__: object) -> Any:
         with suppress(asyncio.CancelledError):
@@ -118,7 +121,7 @@ class SwallowingPath:
     ],
     ids=["publish", "last_of", "read_after"],
 )
-async def test_a_cancelled_request_ends_its_task_although_the_answer_came(request_of: Any) -> None:
+async def test_a_cancelled_request_ends_its_task_even_if_the_answer_arrives(request_of: Any) -> None:
     task = asyncio.create_task(request_of(SwallowingPath()))
     await asyncio.sleep(0)
     task.cancel()
@@ -126,7 +129,7 @@ async def test_a_cancelled_request_ends_its_task_although_the_answer_came(reques
         await task
 
 
-async def test_messages_are_stored_in_the_stream_in_order(running: Cluster, tmp_path: Path) -> None:
+async def test_the_forwarder_stores_the_spools_messages_in_order(running: Cluster, tmp_path: Path) -> None:
     spool = filled(tmp_path / "spool", 7)
     async with empty_stream(running) as path, forwarding(spool, path) as forwarder:
         await until(lambda: forwarder.last == 7)
@@ -159,7 +162,7 @@ async def test_a_restarted_gateway_continues_after_the_last_stored_message(
 
 
 class Lossy:
-    """A path that loses messages, or the stream's answers to them."""
+    """A server connection that loses messages, or the stream's answers to them, as `fates` says."""
 
     def __init__(self, path: ServerPath, fates: str) -> None:
         self._path, self._fates = path, iter(fates)
@@ -185,7 +188,7 @@ class Lossy:
 
 
 @pytest.mark.parametrize("fates", ["aaaaaaa", "bbabab", "ababaaabb", "llaboabl", "alolalolb"])
-async def test_after_lost_messages_or_answers_each_message_is_stored_once(
+async def test_each_message_is_stored_once_although_messages_or_answers_are_lost(
     running: Cluster, tmp_path: Path, fates: str
 ) -> None:
     spool = filled(tmp_path / "spool", 6)
@@ -196,8 +199,13 @@ async def test_after_lost_messages_or_answers_each_message_is_stored_once(
     spool.close()
 
 
-async def test_server_answers_within_a_log_are_ignored(running: Cluster, tmp_path: Path) -> None:
-    """Any client may direct a server's answer to this subject. Each message of the log is still sent once."""
+async def test_the_forwarder_ignores_server_answers_among_its_gateways_samples(
+    running: Cluster, tmp_path: Path
+) -> None:
+    """Any client may direct a server's answer to the subject of a gateway's samples.
+
+    It is no message of the gateway.
+    """
     spool = filled(tmp_path / "spool", 2)
     subject = subject_of("gateway-1", spool.log)
     answers = [{}, {"Nats-Stream": "KV_own_0", samples_stream.SEQUENCE: "99"}]
@@ -214,7 +222,7 @@ async def test_server_answers_within_a_log_are_ignored(running: Cluster, tmp_pat
 
 
 class Refusing(Lossy):
-    """A path on which the stream refuses the first messages, as servers without room do."""
+    """A server connection on which the stream refuses the first messages, as if the disk was full."""
 
     async def request(self, subject: str, data: bytes = b"", *details: Any, **more: Any) -> Any:
         if not subject.startswith("$JS") and next(self._fates, ""):
@@ -222,7 +230,7 @@ class Refusing(Lossy):
         return await self._path.request(subject, data, *details, **more)
 
 
-async def test_a_refusing_stream_is_logged_once_until_it_accepts_a_message(
+async def test_a_stream_that_refuses_messages_is_logged_once(
     running: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     spool = filled(tmp_path / "spool", 2)
@@ -236,7 +244,9 @@ async def test_a_refusing_stream_is_logged_once_until_it_accepts_a_message(
     ]
 
 
-async def test_messages_that_the_spool_has_dropped_are_skipped(running: Cluster, tmp_path: Path) -> None:
+async def test_the_forwarder_skips_messages_that_the_full_spool_has_removed(
+    running: Cluster, tmp_path: Path
+) -> None:
     filled(tmp_path / "spool", 5).close()
     spool = Spool(tmp_path / "spool", "gateway-1", most=1)
     await store(spool, 25)
@@ -248,7 +258,7 @@ async def test_messages_that_the_spool_has_dropped_are_skipped(running: Cluster,
     spool.close()
 
 
-async def test_a_restored_old_folder_is_logged_and_not_forwarded(
+async def test_a_spool_folder_restored_from_a_backup_is_reported_and_not_forwarded(
     running: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     spool = filled(tmp_path / "spool", 2)
@@ -258,7 +268,7 @@ async def test_a_restored_old_folder_is_logged_and_not_forwarded(
         spool.close()
         (tmp_path / "spool" / "000000000002-50.arrows").unlink()
         spool = Spool(tmp_path / "spool", "gateway-1")
-        for number in (100, 200):  # the spool's log is first as long as the stream's, then longer
+        for number in (100, 200):  # first the spool has as many messages as the stream, then more
             async with forwarding(spool, path) as forwarder:
                 await until(lambda forwarder=forwarder: forwarder.trouble)
             await store(spool, number)
@@ -289,7 +299,7 @@ async def test_forwarding_continues_after_an_outage(tmp_path: Path, caplog: pyte
     spool.close()
     told = [record.getMessage() for record in caplog.records if "forwarder" in record.name]
     assert told[0].startswith("samples are not forwarded: ")
-    # The stream may have stored the fourth message without answering.
+    # The servers may have stored message 4 before they ended, without answering.
     assert re.fullmatch("samples are forwarded again, behind message [34]", told[-1])
 
 
@@ -308,7 +318,9 @@ async def test_the_largest_message_is_stored_and_read_back(running: Cluster) -> 
 
 
 @pytest.mark.slow
-async def test_a_missing_stream_is_reported_and_waited_for(running: Cluster, tmp_path: Path) -> None:
+async def test_the_forwarder_reports_a_missing_stream_and_waits_for_it(
+    running: Cluster, tmp_path: Path
+) -> None:
     async with empty_stream(running) as path:
         await samples_stream._ask(path, "STREAM.DELETE.samples", {})
         for asked in (stream_info(path), last_of(path, "samples.a.b")):
@@ -365,10 +377,11 @@ def chaos(monkeypatch: pytest.MonkeyPatch) -> Any:
     return importlib.import_module("bench.questions.fleet_chaos")
 
 
-def test_lost_and_duplicated_rows_are_found(chaos: Any) -> None:
+def test_the_drill_finds_lost_and_duplicated_rows(chaos: Any) -> None:
     told = {"gateway-1": {0: 4, 1_000_000: 2}, "gateway-2": {0: 3}}
     whole = {
-        "gateway-1": Counter([0, 1, 2, 3, 4, 5, 1_000_000, 1_000_001]),  # rows 4 and 5 were not reported
+        # the lost rows 4 and 5 were not reported as lost
+        "gateway-1": Counter([0, 1, 2, 3, 4, 5, 1_000_000, 1_000_001]),
         "gateway-2": Counter([0, 1, 2]),
     }
     assert chaos.compare(told, whole) == (9, 0, 0, 0)
@@ -380,7 +393,7 @@ def test_lost_and_duplicated_rows_are_found(chaos: Any) -> None:
     assert chaos.compare(told, doubled) == (9, 0, 0, 1)
 
 
-def test_the_hubs_alarms_about_lost_and_repeated_messages_are_found(
+def test_the_drill_finds_the_hubs_alarms_about_lost_and_repeated_messages(
     chaos: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     check = SourceCheck({})
@@ -395,7 +408,9 @@ def test_the_hubs_alarms_about_lost_and_repeated_messages_are_found(
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_no_sample_is_lost_during_random_kills(chaos: Any, tmp_path: Path) -> None:
+def test_no_sample_is_lost_when_gateway_hub_and_servers_are_killed_at_random(
+    chaos: Any, tmp_path: Path
+) -> None:
     wrong = chaos.run(tmp_path, 12.0, random.Random(2))
     print(*(f"{path.name}: {path.read_text()[-2000:]}" for path in tmp_path.glob("*.log")), sep="\n")
     assert wrong == 0
@@ -436,7 +451,7 @@ def filled_from(folder: Path, first: int, most: int) -> Spool:
 
 @pytest.fixture
 def most(tmp_path: Path) -> int:
-    """Return a limit of about ten messages, in bytes."""
+    """Return the size, in bytes, of about ten messages."""
     spool = Spool(tmp_path / "one", "gateway-1")
     spool.append(numbered(0, EXCHANGES))
     assert spool.sync(LONG_PATIENCE_S)
@@ -451,8 +466,11 @@ def settled(spool: Spool, most: int) -> SpoolState:
 
 
 @pytest.mark.long
-async def test_after_an_outage_stored_and_lost_rows_add_up(tmp_path: Path, most: int) -> None:
-    """The outage outlasts the spool's limit. Each row is stored, or counted by the spool as lost."""
+async def test_after_a_long_outage_each_row_is_stored_or_counted_as_lost(tmp_path: Path, most: int) -> None:
+    """The spool cannot hold all rows of the outage.
+
+    Each row is stored by the hub, or counted as lost by the spool.
+    """
     require_module("duckdb")
     with cluster(tmp_path / "nats", 1) as servers:
 

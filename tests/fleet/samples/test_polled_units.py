@@ -1,4 +1,4 @@
-"""Units of a fleet's samples: each row has the unit of the description under which it was polled."""
+"""Units of a fleet's samples: each row keeps the unit that its register had when it was polled."""
 
 from __future__ import annotations
 
@@ -68,27 +68,28 @@ def tables(units: PolledUnits | None, first: int = 0) -> list[pa.Table]:
 
 
 def units_in(table: pa.Table, register: str) -> list[tuple[int, str | None]]:
-    """Return pump-1's exchanges in order, each with its number and the unit of this register."""
+    """Return the exchanges of pump-1 in order: the number of each, and the unit of this register in it."""
     columns = [table.column(name).to_pylist() for name in ("drive", "register", "unit")]
     times = table.column("time").cast("int64").to_pylist()
     rows = zip(times, *columns, strict=True)
     return sorted(((time - NOON) // STEP, unit) for time, *of, unit in rows if of == ["pump-1", register])
 
 
-def test_rows_keep_the_unit_that_they_were_polled_in(tmp_path: Path) -> None:
-    """This holds also for rows that are packed after the change, together with rows of the new unit."""
+def test_a_row_keeps_its_unit_when_the_registers_unit_changes_later(tmp_path: Path) -> None:
+    """The old unit stays even if rows of both units are packed into one message after the change."""
     (table,) = tables(changed(tmp_path))
     assert units_in(table, "value_1") == [(at, "V" if at < 20 else "A") for at in range(0, 40, 4)]
     assert units_in(table, "value_2") == [(at, "names of meter.toml") for at in range(0, 40, 4)]
     assert units_in(table, "value_3") == [(at, "") for at in range(0, 40, 4)]
-    assert units_in(table, "value_4") == [(at, None) for at in range(0, 40, 4)]  # the line does not poll it
+    # the line does not poll this register, so its unit is unknown
+    assert units_in(table, "value_4") == [(at, None) for at in range(0, 40, 4)]
 
 
-def test_a_gateway_notes_the_units_of_a_claimed_line(tmp_path: Path) -> None:
+def test_a_gateway_records_a_changed_unit_when_it_polls_a_line_again(tmp_path: Path) -> None:
     units = PolledUnits()
     lines = FleetLines(Mastership(), tmp_path, units)
     lines._take(record('unit = "V"'))
-    with pytest.raises(ValueError, match="line-1"):  # refused: the line is polled already
+    with pytest.raises(ValueError, match="line-1"):  # refused, because the line is polled already
         lines._take(record('unit = "kW"'))
     lines.poller.remove_line("line-1")
     before_ns = time.monotonic_ns()
@@ -101,7 +102,7 @@ def test_a_gateway_notes_the_units_of_a_claimed_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_merged_files_keep_the_units_although_other_rows_have_none(tmp_path: Path) -> None:
+def test_merged_files_keep_units_even_if_some_rows_have_no_unit(tmp_path: Path) -> None:
     require_module("duckdb")
     sink = ParquetSink(tmp_path)
     hour = 3600 * 10**9 // STEP
@@ -118,7 +119,7 @@ def test_merged_files_keep_the_units_although_other_rows_have_none(tmp_path: Pat
     assert {found[at] for at in range(52, 90, 4)} == {"A"}
 
 
-def test_units_are_named_as_in_a_history() -> None:
+def test_a_gateway_names_units_as_a_history_does() -> None:
     plant = {"drives": {"a": {"model": "meter.toml", "registers": {"b": {"values": {"ON": 1}}}}}}
     assert quantities.units_of(plant) == {("a", "b"): "names of meter.toml"}
     assert RAW == quantities.RAW
@@ -126,7 +127,7 @@ def test_units_are_named_as_in_a_history() -> None:
 
 @pytest.fixture(params=["as they came", "merged"])
 def kept(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
-    """Return a hub's folder with a change of units within its first file, and later rows without units."""
+    """Return a hub's folder whose first file has a change of units, and whose last rows have no units."""
     require_module("duckdb")
     folder, units = tmp_path / "kept", changed(tmp_path / "lines")
     sink = ParquetSink(folder)
@@ -147,7 +148,7 @@ BEGIN, BEFORE, END = NOON, NOON + 18 * STEP, NOON + 120 * STEP
 
 @pytest.mark.slow
 @pytest.mark.parametrize("points", [1, 120])
-def test_a_plot_never_mixes_units(kept: Path, points: int) -> None:
+def test_a_plot_of_a_hubs_folder_shows_only_the_newest_unit_of_a_register(kept: Path, points: int) -> None:
     with History(kept) as history:
         found = history.buckets([f"pump-1.value_{at}" for at in (1, 2, 3, 4)], BEGIN, END, points)
         before = history.buckets("pump-1.value_1", BEGIN, BEFORE, points)["pump-1.value_1"]
@@ -162,7 +163,9 @@ def test_a_plot_never_mixes_units(kept: Path, points: int) -> None:
 
 
 @pytest.mark.long
-def test_rows_of_a_hubs_folder_have_one_column_per_unit(kept: Path, tmp_path: Path) -> None:
+def test_a_register_whose_unit_has_changed_is_exported_as_one_column_per_unit(
+    kept: Path, tmp_path: Path
+) -> None:
     with History(kept) as history:
         rows = history.read("pump-1.value_1", BEGIN, END)
         about = rows.metadata["drives"]["pump-1"]["registers"]
@@ -222,7 +225,7 @@ def say_with(url: str, subject: str, headers: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("parser", [None, _as_mail])
-def test_headers_cannot_forge_the_origin_of_samples(
+def test_no_message_header_can_forge_the_origin_of_samples(
     running: Cluster, parser: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     if parser:

@@ -1,4 +1,4 @@
-"""Many answers at a time: which of them are accepted, and what happens if one is missing."""
+"""BatchClient: many answers at a time, which of them are accepted, and what happens if one is missing."""
 
 from __future__ import annotations
 
@@ -31,7 +31,10 @@ SERVERS = (
 
 @pytest.fixture(params=["taken at once", "nats-py's own way", "another nats-py"])
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Receive answers directly, by nats-py's queue, or with a changed nats-py; return a prefix of keys."""
+    """Receive answers directly, through nats-py's queue, or with a changed nats-py.
+
+    Return a prefix for keys.
+    """
     if request.param == "nats-py's own way":
         monkeypatch.delattr(BatchClient, "_process_msg")
     elif request.param == "another nats-py":
@@ -46,13 +49,15 @@ def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 def test_nats_py_still_has_the_method_that_receives_answers() -> None:
-    """If this fails, answers take a slower path. Find the new method, or declare this nats-py too new."""
+    """If this test fails, answers take a slower path. Use the new method, or declare this nats-py too new."""
     names = ["self", "sid", "subject", "reply", "data", "headers"]
     assert list(inspect.signature(Client._process_msg).parameters) == names
     assert inspect.iscoroutinefunction(Client._process_msg)
 
 
-async def test_answers_bypass_the_queue_of_nats_py(one: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_answers_to_batches_bypass_the_queue_of_nats_py(
+    one: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def fail(self: BatchClient, message: object) -> None:
         raise AssertionError("it came in nats-py's own way")
 
@@ -63,7 +68,7 @@ async def test_answers_bypass_the_queue_of_nats_py(one: Cluster, monkeypatch: py
 
 
 def _rested(path: ServerPath) -> None:
-    """Fill the path's budget for repeated reads, as after some time without load."""
+    """Fill the budget for repeated reads of this server connection, as after some time without load."""
     for _ in range(round(connections.MOST_REPEATS / connections.EARNED)):
         path.budget.note(is_late=False)
         path.budget.learn(0.01)
@@ -79,7 +84,7 @@ def _rested(path: ServerPath) -> None:
         b"NATS/1.0 404 No Messages\r\nNats-Sequence: none\r\n",
     ],
 )
-def test_server_headers_take_precedence_over_the_writers_headers(writers: bytes) -> None:
+def test_a_stored_messages_server_headers_take_precedence_over_its_writers(writers: bytes) -> None:
     assert stored_message(writers + SERVERS, b"x") == DirectMessage("$KV.own_0.a", 7, b"x")
 
 
@@ -92,11 +97,13 @@ def test_server_headers_take_precedence_over_the_writers_headers(writers: bytes)
         b"NATS/1.0\r\nNats-Subject: a\r\nNats-Sequence: -1\r\n\r\n",
     ],
 )
-def test_headers_without_a_message_end_an_answer(headers: bytes) -> None:
+def test_headers_that_belong_to_no_stored_message_end_an_answer(headers: bytes) -> None:
     assert stored_message(headers, b"") is None
 
 
-async def test_a_record_like_an_end_marker_does_not_hide_later_ones(one: Cluster, way: str) -> None:
+async def test_a_record_that_imitates_an_answers_end_does_not_hide_later_records(
+    one: Cluster, way: str
+) -> None:
     async with connected_path(one) as path:
         bucket = Bucket("own_0", lambda: path)
         await bucket.put(f"{way}-a", OWNER, 0)
@@ -108,14 +115,16 @@ async def test_a_record_like_an_end_marker_does_not_hide_later_ones(one: Cluster
         await client.flush()
         await client.close()
         while f"{way}-b" not in [record.key for record in await bucket.changes(0)]:
-            await asyncio.sleep(0.05)  # waits until the unanswered write is stored
+            await asyncio.sleep(0.05)  # until the write, which gets no answer, is stored
         await bucket.put(f"{way}-c", OWNER, 0)
         found = await bucket.changes(0)
         keys = [record.key for record in found if record.key.startswith(way)]
         assert keys == [f"{way}-a", f"{way}-b", f"{way}-c"]
 
 
-async def test_each_of_many_records_is_replaced_only_at_its_revision(one: Cluster, way: str) -> None:
+async def test_in_a_batch_of_writes_each_record_is_replaced_only_at_its_revision(
+    one: Cluster, way: str
+) -> None:
     async with connected_path(one) as path:
         bucket = Bucket("own_1", lambda: path)
         a, b, c = f"{way}-a", f"{way}-b", f"{way}-c"
@@ -134,7 +143,7 @@ async def test_each_of_many_records_is_replaced_only_at_its_revision(one: Cluste
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("way")
-async def test_unanswered_requests_are_distinguished_from_answered_ones(one: Cluster) -> None:
+async def test_requests_without_an_answer_and_without_a_receiver_are_distinguished(one: Cluster) -> None:
     client = await connect(one.urls[0], {})
     deaf = await client.subscribe("deaf")
     mute = Request("deaf", b"")
@@ -142,12 +151,12 @@ async def test_unanswered_requests_are_distinguished_from_answered_ones(one: Clu
     info = Request("$JS.API.INFO", b"")
     found = await client.replies([mute, nobody, info], 0.2)
     assert found[0] is None
-    assert found[1] == b""  # the server reports that the request has no receiver
+    assert found[1] == b""  # empty: the server reports that the request has no receiver
     assert found[2] is not None
     assert found[2].startswith(b"{")
-    with pytest.raises(TimeoutError, match=r"no message came for 0.2 s"):
+    with pytest.raises(TimeoutError, match=r"the server sent no message for 0.2 s"):
         await client.batch(mute, DirectGet(), 0.2)
-    with pytest.raises(OSError, match="it ended with status 503"):
+    with pytest.raises(OSError, match="the answer to a read ended with status 503"):
         await client.batch(nobody, DirectGet(), 5.0)
     assert client._takers == {}
     await deaf.unsubscribe()
@@ -155,7 +164,7 @@ async def test_unanswered_requests_are_distinguished_from_answered_ones(one: Clu
 
 
 @pytest.mark.parametrize(("deaf_to", "is_told"), [(0, True), (1, True), (4, True), (5, False)])
-async def test_reads_lost_on_a_cut_off_server_are_repeated(
+async def test_a_read_that_is_lost_on_a_cut_off_server_is_repeated(
     one: Cluster, monkeypatch: pytest.MonkeyPatch, deaf_to: int, is_told: bool
 ) -> None:
     monkeypatch.setattr(connections, "AGAIN_S", (0.1,) * 4 + (30.0 if is_told else 0.1,))
@@ -174,7 +183,8 @@ async def test_reads_lost_on_a_cut_off_server_are_repeated(
                 await other.flush()
 
         await other.subscribe("moody", cb=answer)
-        await other.flush()  # may return before the server has the subscription; the second cannot
+        # this flush may return before the server has the subscription; the second one cannot
+        await other.flush()
         await other.flush()
         if is_told:
             assert await path.collect("moody", b"") == []
@@ -185,7 +195,7 @@ async def test_reads_lost_on_a_cut_off_server_are_repeated(
         await other.close()
 
 
-async def test_reads_on_a_cut_off_path_are_repeated_on_the_others(one: Cluster) -> None:
+async def test_a_read_on_a_cut_off_connection_is_repeated_on_other_connections(one: Cluster) -> None:
     paths = paths_of(one.urls)
     await asyncio.gather(*(path.open() for path in paths))
     asked: list[Request] = []
@@ -213,7 +223,7 @@ async def test_a_late_answer_is_not_taken_for_another_request(one: Cluster) -> N
         asked.put_nowait(message.reply)
 
     await other.subscribe("slow", cb=keep)
-    await other.flush()  # may return before the server has the subscription; the second cannot
+    await other.flush()  # this flush may return before the server has the subscription; the second one cannot
     await other.flush()
     assert await client.replies([Request("slow", b"first")], 0.2) == [None]
     second = asyncio.create_task(client.replies([Request("slow", b"second")], 30.0))
@@ -228,10 +238,10 @@ async def test_a_late_answer_is_not_taken_for_another_request(one: Cluster) -> N
         await one_of.close()
 
 
-async def test_a_late_pong_does_not_end_reading(one: Cluster) -> None:
+async def test_a_pong_after_the_flushs_timeout_does_not_end_reading(one: Cluster) -> None:
     client = await connect(one.urls[0], {})
     given_up = asyncio.get_running_loop().create_future()
-    given_up.cancel()  # as after the timeout of a flush
+    given_up.cancel()  # as when a flush times out
     await client._send_ping(given_up)
     await client.flush(30)
     assert client.is_reading
@@ -254,7 +264,7 @@ async def test_a_connection_that_is_no_longer_read_is_replaced(one: Cluster) -> 
 
 
 @pytest.mark.usefixtures("way")
-async def test_other_messages_are_delivered_as_usual(one: Cluster) -> None:
+async def test_messages_that_answer_no_batch_are_delivered_as_usual(one: Cluster) -> None:
     client = await connect(one.urls[0], {})
     assert isinstance(client, BatchClient)
     await client.replies([Request("$JS.API.INFO", b"")], 5.0)

@@ -1,4 +1,4 @@
-"""Repeated reads, and the leaders of buckets, with fake servers in simulated time."""
+"""Repeated reads, and hand-overs of buckets' leadership, with fake servers in simulated time."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ REQUEST = Request("questions", b"")
 
 
 class SlowPath:
-    """A path that answers its requests after these delays in s, or fails."""
+    """A fake server connection that answers its requests after these delays in s, or fails."""
 
     def __init__(
         self, name: str, *delays: float, failure: FleetError | None = None, pause: float = 0
@@ -56,7 +56,10 @@ class SlowPath:
 
 
 def answer(*paths: SlowPath) -> tuple[str, float]:
-    """Return which path's answer was used, and after how many s. No request may stay in flight."""
+    """Send one read; return which connection's answer was used, and after how many s.
+
+    No request may stay in flight.
+    """
 
     async def main() -> tuple[str, float]:
         found = await first_answer(paths, REQUEST, full())
@@ -69,7 +72,7 @@ def answer(*paths: SlowPath) -> tuple[str, float]:
 
 
 def full() -> RepeatBudget:
-    """Return a full budget, as after some time without load."""
+    """Return a full budget for repeated reads, as after some time without load."""
     budget = RepeatBudget()
     for _ in range(round(MOST_REPEATS / EARNED)):
         budget.note(is_late=False)
@@ -81,20 +84,20 @@ def asked(paths: Sequence[SlowPath]) -> list[list[float]]:
     return [path.asked for path in paths]
 
 
-def test_a_prompt_answer_needs_only_one_request() -> None:
+def test_a_read_with_a_prompt_answer_sends_only_one_request() -> None:
     paths = [SlowPath("a", 0.01), SlowPath("b", 0.01), SlowPath("c", 0.01)]
     assert answer(*paths) == ("a", 0.01)
     assert asked(paths) == [[0.0], [], []]
 
 
-def test_an_unanswered_read_is_repeated_on_all_paths() -> None:
-    """The server may have forwarded the request to a server that is cut off."""
+def test_an_unanswered_read_is_repeated_on_all_connections() -> None:
+    """The first server may have forwarded the request to a server that is cut off."""
     paths = [SlowPath("a"), SlowPath("b", NEVER, 0.01), SlowPath("c")]
     assert answer(*paths) == ("b", 0.21)
     assert asked(paths) == [[0.0, 0.2], [0.1, 0.2], [0.1, 0.2]]
 
 
-def test_a_late_first_answer_is_used_even_after_a_repeat() -> None:
+def test_a_late_answer_to_the_first_request_is_used_even_after_a_repeat() -> None:
     paths = [SlowPath("a", 0.15), SlowPath("b")]
     assert answer(*paths) == ("a", 0.15)
 
@@ -105,12 +108,12 @@ def test_a_long_answer_is_not_requested_again_while_parts_arrive() -> None:
     assert asked(paths) == [[0.0], []]
 
 
-def test_a_failed_path_is_not_waited_for() -> None:
+def test_a_read_that_fails_on_one_connection_uses_another_immediately() -> None:
     paths = [SlowPath("a", 0.0, failure=OutcomeUnknown("lost")), SlowPath("b", 0.01), SlowPath("c")]
     assert answer(*paths) == ("b", 0.01)
 
 
-def test_a_failure_of_all_paths_is_raised_immediately() -> None:
+def test_a_read_that_fails_on_all_connections_raises_immediately() -> None:
     for number in (1, 2, 3):
         paths = [SlowPath("a", 0.01, failure=OutcomeUnknown("it ended with 503")) for _ in range(number)]
         with pytest.raises(OutcomeUnknown, match="503"):
@@ -139,7 +142,7 @@ def test_a_read_whose_repeats_are_unanswered_raises() -> None:
 
 
 class LatePath(SlowPath):
-    """A path that always answers after `delay` seconds."""
+    """A fake server connection that always answers after `delay` seconds."""
 
     def __init__(self, delay: float) -> None:
         super().__init__("late")
@@ -151,7 +154,7 @@ class LatePath(SlowPath):
 
 
 def questions(reads: int, paths: Sequence[LatePath], budget: RepeatBudget) -> int:
-    """Return how many requests are sent for this many reads, one after another."""
+    """Send this many reads one after another; return how many requests were sent for them."""
     before = sum(map(len, asked(paths)))
 
     async def main() -> None:
@@ -163,12 +166,12 @@ def questions(reads: int, paths: Sequence[LatePath], budget: RepeatBudget) -> in
 
 
 def test_reads_are_not_repeated_before_timely_answers_were_seen() -> None:
-    """Many gateways that start together read a lot, and repeats would slow them down more."""
+    """Many gateways that start together slow down the servers, and repeats would slow them down more."""
     assert questions(100, [LatePath(0.9) for _ in range(3)], RepeatBudget()) == 100
 
 
 @pytest.mark.slow
-def test_a_slow_cluster_gets_no_repeats() -> None:
+def test_reads_from_a_slow_cluster_are_not_repeated_for_long() -> None:
     paths, budget = [LatePath(0.9) for _ in range(3)], full()
     assert 300 < questions(300, paths, budget) < 300 + MOST_REPEATS
     assert questions(300, paths, budget) == 300
@@ -176,7 +179,7 @@ def test_a_slow_cluster_gets_no_repeats() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [2, 5, 20])
-def test_reads_that_are_late_now_and_then_cause_few_repeats(late: int) -> None:
+def test_occasional_late_answers_cause_few_repeated_reads(late: int) -> None:
     paths, budget = [LatePath(0.9) for _ in range(3)], full()
     questions(300, paths, budget)
     count = 0
@@ -187,18 +190,21 @@ def test_reads_that_are_late_now_and_then_cause_few_repeats(late: int) -> None:
     assert count < 300 * (1 + EARNED)
 
 
-def test_timely_answers_increase_the_budget_for_repeats() -> None:
+def test_timely_answers_allow_more_repeated_reads() -> None:
     paths, budget = [LatePath(0.9) for _ in range(3)], full()
     questions(300, paths, budget)
     for path in paths:
         path.delay = 0.01
     assert questions(round(2 / EARNED), paths, budget) == 2 / EARNED
-    paths[0].delay = NEVER  # this path no longer answers
+    paths[0].delay = NEVER  # the first connection gives no more answers
     assert questions(1, paths, budget) == 3
 
 
-def test_the_budget_lasts_until_a_dead_route_is_dropped() -> None:
-    """A gateway reads about 100 times within these 3 s, and a third of its requests is lost."""
+def test_enough_reads_can_be_repeated_until_servers_drop_a_dead_route() -> None:
+    """Servers need 3 s to notice a dead route.
+
+    A gateway then sends about 100 reads and loses a third of them.
+    """
     paths, budget = [LatePath(0.01) for _ in range(3)], full()
     took = []
 
@@ -214,7 +220,7 @@ def test_the_budget_lasts_until_a_dead_route_is_dropped() -> None:
     assert max(took) < 0.12
 
 
-def test_a_failed_read_without_budget_raises() -> None:
+def test_a_failed_read_raises_if_the_budget_for_repeats_is_empty() -> None:
     budget = RepeatBudget()
     paths = [SlowPath("a", 0.01, failure=OutcomeUnknown("it ended with 503")), SlowPath("b", 0.01)]
 
@@ -226,8 +232,8 @@ def test_a_failed_read_without_budget_raises() -> None:
     assert asked(paths) == [[0.0], []]
 
 
-def test_slow_answers_delay_repeats() -> None:
-    """After a slow answer, as when many gateways start together, later reads are repeated later."""
+def test_after_slow_answers_reads_are_repeated_later() -> None:
+    """Many gateways that start together slow down the servers; early repeats would slow them down more."""
     path, others, budget = LatePath(0.2), [SlowPath("b"), SlowPath("c")], full()
 
     async def main() -> None:
@@ -238,7 +244,7 @@ def test_slow_answers_delay_repeats() -> None:
     assert asked(others) == [[0.1], [0.1]]  # only the first read was repeated
 
 
-def test_lost_reads_are_repeated_soon_once_answers_are_fast() -> None:
+def test_lost_reads_are_repeated_soon_again_once_answers_are_fast_again() -> None:
     paths, budget = [LatePath(0.3) for _ in range(3)], full()
     questions(10, paths, budget)
     for path in paths:
@@ -260,11 +266,11 @@ def test_lost_reads_are_repeated_soon_once_answers_are_fast() -> None:
 
 SERVERS = ("n1", "n2", "n3")
 PATH: Any = None
-ASKS_S = 4.0  # a server without contact may ask for votes after this time
+ASKS_S = 4.0  # a server without contact to the leader asks for votes after this time, at the earliest
 
 
 class Servers:
-    """Three fake servers. Each bucket has a leader and a Raft term."""
+    """Three fake servers and their buckets, each with a leader and a Raft term."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.leaders = dict(zip((*names.LEASES, *names.OWNERS), 2 * SERVERS, strict=True))
@@ -305,7 +311,7 @@ class Servers:
         return {"cluster": {"leader": leader, "replicas": peers}}
 
     def pass_s(self, seconds: int) -> None:
-        """Let this time pass, with one round of hand-overs per second."""
+        """Let this time pass, and hand over the buckets that are due once per second."""
 
         async def main() -> None:
             for _ in range(seconds):
@@ -326,14 +332,14 @@ def test_no_bucket_is_handed_over_unless_a_server_is_silent(servers: Servers) ->
     assert set(servers.terms.values()) == {1}
 
 
-def test_no_bucket_is_handed_over_because_a_server_lags(servers: Servers) -> None:
+def test_no_bucket_is_handed_over_because_a_servers_copy_lags_behind(servers: Servers) -> None:
     servers.lagging = {"n3"}
     servers.pass_s(10)
     assert set(servers.terms.values()) == {1}
 
 
 @pytest.mark.parametrize(("unheard_ns", "is_due"), [(1_900_000_000, False), (2_100_000_000, True), (0, True)])
-def test_a_server_is_silent_after_two_missed_heartbeats(
+def test_a_server_counts_as_silent_after_two_seconds_without_a_message(
     servers: Servers, unheard_ns: int, is_due: bool
 ) -> None:
     servers.silent, servers.unheard_ns = {"n3"}, unheard_ns
@@ -341,14 +347,14 @@ def test_a_server_is_silent_after_two_missed_heartbeats(
     assert (servers.terms[names.LEASES[0]] > 1) is is_due
 
 
-def test_raft_terms_grow_faster_than_a_silent_server_can_ask_for_votes(servers: Servers) -> None:
+def test_raft_terms_grow_faster_than_a_silent_server_starts_elections(servers: Servers) -> None:
     servers.silent = {"n3"}
     for second in range(60):
         servers.pass_s(1)
         for bucket in names.LEASES[:2]:
             assert servers.terms[bucket] > 1 + second // 4
             assert servers.leaders[bucket] in ("n1", "n2")
-    assert servers.terms[names.LEASES[2]] == 1  # the bucket has no leader that could hand it over
+    assert servers.terms[names.LEASES[2]] == 1  # its leader is silent, so it cannot be handed over
     assert HAND_OVER_S < ASKS_S
 
 
@@ -381,13 +387,13 @@ def test_after_a_failed_hand_over_no_other_bucket_is_handed_over(servers: Server
     assert sorted(servers.terms.values()) == [1, 1, 2]
 
 
-def test_a_single_server_hands_no_bucket_over(servers: Servers) -> None:
+def test_a_single_remaining_server_hands_no_bucket_over(servers: Servers) -> None:
     servers.silent = {"n2", "n3"}
     servers.pass_s(10)
     assert set(servers.terms.values()) == {1}
 
 
-def test_a_silent_leader_does_not_delay_other_hand_overs(servers: Servers) -> None:
+def test_buckets_of_a_silent_leader_do_not_delay_the_others_hand_overs(servers: Servers) -> None:
     servers.silent = {"n2"}
 
     async def main() -> None:
@@ -401,10 +407,13 @@ def test_a_silent_leader_does_not_delay_other_hand_overs(servers: Servers) -> No
 
 
 @pytest.mark.parametrize("cut_after_s", [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
-def test_raft_terms_are_ahead_before_a_server_that_was_cut_off_asks_for_votes(
+def test_raft_terms_are_newer_before_a_cut_off_server_starts_an_election(
     cut_after_s: float, servers: Servers
 ) -> None:
-    """Leaders on the cut-off server do not answer. The other leaders report after 2 s that it is silent."""
+    """A leader on the cut-off server does not answer.
+
+    Leaders on other servers report it as silent after 2 s.
+    """
 
     async def main() -> None:
         keeping = asyncio.create_task(
@@ -421,8 +430,8 @@ def test_raft_terms_are_ahead_before_a_server_that_was_cut_off_asks_for_votes(
     run_controlled(main())
 
 
-def test_leaderships_return_to_their_home_servers(servers: Servers) -> None:
-    """This includes leaderships that were handed over because of a silent server."""
+def test_the_leadership_of_each_bucket_returns_to_its_home_server(servers: Servers) -> None:
+    """The other server leads the bucket after a hand-over because of a silent server, for instance."""
     servers.leaders |= {"lease_0": "n2", "own_2": "n1"}
     servers.lagging = {"n1"}
 

@@ -1,4 +1,4 @@
-"""Whole fleets with rights from `fleet rights`: gateways join and die, keys are revoked and stolen."""
+"""Whole fleets with the rights of `fleet rights`: gateways join and die, keys are revoked and stolen."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ time.time, time.time_ns = lambda: seconds() + 3600, lambda: ns() + 3600 * 10**9
 
 
 def check_that_a_stop_reports_its_progress(fleet: SecuredFleet) -> None:
-    """Check that the sender of a stop hears that the drive refuses the stop, and then how the stop ended."""
+    """Check that a stop's sender is told that the drive refuses the stop, and then how the stop ended."""
     fleet.hall.refusing.add("line-1")
     asker = subprocess.Popen(
         [sys.executable, "-m", "multidrop", "fleet", "stop", "drive-line-1"],
@@ -58,8 +58,8 @@ def check_that_a_stop_reports_its_progress(fleet: SecuredFleet) -> None:
     assert out.startswith("done: drive-line-1: stopped: seen to stand after "), (out, err)
 
 
-def test_a_whole_fleet_works_with_the_rights_as_written(tmp_path: Path) -> None:
-    """Cold start, a new gateway, a dead gateway's lines, a drain and the hub; no log reports a denial.
+def test_a_whole_fleet_works_with_the_rights_that_fleet_rights_writes(tmp_path: Path) -> None:
+    """The steps: cold start, a new gateway, a dead gateway, a drain and the hub. No log reports a denial.
 
     The servers read the new gateway's rights while the other gateways continue. NATS 2.15 gives a new account
     its imports only at the second reload.
@@ -101,16 +101,17 @@ def test_a_whole_fleet_works_with_the_rights_as_written(tmp_path: Path) -> None:
             assert "Traceback" not in fleet.log(name)
 
 
-def test_a_revoked_key_is_logged_and_its_lines_are_taken_over(tmp_path: Path) -> None:
-    """The servers reload their rights, and disconnect users that were removed."""
+def test_a_gateway_with_a_revoked_key_logs_it_and_others_take_its_lines(tmp_path: Path) -> None:
+    """When the servers reload their rights, they disconnect users that were removed."""
     with secured_fleet(tmp_path, 1, ("gw-a", "gw-b")) as fleet:
         fleet.wait_for_polling()
         fleet.servers.give_rights_to(["gw-b"])
         until(lambda: "refuses these credentials" in fleet.log("gw-a"), "the sentence")
         until(lambda: "all lines are closed" in fleet.log("gw-a"), "silence")
         fleet.wait_for_polling()
-        assert fleet.running["gw-a"].poll() is None  # the gateway retries
-        assert fleet.log("gw-a").count("admits nobody") < 10  # logged once per connection
+        assert fleet.running["gw-a"].poll() is None  # the gateway continues to run, and retries
+        # the refusal is logged once per connection, not at each attempt
+        assert fleet.log("gw-a").count("admits nobody") < 10
 
 
 async def end_session(servers: SecuredCluster, name: str) -> None:
@@ -127,8 +128,8 @@ async def end_session(servers: SecuredCluster, name: str) -> None:
     await path.close()
 
 
-def test_a_stolen_gateway_key_can_only_silence_lines(tmp_path: Path) -> None:
-    """A thief with gw-c's key ends the other gateways' sessions. These gateways start new sessions."""
+def test_a_thief_with_a_gateways_key_can_only_interrupt_polling(tmp_path: Path) -> None:
+    """A thief with the key of gw-c ends the sessions of other gateways, which then start new sessions."""
     with secured_fleet(tmp_path, 1, GATEWAYS[:2]) as fleet:
         fleet.servers.give_rights_to(GATEWAYS)
         fleet.servers.reload()
@@ -151,7 +152,7 @@ def test_a_stolen_gateway_key_can_only_silence_lines(tmp_path: Path) -> None:
 
 
 def test_clocks_an_hour_apart_are_logged_and_harmless(tmp_path: Path) -> None:
-    """One of two gateways is an hour ahead. Each takes over the lines of the other."""
+    """The clock of one of two gateways is an hour ahead. Each gateway takes over the lines of the other."""
     (tmp_path / "ahead").mkdir()
     (tmp_path / "ahead" / "sitecustomize.py").write_text(AN_HOUR_AHEAD)
     ahead = {"gw-a": {"PYTHONPATH": str(tmp_path / "ahead")}, "gw-b": {}}
@@ -173,8 +174,11 @@ def test_clocks_an_hour_apart_are_logged_and_harmless(tmp_path: Path) -> None:
         assert fleet.hall.overlaps() == 0
 
 
-def test_a_second_machine_with_a_gateways_name_waits_for_it(tmp_path: Path) -> None:
-    """The second gateway has another folder, as on another machine. It waits, reports it, and takes over."""
+def test_a_second_gateway_of_the_same_name_waits_until_the_first_one_ends(tmp_path: Path) -> None:
+    """The second gateway has another folder, as on another machine.
+
+    It waits for the first one, then takes over.
+    """
     with secured_fleet(tmp_path, 1, ("gw-a",)) as fleet:
         fleet.wait_for_polling()
         fleet.start("gw-a", "second")

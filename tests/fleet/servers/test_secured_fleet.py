@@ -1,4 +1,4 @@
-"""Servers with the rights that `fleet rights` writes: errors if a right is missing, and answers of NATS."""
+"""Servers with the rights that `fleet rights` writes: errors for missing rights, and where answers may go."""
 
 from __future__ import annotations
 
@@ -62,10 +62,10 @@ def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecuredCluster
         yield running
 
 
-@pytest.mark.slow  # slow tests start first, and this file takes longest
+@pytest.mark.slow  # slow: slow tests start first, and this file takes longest
 @pytest.mark.long
 def test_a_route_to_a_silent_server_is_dropped_soon(tmp_path: Path) -> None:
-    """With its defaults, NATS takes more than a minute, during which it forwards requests to that server."""
+    """With default settings, NATS forwards requests to the silent server for more than a minute."""
 
     def routes(node: SecuredNode) -> int:
         with urllib.request.urlopen(f"http://127.0.0.1:{node.monitor}/routez", timeout=5) as answer:
@@ -101,15 +101,15 @@ def test_a_missing_right_is_reported_in_one_sentence(
     said = multidrop(servers, user, *words, *folder.get(words[1], ()))
     assert said.returncode == 1
     lines = said.stderr.splitlines()
-    assert len(lines) == 1 + (words[0] == "hub")  # a hub logs the sentence too
+    assert len(lines) == 1 + (words[0] == "hub")  # a hub also logs the sentence
     assert sentence.lower() in lines[-1].lower()
 
 
 @pytest.mark.slow
-def test_a_stored_message_directed_into_anothers_samples_is_ignored(
+def test_a_stored_message_directed_into_another_gateways_samples_is_ignored(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """With one account for all users, servers would send stored messages to any reply subject."""
+    """With one NATS account for all users, servers would send stored messages to any reply subject."""
 
     async def main(servers: SecuredCluster) -> None:
         await make_streams(servers)
@@ -191,13 +191,16 @@ def test_mistaken_credentials_are_reported_in_one_sentence(
     assert (ended, out) == (status, "")
     [line] = err.splitlines()
     assert sentence in line
-    assert status == 1 or not (tmp_path / "h").exists()  # a mistake in the command creates no folder
+    # a mistake in the options is found before a folder is created
+    assert status == 1 or not (tmp_path / "h").exists()
 
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_no_data_is_sent_to_a_server_without_tls(run: Run, servers: SecuredCluster, tmp_path: Path) -> None:
-    """Otherwise an attacker in between could read and relay the login."""
+def test_a_client_that_requires_tls_sends_no_data_to_a_server_without_tls(
+    run: Run, servers: SecuredCluster, tmp_path: Path
+) -> None:
+    """Otherwise an attacker between client and server could read and relay the login."""
     with cluster(tmp_path / "plain", 1) as plain:
         url = plain.urls[0].replace("nats://", "tls://")
         key, ca = str(servers.key("viewer")), str(servers.tls.ca)
@@ -209,14 +212,16 @@ def test_no_data_is_sent_to_a_server_without_tls(run: Run, servers: SecuredClust
 
 
 @pytest.mark.long
-def test_a_tls_server_is_not_contacted_without_tls(run: Run, servers: SecuredCluster) -> None:
+def test_a_server_that_requires_tls_is_reported_to_a_client_without_tls(
+    run: Run, servers: SecuredCluster
+) -> None:
     status, _, err = run("fleet", "status", "--nats", servers.urls[0].replace("tls://", "nats://"))
     assert status == 1
     assert "no answer in time; write tls:// if it requires TLS" in err
 
 
 @pytest.mark.long
-def test_tls_trusts_only_the_given_authority(servers: SecuredCluster) -> None:
+def test_a_client_trusts_only_certificates_of_the_given_authority(servers: SecuredCluster) -> None:
     context = servers.options("hub")["tls"]
     assert context.verify_mode is ssl.CERT_REQUIRED
     assert context.check_hostname
@@ -252,7 +257,10 @@ STREAMS = ("KV_plant", "KV_lease_0", "KV_own_0", STREAM)
 
 
 def elsewhere(user: str, inboxes: Mapping[str, str]) -> list[str]:
-    """Return other users' subjects that `user` may name as reply subjects. Each contains the user's name."""
+    """Return subjects of other users, to which `user` may ask servers to send answers.
+
+    Each subject contains the name of `user`.
+    """
     return [
         *(f"$KV.plant.{user}", f"$KV.lease_0.{user}.gw-b", f"$KV.own_0.{user}", f"{STREAM}.gw-b.{user}"),
         *(f"stop.{user}", f"cmd.{user}", f"do.gw-b.{user}", f"gateway.gw-b.{user}"),
@@ -283,7 +291,7 @@ async def connected(servers: SecuredCluster, url: str) -> AsyncIterator[Mapping[
 
 
 def questions(user: str) -> Iterator[tuple[str, bytes]]:
-    """Yield the requests for stored data that a user may send. The servers answer each of them."""
+    """Yield the requests for stored data that this user may send. The servers answer each of them."""
     stream, key = (STREAM, f"{STREAM}.gw-b.log") if user == "hub" else ("KV_own_0", "$KV.own_0.last")
     yield f"$JS.API.DIRECT.GET.{stream}", json.dumps({"last_by_subj": key}).encode()
     yield f"$JS.API.STREAM.INFO.{stream}", b""
@@ -300,7 +308,7 @@ def all_inboxes(servers: SecuredCluster) -> dict[str, str]:
 
 
 def foreign(servers: SecuredCluster) -> dict[str, list[str]]:
-    """Return the reply subjects for each user to which that user may not publish."""
+    """Return, for each user, the reply subjects to which that user may not publish."""
     rights, inboxes = rights_of(TWO_GATEWAYS), all_inboxes(servers)
     return {
         user: [
@@ -313,7 +321,7 @@ def foreign(servers: SecuredCluster) -> dict[str, list[str]]:
 
 
 async def arrivals(servers: SecuredCluster, wanted: Set[str]) -> set[str]:
-    """Let each user request answers on forbidden subjects; return the subjects that got one.
+    """Let each user request answers on subjects to which it may not publish; return those that got an answer.
 
     Requests go to each server. The function waits for answers on the `wanted` subjects, because servers do
     not answer in order.
@@ -323,7 +331,7 @@ async def arrivals(servers: SecuredCluster, wanted: Set[str]) -> set[str]:
 
 
 async def arrivals_at(servers: SecuredCluster, url: str, wanted: Set[str]) -> set[str]:
-    """Return the subjects that got an answer, like `arrivals`, for requests to one server."""
+    """Do what `arrivals` does at one server, and return the subjects that got an answer."""
     heard: set[str] = set()
 
     async def hear(message: Msg) -> None:
@@ -358,14 +366,16 @@ async def stored(client: Client, stream: str) -> set[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [1, pytest.param(3, marks=pytest.mark.long)])
-def test_no_answer_leaves_the_requesters_account(tmp_path: Path, number: int) -> None:
+def test_servers_send_no_answer_to_another_users_subject(tmp_path: Path, number: int) -> None:
     with secured_cluster(tmp_path, number, TWO_GATEWAYS) as servers:
         assert asyncio.run(arrivals(servers, set())) == set()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [1, pytest.param(3, marks=pytest.mark.long)])
-def test_with_one_account_for_all_users_each_answer_arrives(tmp_path: Path, number: int) -> None:
+def test_with_one_account_for_all_users_answers_reach_other_users_subjects(
+    tmp_path: Path, number: int
+) -> None:
     with secured_cluster(tmp_path, number, TWO_GATEWAYS, in_one_account) as servers:
         wanted = {subject for subjects in foreign(servers).values() for subject in subjects}
         assert asyncio.run(arrivals(servers, wanted)) == wanted

@@ -1,4 +1,4 @@
-"""`fleet init` on real servers: the buckets that it creates, and the servers that it refuses."""
+"""`fleet init` on real servers: which buckets it creates, and which servers it refuses."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ def test_buckets_are_created_on_all_three_servers(nats: Cluster) -> None:
     made = asyncio.run(_init(nats.urls))
     assert made["replicas"] == 3
     assert set(made["servers"]) == {"n1", "n2", "n3"}
-    assert asyncio.run(_init(nats.urls)) == made  # a second run keeps the buckets
+    assert asyncio.run(_init(nats.urls)) == made  # a second run changes no bucket
 
 
 @pytest.mark.slow
-async def test_paths_and_leaders_are_spread_over_all_servers(fleet: Cluster) -> None:
+async def test_connections_and_bucket_leaders_are_spread_over_all_servers(fleet: Cluster) -> None:
     paths = paths_of(fleet.urls)
     await setup.open_all(paths)
     assert [path.server_name for path in paths] == ["n1", "n2", "n3"]
@@ -63,7 +63,7 @@ async def test_paths_and_leaders_are_spread_over_all_servers(fleet: Cluster) -> 
 
 
 class Deaf:
-    """A path on which the leaders of some master buckets give this answer, or none."""
+    """A server connection on which the leaders of some ownership buckets give the answer `said`, or none."""
 
     server_name = "n1"
 
@@ -92,10 +92,10 @@ def test_lines_can_be_claimed_while_two_of_three_buckets_have_a_leader(said: byt
 
 
 @pytest.mark.slow
-def test_a_cluster_that_grants_a_key_twice_is_refused(
+def test_init_refuses_servers_that_accept_two_writes_to_one_revision(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """These old servers accept two concurrent writes to one revision. The test disables the version check."""
+    """Old servers accept two concurrent writes to one revision. Their version is not checked in this test."""
     monkeypatch.setattr(servers, "OLDEST", (0, 0))
     with cluster(tmp_path, 3, old_server_program()) as old:
         sentence = "same revision of a record: they could give one lease to two gateways"
@@ -103,10 +103,10 @@ def test_a_cluster_that_grants_a_key_twice_is_refused(
             asyncio.run(_init(old.urls))
 
 
-def test_servers_that_ignore_other_writers_records_are_refused(
+def test_init_refuses_servers_that_ignore_records_of_other_writers(
     nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Such servers would grant a lease to two gateways. Some of their answers may come too late."""
+    """Such servers would grant a lease to two gateways. Some of their answers may arrive too late."""
     monkeypatch.setattr(LeaseBucket, "_pattern", LeaseBucket._subject)
     with pytest.raises(FleetError, match=r"accepted [2-6] of 6 concurrent writes to the same revision"):
         asyncio.run(_init(nats.urls))
@@ -114,10 +114,13 @@ def test_servers_that_ignore_other_writers_records_are_refused(
 
 @pytest.mark.slow
 @table(("is_carried_out",), [(True,), (False,)])
-def test_an_unanswered_removal_of_a_bucket_is_checked_and_repeated(
+def test_init_repeats_an_unanswered_removal_of_its_test_bucket(
     is_carried_out: bool, nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A busy leader may answer late when `init` removes the bucket in which it tested concurrent writes."""
+    """`init` removes the bucket in which it has tested concurrent writes.
+
+    A busy leader may answer too late.
+    """
     removals = []
 
     async def ask_in_vain(path: ServerPath, subject: str, data: Any = None) -> dict[str, Any]:
@@ -136,8 +139,8 @@ def test_an_unanswered_removal_of_a_bucket_is_checked_and_repeated(
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_init_needs_all_servers_only_the_first_time(tmp_path: Path) -> None:
-    """Otherwise buckets would be created on two servers, and the failure of either would end all polling."""
+def test_init_needs_all_servers_only_when_it_creates_buckets(tmp_path: Path) -> None:
+    """Otherwise a bucket would be stored on two servers, and the failure of either would end all polling."""
     with cluster(tmp_path, 3) as three:
         down = next(node for node in three.nodes if not node.leads_servers())
         others = [node for node in three.nodes if node is not down]
@@ -152,12 +155,15 @@ def test_init_needs_all_servers_only_the_first_time(tmp_path: Path) -> None:
         while not {f"KV_{name}" for name in names.BUCKETS} <= set().union(*(one.leads() for one in others)):
             assert time.monotonic() < ends
             time.sleep(0.1)
-        assert asyncio.run(_init(three.urls))["replicas"] == 3  # a plant can still be stored
+        # all servers have a copy, so a plant can still be stored
+        assert asyncio.run(_init(three.urls))["replicas"] == 3
 
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_no_quorum_is_reported_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_servers_without_a_quorum_are_reported_in_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(setup, "WAIT_S", 1.0)
     with cluster(tmp_path, 3) as three:
         for node in three.nodes[1:]:
@@ -187,7 +193,7 @@ def test_servers_that_cannot_decide_are_reported_as_no_quorum(
 
 @pytest.mark.slow
 def test_init_waits_until_a_new_plant_can_be_read(nats: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A direct get from a new bucket may at first find no server."""
+    """Right after a bucket was created, no server may answer reads from it."""
     collect, failures = ServerPath.collect, [OutcomeUnknown("it ended with 503")] * 2
 
     async def fail_at_first(self: ServerPath, subject: str, data: bytes) -> list[DirectMessage]:
@@ -223,7 +229,7 @@ def test_a_server_without_jetstream_is_reported_in_one_sentence(
 def test_a_bucket_without_a_leader_is_reported_as_no_quorum(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The last running server of a cluster answers for some seconds, but its answers name no leader."""
+    """The last running server of a cluster answers for some seconds, but names no leader in its answers."""
     told = setup.ask
 
     async def without_leader(path: ServerPath, subject: str) -> dict[str, Any]:
@@ -238,8 +244,10 @@ def test_a_bucket_without_a_leader_is_reported_as_no_quorum(
 
 
 @pytest.mark.slow
-def test_init_waits_for_an_election_in_progress(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After its leader died, a bucket has no leader for a moment, although most servers run."""
+def test_init_waits_for_the_election_of_a_buckets_leader(
+    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Most servers run, but the bucket's leader has died, and the election of the next one takes a moment."""
     told, silent = setup.ask, ["STREAM.INFO.KV_lease_1"] * 3
 
     async def silent_at_first(path: ServerPath, subject: str) -> dict[str, Any]:
@@ -255,7 +263,7 @@ def test_init_waits_for_an_election_in_progress(fleet: Cluster, monkeypatch: pyt
 
 @pytest.mark.long
 @pytest.mark.parametrize(("ahead_s", "words"), [(3600, "is 3600 s ahead of"), (-3600, "is 3600 s behind")])
-def test_a_wrong_clock_is_logged(
+def test_init_warns_if_this_computers_clock_differs_from_the_servers(
     fleet: Cluster,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
@@ -278,7 +286,7 @@ async def _check(fleet: Cluster) -> None:
 
 
 @pytest.mark.long
-def test_a_path_moves_to_another_server_and_returns_home(tmp_path: Path) -> None:
+def test_a_connection_moves_to_another_server_and_returns_home(tmp_path: Path) -> None:
     with cluster(tmp_path, 3) as three:
 
         async def main() -> None:
@@ -302,7 +310,7 @@ def test_a_path_moves_to_another_server_and_returns_home(tmp_path: Path) -> None
 
 
 @pytest.mark.long
-async def test_a_path_whose_home_server_is_silent_uses_another_server(tmp_path: Path) -> None:
+async def test_a_connection_whose_home_server_is_silent_uses_another_server(tmp_path: Path) -> None:
     with cluster(tmp_path, 2) as two:
         two.nodes[0].pause()
 
@@ -342,7 +350,7 @@ address = 3
 
 
 def lines_again(path: Path, folder: Path) -> list[Any]:
-    """Return the lines of a plant file as another computer reads them from their records in JSON."""
+    """Return the lines of a plant file as another computer reads them from JSON records."""
     _, records = read_plant(path)
     shipped: dict[str, Any] = json.loads(json.dumps(records))
     return [line_of(Record(name, 7, value), folder) for name, value in shipped.items()]
@@ -367,7 +375,7 @@ def as_text(line: Any) -> str:
     )
 
 
-def test_lines_read_from_their_records_equal_the_plant_files(tmp_path: Path) -> None:
+def test_lines_read_from_their_records_equal_those_of_the_plant_file(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT, "utf-8")
     again = lines_again(path, tmp_path / "gateway")
@@ -389,14 +397,14 @@ def test_a_family_file_is_stored_with_its_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["../escape.toml", "/escape.toml", "a/../../b.toml"])
-def test_a_record_writes_no_file_outside_its_folder(tmp_path: Path, name: str) -> None:
+def test_a_line_record_cannot_write_a_file_outside_the_lines_folder(tmp_path: Path, name: str) -> None:
     value = {"line": {"name": "hall"}, "files": {name: "text"}}
-    with pytest.raises(ValueError, match="outside of its folder"):
+    with pytest.raises(ValueError, match="outside the line's folder"):
         line_of(Record("hall", 1, value), tmp_path / "gateway")
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
-async def test_unchanged_lines_keep_their_records_revision() -> None:
+async def test_storing_a_plant_again_keeps_the_revision_of_unchanged_lines() -> None:
     memory = MemoryBucket("plant")
     bucket: Any = memory
     first = {name: {"line": {"name": name}, "files": {}} for name in ("a", "b", "c")}
@@ -410,14 +418,14 @@ async def test_unchanged_lines_keep_their_records_revision() -> None:
     assert await store(bucket, first) == {"new": 1, "changed": 1, "removed": 0, "kept": 1}
 
 
-async def test_a_plant_that_another_command_changes_meanwhile_is_reported() -> None:
+async def test_two_fleet_init_commands_at_the_same_time_are_reported() -> None:
     bucket = MemoryBucket(names.PLANT)
     bucket.before_put = lambda key: bucket.store(key, {"line": {"name": key}, "files": {}})
     with pytest.raises(FleetError, match=r"line hall-1 has changed in the meantime: run `multidrop fleet"):
         await store(bucket, {"hall-1": {"line": {"name": "hall-1", "port": "socket://a:1"}, "files": {}}})
 
 
-def test_a_lines_record_has_only_its_own_permissions(tmp_path: Path) -> None:
+def test_a_line_record_has_only_the_permissions_of_its_own_drives(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT)
     _, before = read_plant(path)
@@ -429,20 +437,21 @@ def test_a_lines_record_has_only_its_own_permissions(tmp_path: Path) -> None:
     assert records["hall-2"]["may"] == {"verbs": ["other.reset_fault", "other.start"]}
     assert all("may" not in record for record in before.values())
     path.write_text(f'{PLANT}\n[fleet.may]\nverbs = ["other.start"]\n')
-    assert read_plant(path)[1]["hall-1"] == before["hall-1"]  # the record is unchanged, so polling continues
+    # the record is unchanged, so the line is polled without a break
+    assert read_plant(path)[1]["hall-1"] == before["hall-1"]
 
 
 CHANNEL = '[[line.drive.channel]]\nname = "half"\nvalue = "{} / 2"\nunit = "{}"\n'
 
 
-def test_channels_of_a_line_are_in_its_record(tmp_path: Path) -> None:
+def test_computed_channels_of_a_line_are_in_its_record(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT + CHANNEL.format("output_frequency", "Hz"))
     *_, last = lines_again(path, tmp_path / "copy")
     assert last.drives[0].channels == Plant.load(path).lines[1].drives[0].channels != ()
 
 
-def test_channel_of_several_lines_is_refused(tmp_path: Path) -> None:
+def test_a_channel_that_uses_drives_of_several_lines_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT + CHANNEL.format("fan.output_current", "A"))
     assert Plant.load(path)
