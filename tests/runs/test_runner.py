@@ -70,6 +70,38 @@ def test_steps_are_carried_out_in_order_and_recorded_with_their_phases(tmp_path:
 
 
 PHASES = ["start", "steps 1", "steps 2", "stop"]
+CYCLE = """
+[[phase]]
+name = "cycle"
+repeat = 2
+[[phase.step]]
+frequency = { fan = 10.0, pump = 20.0 }
+start = ["fan", "pump"]
+direction = "reverse"
+dwell = "1 s"
+[[phase.step]]
+stop = ["pump"]
+write = { fan = { setpoint = 60.0 } }
+dwell = "2 s"
+"""
+
+
+@pytest.mark.slow
+def test_a_repeated_phase_starts_writes_and_stops_several_drives(tmp_path: Path) -> None:
+    """The simulated drives record each write with its time: `control` 2 is REVERSE, 5 is STOP."""
+    with simulated_test(write_test(tmp_path, CYCLE, fan=CHE, pump=CHE), speed=SPEED) as (plan, (fan, pump)):
+        assert TestRun(plan, speed=SPEED).run().ok
+    written = {sim: [(write.name, write.raw) for write in sim.counters.writes] for sim in (fan, pump)}
+    reverse, stop = ("control", 2), ("control", 5)
+    assert unrepeated(written[fan]) == [("setpoint", 2000), reverse, ("setpoint", 6000)] * 2 + [stop]
+    assert unrepeated(written[pump]) == [("setpoint", 4000), reverse, stop] * 2
+    stopped_at = next(write.time for write in pump.counters.writes if write.raw == 5)
+    assert any(write.time > stopped_at and write.raw == 6000 for write in fan.counters.writes)
+
+
+def unrepeated(found: list[Any]) -> list[Any]:
+    """Return the list without entries that are equal to the entry before, such as repeated stops."""
+    return [one for at, one in enumerate(found) if at == 0 or one != found[at - 1]]
 
 
 def never(fan: MotorDrive) -> None:

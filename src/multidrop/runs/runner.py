@@ -23,7 +23,7 @@ from multidrop.control.exit_hook import await_signal
 from multidrop.control.outcome import Seen, Stopped
 from multidrop.control.ramp import check_setpoint, checked_rate, ramp
 from multidrop.drive.family import Drive
-from multidrop.errors import BusError, Expired, NoReply, Unconfirmed
+from multidrop.errors import BadReply, BusError, Expired, NoReply, Unconfirmed
 from multidrop.plant.model import Plant, Polled, PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.batch import Rows, copied
@@ -396,12 +396,12 @@ class _Session:
         self._insist(drive, lambda: _command(drive, step))
 
     def _insist(self, drive: Drive, work: Callable[[], object]) -> object:
-        """Do the work. Repeat it if a simulated drive was late; a command to a real drive is not repeated."""
+        """Do the work. Repeat it if a simulated drive was late; commands to a real drive are not repeated."""
         attempts = SIMULATED_ATTEMPTS if _is_simulated(drive.bus) else 1
         for attempt in range(attempts):
             try:
                 return work()
-            except (NoReply, Unconfirmed, Expired):
+            except (NoReply, BadReply, Unconfirmed, Expired):
                 if attempt == attempts - 1 or self._is_stopping:
                     raise
         return None
