@@ -312,7 +312,9 @@ def test_stop_does_not_wait_for_hanging_writes(gateway: Served, monkeypatch: pyt
         write.join()
     refused = [text for text in found if text != "it was held up"]
     assert len(refused) == 4
-    assert all(text.endswith(" was not sent: 8 others are under way on line hall") for text in refused)
+    assert all(
+        text.endswith(" was not sent: 8 other commands are under way on line hall") for text in refused
+    )
 
 
 @pytest.mark.slow

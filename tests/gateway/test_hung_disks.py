@@ -30,7 +30,7 @@ from multidrop.history import writer as writer_module
 SERVE = '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\n'
 HISTORY = '[serve.history]\nfolder = "kept"\n'
 SHORT_S = 0.1
-COMING = "it is not ready: its files do not answer"
+COMING = "it is not ready: the disk with its files does not answer"
 UNAUDITED = "audit log: not done within 0.1 s; does the disk answer? Restart to try again"
 HANGING = """
 import sys, threading
@@ -432,7 +432,7 @@ def test_full_disk_is_reported_while_polling_and_stops_continue(disk: Path, tmp_
         status, recorded, audit = disk_health(gateway)
         assert status == "degraded"
         assert recorded.startswith("nothing is recorded: ")
-        assert audit.startswith("the newest write is not noted: ")
+        assert audit.startswith("the newest write is missing in the audit log: ")
         until(lambda: len(gateway.frame()["troubles"]) == 2)
         assert all(FULL in trouble for trouble in gateway.frame()["troubles"])
         until(lambda: dropped(gateway) > 40)

@@ -267,7 +267,7 @@ def test_answer_that_is_not_http_is_reported_in_one_sentence() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         thread = threading.Thread(target=answer)
         thread.start()
-        with pytest.raises(OSError, match=r"^the answer is not HTTP$"):
+        with pytest.raises(OSError, match=r"^the server's answer is not HTTP$"):
             sending.post(f"http://127.0.0.1:{listener.getsockname()[1]}/", b"", {})
         thread.join()
 

@@ -251,7 +251,7 @@ def test_a_new_token_is_shown_once(run: Run) -> None:
         ),
         (
             ("--new-token", "stop", "--for", "a b"),
-            "'a b' cannot name a token: use letters, digits and . _ @ - (at most 64, no sign first)",
+            "'a b' cannot name a token: use up to 64 letters, digits and . _ @ -, a letter or digit first",
         ),
     ],
 )

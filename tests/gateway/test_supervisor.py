@@ -136,7 +136,7 @@ def test_a_thread_of_the_history_that_ends_makes_health_fail(
         raise SystemExit
 
     monkeypatch.setattr(part._writer, "_write_waiting", leave)
-    until(lambda: dead(gateway) == {"history": "RuntimeError: the writing thread has ended"})
+    until(lambda: dead(gateway) == {"history": "RuntimeError: the thread that writes the history has ended"})
     assert gateway.get("/health").json["parts"]["history"] == dead(gateway)["history"]
     monkeypatch.undo()
     part._writer._segments.close()

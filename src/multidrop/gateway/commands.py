@@ -296,7 +296,7 @@ class Commands:
         if self.withheld:
             return _refused(WriteForbidden(f"{what} was not sent: {self.withheld}", rule=UNAUDITED))
         if self._under_way[line.name] >= MOST_WRITES:
-            reason = f"{what} was not sent: {MOST_WRITES} others are under way on line {line.name}"
+            reason = f"{what} was not sent: {MOST_WRITES} other commands are under way on line {line.name}"
             return _refused(WriteForbidden(reason, rule=BUSY))
         try:
             until_ns = admit(what)
@@ -476,7 +476,7 @@ class FleetStops(Commands):
         missing = found.get(WHOLE)
         # the whole fleet's result does not say whether this drive is stopped
         if missing is None or missing.ok:
-            missing = CommandResult(CommandOutcome.UNKNOWN, "the fleet gives no answer for it")
+            missing = CommandResult(CommandOutcome.UNKNOWN, "the fleet gives no answer for this drive")
         return {name: found.get(name, missing) for name in names}
 
     async def _stop_by_fleet(self, drives: Sequence[str] | None, caller: Caller) -> dict[str, CommandResult]:

@@ -47,7 +47,7 @@ FLEET_LATE_S = 2.0  # how long polled values of a fleet may take to arrive, in s
 MOST_ASKED = 16  # limit of concurrent reads of registers that the drives' tables do not declare
 ASKED_S = 30.0  # time limit, in s, of one read of an undeclared register
 END_S = 4.0  # time limit of shutdown, stops included
-GRACE_S = 1  # s of END_S for finishing HTTP requests in flight
+GRACE_S = 1  # share of END_S, in s, for finishing HTTP requests in flight
 _log = logging.getLogger("multidrop.gateway")
 
 
@@ -79,7 +79,7 @@ class Gateway:
         self._has_news = False  # True: something has changed since the newest frame
         self.ledger = ledger or Ledger()
         self.poller: Poller | None = None  # None before polling starts
-        self._made: Poller | None = None  # the same poller, already set while it starts
+        self._made: Poller | None = None  # the poller, also while it is still starting
         self._end = asyncio.Event()
         self.listener = listen(settings.host, settings.port)
         self.connections = self.listener.connections = Connections(self.clock)
@@ -339,7 +339,7 @@ class Gateway:
         self.count_failure(name)
         if self.clock() - self._logged.get(name, -LOG_S) >= LOG_S:
             self._logged[name] = self.clock()
-            _log.exception("%s failed, %d times so far; the others continue", name, self.failures[name])
+            _log.exception("%s failed, %d times so far; the other parts continue", name, self.failures[name])
 
     def count_failure(self, name: str) -> None:
         self.failures[name] = self.failures.get(name, 0) + 1

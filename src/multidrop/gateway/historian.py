@@ -30,7 +30,7 @@ LOOK_S = 1.0  # interval, in s, of checking that the writing thread still runs
 CLOSING_S = 3.0  # time limit, in s, for writing the last values at shutdown
 QUERY_S = 30.0  # time limit, in s, of a query, and of the wait until other queries have ended
 MOST_QUERIES = 2  # limit of concurrent queries
-PIECE = 1 << 16  # bytes of an export read at a time
+PIECE = 1 << 16  # number of bytes of an export file that are read at once
 UNFINISHED = ".export-"  # prefix of temporary folders of exports
 # regular expression of the ages that `parse_age` accepts, for the JSON Schema
 AGE = r"^\s*\d+(\.\d+)?\s*(s|min|h|days?|weeks?)\s*$"
@@ -99,7 +99,7 @@ class Historian:
         while self._writer.is_alive:
             await asyncio.sleep(LOOK_S)
         if not self._is_closed:
-            raise RuntimeError("the writing thread has ended")
+            raise RuntimeError("the thread that writes the history has ended")
 
     async def close(self) -> None:
         """Write the values that are still in memory. Raises Hung if the disk does not answer."""

@@ -87,7 +87,7 @@ class _TimedBytes(io.RawIOBase):
     def readinto(self, buffer: Any) -> Any:
         left_s = self._ends - time.monotonic()
         if left_s <= 0:
-            raise TimeoutError(f"the answer did not end within {SEND_S:g} s")
+            raise TimeoutError(f"the server's answer did not end within {SEND_S:g} s")
         self._sock.settimeout(left_s)
         return self._raw.readinto(buffer)
 
@@ -129,7 +129,7 @@ def post(url: str, body: bytes, headers: Mapping[str, str]) -> None:
     except urllib.error.URLError as failure:
         raise OSError(getattr(failure.reason, "strerror", None) or failure.reason) from failure
     except HTTPException as failure:
-        raise OSError("the answer is not HTTP") from failure
+        raise OSError("the server's answer is not HTTP") from failure
 
 
 # ---- the thread of a receiver ----

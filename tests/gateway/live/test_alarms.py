@@ -475,7 +475,7 @@ def test_limit_stays_exceeded_over_a_restart() -> None:
         ('drive = "pump-1"\nregister = "fault"', "give either above or below"),
         ('drive = "pump-1"\nregister = "fault"\nabove = 1\nbelow = 0', "give either above or below"),
         ('drive = "pump-1"\nregister = "fault"\nabove = nan', "must be finite"),
-        ('drive = "pump-1"\nregister = "fault"\nabove = 1\nhysteresis = -1', "not below 0"),
+        ('drive = "pump-1"\nregister = "fault"\nabove = 1\nhysteresis = -1', "hysteresis 0 or more"),
         ('drive = "pump-1"\nregister = "fault"\nabove = 1\nfor = "5"', "is not a duration"),
     ],
 )

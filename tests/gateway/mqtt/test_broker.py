@@ -340,7 +340,7 @@ async def test_concurrent_broker_writes_are_limited_and_stops_are_not() -> None:
         orders.write("pump-1", "setpoint", value, NOW_MS)
     await asyncio.sleep(0)  # the commands start
     assert commands.begun == [*range(MOST_COMMANDS)]
-    refused = f"not sent: {MOST_COMMANDS} others are under way"
+    refused = f"not sent: {MOST_COMMANDS} other commands are under way"
     assert told == [(f"setpoint = {MOST_COMMANDS + at}", refused) for at in range(2)]
     for _ in range(3):
         orders.stop(["pump-1"])
@@ -407,7 +407,7 @@ def test_delayed_and_repeated_commands_are_refused_and_stops_are_not(
     write(25.0, sent_ms)
     assert told()["done"] is True
     write(25.0, sent_ms)
-    assert told()["text"] == "not sent: it came a second time"
+    assert told()["text"] == "not sent: it is a copy of an earlier command"
     write(26.0, now_ms() - 60_000)
     assert "s ago by the clocks of sender and gateway" in told()["text"]
     publish(broker, "multidrop/pump-1/stop", b"stop", "-q", "1")

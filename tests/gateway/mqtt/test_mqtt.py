@@ -237,7 +237,7 @@ def test_a_fresh_write_is_carried_out_but_its_copy_is_not(
     publish(broker, "multidrop/pump-1/set/setpoint", fresh)
     assert told(listener) == {"what": "setpoint = 25", "done": True, "text": "done", "id": "order-7"}
     publish(broker, "multidrop/pump-1/set/setpoint", fresh)
-    assert told(listener)["text"] == "not sent: it came a second time"
+    assert told(listener)["text"] == "not sent: it is a copy of an earlier command"
     assert commanded.commands.noted == [("write", "pump-1", "setpoint", 25)]
 
 
@@ -366,7 +366,7 @@ async def test_stop_verb_finds_drives_by_another_spelling(
 def test_unknown_verb_or_other_drive_is_refused(broker: Broker, listener: Listener, commanded: Any) -> None:
     order = {"verb": "start", "drive": FAN.name, "time": now_ms()}
     publish(broker, "multidrop/pump-1/act", json.dumps(order).encode())
-    assert f"it names drive '{FAN.name}'" in told(listener)["text"]
+    assert f"the message names drive '{FAN.name}'" in told(listener)["text"]
     publish(broker, "multidrop/pump-1/act", b'{"verb": ["coast"], "drive": "pump-1", "time": 1}')
     assert not told(listener)["done"]
     assert commanded.commands.noted == []
@@ -407,7 +407,7 @@ def test_verb_that_does_not_name_the_drive_of_its_topic_is_refused(
 ) -> None:
     act = {"verb": "start", "drive": "pump-1", "options": {"direction": "forward"}, "time": now_ms()}
     publish(broker, f"multidrop/{FAN.name}/act", json.dumps(act).encode())
-    assert "it names drive 'pump-1'" in told(listener, FAN.name)["text"]
+    assert "the message names drive 'pump-1'" in told(listener, FAN.name)["text"]
     publish(broker, "multidrop/pump-1/act", json.dumps(act).encode())
     assert told(listener)["done"]
     assert commanded.commands.noted == [("act", "pump-1", "start", {"direction": "forward"})]
@@ -416,7 +416,7 @@ def test_verb_that_does_not_name_the_drive_of_its_topic_is_refused(
 @pytest.mark.parametrize(
     ("payload", "why"),
     [
-        (b"25", "it is not a JSON object"),
+        (b"25", "the message is not a JSON object"),
         (b'{"value": 25}', "time is missing"),
         (b'{"time": 25}', "value is missing"),
         (b'{"value": "25", "time": 1}', "value is '25', not a number"),
@@ -424,7 +424,7 @@ def test_verb_that_does_not_name_the_drive_of_its_topic_is_refused(
         (b'{"value": 25, "time": "1"}', "time is not a whole number of ms"),
         (b"\xc3\x28", "codec"),
         (b"[" * 60_000, "nested too deeply"),
-        (b'{"value": 25, "time": 1}' + b" " * 70_000, "it has 70024 bytes"),
+        (b'{"value": 25, "time": 1}' + b" " * 70_000, "the message has 70024 bytes"),
     ],
 )
 def test_invalid_commands_are_reported(

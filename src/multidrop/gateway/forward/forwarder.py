@@ -39,8 +39,8 @@ REMOVED_S = 0.01  # pause in s after the full spool has removed the message that
 # limit of gaps. A gap is a range of messages that were skipped in order to send a newer message first.
 MOST_GAPS = 64
 SET_BACK = (
-    "it has message {} of the spool {}, which ends at message {}: the folder was copied or set back; "
-    "move it away to start a new spool"
+    "the receiver has message {} of the spool {}, which ends at message {}: the folder was copied or set "
+    "back; move it away to start a new spool"
 )
 _log = logging.getLogger("multidrop.gateway.forward")
 LOOK_S = 1.0  # interval, in s, of checking that the threads still run
@@ -51,7 +51,7 @@ SETTLED_NS = 60_000_000_000
 
 
 def pieces(rows: Any) -> Iterator[Any]:
-    """Yield the table in pieces of at most MOST_ROWS rows."""
+    """Yield a table of rows in pieces of at most MOST_ROWS rows."""
     for begin in range(0, len(rows), MOST_ROWS):
         yield rows.slice(begin, MOST_ROWS)
 
@@ -182,7 +182,7 @@ class RowForwarder(RetryingSender):
         super().__init__(name, clock)
         state = spool.state()
         self.rows = 0  # rows sent since the gateway's start
-        self.refused = 0  # number of rows that the receiver refused
+        self.refused = 0  # rows that the receiver refused
         self._spool = spool
         self._receiver = receiver
         self._earlier = state.newest  # number of the newest message of earlier runs
@@ -308,7 +308,7 @@ class Forwarding:
         self._note_units(0)
         self._spool = Spool(folder, "serve", most=parse_size(most), units=self._units, keep_sent=False)
         self._forwarder = RowForwarder(receiver, self._spool, make_receiver(folder))
-        self._changed: frozenset[str] = frozenset()  # drives that the newest plant changed
+        self._changed: frozenset[str] = frozenset()  # drives that the latest reload changed
         self._adopted_ns = 0
         self._lost_before = 0  # number of lost rows that the health report no longer mentions
         self._sending: asyncio.Future[None] | None = None

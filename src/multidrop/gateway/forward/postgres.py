@@ -89,7 +89,9 @@ class PostgresReceiver:
         with sentences(), self._tables.connection.transaction():
             values = (*positions[0], self._log, *positions[1])
             if self._tables.connection.execute(MOVE, values).rowcount != 1:
-                raise SinkError(f"the position of the spool {self._log} in the database was changed")
+                raise SinkError(
+                    f"another program has changed the position of the spool {self._log} in the database"
+                )
             self._tables.insert([message.rows])
         self._kept = after
 

@@ -28,7 +28,7 @@ REASONS = {
     421: "The Host header does not name this gateway.",
     429: "Too many wrong tokens came from this address.",
     HEADERS_TOO_LONG: "The headers are too long.",
-    503: "The gateway is shutting down, a disk does not answer, or too many others wait.",
+    503: "The gateway is shutting down, a disk does not answer, or too many other requests wait.",
 }
 
 

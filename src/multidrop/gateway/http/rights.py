@@ -98,7 +98,7 @@ def new_token(name: str, right: Right) -> tuple[str, Token]:
     """Return a new secret and its token. Raises ValueError for an invalid name."""
     if not NAME.fullmatch(name):
         raise ValueError(
-            f"{name!r} cannot name a token: use letters, digits and . _ @ - (at most 64, no sign first)"
+            f"{name!r} cannot name a token: use up to 64 letters, digits and . _ @ -, a letter or digit first"
         )
     secret = secrets.token_urlsafe(32)
     return secret, Token(name, right, digest(secret))

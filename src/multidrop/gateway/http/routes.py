@@ -60,7 +60,7 @@ AUDIT_S = 20.0  # time limit of a query of the audit log
 COOKIE_S = 30 * 24 * 3600
 MAP_S = 20.0  # time limit, in s, for making the Modbus address map
 MOST_RECORDS = 200  # limit of the audit log's entries in one answer
-MOST_NOTE = 500  # limit of an acknowledgement's note in characters
+MOST_NOTE = 500  # limit, in characters, of the note on an acknowledged alarm
 # in s: if a stop takes longer than this, the head of its answer is sent before the stop ends
 HEAD_S = 0.5
 # header that makes proxies forward the head of an answer immediately

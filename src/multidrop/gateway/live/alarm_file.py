@@ -46,7 +46,7 @@ class AlarmFile:
         try:
             self._waiting.put_nowait(alarm)
         except Full:
-            self._failure = f"{MOST_WAITING} wait for {self.path} already"
+            self._failure = f"{MOST_WAITING} alarms wait for {self.path} already"
 
     def close(self) -> None:
         """Write the queued alarms, waiting at most CLOSE_S for the disk."""

@@ -30,9 +30,9 @@ UNCALLED = "the motor stopped, and no stop was called here"
 # in ms: a motor counts as stopped after this time at rest; a motor that reverses also passes 0 Hz, but
 # briefly
 STANDS_MS = 2000
-MOST_ENDED = 1000  # limit of ended alarms that are kept
+MOST_ENDED = 1000  # limit of ended alarms that the gateway remembers
 MOST_SHOWN = 20  # limit of ended alarms that clients see
-SEPARATOR = "; "  # text between a drive's exceeded limits in an alarm's text
+SEPARATOR = "; "  # separates a drive's exceeded limits in an alarm's text
 # the status of all rows of a line starts with one of these while the line's port is lost
 LOST = ("port lost", "port refused its settings")
 LIMIT_KEYS = {
@@ -78,7 +78,7 @@ class Alarm(NamedTuple):
         return self.line, self.drive, self.kind
 
     def as_json(self) -> dict[str, Any]:
-        """Return the alarm as its file keeps it, with times in ms."""
+        """Return the alarm as the file of alarms has it, with times in ms."""
         return {"id": self.id, **self._asdict()}
 
     def as_answer(self) -> dict[str, Any]:
@@ -231,7 +231,7 @@ class Alarms:
         present = self._lasting.get(key)
         is_seen = key[:2] in self._known and present is None
         if present is not None and present.is_before and present.text in (alarm.text, UNNAMED):
-            # the alarm seen now is the same one: keep the earlier record, which has the start
+            # both are the same alarm: keep the earlier one, which has the exact start
             self._lasting[key] = alarm
         elif present is not None or is_seen or (alarm.drive or alarm.line) not in names:
             self._ended.append(alarm._replace(ended=time))
@@ -242,7 +242,7 @@ class Alarms:
     # ---- queries ----
 
     def shown(self) -> list[Alarm]:
-        """Return the active alarms, the gravest kind first, followed by the newest ended ones."""
+        """Return the active alarms, the most serious kind first, followed by the newest ended ones."""
         ended = [*self._ended][-MOST_SHOWN:]
         return [*self.lasting, *sorted(ended, key=lambda alarm: -alarm.time)]
 
@@ -291,7 +291,7 @@ class Alarms:
 
 
 def _parts(text: str) -> set[str]:
-    """Return the set of exceeded limits that an alarm's text of kind LIMIT lists."""
+    """Return the exceeded limits that the text of an alarm of kind LIMIT lists."""
     return {*text.split(SEPARATOR)}
 
 
@@ -337,9 +337,9 @@ class Limits:
     def exceeded(self, now_s: float, drive: str, values: Mapping[str, float], before: str) -> str:
         """Return a text with the drive's exceeded limits; "" if there are none.
 
-        `values` has the current values by register. While a value is missing, its limit stays exceeded or not
-        exceeded, and `lasting_s` starts again afterwards. `before` is the text that the previous call
-        returned, or the text of an alarm of an earlier run.
+        `values` has the current values by register. While a value is missing, its limit stays as it was
+        (exceeded or not), and `lasting_s` starts again afterwards. `before` is the text that the previous
+        call returned, or the text of an alarm of an earlier run.
         """
         found = []
         for limit in self._of.get(drive, ()):
@@ -395,9 +395,9 @@ def _limit(given: Mapping[str, Any], lasting_s: float, units: Mapping[tuple[str,
         raise ValueError(f"{drive}.{register} is not polled: only polled values can have a limit")
     sides = [side for side in ("above", "below") if side in given]
     if len(sides) != 1:
-        raise ValueError("give either above or below; a value with both bounds has two [[serve.limit]]")
+        raise ValueError("give either above or below; for both, write two tables [[serve.limit]]")
     bound, hysteresis = float(given[sides[0]]), float(given.get("hysteresis", 0.0))
     if not isfinite(bound) or not 0 <= hysteresis < float("inf"):
-        raise ValueError(f"{sides[0]} and hysteresis must be finite, and hysteresis not below 0")
+        raise ValueError(f"{sides[0]} and hysteresis must be finite numbers, and hysteresis 0 or more")
     unit = units[drive, register] if units is not None else ""
     return Limit(drive, register, unit, sides[0] == "above", bound, lasting_s, hysteresis)

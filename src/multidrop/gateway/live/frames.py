@@ -179,7 +179,7 @@ class Frames:
         self._make = make
         self._clock = clock
         self._begin = begin
-        self._remembered: deque[dict[str, Any]] = deque(maxlen=REMEMBERED)  # the newest last
+        self._remembered: deque[dict[str, Any]] = deque(maxlen=REMEMBERED)  # newest frames, the newest last
         # encodings of the newest frame by the number of the frame that the viewer has, or by WHOLE
         self._encoded: dict[int, Encoded] = {}
         self._due = 0.0

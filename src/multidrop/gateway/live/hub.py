@@ -27,7 +27,7 @@ RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unk
 UNNAMED = "it shows a fault"  # text of a fault without a text of its own
 NOT_ASKED = "not asked recently"  # text for the state UNKNOWN if the drive was not polled recently
 # text for the state UNKNOWN if some values are missing, so that the drive may have a fault
-INCOMPLETE = "not all of it is known"
+INCOMPLETE = "not all of its values are known"
 _STATES = {
     Condition.STOPPED: STANDS,
     Condition.RUNNING: RUNS,
@@ -40,7 +40,7 @@ _STATES = {
 # which it is the difference are read one after the other.
 LEAST_SLEEP_NS = 100_000_000
 FAULT_REGISTER = "fault"
-# in ns: a fault counts as over if the motor still turns this long after the fault record changed
+# in ns: if the motor still turns this long after the register of past faults has changed, the fault is over
 RAN_NS = 3_000_000_000
 # if the status of a failed read starts with one of these, the drive has replied
 _ANSWERED = ("exception ", "no valid value")
@@ -119,7 +119,7 @@ class Shown(NamedTuple):
 
     state: str
     words: str | None
-    note: str = ""  # further text for the user, such as why the state is unknown
+    note: str = ""  # further text for the page, such as why the state is unknown
 
     @property
     def fault(self) -> str | None:
@@ -132,7 +132,7 @@ class Shown(NamedTuple):
 
 
 class _Trip(NamedTuple):
-    """A fault that only a change of the drive's fault record has shown."""
+    """A fault that was only noticed because the drive's register of past faults has changed."""
 
     words: str
     at_ns: int
@@ -146,12 +146,12 @@ def _rows_of(polls: Iterable[Polled], cycle_s: float, since_ns: int) -> dict[str
 
 
 class _WatchedDrive:
-    """One drive of the plant, with the newest rows of its polled registers and its fault record."""
+    """One drive of the plant, with the newest rows of its polled registers."""
 
     def __init__(self, polled: PolledDrive, cycle_s: float, since_ns: int) -> None:
         self.polled = polled
         self.reader = StateReader(polled.drive)
-        self.record: float | None = None  # newest value of the fault record
+        self.record: float | None = None  # newest value of the register of past faults
         self.trip: _Trip | None = None
         self.cells = _rows_of(polled.polls, cycle_s, since_ns)
         # computed channels are not in `cells`, because their values do not show whether the drive answers
@@ -354,7 +354,7 @@ class Hub:
         return bool(FreshValues(watched.cells, *self._times()).get(setpoint) == 0)
 
     def note_reset(self, drive: str) -> None:
-        """Forget the fault that a change of a drive's fault record has shown, because the fault was reset."""
+        """Forget a fault seen in the register of past faults, because the fault was reset."""
         watched = self._watched.get(drive)
         if watched is not None:
             _forget_trip(watched)
@@ -414,9 +414,9 @@ def _lack(watched: _WatchedDrive) -> str:
 
 
 def _look_for_trip(watched: _WatchedDrive) -> None:
-    """Note a fault if the drive's fault record has changed.
+    """Note a fault if the drive's register of past faults has changed.
 
-    The first value of the record is skipped, because that fault may be an old one.
+    The first value of that register is skipped, because that fault may be an old one.
     """
     name = next((name for name in FAULT_RECORDS if name in watched.cells), "")
     cell = watched.cells.get(name)
@@ -437,7 +437,7 @@ def _turns_since(watched: _WatchedDrive, since_ns: int) -> bool:
 
 def _forget_trip(watched: _WatchedDrive) -> None:
     watched.trip = None
-    # a new reader, because the old one remembers the fault record
+    # a new reader, because the old one remembers the value of the register of past faults
     watched.reader = StateReader(watched.polled.drive)
 
 

@@ -196,8 +196,8 @@ def _with_triggers_only(
 ) -> DriveSeries:
     """Return a drive's series in which only triggers are computed; its other channels become inputs.
 
-    The values of these inputs come from rows, whose totals continue after a restart. Totals computed here
-    would not.
+    The values of these inputs come from polled rows. Totals in rows continue after a restart; totals that are
+    computed here would not.
     """
     own = [channel for channel in drive.channels if (drive.name, channel.name) not in triggers]
     inputs = {channel.name: (channel.unit, holds_s[drive.name, channel.name]) for channel in own}

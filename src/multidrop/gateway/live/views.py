@@ -31,7 +31,10 @@ LEDGER_S = 6.0  # time limit, in s, of reading the ledger of EEPROM writes, whic
 
 
 def describe(gateway: Gateway, right: Right | None, language: str) -> dict[str, Any]:
-    """Return the answer to GET /api/plant for a caller with this right, with titles in this language."""
+    """Return the answer to GET /api/plant for a caller with this right.
+
+    It has the registers' titles in this language.
+    """
     is_writer = right is Right.WRITE
     may, fleet = gateway.settings.may, gateway.feeds.get("fleet")
     return {
@@ -247,7 +250,7 @@ def parts_of(gateway: Gateway) -> dict[str, str]:
     parts, dead, kept = gateway.parts, supervisor().dead, gateway.alarm_file
     return (
         {name: _health_of_part(feed) for name, feed in parts.feeds.items()}
-        | dict.fromkeys(parts.pending, "it is not ready: its files do not answer")
+        | dict.fromkeys(parts.pending, "it is not ready: the disk with its files does not answer")
         | parts.dead
         | {name: why for name, why in dead.items() if name in parts.feeds}
         | ({"alarms": kept.trouble} if kept is not None and kept.trouble else {})
@@ -266,7 +269,7 @@ def audit_trouble_of(gateway: Gateway) -> str:
         return gateway.unaudited
     buses = gateway.poller.buses if gateway.poller else {}
     found = (bus.audit_trouble for bus in buses.values())
-    return next((f"the newest write is not noted: {why}" for why in found if why), "")
+    return next((f"the newest write is missing in the audit log: {why}" for why in found if why), "")
 
 
 def troubles_of(gateway: Gateway) -> list[str]:

@@ -61,7 +61,9 @@ class ModbusClient(asyncio.Protocol):
         self._is_draining = False
         # True: a request was forbidden or invalid, and the connection will be closed
         self._is_refused = False
-        self._has_ended = False  # True: the client has closed its sending side, but may still read
+        self._has_ended = (
+            False  # True: the client has closed its sending direction, but may still read answers
+        )
         self._has_lost_answers = False
         self._stalled_since: float | None = None
         self.last_request = port.clock()
@@ -92,7 +94,7 @@ class ModbusClient(asyncio.Protocol):
         self._port.share.note(self, is_busy=False)
         self._port.forget(self)
         for task in self._under_way:
-            # not immediately, because the task must have started
+            # in the next round of the event loop, when the task has started
             asyncio.get_running_loop().call_soon(task.cancel)
 
     def data_received(self, data: bytes) -> None:

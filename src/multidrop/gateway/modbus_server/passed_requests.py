@@ -113,7 +113,7 @@ class LineShare:
     # ---- turns ----
 
     def _step(self) -> None:
-        """Start the next request now, or as soon as line time is available."""
+        """Start the next request now, or as soon as the share of the line's time allows it."""
         if self._running is not None or not self._waiting:
             return
         now = self._loop.time()
@@ -181,7 +181,7 @@ class Standstill:
     def __init__(self, clock: Callable[[], int] = boottime_ns) -> None:
         self._clock = clock
         self._ran_ns = clock()
-        self._until_ns = 0  # writes are refused until this time
+        self._until_ns = 0  # writes are refused until this time (CLOCK_BOOTTIME, ns)
 
     def note(self) -> None:
         """Note that the event loop runs. Call this at least once a second."""

@@ -70,7 +70,7 @@ def take_frame(buffer: bytearray) -> bytes | None:
         return None
     length = int.from_bytes(buffer[4:6])
     if not 2 <= length <= 1 + MOST_DATA:
-        raise InvalidHeader(f"length {length}, but it must be 2 to {1 + MOST_DATA}")
+        raise InvalidHeader(f"the length field is {length}; it must be 2 to {1 + MOST_DATA}")
     if len(buffer) < 6 + length:
         return None
     frame = bytes(buffer[: 6 + length])

@@ -124,7 +124,7 @@ class ToolSettings:
                 if line is None:
                     yield f"{key}: there is no line {name!r}; {did_you_mean(name, lines)}"
                 elif all(polled.drive.framing is Framing.DELIXI for polled in line.drives):
-                    yield f"{key}: all drives of line {name} speak Delixi's own protocol, and tools Modbus"
+                    yield f"{key}: all drives of line {name} speak Delixi's own protocol; tools need Modbus"
 
     def _mistakes(self) -> Iterator[str]:
         if not self.lines:
@@ -245,7 +245,7 @@ class Tool:
 
     def _give_up(self) -> None:
         if self._answering is not None and not self._answering.done():
-            # not immediately, because the task must have started
+            # in the next round of the event loop, when the task has started
             self._loop.call_soon(self._answering.cancel)
         self._answering = None
 

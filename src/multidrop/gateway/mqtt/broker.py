@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 from multidrop.printable import masked
 from multidrop.supervisor import Hung, supervisor
 
-# limit of messages in flight that the broker has not acknowledged: enough for the drives of two lines
+# limit of messages that the broker has not acknowledged: enough for the drives of two lines
 MOST_UNDER_WAY = 64
 # limit of messages that wait to be sent, at most one per topic; no plant needs more topics
 MOST_WAITING = 4096

@@ -110,9 +110,9 @@ class BrokerCommands:
         if self._may_be_before(self._commands.plant_ns, age_ms):
             return "it may have been sent before the plant was reloaded: send it again"
         if command in self._came:
-            return "it came a second time"
+            return "it is a copy of an earlier command"
         if self._under_way >= MOST_UNDER_WAY:
-            return f"{MOST_UNDER_WAY} others are under way"
+            return f"{MOST_UNDER_WAY} other commands are under way"
         return ""
 
     async def _stop(self, drives: Sequence[str] | None, caller: Caller) -> None:

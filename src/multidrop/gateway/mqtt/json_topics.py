@@ -329,7 +329,7 @@ def _read_act(drive: str, given: Mapping[str, Any]) -> tuple[str, dict[str, obje
 
 def _options(drive: str, given: Mapping[str, Any]) -> dict[str, object]:
     if given.get("drive", drive) != drive:
-        raise ValueError(f"it names drive {given['drive']!r}, but its topic names {drive!r}")
+        raise ValueError(f"the message names drive {given['drive']!r}, but its topic names {drive!r}")
     options = given.get("options", {})
     if not isinstance(options, dict):
         raise ValueError("options is not an object")
@@ -345,13 +345,13 @@ def _time(given: Mapping[str, Any]) -> int:
 
 def _read(payload: bytes) -> dict[str, Any]:
     if len(payload) > MOST_BYTES:
-        raise ValueError(f"it has {len(payload)} bytes, more than {MOST_BYTES}")
+        raise ValueError(f"the message has {len(payload)} bytes; the limit is {MOST_BYTES}")
     try:
         given = json.loads(payload)
     except RecursionError:
-        raise ValueError("it is nested too deeply") from None
+        raise ValueError("the message is nested too deeply") from None
     if not isinstance(given, dict):
-        raise ValueError("it is not a JSON object")
+        raise ValueError("the message is not a JSON object")
     return given
 
 

@@ -46,7 +46,7 @@ def sparkplug_rows(
 
     def deliver(message: Outgoing) -> None:
         if broker.loop is None or not broker.is_connected:
-            raise ConnectionError("it is not connected")
+            raise ConnectionError("the connection to the broker is down")
         work = node.send_past(_past_values(message.rows, node), broker.confirm)
         asyncio.run_coroutine_threadsafe(work, broker.loop).result()
 
@@ -134,4 +134,4 @@ class RowPublisher:
             if result != MQTT_ERR_SUCCESS:
                 raise ConnectionError(error_string(result))
             if time.monotonic() > ends:
-                raise ConnectionError(f"no answer within {ANSWER_S:g} s")
+                raise ConnectionError(f"the broker has not answered within {ANSWER_S:g} s")

@@ -38,7 +38,7 @@ EXAMPLE = "127.0.0.1:4840"
 EVERY_S = 0.1  # interval, in s, of passing new values to the server
 # in s: while a server runs, a thread must let another one run after this time (sys.setswitchinterval)
 SWITCH_S = 0.0005
-# the interpreter's own interval for this, 5 ms, which is used without a server
+# the interpreter's default of this time, 5 ms, which applies if no server runs
 USUAL_SWITCH_S = sys.getswitchinterval()
 # drives' states, which take 50 us each to compute, are passed on only once in this many intervals
 STATE_TURNS = 10

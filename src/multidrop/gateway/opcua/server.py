@@ -37,7 +37,7 @@ MOST_REQUEST = 1 << 18  # limit of a request in bytes
 MOST_UNREAD = 1 << 23  # a client is disconnected if it leaves more than this many bytes unread
 MOST_CLIENTS = 64
 MOST_WAITING = 64  # a client is disconnected if more than this many of its requests wait
-MOST_OPERATIONS = 1000  # limit of the nodes that one request names
+MOST_OPERATIONS = 1000  # limit of nodes in one request
 MOST_ITEMS = 20_000  # limit of subscribed values of all clients together
 # limit of notifications of one value that wait to be sent; at the limit, a new one replaces the oldest
 MOST_QUEUED = 10
@@ -293,7 +293,9 @@ def read_identity(certificate: Path, key: Path) -> Identity:
     Raises ValueError for an unsuitable pair, OSError for an unreadable file.
     """
     secret: Any = None
-    with suppress(ValueError, TypeError, UnsupportedAlgorithm):  # TypeError: the key has a password
+    with suppress(
+        ValueError, TypeError, UnsupportedAlgorithm
+    ):  # the library raises TypeError if the key has a password
         found = x509.load_pem_x509_certificate(certificate.read_bytes())
         secret = load_pem_private_key(key.read_bytes(), None)
     if not isinstance(secret, RSAPrivateKey) or secret.public_key() != found.public_key():
@@ -349,8 +351,8 @@ class PlantServer(Server):
     async def stop(self) -> None:
         """Disconnect all clients, even those that do not read, and remove all nodes.
 
-        The nodes are removed one by one. Left to the garbage collector, they would stop all threads for 0.2
-        s.
+        The nodes are removed one by one. If the garbage collector freed them, it would stop all threads for
+        0.2 s.
         """
         for transport in [*self.iserver.asyncio_transports]:
             transport.abort()

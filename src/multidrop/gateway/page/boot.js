@@ -22,7 +22,7 @@ async function fetchTexts() {
     language = chosen ?? navigator.languages.map(known).find(Boolean) ?? "en";
   if (chosen) root.dataset.chosen = "";
   if (language === "en") return {};
-  root.classList.add("untranslated"); // hidden, so that no English text flashes up
+  root.classList.add("untranslated"); // hides the page, so that no English text flashes up
   try {
     const signal = AbortSignal.timeout(TEXTS_MS),
       response = await fetch(`page/texts.${language}.json`, { signal }),

@@ -174,7 +174,7 @@ function outcome(told) {
   return { title, contents: contents.filter(Boolean), isWhole };
 }
 
-const WHOLE_MS = 8000; // time limit for loading the other parts of the page
+const WHOLE_MS = 8000; // time limit for loading the page's other files
 
 // Show a message if the page's other files were not loaded in time.
 setTimeout(() => {

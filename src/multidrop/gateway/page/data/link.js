@@ -24,7 +24,7 @@ function learnSkew(date, sent, received) {
   const least = told - received,
     most = told + 1000 - sent;
   if (least > skew.most || most < skew.least)
-    Object.assign(skew, { least, most }); // a clock was set
+    Object.assign(skew, { least, most }); // one of the clocks was set
   else Object.assign(skew, { least: Math.max(least, skew.least), most: Math.min(most, skew.most) });
 }
 

@@ -93,7 +93,7 @@ export function takeFrame(told) {
   }
 }
 
-// Return an alarm whose times are in ms since 1970 instead of ISO 8601 texts.
+// Replace an alarm's ISO 8601 times by ms since 1970.
 export function withMs(alarm) {
   for (const key of ["time", "ended", "acknowledged"])
     if (alarm[key] !== null) alarm[key] = Date.parse(alarm[key]);

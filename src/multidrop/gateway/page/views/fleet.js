@@ -9,7 +9,7 @@ import { fill, find, glyph, make, named, put, setClass, tableHead } from "../ui/
 import { UNKNOWN } from "../ui/values.js";
 
 const OLD_S = 3;
-const MOST_LINES = 200; // limit of lines drawn: first those whose master does not answer
+const MOST_LINES = 200; // limit of lines that are shown; those whose master does not answer come first
 const NAMES = new Intl.Collator("en", { numeric: true }); // line-2 before line-10
 const UNITS = ["B", "kB", "MB", "GB", "TB"];
 const TABLES = {

@@ -9,8 +9,8 @@ import * as clock from "../ui/clock.js";
 import { fill, find, glyph, make, named, tableHead } from "../ui/dom.js";
 import { UNKNOWN, drives, makeUse, milliseconds, share, showUse } from "../ui/values.js";
 
-const HOUR = 60; // minutes
-const REASONS = ["c2", "c4", "c1", "c3", "c5", "c6"]; // colours
+const HOUR = 60; // number of minutes that are shown
+const REASONS = ["c2", "c4", "c1", "c3", "c5", "c6"]; // colours of the reasons of failed reads
 
 let shown = "";
 

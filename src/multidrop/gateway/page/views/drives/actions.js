@@ -11,10 +11,10 @@ import { DANGER, STOP, confirm, confirmForm, send } from "../../ui/dialog.js";
 import { fill, find, glyph, make, named, say } from "../../ui/dom.js";
 import { registerName, text, unit, unitName, withUnit, words } from "../../ui/values.js";
 
-const MOST = 20; // outcomes kept on the page; the audit log has all
+const MOST = 20; // limit of results that the page lists; the audit log has all
 const outcomes = [];
 const WITH_HZ = new Set(["set_frequency"]);
-const STOPS = new Set(["coast", "emergency_stop"]); // sent even after a stop or a reload
+const STOPS = new Set(["coast", "emergency_stop"]); // verbs that are sent even after a stop or a reload
 const TURNS = ["start", "jog", "run", "forward", "reverse"];
 
 // Make the buttons of the verbs that the page's user may send, and the list of results.

@@ -27,7 +27,7 @@ const RANGES = [
   [3600, t("{n} h", { n: 1 })],
   [86400, t("{n} h", { n: 24 })],
 ];
-const FROM_HISTORY = 600; // in s: longer ranges are fetched from the history, others drawn from frames
+const FROM_HISTORY = 600; // in s: longer ranges come from the history, shorter ones from frames
 const ANEW_MS = 5000;
 const POINTS = 400;
 const SYNC = "panel";
@@ -109,7 +109,7 @@ export function begin(drive) {
   const isOneUnit = unitOf(frequency) === unitOf(setpoint);
   const first = isOneUnit ? [[frequency, setpoint]] : [[frequency], [setpoint]];
   const stack = [...first, [current], [third]]
-    .map(names => names.filter(name => numbers.some(r => r.name === name))) // others have empty plots
+    .map(names => names.filter(name => numbers.some(r => r.name === name)))
     .filter(names => names.length);
   plots = stack.map((names, i) =>
     one(place, names, i, i === stack.length - 1, names[0] === third ? rest : null),

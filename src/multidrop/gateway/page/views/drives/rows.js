@@ -7,8 +7,8 @@ import { fill, glyph, make, named, put, setClass } from "../../ui/dom.js";
 import { STATES, UNKNOWN, makeUse, makeValue, share, showUse, showValue } from "../../ui/values.js";
 
 export const COLUMNS = 8;
-const MANY = 0.01; // share of misses from which a warning is shown
-const FULL_HZ = [50, 60, 80, 100, 150, 200, 300, 400, 600, 1000, 2000, 4000]; // ends of a bar's scale
+const MANY = 0.01; // share of failed reads from which a warning is shown
+const FULL_HZ = [50, 60, 80, 100, 150, 200, 300, 400, 600, 1000, 2000, 4000]; // at which a bar may be full
 
 // Return a line's row and the elements in it that change. A click on the line's name calls `unfold`, unless
 // it is null.

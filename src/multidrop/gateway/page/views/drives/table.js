@@ -26,7 +26,7 @@ const SHOWN = {
 };
 
 const scale = make("span", { class: "full" });
-const MANY = 60; // in a plant with more drives, a closed line shows only its drives with a problem
+const MANY = 60; // in a plant with more drives, a line that is folded shows only its drives with a problem
 let rows = [],
   heads = [],
   show = "all",
@@ -130,7 +130,6 @@ export function neighbour(step) {
   return there[Math.max(0, Math.min(there.length - 1, at < 0 ? 0 : at + step))]?.link ?? null;
 }
 
-// Focus the chosen drive's row.
 export const focusChosen = () => rows.find(r => r.name === chosen)?.link.focus();
 
 export function drawRows() {

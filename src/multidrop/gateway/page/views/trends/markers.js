@@ -9,7 +9,7 @@ import { heldAt } from "../../ui/plots.js";
 import { number } from "../../ui/values.js";
 
 const TRIGGER = t("trigger");
-const marks = { A: null, B: null, [TRIGGER]: null }; // time of each marker in ms
+const marks = { A: null, B: null, [TRIGGER]: null }; // by marker: its time in ms, or null
 let plots = () => [],
   view = () => ({ from: 0, to: 0 });
 

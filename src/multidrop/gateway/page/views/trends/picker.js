@@ -7,7 +7,7 @@ import { COLOURS, DASHES, swatch } from "../../ui/plots.js";
 import { title } from "../../ui/values.js";
 
 const MOST_DRIVES = COLOURS.length * DASHES.length;
-const MOST_SIGNALS = 4; // limit of a trigger's quantities, so that their plots fit on a screen
+const MOST_SIGNALS = 4; // limit of the registers of a trigger, so that their plots fit on a screen
 const NOTE = t(
   "The band shows the smallest and largest value at each point, the line the mean. A gap has no values. " +
     "Drag to zoom in.",

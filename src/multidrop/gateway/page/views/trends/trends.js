@@ -75,7 +75,7 @@ export function begin() {
     ),
   );
   find("#trend-plots").addEventListener("mousedown", () => (isDragged = true));
-  for (const end of ["mouseup", "blur"]) addEventListener(end, letGo); // runs after the plots' listeners
+  for (const end of ["mouseup", "blur"]) addEventListener(end, letGo); // runs after the plots' own listeners
   picker.begin(find("#picker"), ask);
   markers.begin(
     () => plots,
@@ -101,7 +101,7 @@ export function hide() {
 
 function set(from, to, follows) {
   const isSame = Math.abs(from - view.from) + Math.abs(to - view.to) < (view.to - view.from) / 1000;
-  if (isSame && !follows) return; // every plot reports the same drag
+  if (isSame && !follows) return; // all plots report the same drag of the mouse
   triggers.leave();
   if (view.to) view.back.push([view.from, view.to, view.follows]);
   view.back.splice(0, view.back.length - 50);

@@ -87,7 +87,7 @@ function around(one) {
   markers.setTrigger(Date.parse(one.time));
   picker.chooseSignals(one.signals);
   setRange(Date.parse(one.from), Date.parse(one.to), false);
-  fetchAgain(); // the range may be the previous one
+  fetchAgain(); // also if the range is the previous one
   chosen = one;
   choice.value = one.name;
 }
