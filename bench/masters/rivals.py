@@ -232,7 +232,7 @@ def measure(master: str, job: Job) -> dict[str, Any]:
 def measure_bare(job: Job, silence: float, asleep: float = 0.0, *, realtime: bool = False) -> dict[str, Any]:
     """Run bare_master.c, with realtime scheduling if wanted; return the same values as `measure`.
 
-    It waits `silence` s before each request, and sleeps `asleep` s after it.
+    The program waits `silence` s before each request, and sleeps `asleep` s after each request.
     """
     command = [compiled("masters/bare_master.c"), "--seconds", job.seconds, "--drives", job.drives]
     command += ["--registers", REGISTERS, "--silence-us", silence * 1e6]

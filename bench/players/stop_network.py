@@ -100,7 +100,7 @@ def network() -> Iterator[Network | None]:
 
 
 def cut_networks(chance: random.Random, rounds: int, is_long: bool) -> Counters:
-    """Cut the network just before a START is sent, and restore it after the client reported a failure."""
+    """Cut the network just before a client starts a motor, until the client has reported a failure."""
     counters = Counters()
     with network() as made:
         if made is None:

@@ -137,7 +137,7 @@ class Round:
             self.count(rows=len(rows), values=len(values), misattributed=len(wrong))
 
     def come_and_go(self, chance: random.Random) -> None:
-        """Remove a drive and add it again. If two threads choose the same drive, one gets an error."""
+        """Remove a drive and add it again. If another thread has just removed it, count this instead."""
         line = chance.choice(self.plant.lines)
         polled = chance.choice(line.drives[:-1])
         try:

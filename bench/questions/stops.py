@@ -188,7 +188,7 @@ def paused(chance: random.Random, rounds: int, is_long: bool) -> Counters:
     return counters
 
 
-ATTACKS: dict[str, tuple[Attack, float]] = {  # by name: the attack, and its share of the rounds
+ATTACKS: dict[str, tuple[Attack, float]] = {  # attack's name: its function, and its share of all rounds
     "a signal while it runs": (signals(1, leaving=False), 0.5),
     "two signals": (signals(2, leaving=False), 1),
     "three signals": (signals(3, leaving=False), 0.5),

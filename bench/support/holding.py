@@ -38,7 +38,7 @@ class Holding:
 
     entry: ImportedRegister | None  # None: the importer could not convert the entry to a register
     is_held: bool
-    is_written: bool = True  # True if a register may be written as the other program writes it
+    is_written: bool = True  # True if the library can write the register as the other program does
     lacks: str = ""
     is_text: bool = False
 
@@ -113,7 +113,7 @@ def _commanded(entry: ImportedRegister) -> Holding:
 
 
 def _why_not(entry: ImportedRegister) -> str:
-    """Return why the entry cannot be declared as the other program uses it, or "" if it can."""
+    """Return why a family cannot declare the entry as the other program uses it; "" if a family can."""
     try:
         register = _declared(entry)
     except ValueError as refusal:

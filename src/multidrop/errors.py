@@ -17,7 +17,7 @@ class BusError(Exception):
 
 
 class LineError(BusError, OSError):
-    """The port failed: it cannot be opened, does not take its settings, or vanished."""
+    """The port failed: it cannot be opened, does not support the settings, or vanished."""
 
     def __init__(self, port: str, reason: str) -> None:
         super().__init__(f"{port}: {reason}")
@@ -31,7 +31,7 @@ class PortLost(LineError):
 
 
 class NoSuchPort(LineError, ValueError):
-    """The port's name is invalid, so no port can have it: a mistake of the caller."""
+    """The port's name is invalid, which is a mistake of the caller."""
 
 
 class NoReply(BusError, TimeoutError):
@@ -171,8 +171,9 @@ class NotAttached(ValueError):
 
 
 class Advice(NamedTuple):
-    """What the user can do after a refused write: one text each for a program, the command line, and a plant
-    file's drive.
+    """What the user can do after a refused write.
+
+    There is one text each for a program, the command line, and a plant file's drive.
 
     `plant` is empty if it is the same as `command`.
     """

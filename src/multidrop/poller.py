@@ -1,4 +1,4 @@
-"""Poller: all lines of a plant, polled continuously, as batches of rows.
+"""Poller: polls all lines of a plant continuously, and delivers the values as batches of rows.
 
 The core's own thread carries out the exchanges. One Python thread queues new exchanges for all lines and
 handles lost ports, whenever the core requests it.
@@ -391,7 +391,7 @@ class Poller(RowSource):
         with self._changing:
             names = {drive.name for bus in self.buses.values() for drive in bus.drives}
             if polled.drive.name in names:
-                raise ValueError(f"another drive is called {polled.drive.name}; give each its own name")
+                raise ValueError(f"two drives are called {polled.drive.name}; give each its own name")
             self._lines.find(line).add(polled)
             self._adopt_channels()
 

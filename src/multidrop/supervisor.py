@@ -1,4 +1,4 @@
-"""Supervisor: the permanent tasks and threads of a process, and those that end by themselves.
+"""Supervisor: starts and watches a process's tasks and threads, some permanent, some that end by themselves.
 
 The gateway starts all its tasks and threads here, a gateway of a fleet only the permanent ones. The
 supervisor notes which permanent ones have ended: /health of the gateway reports them, and a gateway of a

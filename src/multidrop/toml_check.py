@@ -23,7 +23,7 @@ T = TypeVar("T")
 class Key:
     """A key that a table may have: the type of its value, an example, and keywords for its JSON Schema.
 
-    `keywords` of a table may be the result of `json_schema`.
+    If the value is a table, `keywords` may be the result of `json_schema`.
     """
 
     kind: type | tuple[type, ...]

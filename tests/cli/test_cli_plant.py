@@ -329,7 +329,7 @@ def test_models_are_found_relative_to_the_plant_file(
 def test_writes_to_a_drive_named_by_plant_file_are_refused_as_if_named_by_port(
     run: Run, plant: Path, at: str, port: str
 ) -> None:
-    """Each refused command prints the same error in both cases."""
+    """Each command names the drive first by plant file, then by port. The errors must be equal."""
     for command, further in (
         ("write", ("control", "RUNNING", "--yes")),
         ("write", ("sealed", "1", "--yes")),

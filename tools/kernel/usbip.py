@@ -51,7 +51,7 @@ class Connection(NamedTuple):
     """The resources of a plugged-in USB device: its connection, serial number and timers."""
 
     sock: socket.socket  # connection to the guest's vhci_hcd
-    serial: str  # the device's serial number; "": it has none
+    serial: str  # the device's serial number; "" if it has none
     timers: Timers
 
 

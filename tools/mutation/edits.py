@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-# In this code, only binary operators have a space on both sides; pointers and signs have not.
+# Only binary operators are matched: in this code, pointers and signs have no space on both sides.
 SWAPS = {
     r" == ": (" != ",),
     r" != ": (" == ",),

@@ -32,7 +32,7 @@ def explained() -> dict[Name, str]:
 
 
 def ends(path: str) -> Iterator[tuple[Mutant, str | None]]:
-    """Yield each mutant of the file with the way it ended, such as "killed"; None: it survived."""
+    """Yield each mutant of the file, and how it ended, such as "killed"; None if it survived."""
     source = (ROOT / path).read_text("utf-8")
     found = mutants(path, source)
     trees: SimpleQueue[Path] = SimpleQueue()

@@ -113,7 +113,7 @@ def _check_plant(arguments: argparse.Namespace) -> int:
 
 
 def _family(file: Path) -> type[Drive]:
-    """Return the family in a file, or the built-in family of this name. Raises ValueError for others."""
+    """Return the family in a file, or the built-in family of this name. Raises ValueError for other names."""
     name = str(file)
     if name in MODELS:
         raise ValueError(f"{name} is built in and has no file; see `multidrop models {name}`")
@@ -262,7 +262,7 @@ def _run_import(arguments: argparse.Namespace) -> int:
     for target in filter(None, (arguments.out, arguments.plant)):
         refuse_overwriting(target)
     if arguments.plant and not arguments.out:
-        raise ValueError("--plant needs --out FAMILY.toml: the plant file names the family file")
+        raise ValueError("--plant needs --out FAMILY.toml, because the plant file must name the family file")
     from multidrop.importers import family_text, plant_text, read_devices
 
     try:

@@ -37,7 +37,8 @@ class Finding:
 def adapter_finding(adapter: Adapter, port: str, lasting: str) -> Finding:
     """Return a finding that describes the adapter.
 
-    `lasting` is the device name with the adapter's serial number; if there is none, it is the port.
+    `lasting` is a device name that contains the adapter's serial number; if there is no such name, it is
+    `port`.
     """
     advice = f"name it {lasting} in plant files: {port} is assigned in the order of plugging in"
     return Finding("adapter", str(adapter), advice if lasting != port else "")

@@ -258,7 +258,7 @@ class Monitor:
             self._at.message = "trigger by key t"
 
     def _acknowledge(self) -> None:
-        """Remove the failures that the screen showed, so that the screen has room for the other failures."""
+        """Remove the failures that are on the screen now, to make room for those that did not fit."""
         del self._at.failures[: self._at.failures_shown]
 
     def _leave(self) -> None:
@@ -351,7 +351,7 @@ def _check_size(screen: Screen) -> None:
 # ---- side reads ----
 
 LEAST_PAUSE_S = 0.1  # least pause between two reads
-# share of the line's time for side reads: on a line with spare time, and on a full line
+# share of the line's time for reads of unpolled registers: on a line with spare time, and on a full line
 MOST_SHARE, LEAST_SHARE = 0.05, 0.01
 
 

@@ -26,7 +26,7 @@ from multidrop.planning.prediction import (
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine, planned_on
 
-LONG_CYCLE = 1.0  # if a bus cycle of all readings takes more than this many s, it is probably not intended
+LONG_CYCLE = 1.0  # s; warn of a longer bus cycle of all readings, because the user probably does not want it
 _NAMES = 3  # limit of registers named in a sentence
 
 

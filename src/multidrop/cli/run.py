@@ -112,7 +112,7 @@ def _unseen_faults(test: TestRun) -> dict[str, str]:
 
 @contextmanager
 def _screen(test: TestRun, arguments: argparse.Namespace) -> Iterator[list[Callable[[Rows], object]]]:
-    """Yield the functions that take the rows: a live table's; none without a terminal or with --json."""
+    """Yield the function of a live table that takes polled rows; none without a terminal or with --json."""
     if arguments.json or not sys.stdout.isatty():
         yield []
         return

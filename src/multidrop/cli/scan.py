@@ -82,7 +82,7 @@ class SerialPort:
     device: str
     adapter: str
     may_open: bool
-    advice: str = ""  # how the user gets the permission to open it
+    advice: str = ""  # how the user gets the permission to open the port
 
 
 def _run_ports(arguments: argparse.Namespace) -> int:

@@ -85,7 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _stop_time(text: str) -> float | None:
-    """Return the seconds in a text. If it is invalid, only warn and return None: a stop must be sent."""
+    """Parse a number of seconds. For an invalid text, only warn and return None: the stop must be sent."""
     try:
         return duration(text)
     except argparse.ArgumentTypeError as mistake:

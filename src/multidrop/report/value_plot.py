@@ -57,7 +57,10 @@ CURVES_INCHES = 1.9
 
 
 class Panel(NamedTuple):
-    """A register name and unit that share a panel. Amperes and per cent cannot share an axis."""
+    """A panel of the picture, for all registers with this name and unit.
+
+    Amperes and per cent, for instance, cannot share an axis.
+    """
 
     register: str
     unit: str
@@ -205,8 +208,9 @@ def _draw_curves(axes: Axes, panel: Panel, series: Sequence[Series], recording: 
 
 
 def _fit(axes: Axes, series: Sequence[Series]) -> None:
-    """Scale the y axis, with whole numbers for raw counts, with room around a constant value, and with 0 if
-    it is near.
+    """Scale the y axis.
+
+    Raw counts get whole numbers, a constant value gets room around it, and the axis includes 0 if 0 is near.
     """
     drawn = np.concatenate([one.drawable for one in series])
     seen = drawn[~np.isnan(drawn)]

@@ -1,4 +1,4 @@
-"""What a scan finds: drives, problems of addresses and settings, and progress; and a plant file of it."""
+"""The findings of a scan: drives, problems and progress. Also makes a plant file of the drives found."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ def sweeps(
     ]
     if not found:
         raise ValueError(
-            "no family allows one of these addresses together with one of these baud rates and formats; "
+            "no family allows any of these addresses with any of these baud rates and formats; "
             "choose more of them"
         )
     found.sort(key=lambda weighted: -weighted[0] / weighted[1].needed)
@@ -136,7 +136,7 @@ def _patient(sweep: Sweep) -> Sweep:
 
 
 def _settings(families: Sequence[type[Drive]]) -> dict[Setting, dict[type[Drive], float]]:
-    """Return, by setting, how likely each family uses it; each document's first setting is the likeliest."""
+    """Return each family's likelihood by line setting; the first setting in a manual is the likeliest."""
     found: dict[Setting, dict[type[Drive], float]] = {}
     for family in families:
         for framing in family.framings:

@@ -36,7 +36,8 @@ class Kind:
     stops: Judge
     memory: Mapping[int, int]  # raw counts by address, for all read functions
     turning: Mapping[int, int]  # replaces entries of `memory` while the motor turns
-    mark: str  # name of a register that tests read to mark a place in the log: no verb reads it
+    # name of a register that no verb reads, so that tests can mark a place in the log with a read of it
+    mark: str
     protocol: str = STANDARD
     # keyword arguments with which a drive of this family is made
     makes: Mapping[str, Any] = field(default_factory=dict)

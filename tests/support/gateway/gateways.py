@@ -195,7 +195,8 @@ def running(gateway: Gateway) -> Iterator[asyncio.AbstractEventLoop]:
         patch.setattr(gateway_module, "TAKE_S", 0.01)
         patch.setattr(gateway_module, "LOOK_S", 0.02)
         quick = SimpleNamespace(**{**vars(asyncio), "sleep": lambda seconds: asyncio.sleep(seconds / 10)})
-        patch.setattr(uvicorn.server, "asyncio", quick)  # it pauses for 0.1 s several times when it ends
+        # when uvicorn's server ends, it pauses for 0.1 s several times
+        patch.setattr(uvicorn.server, "asyncio", quick)
         with _running(gateway) as loop:
             yield loop
 

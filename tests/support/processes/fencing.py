@@ -163,7 +163,7 @@ class Fence:
                 self.early += 1
 
     def _is_polling(self, master: int) -> bool:
-        """Wait until the process polls its lines steadily; return False if it died."""
+        """Wait until the process `master` polls its lines steadily; return False if it died."""
         asked, granted, end = self.far.requests, 0, now_s() + PATIENCE_S
         while self.far.requests < asked + 20 * len(self.far.ports):
             granted += self._grant(0.01)

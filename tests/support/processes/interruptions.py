@@ -25,7 +25,7 @@ def interrupted_at(nth: int, counts: Callable[[FrameType], bool]) -> AbstractCon
 
 @contextmanager
 def failing_at(nth: int, counts: Callable[[FrameType], bool], failure: BaseException) -> Iterator[list[str]]:
-    """Raise `failure` before the nth line for which `counts(frame)` is true; yield a list for its place."""
+    """Raise `failure` before the nth line for which `counts(frame)` is true; add its place to a list."""
     left, before = nth, sys.gettrace()
     found: list[str] = []
 
@@ -57,7 +57,7 @@ def place(frame: FrameType) -> str:
 def calling_at(
     nth: int, counts: Callable[[FrameType], bool], call: Callable[[], object]
 ) -> Iterator[list[str]]:
-    """Call `call` before the nth opcode in frames for which `counts` is true; yield a list for its place.
+    """Call `call` before the nth opcode in frames for which `counts` is true; add its place to a list.
 
     `counts` is called once per frame, because a call for each opcode would double the time of such a test.
     """
@@ -94,7 +94,7 @@ class Interruption(BaseException):
 def interrupted_before(
     nth: int, failure: type[BaseException] = Interruption
 ) -> AbstractContextManager[list[str]]:
-    """Raise `failure` before the package's nth bytecode on this thread; yield a list for its place."""
+    """Raise `failure` before the package's nth bytecode on this thread; add its place to a list."""
 
     def fail() -> None:
         raise failure

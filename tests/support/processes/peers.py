@@ -51,7 +51,7 @@ def require_module(name: str) -> ModuleType:
 
 
 def require_installed(name: str) -> None:
-    """Check that a module is installed, without importing it; for the top of a test file."""
+    """Skip the test file, or fail in CI, unless this module is installed. The module is not imported."""
     if find_spec(name) is None:
         _missing(f"the Python module {name} is not installed")
 
@@ -78,7 +78,7 @@ OPTIONS = ["-std=c11", "-D_DEFAULT_SOURCE"]
 STRICT = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
 SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 CC = os.environ.get("CC", "cc")
-SKIPPED = 77  # exit status of a test program that cannot run here; it prints why
+SKIPPED = 77  # exit status of a test program that cannot run on this machine, and prints the reason
 
 
 def build_and_run(

@@ -16,17 +16,17 @@ def examples(number: int) -> int:
 
 
 def usually(tried: object, *others: object) -> list[Any]:
-    """Return the arguments as pytest parameters; all but the first are marked `long`."""
+    """Return the arguments as pytest parameters. Only the first is tried in short test runs."""
     return [tried, *(_marked(other, pytest.mark.long) for other in others)]
 
 
 def first_in_ci(tried: object, *others: object) -> list[Any]:
-    """Return the arguments as pytest parameters; all but the first are marked `nightly`."""
+    """Return the arguments as pytest parameters. All but the first are tried only at night."""
     return [tried, *(_marked(other, pytest.mark.nightly) for other in others)]
 
 
 def in_turn(each: Iterable[object], cases: Sequence[object]) -> list[Any]:
-    """Return all pairs of `each` and `cases`; for each entry of `each`, all but one are marked `long`."""
+    """Return all pairs of `each` and `cases`; short test runs try one pair for each entry of `each`."""
     return [
         (one, case) if number % len(cases) == nth else _marked((one, case), pytest.mark.long)
         for number, one in enumerate(each)
@@ -35,7 +35,7 @@ def in_turn(each: Iterable[object], cases: Sequence[object]) -> list[Any]:
 
 
 def every_third(cases: Sequence[object]) -> list[Any]:
-    """Return pytest parameters with numbers as ids, marked `long` except every third."""
+    """Return pytest parameters with numbers as ids; short test runs try every third case."""
     return [
         pytest.param(case, id=str(number), marks=pytest.mark.long if number % 3 else ())
         for number, case in enumerate(cases)
@@ -43,7 +43,7 @@ def every_third(cases: Sequence[object]) -> list[Any]:
 
 
 def every_fourth(each: Iterable[object], cases: Sequence[object], tried: Sequence[object]) -> list[Any]:
-    """Return the pairs `tried`, and every fourth pair of `each` and `cases`, which is marked `long`."""
+    """Return the pairs `tried`, and for long test runs every fourth pair of `each` and `cases`."""
     return [
         pytest.param(one, case, id=f"{one}-{_case_id(case)}", marks=() if is_tried else pytest.mark.long)
         for number, one in enumerate(each)

@@ -58,7 +58,7 @@ def _imports(path: Path) -> tuple[set[str], set[str]]:
 
 
 def _import_nodes(node: ast.AST, for_types: bool) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
-    """Yield each import below `node`, with True if only a type checker sees it; skips expressions."""
+    """Yield each import statement below `node`, with True if only a type checker sees it."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.Import | ast.ImportFrom):
             yield child, for_types

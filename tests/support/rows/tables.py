@@ -20,9 +20,9 @@ FAILURES = (Exception, pytest.fail.Exception, pytest.skip.Exception)  # a skippe
 def table(
     names: str | Sequence[str], rows: Iterable[Any], ids: Iterable[object] | None = None
 ) -> Callable[[Test], Test]:
-    """Return a decorator that calls a test with each row as arguments `names`; it reports failing rows.
+    """Return a decorator that calls a test for each row, with the row's values as the arguments `names`.
 
-    The test's attribute `rows` has the rows.
+    The test reports all rows that fail. Its attribute `rows` has the rows.
     """
     columns = [name.strip() for name in names.split(",")] if isinstance(names, str) else list(names)
     several = not isinstance(names, str) or len(columns) > 1

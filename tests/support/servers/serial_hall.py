@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 REQUEST = 8  # number of bytes of a Modbus RTU read request
-MAKE = {0x02BC: 1, 0x02BE: 1}  # INNOVERT IBD: baud rate (1: 9600) and address, which identify it
+MAKE = {0x02BC: 1, 0x02BE: 1}  # registers that identify an INNOVERT IBD: baud rate (1 means 9600) and address
 
 
 @dataclass

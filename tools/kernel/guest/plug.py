@@ -30,7 +30,7 @@ class Adapter:
         self.plug_in()
 
     def plug_in(self, socket_number: int | None = None) -> None:
-        """Plug the adapter in, into the USB socket in which it was or into another one."""
+        """Plug the adapter into the USB socket with this number, or by default into its previous socket."""
         if socket_number is not None:
             self.socket_number = socket_number
         before = set(ttys())

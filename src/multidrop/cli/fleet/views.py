@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 async def watch(arguments: argparse.Namespace, paths: list[ServerPath]) -> int:
-    """Show the fleet until Ctrl-C. While no server answers, show the last view with its age."""
+    """Show the fleet's state until Ctrl-C. While no server answers, show the last known state and its age."""
     from multidrop.fleet.overview import FleetView, FleetWatch
 
     if not arguments.json and not sys.stdout.isatty():
@@ -63,7 +63,7 @@ async def watch(arguments: argparse.Namespace, paths: list[ServerPath]) -> int:
 
 
 async def follow(watch: FleetWatch, show: Callable[[dict[str, Any]], object], over: asyncio.Event) -> None:
-    """Show the fleet once a second, with the age of the view, until `over` is set.
+    """Show the fleet's state and its age once a second, until `over` is set.
 
     Raises Ended if the task that keeps the connection open has ended.
     """
@@ -143,7 +143,7 @@ def picture(fleet: FleetState, size: tuple[int, int], head: str) -> list[TextLin
 
 
 def _body(fleet: FleetState, width: int, room: int) -> list[str]:
-    """Return all gateways, and as many moves and lines as fit."""
+    """Return rows of text for all gateways, and for as many lines and moves of lines as fit."""
     begin = [
         *gateway_table(fleet, width - 1),
         "",
@@ -323,7 +323,7 @@ def line_columns(fleet: FleetState, names: Iterable[str], width: int) -> list[st
 
 
 def silent_gateways(fleet: FleetState) -> set[str]:
-    """Return the gateways that do not answer. Their lines may not be polled."""
+    """Return the gateways that do not answer. Perhaps their lines are not polled."""
     return {name for name, gateway in fleet["gateways"].items() if gateway["says"] is None}
 
 

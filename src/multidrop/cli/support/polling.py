@@ -81,7 +81,8 @@ def polling_session(
     takers = list(consumers)
     with ExitStack() as stack:
         interruption = stack.enter_context(noting_signals())
-        poller = stack.enter_context(closing(Poller(plant)))  # opened first: if it fails, no file is created
+        # opened before the recording: if no port can be opened, no file is created
+        poller = stack.enter_context(closing(Poller(plant)))
         writer = stack.enter_context(_open(out, plant.metadata(), how)) if out else None
         if writer:
             takers.append(writer.write)
