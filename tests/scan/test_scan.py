@@ -493,10 +493,10 @@ def test_port_that_supports_no_setting_raises_line_error() -> None:
     [
         ({"baudrates": [300]}, "none of these families has baud rate 300; they have 1200, 2400, "),
         ({"formats": ["7N1"]}, "none of these families has format 7N1; they have 7E1, "),
-        ({"addresses": [250]}, "no family allows one of these addresses"),
+        ({"addresses": [250]}, "no family allows any of these addresses"),
         (
             {"baudrates": [1200], "formats": ["7E1"], "addresses": [40]},
-            "no family allows one of these addresses",
+            "no family allows any of these addresses",
         ),
     ],
 )
