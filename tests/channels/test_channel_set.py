@@ -60,6 +60,15 @@ def test_energy_total_equals_the_analytic_integral_although_5_percent_are_missin
     assert made.outages == []
 
 
+@table("flow_unit, unit, total", [("m3/h", "m3", 0.5), ("m3/h", "l", 500.0), ("l/min", "m3", 0.03)])
+def test_volume_is_the_integral_of_a_flow(flow_unit: str, unit: str, total: float) -> None:
+    """A pump at 25 Hz delivers 5 of the flow's unit for 6 minutes, after a table of its curve."""
+    flow = Channel("flow", f'table(frequency, "{flow_unit}", 0, 0, 50, 10)', flow_unit)
+    made = channels(flow, Channel("volume", "integral(flow)", unit), frequency="Hz")
+    found = made.compute([row(0, at / 2, 25.0) for at in range(721)])
+    assert [one.value for one in found if one.slot == 2][-1] == pytest.approx(total)
+
+
 def test_outage_is_reported_and_adds_nothing_to_a_computed_total() -> None:
     made = channels(ENERGY, power="kW")
     assert last_value(made, [row(0, at, 3600.0) for at in (0.0, 1.0)]) == 1.0

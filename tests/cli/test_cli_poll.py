@@ -11,7 +11,7 @@ import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from batches import METADATA, counting
@@ -21,13 +21,14 @@ from kills import BoundProcess
 from lines import until
 from peers import require_module
 from recordings import recorded
+from simulated_pumps import simulated_test, write_test
 from toy import Toy
 
 from multidrop.bus import Bus
 from multidrop.capture import Capture, Decoding
 from multidrop.cli.support import demo_plant
 from multidrop.cli.support.demo_plant import DRIVES, Operator
-from multidrop.core import Status
+from multidrop.core import Message, Status
 from multidrop.errors import NoReply
 from multidrop.families import MODELS, InvtCHE
 from multidrop.recording import open_recording, open_writer
@@ -461,6 +462,43 @@ def test_poll_records_each_trigger_in_its_own_file(run: Run, plant: Path, tmp_pa
     assert next(time for time, value in values if value) == trigger["time_ns"]
     assert values[0][0] >= trigger["time_ns"] - 100_000_000
     assert values[-1][0] <= trigger["time_ns"] + 200_000_000
+
+
+@pytest.mark.slow
+def test_poll_records_a_fault_and_a_changed_value(run: Run, tmp_path: Path) -> None:
+    """The simulated drive trips once after 30 requests. Nothing else changes, so there are two triggers."""
+    with simulated_test(write_test(tmp_path)) as (_, (fan,)):
+        answer = fan.answer
+
+        def tripping(request: Message, now: float) -> Message | None:
+            if fan.counters.requests == 30:
+                fan.trip(4)
+            return cast("Message | None", answer(request, now))
+
+        vars(fan)["answer"] = tripping
+        options = (
+            "--trigger",
+            "fault",
+            "--trigger",
+            "changed(fan.fault)",
+            "--pre",
+            "1 s",
+            "--post",
+            "500 ms",
+        )
+        _, out, _ = run(
+            "poll", tmp_path / "plant.toml", "--seconds", 5, *options, "--out", tmp_path / "trip.arrows"
+        )
+    assert "2 triggers recorded" in out
+    paths = [tmp_path / f"trip.{number:08d}.arrows" for number in (1, 2)]
+    triggers = [open_recording(path).metadata["trigger"] for path in paths]
+    assert {trigger["condition"] for trigger in triggers} == {"fault of fan", "changed(fan.fault)"}
+    for path, trigger in zip(paths, triggers, strict=True):
+        faults = [(row.time_ns, row.value) for row in recorded(path) if row.register == "fault"]
+        before = [time for time, value in faults if value == 0.0]
+        assert before
+        assert max(before) < trigger["time_ns"]
+        assert min(time for time, value in faults if value == 4.0) == trigger["time_ns"]
 
 
 @pytest.mark.parametrize(
