@@ -54,9 +54,9 @@ class Asked:
 
 
 async def test_a_gateway_without_a_session_answers_no_requests(tmp_path: Path) -> None:
-    """Both gateways get each request.
+    """Another gateway of this name may have a session.
 
-    An answer of the waiting one would mislead `fleet status` and `drain`.
+    Two answers would mislead `fleet status` and `drain`.
     """
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     lease = gateway.member.lease
@@ -72,7 +72,7 @@ async def test_a_gateway_without_a_session_answers_no_requests(tmp_path: Path) -
 
 
 async def test_a_gateway_answers_only_to_subjects_that_are_inboxes(tmp_path: Path) -> None:
-    """Servers would send the answer to that subject, even if the requester may not write there."""
+    """Servers send an answer to any subject that a requester names, even one that it may not write to."""
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     gateway.member.lease.session = 7
     for reply in ("", "$KV.plant.line-1", "stop.line-1", "samples.gw-2.log", "_INBOX", "_INBOXES.a"):

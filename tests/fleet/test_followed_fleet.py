@@ -383,7 +383,7 @@ MOVE = {"line": "line-1", "turn": 5, "at_ms": 7, "from": "gw-9", "to": "gw-1"}
 
 
 class Answering:
-    """A fake server connection with an answer of each gateway. Other gateways do not exist."""
+    """A fake server connection with the answers of some gateways. No other gateway exists."""
 
     urls = ["nats://a:4222"]
     is_open = True

@@ -282,7 +282,7 @@ def test_the_files_of_a_past_hour_are_merged_into_one(sink: ParquetSink, tmp_pat
 USUAL_PRIORITY = """
 import os
 os.nice = os.sched_setscheduler = lambda *details: 0
-"""  # with the lowest priority, the process takes minutes on a busy machine
+"""  # keeps the normal priority: with the lowest one, the process takes minutes on a busy machine
 
 
 class Broken(Exception):
@@ -294,7 +294,7 @@ class Broken(Exception):
 def test_compaction_interrupted_before_any_step_loses_no_row(
     sink: ParquetSink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is interrupted after each possible number of written or removed files, and then repeated."""
+    """Compaction is interrupted after each possible number of written or removed files, and then repeated."""
     write(sink, range(FILES))
     steps = {"replace": Path.replace, "unlink": Path.unlink}
     left = 0

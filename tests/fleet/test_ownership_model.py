@@ -434,7 +434,8 @@ class _PathTable:
         self._model = model
         self.steps: list[list[int]] = []
         self.later: list[int] = []
-        self._deadlines: dict[tuple[int | None, ...], int] = {}  # by the ages of the newest renewals
+        # deadlines by the ages of the newest renewals
+        self._deadlines: dict[tuple[int | None, ...], int] = {}
         self.number(PathState())
         for path in self.paths:  # the loop itself makes this list longer
             after = {self.number(following) for following in model.path_steps(path)}

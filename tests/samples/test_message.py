@@ -36,7 +36,7 @@ def test_rows_are_read_back_unchanged_from_a_message() -> None:
 
 @pytest.mark.slow
 def test_pyarrow_opens_a_message() -> None:
-    """The test has its own copy of the table in the module's docstring, and uses none of our functions."""
+    """Only pyarrow reads the message. The columns are those of the table in the docstring of message.py."""
     (message,) = packed(example())
     with pa.ipc.open_stream(message.data) as reader:
         table = reader.read_all()

@@ -91,7 +91,7 @@ class Denials:
     def __init__(self) -> None:
         # number of denials by kind ("publish" or "subscription") and subject
         self._counts: Counter[tuple[str, str]] = Counter()
-        # if a subscription to this subject is denied, `raising` raises an error, and the denial is not logged
+        # a denied subscription to this subject is not logged, because `raising` raises an error for it
         self._raised = ""
 
     async def note(self, failure: Exception) -> None:

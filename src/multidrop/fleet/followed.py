@@ -35,7 +35,7 @@ SILENT_S = 6.0  # a line counts as lost after this many seconds without a sample
 MOST_NAMES = 65_535  # limit of different drive names, and of register names: their codes have 16 bits
 MOST_STATUSES = 1000  # limit of different status texts
 OTHER = "other"  # shown for each further status beyond MOST_STATUSES
-NO_VALUE = "no valid value"  # status of a row that is marked "ok" but has no value
+NO_VALUE = "no valid value"  # status of a sample that is marked "ok" but has no value
 LATE_S = 5.0  # samples that are older than this on arrival are reported
 EARLY_S = 2.0  # samples dated further in the future than this are reported, because a clock is wrong
 
@@ -97,19 +97,20 @@ class RowReader:
         # further names are counted as "", a name that the gateway ignores
         self._drives, self._registers = NameCodes(MOST_NAMES, ""), NameCodes(MOST_NAMES, "")
         self._statuses = NameCodes(MOST_STATUSES, OTHER, "ok")
-        self._newest: dict[tuple[str, str], int] = {}  # time of the newest row, by drive and register
+        self._newest: dict[tuple[str, str], int] = {}  # time of the newest sample, by drive and register
         self._read_ns = 0  # this computer's clock (UTC, ns) at the last call of `rows`
-        # By gateway: when its newest row arrived, by this computer's clock, and the row's own time (UTC, ns).
+        # By gateway: when its newest sample arrived, by this computer's clock, and the sample's own time
+        # (UTC, ns).
         self.arrivals: dict[str, tuple[int, int]] = {}
 
     def rows(self, messages: Sequence[StreamMessage]) -> FollowedRows | None:
-        """Return the newest row of each register in these messages; None if there is no new row.
+        """Return the newest sample of each register in these messages; None if there is no new sample.
 
-        Skip a row that is older than a returned row of the same register: a gateway may send samples of a
-        line long after another gateway has taken the line over.
+        Skip a sample that is older than a returned sample of the same register: a gateway may send samples of
+        a line long after another gateway has taken the line over.
         """
         now_ns, utc_ns = self._clocks()
-        if utc_ns < self._read_ns:  # the clock was set back, and known times may be in the future now
+        if utc_ns < self._read_ns:  # the clock was set back, so known times may be in the future now
             self._newest.clear()
         self._read_ns = utc_ns
         found: dict[tuple[str, str], tuple[int, int | None, float | None, str]] = {}
@@ -192,7 +193,7 @@ class FollowedFleet:
         self._folder = TemporaryDirectory(prefix="multidrop-")
         self._records: Mapping[str, Record] = {}  # line records that the next call of `adopt` will use
         self._wanted: Mapping[str, int] = {}  # revisions of the line records at the last call of `on_change`
-        # By line: the record's revision, and the line (None: its record has a mistake).
+        # by line: the record's revision, and the parsed line (None if the record has a mistake)
         self._lines: dict[str, tuple[int, PlantLine | None]] = {}
         self._line_of: dict[str, str] = {}  # by drive
         self._begun = time.monotonic()

@@ -42,7 +42,7 @@ STATE = {"state": str, "lines": int, "margin_s": float, "trouble": str, "trouble
 SPOOL = {"bytes": int, "lost": int, "behind": int | None, "lag_s": float | None, "trouble": str | None}
 # time limit at shutdown for forwarding samples; the other samples are forwarded after the next start
 FORWARD_S = 10.0
-IN_TROUBLE_S = 3.0  # time limit at shutdown if the stream of samples has a problem
+IN_TROUBLE_S = 3.0  # time limit at shutdown for forwarding samples if the stream has a problem
 SYNC_S = 3.0  # time limit at shutdown for writing the last samples to the disk
 ENDING_S = 0.05
 LOOK_S = 0.2  # pause between checks of the gateway's threads
@@ -78,7 +78,8 @@ class FleetGateway:
         self.lines = FleetLines(self.mastership, folder, units)
         held = HeldLines(
             self.lines.poller.bus,
-            may_command=lambda line: self.member.keeper.may_command(line),  # `self.member` is created below
+            # a lambda, because `self.member` does not exist yet
+            may_command=lambda line: self.member.keeper.may_command(line),
             may_stop=lambda line: self.member.keeper.may_stop(line),
         )
         self.log = CommandLog(folder / "commands.jsonl")
@@ -120,7 +121,7 @@ class FleetGateway:
                 await self._until_the_end()
                 for name in ("look", "member"):
                     supervisor().let_go(name)
-                self.member.end()  # has no effect if the gateway is already shutting down
+                self.member.end()
                 await asyncio.wait([member])
                 await end_tasks(looking)
                 # the supervisor reports these three exceptions
@@ -305,7 +306,7 @@ class FleetLines:
         return PortLoss(bus.why_lost, silent_ns)
 
     async def close(self) -> None:
-        """Stop polling and deliver the last rows. Raises PollingFailed if polling had failed."""
+        """Stop polling and deliver the last samples. Raises PollingFailed if polling had failed."""
         await self._in_thread(self.poller.close)
 
 
@@ -337,8 +338,8 @@ class CommandedLines:
     async def let_go(self, line: str) -> None:
         """Accept no more commands for the line, stop polling it, and close it.
 
-        Closing waits for stops in progress, so that their senders get answers. It also waits a short time for
-        commands in progress, because their results would otherwise stay unknown.
+        Closing waits for stops in progress, so that their senders get answers. Before that, wait a short time
+        for commands in progress, because their results would otherwise stay unknown.
         """
         self._subjects.leave(line)
         try:

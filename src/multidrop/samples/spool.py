@@ -59,7 +59,7 @@ class StoredMessage(NamedTuple):
 
 
 class SpoolFolder:
-    """The files of one log. Only one process at a time may use the folder.
+    """The folder of a spool, with one file per message. Only one process at a time may use it.
 
     Raises SpoolError if the folder holds other files, belongs to another gateway, is in use by another
     process, or cannot be written.
@@ -210,8 +210,8 @@ class Spool:
         self._taken = self._written = self._lost = 0
         self._acknowledged: int | None = None
         self._missing: Sequence[tuple[int, int]] = ()
-        # Removed messages of which it is unknown whether the receiver has them: the number of rows of each.
-        # `acknowledge` decides whether these rows are lost.
+        # removed messages that the receiver may not have, with the number of their rows: `acknowledge`
+        # decides whether these rows are lost
         self._undecided: dict[int, int] = {}
         self._trouble: str | None = None
         self._logged_s: float | None = None

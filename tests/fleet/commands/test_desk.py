@@ -105,7 +105,7 @@ def test_a_confirmation_more_than_a_second_after_the_offer_sends_nothing(
 def do_after(desk: Desks, deed: Callable[[], object], waited_s: float = 0.0) -> CommandAnswer:
     """Let `waited_s` pass, then confirm an offer.
 
-    Call `deed` in the command's thread, right before it is sent.
+    The command's thread calls `deed` before it sends the command.
     """
     token = desk.offered()
     offer = desk.desk.offers.find(token)
@@ -476,10 +476,7 @@ def test_a_malformed_stop_is_carried_out(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Its sender's name is logged as printable text.
-
-    If it names no drives, all drives of the line are stopped.
-    """
+    """The name of its sender is logged as printable text. Without drives, it stops all drives of the line."""
     # the test must not repeat a stop that has no id, because each repetition would be a new stop
     monkeypatch.setattr(desk_module, "HOLD_S", PATIENCE_S)
     answer = asyncio.run(desk.stop_by(data))
@@ -521,7 +518,7 @@ def test_a_stop_with_an_unknown_drive_stops_the_others(desk: Desks) -> None:
 
 
 @patient
-def test_a_stop_accepts_another_unicode_spelling_of_a_drive_a_command_does_not(tmp_path: Path) -> None:
+def test_only_stops_accept_another_unicode_form_of_a_drives_name(tmp_path: Path) -> None:
     """Keyboards differ: a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
     fan, spelt = "L\u00fcfter", "Lu\u0308fter"
     with desks(tmp_path, {"write": [f"{spelt}.frequency"]}, name=fan) as desk:

@@ -334,7 +334,7 @@ def test_the_drives_of_one_line_are_stopped_by_one_message(tmp_path: Path) -> No
     assert path.asked == ["stop", "stop"]
 
 
-def test_a_stop_accepts_another_unicode_spelling_of_a_drive_a_command_does_not(tmp_path: Path) -> None:
+def test_only_stops_accept_another_unicode_form_of_a_drives_name(tmp_path: Path) -> None:
     """Keyboards differ: a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
     fan, spelt = "L\u00fcfter", "Lu\u0308fter"
     plant = Plant()

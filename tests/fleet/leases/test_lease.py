@@ -403,7 +403,7 @@ async def test_a_released_lock_file_proves_that_the_previous_process_is_dead(
         ("this machine", "this machine", False),
     ],
 )
-async def test_a_lock_of_another_machine_or_file_proves_no_death(
+async def test_another_lock_file_does_not_prove_that_the_previous_process_is_dead(
     before: str, after: str, is_copied: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trial = Trial()
@@ -417,7 +417,7 @@ async def test_a_lock_of_another_machine_or_file_proves_no_death(
         assert not await trial.lease(lock=lock).try_to_begin()
 
 
-async def test_a_lock_file_on_a_copied_disk_or_after_a_reboot_proves_no_death(
+async def test_a_lock_file_from_another_boot_does_not_prove_a_process_dead(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A copied disk has the same machine id, path and lock id, but not the same boot id of the kernel."""

@@ -477,7 +477,7 @@ def test_a_killed_incompatible_gateway_counts_for_at_most_its_lease(trial: Trial
     assert trial.trouble == ""
 
 
-def test_our_own_earlier_session_is_never_incompatible(trial: Trial) -> None:
+def test_a_gateways_own_earlier_session_is_never_incompatible(trial: Trial) -> None:
     trial.begin("me", RULES - 1)
     assert trial.trouble == ""
 

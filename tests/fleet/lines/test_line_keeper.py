@@ -370,7 +370,7 @@ async def test_a_late_answer_to_a_claim_does_not_reopen_a_line_being_released(
     trial.keeper.reconcile()
     await until(lambda: not trial.keeper.polled and not trial.keeper._at_work)
     writers = trial.keeper._owners._writing[trial.buckets[1].name]
-    async with writers, writers:  # takes both permits to write in this bucket
+    async with writers, writers:  # takes all permits to write in this bucket
         trial.keeper.reconcile()
         await until(lambda: owners(trial) == [NOBODY, ME, NOBODY])
         trial.buckets[0].open()
@@ -406,7 +406,7 @@ async def test_a_late_answer_to_a_claim_does_not_undo_the_lines_release() -> Non
     assert trial.lines.taken == set()
 
 
-async def test_a_line_whose_release_is_uncertain_is_claimed_only_if_may_claim() -> None:
+async def test_a_line_with_an_uncertain_release_is_claimed_only_if_claims_are_allowed() -> None:
     trial = await claimed()
     trial.are_down()
     trial.keeper.releasing = {"hall"}

@@ -195,9 +195,9 @@ FIRST_LINES = set(FIRST.values())
 
 
 class Releasing:
-    """A gateway's `Releases`, with fake servers:
+    """A gateway's `Releases`, with fake servers.
 
-    `led` are buckets with a leader, `maimed` those with a silent server.
+    `led` are the buckets with a leader, `maimed` the buckets with a silent server.
     """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -377,7 +377,7 @@ def chaos(monkeypatch: pytest.MonkeyPatch) -> Any:
     return importlib.import_module("bench.questions.fleet_chaos")
 
 
-def test_the_drill_finds_lost_and_duplicated_rows(chaos: Any) -> None:
+def test_the_check_after_random_kills_finds_lost_and_duplicated_rows(chaos: Any) -> None:
     told = {"gateway-1": {0: 4, 1_000_000: 2}, "gateway-2": {0: 3}}
     whole = {
         # the lost rows 4 and 5 were not reported as lost
@@ -393,7 +393,7 @@ def test_the_drill_finds_lost_and_duplicated_rows(chaos: Any) -> None:
     assert chaos.compare(told, doubled) == (9, 0, 0, 1)
 
 
-def test_the_drill_finds_the_hubs_alarms_about_lost_and_repeated_messages(
+def test_the_check_after_random_kills_finds_the_hubs_alarms(
     chaos: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     check = SourceCheck({})

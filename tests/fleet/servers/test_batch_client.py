@@ -84,7 +84,7 @@ def _rested(path: ServerPath) -> None:
         b"NATS/1.0 404 No Messages\r\nNats-Sequence: none\r\n",
     ],
 )
-def test_a_stored_messages_server_headers_take_precedence_over_its_writers(writers: bytes) -> None:
+def test_headers_of_the_server_take_precedence_over_headers_of_the_writer(writers: bytes) -> None:
     assert stored_message(writers + SERVERS, b"x") == DirectMessage("$KV.own_0.a", 7, b"x")
 
 

@@ -37,7 +37,7 @@ class SlowPath:
         self.asked: list[float] = []
         self._delays = [*delays]
         self._failure = failure
-        self._pause = pause  # s between two messages
+        self._pause = pause  # pause between two messages, in s
         self.under_way = 0
 
     async def gather(self, request: Request, get: DirectGet) -> None:
@@ -244,7 +244,7 @@ def test_after_slow_answers_reads_are_repeated_later() -> None:
     assert asked(others) == [[0.1], [0.1]]  # only the first read was repeated
 
 
-def test_lost_reads_are_repeated_soon_again_once_answers_are_fast_again() -> None:
+def test_after_fast_answers_lost_reads_are_repeated_soon() -> None:
     paths, budget = [LatePath(0.3) for _ in range(3)], full()
     questions(10, paths, budget)
     for path in paths:
@@ -276,7 +276,7 @@ class Servers:
         self.leaders = dict(zip((*names.LEASES, *names.OWNERS), 2 * SERVERS, strict=True))
         self.terms = dict.fromkeys(names.LEASES, 1)
         self.silent: set[str] = set()
-        self.unheard_ns = 0  # time since the leader last heard from the server; 0: never
+        self.unheard_ns = 0  # ns since a leader last received a message from a silent server; 0: never
         self.lagging: set[str] = set()
         self.stuck: set[str] = set()  # buckets that have no leader after a hand-over
         self.under_way = 0
@@ -431,7 +431,7 @@ def test_raft_terms_are_newer_before_a_cut_off_server_starts_an_election(
 
 
 def test_the_leadership_of_each_bucket_returns_to_its_home_server(servers: Servers) -> None:
-    """The other server leads the bucket after a hand-over because of a silent server, for instance."""
+    """Another server may lead a bucket, such as after a hand-over because of a silent server."""
     servers.leaders |= {"lease_0": "n2", "own_2": "n1"}
     servers.lagging = {"n1"}
 

@@ -48,7 +48,7 @@ def check_that_a_stop_reports_its_progress(fleet: SecuredFleet) -> None:
     )
     assert asker.stderr
     told = asker.stderr.readline()
-    while "the stop was sent" not in told:  # a busy machine may take more than half a second to send it
+    while "the stop was sent" not in told:  # a busy machine may need more than half a second to send the stop
         assert told.startswith("under way: "), told
         told = asker.stderr.readline()
     assert told.startswith("under way: drive-line-1: the stop was sent, but is not yet confirmed")

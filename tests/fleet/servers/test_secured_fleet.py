@@ -62,7 +62,7 @@ def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecuredCluster
         yield running
 
 
-@pytest.mark.slow  # slow: slow tests start first, and this file takes longest
+@pytest.mark.slow  # marked as slow because slow tests start first, and this file takes longest
 @pytest.mark.long
 def test_a_route_to_a_silent_server_is_dropped_soon(tmp_path: Path) -> None:
     """With default settings, NATS forwards requests to the silent server for more than a minute."""

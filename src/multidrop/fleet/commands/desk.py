@@ -54,9 +54,9 @@ from multidrop.supervisor import supervisor
 
 HOLD_S = 0.5  # an answer waits this long for a command or stop to end, then says "under way"
 AWAITED_S = 3.0  # time limit for commands in progress before their line is closed; most commands are faster
-POLL_S = 0.01  # pause between checks whether these commands have ended
+POLL_S = 0.01  # pause between checks whether commands have ended
 MOST_WRITES = 8  # limit of concurrent commands on one line; stops are not counted
-WAY = "fleet"  # entry in the audit log for commands that came through the fleet
+WAY = "fleet"  # name in the audit log for commands that came through the fleet
 STOPS_REMEMBERED = 1000  # limit of remembered stops; the oldest are forgotten
 CALLED = "a stop was called"
 
@@ -169,8 +169,8 @@ class CommandDesk:
         return answer
 
     def _limit_ns(self, offer: Offer) -> float:
-        """Return the deadline for sending the command (CLOCK_MONOTONIC, ns); 0 if its offer is void."""
-        # CLOCK_MONOTONIC is read first, so a pause between the two reads can only make the limit earlier
+        """Return the deadline for sending the command (CLOCK_MONOTONIC, ns); 0 if its offer was cancelled."""
+        # read before CLOCK_BOOTTIME, because a pause between the two reads must not make the deadline later
         now_ns = time.monotonic_ns()
         return 0 if offer.why_void else now_ns + self.offers.left_ns(offer)
 

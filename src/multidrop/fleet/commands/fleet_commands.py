@@ -136,7 +136,10 @@ class FleetCommands:
         return answer
 
     async def _offer(self, line: str, request: CommandRequest) -> Offered | CommandAnswer:
-        """Ask for an offer on one path after another until one answers. An unused offer has no effect."""
+        """Request an offer over one server connection after another until one answers.
+
+        An unused offer has no effect.
+        """
         why = ""
         for path in self._paths:
             try:

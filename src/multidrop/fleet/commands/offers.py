@@ -166,7 +166,7 @@ class Offers:
             )
 
     def end(self, offer: Offer, answer: CommandAnswer) -> None:
-        """Set the answer of an offer, which later copies of the message get too."""
+        """Set the result of an offered command. Later copies of its message get this result too."""
         offer.answer = answer
         offer.over.set()
 

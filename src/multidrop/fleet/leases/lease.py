@@ -35,7 +35,7 @@ def boottime_ns() -> int:
 
 
 class HeldRecord(NamedTuple):
-    """This gateway's lease record in the bucket of one server path."""
+    """This gateway's lease record in one of the three lease buckets."""
 
     revision: int
     sent: int  # when its renewal was sent (CLOCK_BOOTTIME, ns)
@@ -44,7 +44,7 @@ class HeldRecord(NamedTuple):
 class Lease:
     """The lease of one gateway: a session, which is recorded in three lease buckets.
 
-    Each bucket is written over its own server path. `until` is the deadline for sending on lines
+    Each bucket is written over its own server connection. `until` is the deadline for sending on lines
     (CLOCK_BOOTTIME, ns). `note` returns further fields of the record, for other gateways and for display.
     """
 
@@ -75,7 +75,7 @@ class Lease:
         self._watched: list[SeenRevision | None] = [None] * len(buckets)
         # highest session number that this process has used; later sessions get higher numbers
         self._newest = 0
-        # server paths on which another gateway has ended this session's lease record
+        # numbers of the lease buckets in which another gateway has ended this session
         self._ended: set[int] = set()
 
     # ---- state ----
@@ -91,7 +91,7 @@ class Lease:
 
     @property
     def best(self) -> int:
-        """Return the number of the server path with the newest renewal: its server has the newest records."""
+        """Return the number of the connection with the newest renewal: its server has the newest records."""
         return max(range(len(self.held)), key=lambda path: held.sent if (held := self.held[path]) else 0)
 
     @property
@@ -101,7 +101,10 @@ class Lease:
 
     @property
     def is_weak(self) -> bool:
-        """Return True if other gateways have ended one of the three records. One more ends the session."""
+        """Return True if other gateways have ended one of this session's three lease records.
+
+        If they end one more, the session is over.
+        """
         return bool(self.session and self._ended)
 
     async def could_be_whole(self) -> bool:
@@ -203,10 +206,10 @@ class Lease:
     # ---- renewal ----
 
     async def renew(self, path: int) -> None:
-        """Renew one of the three lease records forever. A task for each record calls this.
+        """Renew one of the three lease records forever. There is a task for each record.
 
-        A failed renewal is repeated soon, because the bucket may get a leader at any moment. Renewals on two
-        paths are enough to poll.
+        A failed renewal is repeated soon, because the bucket may get a leader at any moment. Two renewed
+        records are enough to poll.
         """
         while True:
             begun, before = self.clock(), self.held[path]
@@ -322,10 +325,10 @@ async def put_end(bucket: Bucket, end: Record) -> None:
 
 
 class LifeLock:
-    """A lock on a local file. The process holds it until it ends, so its next holder knows that it is dead.
+    """A lock on a local file, which this process holds until it ends.
 
-    The file holds a random id, because containers may share the machine id and the path. Raises FleetError if
-    another process of this computer holds the lock.
+    So the next holder knows that this process is dead. The file holds a random id, because containers may
+    share the machine id and the path. Raises FleetError if another process of this computer holds the lock.
     """
 
     def __init__(self, path: Path) -> None:
@@ -345,7 +348,7 @@ class LifeLock:
                 os.fsync(file.fileno())
 
     def proves_death(self, value: Mapping[str, Any]) -> bool:
-        """Return True if the process that wrote this lease record is dead: this process has its lock now."""
+        """Return True if the process that wrote this record is dead: this process holds its lock now."""
         mine = (str(self.path), self.id, machine_id())
         return "" not in mine and (value.get("lock"), value.get("lock_id"), value.get("machine")) == mine
 

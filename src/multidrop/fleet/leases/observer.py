@@ -26,7 +26,7 @@ from multidrop.supervisor import end_tasks
 BELIEVING = lease_rules.USUAL._replace(lease=0, guard=0)
 
 LOOK_S = 0.1  # pause between two reads of a lease bucket; it delays a takeover by at most this time
-# how long to wait for answers when a session is ended; a later answer is replaced by the next read
+# how long to wait for answers when a session is ended; the next read shows the effect of later answers
 ENDING_S = 0.1
 
 _log = logging.getLogger("multidrop.fleet")
@@ -59,7 +59,7 @@ class Observer:
     async def look(self, path: int) -> bool:
         """Read the changes in one lease bucket; return True if a session has ended, or may be ended now.
 
-        Raises FleetError if no server of this path can be reached.
+        Raises FleetError if no server can be reached over this connection.
         """
         begun = self._clock()
         found = await self.paths[path].look()
@@ -156,7 +156,7 @@ class Observer:
     # ---- dead gateways ----
 
     def dead(self, present: Iterable[str] | None = None) -> dict[str, dict[int, Record]]:
-        """Return the gateways whose sessions may be ended, each with its stale lease records by path.
+        """Return the gateways whose sessions may be ended, each with its stale lease records by bucket.
 
         A record counts as stale only if it was already stale at the start of the last answered read of its
         bucket. While no reads are answered, this process does not see renewals of the record. `present` are

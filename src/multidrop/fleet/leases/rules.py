@@ -1,15 +1,15 @@
 """Lease rules: until when a gateway may send, and when another may end its session. No I/O.
 
-A session has one record on each of three paths. Its holder must renew two of them (`needed`). A gateway that
-takes over must end two of them (`ended`). So both must write on at least one common path, whose server
-accepts only one of the two writes. The holder's lease starts right before it sends a renewal. An observer
-starts to wait when it first sees a revision, by its own clock. After the time of a lease it ends the record
-only if the record still has that revision. So clocks of different computers are never compared. An ended
-path stays ended for its session.
+A session has one record in each of three lease buckets. Its holder must renew two of them (`needed`). A
+gateway that takes over must end two of them (`ended`). So both must write in at least one common bucket,
+whose server accepts only one of the two writes.
+
+The holder's lease starts right before it sends a renewal. An observer starts to wait when it first sees a
+revision, by its own clock. After the time of a lease it ends the record only if the record still has that
+revision. So clocks of different computers are never compared. An ended record stays ended for its session.
 
 Once a session is over, its lines are claimed and opened immediately. The guard time starts then: before its
 first request on a line, the engine only listens for at least this time (csrc/line.c).
-
 tests/fleet/test_ownership_model.py checks all interleavings with these functions.
 """
 
@@ -61,10 +61,7 @@ def may_send(now: int, until: int) -> bool:
 
 
 def watch(before: SeenRevision | None, revision: int, now: int) -> SeenRevision:
-    """Return the observation of a lease record after a read:
-
-    `before`, or a new one if the revision is new.
-    """
+    """Return what is known about a lease record after a read: `before`, unless the revision is new."""
     return before if before is not None and before.revision == revision else SeenRevision(revision, now)
 
 

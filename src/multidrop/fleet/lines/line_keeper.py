@@ -128,7 +128,7 @@ class LineKeeper:
 
     @property
     def moves(self) -> int:
-        """The number of lines that this gateway has claimed or released."""
+        """The number of claims and releases of lines by this gateway."""
         return self._owners.moves
 
     def is_mine(self, line: str) -> bool:
@@ -163,10 +163,10 @@ class LineKeeper:
             self._start(lines, self._owners.claim({line: claims[line] for line in lines}))
 
     def reconcile(self) -> None:
-        """Close lines of other gateways, open this gateway's lines, and release closed lines that must move.
+        """Close lines that other gateways own now, open own lines, and release closed lines that must move.
 
-        If a line should stay ours after its release was sent, claim it again, because the release may have
-        been stored.
+        If a line should stay with this gateway after its release was sent, claim it again, because the
+        release may have been stored.
         """
         valid = self.may_poll
         kept = {

@@ -133,9 +133,9 @@ def decide(
 ) -> Step:
     """Return which lines to claim and which to release.
 
-    `me` is our name and session, `wanted` the gateway assigned to each line. A line that never had a master
-    is claimed only if `is_settled`, which is False in the first seconds of a session. Otherwise the first
-    gateway of a cold start would take all of these lines.
+    `me` is this gateway's name and session, `wanted` the gateway that each line is assigned to. A line that
+    never had a master is claimed only if `is_settled`, which is False in the first seconds of a session.
+    Otherwise the first gateway of a starting fleet would take all of these lines.
     """
     step = Step({}, set())
     for line in lines:

@@ -25,8 +25,7 @@ from multidrop.fleet.servers.connections import ServerPath
 
 _UNREAD: LineRecords = {}
 ASKED_AT_ONCE = 500  # limit of lines in one read request; servers allow 1024
-# how long a line with an unanswered write is read again: longer than an election takes, because the write may
-# still be stored after an election
+# how long the record of an unanswered write is read again: the write may still be stored after an election
 DOUBT_S = 30.0
 MOST_MOVES = 100  # number of remembered moves of lines between gateways
 MOST_REPORTED = 20  # limit of the moves in the state that a gateway reports
@@ -145,7 +144,7 @@ class FleetRecords:
         if turn != seen:
             self._masters[line] = master, turn
             known = before if turn == seen + 1 else None
-            # they are equal if a gateway has claimed its own line again after an uncertain release
+            # equal if a gateway has claimed its own line again after an uncertain release
             if known != master:
                 self.moves.add([Move(line, turn, record.value["since"], known, master)])
 
@@ -248,7 +247,7 @@ class ShareRecords(FleetRecords):
             share.recompute()
 
     def want(self, lines: Iterable[str]) -> None:
-        """Read the master records of exactly these lines from now on."""
+        """Read the ownership records of exactly these lines from now on."""
         wanted = frozenset(lines)
         for share in self._shares.values():
             share.want(wanted)

@@ -39,7 +39,7 @@ _log = logging.getLogger("multidrop.fleet.samples.forwarder")
 
 
 class NotOurLog(Exception):
-    """The stream has a message that this spool never wrote: the folder was copied, or set back."""
+    """The stream has a message that this spool never wrote: its folder was copied or restored."""
 
 
 class Forwarder:
@@ -67,7 +67,7 @@ class Forwarder:
         stored = self._spool.following(self.last)
         if stored is None:
             return 0.0
-        with suppress(OSError):  # the spool may have removed the file just now
+        with suppress(OSError):  # the spool may just have removed the file
             return max(0.0, time.time() - stored.path.stat().st_mtime)
         return None
 
@@ -89,7 +89,7 @@ class Forwarder:
             await asyncio.sleep(AGAIN_S)
 
     async def _forward(self) -> None:
-        """Ask for the stream's position, and send the messages after that position until one is refused."""
+        """Find the spool's last message in the stream, and send the following ones until one is refused."""
         place, sequence = await self._ask()
         while True:
             self._news.clear()

@@ -58,9 +58,7 @@ class LastMessage(NamedTuple):
     """The newest message of a subject."""
 
     place: int  # position in the stream
-    sequence: (
-        int  # number in the gateway's log; 0 for a server's answer that a client has directed to this subject
-    )
+    sequence: int  # number in the gateway's log; 0 if a client has directed a server's answer to this subject
     digest: str
 
 
@@ -89,7 +87,10 @@ async def _answer_to(request: Awaitable[T]) -> T:
 async def samples_path(
     urls: Sequence[str], options: Mapping[str, Any] | None = None
 ) -> AsyncIterator[ServerPath]:
-    """Yield a path that stays connected to one of these servers. Raises FleetError if none can be used."""
+    """Yield a connection to one of these servers, which moves to another server if that one fails.
+
+    Raises FleetError if none of them can be used.
+    """
     path = ServerPath(urls, options, ANSWER_S)
     try:
         await path.open()

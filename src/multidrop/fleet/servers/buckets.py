@@ -50,7 +50,7 @@ _log = logging.getLogger("multidrop.fleet")
 
 
 class Record(NamedTuple):
-    """A key's newest value, and the sequence number that the server gave it.
+    """A key's newest value, and the revision (sequence number) that the server gave it.
 
     The value is None for a removed and for an invalid record.
     """

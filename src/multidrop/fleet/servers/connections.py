@@ -46,7 +46,7 @@ from multidrop.supervisor import end_tasks
 OLDEST = (2, 12)
 CONNECT_S = 1.0
 ANSWER_S = 1.0  # time limit of an answer; leases are renewed twice a second
-PONG_S = 0.7  # time limit of a ping; if a server is slower, the path moves to another server
+PONG_S = 0.7  # time limit of a ping; if a server is slower, the connection moves to another server
 KEEP_S = 1.0  # pause between checks of a connection
 # One attempt: with a limit of 0, nats-py would retry a closed port until `connect` times out.
 ONE_TRY = {"allow_reconnect": False, "max_reconnect_attempts": 1, "reconnect_time_wait": 0.05}
@@ -82,7 +82,8 @@ class ServerPath:
         self._pong_s = pong_s
         self._client: BatchClient | None = None
         self._denials = Denials()
-        self._trouble = ""  # the failure that was logged last; "" once the connection works again
+        # the failure that was logged last; "" if none was logged since the connection worked
+        self._trouble = ""
         self._leaving: set[asyncio.Task[None]] = set()
         self._wanted: dict[str, Callable[[Msg], Any]] = {}  # the function to call with messages, by subject
         self._standing: dict[str, Subscription] = {}  # active subscriptions at the present server, by subject
@@ -227,15 +228,15 @@ class ServerPath:
             raise OutcomeUnknown(f"{self.url} gave no answer to {subject}: {failure}") from None
 
     async def collect(self, subject: str, data: bytes) -> list[DirectMessage]:
-        """Return all messages of a direct get. If this path is slow, repeat the request on the other paths.
+        """Return all messages of a direct get. Raises the errors of `request`.
 
-        Raises the errors of `request`.
+        If this connection is slow, repeat the request on the other connections.
         """
         paths = [self, *(other for other in self.others if other.is_open)]
         return await first_answer(paths, Request(subject, data), self.budget)
 
     async def gather(self, request: Request, get: DirectGet, silence_s: float = ANSWER_S) -> None:
-        """Collect the messages of a direct get on this path only. Raises the errors of `request`."""
+        """Collect the messages of a direct get on this connection only. Raises the errors of `request`."""
         client, denials = self._connected(), self._denials
         before = denials.of_request(request.subject)
         try:

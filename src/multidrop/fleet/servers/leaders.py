@@ -42,7 +42,7 @@ class Replica(NamedTuple):
     name: str
     is_current: bool
     is_offline: bool
-    active_ns: int  # ns since the leader last heard from this server; 0: never
+    active_ns: int  # ns since the leader last received a message from this server; 0: never
 
     @property
     def is_ready(self) -> bool:
@@ -50,9 +50,9 @@ class Replica(NamedTuple):
 
     @property
     def is_silent(self) -> bool:
-        """Return True if the leader never heard from this server, or has not heard from it for 2 s.
+        """Return True if the leader has received no message from this server for 2 s, or never.
 
-        A server whose copy lags behind is not silent if the leader heard from it.
+        A server whose copy lags behind is not silent if the leader hears from it.
         """
         return not self.is_current and not 0 < self.active_ns < SILENT_NS
 
