@@ -1,4 +1,4 @@
-"""`multidrop fleet`: what it prints about a fleet, and its error for each mistake of the user."""
+"""`multidrop fleet`: its output about a fleet, and its error for each mistake of the user."""
 
 from __future__ import annotations
 

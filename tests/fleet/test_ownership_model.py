@@ -356,7 +356,7 @@ class LeaseModel:
         )
 
     def normal(self, path: PathState) -> PathState:
-        """Return a state that stands for all states with the same future."""
+        """Return a representative of all states with the same future."""
         if not self.has_cas:
             return path
         seen = (

@@ -181,7 +181,7 @@ async def test_each_gateway_polls_its_share_and_others_take_a_dead_gateways_line
 
 
 class Ports:
-    """The ports of a gateway's lines. All of them fail while `is_cut` is True."""
+    """The ports of a gateway's lines. All ports fail while `is_cut` is True."""
 
     def __init__(self, member: Member) -> None:
         self.is_cut = False

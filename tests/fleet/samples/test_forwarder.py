@@ -204,7 +204,7 @@ async def test_the_forwarder_ignores_server_answers_among_its_gateways_samples(
 ) -> None:
     """Any client may direct a server's answer to the subject of a gateway's samples.
 
-    It is no message of the gateway.
+    It is not one of the gateway's messages.
     """
     spool = filled(tmp_path / "spool", 2)
     subject = subject_of("gateway-1", spool.log)

@@ -196,14 +196,14 @@ def test_timely_answers_allow_more_repeated_reads() -> None:
     for path in paths:
         path.delay = 0.01
     assert questions(round(2 / EARNED), paths, budget) == 2 / EARNED
-    paths[0].delay = NEVER  # the first connection gives no more answers
+    paths[0].delay = NEVER  # from now on, the first connection never answers
     assert questions(1, paths, budget) == 3
 
 
 def test_enough_reads_can_be_repeated_until_servers_drop_a_dead_route() -> None:
     """Servers need 3 s to notice a dead route.
 
-    A gateway then sends about 100 reads and loses a third of them.
+    A gateway then sends about 100 reads and loses a third.
     """
     paths, budget = [LatePath(0.01) for _ in range(3)], full()
     took = []

@@ -37,7 +37,7 @@ time.time, time.time_ns = lambda: seconds() + 3600, lambda: ns() + 3600 * 10**9
 
 
 def check_that_a_stop_reports_its_progress(fleet: SecuredFleet) -> None:
-    """Check that a stop's sender is told that the drive refuses the stop, and then how the stop ended."""
+    """Check that the sender of a stop first gets the drive's refusal, and later the stop's outcome."""
     fleet.hall.refusing.add("line-1")
     asker = subprocess.Popen(
         [sys.executable, "-m", "multidrop", "fleet", "stop", "drive-line-1"],

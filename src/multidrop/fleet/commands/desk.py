@@ -9,9 +9,9 @@ A stop needs no offer and no entry in `[fleet.may]`: sending a stop twice is har
 harm. The stop is sent first and recorded afterwards.
 
 A gateway subscribes to a line's subjects only while it polls the line. For a line without a master, the
-server therefore reports to a sender that there is no receiver. A gateway is connected to several servers and
-gets each message from each of them. The desks recognise copies by the id that the sender chose. No stream
-stores these messages.
+server therefore reports to a sender that its message has no receiver. A gateway is connected to several
+servers, and each server delivers each message. The desks recognise copies by the id that the sender chose.
+No stream stores these messages.
 """
 
 from __future__ import annotations

@@ -284,8 +284,8 @@ class FleetCommands:
     async def _read_plant(self, otherwise: str) -> None:
         """Update the local copy of the plant from the servers.
 
-        If the servers fail, keep the old copy, because masters check each command. Raises FleetError if there
-        is no copy yet; its message starts with `otherwise`.
+        If the servers fail, keep the old copy, because masters check each command. Without an
+        old copy, raise FleetError with a message that starts with `otherwise`.
         """
         try:
             await self._plant.look()

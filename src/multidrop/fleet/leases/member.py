@@ -124,7 +124,7 @@ class Releases:
             await asyncio.sleep(SERVERS_LOOK_S)
 
     async def look(self) -> None:
-        """Check the servers' states once. Without a line that waits for its release, do nothing."""
+        """Check the servers' states once if a line waits for its release."""
         buckets = names.OWNERS if self._has_lines else ()
         found = await asyncio.gather(*(known_cluster(self._path(), bucket) for bucket in buckets))
         now, before, self._led = self._clock(), self._led, {}

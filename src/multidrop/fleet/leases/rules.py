@@ -61,7 +61,7 @@ def may_send(now: int, until: int) -> bool:
 
 
 def watch(before: SeenRevision | None, revision: int, now: int) -> SeenRevision:
-    """Return what is known about a lease record after a read: `before`, unless the revision is new."""
+    """Return the newest observation of a lease record: `before`, unless the revision is new."""
     return before if before is not None and before.revision == revision else SeenRevision(revision, now)
 
 

@@ -89,7 +89,7 @@ async def samples_path(
 ) -> AsyncIterator[ServerPath]:
     """Yield a connection to one of these servers, which moves to another server if that one fails.
 
-    Raises FleetError if none of them can be used.
+    Raises FleetError if no server can be used.
     """
     path = ServerPath(urls, options, ANSWER_S)
     try:

@@ -52,8 +52,7 @@ KEEP_S = 1.0  # pause between checks of a connection
 ONE_TRY = {"allow_reconnect": False, "max_reconnect_attempts": 1, "reconnect_time_wait": 0.05}
 SEED = "SU"  # prefix of a user's secret key
 CREDS = "-----BEGIN NATS USER JWT-----"
-# A read is repeated if no data comes for the first of these times (s), again after the next one, and so on.
-# It fails after the last one.
+# Times (s) without data after which a read is repeated. After the last one, the read fails.
 AGAIN_S = (0.1, 0.1, 0.2, 0.4, 1.0)
 SLOW = 3.0  # a read is repeated only after this many times the usual response time
 MOST_SILENCE_S = 1.0  # limit of the wait before a repeat, because requests time out after this time
@@ -422,7 +421,7 @@ class RepeatBudget:
         return max(least_s, min(SLOW * self._took_s, MOST_SILENCE_S))
 
     def spend(self, paths: Sequence[ServerPath]) -> Sequence[ServerPath]:
-        """Return as many of these connections as the budget allows, and charge one repeat for each."""
+        """Return as many connections as the budget allows, and charge the budget one repeat for each."""
         asked = paths[: int(self._left)]
         self._left -= len(asked)
         return asked

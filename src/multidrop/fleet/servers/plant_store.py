@@ -142,7 +142,7 @@ def line_of(record: Record, folder: Path) -> PlantLine:
             raise ValueError(f"line {record.key}: the file {name!r} is outside the line's folder")
         (home / path).parent.mkdir(parents=True, exist_ok=True)
         (home / path).write_text(text, "utf-8")
-    plant = home / "line.plant"  # `.plant` is no suffix of family files, so this name is free
+    plant = home / "line.plant"  # family files never have the suffix `.plant`, so this name is free
     plant.write_text(f"line = [{_toml(value['line'])}]\n", "utf-8")
     return Plant.load(plant).lines[0]
 

@@ -189,7 +189,7 @@ def _import(kind: str, account: str, subject: str) -> str:
 
 
 def _shared(some: Iterable[str], others: Iterable[str]) -> Iterator[str]:
-    """Yield each subject that matches an entry of both lists. In an entry, * stands for one token."""
+    """Yield each subject that matches an entry of both lists. In an entry, * matches one token."""
     for one in some:
         for other in others:
             words = list(zip(one.split("."), other.split("."), strict=False))
