@@ -287,7 +287,7 @@ def test_register_that_writes_to_the_address_of_a_motor_command_is_reported() ->
     assert declare(run=run, speed=setting(9, "rpm", ram_address=0x21)).registers
 
 
-def test_registers_that_write_the_same_value_may_share_an_address() -> None:
+def test_two_registers_with_equal_declarations_may_share_an_address() -> None:
     family = declare(
         volts=setting(8, "V"),
         volts_again=setting(8, "V", span=(0, 5)),

@@ -92,7 +92,7 @@ def test_argument_multiple_writes_one_number_with_function_10h(
     assert [request.function for request, _ in line.frames] == [16, 3, 15, 1]
 
 
-def test_masked_write_changes_only_the_bits_outside_the_mask(
+def test_mask_write_changes_only_the_bits_that_are_0_in_the_and_mask(
     meter: tuple[SimulatedBus, ModbusDevice],
 ) -> None:
     line, device = meter
@@ -111,7 +111,7 @@ def test_masked_write_changes_only_the_bits_outside_the_mask(
         device.mask_holding(5, 65536, 0, confirm=True)
 
 
-def test_masked_write_is_unconfirmed_if_the_register_cannot_be_read(
+def test_mask_write_is_unconfirmed_if_the_register_cannot_be_read(
     meter: tuple[SimulatedBus, ModbusDevice],
 ) -> None:
     line, device = meter

@@ -235,7 +235,7 @@ def ask(sim: Any, drive: Drive, request: Message) -> Message:
 
 
 @table("there", [*RECOGNISABLE, "invt-che", "yd1000", "delixi-modbus"])
-def test_scan_finds_only_drives_that_identify_themselves(there: str) -> None:
+def test_scan_finds_drives_that_identify_themselves(there: str) -> None:
     drive = THERE[there](1)
     sweep = Sweep(drive.settings, drive.framing, (), ScanRequest(3, 0, 1), (1,), 0.0, 0.0)
     found, doubt = identify(sweep, 1, SCANNED, partial(ask, simulated(drive)))

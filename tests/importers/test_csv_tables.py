@@ -279,7 +279,7 @@ def test_invalid_csv_table_raises_value_error_with_the_reason(tmp_path: Path, te
 # ---- modpoll ----
 
 
-def test_missing_byte_order_in_modpoll_is_be_le_and_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_missing_modpoll_byte_order_defaults_to_be_le_and_is_marked_as_a_gap(tmp_path: Path) -> None:
     text = "device,m,1\npoll,holding_register,0,4,{}\nref,a,0,uint32,{},V,0.1{}\n"
     device = only(tmp_path, "m.csv", text.format("", "r", ""))
     assert entries(device)["a"]["order"] == "CDAB"

@@ -133,7 +133,7 @@ def test_polls_with_equal_line_settings_are_sent_in_a_row_if_none_is_late() -> N
     assert [each.skipped for each in jobs] == [0] * 20
 
 
-def test_late_poll_is_sent_before_polls_with_the_present_line_settings() -> None:
+def test_poll_whose_slot_ends_soon_goes_before_polls_with_the_same_settings() -> None:
     made = schedule(one := job(1, 30, 10, kind=1), *(job(drive, 1000, 10, kind=2) for drive in range(2, 12)))
     made.take(0, 0, 1, 1)
     waited = [sent - due for each, due, sent in carry_out(made, 1) if each is one]

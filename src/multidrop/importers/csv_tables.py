@@ -250,7 +250,7 @@ def _row(devices: dict[int | None, ImportedDevice], cells: Cells, gaps: list[str
 
 
 def _placed(name: str, cells: Cells, tag: _Tag | None) -> ImportedRegister:
-    """Return a register at the row's address. An ambiguous table or numbering is noted in `gaps`."""
+    """Return a register at the row's address. An ambiguous table or numbering is noted in the family file."""
     register = ImportedRegister(name, 0)
     stated = _table(register, cells)
     given = tag.address if tag else cells["at"]
@@ -306,7 +306,7 @@ def _steps(cells: Cells) -> list[tuple[str, str]]:
 
 
 def _table(register: ImportedRegister, cells: Cells) -> str | None:
-    """Return the table that a row states, else None. An ambiguous or unknown cell is noted in `gaps`."""
+    """Return the table that a row states, or None. An unclear or unknown cell is noted in the family file."""
     if function := cells.get("function"):
         codes = {int(code, 0) for code in re.findall(r"0x[0-9a-f]{1,4}|(?!0\d)\d{1,5}", function.lower())}
         tables = {(_FUNCTIONS | _WRITES).get(code) for code in codes}
@@ -360,7 +360,7 @@ def _fill(device: ImportedDevice, register: ImportedRegister, cells: Cells, tag:
 
 
 def _access(register: ImportedRegister, given: str) -> None:
-    """Set whether the register can be read and written. An unknown word is noted in `gaps`."""
+    """Set whether the register can be read and written. An unknown word is noted in the family file."""
     words = re.sub(r"subscribe|static|only|[^a-z]", "", given.lower())
     if not given:
         return
@@ -423,7 +423,7 @@ def _number(device: ImportedDevice, register: ImportedRegister, cells: Cells, ta
 def _part(register: ImportedRegister, kind: str, cells: Cells, tag: _Tag | None) -> str:
     """Return the bits of the word that the register uses; "" for all.
 
-    A missing bit number is noted in `gaps`.
+    A missing bit number is noted in the family file.
     """
     if tag and tag.part:
         return tag.part
@@ -440,7 +440,7 @@ def _part(register: ImportedRegister, kind: str, cells: Cells, tag: _Tag | None)
 
 
 def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
-    """Return the number format of a row. A missing type or width is noted in `gaps`."""
+    """Return the number format of a row. A missing type or width is noted in the family file."""
     length = cells.get("length", "")
     words = int(length) if _NUMBER.fullmatch(length) else 0
     signed = _SIGNED.get(cells.get("signed", "").lower())
@@ -470,7 +470,7 @@ def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
 
 
 def _order(register: ImportedRegister, given: str) -> str:
-    """Return the byte order that a cell states. A missing byte order is noted in `gaps`."""
+    """Return the byte order that a cell states. A missing byte order is noted in the family file."""
     word = re.sub(r"[^a-z]|endian|first", "", given.lower())
     if not given:
         register.gaps.append("the order of its words is not stated")
@@ -482,7 +482,7 @@ def _order(register: ImportedRegister, given: str) -> str:
 def _scale(register: ImportedRegister, cells: Cells, *, is_neuron: bool) -> None:
     """Set the step and the offset.
 
-    If programs use a column differently, the assumption is noted in `gaps`.
+    If programs use a column differently, the assumption is noted in the family file.
     """
     found = _steps(cells)
     key, given = found[0] if found else ("scale", "")
@@ -558,7 +558,7 @@ def _parse_tag(cell: str) -> _Tag | None:
 
 
 def _tag_order(register: ImportedRegister, tag: _Tag, number: str) -> str:
-    """Return a number's byte order. If the Neuron tag does not state it, that is noted in `gaps`."""
+    """Return a number's byte order. If the Neuron tag does not state it, that is noted in the family file."""
     if tag.order in _TAG_ORDERS:
         return _TAG_ORDERS[tag.order]
     if tag.order:

@@ -168,13 +168,13 @@ class ImportedRegister:
     of_writes: dict[str, Any] = field(default_factory=dict)  # further keys, if the register is written
 
     def note_write(self, *, is_written: bool = True) -> None:
-        """Record whether the source program writes the register. If it does, that is noted in `gaps`."""
+        """Record whether the source program writes the register; a write is noted in the family file."""
         self.is_written = is_written
         if is_written:
             self.gaps.append(WRITTEN)
 
     def put_names(self, key: str, pairs: Mapping[Any, Any]) -> None:
-        """Add names of the register's values or bits. Names that a register cannot have are noted in `gaps`.
+        """Add names of the register's values or bits. Invalid names are noted in the family file.
 
         If a value or bit has several names, the first is used.
         """
@@ -219,7 +219,7 @@ class ImportedDevice:
     names: UniqueNames = field(default_factory=lambda: UniqueNames())
 
     def add(self, found: ImportedRegister, *, is_text: bool = False) -> None:
-        """Add a register under a unique name. An invalid register is recorded in `lost`."""
+        """Add a register under a unique name. An invalid register is recorded as not imported."""
         if not is_whole(found.address):
             self.lose(found.name, f"its address {str(found.address)[:40]!r} is not a whole number")
             return
@@ -236,12 +236,12 @@ class ImportedDevice:
         (self.texts if is_text else self.registers).append(found)
 
     def lose(self, name: str, reason: str, *, is_entry: bool = True) -> None:
-        """Record in `lost` an entry or a key that was not imported, with the reason."""
+        """Record an entry or a key as not imported, with the reason."""
         self.lost.append(Lost(name, reason, is_entry))
 
     @contextmanager
     def entry(self, name: str) -> Iterator[None]:
-        """Record the entry in `lost` if the block raises an error.
+        """Record the entry as not imported if the block raises an error.
 
         Raises ValueError if there are too many entries.
         """
@@ -257,7 +257,7 @@ class ImportedDevice:
             self.lose(name, f"it is not laid out as an entry: {type(failure).__name__} {str(failure)[:100]}")
 
     def lose_keys(self, place: str, given: Mapping[Any, Any], table: KeyTable) -> None:
-        """Record in `lost` the keys of a device or a line that are not imported."""
+        """Record which keys of a device or a line are not imported."""
         for sentence in unimported_keys(given, table):
             self.lose(place, sentence, is_entry=False)
 

@@ -39,7 +39,7 @@ _SHOWN = (
 )
 _TIMES = "skip_updates custom_command"  # entries with custom_command, which sends raw bytes, are not imported
 _WRITES = "write_lambda"
-KEYS = {  # treatment of keys, by kind of entity, such as sensor
+KEYS = {  # how to treat each key, by kind of entity, such as sensor
     "sensor": key_table(
         imported=f"{_ITEM} value_type unit_of_measurement filters",
         irrelevant=f"{_SHOWN} register_count accuracy_decimals state_class force_update expire_after "
@@ -261,7 +261,7 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
 def _filters(register: ImportedRegister, filters: Any) -> None:
     """Combine factors and offsets into a step and an offset, in their order.
 
-    Other filters are noted in `gaps`.
+    Other filters are noted in the family file.
     """
     step, offset = Fraction(1), Fraction(0)
     others: list[str] = []

@@ -46,7 +46,7 @@ _SHOWN = "unique_id device_class lazy_error_count entity_category icon friendly_
 _SWITCH = key_table(
     imported=f"{_ENTITY} write_type command_on command_off verify", irrelevant=f"{_SHOWN} optimistic"
 )
-KEYS = {  # treatment of keys, by kind of entity, such as sensor
+KEYS = {  # how to treat each key, by kind of entity, such as sensor
     "sensors": key_table(
         imported=f"{_ENTITY} unit_of_measurement input_type data_type count structure scale offset swap "
         "reverse_order nan_value slave_count virtual_count",
@@ -237,7 +237,7 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
 def _verify(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
     """Read the state of a switch from its state register, if it has one.
 
-    Values for on and off other than 1 and 0 are noted in `gaps`.
+    Values for on and off other than 1 and 0 are noted in the family file.
     """
     on, off = entry.get("command_on", 1), entry.get("command_off", 0)
     verify = entry.get("verify")
@@ -295,7 +295,7 @@ def _swap(register: ImportedRegister, entry: Mapping[str, Any]) -> str:
 
 
 def _format(register: ImportedRegister, kind: str, entry: Mapping[str, Any]) -> str | None:
-    """Return the number format of a data type, or None. A doubtful width is noted in `gaps`."""
+    """Return the number format of a data type, or None. A doubtful width is noted in the family file."""
     registers = whole(entry, "count", 1)
     if kind in _LEGACY_TYPES:
         # applies only to floats, because an int has 16 bits in every version

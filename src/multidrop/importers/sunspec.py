@@ -74,7 +74,7 @@ def _size(point: Mapping[str, Any]) -> int:
 
 
 def _lose_group(device: ImportedDevice, group: Mapping[str, Any]) -> None:
-    """Record in `lost` the points of a group and of the groups in it."""
+    """Record the points of a group, and of the groups in it, as not imported."""
     for point in group.get("points", []):
         with device.entry(str(group.get("name"))):
             device.lose(

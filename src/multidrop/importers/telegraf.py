@@ -33,7 +33,7 @@ _ORDERS = {  # byte orders by the plugin's names; they also apply to 16-bit and 
     **dict.fromkeys(("CDAB", "GHEFCDAB", "LSW-BE"), "CDAB"),
     **dict.fromkeys(("DCBA", "BA", "HGFEDCBA", "LSW", "LSW-LE"), "DCBA"),
 }
-FIELD_KEYS = {  # treatment of keys, by configuration style
+FIELD_KEYS = {  # how to treat each key, by configuration style
     "register": key_table(imported="name byte_order data_type scale address bit", irrelevant="measurement"),
     "request": key_table(
         imported="address name type length scale omit bit", irrelevant="measurement", gap="output"

@@ -20,20 +20,20 @@ from multidrop.drive.register import COIL, DISCRETE, HOLDING, INPUT, Access, Car
 from multidrop.drive.request import read_request
 from multidrop.planning.blocks import Block, all_requests
 
-MOST_PROOFS = 4  # limit of proofs per drive, because each one uses memory
+MOST_PROOFS = 4  # limit of proofs (see `proofs`) per drive, because each one uses memory
 
 # Tables to read as proofs if a device's other replies all look alike. Even an exception reply has the
 # function code of its table.
 OTHER_TABLES = (INPUT, COIL, HOLDING, DISCRETE)
-# Number of proofs that a drive needs. A late reply to the first proof may still come, so the second is
-# needed. The third is only sent when a silent drive answers again.
+# Number of proofs (see `proofs`) that a drive needs. A late reply to the first proof may still come, so the
+# second is needed. The third is only sent when a silent drive answers again.
 ENOUGH = 3
 
 RawRange = tuple[int, int]  # lowest and highest raw count that the only register of a reply can have
 
 
 def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
-    """Return blocks of this drive that can be read as proofs.
+    """Return the drive's proofs: blocks whose reply shows that no late reply can still come.
 
     Each block comes with the range of raw values that its reply is known to hold, or with None. The last
     block is the least likely to be polled. If a Modbus device has fewer than ENOUGH blocks, blocks of its

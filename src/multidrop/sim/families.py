@@ -58,7 +58,7 @@ class SimulatedCHE(MotorDrive):
     """
 
     functions = (0x03, 0x06)
-    needs_silence = True  # manual, section 11.5
+    needs_silence = True  # CHE manual, section 11.5
     codes = {
         **MODBUS.codes,
         Reason.VALUE: 0x12,
@@ -76,7 +76,7 @@ class SimulatedCHE(MotorDrive):
 
     @property
     def most_gap(self) -> float:
-        return 1.5 * self.drive.settings.character  # manual, section 11.5
+        return 1.5 * self.drive.settings.character  # CHE manual, section 11.5
 
     def setpoint(self) -> float:
         return _signed(self.word(CHE_SETPOINT)) / CHE_FULL * self.motor.maximum_frequency
@@ -440,7 +440,7 @@ class SimulatedYD1000(MotorDrive):
     """
 
     functions = (0x03, 0x06)
-    needs_silence = True  # notes, section 4.3
+    needs_silence = True  # YD1000 notes, section 4.3
 
     _panel_runs = False
     _in_force = 0  # the control word that was accepted last
@@ -462,7 +462,7 @@ class SimulatedYD1000(MotorDrive):
 
     @property
     def most_gap(self) -> float:
-        return 24 * self.drive.settings.character  # notes, section 4.2 (2)
+        return 24 * self.drive.settings.character  # YD1000 notes, section 4.2 (2)
 
     def accepts_broadcast(self, request: Message) -> bool:
         return request.function == 0x06 and request.start in (YD_CONTROL, YD_COMMUNICATION_FREQUENCY)
