@@ -1,4 +1,4 @@
-"""The forwarder: newest rows first, then the backlog; no row is lost or doubled by any failure."""
+"""The forwarder of rows: the newest rows are sent first. A failure neither loses nor doubles a row."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from multidrop.samples import Spool
 
 
 class Clocked:
-    """A forwarder with a simulated clock, `now_s`, its spool, and a receiver that records messages."""
+    """A forwarder under test: its spool, a simulated clock `now_s`, and a receiver that records messages."""
 
     def __init__(self, folder: Path, receiver: Recorded | None = None, most: int = 10**9) -> None:
         self.now_s = 0.0
@@ -38,7 +38,7 @@ class Clocked:
         return pause_s
 
     def exchanges(self) -> list[int]:
-        """Return the numbers of the received exchanges in the order of sending; fail if one is incomplete."""
+        """Return the numbers of the exchanges received, in this order. Fails if an exchange lacks a row."""
         return [n for one in self.receiver.messages for n in exchanges_in(rows_of(one.rows))]
 
 
@@ -62,7 +62,7 @@ def test_newest_message_is_sent_before_the_backlog() -> None:
     assert sent == [9, 4, 5, 12, 6, 7, 8, 10, 11]
 
 
-def test_each_message_is_sent_once_despite_random_outages() -> None:
+def test_each_message_is_sent_once_although_the_receiver_fails_at_random() -> None:
     dice = random.Random(43)
     for _ in range(200):
         position, sent, newest = SpoolPosition(), list[int](), 0
@@ -106,7 +106,7 @@ def test_after_two_hours_without_a_receiver_no_row_is_lost_or_doubled(clocked: C
     assert (clocked.forwarder.problem, clocked.spool.state().lost) == ("", 0)
 
 
-def test_sent_messages_are_removed_from_the_disk(clocked: Clocked) -> None:
+def test_sent_messages_are_deleted_from_the_disk(clocked: Clocked) -> None:
     for number in range(5):
         store(clocked.spool, number * 5, 5)
         clocked.send_all()
@@ -114,7 +114,7 @@ def test_sent_messages_are_removed_from_the_disk(clocked: Clocked) -> None:
     until(lambda: clocked.spool.state().oldest == 6)
 
 
-def test_full_spool_removes_the_oldest_rows_and_counts_them(tmp_path: Path) -> None:
+def test_a_full_spool_deletes_its_oldest_rows_and_counts_them_as_lost(tmp_path: Path) -> None:
     first = Clocked(tmp_path / "one")
     store(first.spool, 0, 5)
     first.spool.close()
@@ -134,8 +134,8 @@ def test_full_spool_removes_the_oldest_rows_and_counts_them(tmp_path: Path) -> N
     full.spool.close()
 
 
-def test_removed_messages_that_were_sent_before_the_backlog_do_not_count_as_lost(tmp_path: Path) -> None:
-    """The full spool removes messages 1 to 3. The receiver already has message 3, so two are lost."""
+def test_messages_already_sent_do_not_count_as_lost_when_a_full_spool_deletes_them(tmp_path: Path) -> None:
+    """The full spool deletes messages 1 to 3. Message 3 had been sent, so only the rows of two are lost."""
     clocked = Clocked(tmp_path / "spool", most=1)
     clocked.spool.acknowledge(3, [(1, 2)])
     for number in range(4):
@@ -163,7 +163,7 @@ def test_a_restarted_forwarder_continues_after_the_last_sent_message(tmp_path: P
     assert [one.is_historical for one in second.receiver.messages[3:]] == [False, True]
 
 
-def test_message_is_sent_again_with_its_id_if_its_answer_was_lost(
+def test_a_message_without_an_acknowledgement_is_sent_again_with_the_same_id(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = Clocked(tmp_path / "spool")
@@ -181,7 +181,9 @@ def test_message_is_sent_again_with_its_id_if_its_answer_was_lost(
 
 
 @pytest.mark.parametrize("text", ["", "{}", '{"newest": "x", "gaps": []}', '{"newest": 2, "gaps": [1]}'])
-def test_with_a_damaged_position_all_stored_messages_are_sent_again(tmp_path: Path, text: str) -> None:
+def test_all_spooled_messages_are_sent_again_if_the_position_file_is_damaged(
+    tmp_path: Path, text: str
+) -> None:
     first = Clocked(tmp_path / "spool")
     first.receiver.failure = OSError("away")
     for number in range(2):
@@ -194,7 +196,7 @@ def test_with_a_damaged_position_all_stored_messages_are_sent_again(tmp_path: Pa
     assert second.receiver.sequences == [2, 1]
 
 
-def test_a_spool_that_is_older_than_its_position_is_reported(tmp_path: Path) -> None:
+def test_a_position_file_beyond_the_newest_spooled_message_is_reported(tmp_path: Path) -> None:
     clocked = Clocked(tmp_path / "spool")
     (tmp_path / "spool" / "position.json").write_text('{"newest": 7, "gaps": []}')
     store(clocked.spool, 0, 5)
@@ -207,7 +209,7 @@ def test_a_spool_that_is_older_than_its_position_is_reported(tmp_path: Path) -> 
 # ---- receivers ----
 
 
-def test_a_message_is_skipped_if_the_receiver_refuses_it_but_accepts_other_messages(clocked: Clocked) -> None:
+def test_a_refused_message_is_skipped_if_the_receiver_accepts_other_messages(clocked: Clocked) -> None:
     clocked.receiver.failure = Refused("HTTP Error 400: field type conflict")
     store(clocked.spool, 0, 5)
     assert clocked.send_all() > 0
@@ -219,7 +221,7 @@ def test_a_message_is_skipped_if_the_receiver_refuses_it_but_accepts_other_messa
     assert (clocked.receiver.sequences, clocked.forwarder.refused) == ([2], 50)
 
 
-def test_no_message_is_lost_if_a_wrong_setting_makes_the_receiver_refuse_all(clocked: Clocked) -> None:
+def test_no_message_is_lost_while_the_receiver_refuses_all_messages(clocked: Clocked) -> None:
     clocked.receiver.failure = Refused("HTTP Error 400: database is required")
     for number in range(5):
         store(clocked.spool, number * 5, 5)
@@ -231,7 +233,7 @@ def test_no_message_is_lost_if_a_wrong_setting_makes_the_receiver_refuse_all(clo
     assert clocked.forwarder.refused == 0
 
 
-def test_receiver_that_hangs_is_reported(clocked: Clocked) -> None:
+def test_a_hanging_receiver_is_reported(clocked: Clocked) -> None:
     found = []
 
     def hang() -> None:
@@ -246,7 +248,7 @@ def test_receiver_that_hangs_is_reported(clocked: Clocked) -> None:
 
 
 @table("failure", [OSError("away"), KeyError("bug"), MemoryError()])
-def test_rows_are_kept_after_a_failure_of_any_kind(tmp_path: Path, failure: Exception) -> None:
+def test_rows_stay_in_the_spool_after_any_failure_of_the_receiver(tmp_path: Path, failure: Exception) -> None:
     clocked = Clocked(tmp_path / "spool")
     clocked.receiver.failure = failure
     store(clocked.spool, 0, 5)
@@ -258,7 +260,7 @@ def test_rows_are_kept_after_a_failure_of_any_kind(tmp_path: Path, failure: Exce
     assert clocked.exchanges() == list(range(5))
 
 
-def test_appended_rows_are_sent_by_the_thread(clocked: Clocked) -> None:
+def test_the_forwarder_thread_sends_new_rows(clocked: Clocked) -> None:
     thread = threading.Thread(target=clocked.forwarder.run)
     thread.start()
     clocked.spool.append(numbered(0, 5))

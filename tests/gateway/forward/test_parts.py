@@ -1,4 +1,4 @@
-"""The parts `postgres`, `influx` and `upload`: settings, units, health, and receivers that hang."""
+"""Forwarding of rows by `postgres`, `influx` and `upload`: settings, units, health, hanging receivers."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ from multidrop.samples import SpoolState, unpack
         ('[serve.mqtt]\nrows = true\nmost = "1"', "[serve.mqtt]: most = invalid size '1': write 1 kB or"),
     ],
 )
-def test_mistake_in_the_settings_is_reported_in_one_sentence(
+def test_each_mistake_in_the_forwarding_settings_is_reported_in_one_sentence(
     tmp_path: Path, serve: str, mistake: str
 ) -> None:
     with pytest.raises(PlantError) as wrong:
@@ -107,7 +107,7 @@ def test_mistake_in_the_settings_is_reported_in_one_sentence(
     assert mistake.format(folder=tmp_path) in found
 
 
-def test_missing_library_is_reported_in_one_sentence() -> None:
+def test_a_missing_library_of_a_receiver_is_reported_in_one_sentence() -> None:
     missing = ImportError("No module named 'pyarrow'", name="pyarrow")
     assert missing_library("influx", missing).startswith(
         "it needs pyarrow, which is not installed: pip install 'pyarrow"
@@ -116,7 +116,7 @@ def test_missing_library_is_reported_in_one_sentence() -> None:
     assert "# multidrop[postgres]" in missing_library("postgres", missing)
 
 
-def test_a_folder_that_is_not_a_spool_is_reported_in_one_sentence(tmp_path: Path) -> None:
+def test_a_spool_folder_with_other_files_is_reported_in_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "spool" / "upload").mkdir(parents=True)
     (tmp_path / "spool" / "upload" / "rows.csv").touch()
     with pytest.raises(ValueError, match=r"is not a spool: it holds 'rows.csv'"):
@@ -124,7 +124,7 @@ def test_a_folder_that_is_not_a_spool_is_reported_in_one_sentence(tmp_path: Path
 
 
 @pytest.mark.slow
-def test_gateway_sends_all_rows_with_units_and_shows_no_secret(tmp_path: Path) -> None:
+def test_gateway_uploads_all_rows_with_units_and_shows_no_secret(tmp_path: Path) -> None:
     with web_server() as posted:
         (tmp_path / "token").write_text("T0K3N\n")
         serve = f'[serve.upload]\nurl = "{posted.url}"\ntoken = "token"\n'
@@ -142,13 +142,14 @@ def test_gateway_sends_all_rows_with_units_and_shows_no_secret(tmp_path: Path) -
         assert posted.headers[0]["idempotency-key"] == posted.batches[0]["id"]
     units = {(row["register"], row["unit"]) for row in rows}
     assert {("output_frequency", "Hz"), ("output_current", "A"), ("status", "names of invt-che")} <= units
-    for one in posted.batches:  # on a busy machine, several misses may have the same time
+    # Ignore rows without a value: on a busy machine, two failed reads of a register may have the same time.
+    for one in posted.batches:
         one["rows"] = [row for row in one["rows"] if row["value"] is not None]
     assert set(Counter(keys_in(posted.batches)).values()) == {1}
 
 
 @pytest.mark.slow
-def test_a_receiver_that_hangs_delays_neither_polls_nor_stops_nor_the_shutdown(tmp_path: Path) -> None:
+def test_a_hanging_receiver_delays_neither_polling_nor_stops_nor_the_shutdown(tmp_path: Path) -> None:
     with web_server() as posted:
         posted.hang.clear()
         with served(tmp_path, f'[serve.upload]\nurl = "{posted.url}"\n') as gateway:
@@ -164,7 +165,7 @@ def test_a_receiver_that_hangs_delays_neither_polls_nor_stops_nor_the_shutdown(t
 
 
 @pytest.mark.slow
-def test_a_disk_that_hangs_while_a_file_is_removed_does_not_delay_rows(
+def test_new_rows_do_not_wait_while_the_disk_hangs_at_deleting_a_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     part = forwarding("upload", "http://localhost:9/", tmp_path)
@@ -211,7 +212,9 @@ def test_health_reports_lost_rows_until_the_backlog_is_sent(tmp_path: Path) -> N
     spool.close()
 
 
-def test_stdout_gets_line_protocol(tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes]) -> None:
+def test_rows_are_written_to_stdout_in_the_influx_line_protocol(
+    tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes]
+) -> None:
     part = forwarding("influx", "stdout", tmp_path)
     store(part._spool, 0, 1)
     part._forwarder.step()
@@ -221,11 +224,11 @@ def test_stdout_gets_line_protocol(tmp_path: Path, capfdbinary: pytest.CaptureFi
     assert len(lines) == 10
 
 
-def test_flush_of_stdout_does_not_wait_for_a_reader_that_hangs(
+def test_a_hanging_reader_of_stdout_does_not_block_a_flush_by_another_thread(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     part = forwarding("influx", "stdout", tmp_path)
-    store(part._spool, 0, 150)  # more than a pipe holds
+    store(part._spool, 0, 150)  # more bytes than the buffer of a pipe
     reading, writing = os.pipe()
     with os.fdopen(writing, "w", encoding="utf-8") as output:
         monkeypatch.setattr(sys, "stdout", output)
@@ -257,7 +260,7 @@ def plant_with(unit: str, folder: Path) -> Plant:
 
 
 def batch_at(time_ns: int) -> Any:
-    """Return a batch with one row of pump-1's `load`, requested at this monotonic time."""
+    """Return a batch with one row: `load` of pump-1, requested at `time_ns` (monotonic)."""
     columns = Columns(1)
     found = new_completion(result=7, sent_ns=time_ns, first_ns=time_ns + 1)
     found.reply.data_len = 2
@@ -266,7 +269,7 @@ def batch_at(time_ns: int) -> Any:
     return Batch(columns, Names(["pump-1"]), Names(["load"]))
 
 
-def test_units_follow_the_present_plant_and_rows_of_unknown_units_are_left_out(
+def test_rows_get_the_units_of_the_present_plant_or_are_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sent: list[Any] = []
@@ -281,7 +284,7 @@ def test_units_follow_the_present_plant_and_rows_of_unknown_units_are_left_out(
     )
     made.take(batch_at(900))
     made.adopt(plant_with("%", tmp_path))
-    made.take(batch_at(999))  # requested before the new plant was adopted, so its unit is unknown
+    made.take(batch_at(999))  # requested before the new plant was in effect, so its unit is unknown
     made.take(batch_at(1000))
     made._spool.close()
     [stored] = made._spool._folder.messages.values()
@@ -342,11 +345,11 @@ def test_rows_are_sent_as_json_objects() -> None:
         (("a", "n", inf, "ok", "%"), 'm,drive=a,register=n,unit=% miss="not a finite number"'),
     ],
 )
-def test_row_is_written_in_line_protocol(row: Any, line: str) -> None:
+def test_a_row_is_formatted_in_the_influx_line_protocol(row: Any, line: str) -> None:
     assert line_protocol(rows_at_noon(row), "m").decode() == f"{line} {NOON}\n"
 
 
-def test_many_rows_are_sent_in_pieces() -> None:
+def test_many_rows_are_sent_in_several_requests() -> None:
     table = rows_at_noon(*[("a", "n", float(number), "ok", None) for number in range(2 * MOST_ROWS + 1)])
     assert [len(one) for one in pieces(table)] == [MOST_ROWS, MOST_ROWS, 1]
     assert [row["value"] for one in pieces(table) for row in row_objects(one)] == table["value"].to_pylist()

@@ -1,4 +1,4 @@
-"""Real receivers: PostgreSQL, InfluxDB, mosquitto and a web server get every row, and none twice."""
+"""PostgreSQL, InfluxDB, mosquitto and a web server receive each row exactly once."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ KINDS = ("postgres", "influx", "upload", "mqtt")
 
 @dataclass
 class Receiver:
-    """A running receiver: the address to send rows to, and a function that returns its rows' keys."""
+    """A running receiver of rows: its address, and a function that returns the keys of the received rows."""
 
     where: str
     keys: Callable[[], list[Key]]
@@ -88,7 +88,7 @@ def receiver(kind: str, folder: Path) -> Iterator[Receiver]:
 
 
 def wanted(exchanges: range) -> Counter[Key]:
-    """Return the keys of all rows of these exchanges, each with the count 1."""
+    """Return the key of each row of these exchanges, with the count 1."""
     return Counter(
         (NOON + number * STEP, f"pump-{number % 4 + 1}", f"value_{at}")
         for number in exchanges
@@ -100,8 +100,10 @@ def wanted(exchanges: range) -> Counter[Key]:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("kills", first_in_ci(3, 20))
-def test_after_kills_at_any_moment_no_row_is_lost_or_doubled(tmp_path: Path, kind: str, kills: int) -> None:
-    """Each run has its own range of exchange numbers. Each row that was on the disk must arrive once."""
+def test_a_gateway_killed_at_any_moment_loses_and_doubles_no_row(
+    tmp_path: Path, kind: str, kills: int
+) -> None:
+    """Each run of the gateway has its own exchange numbers. Each row on the disk must arrive exactly once."""
     dice = random.Random(kills)
     support = os.pathsep.join(map(str, Path(forwarded.__file__).parents[1].iterdir()))
     here = {**os.environ, "PYTHONPATH": support}
@@ -134,8 +136,8 @@ def test_after_kills_at_any_moment_no_row_is_lost_or_doubled(tmp_path: Path, kin
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kills", first_in_ci(3, 20))
-def test_after_kills_of_the_database_no_row_is_lost_or_doubled(tmp_path: Path, kills: int) -> None:
-    """The server is killed while rows arrive, and started again. Each row must be stored once."""
+def test_kills_of_the_database_lose_and_double_no_row(tmp_path: Path, kills: int) -> None:
+    """The database is killed while rows arrive, and is then started again."""
     dice = random.Random(kills)
     with postgres() as database:
         part = forwarding("postgres", database.where, tmp_path / "gateway")
@@ -160,7 +162,7 @@ def test_after_kills_of_the_database_no_row_is_lost_or_doubled(tmp_path: Path, k
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_values_and_misses_arrive_as_polled(tmp_path: Path, kind: str) -> None:
+def test_a_receiver_gets_all_rows_with_and_without_values(tmp_path: Path, kind: str) -> None:
     with receiver(kind, tmp_path) as target:
         part = forwarding(kind, target.where, tmp_path / "gateway")
         store(part._spool, 0, 20)
@@ -172,8 +174,8 @@ def test_values_and_misses_arrive_as_polled(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.slow
-def test_database_has_the_values_units_and_positions(tmp_path: Path) -> None:
-    """The gateway's database user either has the right to create a schema, or owns the schema."""
+def test_database_has_the_values_and_units_of_rows_and_the_forwarder_position(tmp_path: Path) -> None:
+    """The gateway's database user either may create a schema, or owns one."""
     with postgres() as database:
         database.ask("create role gateway login")
         database.ask("create schema multidrop authorization gateway")
@@ -207,7 +209,7 @@ def test_a_database_that_was_down_for_two_hours_gets_each_row_once(tmp_path: Pat
         assert sender.step() == 0
         database.kill()
         due_s = 0.0
-        for number in range(1, 61):  # two minutes each
+        for number in range(1, 61):  # 60 steps of two minutes
             store(part._spool, number * 5, 5)
             now_s[0] += 120.0
             if now_s[0] >= due_s:
@@ -250,12 +252,12 @@ def test_broker_that_is_away_for_two_hours_gets_each_row_once(tmp_path: Path) ->
         range(300)
     )
     first = parse_time(received[0]["rows"][0]["time"])
-    assert first >= NOON + 295 * STEP  # the newest message comes first
+    assert first >= NOON + 295 * STEP  # from the last of the 60 messages
     assert [one["historical"] for one in received] == [*[False] * 4, *[True] * 59 * 4]
 
 
 @pytest.mark.slow
-def test_influx_keeps_names_with_special_characters_and_writes_a_point_once(tmp_path: Path) -> None:
+def test_influx_keeps_special_characters_of_names_and_stores_a_repeated_row_once(tmp_path: Path) -> None:
     given = [
         ("a b,c=d", "n", 1e-7, "ok", "kgf/cm²"),
         ("насос", "n", 1.0, "ok", "names of yd1000"),
@@ -320,7 +322,7 @@ class Influx:
         return f"http://127.0.0.1:{self.port}/write?db=plant"
 
     def ask(self, query: str, method: str = "GET") -> list[dict[str, Any]]:
-        """Return the rows of a query's first series, with times in ns."""
+        """Return the rows of the first series of a query's answer, with times in ns."""
         words = urllib.parse.urlencode({"db": "plant", "q": query, "epoch": "ns"})
         request = urllib.request.Request(f"http://127.0.0.1:{self.port}/query?{words}", method=method)
         with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:

@@ -40,12 +40,12 @@ from multidrop.gateway.http.rights import digest
 
 HEAD = b"POST /api/act HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n"
 SLOW = [b"", b"POST /api/act HTTP/1.1\r\nhost: loc", HEAD + b"content-length: 100\r\n\r\n{"]
-DESCRIPTORS = MOST_OPEN + 4 * BACKLOG  # limit of files: too few for all slow clients
+DESCRIPTORS = MOST_OPEN + 4 * BACKLOG  # limit of open files for the gateway: too low for the 500 slow clients
 
 
 @contextmanager
 def slow_clients(port: int, sent: bytes) -> Iterator[list[socket.socket]]:
-    """Open 500 connections, each of which sends `sent` and then nothing."""
+    """Open 500 connections, send `sent` on each, and then keep silent."""
     with ExitStack() as stack:
         found = []
         for _ in range(500):
@@ -101,7 +101,9 @@ def connected(gateway: Served) -> Iterator[socket.socket]:
         yield client
 
 
-def test_slow_body_is_answered_with_408(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_request_whose_body_does_not_arrive_is_answered_with_408(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(messages, "BODY_S", 0.1)
     with connected(gateway) as client:
         client.sendall(SLOW[2])
@@ -109,7 +111,9 @@ def test_slow_body_is_answered_with_408(gateway: Served, monkeypatch: pytest.Mon
     assert gateway.get("/api/plant").status == 200
 
 
-def test_connection_with_slow_headers_is_closed(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_connection_whose_headers_do_not_arrive_is_closed(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(connections, "FIRST_S", 0.1)
     with connected(gateway) as client:
         client.sendall(SLOW[1])
@@ -124,11 +128,12 @@ def test_a_request_with_long_headers_is_refused_unless_it_is_a_stop(gateway: Ser
     assert gateway.post("/api/stop", {}, cookie=cookie).status == 200
 
 
-def test_headers_in_pieces_are_accepted_up_to_the_limit(gateway: Served) -> None:
+def test_headers_that_arrive_in_pieces_are_accepted_up_to_the_size_limit(gateway: Served) -> None:
     head = b"GET /api/plant HTTP/1.1\r\nhost: localhost\r\ncookie: "
     with connected(gateway) as client:
         client.sendall(head + b"b" * (MOST_HEAD // 2))
-        assert gateway.get("/page/icon.svg").status == 200  # by now, the first piece has been read
+        # when this is answered, the gateway has read the first piece
+        assert gateway.get("/page/icon.svg").status == 200
         client.sendall(b"\r\n\r\n")
         assert client.recv(1000).startswith(b"HTTP/1.1 200 ")
     with connected(gateway) as client:
@@ -159,7 +164,7 @@ def is_ended(pair: tuple[socket.socket, socket.socket]) -> bool:
         return False
 
 
-def test_connections_are_closed_at_the_time_limits_of_their_requests(
+def test_a_connection_is_closed_if_it_stays_without_a_request_too_long(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
 ) -> None:
     connections = Connections(clock)
@@ -179,19 +184,20 @@ def test_connections_are_closed_at_the_time_limits_of_their_requests(
     connections.sweep()
     assert [is_ended(pair) for pair in pairs[1:3]] == [False, True]
     assert (len(connections), connections.ended) == (1, 2)
-    connections.finish(("10.0.0.9", 9))  # an unknown client is ignored
+    connections.finish(("10.0.0.9", 9))  # unknown client address: ignored
     assert len(connections) == 1
 
 
-def test_the_longest_idle_connection_is_closed_to_accept_a_new_connection(
+def test_the_connection_that_is_idle_longest_is_closed_to_accept_a_new_one(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
 ) -> None:
     connections = Connections(clock)
     for n in range(MOST_OPEN):
         connections.add(pairs[n][1], ("10.0.0.1", n))
-    connections.begin(("10.0.0.1", 0))  # a request of this connection is in progress
+    connections.begin(("10.0.0.1", 0))  # connection 0 has a request in progress
     connections.begin(("10.0.0.1", 1))
-    connections.finish(("10.0.0.1", 1))  # from now on, this connection is idle
+    # the request of connection 1 has ended, so it is idle only from now on
+    connections.finish(("10.0.0.1", 1))
     connections.add(pairs[MOST_OPEN][1], ("10.0.0.2", 1))
     assert [n for n, pair in enumerate(pairs) if is_ended(pair)] == [2]
     for n in range(MOST_OPEN):
@@ -199,13 +205,13 @@ def test_the_longest_idle_connection_is_closed_to_accept_a_new_connection(
     connections.begin(("10.0.0.2", 1))
     connections.add(pairs[MOST_OPEN + 1][1], ("10.0.0.2", 2))
     assert len(connections) == MOST_OPEN
-    assert not is_ended(pairs[MOST_OPEN + 1])  # the newest connection is never closed
+    assert not is_ended(pairs[MOST_OPEN + 1])  # the new connection itself stays open
 
 
 def test_new_connection_is_not_closed_before_its_first_request(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
 ) -> None:
-    """The first request may be a stop, so a later connection must not displace this connection."""
+    """The first request may be a stop, so a newer connection must not replace this one."""
     connections = Connections(clock)
     for n in range(MOST_OPEN):
         connections.add(pairs[n][1], ("10.0.0.1", n))
@@ -216,7 +222,7 @@ def test_new_connection_is_not_closed_before_its_first_request(
 
 
 @pytest.mark.parametrize("is_stalled", [False, True], ids=["sends ahead", "reads nothing"])
-def test_greedy_connections_are_closed_first_and_those_with_stops_last(
+def test_greedy_connections_are_closed_first_and_those_that_sent_stops_last(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]], is_stalled: bool
 ) -> None:
     connections = Connections(clock)
@@ -236,7 +242,7 @@ def test_greedy_connections_are_closed_first_and_those_with_stops_last(
     assert len(connections) == MOST_OPEN
 
 
-def test_client_that_reads_no_answers_is_closed(
+def test_a_connection_whose_client_reads_no_answers_is_closed(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
 ) -> None:
     connections = Connections(clock)
@@ -250,7 +256,7 @@ def test_client_that_reads_no_answers_is_closed(
     assert [is_ended(pair) for pair in pairs[:2]] == [True, False]
 
 
-async def test_one_request_starts_per_loop_round_and_stops_start_first() -> None:
+async def test_one_request_starts_per_event_loop_cycle_and_stops_start_first() -> None:
     order: list[str] = []
 
     async def take(turns: Turns, name: str, waiting: deque[asyncio.Future[None]]) -> None:
@@ -264,15 +270,15 @@ async def test_one_request_starts_per_loop_round_and_stops_start_first() -> None
     stop = asyncio.create_task(take(turns, "stop", turns.stops))
     reads[1].cancel()
     await asyncio.gather(stop, *reads, return_exceptions=True)
-    assert order == ["read 0", "read 2", "stop", "read 3"]  # read 2 got its turn before the stop arrived
-    await take(turns, "later", turns.others)  # no other request is waiting
+    assert order == ["read 0", "read 2", "stop", "read 3"]  # read 2 had its turn before the stop arrived
+    await take(turns, "later", turns.others)  # starts immediately, because no other request waits
     assert order[-1] == "later"
 
 
 def test_stop_is_answered_before_reads_that_arrived_earlier(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """20 clients send 5 requests each at the same time, and read no answers."""
+    """20 clients send 5 requests each at the same time and read no answers."""
     order: list[str] = []
     come, go_on = threading.Event(), threading.Event()
     described = web.describe
@@ -328,7 +334,7 @@ def test_unfinished_request_is_answered_with_503_at_shutdown(
     assert "Traceback" not in caplog.text
 
 
-def test_a_client_that_sends_requests_ahead_counts_as_greedy_until_answered(
+def test_a_client_that_pipelines_requests_counts_as_greedy_until_answered(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on = asyncio.Event()

@@ -1,4 +1,4 @@
-"""The API: openapi.json describes all routes, commands have ids, and unknown names are refused."""
+"""The HTTP API: openapi.json describes all routes, commands have ids, and unknown names are refused."""
 
 from __future__ import annotations
 
@@ -31,16 +31,17 @@ from multidrop.gateway.http.messages import language_of
 from multidrop.gateway.http.operations import OPERATIONS, openapi
 from multidrop.gateway.http.rights import COMMAND_ID, May, Right
 
-DRIVES = ["pump-1", "pump-2", "pump-9"]  # the last one is unknown
+DRIVES = ["pump-1", "pump-2", "pump-9"]  # pump-9 is unknown
 MAY = May("anyone", Right.WRITE, frozenset({"pump-1.setpoint"}), frozenset({"pump-1.start"}))
 PHASES = os.environ.get("SCHEMATHESIS_PHASES", "fuzzing")
-EXAMPLES = os.environ.get("SCHEMATHESIS_EXAMPLES", "3")  # number of examples of each route in each phase
+# examples that schemathesis makes for each route, in each of its phases
+EXAMPLES = os.environ.get("SCHEMATHESIS_EXAMPLES", "3")
 START = {"drive": "pump-1", "verb": "start"}
 
 
 @pytest.fixture(scope="module")
 def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """A gateway whose callers have all rights."""
+    """A gateway that gives all rights to every caller."""
     folder = tmp_path_factory.mktemp("open")
     parts = '[serve.history]\n[serve.modbus]\nlisten = "127.0.0.1:0"\n'
     with served(folder, parts, may=MAY, tokens=(), audit=folder / "audit.jsonl") as gateway:
@@ -48,7 +49,7 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         yield gateway
 
 
-def test_each_route_is_described_with_its_refusals(gateway: Served) -> None:
+def test_openapi_describes_each_route_with_its_refusals(gateway: Served) -> None:
     told = gateway.get("/openapi.json").json
     assert told == json.loads(json.dumps(openapi(gateway.gateway.version)))
     assert set(told["paths"]) == {one.path for one in OPERATIONS}
@@ -81,13 +82,15 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_commands_with_unknown_names_are_refused(gateway: Served, case: str) -> None:
+def test_commands_with_unknown_drives_verbs_or_options_are_refused(gateway: Served, case: str) -> None:
     path, body, status, sentence = REFUSED[case]
     answer = gateway.command(path, body)
     assert (answer.status, answer.json["error"].startswith(sentence)) == (status, True)
 
 
-def test_answer_log_and_audit_log_name_the_command(gateway: Served, caplog: pytest.LogCaptureFixture) -> None:
+def test_answer_and_log_and_audit_log_have_the_id_of_the_command(
+    gateway: Served, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level(logging.INFO)
     setpoint = {"drive": "pump-1", "register": "setpoint", "value": 40.0}
     written = gateway.command("/api/write", {**setpoint, "id": "order-7"}).json
@@ -110,12 +113,12 @@ def audit(gateway: Served) -> list[dict[str, Any]]:
 
 
 def recorded(gateway: Served, command: str) -> set[tuple[str, str]]:
-    """Return the pairs of outcome and drive in the audit records of a command."""
+    """Return the (outcome, drive) pairs in the audit records of a command id."""
     records = [one for one in audit(gateway) if one.get("id") == command]
     return {(one["outcome"], drive) for one in records for drive in one["drive"].split(", ")}
 
 
-def test_requests_give_times_as_iso_text_or_ms(gateway: Served) -> None:
+def test_query_times_are_accepted_as_iso_text_or_ms(gateway: Served) -> None:
     def status(begin: str) -> int:
         return gateway.get(f"/api/alarms?from={begin}&to=2100-01-01").status
 
@@ -133,7 +136,7 @@ def test_long_answers_are_compressed(gateway: Served, path: str) -> None:
     assert "accept-encoding" in plain.headers["vary"]
     assert packed.headers["content-encoding"] == "gzip"
     assert len(packed.body) < len(plain.body) / 2
-    if path != "/metrics":  # metrics change between two requests
+    if path != "/metrics":  # the metrics change from one request to the next
         assert gzip.decompress(packed.body) == plain.body
 
 
@@ -160,8 +163,8 @@ def test_registers_have_titles_in_the_language_of_the_request(
 
 
 @pytest.mark.parametrize("hostile", ["a" * 10**6, "zh" + " " * 10**6], ids=["letters", "spaces"])
-def test_a_long_list_of_languages_is_read_in_linear_time(hostile: str) -> None:
-    """With quadratic time, this test would take hours, and a 60 kB header would delay stops for a minute."""
+def test_a_long_accept_language_header_is_parsed_in_linear_time(hostile: str) -> None:
+    """In quadratic time, a 60 kB header would delay stops for a minute, and this test would take hours."""
     headers = [(b"accept-language", f"{hostile}!, ru".encode())]
     assert language_of(Request({"type": "http", "headers": headers, "query_string": b""})) == "ru"
 
@@ -207,7 +210,7 @@ def test_schemathesis_finds_no_undeclared_answer(gateway: Served, tmp_path: Path
 
 
 def narrowed(node: Any, key: str = "", *, is_answer: bool = False) -> Any:
-    """Return the API's description, narrowed: only the drives in DRIVES, no additional keys in answers."""
+    """Return openapi.json with only the drives in DRIVES, and with no undeclared keys allowed in answers."""
     if isinstance(node, list):
         return [narrowed(one, key, is_answer=is_answer) for one in node]
     if not isinstance(node, dict):
@@ -229,7 +232,7 @@ EXPORT = "/api/export?from=0&to=1&format={}"
 
 
 class SlowHistory:
-    """A history whose exports wait until the test releases them."""
+    """A history whose exports wait until the test sets `go_on`."""
 
     def __init__(self) -> None:
         self.begun = 0
@@ -250,7 +253,7 @@ class SlowHistory:
     async def close(self) -> None: ...
 
 
-def test_concurrent_exports_are_limited_and_delay_no_stop(tmp_path: Path) -> None:
+def test_concurrent_exports_are_limited_and_do_not_delay_a_stop(tmp_path: Path) -> None:
     with (
         served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway,
         ThreadPoolExecutor(MOST_EXPORTS) as clients,
@@ -258,7 +261,8 @@ def test_concurrent_exports_are_limited_and_delay_no_stop(tmp_path: Path) -> Non
         part: Any = SlowHistory()
         gateway.gateway.feeds["history"] = part
         try:
-            for wrong in ("xlsx", "csv&series=pump"):  # invalid exports do not count towards the limit
+            # invalid requests for exports do not count towards the limit of exports
+            for wrong in ("xlsx", "csv&series=pump"):
                 for _ in range(2 * MOST_EXPORTS):
                     assert gateway.get(EXPORT.format(wrong)).status == 400
             paths = [EXPORT.format(("csv", "parquet")[at % 2]) for at in range(MOST_EXPORTS)]
@@ -285,7 +289,7 @@ def test_concurrent_exports_are_limited_and_delay_no_stop(tmp_path: Path) -> Non
         ("series=%D0%BD%D0%B0%D1%81%D0%BE%D1%81.y&", "насос.y 2026-11-21T12-00-00Z to 2026-11-21T12-10-00Z"),
     ],
 )
-def test_export_file_name_has_drive_and_time_range(asked: str, name: str) -> None:
+def test_file_name_of_an_export_has_the_drive_and_the_time_range(asked: str, name: str) -> None:
     noon = 1_795_262_400_000
 
     class Quick(SlowHistory):
@@ -318,9 +322,7 @@ TYPES = {
 
 
 @table(("path", "media_type"), TYPES.items())
-def test_page_files_have_types_and_a_request_with_a_known_etag_gets_304(
-    gateway: Served, path: str, media_type: str
-) -> None:
+def test_page_files_have_content_types_and_etags(gateway: Served, path: str, media_type: str) -> None:
     answer = gateway.get(path)
     assert (answer.status, answer.headers["content-type"]) == (200, media_type)
     again = gateway.get(path, if_none_match=answer.headers["etag"])
@@ -330,12 +332,14 @@ def test_page_files_have_types_and_a_request_with_a_known_etag_gets_304(
 
 
 @table("name", ["", "app", "../gateway.py", "%2e%2e/gateway.py", "vendor", "/etc/passwd"])
-def test_files_outside_the_page_folder_are_not_served(gateway: Served, name: str) -> None:
+def test_files_outside_the_folder_of_the_web_page_are_not_served(gateway: Served, name: str) -> None:
     answer = gateway.get(f"/page/{name}")
     assert (answer.status, answer.json) == (404, {"error": "unknown path"})
 
 
-def test_installation_without_a_page_answers_404(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gateway_installed_without_the_web_page_answers_404(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(files.PageFiles.__init__, "__defaults__", (tmp_path / "missing",))
     with served(tmp_path) as gateway:
         assert "this version of multidrop has no page" in gateway.get("/").json["error"]

@@ -1,4 +1,4 @@
-"""Callers have exactly the rights in TABLE; requests from pages of other sites are refused."""
+"""Callers have exactly the rights in TABLE. Requests from web pages of other sites are refused."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ UNLISTED_VERB = ("/api/act", {"drive": "pump-1", "verb": "jog", "options": {}})
 STOP_VERB = ("/api/act", {"drive": "pump-2", "verb": "stop", "options": {}})
 ACTS = (STOP, WRITE, UNLISTED_WRITE, RESET, UNLISTED_VERB, STOP_VERB)
 
-LOCAL, OTHER = "127.0.0.1", "10.0.0.7"  # client addresses as a proxy reports them
-# Keys: settings and caller's address. Values, for each right of a token (None: no token): the expected status
-# of all requests in LOOKS, and the expected status of each request in ACTS.
+LOCAL, OTHER = "127.0.0.1", "10.0.0.7"  # client addresses that a proxy reports in X-Forwarded-For
+# Keys: (settings, address of the caller). Values: a list with, for each token (by its right; None: no token),
+# the expected HTTP status of all requests in LOOKS, and the expected status of each request in ACTS.
 TABLE = {
     (MAY, LOCAL): [
         (None, 200, (401, 401, 401, 401, 401, 401)),
@@ -91,7 +91,7 @@ TABLE = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("serve", "address"), TABLE)
-def test_callers_have_the_rights_of_their_token_and_the_settings(
+def test_callers_have_the_rights_that_their_token_and_the_settings_give(
     tmp_path: Path, serve: str, address: str
 ) -> None:
     with served(tmp_path, serve, behind_proxy=address is OTHER) as gateway:
@@ -99,15 +99,16 @@ def test_callers_have_the_rights_of_their_token_and_the_settings(
         for right, look, acts in TABLE[serve, address]:
             headers = {} if right is None else {"authorization": gateway.bearer(right)}
             if address is OTHER:
-                headers["x_forwarded_for"] = f"127.0.0.1, {address}"  # the client invented the first address
+                # a client may send any X-Forwarded-For; the proxy appends the true address
+                headers["x_forwarded_for"] = f"127.0.0.1, {address}"
             looks = {path: gateway.get(path, **headers).status for path in LOOKS}
             assert looks == dict.fromkeys(LOOKS, look), right
             assert tuple(gateway.command(path, body, **headers).status for path, body in ACTS) == acts, right
-            assert gateway.get("/", **headers).status in (200, 404)  # the page's files need no right
+            assert gateway.get("/", **headers).status in (200, 404)  # the files of the web page need no right
 
 
 @pytest.mark.parametrize("way", ["authorization", "cookie"])
-def test_wrong_token_is_refused_even_if_none_is_needed(tmp_path: Path, way: str) -> None:
+def test_a_wrong_token_is_refused_even_for_requests_that_need_no_token(tmp_path: Path, way: str) -> None:
     wrong = {way: {"authorization": "Bearer wrong", "cookie": "multidrop=wrong"}[way]}
     with served(tmp_path, LOOPBACK_STOPS) as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)
@@ -119,18 +120,20 @@ def test_wrong_token_is_refused_even_if_none_is_needed(tmp_path: Path, way: str)
         for path, body in (WRITE, RESET, UNLISTED_VERB):
             assert gateway.post(path, {**body, "seen": 1}, **wrong).status == 401
         assert gateway.gateway.commands.called == 0
-        for path, body in (STOP, STOP_VERB):  # these stops need no right, not even with a wrong token
+        # Stops are allowed to everyone here, so a wrong token does not prevent them.
+        for path, body in (STOP, STOP_VERB):
             assert gateway.post(path, body, **wrong).status == 200
         assert gateway.gateway.commands.called == 2
         for at in range(MOST_WRONG):
             gateway.get("/health", authorization=f"Bearer wrong-{at}")
-        for path in LOOKS:  # after so many wrong tokens, this address is refused with any token
+        # After MOST_WRONG wrong tokens from one address, no token from this address is accepted.
+        for path in LOOKS:
             assert gateway.get(path, **wrong).status == 429
             assert gateway.get(path, authorization=gateway.bearer(Right.WRITE)).status == 429
             assert gateway.get(path).status == 200
 
 
-def test_token_is_ignored_without_a_token_file(tmp_path: Path) -> None:
+def test_a_token_is_ignored_if_no_token_file_is_configured(tmp_path: Path) -> None:
     with served(tmp_path, LOOPBACK_STOPS, tokens=()) as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)
         for path in LOOKS:
@@ -138,7 +141,9 @@ def test_token_is_ignored_without_a_token_file(tmp_path: Path) -> None:
         assert gateway.post(WRITE[0], {**WRITE[1], "seen": 1}, authorization="Bearer any").status == 401
 
 
-def test_repeated_wrong_token_is_logged_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_wrong_token_is_logged_once_although_it_is_repeated(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     with served(tmp_path) as gateway:
         for _ in range(3):
             assert gateway.get("/api/plant", cookie="multidrop=taken-away").status == 401
@@ -147,7 +152,7 @@ def test_repeated_wrong_token_is_logged_once(tmp_path: Path, caplog: pytest.LogC
 
 @pytest.fixture(scope="module")
 def open_gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """A gateway whose drives every user of this machine may stop."""
+    """A gateway whose drives may be stopped without a token from this machine."""
     with served(tmp_path_factory.mktemp("open"), LOOPBACK_STOPS, names=("plant.example",)) as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)
         yield gateway
@@ -170,20 +175,22 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("case", FOREIGN)
-def test_stop_from_a_foreign_page_is_refused(open_gateway: Served, case: str) -> None:
+def test_a_stop_sent_by_a_web_page_of_another_site_is_refused(open_gateway: Served, case: str) -> None:
     headers, status = FOREIGN[case]
     before = open_gateway.gateway.commands.called
     assert open_gateway.post(*STOP, **headers).status == status
     assert open_gateway.gateway.commands.called == before
 
 
-ORIGINS = {  # (Origin header, Host header, allowed schemes): True if it is a page of this gateway
+# (Origin header, Host header, schemes of the gateway): True if the origin is the gateway's own page
+ORIGINS = {
     ("https://plant.example", "plant.example", ("https",)): True,
     ("https://plant.example:443", "plant.example", ("https",)): True,
     ("https://plant.example:8443", "plant.example:8443", ("https",)): True,
-    ("http://plant.example", "plant.example", ("https",)): False,  # port 80, but the gateway's is 443
+    # http means port 80, but the gateway has port 443
+    ("http://plant.example", "plant.example", ("https",)): False,
     ("https://plant.example", "plant.example", ("http",)): False,
-    ("https://plant.example", "plant.example", SCHEMES): True,  # behind a proxy with TLS
+    ("https://plant.example", "plant.example", SCHEMES): True,  # a proxy in front of the gateway may add TLS
     ("http://plant.example", "plant.example:443", SCHEMES): False,
     ("https://plant.example.evil.test", "plant.example", ("https",)): False,
     ("https://evil.test", "evil.test", ("https",)): False,
@@ -194,7 +201,7 @@ ORIGINS = {  # (Origin header, Host header, allowed schemes): True if it is a pa
 
 
 @table("case", ORIGINS)
-def test_an_origin_is_accepted_only_with_the_gateways_scheme_host_and_port(
+def test_an_origin_header_is_accepted_only_if_it_is_the_gateways_own_page(
     case: tuple[str, str, tuple[str, ...]],
 ) -> None:
     origin, host, schemes = case
@@ -202,7 +209,7 @@ def test_an_origin_is_accepted_only_with_the_gateways_scheme_host_and_port(
     assert names.has_origin(origin, host, schemes) is ORIGINS[case]
 
 
-def test_stops_from_our_own_page_and_from_programs_are_sent(open_gateway: Served) -> None:
+def test_stops_from_the_gateways_own_page_and_from_programs_are_sent(open_gateway: Served) -> None:
     port = open_gateway.gateway.port
     before = open_gateway.gateway.commands.called
     for headers in (
@@ -226,7 +233,9 @@ def test_request_with_two_host_headers_is_refused(open_gateway: Served) -> None:
 
 
 @pytest.mark.parametrize("path", ["/", "/api/plant", "/api/nothing", "/metrics", "/api/stop"])
-def test_every_answer_forbids_framing_and_type_guessing(open_gateway: Served, path: str) -> None:
+def test_each_answer_forbids_framing_by_other_sites_and_guessing_of_its_type(
+    open_gateway: Served, path: str
+) -> None:
     headers = open_gateway.get(path).headers
     if path == "/":
         policy = "default-src 'self'; base-uri 'none'; form-action 'none'; object-src 'none'"
@@ -240,7 +249,7 @@ def test_every_answer_forbids_framing_and_type_guessing(open_gateway: Served, pa
     assert headers["cache-control"] == ("no-cache" if path == "/" else "no-store")
 
 
-def test_wrong_methods_and_bodies_are_refused(open_gateway: Served) -> None:
+def test_wrong_http_methods_and_invalid_bodies_are_refused(open_gateway: Served) -> None:
     post, get = open_gateway.post, open_gateway.get
     assert get("/api/stop").status == 405
     assert post("/api/plant").status == 405
@@ -262,7 +271,7 @@ def test_wrong_methods_and_bodies_are_refused(open_gateway: Served) -> None:
     assert post("/api/act", {"drive": "pump-1", "verb": "start", "options": []}, **writer).status == 400
 
 
-def test_strings_with_lone_surrogates_are_answered_like_other_strings(open_gateway: Served) -> None:
+def test_a_name_with_a_lone_surrogate_is_answered_like_any_unknown_name(open_gateway: Served) -> None:
     post, writer = open_gateway.post, {"authorization": open_gateway.bearer(Right.WRITE)}
     odd = "\ud800"
     assert post("/api/token", {"token": odd}).status == 401
@@ -275,12 +284,12 @@ def test_strings_with_lone_surrogates_are_answered_like_other_strings(open_gatew
     assert repr(odd) in unknown.json["error"]
 
 
-def test_page_keeps_its_token_in_a_cookie_hidden_from_scripts(open_gateway: Served) -> None:
+def test_the_web_page_keeps_its_token_in_a_cookie_hidden_from_scripts(open_gateway: Served) -> None:
     told = open_gateway.post("/api/token", {"token": open_gateway.secrets[Right.WRITE]})
     assert told.json == {"name": "writer", "role": "write"}
     cookie = told.headers["set-cookie"]
     assert {"HttpOnly", "SameSite=strict", "Path=/"} <= {part.strip() for part in cookie.split(";")}
-    assert "Secure" not in cookie  # this gateway has no TLS
+    assert "Secure" not in cookie  # a Secure cookie would not work, because this gateway has no TLS
     kept = cookie.partition(";")[0]
     assert open_gateway.get("/api/plant", cookie=kept).json["may"]["role"] == "write"
     assert open_gateway.command(*WRITE, cookie=kept).status == 200
@@ -290,7 +299,7 @@ def test_page_keeps_its_token_in_a_cookie_hidden_from_scripts(open_gateway: Serv
 
 
 def test_after_five_wrong_tokens_an_address_is_refused_but_may_stop(tmp_path: Path) -> None:
-    """A valid token still works from other addresses. From this address, it is accepted only for a stop."""
+    """A valid token still works from other addresses. From the refused address, it works only for a stop."""
     now = [1000.0]
     with served(tmp_path, CLOSED, behind_proxy=True) as gateway:
         gateway.gateway.guard_clock = lambda: now[0]
@@ -300,11 +309,12 @@ def test_after_five_wrong_tokens_an_address_is_refused_but_may_stop(tmp_path: Pa
         for at in range(MOST_WRONG):
             assert gateway.get("/api/plant", **anna, authorization=f"Bearer wrong-{at}").status == 401
         assert gateway.get("/api/plant", **wrong).status == 429
-        assert gateway.get("/api/plant", **right).status == 429  # refused although the token is right
+        assert gateway.get("/api/plant", **right).status == 429  # refused although the token is valid
         assert gateway.post("/api/token", {"token": gateway.secrets[Right.STOP]}, **anna).status == 429
         assert gateway.post(*STOP, **right).json["pump-1"]["done"] is True
         assert gateway.post(*STOP, **wrong).status == 401
-        signed = {"token": gateway.secrets[Right.STOP], "to": "stop"}  # sign-in before a stop
+        # sign-in that the page needs before a stop
+        signed = {"token": gateway.secrets[Right.STOP], "to": "stop"}
         assert gateway.post("/api/token", signed, **anna).status == 200
         assert gateway.post("/api/token", {**signed, "token": "wrong"}, **anna).status == 401
         elsewhere = {"x_forwarded_for": "10.0.0.2", "authorization": gateway.bearer(Right.STOP)}
@@ -323,7 +333,7 @@ def test_callers_behind_a_proxy_are_not_local(tmp_path: Path) -> None:
 
 
 def test_wrong_tokens_behind_a_proxy_block_only_their_senders_address(tmp_path: Path) -> None:
-    """A proxy such as HAProxy appends its own X-Forwarded-For header to the client's."""
+    """A proxy such as HAProxy appends its X-Forwarded-For header to the client's own."""
     with served(tmp_path, CLOSED, behind_proxy=True) as gateway:
         for at in range(MOST_WRONG):
             connection = http.client.HTTPConnection("127.0.0.1", gateway.gateway.port, timeout=PATIENCE)
@@ -340,7 +350,7 @@ def test_wrong_tokens_behind_a_proxy_block_only_their_senders_address(tmp_path: 
 
 
 def test_a_new_token_is_accepted_after_many_requests_with_a_revoked_token(tmp_path: Path) -> None:
-    """A browser keeps sending its cookie with every request for a frame."""
+    """A browser keeps sending the cookie with the revoked token with each request for new values."""
     with served(tmp_path, CLOSED) as gateway:
         old = {"cookie": "multidrop=taken-away"}
         for _ in range(2 * MOST_WRONG):
@@ -360,7 +370,8 @@ def test_audit_log_names_the_caller_and_its_interface(tmp_path: Path) -> None:
         assert gateway.command(*WRITE, **writer).json["done"] is True
         assert gateway.post(*STOP, origin=f"http://127.0.0.1:{gateway.gateway.port}").status == 200
         records = gateway.get("/api/audit").json["entries"]
-        written = [(one["drive"], one["by"], one["way"]) for one in records[-2:]]  # call and result
+        # the audit log has a record of the call and a record of the result
+        written = [(one["drive"], one["by"], one["way"]) for one in records[-2:]]
         assert written == [("pump-1", "writer", "http from 127.0.0.1")] * 2
         assert {(one["by"], one["way"]) for one in records[:-2]} == {("anyone", "page from 127.0.0.1")}
         oldest = records[-1]["time"]
@@ -380,7 +391,7 @@ WAYS = ("page", "http", "mqtt", "modbus")
 
 
 class GuardedLines:
-    """A plant with one drive. Every command must be refused before it needs the drive's bus."""
+    """The PolledLines of a plant with one drive. Each command must be refused before it needs the bus."""
 
     plant: Plant = plant_of(("hall", InvtCHE(1, name="mill")), polled=False)
 
@@ -395,7 +406,7 @@ class GuardedLines:
 
 
 def rules_of(may: May, way: str, role: Right) -> dict[str, str | None]:
-    """Return the rule by which each command is refused; None if the caller had the right to send it."""
+    """Return, for each command, the rule by which it is refused; None if the caller may send it."""
     caller = Caller("anna", way, "10.0.0.7", role)
 
     async def carried_out() -> dict[str, Any]:
@@ -428,7 +439,7 @@ def test_callers_with_the_role_stop_can_only_stop(way: str) -> None:
 
 
 @table("way", WAYS)
-def test_writes_that_are_not_listed_are_refused_even_with_the_right_to_write(way: str) -> None:
+def test_writes_not_listed_in_the_settings_are_refused_even_with_the_right_to_write(way: str) -> None:
     rules = rules_of(May(), way, Right.WRITE)
     listed = {verb: rules[verb] for verb in VERBS if verb != "stop"}
     assert {*listed.values()} == {NEVER_THIS_WAY if way == "modbus" else NOT_LISTED}
@@ -436,14 +447,14 @@ def test_writes_that_are_not_listed_are_refused_even_with_the_right_to_write(way
     assert rules["stop all"] not in (NOT_ALLOWED, NOT_LISTED)
 
 
-def test_verbs_over_modbus_are_refused_even_if_listed() -> None:
-    """Modbus has no dialog in which a person could confirm a verb."""
+def test_verbs_are_refused_over_modbus_even_if_the_settings_list_them() -> None:
+    """Over Modbus, no dialog can ask a person to confirm the verb."""
     rules = rules_of(ALL, "modbus", Right.WRITE)
     assert {rules[verb] for verb in VERBS} == {NEVER_THIS_WAY}
 
 
 def test_concurrent_writes_per_line_are_limited_and_stops_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each write uses a thread, so a blocked line could otherwise use any number of threads."""
+    """Each write occupies a thread, so a blocked line could otherwise occupy any number of threads."""
     go_on = threading.Event()
 
     def slow(drive: Drive, **command: object) -> CommandResult:
@@ -454,7 +465,7 @@ def test_concurrent_writes_per_line_are_limited_and_stops_are_not(monkeypatch: p
         control = Commands(GuardedLines(), ALL)  # type: ignore[arg-type]
         writer = Caller("anna", "http", "10.0.0.7", Right.WRITE)
         some = [asyncio.ensure_future(control.write("mill", "setpoint", at, writer)) for at in range(8)]
-        await asyncio.sleep(0)  # all writes are in progress now
+        await asyncio.sleep(0)  # lets all writes start
         for further in (
             control.write("mill", "setpoint", 9.0, writer),
             control.act("mill", "start", {}, writer),
@@ -466,7 +477,8 @@ def test_concurrent_writes_per_line_are_limited_and_stops_are_not(monkeypatch: p
         assert not isinstance(stopped["mill"].error, WriteForbidden)
         go_on.set()
         await asyncio.gather(*some)
-        assert (await control.write("mill", "setpoint", 9.0, writer)).ok  # one of the writes has ended
+        # accepted again, because the earlier writes have ended
+        assert (await control.write("mill", "setpoint", 9.0, writer)).ok
 
     for work in ("write_register", "carry_out_verb"):
         monkeypatch.setattr(commands, work, slow)

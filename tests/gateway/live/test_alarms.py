@@ -35,7 +35,7 @@ from multidrop.polling.batch import Batch
 ERMAN = '["status", "output_frequency", "last_fault"]'
 REGISTERS = ("status", "output_frequency", "last_fault", "fault_record_1")
 NOT_AT_REST = "at rest its state needs two readings in a row, which polled values do not give"
-RUNNING, STOPPED = 1, 0  # values of the status register of an ERMAN drive
+RUNNING, STOPPED = 1, 0  # values of the ERMAN status register
 
 
 def hub_of(folder: Path, model: str, poll: str) -> Hub:
@@ -47,11 +47,11 @@ def hub_of(folder: Path, model: str, poll: str) -> Hub:
     return Hub(Plant.load(path), lambda: (now_ns[0], 0))
 
 
-now_ns = [0]  # present time by CLOCK_MONOTONIC
+now_ns = [0]  # the present time of the hub's clock, in ns
 
 
 def take(hub: Hub, at_s: float, **values: int) -> None:
-    """Set the time to `at_s`, and give the hub good rows with these values."""
+    """Set the clock to `at_s`, and give the hub a successful read of each register in `values`."""
     columns = Columns(len(values))
     for name, value in values.items():
         layout = RowLayout(0, [Field(0, NumberFormat.U16, REGISTERS.index(name), 1.0, 1.0)])
@@ -60,12 +60,13 @@ def take(hub: Hub, at_s: float, **values: int) -> None:
     hub.take(Batch(columns, Names(("pump-1",)), Names(REGISTERS)))
 
 
-def test_changed_fault_record_is_shown_as_a_fault(tmp_path: Path) -> None:
+def test_a_drive_shows_a_fault_when_its_fault_record_changes(tmp_path: Path) -> None:
     hub = hub_of(tmp_path, "erman-er-g-220", ERMAN)
     take(hub, 10, status=RUNNING, output_frequency=500, last_fault=0)
     assert hub.seen("pump-1").state == "runs"
     take(hub, 11, last_fault=ErmanFault.OVERHEAT | 1 << 8)
-    assert hub.seen("pump-1") == Shown("fault", "overheat, bit 8")  # older rows show "runs"
+    # although the latest status and frequency still show a running motor
+    assert hub.seen("pump-1") == Shown("fault", "overheat, bit 8")
     take(hub, 12, status=STOPPED, output_frequency=0, last_fault=ErmanFault.OVERHEAT | 1 << 8)
     assert hub.seen("pump-1")[:2] == ("fault", "overheat, bit 8")
     for at_s in (20, 20 + RAN_NS / SECOND):
@@ -75,7 +76,7 @@ def test_changed_fault_record_is_shown_as_a_fault(tmp_path: Path) -> None:
     assert hub.seen("pump-1").state == "stands"
 
 
-def test_a_reset_ends_a_recorded_fault_and_an_old_record_is_not_a_fault(tmp_path: Path) -> None:
+def test_a_reset_ends_a_recorded_fault_and_an_old_record_is_no_fault(tmp_path: Path) -> None:
     hub = hub_of(tmp_path, "erman-er-g-220", ERMAN)
     take(hub, 10, status=STOPPED, output_frequency=0, last_fault=ErmanFault.OVERHEAT)
     past = "last fault overheat, which may still be in force"
@@ -90,7 +91,7 @@ def test_a_reset_ends_a_recorded_fault_and_an_old_record_is_not_a_fault(tmp_path
     assert hub.seen("pump-1").state == "stands"
 
 
-def test_unknown_state_has_a_reason_and_yd1000_trip_is_a_fault(tmp_path: Path) -> None:
+def test_an_unknown_state_has_a_reason_and_a_new_yd1000_fault_record_is_a_fault(tmp_path: Path) -> None:
     hub = hub_of(tmp_path, "yd1000", '["output_frequency", "status", "fault_record_1"]')
     take(hub, 10, output_frequency=0, status=0, fault_record_1=1)
     shown = hub.seen("pump-1")
@@ -123,7 +124,7 @@ def test_can_show_fault_depends_on_the_polled_registers(
     assert can_show_fault(MODELS[model](1), polled) is is_seen
 
 
-def test_check_warns_of_registers_that_cannot_show_a_fault(run: Run, tmp_path: Path) -> None:
+def test_serve_check_warns_if_no_polled_register_can_show_a_fault(run: Run, tmp_path: Path) -> None:
     plant = written(tmp_path, "[serve]\n")
     status, _, errors = run("serve", "--check", plant.path)
     assert (status, errors) == (0, "")
@@ -149,28 +150,29 @@ def test_a_motor_that_stops_without_a_command_raises_an_alarm(standing: Shown) -
     events = Alarms()
     for time, shown in ((1000, standing), (2000, RUNS), (3000, standing), (4999, standing)):
         events.look(time, "pump-1", shown, 0)
-    assert seen(events) == []  # no alarm yet: the motor may be reversing
+    assert seen(events) == []  # no alarm yet: the motor may only be changing its direction
     events.look(5000, "pump-1", standing, 0)
     assert seen(events) == [("pump-1", "stopped", 3000, None)]
     events.look(6000, "pump-1", RUNS, 0)
     told = [("pump-1", "stopped", 3000, 6000)]
     assert seen(events) == told
-    # stops = 1: a stop was called
+    # Here a stop was called (stops = 1).
     for time, shown, stops in ((7000, standing, 1), (9000, standing, 1), (10000, RUNS, 1)):
         events.look(time, "pump-1", shown, stops)
-    for time, stops in ((11000, None), (13000, 1)):  # None: jog or setpoint 0; 1: after a stop
+    # None: a jog or setpoint 0 may have ended the run
+    for time, stops in ((11000, None), (13000, 1)):
         events.look(time, "pump-1", standing, stops)
     assert seen(events) == told
 
 
-def test_a_motor_that_a_fault_stops_raises_no_alarm_besides_that_of_the_fault() -> None:
+def test_a_motor_stopped_by_a_fault_raises_only_the_alarm_of_the_fault() -> None:
     events = Alarms()
     for time, shown in enumerate((RUNS, Shown("silent", "no reply"), Shown("fault", "a"), STANDS), 1):
         events.look(time, "pump-1", shown, 0)
     assert {kind for _, kind, _, _ in seen(events)} == {"fault", "silent"}
 
 
-def test_alarms_are_ordered_by_kind_and_acknowledged_ones_last() -> None:
+def test_alarms_are_sorted_by_kind_with_acknowledged_alarms_last() -> None:
     events = Alarms()
     events.look(1, "pump-1", Shown("fault", "overheat"))
     events.look(2, "pump-2", RUNS, 0)
@@ -178,13 +180,15 @@ def test_alarms_are_ordered_by_kind_and_acknowledged_ones_last() -> None:
     events.look(2003, "pump-2", STANDS, 0)
     events.look_at_line(4, "hall", "there is no such port")
     events.look(5, "pump-3", Shown("silent", "no reply"))
-    events.look(6, "pump-4", Shown("silent", "port lost"))  # no alarm: the line has one for its port
+    # no alarm for pump-4: the lost port of its line has one
+    events.look(6, "pump-4", Shown("silent", "port lost"))
     assert [one.kind for one in events.shown()] == ["fault", "stopped", "port", "silent"]
     first = events.acknowledge(events.shown()[0].id, 7, "anna by page", "fan is dirty")
     assert (first.acknowledged, first.by, first.note) == (7, "anna by page", "fan is dirty")
     assert [one.kind for one in events.shown()] == ["stopped", "port", "silent", "fault"]
     stopped = events.acknowledge(events.shown()[0].id, 8, "anna by page")
-    assert ("pump-2", "stopped", 3, 8) in seen(events)  # acknowledging an alarm of this kind ends it
+    # an alarm of the kind "stopped" ends when it is acknowledged
+    assert ("pump-2", "stopped", 3, 8) in seen(events)
     with pytest.raises(KeyError):
         events.acknowledge("1 fault pump-9", 9, "anna")
     events.acknowledge(stopped.id, 10, "boris", "the switch")
@@ -193,7 +197,7 @@ def test_alarms_are_ordered_by_kind_and_acknowledged_ones_last() -> None:
     assert ("hall", "port", 4, 11) in seen(events)
 
 
-def test_alarm_at_the_first_observation_may_have_started_earlier() -> None:
+def test_an_alarm_of_the_first_observation_is_marked_as_possibly_older() -> None:
     events = Alarms()
     events.look(1, "pump-1", Shown("fault", "overheat"))
     events.look(1, "pump-2", RUNS)
@@ -206,7 +210,7 @@ def test_alarm_at_the_first_observation_may_have_started_earlier() -> None:
     }  # fmt: skip
 
 
-def test_alarms_of_an_earlier_run_continue_or_end() -> None:
+def test_alarms_from_before_a_restart_continue_or_end() -> None:
     kept: dict[str, Alarm] = {}
     before = Alarms(0, lambda alarm, change: kept.update({alarm.id: alarm}))
     for drive in ("goes-on", "is-over", "is-another", "is-gone", "is-silent"):
@@ -233,8 +237,8 @@ def test_alarms_of_an_earlier_run_continue_or_end() -> None:
     assert [one.note for one in events.between(0, 999) if one.by] == ["seen"]
 
 
-def test_alarms_read_late_are_merged_with_present_alarms() -> None:
-    """On a slow disk, the alarms of earlier runs are read after the first observation of the drives."""
+def test_alarms_from_before_a_restart_that_are_read_late_are_merged_with_new_alarms() -> None:
+    """A slow disk may return the alarms from before a restart after new alarms were raised."""
     events = Alarms(100)
     events.look(101, "pump-1", Shown("fault", "overheat"))
     events.look(101, "pump-2", STANDS)
@@ -263,7 +267,7 @@ def past_of(path: Path) -> list[Alarm]:
     return kept.past or []
 
 
-def test_the_newest_line_of_each_alarm_in_the_file_counts(tmp_path: Path) -> None:
+def test_the_last_line_of_each_alarm_in_the_alarm_file_is_used(tmp_path: Path) -> None:
     path = tmp_path / "alarms.jsonl"
     kept = started(path)
     for alarm in (ALARM, ALARM._replace(ended=5), ALARM._replace(time=9)):
@@ -273,7 +277,7 @@ def test_the_newest_line_of_each_alarm_in_the_file_counts(tmp_path: Path) -> Non
         file.write(b'{"id": "trunc')
     assert past_of(path) == [ALARM._replace(ended=5), ALARM._replace(time=9)]
     kept = started(path)
-    kept.note(ALARM._replace(time=10))  # written after the truncated line
+    kept.note(ALARM._replace(time=10))  # a line after the truncated one
     kept.close()
     assert len(past_of(path)) == 3
 
@@ -299,7 +303,7 @@ def test_long_alarm_file_is_rewritten(tmp_path: Path, monkeypatch: pytest.Monkey
     assert past_of(path) == [ALARM]
 
 
-def test_failing_disk_is_reported_and_the_alarm_file_rewritten_later(tmp_path: Path) -> None:
+def test_a_failing_disk_is_reported_and_the_alarm_file_is_rewritten_later(tmp_path: Path) -> None:
     folder = tmp_path / "none"
     kept = started(folder / "alarms.jsonl")
     kept.note(ALARM)
@@ -315,11 +319,11 @@ def test_failing_disk_is_reported_and_the_alarm_file_rewritten_later(tmp_path: P
 
 
 def faults(gateway: Served) -> list[Any]:
-    """Return the alarms of faults only: on a busy machine, drives may also be silent for a moment."""
+    """Return the alarms of kind "fault" only: on a busy machine, drives may also be silent for a moment."""
     return [one for one in gateway.frame()["alarms"] if one["kind"] == "fault"]
 
 
-def test_alarms_are_logged_acknowledged_and_kept_over_a_restart(
+def test_alarms_are_logged_and_acknowledged_and_survive_a_restart(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "multidrop.gateway")
@@ -342,7 +346,7 @@ def test_alarms_are_logged_acknowledged_and_kept_over_a_restart(
     assert any(
         text.startswith(f"alarm of pump-1, {words}, acknowledged by stopper") for text in caplog.messages
     )
-    with served(tmp_path) as gateway:  # this simulates a new pump-1, without a fault
+    with served(tmp_path) as gateway:  # restart with a new simulated pump-1, which has no fault
         until(lambda: [one for one in faults(gateway) if one["ended"]])
         [again] = faults(gateway)
         kept = ("id", "time", "text", "by", "note", "acknowledged")
@@ -358,7 +362,7 @@ def test_unwritable_alarm_file_is_reported_in_health(tmp_path: Path) -> None:
         assert any("alarms are not kept" in one for one in gateway.frame()["troubles"])
 
 
-def test_a_lost_port_is_one_alarm_of_its_line(tmp_path: Path) -> None:
+def test_a_lost_port_raises_one_alarm_for_its_line(tmp_path: Path) -> None:
     (tmp_path / "plant.toml").write_text(plant_text(str(tmp_path / "none"), ["pump-1", "pump-2"]))
     plant = Plant.load(tmp_path / "plant.toml")
     gateway = Gateway(plant, replace(read_settings(plant, {}), port=0))
@@ -378,7 +382,7 @@ def test_a_lost_port_is_one_alarm_of_its_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_only_a_motor_that_the_gateway_did_not_stop_raises_an_alarm(tmp_path: Path) -> None:
+def test_a_motor_raises_an_alarm_only_if_the_gateway_did_not_stop_it(tmp_path: Path) -> None:
     serve = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
     with served(tmp_path, serve) as gateway:
         writer = {"authorization": gateway.bearer(Right.WRITE)}
@@ -415,7 +419,7 @@ def test_only_a_motor_that_the_gateway_did_not_stop_raises_an_alarm(tmp_path: Pa
         (BusError("pump-1.coast: no stop of start"), "pump-1.coast: no stop of start"),
     ],
 )
-def test_errors_for_page_users_have_no_function_names(failure: BusError, said: str) -> None:
+def test_errors_on_the_web_page_contain_no_function_names(failure: BusError, said: str) -> None:
     assert in_words(str(failure), failure) == said
 
 
@@ -430,14 +434,14 @@ BELOW = Limit("pump", "pressure", "bar", False, 1.0, hysteresis=0.5)
     ("values", "beyond"),
     [
         ([31, 31, 31, 31, 31, 31], [False, False, False, False, False, True]),
-        ([31, 31, 29, 31, 31, 31], [False] * 6),  # the duration restarts
+        ([31, 31, 29, 31, 31, 31], [False] * 6),  # 29 A restarts the duration of 5 s
         ([31, 31, 31, 31, 31, 31, 28.5, 28.0], [False] * 5 + [True, True, False]),
-        ([31, 31, 31, 31, None, 31, 31], [False] * 7),  # after a missing value, the duration restarts
+        ([31, 31, 31, 31, None, 31, 31], [False] * 7),  # a missing value restarts the duration
         ([31, 31, 31, 31, 31, 31, None, 29], [False] * 5 + [True] * 3),
-        ([30] * 7, [False] * 7),  # the bound itself is allowed
+        ([30] * 7, [False] * 7),  # equal to the limit is not above it
     ],
 )
-def test_a_limit_counts_as_exceeded_after_its_duration_and_until_its_hysteresis_is_passed(
+def test_a_limit_is_exceeded_after_its_duration_until_the_hysteresis_is_passed(
     values: list[float | None], beyond: list[bool]
 ) -> None:
     limits, text, seen = Limits([ABOVE]), "", []
@@ -447,7 +451,7 @@ def test_a_limit_counts_as_exceeded_after_its_duration_and_until_its_hysteresis_
     assert seen == beyond
 
 
-def test_a_second_exceeded_limit_raises_a_new_alarm_but_a_smaller_excess_does_not() -> None:
+def test_a_second_exceeded_limit_raises_a_new_alarm_and_its_end_does_not() -> None:
     limits = Limits([ABOVE._replace(lasting_s=0.0), BELOW])
     noted: list[Alarm] = []
     alarms = Alarms(note=lambda alarm, change: noted.append(alarm))
@@ -463,7 +467,7 @@ def test_a_second_exceeded_limit_raises_a_new_alarm_but_a_smaller_excess_does_no
     ]
 
 
-def test_limit_stays_exceeded_over_a_restart() -> None:
+def test_a_limit_that_was_exceeded_before_a_restart_stays_exceeded() -> None:
     assert Limits([ABOVE]).exceeded(0, "pump", {"current": 29}, "current above 30 A")
 
 

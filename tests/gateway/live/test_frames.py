@@ -1,4 +1,4 @@
-"""Frames: made once for all viewers, at most five a second, sent whole or as changes, never queued."""
+"""Page frames (the values that viewers get): shared by all viewers, at most five a second, never queued."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def frames(clock: Clock, made: list[int]) -> Frames:
     return Frames(make, clock)
 
 
-async def test_a_hundred_viewers_share_one_frame(frames: Frames, clock: Clock, made: list[int]) -> None:
+async def test_a_hundred_viewers_share_one_page_frame(frames: Frames, clock: Clock, made: list[int]) -> None:
     first = await frames.after(-1)
     assert first is not None
     viewers = [asyncio.create_task(frames.after(first.n)) for _ in range(100)]
@@ -57,7 +57,7 @@ async def test_a_hundred_viewers_share_one_frame(frames: Frames, clock: Clock, m
     assert made == [1, 2]
 
 
-async def test_changes_are_computed_once_per_known_frame(
+async def test_changes_between_two_page_frames_are_computed_once_for_all_viewers(
     frames: Frames, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compared: list[int] = []
@@ -77,7 +77,9 @@ async def test_changes_are_computed_once_per_known_frame(
     assert compared == [1]
 
 
-async def test_at_most_five_frames_are_made_per_second(frames: Frames, clock: Clock, made: list[int]) -> None:
+async def test_at_most_five_page_frames_are_made_per_second(
+    frames: Frames, clock: Clock, made: list[int]
+) -> None:
     seen = -1
     for _ in range(1000):  # 10 s with a change every 10 ms
         clock.now += 0.01
@@ -93,8 +95,10 @@ async def test_at_most_five_frames_are_made_per_second(frames: Frames, clock: Cl
     assert 45 <= len(made) <= 51
 
 
-async def test_rows_within_the_frame_interval_appear_in_the_next_frame(frames: Frames, clock: Clock) -> None:
-    """Viewers get the next frame without any further event."""
+async def test_rows_that_arrive_too_soon_for_a_page_frame_appear_in_the_next(
+    frames: Frames, clock: Clock
+) -> None:
+    """The next page frame is made without any further rows."""
     first = await frames.after(-1)
     assert first is not None
     frames.note_news()
@@ -107,17 +111,17 @@ async def test_rows_within_the_frame_interval_appear_in_the_next_frame(frames: F
     assert second.n == 2
 
 
-def test_no_frame_is_made_without_viewers(frames: Frames, clock: Clock, made: list[int]) -> None:
+def test_no_page_frame_is_made_without_viewers(frames: Frames, clock: Clock, made: list[int]) -> None:
     for _ in range(100):
         clock.now += 1.0
         frames.note_news()
     assert made == []
 
 
-async def test_late_viewer_gets_the_newest_frame(frames: Frames, clock: Clock) -> None:
+async def test_a_viewer_that_was_away_gets_the_newest_page_frame(frames: Frames, clock: Clock) -> None:
     first = await frames.after(-1)
     assert first is not None
-    for _ in range(50):  # the viewer sends no request during this time
+    for _ in range(50):  # during this time, the viewer that has the first frame asks for no other
         clock.now += 0.25
         frames.note_news()
         await frames.after(-1)
@@ -125,7 +129,7 @@ async def test_late_viewer_gets_the_newest_frame(frames: Frames, clock: Clock) -
     assert late is not None
     assert late.n == 51
     assert told(late) == {"n": 51, "revision": 1}
-    other = await frames.after(900)  # 900: a frame number of an earlier process
+    other = await frames.after(900)  # 900: the number of a frame that an earlier process made
     assert other is late
 
 
@@ -136,7 +140,7 @@ def told(frame: Encoded | None) -> dict[str, Any]:
 
 
 def merged(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
-    """Return `before` with the values of `now` in place of its own; nested objects are merged too."""
+    """Return `before` updated with the values of `now`, including nested objects."""
     both = {key: merged(before[key], value) for key, value in now.items() if isinstance(value, dict)}
     return {**before, **now, **both}
 
@@ -154,7 +158,9 @@ plants = st.fixed_dictionaries(
 
 
 @given(plants, plants)
-def test_changes_turn_the_old_frame_into_the_new_frame(before: dict[str, Any], now: dict[str, Any]) -> None:
+def test_changes_applied_to_the_old_page_frame_give_the_new_page_frame(
+    before: dict[str, Any], now: dict[str, Any]
+) -> None:
     said = changes(before, now)
     assert merged(before, said) == now
     assert changes(before, merged(before, said)) == said
@@ -162,7 +168,7 @@ def test_changes_turn_the_old_frame_into_the_new_frame(before: dict[str, Any], n
 
 
 async def view(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
-    """Check viewers that skip frames. A picture has the data of one frame, and a number of frames to skip."""
+    """Check viewers that skip frames. Each picture is the data of a frame and a number of frames to skip."""
     clock, whole = Clock(), dict[int, dict[str, Any]]()
 
     def make(n: int) -> dict[str, Any]:
@@ -171,7 +177,7 @@ async def view(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
         return whole[n]
 
     frames = Frames(make, clock, begin)
-    has: dict[int, dict[str, Any]] = {}  # by n: data of a viewer that fetches every n-th frame
+    has: dict[int, dict[str, Any]] = {}  # by n: the data of the viewer that gets each n-th frame
     for turn, _ in enumerate(pictures):
         clock.now += 0.25
         frames.note_news()
@@ -192,14 +198,14 @@ async def view(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
 
 @pytest.mark.slow
 @given(st.lists(st.tuples(plants, st.integers(0, 9)), min_size=2, max_size=12), st.integers(0, 2**32))
-def test_viewer_that_skips_frames_ends_with_the_newest_frame(
+def test_a_viewer_that_skips_page_frames_has_the_data_of_the_newest(
     pictures: list[tuple[dict[str, Any], int]], begin: int
 ) -> None:
-    """The plant description changes in the middle of the run."""
+    """The frames' revision number changes in the middle of the run."""
     asyncio.run(view(pictures, begin))
 
 
-async def test_a_waiting_viewer_gets_no_frame_at_its_timeout_or_at_closing(
+async def test_a_viewer_without_a_new_page_frame_gets_none_after_a_timeout_or_shutdown(
     frames: Frames, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "WAIT_S", 0.01)
@@ -233,10 +239,10 @@ async def test_too_many_viewers_get_an_error(frames: Frames, monkeypatch: pytest
     assert json.loads(sent[1]["body"]) == {"error": "too many viewers; the limit is 0"}
 
 
-def test_frame_is_made_after_the_check_for_alarms_of_the_same_rows(
+def test_a_page_frame_is_made_after_the_alarm_check_of_the_same_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At most once in 0.2 s, drives are checked for alarms; then a frame is made from the same rows."""
+    """At most every 0.2 s, the gateway checks drives for alarms and then makes a page frame."""
     gateway = Gateway(written(tmp_path), ServeSettings(port=0))
     gateway.listener.close()
     done: list[str] = []

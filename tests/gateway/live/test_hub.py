@@ -1,4 +1,4 @@
-"""The hub: newest rows and drives' states, computed from the core's rows; alarms from these states."""
+"""The hub keeps the newest row of each register. It computes the drives' states, and alarms from these."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ DRIVES = ("pump-1", "pump-2", "pump-9")
 
 
 class HubClock:
-    """A clock that a test sets: the monotonic time, and the machine's total time asleep, both in ns."""
+    """A clock that a test sets: the monotonic time and the time the machine has slept, both in ns."""
 
     def __init__(self) -> None:
         self.now_ns = 10 * PERIOD
@@ -68,7 +68,10 @@ def hub(tmp_path: Path, clock: HubClock) -> Hub:
 
 
 def rows(*found: tuple[int, int, int | Status], drive: str = "pump-1", utc_0: int = UTC_0) -> Batch:
-    """Return rows of a drive, each given as its time in periods, a register, and a raw count or a status."""
+    """Return rows of a drive.
+
+    Each is given as (time in periods, register, raw count or status of a failed read).
+    """
     columns = Columns(len(found))
     for at, register, said in found:
         layout = RowLayout(DRIVES.index(drive), [Field(0, NumberFormat.U16, register, 1.0, 1.0)])
@@ -84,7 +87,7 @@ def all_of(at: int, status: int, frequency: int = 0, fault: int = 0) -> Batch:
 
 
 def is_fresh(hub: Hub) -> bool:
-    """Return True if the frequency of pump-1 is still current; a later miss does not change that."""
+    """Return True if the last good frequency of pump-1 is still current, even if a later read has failed."""
     return next(current for one, _, _, current in hub.known("pump-1") if one.name == "output_frequency")
 
 
@@ -102,11 +105,11 @@ def test_time_of_the_newest_row_follows_a_clock_that_is_set_back(hub: Hub) -> No
     assert hub.time == UTC_0 + 10 * PERIOD
     hub.take(rows((11, FREQUENCY, 25), utc_0=UTC_0 - 3600 * SECOND))
     assert hub.time == UTC_0 - 3600 * SECOND + 11 * PERIOD
-    hub.take(rows((9, CURRENT, 25)))  # a row of a slower exchange
+    hub.take(rows((9, CURRENT, 25)))  # a slower exchange, which was requested earlier
     assert hub.time == UTC_0 - 3600 * SECOND + 11 * PERIOD
 
 
-def test_a_miss_does_not_replace_the_last_good_row(hub: Hub) -> None:
+def test_a_failed_read_does_not_replace_the_last_good_row(hub: Hub) -> None:
     hub.take(rows((10, FREQUENCY, 25), (11, FREQUENCY, Status.NO_REPLY)))
     sent, missed = 10 * PERIOD, 11 * PERIOD
     good = next(good for one, _, good, _ in hub.known("pump-1") if one.name == "output_frequency")
@@ -119,7 +122,7 @@ def test_a_miss_does_not_replace_the_last_good_row(hub: Hub) -> None:
     ("status", "frequency", "state"),
     [(FORWARD, 25, "runs"), (FORWARD, 0, "runs"), (STANDBY, 0, "stands"), (2, 25, "runs"), (9, 0, "unknown")],
 )
-def test_state_follows_the_status_register_of_the_family(
+def test_state_of_a_drive_follows_from_its_status_register(
     hub: Hub, status: int, frequency: int, state: str
 ) -> None:
     hub.take(all_of(10, status, frequency))
@@ -127,7 +130,7 @@ def test_state_follows_the_status_register_of_the_family(
     assert hub.seen("pump-1").fault is None
 
 
-def test_a_fault_has_the_text_of_its_family(hub: Hub) -> None:
+def test_a_fault_is_shown_with_the_text_of_the_drives_family(hub: Hub) -> None:
     hub.take(all_of(10, TRIPPED, fault=4))
     assert hub.state("pump-1") == "fault"
     assert hub.seen("pump-1").fault == "overcurrent while accelerating (OC1)"
@@ -135,16 +138,14 @@ def test_a_fault_has_the_text_of_its_family(hub: Hub) -> None:
     assert hub.state("pump-2") == "unknown"
 
 
-def test_a_status_alone_shows_a_fault(hub: Hub) -> None:
+def test_the_status_register_alone_can_show_a_fault(hub: Hub) -> None:
     hub.take(rows((10, STATUS, TRIPPED), (10, FREQUENCY, 0)))
     assert hub.seen("pump-1") == Shown("fault", "it shows a fault")
     hub.take(rows((11, FAULT, 4)))
     assert hub.seen("pump-1").fault == "overcurrent while accelerating (OC1)"
 
 
-def test_drive_is_silent_after_many_lost_replies_but_not_after_one_lost_reply(
-    hub: Hub, clock: HubClock
-) -> None:
+def test_a_drive_is_silent_after_many_lost_replies_but_not_after_one(hub: Hub, clock: HubClock) -> None:
     hub.take(all_of(10, FORWARD, 25))
     for at in range(11, 20):
         hub.take(rows(*((at, register, Status.NO_REPLY) for register in range(4))))
@@ -170,9 +171,7 @@ def test_drive_that_answers_with_exceptions_is_not_silent(hub: Hub) -> None:
     assert hub.state("pump-1") == "unknown"
 
 
-def test_a_line_counts_as_lost_if_all_its_newest_rows_have_the_status_of_a_lost_port(
-    hub: Hub, clock: HubClock
-) -> None:
+def test_a_port_counts_as_lost_if_the_newest_row_of_each_register_says_so(hub: Hub, clock: HubClock) -> None:
     hub.take(all_of(10, FORWARD, 25))
     assert lost_of(hub, "hall") is None
     hub.take(rows(*((30, register, Status.LINE_LOST) for register in range(3))))
@@ -185,8 +184,8 @@ def test_a_line_counts_as_lost_if_all_its_newest_rows_have_the_status_of_a_lost_
     assert hub.seen("pump-1") == Shown("silent", "port lost")
 
 
-def test_values_become_stale_without_new_rows(hub: Hub, clock: HubClock) -> None:
-    """Time passes without rows, and the event loop does not run, as in a suspended process."""
+def test_values_become_stale_if_no_new_rows_arrive(hub: Hub, clock: HubClock) -> None:
+    """The event loop does not run meanwhile, as in a suspended process."""
     hub.take(all_of(10, FORWARD, 25))
     clock.now_ns += SECOND
     assert is_fresh(hub)
@@ -196,15 +195,16 @@ def test_values_become_stale_without_new_rows(hub: Hub, clock: HubClock) -> None
     assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
 
 
-def test_values_from_before_a_sleep_are_stale(hub: Hub, clock: HubClock) -> None:
-    """The monotonic clock stopped during the sleep, so the ages of rows do not include it."""
+def test_values_read_before_the_machine_slept_are_stale(hub: Hub, clock: HubClock) -> None:
+    """The monotonic clock stops while the machine sleeps, so the rows' ages do not include the sleep."""
     hub.take(all_of(10, FORWARD, 25))
     assert hub.state("pump-1") == "runs"
-    clock.now_ns, clock.slept_ns = 11 * PERIOD + 1, 8 * 3600 * SECOND  # the hub has not read it since
+    # the hub has not read its clock since the sleep
+    clock.now_ns, clock.slept_ns = 11 * PERIOD + 1, 8 * 3600 * SECOND
     assert not is_fresh(hub)
     assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
     assert not any(fresh for *_, fresh in hub.known("pump-1"))
-    hub.take(all_of(11, FORWARD, 25))  # polled before the sleep, received after it
+    hub.take(all_of(11, FORWARD, 25))  # requested before the sleep and received after it
     assert not is_fresh(hub)
     clock.now_ns = 12 * PERIOD
     hub.take(all_of(12, FORWARD, 25))
@@ -212,14 +212,14 @@ def test_values_from_before_a_sleep_are_stale(hub: Hub, clock: HubClock) -> None
     assert hub.state("pump-1") == "runs"
 
 
-def test_sleep_before_the_start_makes_no_value_stale(tmp_path: Path) -> None:
+def test_a_sleep_of_the_machine_before_the_start_makes_no_value_stale(tmp_path: Path) -> None:
     hub = Hub(written(tmp_path), lambda: (20 * PERIOD, 8 * 3600 * SECOND))
     hub.take(all_of(19, FORWARD, 25))
     assert is_fresh(hub)
     assert hub.woke_ns() == 0
 
 
-def test_a_pause_between_the_readings_of_two_clocks_is_not_taken_for_sleep(tmp_path: Path) -> None:
+def test_a_pause_between_readings_of_two_clocks_is_not_mistaken_for_sleep(tmp_path: Path) -> None:
     slept = [0]
     hub = Hub(written(tmp_path), lambda: (20 * PERIOD, slept[0]))
     hub.take(all_of(19, FORWARD, 25))
@@ -227,7 +227,7 @@ def test_a_pause_between_the_readings_of_two_clocks_is_not_taken_for_sleep(tmp_p
         assert is_fresh(hub)
 
 
-def test_rarely_read_values_stay_fresh_longer(tmp_path: Path, clock: HubClock) -> None:
+def test_values_of_a_slowly_polled_register_stay_fresh_longer(tmp_path: Path, clock: HubClock) -> None:
     path = written(tmp_path).path
     path.write_text(path.read_text().replace("100 ms", "10 s"))
     hub = Hub(Plant.load(path), clock)
@@ -239,12 +239,14 @@ def test_rarely_read_values_stay_fresh_longer(tmp_path: Path, clock: HubClock) -
 
 
 @pytest.mark.slow
-def test_values_of_an_overloaded_line_stay_fresh_for_three_rounds(tmp_path: Path, clock: HubClock) -> None:
+def test_values_of_an_overloaded_line_stay_fresh_for_three_polling_cycles(
+    tmp_path: Path, clock: HubClock
+) -> None:
     path = written(tmp_path, "", *(f"pump-{n}" for n in range(1, 31))).path
     path.write_text(path.read_text().replace("baudrate = 38400", "baudrate = 1200"))
     hub = Hub(Plant.load(path), clock)
     cycle_s = hub.plant.metadata()["planned"]["hall"]["cycle_ms"] / 1000
-    assert cycle_s > 1  # although the plant file asks for 0.1 s
+    assert cycle_s > 1  # longer than the 0.1 s in the plant file
     hub.take(all_of(10, FORWARD, 25))
     row = hub.newest("pump-1", "output_frequency")
     assert row is not None
@@ -254,9 +256,9 @@ def test_values_of_an_overloaded_line_stay_fresh_for_three_rounds(tmp_path: Path
     assert not is_fresh(hub)
 
 
-def test_last_minute_has_one_point_a_second_and_null_for_a_miss(hub: Hub) -> None:
+def test_the_last_minute_has_one_point_a_second_and_null_for_failed_reads(hub: Hub) -> None:
     assert hub.last_minute() == {}
-    for at in range(0, 1000, 5):  # 1000 periods of 100 ms
+    for at in range(0, 1000, 5):  # 100 s: 1000 periods of 100 ms
         hub.take(rows((at, FREQUENCY, Status.NO_REPLY if at == 990 else at)))
         hub.note_minute()
     points = hub.last_minute()["pump-1"]["output_frequency"]
@@ -271,13 +273,13 @@ def test_rows_of_a_removed_drive_are_ignored(hub: Hub) -> None:
     assert "pump-9" not in list(hub.drives)
 
 
-def test_reload_keeps_rows_of_unchanged_drives(hub: Hub) -> None:
+def test_a_reload_keeps_the_rows_of_unchanged_drives(hub: Hub) -> None:
     hub.take(all_of(10, FORWARD, 25))
     hub.adopt(hub.plant)
     assert hub.state("pump-1") == "runs"
 
 
-def test_late_row_of_a_previous_drive_is_ignored(tmp_path: Path) -> None:
+def test_a_late_row_of_a_replaced_drive_is_ignored(tmp_path: Path) -> None:
     now = [0]
     hub = Hub(written(tmp_path, "", "pump-1", "pump-2"), lambda: (now[0], 0))
     now[0] = 20 * PERIOD
@@ -303,8 +305,8 @@ SHOWN = st.sampled_from(
 
 
 @given(st.lists(SHOWN, max_size=30))
-def test_each_alarm_begins_and_ends_once(shown: list[Shown]) -> None:
-    """Alarms for random states equal those of a simple reference implementation."""
+def test_each_alarm_starts_and_ends_once(shown: list[Shown]) -> None:
+    """For random sequences of states, the alarms equal those of a simple reference implementation."""
     events = Alarms()
     fault: str | None = None
     silent = False
@@ -328,7 +330,7 @@ def test_each_alarm_begins_and_ends_once(shown: list[Shown]) -> None:
 def test_fault_stays_while_some_values_of_its_drive_are_unknown(
     hub: Hub, clock: HubClock, status: int, is_over: bool
 ) -> None:
-    """A busy line misses the status for a second but reads other registers: the fault may still be active."""
+    """A busy line may read other registers but not the status for a second. The fault may still be active."""
     events = Alarms()
 
     def look() -> list[tuple[int, int | None]]:
@@ -346,29 +348,29 @@ def test_fault_stays_while_some_values_of_its_drive_are_unknown(
     assert look() == [(10, 31 if is_over else None)]
 
 
-def test_fault_that_gets_its_name_later_is_the_same_alarm() -> None:
+def test_a_fault_whose_name_becomes_known_later_raises_no_second_alarm() -> None:
     events = Alarms()
     for time, words in enumerate(("it shows a fault", "overcurrent", "it shows a fault"), 1):
         events.look(time, "pump-1", Shown("fault", words))
     assert [(one.time, one.text, one.ended) for one in events.shown()] == [(1, "overcurrent", None)]
 
 
-def test_ended_alarms_are_bounded() -> None:
+def test_number_of_ended_alarms_that_are_kept_is_limited() -> None:
     events = Alarms(since=7)
     for time in range(4000):
         events.look(time, "pump-1", Shown("fault", "a") if time % 2 else Shown("runs", None))
         assert time > 100 or events.since == 7
     assert len(events.between(0, 9999)) <= 1001
     oldest = events.between(0, 9999)[-1]
-    assert events.since == oldest.time - 1  # when the newest forgotten alarm ended
+    assert events.since == oldest.time - 1  # all alarms after this time are kept
     assert events.begun == 2000
     assert len(events.shown()) <= 21
 
 
-def test_frame_has_no_value_that_is_overdue_or_followed_by_a_miss(hub: Hub, clock: HubClock) -> None:
+def test_a_page_frame_has_null_for_values_that_are_overdue_or_failed(hub: Hub, clock: HubClock) -> None:
     hub.take(rows((10, FREQUENCY, 25), (10, CURRENT, 12), (11, CURRENT, Status.NO_REPLY)))
     for now, frequency, current in (
-        (12, [25.0], [None, "no reply", 12.0]),  # a miss is shown immediately
+        (12, [25.0], [None, "no reply", 12.0]),  # a failed read is shown immediately
         (25, [None, "overdue", 25.0], [None, "no reply", 12.0]),
     ):
         clock.now_ns = now * PERIOD
@@ -383,8 +385,8 @@ def test_frame_has_no_value_that_is_overdue_or_followed_by_a_miss(hub: Hub, cloc
         assert published_values(hub, "pump-1") == said  # the values that MQTT publishes
 
 
-def test_age_is_right_if_a_clock_was_set_back_or_stopped_in_sleep(hub: Hub, clock: HubClock) -> None:
-    """With too small an age, the last value of a silent drive would look new."""
+def test_age_of_a_value_is_right_after_a_clock_change_or_a_sleep(hub: Hub, clock: HubClock) -> None:
+    """If the age were too small, the last value of a silent drive would look new."""
     hub.take(rows((10, FREQUENCY, 25), (20, FREQUENCY, Status.NO_REPLY)))
     asked_ns = UTC_0 + 10 * PERIOD
     hour_ns = 3600 * SECOND
@@ -421,7 +423,7 @@ class FullHub(Hub):
 
 
 class Fan(Drive):
-    """A user's own drive, whose manual states a unit but no scale."""
+    """A user's own drive class. Its manual states a unit but no scale."""
 
     pressure = setting(1, "Pa", step=None, moves=False)
 
@@ -441,14 +443,14 @@ def test_only_scaled_values_have_a_unit(model: str) -> None:
     for register in described(polled(drive, drive.readings()))["drives"][0]["registers"]:
         known = drive.registers[register["name"]]
         assert register["unit"] == ("raw count" if known.step is None else known.unit)
-        if known.writable and known.values is None:  # the page's dialog needs a range
+        if known.writable and known.values is None:  # the dialog on the web page needs a range
             assert register["least"] < register["most"], known.name
             known.encode(register["least"])
             known.encode(register["most"])
             assert (register["at_least"], register["at_most"]) == (known.at_least, known.at_most)
 
 
-def test_the_common_block_leaves_out_values_of_unknown_scale() -> None:
+def test_the_common_block_has_no_number_for_values_of_unknown_scale() -> None:
     delixi, che = DelixiModbus(1, name="fan"), InvtCHE(2, name="pump", maximum_frequency=50)
     names = ("output_frequency", "output_current")
     drives = [polled(drive, [drive.registers[name] for name in names]) for drive in (delixi, che)]
@@ -458,7 +460,7 @@ def test_the_common_block_leaves_out_values_of_unknown_scale() -> None:
     assert [number(pump, at) for at in COMMON] == [2500, 2500, NO_NUMBER]
 
 
-def test_the_metric_of_values_of_unknown_scale_is_named_raw() -> None:
+def test_the_metric_for_values_of_unknown_scale_is_named_raw() -> None:
     drive = DelixiModbus(1, name="fan")
     hub = FullHub(plant(line("/dev/null", polled(drive, [drive.output_frequency, drive.output_current]))))
     found = {
@@ -495,7 +497,7 @@ def test_home_assistant_shows_a_number_of_unknown_scale_as_a_raw_count() -> None
 
 
 class Transmitter(Drive):
-    """A user's own device, whose registers have different numbers of digits."""
+    """A user's own device class. Its registers have different numbers of decimals."""
 
     pressure = setting(1, "Pa", number_format=NumberFormat.F32, moves=False)
     level = setting(3, "m", step=0.01, moves=False)
@@ -503,14 +505,14 @@ class Transmitter(Drive):
     power_scale = reading(5, number_format=NumberFormat.I16)
 
 
-def test_description_gives_no_digits_for_a_float() -> None:
+def test_the_plant_description_gives_no_decimals_for_a_float_register() -> None:
     told = described(polled(Transmitter(1), Transmitter.readings()))
     registers = {each["name"]: each for each in told["drives"][0]["registers"]}
     assert [registers[name]["digits"] for name in ("pressure", "level", "power")] == [None, 2, None]
     assert [registers[name]["step"] for name in ("pressure", "level")] == [None, 0.01]
 
 
-def test_home_assistant_gets_no_precision_for_a_float() -> None:
+def test_home_assistant_gets_no_display_precision_for_a_float_register() -> None:
     topics = dict.fromkeys(("set", "stop", "state", "gateway", "available"), "topic")
     details = {"prefix": "", "version": "1", "every_s": 1.0, "writable": ["pressure", "level"]}
     drive = Transmitter(1, name="tank")

@@ -1,4 +1,4 @@
-"""Commands delayed or repeated by a network are not sent."""
+"""Commands that a network delays or repeats are refused, by the page frame that each command names."""
 
 from __future__ import annotations
 
@@ -37,7 +37,10 @@ WRITE = {"drive": "pump-1", "register": "setpoint", "value": 50.0}
 
 
 class Times:
-    """A SeenFrames with a clock and times of stops that the test sets, as `now_ns` and `stopped`."""
+    """A SeenFrames under test.
+
+    The test sets its clock, `now_ns`, and the time of each drive's last stop, `stopped`.
+    """
 
     def __init__(self) -> None:
         self.now_ns = 10**12
@@ -46,7 +49,7 @@ class Times:
         self.frames = SeenFrames(lambda: self.now_ns, self.commands)
 
     def rule(self, seen: int, drive: str = "pump-1", command: object = "start") -> str:
-        """Return the rule that a command violates; "" if it may be sent."""
+        """Return the rule by which a command is refused, or "" if it may be sent."""
         try:
             self.frames.admit(drive, f"{drive}.{command}", command, seen)
         except WriteForbidden as refused:
@@ -59,7 +62,7 @@ def times() -> Times:
     return Times()
 
 
-def test_a_command_may_be_sent_until_its_frame_is_too_old(times: Times) -> None:
+def test_a_command_is_accepted_until_its_page_frame_is_too_old(times: Times) -> None:
     times.frames.note(7)
     made_ns = times.now_ns
     times.now_ns += MOST_AGE_NS
@@ -68,14 +71,14 @@ def test_a_command_may_be_sent_until_its_frame_is_too_old(times: Times) -> None:
     assert times.rule(7, command="jog") == TOO_LATE
 
 
-def test_a_command_that_names_an_unknown_frame_is_refused(times: Times) -> None:
+def test_a_command_with_an_unknown_page_frame_number_is_refused(times: Times) -> None:
     times.frames.note(7)
     assert [times.rule(seen) for seen in (8, 6, -1, 0)] == [TOO_LATE] * 4
 
 
-def test_a_stop_makes_only_commands_of_its_drive_invalid(times: Times) -> None:
+def test_a_stop_invalidates_earlier_commands_of_its_own_drive_only(times: Times) -> None:
     times.frames.note(7)
-    times.stopped["pump-1"] = times.now_ns  # equal times: the stop may be later than the frame
+    times.stopped["pump-1"] = times.now_ns  # the same time as the frame, so the stop may have been later
     assert times.rule(7) == OVERTAKEN
     assert times.rule(7, "pump-2") == ""
     times.now_ns += 1
@@ -83,7 +86,7 @@ def test_a_stop_makes_only_commands_of_its_drive_invalid(times: Times) -> None:
     assert times.rule(8) == ""
 
 
-def test_command_that_names_a_frame_from_before_a_reload_is_refused(times: Times) -> None:
+def test_a_command_with_a_page_frame_from_before_a_reload_is_refused(times: Times) -> None:
     times.frames.note(7)
     times.commands.plant_ns = times.now_ns
     assert times.rule(7) == times.rule(7, "pump-2") == ANOTHER_PLANT
@@ -93,14 +96,14 @@ def test_command_that_names_a_frame_from_before_a_reload_is_refused(times: Times
     assert times.rule(7) == ANOTHER_PLANT
 
 
-def test_repeated_command_for_the_same_frame_is_refused(times: Times) -> None:
+def test_a_command_repeated_with_the_same_page_frame_number_is_refused(times: Times) -> None:
     times.frames.note(7)
     assert [times.rule(7, command=one) for one in ("start", "jog", "start")] == ["", "", DOUBLED]
     times.frames.note(8)
     assert times.rule(8) == ""
 
 
-def test_old_frames_are_forgotten(times: Times) -> None:
+def test_old_page_frames_are_forgotten(times: Times) -> None:
     for n in range(1000):
         times.now_ns += 200_000_000
         times.frames.note(n)
@@ -119,7 +122,7 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 @contextmanager
 def held_up(gateway: Served, path: str, body: object) -> Iterator[socket.socket]:
-    """Send a request except its last byte, which `answer` sends."""
+    """Send a request without its last byte; `answer` sends that byte."""
     data = json.dumps(body).encode()
     head = (
         f"POST {path} HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n"
@@ -131,9 +134,9 @@ def held_up(gateway: Served, path: str, body: object) -> Iterator[socket.socket]
 
 
 def answer(client: socket.socket, last: bytes = b"}") -> str:
-    """Send the last byte of a request, and return the gateway's answer."""
+    """Send the last byte of a held request, and return the gateway's answer."""
     client.sendall(last)
-    with closing(HTTPResponse(client)) as response:  # in chunks if the stop takes longer than usual
+    with closing(HTTPResponse(client)) as response:  # the answer is chunked if a stop takes longer than usual
         response.begin()
         assert response.status == 200
         told = json.loads(response.read())
@@ -141,7 +144,7 @@ def answer(client: socket.socket, last: bytes = b"}") -> str:
 
 
 def pass_time(gateway: Served, ns: int) -> None:
-    """Advance the gateway's clocks for frames and commands."""
+    """Advance the clocks that the gateway uses for page frames and for commands."""
     gateway.gateway.seen_frames.clock = lambda: boottime_ns() + ns
 
 
@@ -151,7 +154,9 @@ def commands(gateway: Served) -> list[tuple[str, float]]:
 
 
 @pytest.mark.parametrize(("path", "body"), [("/api/act", START), ("/api/write", WRITE)])
-def test_command_delayed_too_long_is_not_sent(tmp_path: Path, path: str, body: dict[str, object]) -> None:
+def test_a_command_delayed_by_the_network_is_not_sent(
+    tmp_path: Path, path: str, body: dict[str, object]
+) -> None:
     with served(tmp_path, MAY) as gateway:
         seen = gateway.frame_number()
         with held_up(gateway, path, {**body, "seen": seen}) as client:
@@ -162,7 +167,7 @@ def test_command_delayed_too_long_is_not_sent(tmp_path: Path, path: str, body: d
         assert commands(gateway) == []
 
 
-def test_a_stop_is_sent_although_it_was_delayed_too_long_for_a_command(tmp_path: Path) -> None:
+def test_a_stop_is_sent_however_long_the_network_delayed_it(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         assert gateway.command("/api/write", WRITE, authorization=gateway.bearer(Right.WRITE)).json["done"]
         assert gateway.command("/api/act", START, authorization=gateway.bearer(Right.WRITE)).json["done"]
@@ -174,7 +179,7 @@ def test_a_stop_is_sent_although_it_was_delayed_too_long_for_a_command(tmp_path:
         assert not motor.goal
 
 
-def test_a_start_that_names_a_frame_from_before_a_stop_is_not_sent(tmp_path: Path) -> None:
+def test_a_start_with_a_page_frame_from_before_a_stop_is_not_sent(tmp_path: Path) -> None:
     """Otherwise a proxy that repeats or delays a start could start a motor after a stop."""
     writer = {}
     with served(tmp_path, MAY) as gateway:
@@ -195,7 +200,7 @@ def test_a_start_that_names_a_frame_from_before_a_stop_is_not_sent(tmp_path: Pat
         assert gateway.command("/api/act", START, **writer).json["done"] is True
 
 
-def test_command_that_waited_too_long_for_a_thread_is_not_sent(tmp_path: Path) -> None:
+def test_a_command_that_waited_too_long_for_its_thread_is_not_sent(tmp_path: Path) -> None:
     begun: list[threading.Thread] = []
 
     class Late(threading.Thread):
@@ -205,7 +210,7 @@ def test_command_that_waited_too_long_for_a_thread_is_not_sent(tmp_path: Path) -
     with served(tmp_path, MAY) as gateway:
         gateway.gateway.seen_frames.clock = lambda: boottime_ns() - MOST_AGE_NS + 50_000_000
         start = {**START, "seen": gateway.frame_number()}
-        gateway.gateway.seen_frames.clock = lambda: 0  # so that the command is admitted
+        gateway.gateway.seen_frames.clock = lambda: 0  # so that the request itself is not refused as too old
         with pytest.MonkeyPatch.context() as patch, held_up(gateway, "/api/act", start) as client:
             patch.setattr("multidrop.supervisor.threading", SimpleNamespace(Thread=Late))
             client.sendall(b"}")
@@ -217,7 +222,7 @@ def test_command_that_waited_too_long_for_a_thread_is_not_sent(tmp_path: Path) -
         assert commands(gateway) == []
 
 
-def test_a_stop_called_while_a_start_begins_prevents_the_start(
+def test_a_stop_called_just_before_a_start_is_sent_prevents_the_start(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     act, before = commands_module.carry_out_verb, commands(gateway)
@@ -233,7 +238,7 @@ def test_a_stop_called_while_a_start_begins_prevents_the_start(
 
 
 @pytest.mark.slow
-def test_frame_of_a_previous_process_is_refused(tmp_path: Path) -> None:
+def test_a_page_frame_number_of_a_previous_process_is_refused(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         seen = gateway.frame_number()
     with served(tmp_path, MAY) as gateway:
@@ -245,7 +250,9 @@ def test_frame_of_a_previous_process_is_refused(tmp_path: Path) -> None:
 
 
 @table("wrong", [{}, {"seen": None}, {"seen": "7"}, {"seen": True}, {"seen": 1.5}, {"seen": 10**300}])
-def test_writes_and_verbs_without_a_frame_number_are_refused(gateway: Served, wrong: dict[str, Any]) -> None:
+def test_writes_and_verbs_without_a_page_frame_number_are_refused(
+    gateway: Served, wrong: dict[str, Any]
+) -> None:
     before, called = commands(gateway), gateway.gateway.commands.called
     writer = {"authorization": gateway.bearer(Right.WRITE)}
     verbs = {"start": {}, "jog": {}, "reset_fault": {}, "set_frequency": {"hz": 20.0}}
@@ -256,14 +263,14 @@ def test_writes_and_verbs_without_a_frame_number_are_refused(gateway: Served, wr
     assert (commands(gateway), gateway.gateway.commands.called) == (before, called)
 
 
-def test_stops_need_no_frame(gateway: Served) -> None:
+def test_stops_need_no_page_frame_number(gateway: Served) -> None:
     for verb in ("stop", "coast"):
         told = gateway.post("/api/act", {"drive": "pump-1", "verb": verb, "options": {}}).json
         assert told["done"] is True
 
 
 @pytest.mark.slow
-def test_documented_start_from_a_shell_works(tmp_path: Path) -> None:
+def test_the_start_command_in_the_documentation_works_from_a_shell(tmp_path: Path) -> None:
     for program in ("curl", "jq"):
         require_program(program)
     page = (Path(__file__).parents[3] / "docs/gateway/serve.md").read_text("utf-8")
@@ -277,7 +284,7 @@ def test_documented_start_from_a_shell_works(tmp_path: Path) -> None:
         assert json.loads(ran.stdout)["text"] == "pump-1: start is done"
 
 
-def test_frames_state_the_number_of_stops_of_each_drive(gateway: Served) -> None:
+def test_page_frames_contain_the_number_of_stops_of_each_drive(gateway: Served) -> None:
     def stops() -> list[int]:
         return [gateway.frame()["drives"][name]["stops"] for name in ("pump-1", "pump-2")]
 

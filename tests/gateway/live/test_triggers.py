@@ -1,4 +1,4 @@
-"""The gateway's triggers: conditions over rows, the last moment of each, their settings and their route."""
+"""Triggers of the gateway: their conditions, the last moment of each, the settings, and /api/triggers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MISS = None
 
 
 def rows(*found: tuple[float, str, float | None], drive: int = 0) -> Batch:
-    """Return rows of a drive, each given as its time in s, a register, and a value or None for a miss."""
+    """Return rows of a drive. Each is given as (time in s, register, value or None for a failed read)."""
     made = []
     for at, register, value in found:
         ns, status = round(at * SECOND), 0 if value is not None else int(Status.NO_REPLY)
@@ -44,8 +44,8 @@ def moments(found: Triggers) -> dict[str, float]:
     return {name: (one.time_ns - UTC_0) / SECOND for name, one in found.last.items()}
 
 
-def test_a_trigger_occurs_once_when_its_condition_becomes_true(tmp_path: Path) -> None:
-    """A condition that is true from the start is no trigger, and neither is a miss."""
+def test_a_trigger_fires_once_when_its_condition_becomes_true(tmp_path: Path) -> None:
+    """A condition that is true from the start fires no trigger, and neither does a failed read."""
     found = triggers(tmp_path, {"trip": "pump-1.output_current > 30"})
     seen = []
     for at, value in enumerate((40.0, MISS, 41.0, 20.0, MISS, 21.0, 35.0, MISS, 36.0, 5.0, 50.0)):
@@ -64,7 +64,7 @@ def test_a_trigger_occurs_once_when_its_condition_becomes_true(tmp_path: Path) -
     }
 
 
-def test_fault_of_any_drive_is_a_trigger_and_the_newest_is_first(tmp_path: Path) -> None:
+def test_a_fault_of_any_drive_fires_a_trigger_and_the_newest_is_listed_first(tmp_path: Path) -> None:
     found = triggers(tmp_path, {"any": "fault", "fast": "pump-1.output_frequency > 40"})
     for drive in (0, 1):
         found.take(rows((1, "fault", 0.0), (2, "fault", 0.0), drive=drive))
@@ -75,8 +75,8 @@ def test_fault_of_any_drive_is_a_trigger_and_the_newest_is_first(tmp_path: Path)
     assert {"drive": "pump-2", "register": "output_current"} in second["signals"]
 
 
-def test_condition_uses_a_channels_own_rows_in_the_order_of_time(tmp_path: Path) -> None:
-    """A batch has the rows of channels after those of all registers."""
+def test_a_condition_with_a_computed_channel_uses_the_channels_rows_in_time_order(tmp_path: Path) -> None:
+    """In a batch, the rows of channels follow those of all registers."""
     found = triggers(tmp_path, {"odd": "pump-2.load != pump-2.output_current * 2"}, CHANNEL)
     for times in ((0,), (1, 2, 3)):
         currents = [(at, "output_current", float(at)) for at in times]
@@ -86,13 +86,14 @@ def test_condition_uses_a_channels_own_rows_in_the_order_of_time(tmp_path: Path)
     assert moments(found) == {"odd": 4.0}
 
 
-def test_reload_evaluates_the_conditions_over_the_new_plant(tmp_path: Path) -> None:
+def test_after_a_reload_conditions_are_evaluated_with_the_new_plant(tmp_path: Path) -> None:
     found = triggers(tmp_path, {"trip": "pump-1.output_current > 30"})
     found.take(rows((1, "output_current", 1.0)))
 
     async def adopted() -> None:
         found.adopt(written(tmp_path))
-        found.take(rows((2, "output_current", 40.0)))  # ignored: `run` has not checked the new plant
+        # ignored, because `run` has not yet prepared the conditions for the new plant
+        found.take(rows((2, "output_current", 40.0)))
         running = asyncio.create_task(found.run())
         while found._conditions is None:
             await asyncio.sleep(0.001)
@@ -106,7 +107,7 @@ def test_reload_evaluates_the_conditions_over_the_new_plant(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_route_returns_the_last_triggers(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_api_triggers_returns_the_last_triggers(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     condition = "integral(pump-1.output_current >= 0) > 0.2"
     with served(tmp_path, f'[serve.trigger]\nconditions = {{ trip = "{condition}" }}\n') as gateway:

@@ -1,4 +1,4 @@
-"""A gateway with all kinds of users together: answers are right and all drives are stopped."""
+"""A gateway with users of all kinds at once: its answers are right, and all drives can be stopped."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LEAST = {"frames": 100, "scrapes": 5, "queries": 5, "messages": 200, "reads": 10
 
 @pytest.mark.long
 def test_gateway_stays_healthy_with_all_kinds_of_users_together(tmp_path: Path) -> None:
-    """Users: five viewers, ten clients that read no answers, a scraper, history, MQTT, two Modbus masters."""
+    """Five viewers, ten clients that read no answers, Prometheus, history, MQTT, and two Modbus masters."""
     require_module("paho.mqtt.client")
     with ExitStack() as stack:
         broker = stack.enter_context(mosquitto(tmp_path))

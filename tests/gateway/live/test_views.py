@@ -1,4 +1,4 @@
-"""Views of a plant over HTTP: its description, frames, one drive, lines, alarms, and unpolled registers."""
+"""Views of a plant over HTTP: description, page frames, a drive, lines, alarms, unpolled registers."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 @pytest.fixture
 def gateway(shared: Served) -> Iterator[Served]:
-    """One gateway for all tests. When a test starts, both drives answer, and no view reads are pending."""
+    """The shared gateway. When a test starts, both drives answer, and no reads for viewers are pending."""
     shared.await_state("pump-2", "stands")
     yield shared
     for sim in shared.sims.values():
@@ -53,7 +53,7 @@ def gateway(shared: Served) -> Iterator[Served]:
     until(lambda: not shared.gateway.side_reads.under_way)
 
 
-def test_plant_description_has_data_of_plant_file_and_manual(gateway: Served) -> None:
+def test_plant_description_combines_the_plant_file_and_the_manuals(gateway: Served) -> None:
     plant = gateway.get("/api/plant").json
     assert (plant["name"], plant["history"]) == ("plant.toml", False)
     assert plant["may"] == {"role": "look", "write": [], "verbs": []}
@@ -87,7 +87,7 @@ def test_a_line_is_described_with_the_baud_rates_of_all_its_drives() -> None:
     assert [drive["speed"] for drive in told["drives"]] == ["38400 8N1", "9600 8N1", "9600 8N1"]
 
 
-def test_a_frame_has_values_with_their_own_times(gateway: Served) -> None:
+def test_a_page_frame_has_a_time_for_each_value(gateway: Served) -> None:
     gateway.sims["pump-1"]["output_current"] = 12.3
     frame: dict[str, Any] = {}
 
@@ -105,10 +105,10 @@ def test_a_frame_has_values_with_their_own_times(gateway: Served) -> None:
     assert frame["lines"]["hall"]["lost"] is None
     following = gateway.get(f"/api/frame?after={frame['n']}").json
     assert following["n"] > frame["n"] == following["since"]
-    assert "revision" not in following  # not changed, and so not in a frame of changes
+    assert "revision" not in following  # a frame of changes has no revision if the plant has not changed
 
 
-def test_new_page_gets_the_samples_of_the_last_minute(gateway: Served) -> None:
+def test_a_newly_opened_web_page_gets_the_values_of_the_last_minute(gateway: Served) -> None:
     began_ms, values = time.time() * 1e3, set[float]()
 
     def has_new_values() -> bool:
@@ -142,7 +142,7 @@ def test_values_of_a_silent_drive_are_marked_as_old(gateway: Served) -> None:
     def lasting() -> list[dict[str, Any]]:
         return [one for one in alarms() if one["ended"] is None]
 
-    until(lasting)  # on a busy machine there may have been other alarms before
+    until(lasting)  # on a busy machine, the drive may have had shorter alarms before
     begun = lasting()[0]
     assert begun["kind"] == "silent"
     gateway.sims["pump-2"].deaf_until = 0.0  # the drive answers again
@@ -201,8 +201,8 @@ def test_lines_show_the_delays_of_each_drive(gateway: Served) -> None:
 
 
 @pytest.mark.long
-def test_misses_of_a_silent_drive_are_counted_against_requested_values(gateway: Served) -> None:
-    """One request reads several values. Misses are counted by value, and so divided by requested values."""
+def test_failed_reads_of_a_silent_drive_are_divided_by_the_requested_values(gateway: Served) -> None:
+    """A request reads several values at once. Both failures and requests are counted per value."""
     recent = gateway.gateway.recent
 
     def came() -> int:
@@ -223,8 +223,8 @@ def test_misses_of_a_silent_drive_are_counted_against_requested_values(gateway: 
     assert drive["asked"] >= sum(drive["misses"].values()) + before
 
 
-def test_drive_shows_only_eeprom_writes_of_its_port_address_and_family(gateway: Served) -> None:
-    """Another drive may have the same address on another port, or may have had this address earlier."""
+def test_a_drive_shows_the_eeprom_writes_of_its_own_port_address_and_family_only(gateway: Served) -> None:
+    """Another drive may have the same address on another port, or may have had this address before."""
     drive = gateway.gateway.plant.find_drive("pump-1")[1]
     assert gateway.gateway.poller
     port = gateway.gateway.poller.bus("hall").line.identity
@@ -240,8 +240,8 @@ def test_drive_shows_only_eeprom_writes_of_its_port_address_and_family(gateway: 
 
 
 @pytest.mark.slow
-def test_the_function_ask_reads_the_words_at_any_address(gateway: Served) -> None:
-    """`ask` returns words as the drive stores them, for Modbus masters."""
+def test_gateway_ask_reads_the_words_at_any_address(gateway: Served) -> None:
+    """Modbus masters need the words exactly as the drive stores them."""
     gateway.sims["pump-1"]["output_current"] = 12.3
 
     def ask(drive: str, expiry_s: float) -> list[int]:
@@ -267,7 +267,7 @@ def test_health_is_ok_while_all_drives_answer(gateway: Served) -> None:
     assert (health.status, health.json["status"], health.json["lines"]) == (200, "ok", {"hall": "ok"})
 
 
-def test_gateway_without_triggers_answers_with_an_empty_list(gateway: Served) -> None:
+def test_a_gateway_without_triggers_answers_with_an_empty_list(gateway: Served) -> None:
     assert gateway.get("/api/triggers").json == {"triggers": []}
 
 
@@ -278,7 +278,7 @@ MINUTE_MS = 60_000
 
 
 def reading(seconds: int, *, per_s: int = 10) -> LineStatistics:
-    """Return a line's statistics after `seconds` of samples, with a miss every 30 s."""
+    """Return the statistics of a line after `seconds` s, with one failed read every 30 s."""
     missed = Counter({int(Status.NO_REPLY): seconds // 30})
     counters = Counters()._replace(values=seconds * per_s, sent=seconds * per_s, missed=missed)
     return line_statistics(float(seconds), {"pump-1": counters}, None)
@@ -290,7 +290,9 @@ def recent(tmp_path: Path) -> RecentStatistics:
 
 
 @pytest.mark.slow
-def test_hour_has_60_minutes_of_figures_but_few_readings_are_stored(recent: RecentStatistics) -> None:
+def test_the_last_hour_has_figures_for_60_minutes_but_few_readings_are_stored(
+    recent: RecentStatistics,
+) -> None:
     alive: list[weakref.ref[LineStatistics]] = []
     for second in range(0, 70 * 60 + 31, 5):
         found = reading(second)
@@ -306,7 +308,7 @@ def test_hour_has_60_minutes_of_figures_but_few_readings_are_stored(recent: Rece
     assert recent.hour("roof") == []
 
 
-def test_line_figures_cover_the_last_seconds(recent: RecentStatistics) -> None:
+def test_figures_of_a_line_cover_the_last_seconds(recent: RecentStatistics) -> None:
     for second in range(200):
         recent.tick(float(second), second * 1000, {"hall": reading(second)})
         if second == 100:
@@ -316,10 +318,13 @@ def test_line_figures_cover_the_last_seconds(recent: RecentStatistics) -> None:
     assert recent.line("roof")["rate"] is None
 
 
-def test_figures_without_replies_are_none_not_zero(recent: RecentStatistics, tmp_path: Path) -> None:
+def test_figures_of_a_line_without_replies_are_none_instead_of_zero(
+    recent: RecentStatistics, tmp_path: Path
+) -> None:
     assert recent.line("hall")["misses"] is None
     for second in range(100):
-        recent.tick(float(second), second * 1000, {"hall": reading(second)})  # a reading without any reply
+        # these statistics contain no reply
+        recent.tick(float(second), second * 1000, {"hall": reading(second)})
     assert recent.line("hall")["p99"] is None
     plant = written(tmp_path)
     gateway: Any = SimpleNamespace(plant=plant, hub=Hub(plant), recent=recent)
@@ -330,7 +335,7 @@ def test_figures_without_replies_are_none_not_zero(recent: RecentStatistics, tmp
     assert delays.samples == [("_count", {"line": "hall", "drive": "pump-1"}, 0.0)]
 
 
-def test_a_reopened_line_has_figures_only_after_its_second_reading(recent: RecentStatistics) -> None:
+def test_a_reopened_line_has_figures_from_its_second_reading_on(recent: RecentStatistics) -> None:
     recent.tick(100.0, 100_000, {"hall": replace(reading(100), epoch=1)})
     recent.tick(101.0, 101_000, {"hall": replace(reading(1), epoch=2)})
     assert (recent.line("hall")["rate"], recent.line("hall")["used"]) == (None, None)
@@ -338,7 +343,7 @@ def test_a_reopened_line_has_figures_only_after_its_second_reading(recent: Recen
     assert recent.line("hall")["rate"] == 10.0
 
 
-def test_a_removed_drive_never_makes_a_rate_negative(recent: RecentStatistics) -> None:
+def test_removing_a_drive_makes_no_rate_negative(recent: RecentStatistics) -> None:
     recent.tick(100.0, 100_000, {"hall": reading(100)})
     recent.tick(101.0, 101_000, {"hall": replace(reading(1), seconds=101.0)})
     assert recent.line("hall")["rate"] == 0.0
@@ -351,8 +356,10 @@ MAY_STOP = '[serve.may]\nstop = "anyone"\n'
 
 
 @pytest.mark.long
-def test_first_stop_reads_no_identity(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No identity is read between the call of a stop and its Modbus frame."""
+def test_a_stop_does_not_first_read_the_drives_identity(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No identity is read between the call of the stop and the Modbus request that stops the drive."""
     asked: list[str] = []
     with served(tmp_path, MAY_STOP) as gateway:
         bus = gateway.gateway.bus("hall")
@@ -366,7 +373,7 @@ def test_first_stop_reads_no_identity(tmp_path: Any, monkeypatch: pytest.MonkeyP
 
 
 class AskedBus:
-    """A bus that records the checked drives, and raises the exceptions in `failures`."""
+    """A fake bus that records whose identity was checked, and raises the exceptions in `failures`."""
 
     def __init__(self, failures: dict[str, Exception]) -> None:
         self.names: list[str] = []
@@ -383,7 +390,7 @@ class AskedBus:
 
 
 def ask_all(bus: AskedBus, is_there: Callable[[str], bool], *names: str) -> list[str]:
-    """Check these drives in two rounds; return "failed" for each unexpected exception."""
+    """Check the identities of these drives twice; return "failed" for each unexpected exception."""
     drives = [SimpleNamespace(drive=SimpleNamespace(name=name)) for name in names]
     plant = SimpleNamespace(lines=[SimpleNamespace(name="hall", drives=drives)])
     failed: list[str] = []
@@ -418,7 +425,7 @@ def test_identity_of_a_silent_drive_is_not_read() -> None:
 
 @pytest.mark.usefixtures("_at_once")
 def test_known_identity_is_not_read_again() -> None:
-    """No thread is started for a known identity either."""
+    """A drive whose identity is known needs no thread either."""
     bus = AskedBus({})
     bus.known.add("pump-1")
     assert ask_all(bus, lambda name: True, "pump-1", "pump-2") == []
@@ -426,7 +433,7 @@ def test_known_identity_is_not_read_again() -> None:
 
 
 @pytest.mark.usefixtures("_at_once")
-def test_wrong_identity_is_logged_once_and_failures_do_not_end_the_check(
+def test_a_wrong_identity_is_logged_once_and_failures_do_not_end_the_checks(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     stranger = WriteForbidden(
@@ -450,7 +457,9 @@ def parameter_state(gateway: Served) -> str:
     return str(gateway.get(PARAMETERS).json["state"])
 
 
-def test_parameters_are_read_on_request_and_exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drive_parameters_are_read_on_request_and_exported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     space = ParameterSpace(groups=(ParameterGroup("P.", 0x2000, range(3)),))
     monkeypatch.setattr(InvtCHE, "parameter_space", space)
     parameters._parameters_of.cache_clear()
@@ -471,7 +480,7 @@ def test_parameters_are_read_on_request_and_exported(tmp_path: Path, monkeypatch
     parameters._parameters_of.cache_clear()
 
 
-def test_parameters_of_a_family_without_known_addresses_are_refused(tmp_path: Path) -> None:
+def test_reading_parameters_is_refused_for_a_family_without_known_addresses(tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         gateway.get(f"{PARAMETERS}?read=1")
         until(lambda: parameter_state(gateway) == "failed")
