@@ -371,7 +371,7 @@ def test_a_ledger_with_an_invalid_time_blocks_the_write(tmp_path: Path, time: st
     with closing(sqlite3.connect(ledger.path)) as file:
         file.execute(f"update writes set time = {time}")
         file.commit()
-    why = "cannot be kept: it has a write of acceleration_time at an invalid time"
+    why = "cannot be kept: a write of acceleration_time has an invalid time"
     with pytest.raises(OSError, match=why):
         ledger.enter(cell, 1000.0, 60.0)
     assert main(["wear", "--ledger", str(ledger.path)]) == 1

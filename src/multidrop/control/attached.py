@@ -32,8 +32,8 @@ _log = logging.getLogger("multidrop.bus")
 def made(drive: D | type[D], address: int | None, line: dict[str, Any], details: dict[str, Any]) -> D:
     """Return `drive`, or, if it is a family, a new drive of that family.
 
-    `line` and `details` are options of the new drive; `details` override `line`. Raises TypeError for any
-    other object, for a missing address, and for details of an existing drive.
+    `line` and `details` are options of the new drive; `details` override `line`. Raises TypeError if `drive`
+    is neither a family nor a drive, if the address is missing, or if details are given for an existing drive.
     """
     family = drive if isinstance(drive, type) else type(drive)
     if not issubclass(family, Drive):
@@ -48,7 +48,7 @@ def made(drive: D | type[D], address: int | None, line: dict[str, Any], details:
 
 
 class BusLink:
-    """The link through which drives of a bus read, write, move and stop when their methods are called."""
+    """Carries out the reads, writes, moves and stops that are requested by methods of a bus's drives."""
 
     def __init__(self, exchanges: Exchanges, performer: Performer, stopper: Stopper) -> None:
         self._exchanges = exchanges
@@ -163,7 +163,7 @@ class Attached:
 
 
 class Leaving:
-    """Cancels all calls of a bus at its end, and stops its drives if `stop_on_exit` was called."""
+    """Cancels all calls on a bus when it ends, and stops its drives if `stop_on_exit` was called."""
 
     def __init__(
         self,
@@ -217,7 +217,7 @@ class Leaving:
 
         If `stop_on_exit` was called, stop the drives `to_stop` before that wait.
         """
-        self._latches.end(drives)  # first, because a start that is sent after the stops would not be stopped
+        self._latches.end(drives)  # cancel calls first: a start sent after the stops would not be stopped
         if to_stop and self.stops:
             run = self._stopper.stop_all(to_stop, lambda: False, None)
             try:

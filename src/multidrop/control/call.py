@@ -22,7 +22,7 @@ from multidrop.transport.exchange import Exchanges
 STOPPED = "a stop was called"
 REMOVED = "the drive was taken off the bus"
 LEFT = "the bus was left"
-POLL_S = 0.005  # s between checks for the end of stops
+POLL_S = 0.005  # s between checks whether all stops have ended
 
 
 class Latches:
@@ -61,7 +61,7 @@ class Latches:
         self._latches.pop(drive, None)
 
     def shut(self) -> None:
-        """Cancel all calls for good. Takes no lock, because a signal handler may call it."""
+        """Cancel all present and future calls. Takes no lock, because a signal handler may call it."""
         self.is_shut = True
         for latch in list(self._latches.values()):
             latch.shut(LEFT)
@@ -89,7 +89,7 @@ class Latches:
             self.latch(drive).rise(STOPPED)
 
     def begin(self, stop: object, drives: Sequence[Drive]) -> None:
-        """Start a stop: until `over(stop)`, cancel and refuse moves of these drives, and keep them attached.
+        """Start a stop. Until `over(stop)`, cancel and refuse moves of these drives, and keep them attached.
 
         `begin` may be called repeatedly. Neither `begin` nor `over` takes a lock. Each of their steps is
         atomic, so an exception that a signal handler raises leaves no step half done.
@@ -109,7 +109,7 @@ class Latches:
 # ---- calls ----
 
 
-MOST_CHARACTERS = 64  # longest request for one register plus its reply, in characters
+MOST_CHARACTERS = 64  # length in characters of the longest request for one register and its reply together
 
 _log = logging.getLogger("multidrop.control")
 
@@ -131,7 +131,8 @@ class Call:
         self.verb = verb
         self.sent = ""  # the latest write that may have been sent
         self.is_confirmed = False  # whether the drive confirmed the write in `sent`
-        self.unverified: Outcome | None = None  # outcome of the write in `sent`, until a later read succeeds
+        # outcome of the write in `sent`; None once a later read has succeeded
+        self.unverified: Outcome | None = None
         self.expiry = expiry
         self._due_ns = clock.boottime_ns()
         self._limit_ns = limit_ns
@@ -234,7 +235,8 @@ def _called(limit: Limit) -> float:
     if not callable(limit):
         raise TypeError(f"limit = {limit!r} must be a function that returns a time of CLOCK_MONOTONIC in ns")
     at_ns = limit()
-    return at_ns if at_ns == at_ns else 0  # a deadline of NaN would never pass: 0 has always passed
+    # NaN becomes 0, a deadline that has passed: no comparison with NaN is true
+    return at_ns if at_ns == at_ns else 0
 
 
 @contextmanager

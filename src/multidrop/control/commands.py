@@ -30,10 +30,11 @@ from multidrop.errors import NotAttached
 from multidrop.supervisor import supervisor
 
 COMMAND_S = 60.0  # a command that takes longer is reported as hanging (a stop may take 30 s)
-TURN_S = 0.2  # s; how long a stop that has no thread blocks the event loop in one turn
-AGAIN_S = 0.2  # s; pause between two such turns, for the event loop's other work
-STOP_S = 30.0  # s; how long the event loop repeats a stop that has no thread
-REPEATED_S = 30.0  # s; a drive's stop is repeated for at least this long after each call of a stop
+TURN_S = 0.2  # s; how long each stop may block the event loop, if no thread can be started
+AGAIN_S = 0.2  # s; pause between two stops in the event loop, so that its other work runs
+STOP_S = 30.0  # s; how long the event loop repeats stops, if no thread can be started
+# s; a drive's stop is repeated for at least this long after a client's newest call of a stop
+REPEATED_S = 30.0
 BEGINNING_S = 0.25  # s; longest time from the call of a stop until `stops_under_way` lists it
 
 R = TypeVar("R")
@@ -55,7 +56,7 @@ def carry_out_verb(drive: Drive, verb: str, arguments: Mapping[str, Any]) -> Com
 
 
 def write_register(drive: Drive, name: str, value: float | str) -> CommandResult:
-    """Write a register and return the result; never raise. A choice is given by its name or raw count."""
+    """Write a register and return the result; never raise. A choice is given as its name or raw count."""
     try:
         register = drive.register(name)
         typed = typed_value(register, value)
@@ -71,7 +72,7 @@ def write_register(drive: Drive, name: str, value: float | str) -> CommandResult
 
 
 def typed_value(register: Register[Any], value: float | str) -> Any:
-    """Return a value in the register's type. Raises ValueError if a choice's number is not whole."""
+    """Convert a value to the register's type. Raises ValueError if the number of a choice is not whole."""
     if isinstance(value, str):
         return register.parse(value)
     if register.values is None:
@@ -98,7 +99,7 @@ def stop_line(bus: Callable[[], Any], names: Sequence[str], seconds: float | Non
     """Stop all drives on the bus that `bus` returns; return the results of the drives `names`, by name."""
     try:
         found: Mapping[str, Stopped] = bus().stop_all(seconds=seconds)
-    except Exception as failure:  # any failure: each drive's result reports it
+    except Exception as failure:  # any failure: the results of all drives report it
         return dict.fromkeys(names, result_of_failed_stop(failure))
     gone = result_of_failure(NotAttached("it is no longer on its line"))
     return {name: result_of_stop(found[name]) if name in found else gone for name in names}
@@ -160,10 +161,10 @@ def begin_stops(works: Sequence[StopWork]) -> list[asyncio.Future[Results]]:
 
 
 async def _stop_without_threads(works: Sequence[StopWork]) -> Results:
-    """Send all stops once before waiting for any motor to stop; then repeat the stops in turns.
+    """Send each stop once before waiting for any motor to stop; then repeat one stop after another.
 
     As soon as the system has a thread again, a stop continues in that thread. The event loop runs between the
-    turns, because a fleet's gateway must renew its lease: it may not send a stop without one.
+    stops, because a gateway in a fleet must renew its lease: without a lease it may not send a stop.
     """
     loop = asyncio.get_running_loop()
     found: Results = {}
@@ -214,8 +215,9 @@ class RepeatedStops:
         self._begin = begin
         # by drive: the newest repeated stop, and the time of that stop's call
         self._repeated: dict[Drive, tuple[StopFuture, float]] = {}
-        self._sent: dict[Drive, StopFuture] = {}  # stops that are sent once, in flight
-        self._waiting: dict[Drive, StopFuture] = {}  # stops to send after the stop in flight
+        self._sent: dict[Drive, StopFuture] = {}  # by drive: the single stop that is in flight
+        # by drive: the single stop to send after the one in flight
+        self._waiting: dict[Drive, StopFuture] = {}
         self._tasks: set[StopFuture] = set()
 
     def begin(self, lines: Iterable[LineStop]) -> list[StopFuture]:
@@ -258,7 +260,7 @@ class RepeatedStops:
         return stops if goes_on or _now() - called < BEGINNING_S else None
 
     def divided(self, drives: Iterable[Drive]) -> tuple[list[Drive], list[Drive]]:
-        """Return the drives whose stop must be started, and those whose stop is already being repeated."""
+        """Divide the drives into those whose stop must be started, and those whose stop is being repeated."""
         drives = [*drives]
         again = [drive for drive in drives if self.of(drive) is not None]
         return [drive for drive in drives if drive not in again], again
@@ -286,7 +288,7 @@ class RepeatedStops:
         return {drive.name: result}
 
     def _soon(self, drive: Drive) -> StopFuture:
-        """Send a stop now; during another stop, send one more after it, which serves all waiting calls."""
+        """Send a stop now. While one is in flight, queue one more, which serves all calls made meanwhile."""
         if drive not in self._sent:
             return self._send(drive)
         if drive not in self._waiting:

@@ -1,6 +1,6 @@
 """Ledger: a file that counts the writes of each register that a drive may keep in EEPROM.
 
-Several processes share the file. It identifies a drive by its port's identity and its address. An
+Several processes share the file. The ledger identifies a drive by its port's identity and its address. An
 EEPROM survives about 10,000 writes; a yearly budget makes these writes last for ten years.
 """
 
@@ -19,7 +19,7 @@ YEAR = 365 * 86400.0  # s
 CYCLES = 10_000  # writes that an EEPROM survives (Toshiba's figure for a relative of the YD1000)
 YEARS = 10
 BUDGET = CYCLES // YEARS  # limit of writes of one register in a year
-NO_HOME = Path("/nonexistent")  # used for a user without a home folder
+NO_HOME = Path("/nonexistent")  # replaces the home folder of a user who has none
 LATEST = 6e10  # s; the file is damaged if a time in it is further than this from 1970
 YEARLY = "times in a year"  # only the error for a used-up yearly budget contains these words
 LEAST_INTERVAL = 60.0  # s between two writes of a register that is kept in EEPROM
@@ -42,7 +42,7 @@ class LedgerCell:
 
 @dataclass(frozen=True)
 class Wear:
-    """The number of writes to a cell."""
+    """The number of writes to one register of one drive (a cell)."""
 
     cell: LedgerCell
     writes: int  # all writes so far
@@ -176,5 +176,5 @@ def _wear(ledger: sqlite3.Connection, cell: LedgerCell, ports: list[str], now: f
     ).fetchone()
     (last,) = ledger.execute("select time from writes where rowid = ?", (latest,)).fetchone() or (0.0,)
     if not isinstance(last, float) or not abs(last) < LATEST:
-        raise sqlite3.DataError(f"it has a write of {cell.register} at an invalid time: {last!r}")
+        raise sqlite3.DataError(f"a write of {cell.register} has an invalid time: {last!r}")
     return Wear(replace(cell, spelt=""), writes, this_year, last)

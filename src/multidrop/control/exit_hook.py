@@ -26,7 +26,7 @@ from multidrop.errors import BusError
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 IMPATIENT = 3  # this many signals within a second end the wait for the stops
-HANDLING_S = 0.05  # longest time until a signal is handled
+HANDLING_S = 0.05  # s; duration of each short wait, so that signals are handled in between
 PACKAGE = __name__.partition(".")[0]
 MOST_NAMES = 20  # limit of drives named in a message
 CUT_SHORT = "the stops were cut short by a third signal: motors may still be turning"
@@ -134,7 +134,7 @@ class ExitHook:
     def __init__(self) -> None:
         # changed by atomic operations only, because any thread may add and remove acts
         self._acts: list[LastAct] = []
-        # by signal: the program's handler before ours was installed
+        # by signal: the handler of the program that ours replaced
         self._before: dict[signal.Signals, Any] = {}
         self._has_taken = False
         self._held: int | None = None  # number of the first signal, while the signal's effect is delayed
@@ -203,7 +203,7 @@ class ExitHook:
         """If no last act is left, restore the earlier handlers. Does nothing outside the main thread."""
         if not self._acts and self._held is None and threading.current_thread() is threading.main_thread():
             self._let_go()
-            if self._acts:  # another act was added in between
+            if self._acts:  # another thread has added an act
                 self.take_signals()
 
     def _at_exit(self) -> None:
@@ -216,7 +216,7 @@ class ExitHook:
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         """Start the last acts. Takes no lock that the interrupted main thread may hold."""
         now = time.monotonic()
-        if number in _SIGNALS:  # a closing terminal may send several SIGHUPs
+        if number in _SIGNALS:  # not SIGHUP: a closing terminal may send it several times
             self._came = [*(at for at in self._came if now - at < 1.0), now]
         is_first = self._held is None
         if is_first:
@@ -236,7 +236,7 @@ class ExitHook:
             self._pass_on(number, frame)
 
     def _one_is_over(self) -> None:
-        """Once all last acts are over, send the delayed signal to the main thread."""
+        """If all last acts are over, send the delayed signal to the main thread."""
         with self._passing:
             held, ident = self._held, threading.main_thread().ident
             if self._has_passed or held is None or ident is None:

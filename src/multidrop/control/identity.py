@@ -35,7 +35,7 @@ Timed = Callable[[], AbstractContextManager[None]]
 
 
 class Suspicion(NamedTuple):
-    """The reason to suspect that a drive is of another family, and the make that it answers as, if known."""
+    """Why a drive may be of another family, and the make that it seems to be, if known."""
 
     why: str
     is_certain: bool = False
@@ -88,8 +88,8 @@ class EchoCheck:
 class _Confirmed(NamedTuple):
     """The drive's state when its family was last confirmed."""
 
-    silences: int  # number of the drive's unanswered requests until then
-    pauses: int  # number of pauses of PAUSE_NS or more between the drive's replies until then
+    silences: int  # number of the drive's unanswered requests before the confirmation
+    pauses: int  # number of the drive's silences of PAUSE_NS or more before the confirmation
     at_ns: int
     slept_ns: int  # how long the computer had slept since it was started
 
@@ -105,8 +105,8 @@ class _Findings:
     def __init__(self, port: object) -> None:
         self.port = port  # the open port's object; reopening creates another one
         self.confirmed: _Confirmed | None = None
-        self.stops: set[float] = set()  # raw counts of stops that were allowed
-        self.suspicion: Suspicion | None = None  # found by the previous check before a stop
+        self.stops: set[float] = set()  # raw counts that `check_before_stop` has allowed
+        self.suspicion: Suspicion | None = None  # the suspicion of the previous check before a stop
         self.doubt = ""  # why the drive may be of another family, although it was sent a stop
 
 
@@ -223,13 +223,14 @@ class IdentityCheck:
         if suspicion is not None and suspicion == before:
             other = self._lookalike(drive, register, count) or self._shown(drive, rivals)
             if other is not None or suspicion.is_certain:
-                raise _withheld(drive, suspicion.why, other)  # the next stop checks the drive again
+                # the result is not kept: the next stop checks the drive again
+                raise _withheld(drive, suspicion.why, other)
         if suspicion is not None:
             findings.doubt = suspicion.why
         findings.stops.add(count)
 
     def doubt(self, drive: Drive) -> str:
-        """Return why a drive that was sent a stop may be of another family; "" without a suspicion."""
+        """Return why a drive may be of another family although it was sent a stop; "" without a suspicion."""
         findings = self._findings(drive)
         return "" if findings.confirmed else findings.doubt
 
@@ -249,7 +250,7 @@ class IdentityCheck:
         def do(step: Step) -> object:
             nonlocal refused
             if isinstance(step, Wait):
-                return None  # a stop does not wait
+                return None  # skipped, because a stop must not be delayed
             try:
                 return self._read(drive, step, 1, insists=True)
             except DriveException as refusal:
@@ -270,7 +271,7 @@ class IdentityCheck:
         except Exception:  # no reply, or an error in the family's own code: the stop is sent
             return self._rival(drive, rivals)
         if self._is_in_step(drive):
-            # only drives whose family is not confirmed are checked here
+            # `_suspicion` is called only for drives whose family is not confirmed
             self._know(drive, findings, silences, was_heard=False)
         return None
 
@@ -307,7 +308,7 @@ class IdentityCheck:
         return None
 
     def _lookalike(self, drive: Drive, register: Register[Any], count: float) -> Drive | None:
-        """Return this drive as an object of the built-in family that recognises it SURE times; else None.
+        """Return the drive as an object of a built-in family that recognises it SURE times; None without one.
 
         Families in which the same raw count at this register is also a stop are skipped.
         """
@@ -332,7 +333,7 @@ class IdentityCheck:
             return False
 
     def _reads_as(self, other: Drive, drive: Drive, script: Script[Any], timed: Timed = nullcontext) -> Any:
-        """Run a script that reads registers of `other` from this drive; return its result, False if it fails.
+        """Read `drive` by a script of the drive `other`; return the script's result, or False if it fails.
 
         Raises NoReply if the drive does not answer.
         """

@@ -26,7 +26,7 @@ from multidrop.errors import (
 
 class Effect(Enum):
     DONE = "done"
-    TAKEN_AS = "taken as"  # the drive holds another value
+    TAKEN_AS = "taken as"  # the drive holds another value than the one that was written
     REFUSED = "refused by the drive"
     UNCONFIRMED = "unconfirmed"  # no reply: the write may have had its effect
 
@@ -98,7 +98,8 @@ class Stopped:
 # ---- results of commands ----
 
 
-_OUTCOMES: tuple[tuple[type[BaseException], CommandOutcome], ...] = (  # the first match counts
+# the first type that the exception is an instance of counts
+_OUTCOMES: tuple[tuple[type[BaseException], CommandOutcome], ...] = (
     (WriteForbidden, CommandOutcome.REFUSED),
     (Unsupported, CommandOutcome.REFUSED),
     (NotAttached, CommandOutcome.NOT_SENT),
@@ -163,7 +164,7 @@ def _failed(failure: BaseException, outcome: CommandOutcome) -> CommandResult:
 
 
 def _outcome_of(failure: BaseException) -> CommandOutcome:
-    if isinstance(failure, (LineError, NotMaster)):  # their `is_sent`: whether a frame may have been sent
+    if isinstance(failure, (LineError, NotMaster)):  # `is_sent`: a frame may have been sent
         return CommandOutcome.UNKNOWN if failure.is_sent else CommandOutcome.NOT_SENT
     found = (outcome for kind, outcome in _OUTCOMES if isinstance(failure, kind))
     return next(found, CommandOutcome.UNKNOWN)

@@ -28,7 +28,7 @@ _log = logging.getLogger("multidrop.control")
 
 
 class _Over(Exception):
-    """Raised if a script continues after CancelledByStop was raised in it."""
+    """Raised if a script catches CancelledByStop and continues."""
 
 
 class Performer:
@@ -102,7 +102,7 @@ class Performer:
             return self._writer.raw(drive, request, call)
 
     def check_identity(self, drive: Drive, rest_s: float = 0.0) -> None:
-        """Check that a drive is of its declared family and log its watchdog, unless this was done before.
+        """Check a drive's declared family and log its `watchdog` sentence, unless this was done before.
 
         `rest_s` is a pause in s before each read.
         """
@@ -123,9 +123,10 @@ class Performer:
                 _log.info("%s: %s", drive.name, self.watchdog(drive))
 
     def watchdog(self, drive: Drive) -> str:
-        """Return a sentence on what the motor does if this client dies.
+        """Return a sentence that says what the motor does if this client dies.
 
-        The sentence has the drive's `communication_timeout` if that can be read, else the family's text.
+        The sentence contains the drive's `communication_timeout`. If that cannot be read, return the family's
+        text.
         """
         register = drive.registers.get("communication_timeout")
         if register is None or not register.readable:
@@ -144,7 +145,7 @@ class Performer:
         Raises Unconfirmed if a read fails after a write. The read's own error would mislead: NoReply means
         that the write was not sent, and DriveException that the drive refused the write.
         """
-        unseen: list[Exception] = []  # failures of steps that are not writes
+        unseen: list[Exception] = []  # failures of steps other than writes
         cancelled: list[CancelledByStop] = []
 
         def do(step: Step) -> Any:

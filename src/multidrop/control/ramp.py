@@ -20,8 +20,8 @@ from multidrop.transport import clock
 
 # s between reads of waiting drives: a drive silent for PAUSE_NS may have lost its power (identity.py)
 HEARD_S = PAUSE_NS / 2e9
-# A start whose turn comes later than planned expires. Delays up to these limits are not counted, in s.
-WAIT_SLACK_S, READ_S = 2.0, 5.0  # of each wait, and of the reads of each waiting drive
+# A start that comes later than planned expires. Delays up to these limits (s) do not count as late.
+WAIT_SLACK_S, READ_S = 2.0, 5.0  # limits for one wait, and for the reads of one waiting drive
 
 
 def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | None = None) -> None:
@@ -52,7 +52,7 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
 
 
 def _is_safe_to_stop(drive: Drive, call: Call | None) -> bool:
-    """Return False if nothing was sent to the drive, and its identity is unknown or it left its bus."""
+    """Return True if a write was sent to the drive, or if its identity is known on its present bus."""
     if call is None or call.sent:
         return True
     try:
@@ -192,7 +192,7 @@ def _own_rate(drive: Drive) -> Script[float | None]:
 
 
 def _present(drive: Drive, register: Register[float]) -> Script[float]:
-    """Return the setpoint in force, in Hz."""
+    """Return the drive's present setpoint, in Hz."""
     held = (yield from read(register)) if register.readable else drive.commanded
     if held is None:
         raise WriteForbidden(f"{drive.name} cannot report its setpoint: call set_frequency before a ramp")

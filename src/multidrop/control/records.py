@@ -33,7 +33,7 @@ T = TypeVar("T")
 
 OPENING_S = 5.0  # timeout for opening the file
 
-_sync = getattr(os, "fdatasync", os.fsync)  # macOS has no fdatasync
+_sync = getattr(os, "fdatasync", os.fsync)  # fsync on macOS, which has no fdatasync
 
 
 class AuditLog:
@@ -190,7 +190,7 @@ def _spelt(given: object) -> str:
     """Return the name of an author as printable text; the name may be any object."""
     try:
         text = given if isinstance(given, str) else repr(given)
-    except Exception:  # raised by the caller's own `__repr__`
+    except Exception:  # the object's own `__repr__` may raise anything
         text = type(given).__name__
     return printable(text).strip()[:MOST_CHARACTERS]
 
@@ -198,9 +198,9 @@ def _spelt(given: object) -> str:
 # ---- the records of a line's writes ----
 
 
-CALLED = "called"  # outcome in the record of a stop that is about to be sent
+CALLED = "called"  # outcome in the record of a write or a stop that is about to be sent
 REFUSED = "refused"  # outcome in the record of a write that was not sent
-CALLED_S = 0.05  # s; longest time that a stop waits for its record
+CALLED_S = 0.05  # s; longest time that a stop waits until its audit record is written
 CLOSING_NS = 1_000_000_000  # longest time that closing waits for other threads' records
 
 _log = logging.getLogger("multidrop.control")
@@ -213,11 +213,12 @@ class WriteRecords:
 
     def __init__(self, line: Line, ledger: Ledger, audit: AuditLog | None) -> None:
         self.audit = audit
-        self.audit_trouble = ""  # why the newest record could not be written
+        self.audit_trouble = ""  # why the newest audit record could not be written; "" if it was written
         self._line = line
         self._ledger = ledger
         self._uncounted: deque[LedgerCell] = deque()
-        self._unlogged: deque[tuple[int, dict[str, Any]]] = deque()  # records, each with its UTC in ns
+        # queued audit records, each with its time: UTC in ns
+        self._unlogged: deque[tuple[int, dict[str, Any]]] = deque()
         self._writers: list[None] = []  # one item for each thread in `catch_up`; a list needs no lock
 
     def count(self, drive: Drive, register: Register[Any], kept: Kept) -> None:
@@ -389,7 +390,7 @@ class WriteRecords:
 def _way_out(
     drive: Drive, register: Register[Any], kept: Kept, *, is_yearly: bool
 ) -> tuple[str, Advice | None]:
-    """Return a hint for the caller of a write that the ledger refuses, and Advice if there is any."""
+    """Return a hint on how to make a write that the ledger refuses, and its Advice; None if there is none."""
     if kept is Kept.UNKNOWN:
         declared = f'ram = ["{register.name}"]'
         written = f"write {declared} below its [[line.drive]]"

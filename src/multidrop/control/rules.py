@@ -47,12 +47,12 @@ def raw_count(drive: Drive, register: Register[T], value: T) -> float:
 
 
 def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden if this write may command the motor and the owner must still confirm the class.
+    """Raise WriteForbidden if the owner must first confirm the drive's class, and this may command the motor.
 
     A stop needs no confirmation. If the class is from a family file, all other raw counts need the owner's
     confirmation, even harmless ones.
     """
-    is_unproven = bool(drive.declared_in) and "confirmed" in drive.options  # its file may be wrong
+    is_unproven = bool(drive.declared_in) and "confirmed" in drive.options  # the family file may be wrong
     if is_harmless(register, raw):
         if is_unproven and not is_stop(drive, register, raw):
             drive.check_confirmed(register.name)
@@ -63,7 +63,7 @@ def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
 def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
     """Raise WriteForbidden if only a verb may send this write, such as one that starts a motor.
 
-    A command that does not move the motor by itself is allowed unless the owner must still confirm the
+    A command that does not move the motor by itself is allowed, unless the owner must first confirm the
     drive's class.
     """
     if is_harmless(register, raw) or not register.commands:
@@ -91,7 +91,7 @@ def _has(drive: Drive, name: str) -> bool:
 
 
 def check_broadcast(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden if the owner must still confirm the class and this broadcast is not a stop."""
+    """Raise WriteForbidden if the owner must first confirm the drive's class, unless this is a stop."""
     if not is_stop(drive, register, raw):
         drive.check_confirmed(register.name)
 

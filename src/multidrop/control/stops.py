@@ -46,7 +46,7 @@ MOST_STEPS = 8  # limit of the script's steps when a stop is sent again after an
 UNSENT = (WriteForbidden, LineError, NotMaster, ValueError)
 WORTH_REPEATING = (Unconfirmed, NotVerified, NoReply, BadReply, DriveException, PortLost, NotMaster)
 UNANSWERED = (Unconfirmed, NoReply, BadReply)
-NO_ROOM = (MemoryError, OSError)  # temporary: the system may soon have memory or descriptors again
+NO_ROOM = (MemoryError, OSError)  # retried: the system may soon have memory or descriptors again
 REGAIN_NS = 500_000_000  # interval at which stops try to reopen a lost port
 
 _log = logging.getLogger("multidrop.control")
@@ -83,9 +83,10 @@ class StopAttempt:
         self._unanswered = 0  # steps without a good reply
         self.is_over = False
         self.ended = begun  # time in s at which the attempt ended
-        self.interruption: BaseException | None = None  # SystemExit or the like, if the script raised it
+        # SystemExit or similar, raised by the script; kept until all stops are over
+        self.interruption: BaseException | None = None
         self.frame: Message | None = None  # the newest request of this stop
-        self._times_in_doubt = 0  # number of frames that may or may not have been sent
+        self._times_in_doubt = 0  # number of frames of which it is unknown whether they were sent
         self._is_confirmed = False
         self._pulses: set[tuple[str, Any]] = set()
         self._has_warned = False
@@ -122,7 +123,8 @@ class StopAttempt:
             else:
                 begun = now()
                 is_answered = self._carry_out(step, do)
-                self.due = max(self.due, now())  # due now at the earliest, so that overdue stops go first
+                # not earlier than now, so that stops that are already overdue go first
+                self.due = max(self.due, now())
                 if not is_answered:
                     self._share_line(begun, now())
         except StopIteration:
@@ -342,7 +344,8 @@ class StopRun:
         self._drives = drives
         self._make = make
         self._seconds = seconds
-        self._broadcast: Callable[[], bool] | None = broadcast  # None once it was called
+        # sends a broadcast stop; None once it was called
+        self._broadcast: Callable[[], bool] | None = broadcast
         self._tries = 0
         self.attempts: list[StopAttempt] = []
 
@@ -390,7 +393,7 @@ class StopRun:
         latest = interruption
         try:
             self._begin()
-            # the attempt that was interrupted comes last
+            # last: the stop of which a frame may already have been sent
             for attempt in sorted(self._left(), key=StopAttempt.is_in_doubt):
                 attempt.once_more(self._stopper.do)
         except BaseException as another:

@@ -74,7 +74,7 @@ class Writer:
         self.records.note_called(drive, write_request(drive, register, raw), _in_words(register, asked))
         if kept is not Kept.RAM:
             self.records.count(drive, register, kept)
-        # checked again, because counting the write may have taken long
+        # checked again, because counting the write in the ledger may have taken long
         self.identity_check.check(drive, call.look)
         return self._send(drive, register, raw, call, 0.0, self.records.log)
 
@@ -227,7 +227,8 @@ class Writer:
             lost = failure
         except (NoReply, BadReply) as failure:
             lost = failure
-        if lost is None or call is not None:  # a stop without a reply is repeated, not read back
+        # a stop (`call` is None) without a reply is repeated, not read back
+        if lost is None or call is not None:
             held, unread = self._held(drive, register, call)
         if held is not None and (held == asked or lost is None):
             effect = Effect.DONE if held == asked else Effect.TAKEN_AS
@@ -250,7 +251,7 @@ class Writer:
             return None, failure
 
     def _look(self, drive: Drive, step: Step, call: Call) -> Any:
-        """Carry out one step of a rule's check, a wait or a read of a register; return its result."""
+        """Carry out a step of a rule's check: wait, or read a register and return its value."""
         if isinstance(step, Wait):
             with call.step(step.seconds):
                 return clock.sleep(step.seconds)

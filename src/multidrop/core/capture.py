@@ -22,7 +22,7 @@ class Side(IntEnum):
 
 
 class Kind(IntEnum):
-    """The kind of a span of sniffed bytes (enum md_kind)."""
+    """What a run of sniffed bytes is: a request, a reply or junk (enum md_kind)."""
 
     JUNK = lib.MD_JUNK
     REQUEST = lib.MD_REQUEST
@@ -32,7 +32,7 @@ class Kind(IntEnum):
 
 
 class FrameSpan(NamedTuple):
-    """A frame, or junk between frames; junk has no valid `message` and `framing`."""
+    """A frame, or junk bytes between frames; for junk, `message` and `framing` are invalid."""
 
     kind: Kind
     framing: Framing
@@ -58,7 +58,7 @@ class Stream:
     def put(
         self, received: bytes, time_ns: int, *, side: Side = Side.EITHER, after_pause: bool = False
     ) -> None:
-        """Append bytes received at `time_ns`. With `after_pause` a frame probably starts with them."""
+        """Append bytes received at `time_ns`. If `after_pause` is True, a frame probably starts here."""
         piece = {"time_ns": time_ns, "side": side, "is_after_pause": after_pause}
         if not lib.md_stream_put(self.c, received, len(received), ffi.new("struct md_piece *", piece)[0]):
             raise BufferError("the stream is full: split it first")
@@ -69,7 +69,7 @@ class Stream:
 
 
 class Splitter:
-    """Cuts a stream into spans (struct md_splitter)."""
+    """Cuts a stream into frames and junk between frames, called spans (struct md_splitter)."""
 
     def __init__(self) -> None:
         self._c = ffi.new("struct md_splitter *")
@@ -100,15 +100,15 @@ class Decoder:
         self._c.block = ffi.NULL
         ffi.buffer(self._known)[:] = bytes(ffi.sizeof(self._known))
         self._c.taken = 0
-        self._blocks.clear()  # cleared last, because the core used them until here
+        self._blocks.clear()  # cleared last: until `known` is reset, the core uses these layouts
 
     @property
     def asked(self) -> tuple[Framing, Message]:
-        """Framing and content of the request for which `decode` returned UNKNOWN; next, call `know`."""
+        """The framing and content of the request for which `decode` returned UNKNOWN; answer by `know`."""
         return Framing(self._c.span.framing), from_c(self._c.span.message)
 
     def know(self, block: RowLayout | None) -> bool:
-        """Store the layout of replies to `asked` (None: no rows); return False if the table is full."""
+        """Store the layout of replies to that request (None: no rows); return False if the table is full."""
         if block:
             self._blocks.append(block)
         c = block.c if block else ffi.NULL
@@ -178,7 +178,7 @@ class Unpacker:
         self._c.count += 1
 
     def unpack(self) -> Unpacked:
-        """Append packets to their channels' streams until the caller must act; return why it must."""
+        """Append packets to their channels' streams until the caller must act; return the reason."""
         return Unpacked(lib.md_unpack(self._c))
 
 
@@ -189,7 +189,7 @@ _TAKEN = 1 << 16  # limit of the bytes read from the ring in one call
 class Wrappings:
     """Headers and trailers of a capture file's packets.
 
-    Each key of `wrappings` is a pair: the sender, and True if the frame starts with ':'.
+    Each key of `wrappings` is a pair: the sender of a frame, and True if the frame starts with ':'.
     """
 
     def __init__(self, wrappings: Mapping[tuple[Side, bool], tuple[bytes, bytes]]) -> None:

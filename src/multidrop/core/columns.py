@@ -15,12 +15,12 @@ from multidrop.core.memory import new_beside
 
 
 def number_at(path: str) -> int:
-    """Return a property that reads a number of a C struct. It uses attrgetter, which is fastest."""
+    """Return a property that reads a number in a C struct at this path, such as "c.error"."""
     return cast(int, property(attrgetter(path)))
 
 
 def flag_at(path: str) -> bool:
-    """Return a property that reads a number of a C struct as a bool."""
+    """Return a property that reads a number in a C struct at this path, as a bool."""
     read = attrgetter(path)
     return cast(bool, property(lambda owner: bool(read(owner))))
 
@@ -62,13 +62,13 @@ def raw_value(data: bytes, at: int, number_format: int) -> float:
 
 
 class Extra(NamedTuple):
-    """Properties that few fields have (struct md_extra): value = (raw * multiplier + addend) / divisor."""
+    """Rare properties of a field (struct md_extra); its value is (raw * multiplier + addend) / divisor."""
 
     addend: float = 0.0
-    low: int = 0  # lowest bit of the raw number that belongs to the field
-    bits: int = 0  # number of bits that belong to the field; 0: all
+    low: int = 0  # index of the field's lowest bit within the raw number
+    bits: int = 0  # number of the field's bits; 0: all bits of the raw number
     scale_at: int | None = None  # index in the reply of the 16-bit word with the decimal exponent
-    scale_format: int = NumberFormat.I16  # format of the exponent; its low 16 bits are signed
+    scale_format: int = NumberFormat.I16  # format of the exponent, whose low 16 bits are a signed number
     invalid: tuple[tuple[int, int], ...] = ()  # pairs of mask and bit pattern that mean "no value"
     scale_invalid: tuple[tuple[int, int], ...] = ()
 
@@ -79,10 +79,10 @@ class Extra(NamedTuple):
 
 
 class Field(NamedTuple):
-    """A register's place in a block's reply, its scale, and the code of its name."""
+    """How to decode one register: its place in a reply, its scale, and the code of its name."""
 
     at: int
-    number_format: int  # including order flags
+    number_format: int  # a NumberFormat, plus order flags
     register: int
     multiplier: float
     divisor: float
@@ -173,7 +173,7 @@ class Columns:
 
     @classmethod
     def lent(cls, made: Any, give_back: Callable[[Any], object]) -> Columns:
-        """Return columns over memory `made`. When its last view is freed, call `give_back(made)`."""
+        """Return columns in the memory `made`. When all views of it are freed, call `give_back(made)`."""
         columns = cls.__new__(cls)
         columns._own(made, give_back)
         return columns
@@ -237,7 +237,7 @@ class Names:
 
     @property
     def listed(self) -> tuple[str, ...]:
-        """All names in the order of their numbers; the same tuple until one is added."""
+        """All names in the order of their numbers; the same tuple object until a name is added."""
         if len(self._listed) != len(self._names):
             self._listed = tuple(self._names)
         return self._listed
@@ -272,7 +272,7 @@ def spell(codes: memoryview[Any], names: Names) -> tuple[memoryview[Any], memory
     return memoryview(ffi.buffer(offsets)).cast("i"), memoryview(ffi.buffer(text, used))
 
 
-MOST_NARROW = 256  # limit of the names that codes of one byte can distinguish
+MOST_NARROW = 256  # number of names that one-byte codes can distinguish
 
 
 class CodeTable:
@@ -288,14 +288,14 @@ class CodeTable:
         self.used = ()
 
     def know(self, names: Sequence[str]) -> None:
-        """Replace the known names by `names`, which starts with the known names, if `names` has more."""
+        """Add the new names in `names`, which starts with the names that are already known."""
         if len(names) > len(self._names):
             known = [self._numbers[at] for at in range(len(self._names))]
             self._numbers = ffi.new("int16_t[]", [*known, *[-1] * (len(names) - len(known))])
             self._names = names
 
     def narrow(self, codes: memoryview[Any]) -> memoryview[Any] | None:
-        """Return the one-byte code for each two-byte code; None if one byte cannot number all used names.
+        """Return the one-byte code for each two-byte code; None if the used names are too many for one byte.
 
         Raises ValueError if a code has no name.
         """

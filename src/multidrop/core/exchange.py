@@ -84,7 +84,7 @@ class Status(IntEnum):
         return self.text
 
 
-UNASKED = "not "  # start of the texts of statuses for values that were not requested
+UNASKED = "not "  # the status texts of values that were not requested start with this
 EXCEPTION_STATUS: int = lib.MD_EXCEPTION  # status of an exception, to which its code is added
 
 _STATUS_OF: dict[int, Status] = {status.value: status for status in Status}
@@ -115,7 +115,7 @@ class Counters(NamedTuple):
     timeout_ns: int = 0  # ns; usual timeout of a read
     ended: Counter[Status] = Counter()  # exchanges without a reply, by status; broadcasts count as OK
     missed: Counter[Status] = Counter()  # number of missing values, by status
-    refused: Counter[int] = Counter()  # number of missing values, by exception code
+    refused: Counter[int] = Counter()  # number of values missing because of an exception, by its code
     delays: Counter[int] = Counter()  # number of replies, by the bucket of their response delay
 
 
@@ -190,7 +190,8 @@ class Completion:
     sent_ns = number_at("c.sent_ns")  # when the request was sent; 0: never
     first_ns = number_at("c.first_ns")  # when the first byte after the request arrived; 0: none came
     last_ns = number_at("c.last_ns")  # when the last byte arrived; 0: none came
-    late_until_ns = number_at("c.late_until_ns")  # the peer's `late_until_ns` when the exchange was requested
+    # copy of the peer's `late_until_ns` from the time when the exchange was requested
+    late_until_ns = number_at("c.late_until_ns")
     stale = number_at("c.stale")  # number of bytes discarded before the request was sent
     skipped = number_at("c.skipped")  # number of bytes after the request that are not part of the reply
 
@@ -249,7 +250,7 @@ class Peer:
         )
         self.number = next(_NUMBERS)  # identifies this peer within the process
         self.proofs: tuple[Exchange, ...] = ()
-        self.unasked: Counter[Status] = Counter()  # due values that were not requested, by status
+        self.unasked: Counter[Status] = Counter()  # number of due values that were not requested, by status
 
     exchanges = number_at("c.counters.exchanges")  # number of exchanges so far
 
@@ -273,11 +274,11 @@ class Peer:
     ready_ns = number_at("c.ready_ns")  # ns; earliest time of the next request
 
     def inherit(self, before: Peer) -> None:
-        """Take over the outstanding requests of `before`, the peer that this peer replaces at its address."""
+        """Take over the outstanding requests of `before`, the earlier peer at this peer's address."""
         lib.md_late_inherit(self.c, before.c)
 
     def prove_by(self, proofs: Sequence[Exchange]) -> None:
-        """Set the proofs, reads whose replies show that no earlier reply can still come.
+        """Set the proofs. A proof is a read whose reply shows that no earlier reply can still come.
 
         If a late reply could be mistaken for a new one, the core sends a proof first. Only the first
         MOST_PROOFS are used; their replies must all differ. Call this once, before the first exchange: from
@@ -367,9 +368,10 @@ class Exchange:
         echo_probe: Exchange | None = None,
         permit: Permit | None = None,
     ) -> None:
-        least, most = answer or (0, -1)  # (0, -1): any value
+        least, most = answer or (0, -1)  # (0, -1): any raw value is accepted
         frame = build_request(framing, request)
-        kept = frame if len(frame) <= lib.MD_KEPT_FRAME else b""  # the core rebuilds longer frames
+        # not stored if longer: the core then builds the frame for each exchange
+        kept = frame if len(frame) <= lib.MD_KEPT_FRAME else b""
         self.framing = framing
         self.request = request
         self.peer = peer

@@ -42,7 +42,7 @@ _LONGER_THAN_RTU = 4  # bytes by which a Modbus TCP frame exceeds the same frame
 
 
 def characters_on_wire(framing: Framing, length: int) -> int:
-    """Return the number of characters that a frame has on the serial wire; a gateway turns TCP into RTU."""
+    """Return a frame's number of characters on the serial wire. A gateway sends Modbus TCP as RTU."""
     return length - _LONGER_THAN_RTU if framing is Framing.TCP else length
 
 
@@ -109,7 +109,7 @@ def parse_request(framing: Framing, received: bytes) -> tuple[int, Message | Non
 
 
 def parse_reply(framing: Framing, received: bytes, request: Message) -> tuple[int, Message | None]:
-    """Parse the reply to `request`, with any transaction id. Return a pair like that of `parse_request`."""
+    """Parse the reply to `request`, whatever its transaction id. Return the same pair as `parse_request`."""
     found = ffi.new("struct md_message *")
     used = lib.md_parse_reply(framing, received, len(received), to_c(request), found)
     return used, from_c(found) if used > 0 else None

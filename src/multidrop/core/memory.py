@@ -16,7 +16,7 @@ CACHE_LINE = 64
 
 
 class Chunk:
-    """A piece of memory that holds several structs."""
+    """A piece of memory for several structs of the core."""
 
     def __init__(self, size: int) -> None:
         self.owner = ffi.new("uint8_t[]", size + CACHE_LINE)
@@ -34,7 +34,7 @@ class Chunk:
 
 
 class Chunks:
-    """Allocator of structs, from one chunk after another."""
+    """Allocates structs in one chunk of memory after another."""
 
     def __init__(self) -> None:
         self._lock = Lock()
@@ -43,7 +43,8 @@ class Chunks:
     def take(self, kind: str) -> tuple[Any, Any]:
         """Return a pointer to a new struct of this C type, all zero, and the object that owns its memory."""
         size = -(-ffi.sizeof(kind) // CACHE_LINE) * CACHE_LINE
-        if not self._lock.acquire(blocking=False):  # held by another thread or by interrupted code
+        # the lock is held by another thread, or by code that a signal has interrupted
+        if not self._lock.acquire(blocking=False):
             chunk = Chunk(size)
             return chunk.take(kind, size), chunk.owner
         try:

@@ -1,4 +1,4 @@
-"""Permissions to send: a drive's stop invalidates its permits, a deadline ends a process's mastership."""
+"""Permissions to send: permits, which a drive's stop ends, and a mastership, which a deadline ends."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Latch:
 
     def __init__(self) -> None:
         self.c: Any = ffi.new("uint32_t *")
-        self.why = ""  # why permits were last invalidated, or after `shut`, why all permits are invalid
+        self.why = ""  # why permits were last invalidated; after `shut`, why all permits are invalid
         self._is_shut = False
         self._holds: set[object] = set()  # stops in progress, during which new permits are invalid
 
@@ -43,7 +43,7 @@ class Latch:
         self.rise(why)
 
     def let_go(self, stop: object) -> None:
-        """Allow valid permits again, unless another stop is in progress."""
+        """End this stop's `hold`: new permits are valid again, unless another stop is in progress."""
         self._holds.discard(stop)
 
     def permit(self, seen: int | None = None) -> Permit:
@@ -108,7 +108,7 @@ class Mastership:
         self._free = finalize(self, lib.md_mastership_free, c)
         self._free.atexit = False  # the struct is not freed at exit, because ports may still use it
         self._is_inherited = False
-        self._lock = threading.Lock()  # keeps the deadline and its timer consistent
+        self._lock = threading.Lock()  # held while the deadline and its timer are changed together
         register_at_fork(self)
 
     def forked(self) -> None:
@@ -158,7 +158,7 @@ class Mastership:
     def end(self) -> None:
         """End the mastership and disarm the kernel's timer; after this call no byte is written.
 
-        Bytes that wait in the system's output buffers may still leave. Closing the ports discards these
+        Bytes in the system's output buffers may still be sent. Closing the ports discards these
         bytes, so remove the lines first.
         """
         if self._is_inherited:

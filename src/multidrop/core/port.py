@@ -22,7 +22,7 @@ from multidrop.core.permissions import Mastership
 from multidrop.core.process import only_here, register_at_fork
 
 CHUNK_ROWS = 1 << 12
-WAKE_PERIOD_S = 2e-3  # s; duration of each sleep whose end is measured
+WAKE_PERIOD_S = 2e-3  # s; duration of each sleep in `wake_lateness`
 MOST_CHUNKS = 256  # when all chunks are full, the queue drops new rows and counts them
 
 
@@ -68,7 +68,7 @@ class RowQueue:
         return int(lib.md_row_queue_dropped(self.c))
 
     def call(self, number: int) -> None:
-        """Wake the waiting client as if the port with this number needed attention."""
+        """Wake the client that waits in `await_calls`, as if the port with this number needed attention."""
         lib.md_row_queue_call(self.c, number)
 
     def await_calls(self, seconds: float) -> list[int]:
@@ -177,7 +177,7 @@ class _Engine:
             was_wanted = bool(self._realtime)
             (self._realtime.add if wanted else self._realtime.discard)(client)
             if was_wanted == bool(self._realtime):
-                return  # a thread that has ended realtime scheduling by itself does not return to it
+                return  # nothing to change, even if the thread has ended realtime scheduling by itself
             failure = lib.md_engine_realtime(self.c, bool(self._realtime))
             if failure:
                 self._realtime.discard(client)
@@ -189,7 +189,7 @@ class _Engine:
 
 
 class Realtime:
-    """A client's request to run the core's thread under realtime scheduling, before all normal threads.
+    """A client's request that the core's thread has realtime scheduling, a priority above all normal threads.
 
     The thread has realtime scheduling while any client requests it. It returns to normal scheduling by itself
     if it uses more than half of a processor.
@@ -251,7 +251,8 @@ REFUSALS = {
     lib.MD_REFUSED_PARITY: "parity",
     lib.MD_REFUSED_STOPBITS: "stop bits",
 }
-NO_DIVISOR = int(lib.MD_REFUSED_DIVISOR)  # no whole divisor of the UART's clock gives the baud rate
+# refused because no whole divisor of the UART's clock gives the baud rate
+NO_DIVISOR = int(lib.MD_REFUSED_DIVISOR)
 
 
 def is_pseudo_terminal(device: str) -> bool:
@@ -322,7 +323,7 @@ class _PortMemory:
 
     @contextmanager
     def replacing(self, kind: str, new: object) -> Iterator[None]:
-        """Keep the new object of this kind alive; in the `with` block, also the object that it replaces."""
+        """Keep the new object of this kind alive; within the block, keep the replaced object alive too."""
         self._newest[kind] = (*self._newest.get(kind, ()), new)
         yield
         self._newest[kind] = (new,)
@@ -345,7 +346,7 @@ def _owner_of(port: Any, memory: _PortMemory) -> Any:
 def _stop(port: Any, memory: _PortMemory) -> None:
     """Stop an unreferenced port while all of its memory still exists.
 
-    The garbage collector calls this first, before it finalizes other objects, such as the descriptor's owner.
+    The garbage collector calls this before it finalizes other objects, such as the descriptor's owner.
     """
     lib.md_port_stop(port)
 
@@ -377,7 +378,8 @@ class Port:
             raise OSError(ffi.errno, "the core cannot watch the port")
         self._owner = _owner_of(self.c, self._memory)
         self._abandoned = finalize(self, _stop, self.c, self._memory)
-        self._abandoned.atexit = False  # not stopped at exit: other exit handlers may use the port
+        # not called at exit, because other exit handlers may still use the port
+        self._abandoned.atexit = False
         if mastership is not None:
             lib.md_port_fence(self.c, mastership.c)
         # Python reads this struct directly: a call into the core would release the GIL and wait for it again.
@@ -393,16 +395,16 @@ class Port:
     done = number_at("_progress.done")  # number of queued exchanges that ended; wraps around at 2^32
     lost = flag_at("_progress.lost")  # whether the descriptor failed: no further exchange is sent
     lost_error = number_at("_progress.lost_error")  # errno of the loss; 0 if the far end hung up
-    # whether the port repeats exchanges: until it is lost, or an exchange cannot be sent
+    # whether the port repeats exchanges; False once it is lost or an exchange cannot be sent
     repeating = flag_at("_progress.repeating")
-    # whether the port was lost during a polled exchange, after an earlier good reply on it
+    # whether the port was lost during a polled exchange, after it had delivered a good reply
     cut_off = flag_at("_progress.cut_off")
     # whether at the last timeout the driver still held the request, and no reply has come since
     is_stalled = flag_at("_progress.stalled")
     # whether the driver's count of unsent bytes is ignored: it stayed above 0 although replies came
     miscounts = flag_at("_progress.miscounts")
-    # 1 if the driver may still hold bytes of a command that has ended: they must be discarded
-    called_off = number_at("_progress.called_off")  # no bool: it is read at each exchange
+    # 1 if the driver may still hold bytes of a command that has ended, which must be discarded
+    called_off = number_at("_progress.called_off")  # not a bool, because reading a number is faster
     # number of another master's bytes, received while the port listened before its first request
     foreign = number_at("_progress.foreign")
 
@@ -416,7 +418,7 @@ class Port:
         lib.md_port_set_echo(self.c, _ECHOES[echo])
 
     def switch(self, rs485: RS485, is_usb: bool = False) -> None:
-        """Set who switches the transceiver between receiving and sending. Call it before the first request.
+        """Set what switches the transceiver between receiving and sending. Call before the first request.
 
         A USB adapter (`is_usb`) does not report when a request has left. Raises OSError if the driver
         refuses.
@@ -475,7 +477,8 @@ class Port:
         """Queue exchanges, each with its earliest start in ns; return how many fitted into the queue."""
         todo = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
         times = ffi.new("int64_t[]", not_before_ns)
-        self._memory.lasting.update(exchange.peer for exchange in exchanges)  # its late reply may still come
+        # keep the peers: late replies from them may still come
+        self._memory.lasting.update(exchange.peer for exchange in exchanges)
         free = exchanges[: self.room - self.pending]
         for at, exchange in enumerate(free, int(self._progress.submitted)):
             self._memory.queued[at & (self.room - 1)] = exchange
@@ -504,7 +507,7 @@ class Port:
         Reuse the completion `into` if it has room for the values. The request is not sent after
         `expires_ns` (CLOCK_BOOTTIME; 0: no limit), nor after a stop that ends its permit.
         """
-        self._memory.lasting.add(exchange.peer)  # its late reply may still come
+        self._memory.lasting.add(exchange.peer)  # keep the peer: a late reply may still come
         found = into if into is not None and into.room == exchange.room else Completion(room=exchange.room)
         found.count = lib.md_port_carry_out(
             self.c, exchange.c, not_before_ns, expires_ns, found.c, found.values
