@@ -1,6 +1,4 @@
-"""Rows that a poller adds to the core's rows: events, and values of channels. A file keeps channels'
-totals.
-"""
+"""Rows that a poller adds to the core's rows: events, and values of computed channels and their totals."""
 
 from __future__ import annotations
 
@@ -27,13 +25,15 @@ from multidrop.transport.aside_log import AsideThread, log_aside
 from multidrop.transport.port_identity import is_simulated, of_name
 from multidrop.whole_file import whole_file
 
-EVENT = "event"  # the drive name in rows of events; the register name is the kind of event
+# in an event's row this takes the place of the drive name; the kind of event takes that of the register
+EVENT = "event"
 COMMENT, OUTAGE, TRIGGER = "comment", "outage", "trigger"  # kinds of events
-INPUT_OLD = status_code("input too old")  # status of a channel's row if an input has no recent row
-SAVE_NS = 10_000_000_000  # interval between writes of the totals' file
+# status of a computed channel's row if one of its inputs has no recent row
+INPUT_OLD = status_code("input too old")
+SAVE_NS = 10_000_000_000  # interval between writes of the file that keeps the channels' totals
 LONGEST_TEXT = 500  # limit of an event's text, in characters
 CLOSE_S = 2.0  # how long the end of polling waits for the disk
-MOST_BYTES = 1 << 26  # limit for the file of totals
+MOST_BYTES = 1 << 26  # limit of the size of the file that keeps the channels' totals
 
 _log = logging.getLogger("multidrop.polling")
 
@@ -51,7 +51,7 @@ class AddedRow(NamedTuple):
 
 
 class JoinedColumns(CopiedColumns):
-    """Copies of other columns, followed by added rows."""
+    """A copy of other columns, with added rows at the end."""
 
     def __init__(self, columns: Columns | None, added: Sequence[AddedRow]) -> None:
         super().__init__(
@@ -64,29 +64,29 @@ class JoinedColumns(CopiedColumns):
 
 
 class AddedRows:
-    """A poller's channels, and its events that wait for the next batch. Thread-safe."""
+    """A poller's computed channels, and the events that wait for the next batch. Thread-safe."""
 
     def __init__(self, names: RowNames) -> None:
         self._names = names
         self._lock = threading.RLock()  # reentrant: a signal handler may close the poller during `take`
         self._channels = ChannelSet(())
-        self._codes: dict[int, tuple[int, int]] = {}  # by slot: the codes of the drive and the register
-        # by the codes of a drive and a register: the slot, if channels use that register
+        self._codes: dict[int, tuple[int, int]] = {}  # by input slot: the codes of its drive and register
+        # by the codes of a drive and a register: the input slot; only for registers that channels use
         self._slots: dict[tuple[int, int], int] = {}
         # the newest drive of each name; weak: a drive that was removed must not stay in memory
         self._drives: dict[str, ref[Drive]] = {}
-        # if a drive has taken over another drive's name: the monotonic time since which its rows count
+        # monotonic time since which rows of a drive count, if the name belonged to another drive before
         self._since_ns: dict[str, int] = {}  # by drive name
         self._slot_since_ns: dict[int, int] = {}  # by slot
         self._events: list[AddedRow] = []
         self._totals: TotalsFile | None = None
-        self._kept: dict[str, Any] = {}  # totals, including those of channels that are not computed now
+        # totals by channel name, including those of channels that are not computed now
+        self._kept: dict[str, Any] = {}
         self._save_ns = 0
         self._is_saved = True  # True if the totals have not changed since the last write
 
     def adopt(self, plant: Plant, polled_since: Mapping[str, int]) -> None:
-        """Compute the channels of this plant from now on. A channel that was computed before continues its
-        total.
+        """Compute the channels of this plant from now on. Channels computed before keep their totals.
 
         `polled_since` has the monotonic time in ns since which each drive of the plant is polled, by drive
         name. If another drive has taken over a name, earlier rows of that name are not used.
@@ -125,9 +125,10 @@ class AddedRows:
             }
 
     def _note_start(self, text: str, level: int) -> None:
-        """Log that a total does not continue the earlier one, and add an event."""
+        """Log why a total starts again instead of continuing the kept total, and add an event."""
         log_aside(_log, level, "%s", text)
-        with suppress(ValueError):  # too many different texts: the start is only logged
+        # raised if there are too many different event texts: then the event is only logged
+        with suppress(ValueError):
             self.mark(OUTAGE, text)
 
     def mark(self, kind: str, text: str, ago_s: float = 0.0) -> None:
@@ -179,7 +180,8 @@ class AddedRows:
             log_aside(_log, logging.WARNING, "%s", outage)
             # each event has another time: InfluxDB keeps one row of a series and time
             end_ns = outage.end_ns + number
-            with suppress(ValueError):  # too many different texts: the outage is only logged
+            # raised if there are too many different event texts: then the outage is only logged
+            with suppress(ValueError):
                 added.append(self._event(end_ns, clock.now_ns(), OUTAGE, str(outage)))
         self._is_saved &= not added
         if self._totals and clock.now_ns() >= self._save_ns:
@@ -188,7 +190,7 @@ class AddedRows:
         return added
 
     def _rows_of_present_drives(self, batch: Batch) -> Iterator[SlotRow]:
-        """Yield the rows from which channels are computed, without rows of replaced drives."""
+        """Yield the rows that channels are computed from, but no rows of drives that have been replaced."""
         rows = slot_rows(batch.columns(), self._slots)
         since_ns = self._slot_since_ns
         return (row for row in rows if row.monotonic_ns >= since_ns.get(row.slot, 0)) if since_ns else rows

@@ -61,7 +61,8 @@ def check_plant(plant: Plant, *, is_free: Callable[[Drive], bool]) -> None:
             for poll in polled.polls:
                 found += _mistakes(at, partial(_check_polled, drive, poll.register))
     if found:
-        raise PlantError(tuple(dict.fromkeys(found)))  # several registers may cause the same mistake
+        # without duplicates: several registers may cause the same mistake
+        raise PlantError(tuple(dict.fromkeys(found)))
 
 
 def _check_polled(drive: Drive, register: Register[Any]) -> None:
@@ -78,7 +79,7 @@ def _mistakes(place: str, check: Callable[[], object]) -> list[str]:
 
 
 def _description(drive: Drive) -> tuple[object, ...]:
-    """Return a key to compare drive objects: it is equal for the same class and options."""
+    """Return a key that is equal for two drive objects of the same class with the same options."""
     return (
         type(drive),
         drive.address,
@@ -97,13 +98,13 @@ GONE = "its line is no longer polled"
 
 
 class KeptLine:
-    """A kept line, whose port stays open, its new description, and the changes to its drives."""
+    """A line that stays, with its open port; its new description; and the changes of its drives."""
 
     def __init__(self, line: PolledLine, wanted: PlantLine) -> None:
         self.line = line
         self.wanted = wanted
         self.joining: list[PolledDrive] = []
-        self._repolled: list[PolledDrive] = []  # kept drives with changed registers or rates
+        self._repolled: list[PolledDrive] = []  # drives that stay, whose polled registers or rates change
         left = list(line.polled)
         for polled in wanted.drives:
             description = _description(polled.drive)
@@ -117,17 +118,17 @@ class KeptLine:
         self.leaving = [polled.drive for polled in left]
 
     def await_stops(self) -> None:
-        """Cancel the calls of the leaving drives, and wait for their stops.
+        """Cancel the calls of the drives that leave the line, and wait for their stops.
 
-        With `stop_on_exit`, the leaving drives are stopped first. A drive whose address a joining drive takes
-        is not stopped, because its stop could be a different command to the joining drive. Drives are removed
-        only after all stops have ended: until then, every drive can be stopped again.
+        With `stop_on_exit`, the leaving drives are stopped first. A drive whose address a new drive takes is
+        not stopped, because its stop could be a different command to the new drive. Drives are removed only
+        after all stops have ended: until then, every drive can be stopped again.
         """
         taken = {polled.drive.address for polled in self.joining}
         self.line.bus.part_with(self.leaving, [one for one in self.leaving if one.address not in taken])
 
     def let_leave(self, names: Collection[str]) -> None:
-        """Remove the leaving drives. If a drive's name is in `names`, wait for its last exchange's end."""
+        """Remove the drives that leave. Of drives in `names`, first wait for the last exchange to end."""
         for drive in self.leaving:
             self.line.remove(drive)
             self.line.forget(drive)
@@ -136,11 +137,11 @@ class KeptLine:
                 self.line.await_gone(drive.address)
 
     def is_free(self, leaving: Mapping[str, KeptLine]) -> bool:
-        """Return False if a joining drive has the name of a drive that has not left another line yet."""
+        """Return False if a drive that joins has the name of a drive that has not left another line yet."""
         return all(leaving.get(polled.drive.name, self) is self for polled in self.joining)
 
     def take_in(self) -> None:
-        """Start polling the joining drives, and the changed registers and rates of kept drives.
+        """Start polling the drives that join, and the changed registers and rates of drives that stay.
 
         Raises LineError if the port does not support a drive's settings.
         """
@@ -155,7 +156,7 @@ class KeptLine:
 
 @dataclass(frozen=True)
 class NewLine:
-    """A line to open; `before` is the present line on the same port, or None."""
+    """A line to open; `before` is the poller's present line on the same port, or None."""
 
     wanted: PlantLine
     before: PolledLine | None
@@ -173,7 +174,7 @@ class Adoption:
         self._check()
 
     def _pair(self) -> None:
-        """Match each line of the new plant with a present line, by name or else by port."""
+        """Match each line of the new plant with a present line of the same name, or else of the same port."""
         named = {line.name: line for line in self._lines}
         found = {
             wanted.name: line
@@ -219,7 +220,7 @@ class Adoption:
     # ---- carrying out the change ----
 
     def carry_out(self, *, start: bool) -> dict[str, LineError]:
-        """Change the lines; with `start`, start polling the new ones. Return ports' errors, by line name."""
+        """Change the lines; with `start`, poll the new lines. Return the errors of ports, by line name."""
         self._let_go()
         failures = self._change() | self._open(start)
         self._lines.put_in_order([line.name for line in self._plant.lines])

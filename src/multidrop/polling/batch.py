@@ -1,4 +1,4 @@
-"""Rows of samples and misses: as columns for Arrow, as tables by time, and as single `Row` objects.
+"""Rows of samples and misses (missing values): as Arrow columns, tables by time, and `Row` objects.
 
 `batch.to_pandas()`, `batch.to_polars()` and `batch.wide()` make tables. Any library with the Arrow PyCapsule
 interface can read a batch directly: `pyarrow.record_batch(batch)`, `duckdb.sql("from batch")`. multidrop
@@ -70,14 +70,14 @@ TIMES = ("time", "monotonic_ns")
 
 
 class _WideColumn:
-    """One register's values on one drive, each with its row number."""
+    """The values of one register of one drive, each with its row number in the table."""
 
     def __init__(self) -> None:
         self.rows = array("q")
         self.values = array("d")
 
     def dense(self, places: Sequence[int]) -> tuple[bytearray, array[float]]:
-        """Return a bitmap (1 for each row with a value) and the values, in the table's final order.
+        """Return a bitmap (1 for each row with a value) and the values, in the order of the final table.
 
         `places[n]` is the position of row n in that order.
         """
@@ -194,7 +194,7 @@ def _check_chosen(chosen: Sequence[str], known: set[str]) -> None:
 
 
 _STATUSES = Names(STATUSES)  # the core's status texts, followed by the texts of events
-MOST_STATUSES = 1 << 14  # limit of different status texts in a process
+MOST_STATUSES = 1 << 14  # limit of the different status texts in one process
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -215,11 +215,11 @@ class Row(NamedTuple):
         return EPOCH + timedelta(microseconds=self.time_ns // 1000)
 
 
-ROW_COLUMNS = ("time", *Row._fields[1:])  # column names of a table of rows
+ROW_COLUMNS = ("time", *Row._fields[1:])  # names of the columns if rows are shown as a table
 
 
 def shown_span(rows: Sequence[Row]) -> str:
-    """Return a text for a repr: the numbers of rows and drives, the duration, and the first row's time."""
+    """Return a text for a repr: number of rows and drives, duration, and the time of the first row."""
     if not rows:
         return "no rows"
     first, last = min(row.time_ns for row in rows), max(row.time_ns for row in rows)
@@ -255,7 +255,7 @@ class BatchColumns(NamedTuple):
 
 
 def slot_rows(columns: BatchColumns, slots: Mapping[tuple[int, int], int]) -> Iterator[SlotRow]:
-    """Yield the rows of the series in `slots`, which maps codes (drive, register) to slots."""
+    """Yield the rows of registers in `slots`, which maps their codes (drive, register) to slot numbers."""
     for at in find_codes(columns.drive, columns.register, slots):
         yield SlotRow(
             slots[columns.drive[at], columns.register[at]],
@@ -278,7 +278,7 @@ class Rows(ArrowTable):
 
     @abstractmethod
     def arrow(self) -> Any:
-        """Return the rows as a nanoarrow array."""
+        """Return all rows as one nanoarrow array."""
 
     def wide(self, *columns: str) -> WideRows:
         """Return a table with a row for each time and a column for each `drive.register`, or only `columns`.
@@ -289,7 +289,7 @@ class Rows(ArrowTable):
         return WideRows(self, columns, self._may_have() if columns else ())
 
     def _may_have(self) -> Collection[str]:
-        """Return the names of all columns that the wide form may have, even those without a row."""
+        """Return the names of all columns that `wide` accepts, including columns without a row."""
         return ()
 
     def __array__(self, *how: object, **details: object) -> NoReturn:
@@ -350,7 +350,7 @@ class Batch(Rows):
         return Batch(CopiedColumns(copies), self._drives, self._registers)
 
     def parts(self) -> tuple[Columns, Names, Names]:
-        """Return the core's columns, and the names of drives and registers."""
+        """Return the core's columns, the names of the drives, and the names of the registers."""
         return self._columns, self._drives, self._registers
 
     def _may_have(self) -> Collection[str]:
@@ -400,7 +400,7 @@ def bitmap_of(statuses: memoryview[Any]) -> memoryview[Any]:
 
 
 def status_code(text: str) -> int:
-    """Return the code of a row's status. Raises ValueError if there are too many different texts."""
+    """Return the code of a status text. Raises ValueError if the process has too many different texts."""
     if len(_STATUSES) >= MOST_STATUSES and text not in _STATUSES.listed:
         raise ValueError(f"this process has more than {MOST_STATUSES} different event texts")
     return _STATUSES.number(text)
@@ -465,7 +465,7 @@ class GatheredRows(CopiedColumns):
 
 
 def gather(gathered: list[GatheredRows], batch: Batch) -> None:
-    """Append the rows to the last element of `gathered`. Rows of another poller go into a new element."""
+    """Append the rows to the last element of `gathered`; rows of another poller start a new element."""
     if not gathered or not gathered[-1].add(batch):
         _, drives, registers = batch.parts()
         gathered.append(GatheredRows(drives, registers))

@@ -20,7 +20,7 @@ MOST_NAMES = 1 << 16  # limit of the uint16 name codes
 
 
 class RowNames:
-    """Names of drives and registers, and the numbers that rows store instead of names."""
+    """Names of drives and registers, each with the number that rows store in place of the name."""
 
     def __init__(self) -> None:
         self.drives = Names()
@@ -34,12 +34,12 @@ class RowNames:
         for names, of in ((of_drives, "drives"), (of_registers, "registers")):
             if len(names) > MOST_NAMES:
                 raise ValueError(
-                    f"a poller uses at most {MOST_NAMES} names of {of} while it runs, and this one would use "
+                    f"a poller uses at most {MOST_NAMES} names of {of} while it runs; this poller would use "
                     f"{len(names)}; start another poller"
                 )
 
     def layout(self, drive: Drive, block: Block) -> RowLayout:
-        """Return the layout of the rows that a reply with this block is decoded into."""
+        """Return the layout of the rows into which the core decodes a reply with this block."""
         return RowLayout(
             self.drives.number(drive.name),
             [
@@ -57,7 +57,8 @@ class PolledJob(Job):
     block: Block
     exchange: Exchange
     rows: RowLayout
-    own_ns: int  # duration of the exchange's silence and characters, without the response delay
+    # duration of the exchange's silence and characters on the line, without the drive's response delay
+    own_ns: int
     may_be_too_long: bool  # True if the block may have more registers than the drive answers in one reply
 
     @property
@@ -81,9 +82,9 @@ class JobMaker:
         self._bus = bus
         self._names = names
         self._made: dict[tuple[Drive, Block, int | None], PolledJob] = {}
-        # The layout counts a block's refusals, so a block has the same layout at all rates.
+        # A layout counts the refusals of its block, so jobs that read a block at different rates share it.
         self._rows: dict[tuple[Drive, Block], RowLayout] = {}
-        self._skipped = 0  # skipped slots of forgotten jobs
+        self._skipped = 0  # number of skipped slots of jobs that were forgotten
 
     def plan(self, polled: PolledDrive, delay: float) -> PlannedJobs:
         """Plan the requests that poll a drive, for a response delay of `delay` s; return their jobs.
@@ -153,7 +154,7 @@ class JobMaker:
 # ---- the exchanges of a port ----
 
 
-AHEAD_NS = 300_000_000  # how far in advance exchanges are queued
+AHEAD_NS = 300_000_000  # exchanges are queued this long in advance
 
 Slot = tuple[PolledJob, int]  # a job, and the time in ns at which it was due
 
@@ -168,7 +169,7 @@ class PortQueue:
     def __init__(self, schedule: Schedule[PolledJob]) -> None:
         self._schedule = schedule
         self.port: Port | None = None
-        self._done = 0  # number of the port's exchanges completed at the last `conclude`
+        self._done = 0  # number of the port's completed exchanges, as of the last `conclude`
         self._queued: deque[Turn[PolledJob]] = deque()  # turns that the core has not carried out yet
         self._ahead_ns = 0  # total duration of the queued turns
         self._newest: Turn[PolledJob] | None = None  # the last turn carried out
@@ -184,7 +185,7 @@ class PortQueue:
 
     def conclude(self, port: Port) -> None:
         """Report to the schedule which exchanges were carried out."""
-        if port is not self.port:  # the port was reopened, and its queue is empty
+        if port is not self.port:  # the port was reopened, and the new port's queue is empty
             return
         done = port.done
         for _ in range((done - self._done) & 0xFFFF_FFFF):

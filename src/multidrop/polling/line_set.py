@@ -113,7 +113,7 @@ class LineSet:
         done: SimpleQueue[tuple[int, Future[Bus | OSError]]] = SimpleQueue()
 
         def work() -> None:
-            with suppress(IndexError):  # no line is left
+            with suppress(IndexError):  # raised when no line is left to open
                 while True:
                     place, line = left.popleft()
                     done.put((place, _settled(partial(self._opened, line))))
@@ -123,7 +123,7 @@ class LineSet:
             try:
                 for _ in range(min(OPENING, len(declared))):
                     pool.submit(work)
-            except RuntimeError:  # the thread limit is reached
+            except RuntimeError:  # the system's thread limit is reached
                 work()
             for _ in declared:
                 place, opened = done.get()
@@ -138,7 +138,8 @@ class LineSet:
 
     def _opened(self, line: PlantLine) -> Bus | OSError:
         try:
-            if self._mastership and not self._mastership.holds:  # open the port only as master
+            # a line with a mastership is opened only while this process is the master
+            if self._mastership and not self._mastership.holds:
                 return self.await_port(line)
             return self._bus(Bus, line)
         except OSError as failure:  # a LineError if the port failed, another OSError if the audit log did
@@ -174,7 +175,7 @@ class LineSet:
         return line
 
     def put_in_order(self, names: Sequence[str]) -> None:
-        """Sort the lines in the order of these names."""
+        """Sort the lines into the order of these names."""
         places = {name: place for place, name in enumerate(names)}
         self._lines = tuple(sorted(self._lines, key=lambda line: places[line.name]))
 

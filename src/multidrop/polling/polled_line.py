@@ -105,14 +105,16 @@ LEARN_NS = 1_000_000_000  # interval between updates of exchange durations from 
 # interval between updates of exchange durations while the core repeats the bus cycle
 RELEARN_NS = 2_000_000_000
 REOPEN_NS = 500_000_000  # interval between attempts to reopen a lost port
-# After so many losses without a reply in between, the port is reopened at once. More than one loss, because
-# some devices close each connection at one particular request.
+# Limit of losses without a reply in between after which the port is reopened at once. It is above one,
+# because some devices close each connection at one particular request.
 MOST_AT_ONCE = 2
-STANDBY_NS = 500_000_000  # interval between additions of miss rows while this process may not poll the line
+# interval at which miss rows are added while this process may not poll the line
+STANDBY_NS = 500_000_000
 RETRY_NS = 500_000_000  # pause before polling is retried after a failure; each further failure doubles it
 LONGEST_RETRY_NS = 30_000_000_000
 SOUND_NS = 10_000_000_000  # time without failures after which earlier ones are forgotten
-MARGIN = 0.05  # plan again if the delay is outside its plan's best range by this fraction
+# plan again if the response delay leaves the range for which the plan is best by more than this fraction
+MARGIN = 0.05
 
 
 class PolledLine:
@@ -125,9 +127,10 @@ class PolledLine:
     def __init__(
         self, declared: PlantLine, number: int, bus: Bus, row_queue: RowQueue, names: RowNames
     ) -> None:
-        self.declared = declared  # the declared line; `polled` has its present drives
+        self.declared = declared  # the line as declared; `polled` has the drives that are on it now
         self.bus = bus
-        self.switching = declared.switching  # s per settings change: declared, or measured at `end`
+        # s; duration of a change of the line's settings: declared, or measured at `end`
+        self.switching = declared.switching
         self.started_ns = clock.now_ns()
         self.number = number
         self._is_left = False  # whether `leave` was called
@@ -141,13 +144,13 @@ class PolledLine:
         self._planned: dict[PolledDrive, PlannedJobs] = {}  # plans, also of removed drives until `forget`
         self._present: dict[Drive, PolledDrive] = {}  # the drives on the line
         self._since_ns: dict[Drive, int] = {}  # when each drive's polls were last changed
-        # Peers of removed drives, by address; a peer may still be in an exchange.
+        # by address: the peer of a removed drive, with which an exchange may still be in flight
         self._gone: dict[int, Peer] = {}
         self._polled: list[tuple[Drive, Peer]] = []  # the present drives that have jobs
         self._observed: list[tuple[int, int, bool]] = []  # the last observation of each drive in `_polled`
         self._is_started = False
         self._learnt_ns = 0
-        # Some servers close a connection that stays idle: send the next request at once.
+        # After reopening, send the next request at once: some servers close a connection that stays idle.
         self._reopening = Reopening(bus, lambda: row_queue.call(number))
         self._lost_ns = 0  # when the port was lost; 0 if a drive has answered since
         self._losses = 0  # number of losses since a drive answered
@@ -155,9 +158,9 @@ class PolledLine:
         self._reopen_ns = 0  # when the next attempt is due
         self._standby_ns = 0
         self.failure = ""  # the last failure of polling; "" after SOUND_NS without another failure
-        self._failures = 0  # number of failures in a row
-        self._retry_ns = 0  # when to poll again after the last failure
-        self._is_broken = False  # whether a failure may have left the schedule incomplete
+        self._failures = 0  # number of failures of polling in a row
+        self._retry_ns = 0  # when to poll again after the last failure of polling
+        self._is_broken = False  # whether a failure of polling may have left the schedule incomplete
         # protects all attributes above, because any thread may add and remove drives
         self._lock = threading.Lock()
         register_at_fork(self)
@@ -193,7 +196,7 @@ class PolledLine:
         unknown whether a late reply of the earlier drive is due.
         """
         self.await_gone(polled.drive.address)
-        # called without the lock: `require` may wait until a port is open, but polling must not wait
+        # called before taking the lock, for which polling waits: `require` may wait until a port is open
         settings = polled.drive.settings
         self.bus.line.require((settings.baudrate, settings.format))
         with self._lock:
@@ -295,8 +298,8 @@ class PolledLine:
         """
         present = self._jobs(drive)
         old = [job for job in present if job not in wanted]
-        # A new job is first due at the earliest slot of the old jobs that have its period. If there are none,
-        # it takes the earliest slot of the present jobs that have its period.
+        # A new job is first due with the earliest of the old jobs that have the same period. Without such an
+        # old job, it is first due with the earliest of the present jobs that have the same period.
         latest_first = [*sorted(present, key=_due, reverse=True), *sorted(old, key=_due, reverse=True)]
         dues = {job.period_ns: job.due_ns for job in latest_first}
         self._refusals.forget(drive)
@@ -320,14 +323,15 @@ class PolledLine:
             self.started_ns = clock.now_ns()
             self.bus.tended(True)
             self.bus.reset_statistics()
-            polled = [polled.drive for polled in self.polled]  # the bus may have unpolled drives too
+            # not all drives of the bus, because some may not be polled
+            polled = [polled.drive for polled in self.polled]
             for drive in in_order(polled, self.switching):
                 self._schedule_jobs(drive, self.started_ns)
             self._is_started = True
         self._row_queue.call(self.number)
 
     def is_steady(self, now_ns: int) -> bool:
-        """Return True while the line needs no check, because the core repeats the bus cycle by itself."""
+        """Return True while the core repeats the bus cycle by itself, so that `tend` need not be called."""
         return self._queue.is_repeating and now_ns - self._learnt_ns < RELEARN_NS
 
     def is_well(self, now_ns: int) -> bool:
@@ -347,7 +351,8 @@ class PolledLine:
             return
         try:
             self._tend(now_ns)
-        except BaseException as failure:  # even SystemExit of a user's class: other lines go on
+        # any exception, even SystemExit from a user's class: other lines continue
+        except BaseException as failure:
             self._fail(failure, now_ns)
 
     def _fail(self, failure: BaseException, now_ns: int) -> None:
@@ -416,7 +421,7 @@ class PolledLine:
             self._miss_unasked(now_ns)
 
     def _observe(self, now_ns: int) -> None:
-        """Report changed failures and late replies to the schedule, which polls silent drives less."""
+        """Report failures and late replies to the schedule, which polls silent drives less often."""
         seen = [(peer.failures, peer.late_until_ns, peer.has_answered) for _, peer in self._polled]
         if seen == self._observed:
             return
@@ -435,7 +440,7 @@ class PolledLine:
     def _learn(self, now_ns: int) -> None:
         """Update exchange durations and plans with the drives' measured response delays.
 
-        A plan is not changed while blocks of it are split because of refusals.
+        A plan is not changed while some of its blocks are split because the drive refused them.
         """
         self._learnt_ns = now_ns
         delays = {drive: peer.response_delay for drive, peer in self._polled}
@@ -457,7 +462,7 @@ class PolledLine:
                 self._row_queue.add_miss(job.rows, why, due_ns)
 
     def _miss_unasked(self, now_ns: int) -> None:
-        """Add miss rows for skipped slots that are now due. A slot may be skipped before it is due."""
+        """Add a miss row for each skipped slot that is now due; a slot may be skipped before it is due."""
         unasked = self._schedule.unasked
         if unasked:
             self._miss([slot for slot in unasked if slot[1] <= now_ns], Status.NOT_ASKED)
@@ -466,7 +471,7 @@ class PolledLine:
     # ---- lack of mastership, lost ports, and the end of polling ----
 
     def _stand_by(self, now_ns: int, why: Status) -> None:
-        """Instead of polling, add a miss row for each value that is due, every STANDBY_NS."""
+        """Instead of polling, every STANDBY_NS add a miss row for each value that has become due."""
         if now_ns >= self._standby_ns:
             self._standby_ns = now_ns + STANDBY_NS
             self._miss(self._schedule.pass_all(now_ns), why)
@@ -546,7 +551,7 @@ class PolledLine:
 
 
 def _over(slots: list[Slot], ended_ns: int) -> list[Slot]:
-    """Return the slots that end by `ended_ns`. The value of a later slot does not count as missed."""
+    """Return the slots that end by `ended_ns`; the values of later slots do not count as missed."""
     return [(job, due_ns) for job, due_ns in slots if due_ns + (job.period_ns or 0) <= ended_ns]
 
 

@@ -1,10 +1,11 @@
 """Refusals: split blocks that a drive does not answer as a whole, and poll refused registers rarely.
 
-Then a refused register does not prevent its neighbours from being read. Refused registers and whole blocks
-are retried every SET_ASIDE_NS. Once the drive answers one, it is polled as before. The retries of a split
-block add no rows. A drive may also give no reply to a block that is too long. Such a block is split if it was
-never answered, the drive answers other requests, and its class states no limit. A drive that has never
-answered is also sent requests for a single register, because it may answer only short requests.
+So registers beside a refused register can still be read. Refused registers, and split blocks as a whole, are
+retried every SET_ASIDE_NS. Once the drive answers a retry, the register or block is polled as before. The
+retries of a split block add no rows. A drive may also give no reply to a block that is too long. Such a block
+is split if it was never answered, the drive answers other requests, and its class states no limit. A drive
+that has never answered is also sent requests for a single register, because it may answer only short
+requests.
 """
 
 from __future__ import annotations
@@ -26,16 +27,16 @@ _log = logging.getLogger("multidrop.polling")
 
 
 class Refusals:
-    """The registers of one line that are polled rarely ("set aside"), and its split blocks."""
+    """One line's refused registers, which are polled rarely ("set aside"), and its split blocks."""
 
     def __init__(self, schedule: Schedule[PolledJob], maker: JobMaker) -> None:
         self._schedule = schedule
         self._maker = maker
-        # for each rare job in use, the job that it replaces
+        # by rare job in use: the normal job that it replaces
         self._set_aside: dict[PolledJob, PolledJob] = {}
-        self._rare: dict[PolledJob, PolledJob] = {}  # for a job, the rare job made for it
-        self._wholes: dict[PolledJob, PolledJob] = {}  # for a part of a split job, the whole job as planned
-        self._trials: dict[PolledJob, PolledJob] = {}  # for a retry of a split job, the whole job as planned
+        self._rare: dict[PolledJob, PolledJob] = {}  # by normal job: the rare job that was made for it
+        self._wholes: dict[PolledJob, PolledJob] = {}  # by part of a split job: the whole job as planned
+        self._trials: dict[PolledJob, PolledJob] = {}  # by retry of a split job: the whole job as planned
         self._probes: dict[int, PolledJob] = {}  # single-register jobs, by drive address
 
     @property
@@ -99,7 +100,7 @@ class Refusals:
         log_aside(_log, logging.INFO, said, job.name, len(job.block.registers) - 1, why)
 
     def _try_rarely(self, whole: PolledJob, now_ns: int) -> None:
-        """Every SET_ASIDE_NS, check whether the drive answers a split block as a whole after all."""
+        """Every SET_ASIDE_NS, check whether the drive now answers a split block as a whole."""
         if whole in self._trials.values():
             return
         trial = self._maker.make(whole.owner, whole.block, SET_ASIDE_NS, rows=RowLayout(0, []))

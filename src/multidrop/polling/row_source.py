@@ -123,7 +123,7 @@ class WakeUp:
             self._writer.close()
 
 
-FILLING_NS = 10_000_000  # minimum interval between batches taken from a chunk that is not full
+FILLING_NS = 10_000_000  # minimum interval between two batches that are taken from a chunk that is not full
 ASYNC_LOOK_S = 0.05  # interval between checks for rows in `async for`
 
 
@@ -133,9 +133,9 @@ class RowSource:
     def __init__(self, row_queue: RowQueue, names: RowNames) -> None:
         self._row_queue = row_queue
         self._names = names
-        self._added = AddedRows(names)  # rows of computed channels and events
+        self._added = AddedRows(names)  # adds the rows of computed channels and of events
         self._wakeup = WakeUp()
-        self._is_watched = False  # True once `fileno` was called
+        self._is_watched = False  # True once `fileno` was called: its descriptor is then kept up to date
         self._taken_ns = 0  # when rows were last taken from a chunk that was not full
         self._closing = False
         self._over = threading.Event()  # set once all lines are closed, so that no further rows come

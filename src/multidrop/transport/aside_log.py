@@ -1,4 +1,4 @@
-"""Do work that may hang, such as writing a log to a disk, on a separate thread. Stops never wait for it."""
+"""Do work that may hang, such as logging to a disk, on a separate thread, so that no stop waits for it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from queue import Empty, SimpleQueue
 from multidrop.core.process import register_at_fork
 
 MOST_FRAMES = 30  # number of innermost frames in a logged traceback
-MOST_WAITING = 10_000  # limit of the queued pieces of work; further ones are dropped
+MOST_WAITING = 10_000  # limit of the queued pieces of work; further pieces are dropped
 
 
 class AsideThread:
@@ -27,9 +27,9 @@ class AsideThread:
 
     def forked(self) -> None:
         self._work: SimpleQueue[Callable[[], object]] = SimpleQueue()
-        self._begun = threading.Lock()  # locked by the first `put`, which starts the thread
-        # The last call of `flush` that timed out: a queue that gets an item once the work queued before that
-        # call is done, and the timeout of that call in s.
+        self._begun = threading.Lock()  # locked once the thread was started, by the first `put`
+        # The newest call of `flush` that timed out, and its timeout in s. Its queue gets an item once the
+        # work that was queued before that call is done.
         self._late: tuple[SimpleQueue[None], float] | None = None
 
     def put(self, work: Callable[[], object], most: int = MOST_WAITING) -> None:
@@ -49,7 +49,8 @@ class AsideThread:
         if not self._begun.locked():
             return self._work.empty()
         done: SimpleQueue[None] = SimpleQueue()
-        self.put(partial(done.put, None), 2 * MOST_WAITING)  # even if the queue is full of other work
+        # a higher limit, because the queue may be full of other work
+        self.put(partial(done.put, None), 2 * MOST_WAITING)
         try:
             done.get(timeout=seconds)
         except Empty:

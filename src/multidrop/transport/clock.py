@@ -42,7 +42,7 @@ def utc_ns() -> int:
 
 @contextmanager
 def at_speed(speed: float) -> Iterator[None]:
-    """In this context and its copies, let `sleep` wait for a time that is shorter by the factor `speed`.
+    """Within the block, let `sleep` wait for only 1 / `speed` of its time, in this context and its copies.
 
     Other threads, which may command real drives, wait for the whole time.
     """

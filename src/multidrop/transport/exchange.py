@@ -71,7 +71,7 @@ def refusal_of(drive: Drive, code: int, register: str | None = None) -> DriveExc
 
 
 def no_value(drive: Drive, found: dict[str, Any]) -> NoValue:
-    """Return NoValue for the first register in `found` without a value; the error has the valid values."""
+    """Return NoValue for the first register in `found` without a value; it contains the valid values."""
     known = {name: value for name, value in found.items() if value is not None}
     return NoValue(drive.name, next(name for name in found if name not in known), known)
 
@@ -83,9 +83,10 @@ def _port_of(drive: Drive) -> str:
 T = TypeVar("T")
 
 READ_ATTEMPTS = 3
-READ_FAILURES = (NoReply, BadReply, DriveException, LineError, NotAttached, NotMaster)  # errors of a read
+# the errors that a read may raise
+READ_FAILURES = (NoReply, BadReply, DriveException, LineError, NotAttached, NotMaster)
 WRITE_TIMEOUT = 1.0  # s; long, because a write wrongly reported as unconfirmed is worse than a wait
-ILLEGAL_FUNCTION = 1  # exception code for an unsupported function: a shorter request would get it too
+ILLEGAL_FUNCTION = 1  # exception code of an unsupported function; smaller blocks would fail too
 
 
 class Exchanges:
@@ -110,7 +111,7 @@ class Exchanges:
     # ---- reading ----
 
     def read(self, drive: Drive, registers: Sequence[Register[Any] | Text | str]) -> dict[str, Any]:
-        """Return the registers' values by name, as `values` does; reopen the port if it is lost.
+        """Return the registers' values by name, as `values` does. If the port is lost, reopen it.
 
         Some gateways close the connection after each reply. If the port was already closed, or is lost after
         an answer of the drive, reopen it and read block by block. Raises PortLost if the port is lost before
@@ -135,7 +136,7 @@ class Exchanges:
         return found
 
     def read_text(self, drive: Drive, text: Text) -> str:
-        """Return a text, as `text` does; reopen a port that is lost, as `read` does."""
+        """Return a text, as `text` does. If the port is lost, reopen it as `read` does."""
         try:
             return self.text(drive, text)
         except PortLost:
@@ -192,11 +193,11 @@ class Exchanges:
                     into = read.spare.pop()
                 except IndexError:
                     into = None
-                try:  # a successful read is fast because it makes few calls: see Completion
+                try:  # kept short, so that a successful read is fast: see Completion
                     reply = self.peers.carry_out(drive, exchange, into=into)
                     if reply.count < 0:
                         reply = self._good(drive, exchange, attempts, self._settled(drive, exchange, reply))
-                    if reply.count == read.whole:  # fast path: zip without `strict`, no call of `decode`
+                    if reply.count == read.whole:  # fast path, without a call of `decode`
                         values = dict(zip(read.names, reply.numbers.tolist()))  # noqa: B905
                     else:
                         values = read.decode(reply)
@@ -269,7 +270,7 @@ class Exchanges:
         return self._ask(drive, read, attempts).data
 
     def _prepare(self, drive: Drive) -> PreparedReads:
-        """Return the drive's cached reads; replace them if the port, the settings or the peer has changed."""
+        """Return the drive's cached reads, or new ones if the port, the settings or the peer has changed."""
         peer = self.peers.present.get(drive) or self.peers.of(drive)
         asked_as = (drive.address, drive.framing, drive.settings, drive.agreed_silence, drive.response_delay)
         made_for = (peer, self.line.queue, *asked_as)
@@ -319,7 +320,7 @@ class Exchanges:
         return good_reply(drive, completion).data
 
     def _note_answer(self, drive: Drive, completion: Completion) -> None:
-        if completion.result > 0:  # an exception also shows that the drive answers
+        if completion.result > 0:  # true also for an exception, which shows that the drive answers
             self._answered_on[drive] = self.line.queue
 
     def _ask(self, drive: Drive, exchange: Exchange, attempts: int) -> Completion:

@@ -45,19 +45,20 @@ MISCOUNTS = (
     "will not be noticed"
 )
 FOREIGN = "%s: another master: %d unexpected bytes came; only stops are sent until the line has been silent"
-MOST_LOSSES = 5  # number of losses that are logged within LOSSES_NS
+MOST_LOSSES = 5  # limit of the losses of a port that are logged within LOSSES_NS
 LOSSES_NS = 60_000_000_000
 UNLOGGED = "; it is lost often, so further losses are not logged until a minute after the first"
 
 
 class LineLog:
-    """The log of one line: reports each loss once, but not too often; counts another master's bytes."""
+    """The log of one line: reports losses of its port, but not too often; counts another master's bytes."""
 
     def __init__(self, port: str) -> None:
-        self.foreign = 0  # number of another master's bytes, received while listening
+        # number of another master's bytes, received while the line listened before a request
+        self.foreign = 0
         self.shows = _log.isEnabledFor  # returns whether a log level is enabled
         self._port = port
-        self._foreign_here = 0  # part of `foreign` since the port was last opened
+        self._foreign_here = 0  # as `foreign`, but since the port was last opened
         self._is_lost = self._is_stalled = self._miscounts = False
         self._why_unopened = ""
         self._losses = 0  # number of losses since `_losses_ns`
@@ -89,7 +90,7 @@ class LineLog:
             log_aside(_log, logging.WARNING, "%s: lost (%s)%s", self._port, why, more)
 
     def note_stall(self, is_stalled: bool) -> None:
-        """Log that the adapter accepts no bytes, or accepts them again, unless this is already logged."""
+        """Log that the adapter accepts no bytes, or accepts bytes again, unless this is already logged."""
         if is_stalled != self._is_stalled:
             self._is_stalled = is_stalled
             said = STALLED if is_stalled else "its adapter takes bytes again"
@@ -181,7 +182,8 @@ class Line:
         self._is_over = False
         self._why_closed = "it is closed"
         self._why_lost: str | None = None
-        self.why_closing: str | None = None  # why calls fail although `close` was not called yet
+        # why calls fail although the line is not closed yet; None: they do not fail
+        self.why_closing: str | None = None
         self._make_locks()
         register_at_fork(self)
 
@@ -260,7 +262,7 @@ class Line:
 
     def end(self) -> bool:
         """Start no more queued exchanges. Return True while a queued exchange is in flight."""
-        with self._lock:  # without the lock, another thread could free the port in the meantime
+        with self._lock:  # held, because otherwise another thread could free the port
             return self.queue is not None and self.queue.end()
 
     def _let_go(self) -> None:
@@ -325,7 +327,7 @@ class Line:
                 self.queue.tap(tap)
 
     def require(self, settings: tuple[int, str]) -> None:
-        """Set a bridged port's settings. Raises LineError if the port has other settings or rejects these."""
+        """Set a bridged port's settings. Raises LineError if it has other settings, or rejects these."""
         with self._lock:
             self._opened.require(settings)
 
@@ -335,7 +337,7 @@ class Line:
         return self._opened.settings if self._opened.bridge else None
 
     def inherit(self, peer: Peer, before: Peer) -> None:
-        """Let `peer` also expect the late replies due to `before`, the earlier peer at its address."""
+        """Let `peer` also expect late replies to requests of `before`, the earlier peer at its address."""
         with self._lock:
             if self.queue:
                 self.queue.inherit(peer, before)
@@ -373,7 +375,7 @@ class Line:
             if is_lost:
                 failure = self._failure(found, exchange, core)
                 failure.is_sent = found.sent_ns > 0
-        finally:  # also after Ctrl-C during the exchange
+        finally:  # reached even if Ctrl-C interrupts the exchange
             if core.called_off:
                 self._discard(core)
         if failure:
@@ -410,7 +412,7 @@ class Line:
         return (LineError if is_over else PortLost)(self.port, self.why_closing or self._why_closed)
 
     def counted_ns(self, now_ns: int) -> int:
-        """Return the time up to which exchanges are counted: now, or the start of the exchange in flight."""
+        """Return the time (ns) up to which exchanges are counted: now, or the start of the one in flight."""
         return now_ns if (core := self.queue) is None else min(now_ns, core.counted_ns())
 
     def overruns(self) -> int | None:

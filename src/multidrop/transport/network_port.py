@@ -47,7 +47,7 @@ class SocketPort(Serial):
 
 
 MOST_RECEIVED = 4096  # limit of the bytes read from the network in one call
-MOST_CHUNKS = 64  # limit of the received chunks that are buffered
+MOST_CHUNKS = 64  # limit of the chunks of received bytes that are buffered
 MOST_SUBOPTION = 256  # bytes; RFC 2217's suboptions are short, except the signature
 LOCK_TIME = 0.1  # s; how long a write waits for the reading thread to answer a telnet option
 
@@ -115,12 +115,12 @@ def _send_at_once(connection: socket.socket, data: bytes) -> int:
 class RFC2217Port(rfc2217.Serial):
     """A serial port on a network (RFC 2217); `port` is rfc2217://host:port.
 
-    pyserial buffers received bytes without a limit, and waits for seconds until a stalled network takes a
-    request. This class drops bytes that come too fast, as a serial line does. It sends a request immediately
-    or never.
+    pyserial's own class buffers received bytes without a limit, and waits for seconds until a stalled network
+    takes a request. This class drops bytes that come too fast, as a serial line does. It sends a request
+    immediately or not at all.
     """
 
-    # pyserial's own attributes, which its type stubs omit
+    # attributes of pyserial's class that its type stubs omit
     _socket: Any
     _write_lock: Any
     _read_buffer: Any
@@ -177,13 +177,13 @@ class RFC2217Port(rfc2217.Serial):
 
 
 _HEAD = 6  # bytes of Modbus TCP's header before the unit id
-_LEAST, _MOST_RTU = 5, 256  # bytes of an RTU reply; the shortest reply is an exception
+_LEAST, _MOST_RTU = 5, 256  # least and greatest length of an RTU reply in bytes; an exception is the shortest
 _OTHER = {"socket": "tcp", "tcp": "socket"}
 _SPOKEN = {"socket": "RTU over TCP", "tcp": "Modbus TCP"}
 
 
 def other_port(port: str) -> str:
-    """Return the URL for the other protocol at the same host and port; "" for other kinds of ports."""
+    """Return the socket:// URL for a tcp:// port, and vice versa; "" for other kinds of ports."""
     url = urlsplit(port)
     if url.scheme not in _OTHER:
         return ""
@@ -197,7 +197,7 @@ def spoken_on(port: str) -> str:
 
 
 def mixed_up(port: str, received: bytes) -> str:
-    """Return a hint for the user if bytes received on this port look like the other protocol, else ""."""
+    """Return a hint for the user if RTU bytes came on a tcp:// port, or Modbus TCP on socket://; else ""."""
     other = other_port(port)
     is_shaped = other and (_is_tcp(received) if other.startswith("tcp") else _is_rtu(received))
     if not is_shaped:
@@ -243,12 +243,12 @@ _log = logging.getLogger("multidrop.line")
 # All exceptions that pyserial's ports may raise.
 PORT_FAILURES = (OSError, _terminal_error, serial.SerialException, ValueError, EOFError)
 
-# The next two limits are below WRITE_TIMEOUT, so that no write is sent after it was reported as unconfirmed.
+# MOST_STALL_MS and MOST_AGE are below WRITE_TIMEOUT: no write is sent after it was reported as unconfirmed.
 MOST_STALL_MS = 750  # ms; the kernel cuts a connection that stalls for longer
-MOST_AGE = 0.25  # s; an older request is not forwarded
+MOST_AGE = 0.25  # s; the bridge does not forward a request older than this
 MOST_CHUNK = 1024  # limit of the bytes that the core reads in one call
-LOOK_EVERY = 0.1  # s between checks of whether the bridge is closed
-CLOSING_TIME = 2.0  # s; limit of the wait for a thread that the port blocks
+LOOK_EVERY = 0.1  # s between checks whether the bridge was closed
+CLOSING_TIME = 2.0  # s; limit of the wait for the bridge's threads, which the port may block
 
 # On Linux the socket pair keeps requests separate, and gives the time at which the core wrote each request.
 _STAMPED = sys.platform == "linux"
@@ -286,7 +286,8 @@ def discard_late_bytes(connection: socket.socket) -> None:
 def _pair() -> tuple[socket.socket, socket.socket]:
     if hasattr(socket, "AF_UNIX"):
         return socket.socketpair(socket.AF_UNIX, _KIND)
-    pair = socket.socketpair()  # on Windows a TCP connection, so disable its delay of small packets
+    # on Windows the pair is a TCP connection, so its delay of small packets is disabled
+    pair = socket.socketpair()
     for end in pair:
         end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return pair
@@ -321,7 +322,7 @@ class Bridge:
             raise OSError(errno.ENOMEM, str(failure)) from failure
 
     def _run(self, copy: Callable[[], None]) -> None:
-        """Copy in one direction until the port fails; then hang up, so that the core sees a lost port."""
+        """Copy bytes one way until the port fails; then hang up, so that the core sees a lost port."""
         try:
             copy()
         except PORT_FAILURES:
@@ -343,7 +344,7 @@ class Bridge:
                 self._port.write(request)
 
     def _take(self) -> tuple[bytes, bool]:
-        """Return a request of the core, and whether it is fresh (always True if there are no time stamps)."""
+        """Return a request of the core, and True if it is younger than MOST_AGE or has no time stamp."""
         if not _STAMPED:
             return self._ours.recv(MOST_CHUNK), True
         request, stamps, _, _ = self._ours.recvmsg(MOST_CHUNK, socket.CMSG_SPACE(_TIMESPEC.size))
@@ -351,7 +352,7 @@ class Bridge:
 
     def _in(self) -> None:
         while not self._closing.is_set():
-            received = self._port.read(1)  # waits for 10 ms at most
+            received = self._port.read(1)  # this read waits for at most 10 ms
             if received:
                 received += self._port.read_all()
             for at in range(0, len(received), MOST_CHUNK):
@@ -368,7 +369,7 @@ class Bridge:
             self._ours.shutdown(socket.SHUT_RDWR)
 
     def forget(self) -> None:
-        """Close both ends of the pair without hanging up: the parent of a fork still uses the connection."""
+        """Close both ends of the pair, but do not hang up: a fork's parent still uses the connection."""
         self._ours.close()
         self.theirs.close()
 
@@ -381,6 +382,6 @@ class Bridge:
 
 
 def _is_fresh(stamps: list[tuple[int, int, bytes]]) -> bool:
-    """Return True if the request is at most MOST_AGE s old; False if the clock was changed since."""
+    """Return True if the request is at most MOST_AGE s old, and the clock was not changed since then."""
     written = [_TIMESPEC.unpack(stamp) for _, kind, stamp in stamps if kind == _SO_TIMESTAMPNS]
     return any(abs(time.time() - seconds - ns / 1e9) <= MOST_AGE for seconds, ns in written)

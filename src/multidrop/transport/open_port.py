@@ -82,7 +82,7 @@ _WINDOWS_REASONS = {
 
 
 def reason_of(failure: BaseException) -> str:
-    """Return the cause of a failure in words, from the system's error that pyserial's exception hides."""
+    """Return the cause of a failure in words, from the system's error inside pyserial's exception."""
     for error in (failure, failure.__context__):
         if isinstance(error, socket.gaierror):
             return error.strerror or str(error)
@@ -102,7 +102,8 @@ def is_lost_by(result: int, port: Port) -> bool:
 
 
 STALLED = "stalled: its adapter takes no bytes"
-_UNPLUGGED = (0, errno.EIO, errno.ENODEV, errno.ENXIO)  # errors of a descriptor whose device is gone
+# errnos that an unplugged device causes; 0: the far end hung up
+_UNPLUGGED = (0, errno.EIO, errno.ENODEV, errno.ENXIO)
 
 
 def why_lost(port: str, error: int, received: bytes = b"") -> str:
@@ -142,7 +143,7 @@ def unopened(port: str) -> serial.Serial:
     if url.scheme == "rfc2217":
         found = RFC2217Port()
         found.port = port
-        return cast(serial.Serial, found)  # pyserial declares this type for all its ports
+        return cast(serial.Serial, found)  # the type that pyserial declares for all its ports
     if url.scheme in ("socket", "tcp"):
         connection = SocketPort()
         connection.port = _socket_url(url) if url.scheme == "tcp" else port
@@ -203,10 +204,10 @@ def failing_refusals(device: str) -> int:
     return must_take(device) | (NO_DIVISOR if port_identity.has_divisor(device) else 0)
 
 
-TOLERANCE = 0.02  # relative deviation of a baud rate: the limit of the core and of the kernel
-CLOSING_S = 0.75  # time for which closing a port waits until the adapter has taken the driver's bytes
+TOLERANCE = 0.02  # greatest relative error of a baud rate that the core and the kernel accept
+CLOSING_S = 0.75  # s; longest time that closing a port waits for the adapter to take the driver's bytes
 _UNNOTICED_S = 0.05  # s; time in which a healthy adapter takes all bytes
-BY_PLACE = "/dev/serial/by-path/"  # links that name USB sockets, not adapters
+BY_PLACE = "/dev/serial/by-path/"  # links whose names state the USB socket, not the adapter
 _NO_SETTINGS = -1
 _TRANSACTIONS = {TransactionIds.MATCH: Transactions.MATCHED, TransactionIds.IGNORE: Transactions.IGNORED}
 
@@ -227,7 +228,7 @@ class OpenPort:
         self, name: str, ids: TransactionIds, rs485: RS485, mastership: Mastership | None, settle: float = 0.0
     ) -> None:
         self.name = name
-        self.identity = name  # see port_identity; the given name until the port is opened
+        self.identity = name  # the port's identity (see port_identity); until it is opened, the given name
         self.bridge: Bridge | None = None
         self.settings: tuple[int, str] | None = None  # baud rate and format of a bridged port
         self._ids = ids
@@ -235,8 +236,9 @@ class OpenPort:
         self._mastership = mastership
         self._settle = settle
         self._serial: serial.SerialBase | None = None
-        self._adapter: USBAdapter | None = None  # the adapter when the port was last opened
-        self._terminal: PseudoTerminal | None = None  # the pseudo-terminal when the port was last opened
+        self._adapter: USBAdapter | None = None  # the USB adapter behind the port when it was last opened
+        # the pseudo-terminal behind the port when it was last opened
+        self._terminal: PseudoTerminal | None = None
         self.must_discard = False  # True: the driver may hold bytes of a command that has ended
 
     def open(self) -> Port:
@@ -249,7 +251,7 @@ class OpenPort:
         port.timeout = 0
         if isinstance(port, serial.Serial):
             port.exclusive = True
-            # opening with the other level would switch the transceiver to sending
+            # at the other level, opening the port would switch the transceiver to sending
             port.rts = self._rs485 is not RS485.RTS_UP
         port.open()
         if isinstance(port, serial.Serial) and not self.name.startswith(BY_PLACE):
@@ -265,7 +267,7 @@ class OpenPort:
         return core
 
     def _name_now(self) -> str:
-        """Return the port's name, or the device name that its adapter has now instead.
+        """Return the port's name, or the present device name of its adapter.
 
         An adapter gets another name if its old name is in use when it comes back, as after a sleep.
         """
@@ -354,7 +356,7 @@ class OpenPort:
             self.bridge = None
         if self._serial:
             connection = connection_of(self._serial)
-            if self._holds_bytes_now():  # pyserial would wait for them for up to 30 s
+            if self._holds_bytes_now():  # pyserial would wait for up to 30 s until these bytes are sent
                 port = cast(serial.Serial, self._serial)
                 other = cast(int, port.pipe_abort_read_r)
                 close_behind(port.fileno(), other, 0.0 if self.must_discard else CLOSING_S)
@@ -380,7 +382,8 @@ class OpenPort:
 
         Raises LineError if the port already has other settings, or rejects these.
         """
-        if self._serial is None or self.bridge is None:  # not open yet: the port may be bridged
+        # not open yet: keep the settings, because the port may be bridged
+        if self._serial is None or self.bridge is None:
             self.settings = self.settings or settings
             return
         if self.settings == settings:

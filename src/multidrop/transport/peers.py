@@ -26,11 +26,11 @@ class FormerPeers(NamedTuple):
     peers: tuple[tuple[int, Peer], ...]
 
 
-_former: dict[str, FormerPeers] = {}  # by port name; every change is atomic, so no lock is needed
+_former: dict[str, FormerPeers] = {}  # by identity of the port; every change is atomic, so no lock is needed
 
 
 def identities_of(*names: str) -> set[str]:
-    """Return the identities of an open port that has these names.
+    """Return the identities of the open port that has these names.
 
     The number of a pseudo-terminal is soon reused, so its identity here includes its creation time.
     """
@@ -63,8 +63,8 @@ def former_at(names: Iterable[str], address: int) -> Iterator[Peer]:
         yield from (peer for at, peer in former.peers if at == address) if former else ()
 
 
-GONE_S = 0.001  # s between checks of whether a removed drive's exchange has ended
-LEAST_TIMEOUT = 0.02  # s; delay that computer and adapter may add to the drive's delay
+GONE_S = 0.001  # s between checks whether a removed drive's exchange has ended
+LEAST_TIMEOUT = 0.02  # s; time allowed at least for a reply, because computer and adapter delay it too
 
 
 class Peers:
@@ -73,8 +73,8 @@ class Peers:
     def __init__(self, line: Line) -> None:
         self._line = line
         self.present: dict[Drive, Peer] = {}  # peers of the drives that are on the line now
-        self._asked: dict[object, Peer] = {}  # the peer of each exchange that a thread carries out
-        # All peers by address and description of the drive, including removed drives.
+        self._asked: dict[object, Peer] = {}  # by exchange that a thread carries out: its peer
+        # Peers of present and removed drives, by the drive's address and description.
         self._known: dict[tuple[int, *tuple[object, ...]], Peer] = {}
 
     def add(self, drive: Drive) -> None:
@@ -90,7 +90,7 @@ class Peers:
         least = min(drive.response_timeout, documented)
         asked_as = type(drive), drive.framing, drive.settings, silence(drive), least, drive.response_timeout
         key = drive.address, *asked_as
-        # otherwise keep the known peer: the core may still use its proofs (see Peer.prove_by)
+        # a known peer is kept, because the core may still use its proofs (see Peer.prove_by)
         if key not in self._known:
             self._known[key] = self._new(drive, least)
         # A late reply of a removed drive could be mistaken for a reply of the next drive at its address.
@@ -122,7 +122,7 @@ class Peers:
         return identities_of(self._line.identity, self._line.port)
 
     def remember(self, before: Peers) -> None:
-        """Copy the peers of an earlier bus on the same line."""
+        """Take over the peers of an earlier bus on the same line."""
         self._known.update(before._known)
 
     def remove(self, drive: Drive) -> None:
@@ -142,7 +142,7 @@ class Peers:
     ) -> Completion:
         """Carry out an exchange on the line. Raises NotAttached if the drive was removed meanwhile."""
         asking = object()
-        # a signal must never leave an entry in `_asked`, because `add` would wait for that entry forever
+        # even a signal must not leave an entry in `_asked`: `add` would wait forever until it is removed
         try:
             # set before the check, so that `add` of another drive at this address waits for this exchange
             self._asked[asking] = made.peer

@@ -1,4 +1,4 @@
-"""Find the identity of a port, a text that is the same for all its names, and mark simulated ports by it."""
+"""Find a port's identity, a text that is the same for all its names; mark simulated ports by it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _INTERFACE = re.compile(r"[\d.-]+:(\d+\.\d+)")  # 1-4.2:1.0 is an interface of t
 
 @dataclass(frozen=True)
 class USBAdapter:
-    """A port of a USB adapter: its place on the USB bus, and the adapter's serial number (or "").
+    """One port of a USB adapter: its place on the USB bus, and the adapter's serial number ("" without one).
 
     `has_twin` means that another adapter has the same serial number: then the place must be the same too.
     """
@@ -96,7 +96,7 @@ class PseudoTerminal:
 
     device: str
     changed_ns: int  # ns; a later terminal with the same number has a later time
-    links: tuple[tuple[int, int], ...]  # inode and time of each link; they change if a link is replaced
+    links: tuple[tuple[int, int], ...]  # inode and time of each link, which change if the link is replaced
 
     def is_replaced_by(self, other: PseudoTerminal) -> bool:
         """Return True if the same links now lead to another terminal."""
@@ -130,7 +130,7 @@ def com_name(name: str) -> str:
 
 
 def of_device(path: str) -> str:
-    """Return the link in BY_ID to this device; without one, the path with its links resolved."""
+    """Return the link in BY_ID to this device; if there is none, return the path with its links resolved."""
     if sys.platform == "win32":
         return com_name(path)
     device = os.path.realpath(path)
@@ -142,7 +142,7 @@ def of_device(path: str) -> str:
 
 
 def lasting_name(port: str) -> str:
-    """Return the port's device name with the adapter's serial number; the given name if there is none."""
+    """Return the port's device name that contains the adapter's serial number, or else the given name."""
     if "://" in port or Path(port).is_symlink():
         return port
     adapter = adapter_of(port)
@@ -150,7 +150,7 @@ def lasting_name(port: str) -> str:
 
 
 def of_connection(connection: socket.socket) -> str:
-    """Return the address and port of the far end: 10.0.0.7:4001."""
+    """Return the address and port of the far end, such as 10.0.0.7:4001."""
     return of_address(connection.getpeername())
 
 

@@ -15,7 +15,7 @@ from multidrop.drive.text import Text
 from multidrop.planning.blocks import Block, blocks, may_be_too_long
 from multidrop.planning.bus_time import silence
 
-MOST_EXACT = 1 << 53  # a float holds every whole number up to this one
+MOST_EXACT = 1 << 53  # every whole number up to this limit is exact as a float
 
 
 def _is_exact(register: Register[Any]) -> bool:
@@ -36,7 +36,7 @@ class BlockDecoder:
     def __init__(self, registers: tuple[Register[Any], ...], start: int) -> None:
         places = [(register, register.address - start) for register in registers]
         exact = [(register, at) for register, at in places if _is_exact(register)]
-        # The names of the registers that the core decodes.
+        # Names of the registers that the core decodes.
         self.names = tuple(register.name for register, _ in exact)
         self.layout = RowLayout(0, [row_field(register, at, 0) for register, at in exact])
         self.count = len(exact)
@@ -68,7 +68,7 @@ def decoder_of(block: Block) -> BlockDecoder:
 
 
 MOST_PREPARED = 256  # limit of a drive's cached read plans, and of its cached blocks
-# layout for reads of commands, whose values the poll's summary does not count
+# a layout without fields, for commands: the summary of polling does not count their values
 NO_ROWS = core.RowLayout(0, [])
 
 
@@ -94,7 +94,7 @@ def make_exchange(
 def make_read(
     drive: Drive, block: Block, peer: Peer, rows: core.RowLayout = NO_ROWS, **details: Any
 ) -> Exchange:
-    """Return an exchange that reads a block, with the drive's echo probe unless the block contains it."""
+    """Return an exchange that reads a block. It has the drive's echo probe, unless that is in the block."""
     probe, register = None, drive.echo_probe
     if register and register not in block.registers:
         probe = make_exchange(drive, Block.of(drive, [register]).request, peer, NO_ROWS)
@@ -121,7 +121,7 @@ class PreparedRead:
 
 
 class ReadPlan:
-    """The reads that return `wanted` (registers or their names), in reverse order.
+    """The reads that return the values of `wanted` (registers or their names), in reverse order.
 
     `only` is the read that alone returns all of `wanted` in its order; None if there is no such read.
     """
@@ -163,10 +163,11 @@ class PreparedReads:
             return ReadPlan(wanted, registers, tuple(map(prepare, reversed(blocks(drive, registers)))))
 
         self.of = of
-        self.newest = NOTHING  # the last plan used; using it again needs no hashing of registers
+        self.newest = NOTHING  # the plan that was used last; to use it again, no registers are hashed
         self.prepare = prepare
         self.parts: dict[Block, tuple[Block, ...]] = {}  # smaller blocks to read instead of a block
-        self.answered: set[Block] = set()  # answered blocks among those that may be too long for the drive
+        # blocks that may be too long for the drive, but that it has answered
+        self.answered: set[Block] = set()
 
     def ask_first(self, block: Block) -> None:
         """From now on read a refused block before the other parts of its larger block.

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from multidrop.transport.exchange import Exchanges
 
 
-LOOKS = 3  # attempts to read all counters without an exchange ending meanwhile
+LOOKS = 3  # attempts to read all counters before another exchange ends
 _EPOCHS = count(1)
 
 
-# Statuses of exchanges in which bytes came, but no good frame.
+# Statuses of exchanges in which bytes were received, but no good frame.
 _DAMAGED = (Status.BAD_CHECKSUM, Status.BAD_CHARACTER, Status.CUT_SHORT, Status.NO_START)
 
 _NOTHING = Counters()
@@ -222,7 +222,7 @@ def line_statistics(
 ) -> LineStatistics:
     """Return the statistics of a line and its drives from counters over `seconds` s, given by drive name.
 
-    `epochs`: each drive's epoch by name, a number that changes when its counts restart at zero.
+    `epochs` has a number for each drive name, which changes when the drive's counts restart at zero.
     """
     drives = {
         name: Statistics(seconds, counters, counted_s=counted_s, epoch=epochs.get(name, 0))
@@ -253,7 +253,7 @@ def _difference(now: Counters, earlier: Counters) -> Counters:
         return now
     found = Counters._make(map(_minus, now, earlier))
     longest = now.longest_ns
-    if longest == earlier.longest_ns:  # the longest delay may be older than the time span
+    if longest == earlier.longest_ns:  # the longest delay may have been measured before the time span
         longest = min(longest, delay_edge(max(found.delays, default=-1) + 1))
     return found._replace(longest_ns=longest, timeout_ns=now.timeout_ns)
 
