@@ -42,7 +42,7 @@ struct md_port *md_port_open(struct md_engine *engine, int fd, int must_take, in
     port->turn.line.transactions = (uint8_t)transactions;
     port->is_watched = 1;
     port->doubts = MD_WRONG_COUNTS;
-    /* Make the port raw before the first read: with VMIN 0, an empty read returns 0, as after a hang-up. */
+    /* Make the port raw before the first read: otherwise an empty read may return 0, as after a hang-up. */
     struct md_settings settings;
     if (must_take >= 0 && md_port_get(fd, &settings) == 0)
         md_port_set(fd, &settings);
@@ -207,8 +207,8 @@ int md_port_carry_out(struct md_port *port, const struct md_exchange *exchange, 
     return exchange->values ? md_values(exchange->values, &completion->reply, values) : 0;
 }
 
-/* The engine's thread holds its mutex from the check of the deadline to the end of write(2). Once this thread
- * has held the mutex after resetting the deadline, no write is in flight. */
+/* The engine's thread holds its mutex from the check of the deadline to the end of write(2). So once the
+ * caller has reset the deadline and then held the mutex, no write is in flight. */
 void md_mastership_end(struct md_mastership *mastership)
 {
     __atomic_store_n(&mastership->until_ns, 0, __ATOMIC_SEQ_CST);

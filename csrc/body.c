@@ -27,7 +27,7 @@ enum layout {
 };
 
 static const struct fields {
-    uint8_t start, count, byte_count; /* 1: the layout has the field, 0: not */
+    uint8_t start, count, byte_count; /* 1: the layout has this field, 0: it has not */
     uint8_t data_len;                 /* number of data bytes, if byte_count is 0 */
 } fields_of[] = {
     [RANGE] = {.start = 1, .count = 1},
@@ -340,7 +340,7 @@ static int is_reply(int framing, const struct md_message *message)
 static int confirms(int framing, const uint8_t *body, const struct md_message *request)
 {
     int layout = find_function(framing, request->function)->reply;
-    if (layout == STATUS) /* its body is too short to have a start field */
+    if (layout == STATUS) /* the body of this reply is too short to have a start field */
         return 1;
     uint16_t start = md_get16(body + 2);
     switch (layout) {
@@ -408,7 +408,7 @@ int md_body_get_reply(int framing, const uint8_t *body, const struct md_message 
         reply->start = request->start;
         reply->count = request->count;
     }
-    if (framing == MD_DELIXI && body[1] == MD_DELIXI_STATE_QUERY) /* copy the value to data */
+    if (framing == MD_DELIXI && body[1] == MD_DELIXI_STATE_QUERY) /* copy the queried value to data */
         md_put16(reply->data + 2, reply->start);
     return 1;
 }

@@ -22,7 +22,7 @@ enum {
 
 static const char tcp_dissector[] = "mbtcp"; /* Wireshark's name for Modbus TCP */
 
-/* The senders' port numbers in files from multidrop. */
+/* The port numbers by which multidrop's own capture files name the sender of a packet. */
 static const struct { uint32_t port; uint8_t side; } senders[] = {
     {50000, MD_ASKING}, {502, MD_ANSWERING}, {1, MD_FAILED}, {2, MD_NOISE},
 };
@@ -74,7 +74,8 @@ static int put(struct md_channel *channel, const uint8_t *packet, size_t len, ui
         piece.side = MD_EITHER_SIDE;
     uint64_t seconds = ticks / channel->ticks_per_s, rest = ticks % channel->ticks_per_s;
     uint64_t time_ns = seconds * 1000000000u + rest * 1000000000u / channel->ticks_per_s;
-    piece.time_ns = (int64_t)(time_ns + (uint64_t)channel->offset_ns); /* invalid times may wrap around */
+    /* an invalid time in the file may wrap around */
+    piece.time_ns = (int64_t)(time_ns + (uint64_t)channel->offset_ns);
     return md_stream_put(&channel->stream, packet + header, len - header, piece);
 }
 
@@ -200,7 +201,7 @@ static void read_head(int framing, const uint8_t *bytes, size_t len, uint8_t hea
     }
 }
 
-/* Parse a reply without its request: guess the matching request. */
+/* Parse a reply whose request was not captured, by guessing that request. */
 static int find_reply(int framing, const uint8_t *bytes, size_t len, struct md_message *message)
 {
     uint8_t head[HEAD];
@@ -312,7 +313,8 @@ int md_split(struct md_splitter *splitter, const struct md_stream *stream, struc
     span->at = splitter->at;
     span->len = at - splitter->at;
     if (!span->len && is_junk) {
-        span->kind = MD_JUNK; /* pass() is not called: frames before and after count as adjacent */
+        /* without pass(): the frames before and after this junk still count as adjacent */
+        span->kind = MD_JUNK;
         size_t next = splitter->piece + 1;
         splitter->at = next < stream->count ? pieces[next].at : stream->len;
         span->len = splitter->at - span->at;
@@ -354,7 +356,7 @@ void md_stream_forget(struct md_stream *stream, struct md_splitter *splitter)
     memmove(stream->pieces, stream->pieces + first, stream->count * sizeof *stream->pieces);
     for (size_t i = 0; i < stream->count; i++) {
         struct md_piece *piece = &stream->pieces[i];
-        if (piece->at < gone) /* the start of this piece, after the pause, is discarded */
+        if (piece->at < gone) /* the bytes directly after the pause are discarded */
             piece->is_after_pause = 0;
         piece->at = piece->at < gone ? 0 : piece->at - gone;
     }
@@ -444,8 +446,8 @@ static int take_request(struct md_decoder *decoder, struct md_columns *columns)
     return MD_ALL_DECODED;
 }
 
-/* Append the span to the bytes that came instead of a reply, and set `failure` to the reason why all these
- * bytes are not a reply. */
+/* Append the span to the bytes that came instead of a reply. Set `failure` to the reason why these bytes are
+ * not a reply. */
 static void explain(struct md_decoder *decoder, const struct md_stream *stream)
 {
     const struct md_span *span = &decoder->span;
@@ -472,7 +474,8 @@ static int take(struct md_decoder *decoder, const struct md_stream *stream, stru
     case MD_REQUEST:
     case MD_EITHER:
         if (!decoder->is_sure)
-            decoder->block = NULL; /* the frame may be the reply to a write: then no reply follows */
+            /* no rows: the previous frame may have been the reply to a write, not a request */
+            decoder->block = NULL;
         int undone = take_request(decoder, columns);
         if (undone)
             return undone;

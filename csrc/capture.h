@@ -84,7 +84,8 @@ struct md_span {
 struct md_splitter {
     size_t at, piece;          /* index of the next byte, and of its piece */
     size_t junk;               /* bytes since the last frame */
-    int is_in_step;            /* 1: a frame ended at `at`; 0: junk: an apparent request may be a reply */
+    /* 1: a frame ended at `at`; 0: junk came, so an apparent request may be a reply */
+    int is_in_step;
     int awaited, framing;      /* `awaited`: the reply to `request` is due, in this framing */
     struct md_message request; /* the last request */
 };
@@ -113,7 +114,8 @@ struct md_decoder {
     size_t places, taken;
     const struct md_block *block; /* fields in the reply to the last request */
     int64_t asked_ns;
-    int is_sure, failure;         /* 1: the last frame was surely a request; its result if no reply comes */
+    /* is_sure: 1: the last frame was surely a request; failure: the result without a reply */
+    int is_sure, failure;
     int is_due;                   /* `span` is not processed yet */
     uint64_t frames, exchanges, junk, strays;
     struct md_completion completion;

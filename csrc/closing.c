@@ -4,7 +4,7 @@
  * root may change). A signal to the closing thread ends the wait, and the driver then discards the bytes. A
  * timer sends this signal to the closing thread only. The program does not otherwise use the signal.
  *
- * dup2(2) closes the port too. It needs no free descriptor, and pyserial may later close its own. */
+ * The port is closed by dup2(2): it needs no free descriptor, and leaves a valid one for pyserial to close. */
 #define _GNU_SOURCE
 #include "internal.h"
 
@@ -20,7 +20,8 @@
 #define sigev_notify_thread_id _sigev_un._tid
 #endif
 
-static const int64_t AGAIN_NS = 20000000; /* repeat the signal: the first may come before the wait */
+/* ns; the signal is repeated, because the first one may come before the wait */
+static const int64_t AGAIN_NS = 20000000;
 
 static void interrupt(int number)
 {

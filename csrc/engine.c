@@ -80,8 +80,9 @@ static void bring_rest(const struct md_port *port)
         bring((*next_pointer(port))->drive, offsetof(struct md_drive, counters));
 }
 
-/* In each round, each port ahead gets one step. The port farthest ahead gets the last step of this list, and
- * its next step is the one before it. Each step reads memory that the previous round prefetched. */
+/* The steps of prefetching, from the last to the first. In each round, each of the next STEPS_AHEAD ports
+ * gets one step: the nearest port the last step, the farthest port the first. Each step reads memory that the
+ * previous round prefetched. */
 static void (*const steps[STEPS_AHEAD])(const struct md_port *port) = {
     bring_rest, bring_drives, bring_exchanges, bring_port,
 };
@@ -119,7 +120,7 @@ static int wait_until(struct md_engine *engine, void **ready, int64_t until_ns)
     if (n > 0)
         return n;
     int64_t late = md_now_ns() - until_ns;
-    if (left > 0 && late >= 0) { /* the thread did sleep */
+    if (left > 0 && late >= 0) { /* the thread has slept until its time or longer */
         late = sooner(late, MD_MOST_LATENESS);
         engine->lateness_ns += (late - engine->lateness_ns) / (late > engine->lateness_ns ? 4 : 16);
     }

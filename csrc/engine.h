@@ -10,7 +10,7 @@
 #include <stdint.h>
 #include <sys/types.h>
 
-enum { MD_WRONG_COUNTS = 3 }; /* ignore the driver's count of unsent bytes after so many wrong counts */
+enum { MD_WRONG_COUNTS = 3 }; /* after so many wrong counts of unsent bytes, the driver's count is ignored */
 
 /* The state of the transceiver's direction. */
 struct md_rs485 {
@@ -18,7 +18,7 @@ struct md_rs485 {
     int reports_end; /* 1: the driver reports when the last bit has left */
     int is_sending;  /* 1: RTS now switches the transceiver to sending */
     int64_t sent_ns; /* when the last bit leaves, if the UART sends without delay */
-    int64_t look_ns; /* time of the next check whether the last bit has left */
+    int64_t look_ns; /* when to check next whether the last bit has left */
     int64_t empty_ns; /* when the driver's queue was found empty; 0: not found yet */
     int64_t wire_ns; /* duration on the wire of all bytes written since RTS was switched to sending */
 };
@@ -31,7 +31,8 @@ struct md_port {
     int is_blind;      /* 1: the port is not watched, because no useful bytes come before its wake time */
     int is_watched;    /* the waiter reports when the port is readable */
     int is_empty;      /* 1: the last read left no bytes in the driver */
-    int doubts;        /* after so many wrong counts of unsent bytes, ignore the driver's count; 0: trust */
+    /* number of further wrong counts until the driver's count is ignored; 0: it is trusted or ignored */
+    int doubts;
     int is_closing;
     struct md_settings settings; /* the port's present settings; baudrate 0: unknown */
     struct md_engine *engine;
@@ -59,9 +60,9 @@ struct md_engine {
     unsigned count, room;
     int64_t lateness_ns; /* how late the thread usually wakes from a sleep */
     struct md_realtime realtime;
-    int wants_realtime;      /* 1: start realtime scheduling, 0: end it */
+    int wants_realtime;      /* requested change: 1: start realtime scheduling, 0: end it */
     int realtime_failure;    /* 0 or -errno */
-    int is_realtime_changed; /* 1: the change is done */
+    int is_realtime_changed; /* 1: the requested change is done */
 };
 
 /* This process's right to send on its lines, which ends at a deadline. Each time that the process gets the
@@ -145,7 +146,8 @@ static inline int md_descriptor_take_rs485(int fd)
     struct serial_rs485 mode;
     if (ioctl(fd, TIOCGRS485, &mode))
         return -errno;
-    if (!(mode.flags & (SER_RS485_RTS_ON_SEND | SER_RS485_RTS_AFTER_SEND))) /* keep a polarity that is set */
+    /* keep the polarity of RTS if it is configured */
+    if (!(mode.flags & (SER_RS485_RTS_ON_SEND | SER_RS485_RTS_AFTER_SEND)))
         mode.flags |= SER_RS485_RTS_ON_SEND;
     mode.flags |= SER_RS485_ENABLED;
     if (ioctl(fd, TIOCSRS485, &mode) || ioctl(fd, TIOCGRS485, &mode))

@@ -17,7 +17,8 @@ void md_counters_end(const struct md_exchange *exchange, const struct md_complet
 /* Count a reply with its delay and the least time that its exchange needs on the line. */
 void md_counters_answer(struct md_drive *drive, int64_t delay_ns, int64_t ideal_ns);
 uint64_t md_replies(const struct md_drive *drive);
-const uint64_t *md_usual_delays(const struct md_drive *drive); /* the counter for the usual delay */
+/* the histogram's counter of the drive's usual delay */
+const uint64_t *md_usual_delays(const struct md_drive *drive);
 
 /* ---- clock.c ---- */
 

@@ -224,7 +224,8 @@ static void forget_settled(struct md_drive *drive, int64_t now_ns)
 static int has_mistakable(const struct md_exchange *exchange, int own)
 {
     const struct md_drive *drive = exchange->drive;
-    int is_crowded = drive->owed_count > MD_MOST_OWED - MD_MOST_PROOFS; /* last places: for proofs */
+    /* the last places are reserved for proofs */
+    int is_crowded = drive->owed_count > MD_MOST_OWED - MD_MOST_PROOFS;
     for (uint32_t i = 0; i < drive->owed_count; i++) {
         const struct md_owed *owed = &drive->history->owed[i];
         int counts = is_open(drive, owed) && (own || !is_same(owed, exchange));
@@ -334,7 +335,8 @@ const struct md_exchange *md_late_proof(const struct md_exchange *exchange, int6
         const struct md_exchange *proof = drive->proofs[n];
         if (is_free(drive, proof))
             return proof;
-        if (!latest || sent_last_ns(drive, proof) > sent_last_ns(drive, latest)) /* the latest settles most */
+        /* the proof that was sent last settles most requests */
+        if (!latest || sent_last_ns(drive, proof) > sent_last_ns(drive, latest))
             latest = proof;
     }
     return is_answering ? last_proof(drive) : latest;

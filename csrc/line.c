@@ -111,7 +111,8 @@ static void count(const struct md_exchange *exchange, const struct md_completion
     struct md_block *block = exchange->block;
     md_counters_end(exchange, completion);
     md_proof_end(exchange, completion->result);
-    int is_alive = completion->result == MD_BAD_ECHO && md_proof_is(exchange); /* a reply, out of range */
+    /* the drive replied, but with a value out of range */
+    int is_alive = completion->result == MD_BAD_ECHO && md_proof_is(exchange);
     if (is_failure(completion->result)) {
         md_count_failures(drive, is_alive ? 0 : drive->failures + 1);
         if (block)
@@ -258,7 +259,7 @@ void md_line_begin(struct md_line *line, const struct md_exchange *exchange, str
     md_line_go(line, MD_BEGUN);
     if (md_listen_is_held(line))
         line->give_up_ns = later(line->give_up_ns, line->listened_ns + exchange->drive->most_timeout_ns);
-    if (exchange->drive->owed_count) /* sent on another line, or before this port was reopened */
+    if (exchange->drive->owed_count) /* requests sent on another line, or before this port was reopened */
         md_late_link(line, exchange->drive);
     int refused = md_late_bars(exchange, now_ns) ? MD_LATE_ANSWER_DUE : load(line, exchange);
     if (refused)
@@ -375,7 +376,7 @@ static void forget(struct md_line *line)
 {
     enum { GONE = sizeof line->rx / 2 };
     _Static_assert(sizeof line->rx / 2 >= MD_MOST_FRAME, "half of the room holds the longest frame");
-    if (md_line_is_under_way(line)) /* otherwise there is no completion */
+    if (md_line_is_under_way(line)) /* before the request, there is no completion yet */
         tap_bytes(line, MD_NOISE, line->completion->first_ns, line->rx, GONE);
     line->sight = 0;
     line->rx_len = (uint16_t)(line->rx_len - GONE);
@@ -434,7 +435,8 @@ static void take_frames(struct md_line *line, const uint8_t *bytes, size_t len, 
     }
     if (line->state < MD_AWAITING) /* no reply is awaited, and the bytes are not Modbus TCP */
         md_tap_put(line->tap, MD_NOISE, now_ns, bytes, len);
-    for (size_t at = 0; at < len && line->state >= MD_AWAITING;) /* keep the bytes for the error message */
+    /* for the error message, keep bytes that are not Modbus TCP */
+    for (size_t at = 0; at < len && line->state >= MD_AWAITING;)
         at += keep(line, bytes + at, len - at);
     if (line->state != MD_IDLE && now_ns < line->give_up_ns)
         md_line_go(line, MD_BYTES_IN_TIME);

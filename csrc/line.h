@@ -152,8 +152,8 @@ struct md_turn {
     uint32_t round_len, round_at;
     struct md_slot *slots; /* a ring buffer */
     uint32_t room;         /* number of slots, a power of two */
-    uint32_t is_idle;      /* 1: md_port_submit() must wake the thread */
-    int64_t owed_ns;       /* line time that urgent requests still owe to polling */
+    uint32_t is_idle;      /* 1: the thread may sleep, so md_port_submit() must wake it */
+    int64_t owed_ns;       /* line time that polling must still get, because urgent requests took it */
     struct md_before before;
     struct md_row_queue *row_queue;
     uint32_t number; /* the port's number in row_queue */

@@ -28,7 +28,7 @@ enum {
 /* ---- frame.c: return the checksum ---- */
 
 uint16_t md_crc16(const uint8_t *bytes, size_t len); /* CRC-16/MODBUS; sent low byte first */
-uint8_t md_lrc(const uint8_t *bytes, size_t len);    /* two's complement of the sum */
+uint8_t md_lrc(const uint8_t *bytes, size_t len);    /* of Modbus ASCII: two's complement of the sum */
 uint8_t md_sum(const uint8_t *bytes, size_t len);    /* Delixi's checksum: the low byte of the sum */
 
 /* ---- frame.c: return the frame's length (> 0), or an enum md_frame_fault (<= 0) ---- */
@@ -45,7 +45,7 @@ enum md_frame_fault {
     MD_BAD_FUNCTION = -5, /* neither the request's function nor its exception */
     MD_BAD_LENGTH = -6,   /* byte count or quantity does not match the request */
     MD_BAD_ECHO = -7,     /* the reply to a write repeats another address or value */
-    MD_BAD_REQUEST = -8   /* a field is out of bounds */
+    MD_BAD_REQUEST = -8   /* a field of the request is out of bounds */
 };
 
 /* The content of a frame in any framing. The function determines the fields in use:
@@ -174,7 +174,7 @@ struct md_drive {
     int64_t answered_ns;               /* requests sent before this time get no further reply */
     int64_t late_until_ns;             /* late replies may come in any order until then */
     uint64_t failed_at;                /* the drive's count of replies when a proof last failed */
-    uint8_t proof_failures[MD_MOST_PROOFS]; /* for each proof; 255: it was answered once */
+    uint8_t proof_failures[MD_MOST_PROOFS]; /* number of failures of each proof; 255: it was answered once */
     uint32_t doubtful;                 /* number of replies that may have been to another process's request */
     uint32_t unanswered_count;
     const struct md_exchange **proofs; /* reads whose replies cannot be mistaken for late replies */
@@ -282,7 +282,7 @@ struct md_progress {
     uint32_t miscounts;   /* 1: the driver's count of unsent bytes is wrong, and is ignored */
     uint32_t called_off;  /* 1: the driver may still hold bytes of a command that has ended */
     int32_t lost_error;   /* errno of the loss; 0: the far end hung up */
-    int64_t switching_ns; /* total duration of these changes, in ns */
+    int64_t switching_ns; /* total duration of all changes of baud rate or format, in ns */
 };
 
 struct md_engine;

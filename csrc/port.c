@@ -46,7 +46,7 @@ static int is_count_late(struct md_port *port, int64_t now_ns)
     }
     if (now_ns - line->quiet_ns < COUNT_LAG_NS)
         return 1;
-    line->is_answered = 0; /* each reply counts once */
+    line->is_answered = 0; /* so that each reply is counted only once */
     if (--port->doubts == 0)
         md_store(&port->turn.progress.miscounts, 1);
     return 0;

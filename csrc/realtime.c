@@ -34,7 +34,8 @@ static int is_loaded(const ElfW(Phdr) *segment)
     return segment->p_type == PT_LOAD;
 }
 
-/* If this loaded object is the core, lock or unlock its segments. The core is the object with CHECK_NS. */
+/* If this loaded object is the core, lock or unlock its segments. The core is the object that contains the
+ * constant CHECK_NS. */
 static int change_own(struct dl_phdr_info *object, size_t size, void *argument)
 {
     change_function **change = argument;

@@ -113,7 +113,8 @@ void md_echo_keep(struct md_line *line)
 /* ---- replies ---- */
 
 enum { MOST_BURST = 16 }; /* limit of the characters that a UART collects before it delivers them */
-static const int64_t OLDEST_IN_DOUBT = INT64_C(2000000000); /* ns; values of older requests make no row */
+/* ns; if the request may be older than this, no row is made */
+static const int64_t OLDEST_IN_DOUBT = INT64_C(2000000000);
 
 int md_reply_parse(const struct md_line *line, size_t at, struct md_message *reply)
 {
@@ -389,7 +390,7 @@ static int is_damaged_answer(const struct md_line *line, size_t begin, int found
 {
     if (begin == 0 && line->echo == MD_ECHO)
         return 0;
-    if (found == MD_BAD_CHARACTER) /* here the parser has not checked the address */
+    if (found == MD_BAD_CHARACTER) /* the parser finds this fault before it checks the address */
         return line->rx_len >= begin + 5 &&
                md_hex_byte(line->rx + begin + 1) == line->exchange->request.address &&
                md_hex_byte(line->rx + begin + 3) >= 0;

@@ -18,7 +18,7 @@ enum md_number_format {
     MD_I8, /* the low byte of a 16-bit word */
     MD_U64, MD_I64, MD_F64, MD_BCD16, MD_BCD32, MD_F16,
     MD_LOW_WORD_FIRST = 0x40, /* flag for formats of several 16-bit words */
-    MD_LOW_BYTE_FIRST = 0x80  /* flag for all formats except MD_BIT: within each word */
+    MD_LOW_BYTE_FIRST = 0x80  /* flag for all formats except MD_BIT: low byte first in each word */
 };
 
 /* Read the number at the 16-bit word (MD_BIT: bit) `at` of a reply's data; NaN if a BCD digit is above 9. */
@@ -68,7 +68,7 @@ enum md_status {
     MD_OK = 0,
     MD_NOT_ASKED = 15, /* not requested: the poller temporarily skips a silent drive */
     MD_NO_VALUE = 18,  /* the reply holds the device's mark for "no value": NaN, an invalid count */
-    MD_EXCEPTION = 256 /* + the exception's code */
+    MD_EXCEPTION = 256 /* an exception; the exception's code is added to this number */
 };
 
 /* Rows. All arrays have `room` elements. */

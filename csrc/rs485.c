@@ -11,7 +11,7 @@
 #include "engine.h"
 
 static const int64_t LOOK_AGAIN_NS = 200000;
-static const int64_t ADAPTER_NS = 1000000; /* one USB frame: the adapter may start to send so late */
+static const int64_t ADAPTER_NS = 1000000; /* ns; one USB frame: the adapter may start to send this late */
 enum { CLOCK_DEVIATION = 50 };             /* 1/50: the adapter's baud rate may be 2 % too low */
 static const int64_t MOST_HELD_NS = 1000000000; /* if sending takes longer than this, the port is broken */
 
@@ -52,7 +52,8 @@ int md_rs485_begin(struct md_port *port, int mode, int is_usb)
     else if (is_by_rts(&port->rs485)) {
         port->rs485.reports_end = !is_usb && md_descriptor_is_shifted_out(port->fd) >= 0;
         failure = set_direction(port, 0);
-        if (!failure && mode == MD_RS485_RTS_DOWN) /* RTS off after closing would leave it sending */
+        /* RTS off at closing would switch the transceiver to sending */
+        if (!failure && mode == MD_RS485_RTS_DOWN)
             failure = md_port_keep_rts(port->fd);
     }
     if (failure)

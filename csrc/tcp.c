@@ -241,7 +241,8 @@ static int judge(struct md_line *line, size_t at, int64_t now_ns, struct md_endi
                           : used == MD_BAD_LENGTH || used == MD_NO_START;
     line->is_adrift |= (uint8_t)is_odd;
     line->is_proven |= used > 0;
-    if (used > 0 && md_is_from_gateway(MD_TCP, &reply)) { /* the drive may still answer */
+    /* a gateway's exception: the drive itself may still answer */
+    if (used > 0 && md_is_from_gateway(MD_TCP, &reply)) {
         expect(line);
         *ending = (struct md_ending){MD_NO_REPLY, at, line->frame_len};
         return 1;

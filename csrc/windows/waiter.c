@@ -84,7 +84,7 @@ int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t tim
 
 int md_wakeup_make(struct md_wakeup *wakeup)
 {
-    HANDLE event = CreateEventW(NULL, FALSE, FALSE, NULL); /* resets itself when a wait ends by it */
+    HANDLE event = CreateEventW(NULL, FALSE, FALSE, NULL); /* the event resets itself when it ends a wait */
     *wakeup = (struct md_wakeup){.fd = (int)(intptr_t)event};
     errno = event ? 0 : ENOMEM;
     return event ? 0 : -1;
