@@ -213,7 +213,7 @@ class Gateway:
             await asyncio.wait_for(work, seconds)
         except TimeoutError:
             _log.error("%s did not end in time", name)
-        except Exception:  # the other parts must be closed too
+        except Exception:
             _log.exception("ending %s failed", name)
 
     async def _find_audit(self) -> None:
@@ -449,7 +449,7 @@ class Notifier:
 
     @property
     def watchdog_s(self) -> float | None:
-        """The longest allowed time between two WATCHDOG=1 messages, in s; None if there is no limit."""
+        """The longest allowed time between two WATCHDOG=1 messages, in s; None: any time."""
         asked = os.environ.get("WATCHDOG_USEC", "")
         mine = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         return int(asked) / 1e6 if asked.isdigit() and int(asked) > 0 and mine else None

@@ -197,7 +197,7 @@ class LiveParts:
             try:
                 await self.build({name: settings}, self._host.plant)
                 self.take_up()
-            except Exception as failure:  # for example, another program has opened the part's port meanwhile
+            except Exception as failure:  # for example, another program has opened the part's port
                 self.dead[name] = str(failure)
                 _log.error("%s did not start again: %s", name, failure)
 
@@ -286,5 +286,5 @@ async def _close_when_built(built: Mapping[str, Building]) -> None:
 async def _close(name: str, part: Part, seconds: float) -> None:
     try:
         await asyncio.wait_for(part.close(), seconds)
-    except Exception:  # the other parts must be closed too
+    except Exception:
         _log.exception("closing %s failed", name)

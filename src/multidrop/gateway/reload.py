@@ -1,4 +1,4 @@
-"""Reload: read the plant file again while polling continues. A file with mistakes changes nothing."""
+"""Reload: read the plant file again while polling continues. A file with mistakes is ignored."""
 
 from __future__ import annotations
 

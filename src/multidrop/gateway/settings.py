@@ -162,7 +162,7 @@ def secret_mistakes(key: str, name: str, plant: Plant) -> Iterator[str]:
 
 
 def refuse(mistakes: Iterable[str]) -> None:
-    """Raise ValueError with a line for each mistake; return None if there are no mistakes."""
+    """Raise ValueError with a line for each mistake, if there are any."""
     if wrong := "\n".join(mistakes):
         raise ValueError(wrong)
 

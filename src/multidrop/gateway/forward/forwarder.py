@@ -182,7 +182,7 @@ class RowForwarder(RetryingSender):
         super().__init__(name, clock)
         state = spool.state()
         self.rows = 0  # rows sent since the gateway's start
-        self.refused = 0  # rows that the receiver refused
+        self.refused = 0
         self._spool = spool
         self._receiver = receiver
         self._earlier = state.newest  # number of the newest message of earlier runs

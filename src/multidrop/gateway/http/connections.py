@@ -25,8 +25,8 @@ from multidrop.gateway.http.messages import JsonResponse
 MOST_OPEN = 256
 # time limit, in s, from the opening of a connection to its first complete request, including a TLS handshake
 FIRST_S = 10.0
-# time limit, in s, from an answer to the next complete request. uvicorn closes a connection on which nothing
-# arrives after 30 s already.
+# time limit, in s, from an answer to the next complete request. uvicorn closes a silent connection after 30 s
+# already.
 AGAIN_S = 40.0
 # in s: a new connection without a request counts as fresh for this long; idle and busy connections are closed
 # before fresh ones
@@ -93,7 +93,7 @@ class _Open:
 class Connections:
     """The open connections by client address.
 
-    They are ordered by the time of the latest answer, or of the opening if there was no answer.
+    They are ordered by the time of the latest answer, or else of the opening.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:

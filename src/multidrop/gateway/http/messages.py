@@ -27,9 +27,9 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 COMPRESSIBLE = ("text", "json", "javascript", "svg", "toml")
 LEAST_COMPRESSED = 1024  # in bytes; shorter answers are not compressed
 LEVEL = 6
-COMPRESSION_S = 10.0  # time limit for compressing an answer
-MOST_BYTES = 64 * 1024  # limit of a request's body in bytes
-BODY_S = 10.0  # time limit for receiving a body
+COMPRESSION_S = 10.0
+MOST_BYTES = 64 * 1024
+BODY_S = 10.0
 STOP_BODY_S = 3.0  # time limit for receiving a stop's body, enough for one or two TCP retransmissions
 # a language in Accept-Language, and its weight from 0 to 1
 _ACCEPTED = re.compile(r"([A-Za-z][A-Za-z0-9-]*)(?:;q=([01](?:\.[0-9]{0,3})?))?")

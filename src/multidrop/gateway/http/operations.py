@@ -39,7 +39,7 @@ class Operation(NamedTuple):
     answers, except those with which the guard may refuse any request.
     """
 
-    path: str  # `{name}` in the path stands for the rest of the path
+    path: str  # `{name}` matches the rest of a request's path
     handler: str
     right: Right | None  # None: no token is checked
     summary: str

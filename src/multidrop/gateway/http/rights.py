@@ -18,9 +18,9 @@ from urllib.parse import urlsplit
 NOT_LISTED = "not on the list"
 NOT_ALLOWED = "the role does not allow it"
 NEVER_THIS_WAY = "never by this way"
-ANYONE = "anyone"  # the name of callers without a token
+ANYONE = "anyone"
 
-# limit of wrong tokens from one address, and for how many seconds each of them counts
+# limit of wrong tokens from one address, and for how many seconds each wrong token counts
 MOST_WRONG, WINDOW_S = 5, 60.0
 MOST_ADDRESSES = 10_000  # limit of addresses whose wrong tokens are remembered
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")

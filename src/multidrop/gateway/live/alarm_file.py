@@ -20,7 +20,7 @@ CLOSE_S = 2.0
 
 
 class AlarmFile:
-    """A file of alarms as JSON lines. If several lines are about one alarm, the last of them counts.
+    """A file of alarms as JSON lines. If several lines are about one alarm, the last line counts.
 
     All disk access is in `run`, which needs its own thread. No method raises.
     """

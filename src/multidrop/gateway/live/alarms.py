@@ -33,7 +33,7 @@ STANDS_MS = 2000
 MOST_ENDED = 1000  # limit of ended alarms that the gateway remembers
 MOST_SHOWN = 20  # limit of ended alarms that clients see
 SEPARATOR = "; "  # separates a drive's exceeded limits in an alarm's text
-# the status of all rows of a line starts with one of these while the line's port is lost
+# while a line's port is lost, the status of all its rows starts with one of these texts
 LOST = ("port lost", "port refused its settings")
 LIMIT_KEYS = {
     "drive": Key(str, 'drive = "pump-1"', needed=True),

@@ -169,8 +169,8 @@ def changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
 class Frames:
     """The newest frames, and the viewers that wait for the next frame.
 
-    `clock` returns monotonic seconds. Frame numbers start at `begin`. It must be random, so that a frame of
-    an earlier process is never mistaken for one of this process.
+    `clock` returns monotonic seconds. Frame numbers start at `begin`, which must be random, so that a frame
+    of an earlier process is never mistaken for one of this process.
     """
 
     def __init__(

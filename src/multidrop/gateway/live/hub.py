@@ -36,15 +36,15 @@ _STATES = {
     Condition.FAULT: FAULT,
     Condition.UNKNOWN: UNKNOWN,
 }
-# in ns: the computer's time asleep must increase by more than this to count as a sleep. The two clocks of
-# which it is the difference are read one after the other.
+# in ns: a smaller increase of the computer's time asleep is ignored. It is the difference of two clocks that
+# are read one after the other, so it is inexact.
 LEAST_SLEEP_NS = 100_000_000
 FAULT_REGISTER = "fault"
 # in ns: if the motor still turns this long after the register of past faults has changed, the fault is over
 RAN_NS = 3_000_000_000
-# if the status of a failed read starts with one of these, the drive has replied
+# the drive has replied if the status of a failed read starts with one of these texts
 _ANSWERED = ("exception ", "no valid value")
-# polling leaves out most reads of a silent drive; both statuses then mean that the drive is silent
+# statuses of a read that polling left out, and of a read without a reply; a silent drive has both
 _SKIPPED, _NO_REPLY = STATUSES[Status.NOT_ASKED], STATUSES[Status.NO_REPLY]
 
 

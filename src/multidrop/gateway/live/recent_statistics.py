@@ -24,7 +24,7 @@ class RecentStatistics:
         self._recent: deque[tuple[float, Reading]] = deque()
         self._minute: dict[str, LineStatistics | None] = {}  # by line: statistics over the last minute
         self._due = 0.0  # monotonic time, in s, at which the figures of the last minute are refreshed next
-        self._drives: dict[str, dict[str, Any]] = {}  # by drive: figures of the last minute
+        self._drives: dict[str, dict[str, Any]] = {}
         # by line: figures from the newest reading of the counters
         self._figures: dict[str, dict[str, Any]] = {}
         # one reading of the counters per minute; only the last two, because readings are large

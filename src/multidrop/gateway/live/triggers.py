@@ -118,7 +118,7 @@ class Triggers:
                 self._conditions = found
 
     async def close(self) -> None:
-        """Do nothing: triggers are only in memory."""
+        """Keep no triggers, which are only in memory."""
 
     def as_answer(self) -> list[dict[str, Any]]:
         """Return the last trigger of each name for clients, the newest first.
@@ -196,8 +196,8 @@ def _with_triggers_only(
 ) -> DriveSeries:
     """Return a drive's series in which only triggers are computed; its other channels become inputs.
 
-    The values of these inputs come from polled rows. Totals in rows continue after a restart; totals that are
-    computed here would not.
+    The inputs' values come from polled rows. Totals in rows continue after a restart, but totals computed
+    here would not.
     """
     own = [channel for channel in drive.channels if (drive.name, channel.name) not in triggers]
     inputs = {channel.name: (channel.unit, holds_s[drive.name, channel.name]) for channel in own}

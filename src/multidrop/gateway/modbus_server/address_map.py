@@ -49,8 +49,8 @@ class AddressRow(NamedTuple):
     offset: float = 0
     scale_address: int | None = None
     unit: str = ""
-    unknown: str = NO_ANSWER  # what a read returns if there is no current value
-    # where the value is from: "gateway": computed; "polled": polled from the drive; "drive": read on request
+    unknown: str = NO_ANSWER  # answer to a read without a current value
+    # origin of the value: "gateway": computed; "polled": polled from the drive; "drive": read on request
     source: str = "gateway"
     note: str = ""
 
@@ -63,7 +63,7 @@ MakeRow = Callable[..., AddressRow]
 def address_map(
     units: Units, settings: ModbusSettings, ports: Mapping[str, int], may: May
 ) -> list[AddressRow]:
-    """Return a row for each value of these units, which are the drives that clients can address.
+    """Return a row for each value of the units. A unit is a drive that clients can address.
 
     `ports` has the TCP ports by line.
     """

@@ -139,7 +139,7 @@ class ModbusClient(asyncio.Protocol):
     def _look(self) -> bool:
         """Start the writes among the received requests, and queue the others.
 
-        Return False if the time for this was too short for all of them.
+        Return False if the time was too short for all requests.
         """
         begun = self._port.clock()
         answers: list[bytes] = []
@@ -173,7 +173,7 @@ class ModbusClient(asyncio.Protocol):
         self._came.clear()
 
     def _answer_some(self) -> bool:
-        """Answer queued requests until the turn ends; return True if more of them can be answered."""
+        """Answer queued requests until the turn ends; return True if more can be answered."""
         begun = self._port.clock()
         answers: list[bytes] = []
         for _ in range(SLICE):
@@ -283,7 +283,7 @@ class ModbusPort:
         self.clock = clock
         self.share = share or RoundShare()
         self.clients: set[ModbusClient] = set()
-        self.refused = 0  # number of refused connections
+        self.refused = 0
         self._may_connect = may_connect
         self._server: asyncio.Server | None = None
 

@@ -37,8 +37,7 @@ BURST_S = 0.2  # limit, in s, of unused line time that is saved for later reques
 MOST_WAITING = 8  # limit of the requests that wait for one line
 EXPIRY_S = 1.0  # in s: a request that has waited for this long is dropped
 CLOSED = "the gateway is shutting down, or has read its plant file again"
-# in s: writes are refused for this long after the gateway stood still, until the requests that arrived
-# meanwhile are read
+# in s: writes are refused for this long after a standstill of the gateway, until all old requests are read
 SETTLE_S = 1.0
 # in s: how long the answer to a stop waits for the motor; less than the usual timeout of clients
 STOP_WAIT_S = 0.4
@@ -172,8 +171,8 @@ class LineShare:
 class Standstill:
     """Detects that the gateway did not run for more than MOST_AGE_S, and then refuses writes for SETTLE_S.
 
-    For example, the computer may have slept. Writes that arrived meanwhile may be old, and a Modbus request
-    contains no time that would show it.
+    For example, the computer may have slept. Writes that arrive after such a standstill may be old, and a
+    Modbus request contains no time that would show it.
 
     `clock` returns CLOCK_BOOTTIME in ns.
     """
@@ -193,7 +192,7 @@ class Standstill:
     def admit(self, what: str) -> float:
         """Return the deadline for sending a write that is received now (CLOCK_BOOTTIME, ns).
 
-        Raises WriteForbidden if the gateway has just stood still.
+        Raises WriteForbidden after a standstill of the gateway.
         """
         self.note()
         if self._ran_ns < self._until_ns:
@@ -215,7 +214,7 @@ class WritingClient(Protocol):
 class ClientWrites:
     """Carries out the writes of clients that share a role and an interface, such as "modbus".
 
-    `common` has the addresses of the common block, or is None if there is no such block. Writes are refused
+    `common` has the addresses of the common block, or is None without such a block. Writes are refused
     after the `standstill` has detected that the gateway did not run.
     """
 
@@ -241,7 +240,7 @@ class ClientWrites:
         allowed.
         """
         if self._role < Right.STOP:
-            raise Declined(ModbusCode.ILLEGAL_FUNCTION)  # clients may only read
+            raise Declined(ModbusCode.ILLEGAL_FUNCTION)
         carrier, address, count, data = written = WRITES[request.function](request)
         register = unit.writable(carrier, address)
         is_one = count == (register.words if register else 1)

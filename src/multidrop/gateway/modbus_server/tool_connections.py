@@ -101,7 +101,7 @@ class Terminal:
     def _make_raw(self) -> None:
         """Turn echo and translation of bytes off.
 
-        With echo, the gateway would receive its own reply to a write, which looks like a second write.
+        With echo, the gateway would receive its own reply to a write as a second write.
         """
         import termios
         import tty
@@ -158,7 +158,7 @@ class Connection:
             self._peer.send(data)
 
     def discard(self) -> None:
-        """Do nothing: TCP cannot take back the bytes that were sent."""
+        """Keep sent bytes, because TCP cannot take them back."""
 
     def close(self) -> None:
         self._peer.close()
@@ -224,7 +224,7 @@ def _request_length(came: bytearray, is_in_step: bool) -> int | None:
     if found != FrameFault.BAD_FUNCTION:
         return max(found, 0)
     # Requests of other functions have an unknown length. But a tool waits for the reply to a request, so the
-    # request ends where the received bytes end.
+    # last received byte is the request's last byte.
     if not is_in_step or came[1] >= EXCEPTION or len(came) > MOST_FRAME:
         return 0
     return None if crc16(bytes(came), len(came)) else len(came)

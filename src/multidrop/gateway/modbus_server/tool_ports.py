@@ -64,7 +64,7 @@ LEAST_SHARE, MOST_SHARE = 0.1, 0.5
 MOST_TOOLS = 8  # limit of TCP connections to one line
 # pause, in s, between two reads from a tool, so that one tool cannot keep the event loop busy
 PAUSE_S = 0.005
-REST_S = 0.2  # in s: an incomplete request is dropped if no more bytes arrive for this long
+REST_S = 0.2  # in s: an incomplete request is dropped if no byte arrives for this long
 PLAN_S = 60.0  # time limit, in s, for computing how much of a line's time polling takes
 IDLE_S = 300.0  # in s: a TCP connection without a request for this long is closed
 SWEEP_S = 1.0  # interval, in s, of checking for idle connections
@@ -88,7 +88,7 @@ class ToolSettings:
     rtu: Mapping[str, str] = field(
         default_factory=dict, metadata={"additionalProperties": {**_TEXT, **ADDRESS}}
     )
-    # The role of all tools: what they may do.
+    # The role of all tools.
     may: str = field(default="look", metadata={"enum": [*ROLES]})
     # Addresses and networks that may connect to `rtu`; empty: only this computer.
     clients: Sequence[str] = field(default=(), metadata={"items": {"type": "string", "pattern": NETWORK}})
@@ -221,7 +221,7 @@ class Tool:
     def _drop_rest(self) -> None:
         """Drop an incomplete request, unless the rest of it has arrived while the event loop was busy.
 
-        Requests in the bytes after it are served, because one of them may be a stop.
+        Requests in the bytes after it are served, because a stop may be among them.
         """
         self._rest = None
         if self._take_in() and self._rest is None:

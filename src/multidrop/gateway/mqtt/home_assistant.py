@@ -1,5 +1,4 @@
-"""Discovery messages, which tell Home Assistant what a drive publishes and accepts (topic
-homeassistant/device/ID/config).
+"""Discovery messages: they describe a drive to Home Assistant (topic homeassistant/device/ID/config).
 
 There is one message for each drive. Each component, such as a sensor or a button, has its own state topic,
 because a state topic of the whole device would also apply to numbers and buttons.

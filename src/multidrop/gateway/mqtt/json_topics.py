@@ -47,7 +47,7 @@ class RetainedTopics:
     """Finds retained MQTT messages about drives that were removed from the plant.
 
     Such messages remain if a gateway is killed, and a drive is removed from its plant file before the next
-    start. The methods return only topics under the gateway's own prefix, and at most MOST_KEPT of them.
+    start. The methods return only topics under the gateway's own prefix, and at most MOST_KEPT topics.
     """
 
     def __init__(self, prefix: str, *, home_assistant: bool) -> None:
@@ -137,7 +137,7 @@ class JsonTopics:
 
     @staticmethod
     def _kept(topic: str, payload: bytes) -> Publication:
-        """Return a message that the broker is asked to retain."""
+        """Return a message with the retain flag."""
         return Publication(topic, lambda: payload, is_retained=True)
 
     # ---- the methods of Speaker ----

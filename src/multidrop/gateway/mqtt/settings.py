@@ -17,7 +17,7 @@ from multidrop.plant import check_drive_name
 from multidrop.recording import parse_size
 from multidrop.toml_check import DURATION, SIZE, parse_duration
 
-LEVEL = re.compile(r"[^+#/\x00]+")  # what one level of an MQTT topic may contain
+LEVEL = re.compile(r"[^+#/\x00]+")  # pattern of one level of an MQTT topic
 # topics that start with these levels are reserved for Home Assistant's discovery and Sparkplug
 OTHERS = ("homeassistant", "spBv1.0")
 LEAST_EVERY_S, MOST_EVERY_S = 0.1, 3600.0
@@ -43,7 +43,7 @@ class MqttSettings:
     node: str = field(default="", metadata={"pattern": rf"^{LEVEL.pattern}$"})
     # True: publishers may write the registers and send the verbs that [serve.may] lists
     commands: bool = False
-    # True: publish all polled values, also those polled while there was no connection to the broker
+    # True: publish all polled values, also those polled without a connection to the broker
     rows: bool = False
     spool: str = "spool"  # folder for the polled values that are not published yet
     most: str = field(default="1 GB", metadata=SIZE)  # limit of the size of the folder `spool`

@@ -124,7 +124,7 @@ def state_of(
 def fault_of(shown: hub.Shown) -> tuple[int, str | None]:
     """Return the status code and the text of a drive's fault.
 
-    The text is "" if there is no fault, and None if it is unknown whether there is one.
+    The text is "" without a fault, and None if the fault is unknown.
     """
     if shown.words is None or shown.state == hub.FAULT:
         return GOOD, shown.words or ""

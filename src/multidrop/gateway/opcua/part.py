@@ -128,7 +128,7 @@ class OpcUa:
         self._wrong = Tokens()
         # number of stops in progress, by drive; None: stops of all drives
         self._stopping: Counter[str | None] = Counter()
-        self._loop: asyncio.AbstractEventLoop | None = None  # the event loop of the gateway
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._serving: asyncio.Future[None] | None = None  # done when the server's thread has ended
         self._opened: tuple[asyncio.AbstractEventLoop, asyncio.Event, PlantNodes] | None = None
         self._is_over = False  # True: the server must end now, or as soon as it is open

@@ -19,7 +19,7 @@ const HARD = t("Use the hard-wired stop at the machine if a motor must stop now.
 const HARD_NOW = t("Use the hard-wired stop at the machine now. This page keeps waiting for the gateway.");
 const TAKEN_MS = 1500; // time limit for the gateway to confirm that it has accepted a stop
 
-// Return what "Stop all" stops in the present view: the button's label, the name of what is stopped, the
+// Return the target of the button "Stop all" in the present view: the button's label, the target's name, the
 // requests.
 function target() {
   const { drives, lines, plant, fleet } = find("#stopall").dataset;
@@ -46,14 +46,13 @@ function target() {
   };
 }
 
-// Write on the button "Stop all" what it stops.
+// Label the button "Stop all" with its target.
 export function showTarget() {
   const { label, what } = target();
   find("#stopall").textContent = label;
   find("#stopall").title = t("Stop {what}", { what });
 }
 
-// Ask for confirmation, and stop all drives that the button names.
 async function stopAll() {
   const { what, where, requests } = target();
   const contents = [make("p", {}, where ? `${where} ${HOW}` : HOW)];
@@ -61,7 +60,6 @@ async function stopAll() {
     await stop(requests, what);
 }
 
-// Ask for confirmation, and stop this drive.
 export async function stopOne(name) {
   const title = pieces("Stop {what}?", { what: named(name) }),
     yes = pieces("Stop {what}", { what: named(name) });
@@ -130,7 +128,7 @@ async function ending(path, body, watch) {
   }
 }
 
-// Return the title and the contents of a dialog about a stop of which a request failed: the failure, and the
+// Return the title and the contents of the dialog after a failed request of a stop: the failure, and the
 // results of the other requests.
 function failure(error, ends) {
   const isRefused = error.status >= 400 && error.status < 500;

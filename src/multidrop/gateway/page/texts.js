@@ -2,7 +2,7 @@
 // translations. If the translations could not be fetched, the page is in English and still works.
 
 const texts = new Map(Object.entries(await globalThis.texts));
-// Placeholders in the gateway's texts, and patterns of what they stand for: a number, or a register's name.
+// Placeholders in the gateway's texts, and patterns of their values: a number, or a register's name.
 const VALUES = { "{n}": /\d+(\.\d+)?/, "{name}": /^\w+/ };
 
 export const LANGUAGES = [
@@ -22,7 +22,6 @@ export const plantPath =
 export const pieces = (english, values = {}) =>
   (texts.get(english) ?? english).split(/\{(\w+)\}/).map((piece, i) => (i % 2 ? values[piece] : piece));
 
-// Return a translated text with its values.
 export const t = (english, values) => pieces(english, values).join("");
 
 // Return the translation of a text from the gateway, such as "unconfirmed: no reply" or "undervoltage (UV)".

@@ -11,7 +11,7 @@ export class Refused extends Error {
 
 const PATIENCE_MS = 15000;
 
-// Return the sentence that tells the user why a request failed.
+// Return the sentence about a failed request that the user sees.
 export const errorOf = ({ status }, body) =>
   body?.error ? said(body.error) : t("The gateway answered with status {n}.", { n: status });
 

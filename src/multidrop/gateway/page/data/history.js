@@ -32,7 +32,7 @@ export async function read(labels, from, to, points) {
 }
 
 // Remove empty points between two values. A register may be polled less often than the plot has points, so
-// such points are no gap unless they last longer than `longest`.
+// such points are only a gap if they last longer than `longest`.
 function withoutPauses(series, longest) {
   const kept = [];
   let pause = [],

@@ -30,8 +30,8 @@ function learnSkew(date, sent, received) {
 
 export const correction = () => (skew.least > 0 ? skew.least : skew.most < 0 ? skew.most : 0);
 
-// Return the present time of the gateway in ms. Of two computed times it is the later one, because this
-// device's clock may be set back.
+// Return the gateway's present time in ms. It is computed from this device's wall clock and from its
+// monotonic clock. The later result counts, because the wall clock may be set back.
 export const now = () => Math.max(Date.now() + correction(), store.time + performance.now() - store.came);
 
 const pause = ms => new Promise(done => setTimeout(done, ms));
@@ -50,7 +50,6 @@ pages.addEventListener("message", () => {
   under?.abort();
 });
 
-// Request one frame after the other until the page is closed.
 export async function run() {
   let n = NONE,
     isKnown = false;
@@ -80,8 +79,8 @@ export async function run() {
   }
 }
 
-// Return the changes since frame `n`, or a whole frame if the gateway has forgotten frame `n`. Return null if
-// there is no newer frame.
+// Return the changes since frame `n`, or a whole frame if the gateway has forgotten frame `n`. Return null
+// without a newer frame.
 async function newer(n) {
   const sent = Date.now();
   under = new AbortController();

@@ -1,5 +1,5 @@
 // The plant's description and newest values, as the gateway sends them, and recent samples of each register
-// for plots. Each value has its time, so that an old value never looks new.
+// for plots. Each value has its time, so that the page can mark old values.
 
 import { t } from "../texts.js";
 import { Ring } from "./ring.js";

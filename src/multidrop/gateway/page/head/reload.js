@@ -11,10 +11,8 @@ const WHAT = t(
     "state. If the file has a mistake, nothing changes.",
 );
 
-// Return true if this page's user may reload the plant file.
 export const mayReload = () => store.plant?.file === true && store.plant.may?.role === "write";
 
-// Ask for confirmation, and reload the plant file.
 export async function reload() {
   const file = () => named(store.plant.name);
   const title = pieces("Reload {file}?", { file: file() }),

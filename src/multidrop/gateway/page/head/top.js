@@ -16,7 +16,6 @@ let told = "";
 let shownStrip = "",
   ages = []; // [element, alarm] for each duration in the strip
 
-// Show the plant's name and views in the head.
 export function showPlant() {
   const { plant } = store;
   const name = plant.name.replace(/\.toml$/, "");
@@ -113,7 +112,7 @@ function drawStrip(at) {
   for (const [age, alarm] of ages) put(age, `, ${clock.since(alarm, at)}`);
 }
 
-// Return the text that the strip shows if there is no alarm.
+// Return the text of the strip without alarms.
 function calm() {
   if (!store.frame) return t("No values yet.");
   const unknown = [...store.drives.keys()].filter(name => state(name) === "unknown").length;

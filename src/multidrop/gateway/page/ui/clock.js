@@ -17,7 +17,6 @@ function kept() {
 
 export const isUtc = () => zone === "UTC";
 
-// Switch between UTC and local time, and store the choice in this browser.
 export function switchZone() {
   zone = isUtc() ? "local" : "UTC";
   formats = {};
@@ -75,8 +74,8 @@ export function lasting(ms) {
   return t("{n} days", { n: Math.round(s / 86400) });
 }
 
-// Return for how long an alarm has lasted. An alarm that was present when the gateway started may have begun
-// earlier.
+// Return for how long an alarm has lasted. An alarm that was present when the gateway started may have
+// started earlier.
 export const since = ({ time: begin, is_before: isBefore }, now) =>
   isBefore ? t("since before {time}", { time: when(begin).slice(0, -3) }) : lasting(now - begin);
 

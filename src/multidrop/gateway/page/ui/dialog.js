@@ -82,7 +82,7 @@ async function open(title, contents, buttons, { cancel = t("Cancel"), kind } = {
 }
 
 // Show the dialog and return the user's choice: a button's name, or null if cancelled. `buttons` are [name,
-// text, class]. "Cancel" is the first button and has the focus, so that the Enter key alone does nothing.
+// text, class]. "Cancel" is the first button and has the focus, so that the Enter key alone sends no command.
 function show(title, contents, buttons, cancel) {
   answer?.(null);
   const close = choice => {

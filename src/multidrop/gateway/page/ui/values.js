@@ -58,7 +58,6 @@ function bits(value, names) {
 export const unit = register =>
   register?.unit && register.kind !== "words" && register.kind !== "bits" ? register.unit : "";
 
-// Return a register's unit in the viewer's language.
 export const unitName = register => said(unit(register));
 
 // Return a value's text with the register's unit, if the register has one.

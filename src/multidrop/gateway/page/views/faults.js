@@ -84,7 +84,7 @@ function row(alarm) {
   );
 }
 
-// Return how long an alarm has lasted. The time stands still while the gateway does not answer.
+// Return how long an alarm has lasted. The time is frozen while the gateway does not answer.
 function lasted({ time, ended, is_before: isBefore }) {
   const at = now(),
     isNew = isLive(at) || store.frame === null, // before the first frame the fetched list counts as fresh

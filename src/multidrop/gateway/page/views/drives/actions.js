@@ -68,8 +68,8 @@ function note(drive, what, done, told) {
 
 // Return a function that makes the request's body when the user confirms. Call this when the dialog opens,
 // because the body contains the number of the newest frame that the user has seen. The returned function
-// throws if the drive was stopped or the plant was reloaded meanwhile. After a reload, names may mean other
-// drives.
+// throws if the drive was stopped or the plant was reloaded since the dialog opened. After a reload, names
+// may mean other drives.
 function seen(drive) {
   const stopped = stops(drive),
     { revision } = store.plant;
@@ -180,7 +180,6 @@ function span([least, most], of) {
   return most !== null ? t("Allowed: to {to}.", { to }) : t("No limits known.");
 }
 
-// Ask for a value in a dialog, and write it to a register.
 export async function change(drive, register) {
   const name = registerName(register),
     withSeen = seen(drive),

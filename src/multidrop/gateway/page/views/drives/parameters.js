@@ -1,4 +1,4 @@
-// All parameters of the chosen drive, read on request, as a table and as files. Nothing is written here.
+// All parameters of the chosen drive, read on request, as a table and as files. The page cannot write them.
 
 import { get, query } from "../../data/api.js";
 import { said, t } from "../../texts.js";

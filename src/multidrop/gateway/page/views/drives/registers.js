@@ -11,7 +11,6 @@ import { change } from "./actions.js";
 let name = null,
   rows = [];
 
-// Make the table for a drive.
 export function build(spec) {
   name = spec.name;
   const rank = ({ period_s: period, access }) => (period ? 0 : access === "command" ? 2 : 1);

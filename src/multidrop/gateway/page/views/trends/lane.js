@@ -45,7 +45,7 @@ export async function draw(place, from, to, drives) {
   );
 }
 
-// Return a bar for the time before the gateway's start, of which the alarms are unknown.
+// Return a bar for the time before the gateway's start, because its alarms are unknown.
 function unknown(since, from, to) {
   const text = t("unknown: the gateway started later"),
     shown = make("span", { class: "unknown", title: text }, text);

@@ -19,8 +19,8 @@ export function begin(getPlots, getView) {
   [plots, view] = [getPlots, getView];
 }
 
-// Return the buttons of the two markers. A button puts its marker at the mouse cursor, or into the shown
-// range if there is no cursor. Arrow keys move the marker.
+// Return the buttons of the two markers. A button puts its marker at the mouse cursor, or without a cursor
+// into the shown range. Arrow keys move the marker.
 export const buttons = () =>
   ["A", "B"].map(name =>
     make(

@@ -51,8 +51,8 @@ export function choose(name) {
   draw();
 }
 
-// Select the drives of these registers, and the registers whose values are numbers, at most MOST_SIGNALS of
-// them.
+// Select the drives of these registers, and the registers whose values are numbers, at most MOST_SIGNALS
+// registers.
 export function chooseSignals(signals) {
   chosen = [...new Set(signals.map(({ drive }) => drive))].filter(name => store.drives.has(name));
   const there = numbers().map(({ name }) => name);

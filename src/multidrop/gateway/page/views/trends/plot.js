@@ -80,7 +80,7 @@ function widest(values, digits) {
   return Math.max(...ends.map(value => number(value, digits).length));
 }
 
-// Return the legend: each drive's value at the cursor. If there is no cursor, the drives' names take the same
+// Return the legend: each drive's value at the cursor. Without a cursor, the drives' names take the same
 // space, so that the plot does not move when the cursor enters it.
 function under(u, { drives, marks, widths, holds, spec }) {
   const i = u.cursor.idx ?? null,
