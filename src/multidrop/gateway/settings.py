@@ -69,7 +69,7 @@ _SERVE = {
 } | {name: Key(dict, f"[serve.{name}], a table") for name in PARTS}
 
 
-NOT_FOLLOWED = {  # by part that a gateway for a fleet's lines cannot have: the reason
+NOT_FOLLOWED = {  # parts that a gateway without lines of its own cannot have, each with the reason
     **dict.fromkeys(
         ("history", "influx", "postgres", "upload"), "`multidrop hub` stores the samples of a fleet"
     ),

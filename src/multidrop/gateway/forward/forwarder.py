@@ -172,7 +172,7 @@ class RepeatingReceiver:
 
 
 class RowForwarder(RetryingSender):
-    """Sends a spool's messages to a receiver."""
+    """Sends the messages of a spool, a folder of stored rows, to a receiver."""
 
     log, what, slow_s = _log, "rows", SLOW_S
 
