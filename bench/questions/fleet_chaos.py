@@ -110,7 +110,7 @@ class Chaos:
         self.counts[name] += 1
         self._wait(0.2, 6.0)  # an election takes 4 to 9 s
         for hub in self.hubs:
-            if hub.is_over():  # the hub has ended although nobody attacked it
+            if hub.is_over():  # the hub has ended without an attack
                 self.counts["hub ended by itself"] += 1
                 hub.start()
 

@@ -168,7 +168,7 @@ class Worker:
             before = self.transport.written
             for unit in units.values():
                 client.data_received(struct.pack(">HHHBBHH", unit, 0, 6, unit, 3, start, words))
-                client._drain()  # answer now; the gateway would first serve other clients
+                client._drain()  # answer immediately, whereas the gateway would serve other clients first
             assert self.transport.written - before == len(units) * (9 + 2 * words)
 
         return read

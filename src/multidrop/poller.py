@@ -94,7 +94,7 @@ class Poller(RowSource):
         super().__init__(row_queue, self._lines.names)
         self._path, self._totals = plant.path, plant.totals
         self._thread = threading.Thread(target=self._run, name="multidrop poller", daemon=True)
-        self._look_ns = 0  # time of the next check of the lines about which the core has reported nothing
+        self._look_ns = 0  # time of the next check of the lines that the core has not reported
         self._is_failure_raised = False
         self._ending = threading.Lock()
         register_at_fork(self)

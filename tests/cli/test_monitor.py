@@ -267,7 +267,8 @@ def test_the_narrowest_picture_shows_the_age_and_all_keys(tmp_path: Path, name: 
     assert shown[2].split()[-1] == "AGE"
     assert shown[3].rstrip().endswith(" never")
     assert columns_of(shown[3]) <= LEAST_WIDTH
-    assert columns_of(shown[3].rstrip()) == len(shown[2].rstrip())  # the age ends where its heading ends
+    # the age is right-aligned below its heading
+    assert columns_of(shown[3].rstrip()) == len(shown[2].rstrip())
     for lines in (shown, texts(page(live.drives[0], {}, Position(), size, NOW))):
         assert lines[-1].endswith("s stop   S stop all   q quit")
 
@@ -546,7 +547,7 @@ def test_quitting_during_a_stop_asks_and_then_waits_for_it(
         assert not monitor._has_left
     screened.press(("q", "y"))
     assert monitor._has_left
-    # the motor stands still once rows are recorded during the wait
+    # the stop is done once rows are recorded during the wait
     monitor._session = monitor._session._replace(hand_out=stands.set)
     assert monitor.await_stops() == []
     assert not any(thread.is_alive() for thread in monitor._stops)

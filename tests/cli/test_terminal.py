@@ -77,7 +77,7 @@ def test_keys_that_arrive_together_are_separated(pressed: bytes, told: list[str]
 @table(
     ("pieces", "pressed"),
     [
-        ([b"\x1b", b"OS", b"s"], [UNKNOWN, "s"]),  # the bytes of the key F4, of which the last is "S"
+        ([b"\x1b", b"OS", b"s"], [UNKNOWN, "s"]),  # the bytes of the key F4 end in S, which is a key too
         ([b"j\x1b[", b"5", b"~y"], ["j", PAGE_UP, "y"]),
         (["\u044b".encode()[:1], "\u044b".encode()[1:]], ["\u044b"]),
         ([b"\x1b", b""], ["escape"]),

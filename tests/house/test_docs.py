@@ -286,12 +286,12 @@ def test_page_runs_as_printed(page: Path, session: Session) -> None:
             raise AssertionError(f"{named(page)}, line {block.line}: {failure}") from failure
 
 
-def test_blocks_name_a_known_language() -> None:
+def test_code_blocks_name_a_known_language() -> None:
     found = {(named(page), block.line, block.language) for page in PAGES for block in blocks(page)}
     assert [each for each in found if each[2] not in LANGUAGES] == []
 
 
-def test_commands_that_are_not_run_are_on_the_pages() -> None:
+def test_commands_listed_as_not_run_are_on_the_pages() -> None:
     text = "\n".join(block.text for page in PAGES for block in blocks(page))
     assert [begin for begin in NOT_RUN if begin not in text] == []
 
@@ -426,7 +426,7 @@ def test_every_family_is_in_the_reference() -> None:
     assert re.findall(r"^- `([\w-]+)` ", text, re.MULTILINE) == list(MODELS)
 
 
-def test_table_headers_are_not_copied_rows() -> None:
+def test_no_header_of_a_table_is_a_copied_row() -> None:
     """Find table headers that were copied from a row, which mislabel the columns below."""
     for page in PAGES:
         text = page.read_text("utf-8")

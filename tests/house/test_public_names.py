@@ -39,7 +39,7 @@ def test_public_name_is_the_object_of_its_module() -> None:
         assert name in dir(multidrop)
 
 
-def test_no_name_is_listed_twice() -> None:
+def test_no_public_name_is_listed_twice() -> None:
     stub = Path(multidrop.__file__).with_suffix(".pyi").read_text()
     imports = [line for line in stub.splitlines() if line.startswith("from ")]
     assert len(imports) == len(NAMES)
@@ -105,7 +105,7 @@ def test_repr_of_poller_shows_its_state() -> None:
 # ---- completion at a prompt ----
 
 
-def test_package_has_few_names_and_dir_lists_only_these() -> None:
+def test_dir_of_the_package_lists_only_its_few_public_names() -> None:
     assert len(NAMES) <= 45
     assert dir(multidrop) == sorted(multidrop.__all__)
 
@@ -181,7 +181,7 @@ def mypy(folder: Path) -> str:
 
 
 @pytest.mark.long
-def test_scripts_of_users_are_strictly_typed(tmp_path: Path) -> None:
+def test_scripts_that_use_public_names_pass_mypy_strict(tmp_path: Path) -> None:
     pytest.importorskip("mypy")
     for name, script in SCRIPTS.items():
         (tmp_path / f"{name}.py").write_text(script, "utf-8")
@@ -247,7 +247,7 @@ def test_every_opened_text_file_has_an_explicit_encoding() -> None:
     "call",
     ["p.read_text()", "p.write_text(text)", "open(name)", 'p.open("w")', "subprocess.run([], text=True)"],
 )
-def test_call_without_encoding_is_detected(call: str) -> None:
+def test_a_call_that_opens_text_without_encoding_is_detected(call: str) -> None:
     assert list(lacking(call)) == [1]
 
 
@@ -262,7 +262,7 @@ def test_call_without_encoding_is_detected(call: str) -> None:
         'p.open("w", encoding=e)',
     ],
 )
-def test_call_with_encoding_is_not_reported(call: str) -> None:
+def test_a_call_that_opens_text_with_encoding_is_not_reported(call: str) -> None:
     assert list(lacking(call)) == []
 
 

@@ -113,7 +113,7 @@ def run(directory: Path, name: str, *words: str, through: tuple[str, ...] = (pat
 
 
 @table("path", sorted(EXAMPLES.glob("*.py")))
-def test_example_is_linked_and_tested(path: Path) -> None:
+def test_every_example_is_linked_and_tested(path: Path) -> None:
     if path.name != "simulated_plant.py":  # a module that the other examples import
         assert f"examples/{path.name}" in PAGES
         assert f'"{path.name}"' in Path(__file__).read_text("utf-8")

@@ -221,7 +221,7 @@ def test_the_mutation_tool_makes_the_expected_mutants_of_a_source(
 
 
 @pytest.mark.long
-def test_a_condition_of_several_lines_is_negated_as_a_whole() -> None:
+def test_a_mutant_negates_a_whole_condition_of_several_lines() -> None:
     (negated,) = (
         mutant.after for mutant in mutants("a.c", "    if (a\n        || b)\n") if "!(" in mutant.after
     )
@@ -230,7 +230,7 @@ def test_a_condition_of_several_lines_is_negated_as_a_whole() -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_explained_mutants_exist() -> None:
+def test_the_mutants_listed_in_explained_toml_exist() -> None:
     files = {each["file"] for each in EXPLAINED}
     names = {mutant.name for path in files for mutant in mutants(path, (ROOT / path).read_text("utf-8"))}
     for row in EXPLAINED:
@@ -331,7 +331,7 @@ def never_named(tree: ast.AST) -> list[str]:
 
 
 @pytest.mark.long
-def test_inner_functions_are_used() -> None:
+def test_every_inner_function_is_used() -> None:
     found = {}
     for path in sorted(TESTS.rglob("*.py")):
         if lost := never_named(ast.parse(path.read_text("utf-8"))):

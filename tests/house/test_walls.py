@@ -61,7 +61,7 @@ FILES_TOUCHING_THE_SYSTEM = {
     "gateway/live/views.py",
 }
 
-CLIENTS = {  # rooms that import only public names, and the commands that import them
+CLIENTS = {  # packages that import only public names, and the commands that may import these packages
     "gateway": {"cli/serve.py", "cli/schema.py"},
     "fleet": {
         *(
@@ -126,13 +126,13 @@ def offenders(found: dict[str, set[str]]) -> dict[str, set[str]]:
 
 def upwards(path: Path, modules: set[str]) -> set[str]:
     others = rooms(modules) - {"_core", room(path)}
-    if room(path) in CLIENTS:  # these packages are checked by test_clients_use_only_public_names
+    if room(path) in CLIENTS:  # these packages are checked by test_gateway_and_fleet_import_only_public_names
         others -= set(multidrop.__all__)
     return {name for name in others if floor(name) >= floor(room(path))}
 
 
 @pytest.mark.long
-def test_public_names_are_listed_before_they_are_loaded() -> None:
+def test_dir_lists_public_names_before_their_modules_are_imported() -> None:
     assert set(multidrop.__all__) <= set(dir(multidrop))
 
 
@@ -156,7 +156,7 @@ def test_only_listed_files_import_operating_system_modules() -> None:
 
 
 @pytest.mark.long
-def test_families_import_only_drive() -> None:
+def test_families_import_only_the_package_drive() -> None:
     families = sorted({*(PACKAGE / "families").glob("*.py")} - {PACKAGE / "families" / "registry.py"})
     found = {path.name: rooms(run_time_imports(path)) - {"drive", "families"} for path in families}
     assert offenders(found) == {}
@@ -193,7 +193,7 @@ def test_no_import_cycles_between_files() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("client", CLIENTS)
-def test_clients_use_only_public_names(client: str) -> None:
+def test_gateway_and_fleet_import_only_public_names(client: str) -> None:
     """Check that users could write such a client too, because it imports only public names."""
     found = {
         str(path.relative_to(PACKAGE)): {
@@ -213,13 +213,13 @@ def _is_public(name: str, client: str) -> bool:
 
 @pytest.mark.long
 @pytest.mark.parametrize("client", CLIENTS)
-def test_only_listed_commands_import_a_client(client: str) -> None:
+def test_only_listed_commands_import_gateway_or_fleet(client: str) -> None:
     found = {str(path.relative_to(PACKAGE)) for path in FILES if client in rooms(_imported(path))}
     assert {name for name in found if not name.startswith(f"{client}/")} <= CLIENTS[client]
 
 
 @pytest.mark.long
-def test_files_are_short() -> None:
+def test_no_source_file_is_longer_than_the_limit() -> None:
     """Check that each file keeps the length limit, or is listed with a reason; a longer file has two jobs."""
     lines = {
         path.relative_to(ROOT).as_posix(): len(path.read_text("utf-8").splitlines())

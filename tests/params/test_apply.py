@@ -215,7 +215,7 @@ def test_parameter_that_the_drive_lacks_is_left_out(monkeypatch: pytest.MonkeyPa
         ({"0011": 12000, "0012": 10000, "0013": 9000}, ["0011", "0012", "0013"]),
     ],
 )
-def test_writes_are_ordered_so_that_each_is_within_its_limits(
+def test_parameters_are_written_in_an_order_that_keeps_their_limits(
     monkeypatch: pytest.MonkeyPatch, values: dict[str, int], order: list[str]
 ) -> None:
     _, drive, sim = attached(monkeypatch, YD1000(1), [])
@@ -225,7 +225,7 @@ def test_writes_are_ordered_so_that_each_is_within_its_limits(
     assert sim["maximum_frequency"] == values["0011"] / 100
 
 
-def test_value_outside_all_limits_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_value_above_its_upper_limit_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, _ = attached(monkeypatch, YD1000(1), [])
     left = params.plan(drive, {"0013": 9000}).left
     assert left == {"0013": "90.00 Hz is outside its limits, which are upper_limit_frequency of yd1000@1"}

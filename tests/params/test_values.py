@@ -70,7 +70,7 @@ def test_a_refused_block_does_not_prevent_reading_the_other_blocks(monkeypatch: 
     assert counts(line) == [16, 8, 4, 4, 2, 1, 1, 2, 8, 16]
 
 
-def test_longest_accepted_block_length_is_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_longest_block_that_the_drive_accepts_is_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive = blocky(monkeypatch, set(), longest=8)
     assert len(params.read(drive).values) == 32
     assert counts(line) == [16, 8, 8, 8, 8]
@@ -146,7 +146,7 @@ def test_explained_parameters_of_a_delixi_e_are_written() -> None:
     assert {code for code, one in known.items() if not one.never} == {*named}
 
 
-def test_family_without_an_address_rule_raises_unsupported(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_family_without_parameter_addresses_raises_unsupported(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, _ = one(monkeypatch, InvtCHE(1))
     with pytest.raises(
         Unsupported, match=r"no reliable rule .* invt-che: read and write its declared registers instead"
@@ -154,7 +154,7 @@ def test_family_without_an_address_rule_raises_unsupported(monkeypatch: pytest.M
         params.read(drive)
 
 
-def test_differences_show_names_and_units() -> None:
+def test_differing_parameters_have_names_and_units() -> None:
     first = params.ParameterSet("yd1000", {"0009": 100, "F240": 5}, source="a")
     second = params.ParameterSet("yd1000", {"0009": 150, "F240": 5, "F241": 1}, source="b")
     assert params.compare(first, second, YD1000) == [
@@ -195,7 +195,7 @@ FOUND = params.ParameterSet(
 
 
 @pytest.mark.parametrize("name", ["pump.toml", "pump.csv"])
-def test_saved_files_load_with_the_same_values(tmp_path: Path, name: str) -> None:
+def test_saved_parameter_files_load_with_the_same_values(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     params.save(FOUND, path, YD1000)
     found = params.load(path)
@@ -207,7 +207,7 @@ def test_saved_files_load_with_the_same_values(tmp_path: Path, name: str) -> Non
     assert params.is_parameter_file(path)
 
 
-def test_saving_to_an_existing_file_raises(tmp_path: Path) -> None:
+def test_saving_parameters_to_an_existing_file_raises(tmp_path: Path) -> None:
     (tmp_path / "pump.toml").write_text("")
     with pytest.raises(ValueError, match="exists already, and is not replaced"):
         params.save(FOUND, tmp_path / "pump.toml")
@@ -221,7 +221,7 @@ def test_a_set_without_parameters_is_not_saved(tmp_path: Path) -> None:
     assert not (tmp_path / "pump.toml").exists()
 
 
-def test_file_that_is_too_long_is_refused(tmp_path: Path) -> None:
+def test_a_parameter_file_that_is_too_long_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_bytes(b"#" * (files.MOST_BYTES + 1))
     with pytest.raises(ValueError, match="the parameter file has more than 1000000 bytes"):
         params.load(tmp_path / "a.csv")
@@ -260,7 +260,7 @@ def test_backup_files_of_the_gd20_tool_are_loaded(tmp_path: Path, quote: str) ->
         ("a.csv", "", "is not a parameter file"),
     ],
 )
-def test_invalid_file_raises_a_one_sentence_error(
+def test_an_invalid_parameter_file_raises_a_one_sentence_error(
     tmp_path: Path, name: str, text: str, sentence: str
 ) -> None:
     (tmp_path / name).write_text(text)
@@ -270,14 +270,14 @@ def test_invalid_file_raises_a_one_sentence_error(
     assert "\n" not in str(raised.value)
 
 
-def test_a_device_or_directory_is_not_opened(tmp_path: Path) -> None:
+def test_a_device_or_directory_is_not_opened_as_a_parameter_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "port.csv")
     for path in (tmp_path / "port.csv", tmp_path):
         with pytest.raises(ValueError, match="is not a file, but a directory or a device"):
             params.load(path)
 
 
-def test_missing_file_raises_a_one_sentence_error(tmp_path: Path) -> None:
+def test_a_missing_parameter_file_raises_a_one_sentence_error(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="cannot be read: No such file"):
         params.load(tmp_path / "a.toml")
     assert not params.is_parameter_file(tmp_path / "a.toml")

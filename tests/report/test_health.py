@@ -71,7 +71,7 @@ def test_recordings_of_every_format_are_read_as_the_same_data(tmp_path: Path, su
     ]
 
 
-def test_misses_do_not_end_a_fault(look: Recording) -> None:
+def test_missed_values_do_not_end_a_fault(look: Recording) -> None:
     (span,) = look.of("pump", "fault")[0].faults()
     assert span.what == "OVERHEAT"
     assert (span.begin - UTC_0, span.end - UTC_0) == (40 * SECOND, 50 * SECOND)
@@ -149,7 +149,7 @@ def test_reply_that_may_answer_a_lost_request_has_no_response_delay(tmp_path: Pa
     assert pump.seconds * 1e3 == pytest.approx([10.0] * 10 + [30.0])
 
 
-def test_misses_that_grow_with_speed_are_found(look: Recording) -> None:
+def test_misses_that_grow_with_the_motors_speed_are_found(look: Recording) -> None:
     shares = miss_shares(look, "pump")
     assert shares is not None
     slow = shares[1][shares[0] < 28]
@@ -160,7 +160,7 @@ def test_misses_that_grow_with_speed_are_found(look: Recording) -> None:
     assert miss_shares(look, "fan") is None
 
 
-def test_misses_by_frequency_need_a_varying_speed(tmp_path: Path) -> None:
+def test_misses_by_output_frequency_need_a_varying_frequency(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", 50.0) for at in range(50)]
     rows.append(row(50, "pump", "output_frequency", None, "bad checksum"))
     assert miss_shares(load(record(tmp_path / "it.arrows", rows)), "pump") is None

@@ -60,7 +60,7 @@ def test_a_thinned_curve_keeps_every_minimum_and_maximum() -> None:
 
 
 @pytest.mark.long
-def test_there_is_a_panel_for_every_quantity_and_unit(look: Recording) -> None:
+def test_a_plot_has_a_panel_for_every_quantity_and_unit(look: Recording) -> None:
     figure, left = plot(look)
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert titles == ["faults", "output_frequency, Hz", "output_current, raw count"]
@@ -68,7 +68,7 @@ def test_there_is_a_panel_for_every_quantity_and_unit(look: Recording) -> None:
     assert png(figure).startswith(PNG)
 
 
-def test_drives_and_registers_can_be_chosen(look: Recording) -> None:
+def test_a_plot_can_be_limited_to_some_drives_and_registers(look: Recording) -> None:
     figure, _ = plot(look, ["fan"])
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["output_current, raw count"]
     figure, _ = plot(look, [], ["output_frequency"])
@@ -110,7 +110,7 @@ def test_a_fault_is_shaded_if_its_drive_is_plotted_alone(tmp_path: Path) -> None
     }
 
 
-def test_lines_and_states_end_at_a_pause(tmp_path: Path) -> None:
+def test_drawn_curves_and_states_end_at_a_pause_of_polling(tmp_path: Path) -> None:
     """A suspended process records no rows, not even misses: that is a pause. A changed rate is not."""
     times = [0.0, 0.1, 0.2, 10.2, 10.3, 10.4, 30.4, 50.4, 70.4]
     rows = [row(at, "pump", name, 1.0) for at in times for name in ("output_frequency", "status")]
@@ -275,7 +275,7 @@ def test_state_lanes_that_do_not_fit_into_a_panel_are_counted(tmp_path: Path) ->
 # ---- limits ----
 
 
-def test_drives_that_do_not_fit_into_the_picture_are_counted_and_stay_in_the_tables(tmp_path: Path) -> None:
+def test_a_plot_counts_drives_that_do_not_fit_and_tables_list_them(tmp_path: Path) -> None:
     rows = [row(at, f"pump-{number}", "x", at) for at in range(2) for number in range(MOST_DRIVES + 2)]
     look = load(record(tmp_path / "it.arrows", rows, {}))
     assert plot(look)[1] == ["2 more drives"]

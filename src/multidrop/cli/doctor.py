@@ -214,7 +214,7 @@ def _findings(target: _Target) -> Iterator[Finding]:
     block = first_block(target.drives[0]) if target.drives else None
     if block:
         yield other_way_finding(port, block.request, settings)
-    # if the user named no drive, a missing answer in the other framing proves nothing
+    # if the user named no drive, a missing answer in the other framing does not exclude it
     elif not speaks_tcp(port):
         yield other_way_finding(port, nobody, settings)
 

@@ -37,8 +37,7 @@ class Finding:
 def adapter_finding(adapter: Adapter, port: str, lasting: str) -> Finding:
     """Return a finding that describes the adapter.
 
-    `lasting` is a device name that contains the adapter's serial number; if there is no such name, it is
-    `port`.
+    `lasting` is a device name that contains the adapter's serial number; without such a name, it is `port`.
     """
     advice = f"name it {lasting} in plant files: {port} is assigned in the order of plugging in"
     return Finding("adapter", str(adapter), advice if lasting != port else "")
@@ -305,7 +304,7 @@ def find_adapter(device: str, sysfs: Path = SYSFS) -> Adapter:
 
 def com_description(port: str) -> str:
     """Return Windows' description of a COM port's adapter; "" if Windows lists none."""
-    with suppress(ImportError, AttributeError, OSError):  # Wine lacks some of these functions
+    with suppress(ImportError, AttributeError, OSError):  # not all these functions exist on Wine
         from serial.tools.list_ports import comports
 
         return next((found.description for found in comports() if of_name(found.device) == of_name(port)), "")

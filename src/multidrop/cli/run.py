@@ -123,7 +123,7 @@ def _screen(test: TestRun, arguments: argparse.Namespace) -> Iterator[list[Calla
         def show(rows: Rows) -> None:
             nonlocal is_ending
             table.add(rows)
-            # after a signal, another message is printed below the table
+            # print the first table after a signal below the signal's message, not over it
             if not is_ending and signal_has_come():
                 is_ending = True
                 table.keep_drawing(time.monotonic())

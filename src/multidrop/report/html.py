@@ -31,7 +31,7 @@ from multidrop.report.value_plot import FAULTS, plot
 
 BAND = 0.02  # a value is settled if it differs from the settled value by at most this fraction of its change
 LAST = 0.2  # the settled value is the mean over this last fraction of a step
-KILOWATTS = {"kW": 1.0, "W": 1e-3}  # units whose integral is an energy, each in kW
+KILOWATTS = {"kW": 1.0, "W": 1e-3}  # units of power, as multiples of 1 kW; their integral is an energy
 SHORT = 32  # a table cell with at most this many characters is not wrapped
 
 _STYLE = """

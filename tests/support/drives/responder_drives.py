@@ -36,7 +36,7 @@ class Kind:
     stops: Judge
     memory: Mapping[int, int]  # raw counts by address, for all read functions
     turning: Mapping[int, int]  # replaces entries of `memory` while the motor turns
-    # name of a register that no verb reads, so that tests can mark a place in the log with a read of it
+    # name of a register that no verb reads; tests read it to mark a place in the log
     mark: str
     protocol: str = STANDARD
     # keyword arguments with which a drive of this family is made
