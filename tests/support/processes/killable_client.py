@@ -22,6 +22,10 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+sys.path.append(str(Path(__file__).parents[1] / "simulated"))
+
+from patient import await_turns
+
 from multidrop import Bus, BusError, DelixiNative, params
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.core import NumberFormat
@@ -94,6 +98,7 @@ def apply(port: str, file: str, report: str) -> None:
 
 
 def main() -> None:
+    await_turns(setattr, dict.__setitem__)  # a busy machine delays writes for more than a second
     for line in sys.stdin:
         process = os.fork()
         if process == 0:
