@@ -187,7 +187,8 @@ SHEETS = {
         ((0x2000, 5),),
         (0x2000, 7),
     ),
-    # CHE100 manual p. 117 to 119, and the row 3137, 5564, 293, 70, 1882, 262, 198 of the public log.
+    # CHE100 manual p. 117 to 119. The values 3137, 5564, 293, 70, 1882, 262, 198 are a row of an owner's
+    # public log.
     "invt-chf100a": Sheet(
         {0x1000: 0, 0x1001: 3, 0x2000: 0, 0x3000: 0, 0x3002: 5564, 0x3006: 0, 0x3016: 0x0201, 0x5000: 0},
         {"output_frequency": 31.37, "dc_bus_voltage": 556.4, "output_power": 2.62},

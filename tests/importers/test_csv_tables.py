@@ -20,7 +20,7 @@ def row(folder: Path, header: str, cells: str) -> ImportedDevice:
 
 
 def found(device: ImportedDevice) -> list[str]:
-    """Return the device's gaps, except those about the address numbering and about a missing table."""
+    """Return the device's gaps (unknown properties), except those about numbering and a missing table."""
     return [gap for gap in gaps(device, "a") if gap not in UNPLACED]
 
 

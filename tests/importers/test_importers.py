@@ -1,4 +1,4 @@
-"""Importers: an example file of each format becomes a family file that loads, with every gap marked."""
+"""Importers: an example file of each format becomes a family file that loads, with comments for every gap."""
 
 from __future__ import annotations
 

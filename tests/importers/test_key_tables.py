@@ -1,4 +1,4 @@
-"""Every key of another program's schema is imported, ignored or marked as a gap. Unknown keys become gaps."""
+"""Every key of another program's schema is imported, ignored or marked as a gap (a property not imported)."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ def test_read_plan_for_a_register_that_cannot_be_read_raises() -> None:
         blocks(Example(1), [Example.run])
 
 
-def test_blocks_have_the_read_requests_of_the_modbus_standard() -> None:
+def test_planned_reads_and_writes_are_requests_of_the_modbus_standard() -> None:
     (block,) = blocks(Example(7), [Example.a, Example.b])
     assert block.request == Message(7, 3, 1, 2)
     assert write_request(Example(7), Example.coil, 1) == Message(7, 5, 3, data=b"\xff\x00")
@@ -90,7 +90,7 @@ def test_blocks_have_the_read_requests_of_the_modbus_standard() -> None:
         write_request(Example(7), Example.a, 1)
 
 
-def test_duration_of_a_block_includes_characters_silence_and_response_delay() -> None:
+def test_duration_of_a_read_includes_characters_silence_and_response_delay() -> None:
     drive = Example(1, baudrate=9600, format="8N1")
     (block,) = blocks(drive, [Example.a])
     characters = 8 + 7
@@ -359,7 +359,7 @@ def test_pause_between_two_drives_is_the_longer_silence_plus_the_switching_time(
     assert gap(fast, fast, switching=0.002) == pytest.approx(1.75e-3 + 1 / 38400)
 
 
-def test_block_of_a_table_without_a_read_function_raises() -> None:
+def test_planning_a_read_of_a_table_without_a_read_function_raises() -> None:
     table = Table("command word", None, 0x06)
     with pytest.raises(ValueError, match=r"^a command word cannot be read$"):
         read_request(Example(1), table, 0, 1)

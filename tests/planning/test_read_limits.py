@@ -230,7 +230,7 @@ def test_no_other_plan_for_overlapping_registers_takes_less_time(
 
 
 class Grouped(Drive):
-    """A family with an energy in two registers, a state that must be read first, and large gaps."""
+    """A family with an energy in two registers, a state that must be read first, and large readable gaps."""
 
     most_registers = {HOLDING: 100}
     readable_gaps = {HOLDING: range(200)}

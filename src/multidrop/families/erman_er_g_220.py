@@ -165,13 +165,13 @@ class ErmanERG220(Drive):
         )
     }
 
-    # Commands (section 10)
+    # Commands, which are coils (section 10 of the document)
     start_coil = _coil(0x0000, Coil, harmless=(Coil.OFF,))
     stop_coil = _coil(0x0001, Coil, harmless=(Coil.ON,))
     emergency_stop_coil = _coil(0x0002, Coil, harmless=(Coil.ON,))
     fault_reset_coil = _coil(0x0009, Coil, harmless=(Coil.OFF,))
 
-    # State registers (section 10)
+    # State registers (section 10 of the document)
     output_frequency = _state(0x0001, "Hz", step=0.1)
     output_current = _state(0x0003, "A", step=0.1)
     dc_bus_voltage = _state(0x0005, "V")
@@ -194,7 +194,7 @@ class ErmanERG220(Drive):
         note="The last fault, which may be past. The word order is not stated.",
     )
 
-    # Control registers (section 10)
+    # Control registers (section 10 of the document)
     control_register = setting(
         0x0001,
         Modes,

@@ -241,7 +241,7 @@ class YD1000(Drive):
         "the longest gap between two polls."
     )
 
-    # Section 6.1, basic parameters
+    # Basic parameters (section 6.1 of the notes)
     automatic_ramp = choice(0x0000, "6.1, AU1", 1, default=0)
     automatic_torque_boost = choice(0x0001, "6.1, AU2", default=0, while_running=False, never=PANEL)
     automatic_environment = choice(
@@ -274,7 +274,7 @@ class YD1000(Drive):
     preset_speed_6 = preset(0x0023, "6.1, SR6")
     preset_speed_7 = preset(0x0024, "6.1, SR7")
 
-    # Section 6.2, extended parameters
+    # Extended parameters (section 6.2 of the notes)
     low_speed_frequency = hertz(0x0100, "6.2, F100", at_most="maximum_frequency", default=0.0)
     speed_reach_frequency = hertz(0x0101, "6.2, F101", at_most="maximum_frequency", default=0.0)
     speed_reach_band = hertz(0x0102, "6.2, F102", at_most="maximum_frequency", default=2.5)
@@ -289,7 +289,7 @@ class YD1000(Drive):
     output_1_function = choice(0x0130, "6.2, F130", 9, default=4)
     output_2_function = choice(0x0131, "6.2, F131", 9, default=6)
 
-    # Section 6.3, commands
+    # Commands (section 6.3 of the notes)
     control = command(
         0x1000,
         YD1000Control,
@@ -323,7 +323,7 @@ class YD1000(Drive):
         place="6.3: 1002",
     )
 
-    # Section 6.4, live values
+    # Live values (section 6.4 of the notes)
     output_frequency = reading(0x1100, "Hz", step=0.01, place="6.4: 1100")
 
     # Section 6.5
@@ -345,7 +345,7 @@ class YD1000(Drive):
     fault_record_4 = reading(0x1213, place="6.5: 1213", note="A code; the table of faults is missing.")
     run_hours = reading(0x1214, "h", step=1, place="6.5: 1214")
 
-    # Section 7, communication
+    # Communication parameters (section 7 of the notes)
     baudrate_setting = setting(
         0x0800, YD1000Baudrate, kept=Kept.EEPROM, never=LINE, place="7 (1), F800", note=AFTER_RESET
     )

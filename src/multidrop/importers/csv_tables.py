@@ -1,7 +1,7 @@
 """Import CSV and TSV tables of ioBroker, modpoll and Neuron, and other tables with known column names.
 
-If programs use a column name with different meanings, the most frequent meaning is assumed and noted in
-`gaps`.
+If programs use a column name with different meanings, the most frequent meaning is assumed, and noted
+in the family file.
 """
 
 from __future__ import annotations

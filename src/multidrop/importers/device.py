@@ -152,8 +152,8 @@ class ImportedRegister:
     """A register with its address in requests. `gaps` are sentences about unknown properties.
 
     `lacks` names a property that affects the value, but that a family file cannot declare. Then only the raw
-    count is imported. In a family file, each register is only read; `is_written` and `of_writes` are for
-    coverage reports.
+    count is imported. A family file declares every register as read-only; `is_written` and `of_writes` are
+    only for reports.
     """
 
     name: str

@@ -19,7 +19,7 @@ from multidrop.planning.bus_time import characters, silence
 
 @dataclass(frozen=True)
 class Block:
-    """Registers that one request reads from a drive, and this request."""
+    """A read request (block): the registers that it reads, and the request itself."""
 
     table: Table
     start: int
@@ -29,7 +29,7 @@ class Block:
 
     @classmethod
     def of(cls, drive: Drive, registers: Sequence[Register[Any]]) -> Block:
-        """Return the block that reads these registers, which one function code must read."""
+        """Return one request (block) that reads these registers; they must have the same read function."""
         spans = [register.reach for register in registers]
         table, start = registers[0].table, min(span.start for span in spans)
         count = max(span.stop for span in spans) - start
@@ -42,7 +42,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Planned:
-    """A block of a drive that is read every `every` seconds; None: as fast as the line allows."""
+    """A read request (block) that is sent every `every` seconds; None: as often as the line allows."""
 
     drive: Drive
     block: Block
@@ -51,7 +51,7 @@ class Planned:
 
 @dataclass(frozen=True)
 class Plan:
-    """The quickest blocks for reading a drive's registers, if its response delay is `least` to `most` s."""
+    """The quickest requests for reading a drive's registers, if its response delay is `least` to `most` s."""
 
     planned: tuple[Planned, ...]
     least: float  # s; if the response delay is shorter, more and shorter requests would be quicker
@@ -98,7 +98,7 @@ def plan(
 
 
 def in_declared_order(drive: Drive, found: Iterable[Planned]) -> list[Planned]:
-    """Return the blocks sorted: first the blocks with registers of `read_together`, in declared order."""
+    """Return the requests sorted: first those with registers of `read_together`, in the declared order."""
     places = {name: place for place, group in enumerate(drive.read_together) for name in group}
     return sorted(
         found, key=lambda one: min(places.get(each.name, len(places)) for each in one.block.registers)
@@ -108,18 +108,18 @@ def in_declared_order(drive: Drive, found: Iterable[Planned]) -> list[Planned]:
 def planned(
     drive: Drive, wanted: Iterable[tuple[Register[Any], float | None]], delay: float | None = None
 ) -> list[Planned]:
-    """Return the blocks of the quickest plan; see `plan`."""
+    """Return the requests of the quickest plan, each with its period; see `plan`."""
     return list(plan(drive, wanted, delay).planned)
 
 
 def blocks(drive: Drive, registers: Iterable[Register[Any]]) -> tuple[Block, ...]:
-    """Return the blocks that read these registers once in the least time; see `plan`."""
+    """Return the requests that read these registers once in the least time; see `plan`."""
     found = planned(drive, ((register, None) for register in registers))
     return tuple(each.block for each in found)
 
 
 def first_block(drive: Drive) -> Block | None:
-    """Return a block with the drive's first reading, else its first readable register; None without any."""
+    """Return a request for the drive's first reading, else for its first readable register, else None."""
     readable = [*drive.readings(), *(each for each in drive.registers.values() if each.readable)]
     return blocks(drive, readable[:1])[0] if readable else None
 
@@ -139,7 +139,7 @@ def all_requests(
 
 
 def text_blocks(drive: Drive, text: Text) -> tuple[Block, ...]:
-    """Return the blocks that read a text register, in order. Each is within the family's limit."""
+    """Return the requests that read a text register, in order. Each is within the family's limit."""
     limit, end = read_limit(drive, text.table), text.address + text.length
     counts = ((start, min(limit, end - start)) for start in range(text.address, end, limit))
     return tuple(
@@ -149,7 +149,7 @@ def text_blocks(drive: Drive, text: Text) -> tuple[Block, ...]:
 
 
 def sending(drive: Drive, block: Block) -> float:
-    """Return the seconds that the characters of a block's request and reply take on the wire."""
+    """Return the seconds that the characters of this request and its reply take on the wire."""
     return characters(drive.framing, block.table.carrier, block.count) * drive.settings.character
 
 
@@ -271,7 +271,7 @@ def _even(drive: Drive, few: _Way, many: _Way) -> float:
 
 
 def halves(drive: Drive, block: Block) -> tuple[Block, ...]:
-    """Return two smaller blocks that together read the block's registers; () if it cannot be split.
+    """Return two smaller requests (blocks) that together read the same registers; () if there are none.
 
     Registers at the same address stay in one block, and so do those of a group in `read_together`. Splitting
     a block of n registers repeatedly gives at most 2 n - 1 blocks, including the block itself.
@@ -285,7 +285,7 @@ def halves(drive: Drive, block: Block) -> tuple[Block, ...]:
 
 
 def _units(drive: Drive, block: Block) -> list[list[Register[Any]]]:
-    """Group the block's registers so that each group must be read by one request; sorted by address."""
+    """Group a request's registers so that one request must read each group; sorted by address."""
     groups = {name: place for place, group in enumerate(drive.read_together) for name in group}
     found: dict[object, list[Register[Any]]] = {}
     for register in block.registers:
@@ -300,5 +300,5 @@ def may_be_too_long(drive: Drive, block: Block) -> bool:
 
 
 def least(drive: Drive, block: Block) -> Block:
-    """Return the smallest block: the first registers that one request must read together."""
+    """Return the smallest part of a request: the first registers that one request must read together."""
     return Block.of(drive, _units(drive, block)[0])

@@ -49,7 +49,7 @@ class Rate:
 class Prediction:
     """The predicted bus cycle, utilisation and rates of one line."""
 
-    cycle: float  # s in which each block is read once
+    cycle: float  # s in which each request of the line is sent once
     switches: int  # number of changes of baud rate or format in a bus cycle
     utilisation: float  # fraction of the line's time that the rates need; above 1, they cannot all be reached
     rates: tuple[Rate, ...]
@@ -452,7 +452,7 @@ def reading_gain(drive: Drive, wanted: Iterable[tuple[Register[Any], float | Non
 
 
 def _crossed(drive: Drive, table: Table, found: Sequence[Planned]) -> range:
-    """Return the range from the first to the last undeclared address that these blocks of `table` include."""
+    """Return the range from the first to the last undeclared address in these requests to `table`."""
     family: Any = type(drive)
     readable = readable_addresses(family, table)
     blocks = [one.block for one in found if one.block.table.read_space == table.read_space]

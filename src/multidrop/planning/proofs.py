@@ -33,11 +33,11 @@ RawRange = tuple[int, int]  # lowest and highest raw count that the only registe
 
 
 def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
-    """Return the drive's proofs: blocks whose reply shows that no late reply can still come.
+    """Return the drive's proofs: read requests whose reply shows that no late reply can still come.
 
-    Each block comes with the range of raw values that its reply is known to hold, or with None. The last
-    block is the least likely to be polled. If a Modbus device has fewer than ENOUGH blocks, blocks of its
-    other tables are added.
+    Each request (block) comes with the range of raw counts that its reply must have, or with None. The last
+    request is the least likely to be polled. If a Modbus device has fewer than ENOUGH requests, requests to
+    its other tables are added.
     """
     known = [(Block.of(drive, [register]), counts) for register, counts in drive.known_counts().items()]
     family: Any = type(drive)
@@ -75,7 +75,7 @@ def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
 
 
 def _of_other_tables(drive: Drive, found: Sequence[Block]) -> list[Block]:
-    """Return blocks of one register each. No two of them, or of `found`, have the same function code."""
+    """Return requests for one register each. No two of them, or of `found`, have the same function code."""
     start = found[0].start if found else 0
     functions = {block.table.read for block in found}
     return [

@@ -237,7 +237,7 @@ def current_for(period: float) -> float:
 
 
 def planned_on(line: PlantLine, delays: Mapping[Drive, float] | None = None) -> list[Planned]:
-    """Return the blocks to read on a line; `delays` are measured response delays in s, by drive."""
+    """Return the requests that poll a line; `delays` are measured response delays in s, by drive."""
     known = delays or {}
     return [
         each

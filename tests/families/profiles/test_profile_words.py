@@ -83,9 +83,11 @@ STARTS: dict[str, tuple[list[int], tuple[str, ...]]] = {
     "danfoss-fc51": ([FC_READY, FC_RUNS], (FC + "04 7C",)),
     # CP2000 manual p. 12.1-09-8: bits run and forward
     "delta-vfd-el": ([DELTA_STOP, DELTA_RUNS], (DELTA + "00 12",)),
-    "invt-goodrive": ([GD_STANDBY, GD_RUNS], (DELTA + "00 01",)),  # Goodrive100 p. 167
-    "optidrive-e3": ([E3_READY, E3_RUNS], (E3 + "00 01",)),  # ODE-3 user guide p. 33
-    "powtran-pi130": ([MD_STOPPED, MD_RUNS], (DELTA + "00 01",)),  # PI130 p. 116
+    # control word 1 runs forward (Goodrive100 manual p. 167)
+    "invt-goodrive": ([GD_STANDBY, GD_RUNS], (DELTA + "00 01",)),
+    "optidrive-e3": ([E3_READY, E3_RUNS], (E3 + "00 01",)),  # bit 0 runs the motor (ODE-3 user guide p. 33)
+    # control word 1 runs forward (PI130 manual p. 116)
+    "powtran-pi130": ([MD_STOPPED, MD_RUNS], (DELTA + "00 01",)),
     "delixi-e": ([MD_STOPPED, MD_RUNS], (DELIXI + "00 01",)),
     "yaskawa-a1000": ([YK_OFF, YK_RUNS], (A1000 + "00 01",)),
 }
