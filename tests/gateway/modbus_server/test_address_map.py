@@ -1,4 +1,4 @@
-"""The address map: a Modbus client that knows only the map's rows reads the same values as /api/frame."""
+"""The Modbus address map: a client that knows only its rows reads the same values as /api/frame."""
 
 from __future__ import annotations
 
@@ -88,11 +88,12 @@ every = "50 ms"
 """
 READ = {1: "read_coils", 2: "read_discrete_inputs", 3: "read_holding_registers", 4: "read_input_registers"}
 STRUCT = {"u16": "H", "i16": "h", "u32": "I", "i32": "i", "u64": "Q", "f16": "e", "f32": "f", "f64": "d"}
-UNPOLLED = "output_voltage", 0x3003  # name and address of a register of the mill: CHE100 manual v1.4, p. 117
+# a register of the drive "mill" and its address (CHE100 manual v1.4, p. 117)
+UNPOLLED = "output_voltage", 0x3003
 
 
 class Client:
-    """Clients of pymodbus, one for each port in a map. They know only the map's rows."""
+    """Modbus TCP clients of pymodbus, one for each port in the map. They know only the rows of the map."""
 
     def __init__(self) -> None:
         self._clients: dict[int, Any] = {}
@@ -109,17 +110,18 @@ class Client:
         return self._clients[port]
 
     def words(self, row: dict[str, Any], function: int, address: int, count: int) -> list[int] | int:
-        """Return the words or bits at an address of the row's unit, or an exception code."""
+        """Return the words or bits at an address of the row's unit id, or an exception code."""
         while True:
             read = getattr(self._of(row), READ[function])
             found = read(address, count=count, device_id=row["unit_id"])
             if not found.isError():
                 return list(found.registers if function in (3, 4) else found.bits[:count])
-            if found.exception_code not in (6, 11):  # 6: the clients' share of the line's time is used up
+            # Exception 6: the share of the line's time that clients may use is used up.
+            if found.exception_code not in (6, 11):
                 return int(found.exception_code)
 
     def write(self, row: dict[str, Any]) -> int:
-        """Write the present value of a row; return an exception code, or 0."""
+        """Write to a row the value that it has now; return 0 or an exception code."""
         words = self.words(row, row["function"], row["address"], row["words"])
         assert isinstance(words, list)
         if row["function"] == 1:
@@ -129,7 +131,7 @@ class Client:
         return int(done.exception_code) if done.isError() else 0
 
     def number(self, row: dict[str, Any]) -> float:
-        """Return the value of a row in its unit."""
+        """Return the value of a row, in the unit of measurement of the row."""
         words = self.words(row, row["function"], row["address"], row["words"])
         assert isinstance(words, list), (row["name"], words)
         if row["format"] == "bit":
@@ -144,7 +146,7 @@ class Client:
 
 
 def decoded(data: bytes, row: dict[str, Any]) -> float:
-    """Return the number of a row in bytes whose most significant byte is first."""
+    """Decode the bytes of a row, most significant byte first."""
     if row["format"].startswith("bcd"):
         return int(data.hex())
     if row["bits"]:
@@ -157,7 +159,7 @@ def decoded(data: bytes, row: dict[str, Any]) -> float:
 
 @contextmanager
 def served(folder: Path, passing: str) -> Iterator[Any]:
-    """Run a gateway with two simulated drives, whose registers hold random words."""
+    """Run a gateway with two simulated drives whose registers hold random words."""
     (folder / "mixed.toml").write_text(FAMILY)
     path = folder / "plant.toml"
     path.write_text(PLANT.format(passing=passing, hall="/dev/a", yard="/dev/b"))
@@ -166,14 +168,14 @@ def served(folder: Path, passing: str) -> Iterator[Any]:
         drive = SimulatedDrive(line.drives[0].drive)
         for register in drive.drive.registers.values():
             for cell in drive.memory.of(register):
-                # only decimal digits, so that the word is valid as BCD too, and no float is infinite
+                # Use decimal digits only: then the word is also valid as BCD, and no float is infinite.
                 cell.raw = (
                     chance.randint(0, 1) if register.is_bit else int(f"{chance.randint(1, 9999):d}", 16)
                 )
         drives.append(drive)
     drives[0]["device"], drives[0]["setpoint"] = 0x0101, 50
     drives[1]["power_of_ten"] = -2
-    drives[1]["huge"] = (1 << 53) - 1  # larger numbers are not certain: the rows have them as floats
+    drives[1]["huge"] = (1 << 53) - 1  # the largest integer that a row, which has a float, can hold exactly
     with Simulator([Wire([one], unpaced=True) for one in drives]) as simulator:
         hall, yard = (wire.path for wire in simulator.wires)
         path.write_text(PLANT.format(passing=passing, hall=hall, yard=yard))
@@ -190,7 +192,9 @@ def get(gateway: Any, path: str) -> Any:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("passing", ["declared", "off"])
-def test_a_client_that_follows_the_map_reads_the_values_of_the_page(tmp_path: Path, passing: str) -> None:
+def test_a_client_that_follows_the_address_map_reads_the_values_of_the_web_page(
+    tmp_path: Path, passing: str
+) -> None:
     with served(tmp_path, passing) as gateway, closing(Client()) as client:
         rows = get(gateway, "/api/modbus-map")
         until(lambda: None not in [one[0] for drive in values(gateway).values() for one in drive.values()])
@@ -203,7 +207,7 @@ def test_a_client_that_follows_the_map_reads_the_values_of_the_page(tmp_path: Pa
         assert (("mill", UNPOLLED[0]) in names) is (passing == "declared")
 
         def wrong() -> list[str]:
-            """Return the names of rows whose values differ from the page, as old values may for a moment."""
+            """Return the names of rows whose values differ from the web page; a cached value may be old."""
             pairs = [(row, shown[row["drive"]].get(row["name"])) for row in read]
             return [
                 row["name"]
@@ -221,7 +225,7 @@ def test_a_client_that_follows_the_map_reads_the_values_of_the_page(tmp_path: Pa
 
 
 def values(gateway: Any) -> dict[str, dict[str, list[Any]]]:
-    """Return the values on the page by drive and name, each as a list that starts with the number."""
+    """Return the values on the web page by drive and register. Each is a list that starts with the number."""
     drives = get(gateway, "/api/frame")["drives"]
     return {name: drive["values"] for name, drive in drives.items()}
 
@@ -240,7 +244,7 @@ def check_common_block(rows: list[dict[str, Any]], shown: dict[str, list[Any]], 
 
 
 @pytest.mark.slow
-def test_clients_can_write_exactly_the_rows_that_are_marked_writable(tmp_path: Path) -> None:
+def test_clients_can_write_only_the_rows_that_the_address_map_marks_writable(tmp_path: Path) -> None:
     with served(tmp_path, "declared") as gateway, closing(Client()) as client:
         rows = get(gateway, "/api/modbus-map")
         assert [row["name"] for row in rows if "write" in row["access"]] == [
@@ -252,7 +256,7 @@ def test_clients_can_write_exactly_the_rows_that_are_marked_writable(tmp_path: P
 
 
 @pytest.mark.slow
-def test_http_and_the_command_give_the_same_address_map(
+def test_http_and_the_command_line_give_the_same_address_map(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with served(tmp_path, "declared") as gateway:
@@ -271,7 +275,7 @@ def test_http_and_the_command_give_the_same_address_map(
     assert "map.xls: the name of an address map must end in .csv or .json" in capsys.readouterr().err
 
 
-def test_the_map_states_an_invalid_count_of_32_bits_and_the_bits_of_a_byte(tmp_path: Path) -> None:
+def test_the_address_map_has_the_invalid_count_of_32_bits_and_the_bits_of_a_byte(tmp_path: Path) -> None:
     (tmp_path / "mixed.toml").write_text(FAMILY)
     (tmp_path / "plant.toml").write_text(PLANT.format(passing="declared", hall="/dev/a", yard="/dev/b"))
     assert main(["serve", str(tmp_path / "plant.toml"), "--modbus-map", str(tmp_path / "map.json")]) == 0
@@ -280,8 +284,8 @@ def test_the_map_states_an_invalid_count_of_32_bits_and_the_bits_of_a_byte(tmp_p
     assert (rows["byte"]["format"], rows["byte"]["bits"]) == ("i8", "0 to 7")
 
 
-def test_rows_of_the_json_map_are_encoded_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A call of json.dumps stops all other threads until it ends."""
+def test_rows_of_the_json_address_map_are_encoded_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One call of json.dumps for all rows would block all other threads until it ends."""
     encoded: list[Any] = []
 
     def dumps(row: Any, **_: Any) -> str:
@@ -294,7 +298,9 @@ def test_rows_of_the_json_map_are_encoded_one_by_one(monkeypatch: pytest.MonkeyP
     assert encoded == [row._asdict()] * 3
 
 
-def test_plant_without_modbus_server_has_no_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_plant_without_a_modbus_server_has_no_address_map(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(
         '[[line]]\nname = "a"\nport = "/dev/a"\n[[line.drive]]\nname = "b"\naddress = 1\nmodel = "yd1000"\n'

@@ -1,6 +1,4 @@
-"""Read and write drives through the gateway with mbpoll, libmodbus and pyModbusTCP: words equal the drives'
-memory.
-"""
+"""mbpoll, libmodbus and pyModbusTCP read and write drives through the gateway: words equal the drives'."""
 
 from __future__ import annotations
 
@@ -34,14 +32,14 @@ class Master(Protocol):
     """A Modbus master connected to the gateway."""
 
     def read(self, unit: int, function: int, start: int, count: int) -> list[int] | int:
-        """Return the words or bits read, or an exception code."""
+        """Return the words or bits at these addresses, or an exception code."""
 
     def write(self, unit: int, function: int, start: int, value: int) -> int:
-        """Write a value; return an exception code, or 0."""
+        """Write one value; return 0 or an exception code."""
 
 
 class PyModbusTcp:
-    """The client of pyModbusTCP."""
+    """A master that uses the client of pyModbusTCP."""
 
     def __init__(self, port: int) -> None:
         client = require_module("pyModbusTCP.client")
@@ -73,7 +71,7 @@ class PyModbusTcp:
 
 @contextmanager
 def master_of(name: str, port: int, built: Path) -> Iterator[Master]:
-    """Yield the master of this name, connected to this port; skip the test if it is not installed."""
+    """Yield the master of this name, connected to this port. Skips the test if it is not installed."""
     masters: dict[str, Callable[[], Any]] = {
         "mbpoll": lambda: Mbpoll("127.0.0.1", "-m", "tcp", "-p", str(port)),
         "libmodbus": lambda: Libmodbus(port, built),
@@ -86,17 +84,18 @@ def master_of(name: str, port: int, built: Path) -> Iterator[Master]:
 MASTERS = ["pyModbusTCP", "mbpoll", "libmodbus"]
 METER = Path(__file__).parents[2] / "data" / "families" / "sdm630.toml"
 MODELS = ["innovert-ibd", "invt-che", "delixi-modbus", "yd1000", "erman-er-g-220", str(METER)]
-COMMANDED = 7  # id of the unit that the tests write to
-SETPOINT, CONTROL, STOP = 0x2000, 0x1000, 5  # two addresses and a value: CHE100 manual v1.4, p. 117
+COMMANDED = 7  # unit id of the drive that the tests write to
+# addresses of two registers, and the value that means stop (CHE100 manual v1.4, p. 117)
+SETPOINT, CONTROL, STOP = 0x2000, 0x1000, 5
 PATIENCE = 60.0  # s
 
 
 class Lines(NamedTuple):
-    """Adapts a poller to the protocol PolledLines of Commands."""
+    """A poller with the protocol PolledLines, which Commands needs."""
 
     plant: Plant
     poller: Poller
-    asked: list[tuple[str, int, int, int]]  # reads that were passed on to a drive
+    asked: list[tuple[str, int, int, int]]  # reads that the gateway passed on to a drive
 
     def bus(self, line: str) -> Bus:
         return self.poller.bus(line)
@@ -107,7 +106,7 @@ class Lines(NamedTuple):
 
     @property
     def plant_coming(self) -> None:
-        return None  # no reload is in progress
+        return None  # no reload in progress
 
     async def ask(self, drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:
         self.asked.append((drive, function, start, count))
@@ -119,7 +118,7 @@ class Lines(NamedTuple):
 
 
 class Rig(NamedTuple):
-    """The gateway, its simulated drives by unit, and the poller."""
+    """The gateway's Modbus server, the simulated drives by unit id, and the poller."""
 
     server: ModbusServer
     drives: dict[int, SimulatedDrive]
@@ -131,7 +130,7 @@ class Rig(NamedTuple):
 
 
 def plant_text(ports: list[str]) -> str:
-    """Return a plant file with half of the drives on each line, and some registers that are not polled."""
+    """Return a plant file with half of the drives on each of two lines; some registers are not polled."""
     models = [*MODELS, "invt-che"]
     text = ""
     for at, port in enumerate(ports):
@@ -170,7 +169,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory, _patient_module: None) -> Iter
                 loop = asyncio.get_running_loop()
 
                 def feed(batch: Batch) -> None:
-                    with suppress(RuntimeError):  # raised at the end of the tests, after the loop was closed
+                    with suppress(RuntimeError):  # raised when a batch arrives after the loop was closed
                         loop.call_soon_threadsafe(hub.take, batch)
 
                 poller.on_batch(feed, every=0.02)
@@ -181,7 +180,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory, _patient_module: None) -> Iter
 
 
 def fill(drive: SimulatedDrive, chance: random.Random) -> None:
-    """Set each word to a random number, often a small one, or to a documented value if it has such values."""
+    """Set each register to random words, often small numbers, or to a value that its manual lists."""
     for register in drive.drive.registers.values():
         for cell in drive.memory.of(register):
             top = 1 if register.table.carrier is Carrier.BIT else 0xFFFF
@@ -192,7 +191,7 @@ def fill(drive: SimulatedDrive, chance: random.Random) -> None:
 
 
 class Chunk(NamedTuple):
-    """Adjacent readable addresses of a unit, and their values."""
+    """Adjacent readable addresses of a unit id, and the words there."""
 
     unit: int
     function: int
@@ -205,7 +204,7 @@ class Chunk(NamedTuple):
 
 
 def chunks(rig: Rig) -> list[Chunk]:
-    """Return all declared readable addresses in pieces, with the simulated memory's values."""
+    """Return all declared readable addresses as chunks, with the words of the simulated memory."""
     found: list[Chunk] = []
     for unit, drive in rig.drives.items():
         readable: set[tuple[int, int]] = set()
@@ -228,7 +227,7 @@ def chunks(rig: Rig) -> list[Chunk]:
 
 
 def patiently(ask: Any, *numbers: int) -> Any:
-    """Repeat a call if the clients' share of line time is used up or a busy machine lost a reply."""
+    """Repeat a call while it returns 6 (line time used up) or 11 (reply lost on a busy machine)."""
     end = monotonic() + PATIENCE
     while (found := ask(*numbers)) in (6, 11) and monotonic() < end:
         sleep(0.1)
@@ -243,7 +242,7 @@ def master(request: pytest.FixtureRequest, rig: Rig, tmp_path: Path) -> Iterator
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_a_master_reads_all_words_as_the_drives_store_them(rig: Rig, master: Master) -> None:
+def test_a_master_reads_the_words_that_each_drive_stores(rig: Rig, master: Master) -> None:
     asked, before = chunks(rig), len(rig.lines.asked)
     assert len(asked) > 40
     wrong = [
@@ -259,8 +258,8 @@ def test_a_master_reads_all_words_as_the_drives_store_them(rig: Rig, master: Mas
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_register_words_from_the_cache_equal_those_read_from_the_line(rig: Rig, master: Master) -> None:
-    """Reads of whole polled registers are answered from polled rows, with the words on the line."""
+def test_words_computed_from_polled_rows_equal_those_read_from_the_drive(rig: Rig, master: Master) -> None:
+    """Reads of whole polled registers need no request on the line."""
     frequency = rig.drives[2].drive.register("output_frequency").address  # polled
 
     def is_cached() -> bool:
@@ -280,7 +279,7 @@ def test_register_words_from_the_cache_equal_those_read_from_the_line(rig: Rig, 
 
 
 def direct_words(bus: Bus, drive: SimulatedDrive, register: Any) -> list[int]:
-    """Read a register's words directly over the line; retry if a busy machine lost the reply."""
+    """Read the words of a register directly from the drive. Retries if a busy machine loses the reply."""
     end = monotonic() + PATIENCE
     data = b""
     while not data:
@@ -294,7 +293,7 @@ def direct_words(bus: Bus, drive: SimulatedDrive, register: Any) -> list[int]:
 
 
 @pytest.mark.slow
-def test_master_writes_and_reads_back_a_setpoint(
+def test_a_master_writes_a_setpoint_and_reads_it_back(
     rig: Rig, master: Master, request: pytest.FixtureRequest
 ) -> None:
     value = 3000 + 100 * MASTERS.index(request.node.callspec.params["master"])
@@ -304,26 +303,29 @@ def test_master_writes_and_reads_back_a_setpoint(
     assert patiently(master.read, COMMANDED, 3, SETPOINT, 1) == [value]
 
 
-def test_master_gets_the_exception_codes_of_refused_writes(rig: Rig, master: Master) -> None:
+def test_a_master_gets_the_exception_codes_of_refused_writes(rig: Rig, master: Master) -> None:
     writes = len(rig.drives[COMMANDED].counters.writes)
-    assert patiently(master.write, COMMANDED, 6, SETPOINT, 60000) == 3  # above its range
+    assert patiently(master.write, COMMANDED, 6, SETPOINT, 60000) == 3  # above the register's range
     assert patiently(master.write, COMMANDED, 6, CONTROL, 1) == 3  # FORWARD
-    assert patiently(master.write, 1, 6, 0x0002, 1) == 2  # 2: not a writable register
+    assert patiently(master.write, 1, 6, 0x0002, 1) == 2  # the register is read-only
     assert patiently(master.write, 4, 6, 0x2000, 1) == 2
     assert master.read(99, 3, 0, 1) == 10
     assert len(rig.drives[COMMANDED].counters.writes) == writes
 
 
-def test_master_stops_a_motor_by_control_register_and_common_block(rig: Rig, master: Master) -> None:
+def test_a_master_stops_a_motor_by_its_control_register_and_by_the_common_block(
+    rig: Rig, master: Master
+) -> None:
     drive = rig.drives[COMMANDED]
     for address, value in ((CONTROL, STOP), (0xF00A, 1)):
         drive.counters.writes.clear()
-        assert master.write(COMMANDED, 6, address, value) in (0, 5)  # 0: done, 5: still in progress
+        # 0: confirmed, 5: acknowledged and still in progress
+        assert master.write(COMMANDED, 6, address, value) in (0, 5)
         until(lambda: drive.counters.writes)
         assert [(one.name, one.raw) for one in drive.counters.writes][-1] == ("control", STOP)
 
 
-def test_common_block_is_equal_for_all_masters(rig: Rig, master: Master) -> None:
+def test_each_master_reads_the_common_block(rig: Rig, master: Master) -> None:
     for unit in rig.drives:
         found = patiently(master.read, unit, 3, 0xF000, 11)
         assert isinstance(found, list)

@@ -1,4 +1,4 @@
-"""Modbus clients: each gets only its own answers, and a stop waits for no other request or answer."""
+"""Modbus TCP clients: each gets only its own answers, and a stop waits for no other request or answer."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from multidrop.gateway.modbus_server.passed_requests import BURST_S, EXPIRY_S, M
 from multidrop.gateway.modbus_server.protocol import MbapRequest, PassingBusy, take_request
 from multidrop.gateway.modbus_server.settings import ModbusSettings
 
-UNREAD = 150_000  # number of requests whose answers exceed the socket buffers of both sides
+UNREAD = 150_000  # so many requests that their answers do not fit into the socket buffers of both sides
 
 # ---- connections ----
 
 
 class FakeTransport(asyncio.Transport):
-    """A transport that stores all written bytes."""
+    """A transport that stores the bytes written to it."""
 
     def __init__(self, address: str = "127.0.0.1") -> None:
         super().__init__({"peername": (address, 40000)})
         self.written = bytearray()
-        self.taken = 0  # number of written bytes that the client has read
+        self.taken = 0  # number of stored bytes that the client has read
         self.is_reading = True  # type: ignore[assignment, method-assign]
         self.ended = ""
 
@@ -97,7 +97,9 @@ async def test_answers_have_their_requests_ids_and_are_sent_when_ready() -> None
     assert [transport.written[at + 8] for at in (0, 9, 18)] == [1, 2, 3]
 
 
-async def test_internal_failure_is_answered_with_an_exception_code(caplog: pytest.LogCaptureFixture) -> None:
+async def test_an_internal_failure_is_answered_with_a_modbus_exception(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     async def fails(found: MbapRequest) -> bytes:
         raise RuntimeError("a mistake of ours")
 
@@ -121,13 +123,13 @@ async def test_a_flooding_client_does_not_delay_other_clients() -> None:
 
 
 def slowly(found: MbapRequest, _: ModbusClient) -> bytes:
-    """Return an answer that takes 0.5 ms by the event loop's clock."""
+    """Return an answer, and advance the event loop's clock by 0.5 ms."""
     cast(ControlledLoop, asyncio.get_running_loop()).passing.now += 0.0005
     return found.reply(b"")
 
 
-async def test_busy_clients_share_the_time_of_one_round() -> None:
-    """A stop through any interface may have to wait for one round, in which every client has a turn."""
+async def test_busy_clients_share_the_time_slice_of_one_event_loop_cycle() -> None:
+    """A stop may have to wait for one cycle, in which each client has a turn."""
     share = modbus_clients.RoundShare()
     clock = cast(ControlledLoop, asyncio.get_running_loop()).passing
     ports = [ModbusPort(slowly, lambda _: True, lambda: clock.now, share) for _ in range(2)]
@@ -146,7 +148,7 @@ async def test_busy_clients_share_the_time_of_one_round() -> None:
     assert share.slice_s == modbus_clients.SLICE_S
 
 
-async def test_slow_answers_end_a_clients_turn_early() -> None:
+async def test_a_client_with_slow_answers_ends_its_turn_early() -> None:
     client, transport = connected(port_of(slowly))
     client.data_received(b"".join(request(number, 1, 3, 0, 125) for number in range(100)))
     assert len(transactions(transport.written)) < 10
@@ -154,7 +156,7 @@ async def test_slow_answers_end_a_clients_turn_early() -> None:
     assert transactions(transport.written) == list(range(100))
 
 
-async def test_garbage_closes_the_connection_after_earlier_answers() -> None:
+async def test_invalid_bytes_close_the_connection_after_earlier_requests_are_answered() -> None:
     port = port_of()
     client, transport = connected(port)
     _, other = connected(port)
@@ -194,7 +196,7 @@ def writes(first: int, end: int) -> bytes:
 
 
 @pytest.mark.parametrize("is_stalled", [False, True])
-async def test_writes_start_on_arrival_in_their_order(is_stalled: bool) -> None:
+async def test_writes_start_on_arrival_and_in_their_order(is_stalled: bool) -> None:
     begun: list[int] = []
 
     def noted(found: MbapRequest, _: ModbusClient) -> bytes:
@@ -212,7 +214,7 @@ async def test_writes_start_on_arrival_in_their_order(is_stalled: bool) -> None:
     assert begun == transactions(transport.written) == [500, 501, *range(500)]
 
 
-async def test_parsing_of_received_writes_pauses_after_each_time_slice() -> None:
+async def test_parsing_of_received_writes_is_interrupted_after_each_time_slice() -> None:
     client, transport = connected(port_of(slowly))
     client.data_received(writes(0, 100))
     assert len(transactions(transport.written)) < 10
@@ -222,7 +224,7 @@ async def test_parsing_of_received_writes_pauses_after_each_time_slice() -> None
     assert transport.is_reading
 
 
-def test_a_client_that_reads_no_answers_can_send_only_a_limited_number_of_requests(
+def test_number_of_requests_of_a_client_that_reads_no_answers_is_limited(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(modbus_clients, "MOST_UNTAKEN", 4096)
@@ -248,7 +250,7 @@ def test_a_client_that_reads_no_answers_can_send_only_a_limited_number_of_reques
         client.resume_writing()
         await asyncio.sleep(1)
         answered = transactions(transport.written[kept:])
-        assert answered == [*range(500), *range(1000, 1500)]  # only the reads that fit into the queue
+        assert answered == [*range(500), *range(1000, 1500)]  # the other reads did not fit into the queue
         client.data_received(reads(7, 8))
         assert transactions(transport.written)[-1] == 7
 
@@ -256,7 +258,9 @@ def test_a_client_that_reads_no_answers_can_send_only_a_limited_number_of_reques
     assert caplog.text.count("does not read its answers") == 1
 
 
-async def test_pending_requests_beyond_the_limit_are_answered_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_requests_beyond_the_limit_of_waiting_requests_are_answered_busy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(modbus_clients, "MOST_BEHIND", 1000 * READ_SIZE)
     client, transport = connected(port_of())
     client.data_received(reads(0, 1002))
@@ -266,7 +270,7 @@ async def test_pending_requests_beyond_the_limit_are_answered_busy(monkeypatch: 
     assert transactions(rest) == list(range(1000))
 
 
-async def test_idle_client_is_disconnected_unless_it_waits_for_an_answer() -> None:
+async def test_an_idle_client_is_disconnected_unless_it_waits_for_an_answer() -> None:
     never = asyncio.get_running_loop().create_future()
     port = port_of(lambda found, _: never if found.transaction == 9 else found.reply(b""))
     connections = [connected(port) for _ in range(3)]
@@ -286,7 +290,8 @@ async def test_a_client_beyond_the_limit_replaces_the_client_that_is_idle_longes
         found.append(connected(port)[1])
         await asyncio.sleep(0.1)
     refused = connected(port)[1]
-    assert refused.ended == "aborted"  # none is replaced: no client was idle for 10 s
+    # refused instead of replacing another, because no other client was idle for 10 s
+    assert refused.ended == "aborted"
     await asyncio.sleep(modbus_clients.FORGETTABLE_S - 6.35)
     assert not connected(port)[1].ended
     assert [transport.ended for transport in found[:2]] == ["aborted", ""]
@@ -294,13 +299,13 @@ async def test_a_client_beyond_the_limit_replaces_the_client_that_is_idle_longes
     assert port.refused == 1
 
 
-async def test_client_whose_address_is_not_listed_is_refused() -> None:
+async def test_a_client_whose_address_is_not_listed_is_refused() -> None:
     port = port_of()
     assert connected(port, "10.0.0.1")[1].ended == "aborted"
     assert not port.clients
 
 
-async def test_a_started_answer_is_cancelled_if_its_client_disconnects() -> None:
+async def test_an_answer_in_progress_is_cancelled_if_its_client_disconnects() -> None:
     happened = []
 
     async def slow(found: MbapRequest) -> bytes:
@@ -321,7 +326,7 @@ async def test_a_started_answer_is_cancelled_if_its_client_disconnects() -> None
     assert (transport.written, port.clients) == (b"", set())
 
 
-async def test_a_client_that_closed_its_sending_side_gets_its_answers() -> None:
+async def test_a_client_that_closed_its_sending_side_still_gets_its_answers() -> None:
     async def slow(found: MbapRequest) -> bytes:
         await asyncio.sleep(1)
         return found.reply(b"")
@@ -338,7 +343,7 @@ async def test_a_client_that_closed_its_sending_side_gets_its_answers() -> None:
 # ---- over real sockets ----
 
 
-def test_garbage_of_one_client_does_not_affect_another() -> None:
+def test_invalid_bytes_of_one_client_do_not_affect_another() -> None:
     plant = plant_of(("hall", InvtCHE(1, name="mill")))
     with serving(plant, ModbusSettings(listen="127.0.0.1:0")) as gateway, gateway.client() as good:
         gateway.hub.values["mill", "output_voltage"] = 231.0
@@ -386,25 +391,26 @@ def test_a_stop_waits_neither_for_earlier_requests_nor_until_answers_are_read() 
             assert stopped.wait(PATIENCE)
 
 
-POLLED, PASSED = 500, 40  # number of polled and of unpolled addresses of each drive
+# number of addresses of each drive that are polled, and that are passed on to the drive
+POLLED, PASSED = 500, 40
 CLIENTS = 3
-WINDOW = 200  # requests that a client sends before it reads their answers
+WINDOW = 200  # requests sent before the client reads their answers
 
 
 class Ramp(Drive):
-    """A device whose registers hold different numbers."""
+    """A drive whose registers all hold different numbers."""
 
 
 Wide = type("Wide", (Ramp,), {f"level_{at}": reading(at) for at in range(POLLED + PASSED)})
 
 
 def value(unit: int, address: int) -> int:
-    """Return the number in a register, which differs for every unit and address."""
+    """Return the number in a register, by unit id and address."""
     return (7919 * address + 20011 * unit) % 0x10000
 
 
 class SlowLine(FakeLine):
-    """A line that answers with the registers' numbers; later requests may be answered earlier."""
+    """A line that returns the registers' numbers. It answers some later requests before earlier ones."""
 
     async def ask(self, drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:
         await asyncio.sleep(0.001 * (start % 5))
@@ -428,14 +434,14 @@ def expected(unit: int, start: int, count: int) -> list[int]:
 
 
 def drawn(chance: random.Random) -> tuple[int, int]:
-    """Return a random range of addresses; one range in fifty is not in the cache."""
+    """Return a random address and count. One range in fifty is not polled, and needs the line."""
     if chance.random() < 0.02:
         return POLLED + chance.randrange(PASSED - 4), chance.randint(1, 4)
     return chance.randrange(POLLED - 4), chance.randint(1, 4)
 
 
 def pipeline(client: RawClient, unit: int, requests: int) -> int:
-    """Send windows of requests, and check each reply; return how many requests went to the line."""
+    """Pipeline requests and check each reply; return how many requests were passed on to the line."""
     chance = random.Random(unit)
     passed = 0
     for first in range(0, requests, WINDOW):
@@ -447,7 +453,7 @@ def pipeline(client: RawClient, unit: int, requests: int) -> int:
             start, count = asked.pop(reply.transaction)
             assert reply.unit == unit
             if start >= POLLED and reply.code == 6:
-                continue  # the clients' share of line time is used up
+                continue  # the share of the line's time for clients is used up
             assert (reply.function, reply.words) == (3, expected(unit, start, count))
             passed += start >= POLLED
         assert asked == {}
@@ -455,7 +461,7 @@ def pipeline(client: RawClient, unit: int, requests: int) -> int:
 
 
 def all_clients(gateway: Gateway, requests: int) -> None:
-    """Run concurrent clients that pipeline requests, each to its own unit, with the same transaction ids."""
+    """Run concurrent clients that pipeline requests to different unit ids with equal transaction ids."""
     failures: list[BaseException] = []
     passed: list[int] = []
 
@@ -473,28 +479,29 @@ def all_clients(gateway: Gateway, requests: int) -> None:
         thread.join()
     if failures:
         raise failures[0]
-    assert sum(passed) > 10  # some went to the line, so answers were out of order
+    # requests passed on to the line are answered later than others, so answers were out of order
+    assert sum(passed) > 10
 
 
 @pytest.mark.long
-def test_thousands_of_requests_are_answered_under_their_own_ids(gateway: Gateway) -> None:
+def test_each_of_thousands_of_answers_has_the_transaction_id_of_its_request(gateway: Gateway) -> None:
     all_clients(gateway, 8_000)
 
 
 @pytest.mark.nightly
-def test_a_million_requests_are_answered_under_their_own_ids(gateway: Gateway) -> None:
+def test_each_of_a_million_answers_has_the_transaction_id_of_its_request(gateway: Gateway) -> None:
     all_clients(gateway, 1_000_000)
 
 
 @pytest.mark.long
 def test_a_client_that_reads_its_answers_late_gets_all_of_them(gateway: Gateway) -> None:
-    """The client sends all requests before it reads; meanwhile the server holds back unread answers."""
+    """The client sends all requests before it reads any answer. The server keeps the answers meanwhile."""
     requests = 20_000
     with gateway.client() as client:
         frames = b"".join(request(number, 1, 3, 0, 120) for number in range(requests))
         sender = threading.Thread(target=client.send, args=(frames,))
         sender.start()
-        with gateway.client() as other:  # served although the first client's answers are unread
+        with gateway.client() as other:  # another client is served although the first reads no answers
             for _ in range(50):
                 assert other.ask(2, 3, 1, 1).words == expected(2, 1, 1)
         for number in range(requests):
@@ -508,7 +515,10 @@ def test_a_client_that_reads_its_answers_late_gets_all_of_them(gateway: Gateway)
 
 
 class PacedLine:
-    """A line whose requests take `seconds` each; records their start times and how many overlapped."""
+    """A line on which each request takes `seconds`.
+
+    It records start times and how many requests overlapped.
+    """
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
@@ -527,7 +537,7 @@ class PacedLine:
 
 
 async def flood(share: LineShare, line: PacedLine, seconds: float, clients: int = 3) -> int:
-    """Send requests without pause for `seconds`; return how many were answered."""
+    """Send requests without pauses for `seconds`; return the number of answers."""
     loop = asyncio.get_running_loop()
     until = loop.time() + seconds
     answered = 0
@@ -560,7 +570,7 @@ async def test_a_flooding_client_gets_exactly_a_fifth_of_the_line_s_time(seconds
 
 
 @pytest.mark.long
-async def test_line_time_used_in_any_second_is_at_most_share_plus_burst() -> None:
+async def test_line_time_used_in_any_second_is_at_most_the_clients_share_plus_a_burst() -> None:
     share, line = LineShare(), PacedLine(0.01)
     await flood(share, line, 30.0)
     first = line.begun[0]
@@ -571,16 +581,18 @@ async def test_line_time_used_in_any_second_is_at_most_share_plus_burst() -> Non
 
 async def test_ninth_waiting_request_is_refused_immediately() -> None:
     share, line = LineShare(), PacedLine(0.5)
-    asked = [share.ask("one", line.ask) for _ in range(1 + MOST_WAITING)]  # the first is in progress
+    # one request in progress, and MOST_WAITING waiting requests
+    asked = [share.ask("one", line.ask) for _ in range(1 + MOST_WAITING)]
     await asyncio.sleep(0)
     with pytest.raises(PassingBusy, match="8 requests are waiting"):
         share.ask("one", line.ask)
     results = await asyncio.gather(*asked, return_exceptions=True)
     assert results[0] == [1]
-    assert all(isinstance(result, PassingBusy) for result in results[1:])  # the share is used up
+    # because the clients' share of the line's time is used up
+    assert all(isinstance(result, PassingBusy) for result in results[1:])
 
 
-async def test_request_that_waited_a_second_is_dropped() -> None:
+async def test_a_request_that_waited_a_second_for_the_line_is_dropped() -> None:
     loop = asyncio.get_running_loop()
     share, line = LineShare(), PacedLine(1.5)
     first, second = share.ask("one", line.ask), share.ask("two", line.ask)
@@ -593,14 +605,14 @@ async def test_request_that_waited_a_second_is_dropped() -> None:
     assert len(line.begun) == 1
 
 
-async def test_each_request_is_passed_on_with_the_seconds_left_until_it_expires() -> None:
+async def test_each_request_is_passed_on_with_the_time_left_until_it_expires() -> None:
     share, line = LineShare(), PacedLine(0.15)
     first, second = share.ask("one", line.ask), share.ask("one", line.ask)
     await asyncio.gather(first, second)
     assert line.left == [pytest.approx(1.0), pytest.approx(0.85)]
 
 
-async def test_last_request_of_a_greedy_client_is_dropped_for_another_client() -> None:
+async def test_the_last_request_of_a_greedy_client_is_dropped_for_another_client() -> None:
     share, line = LineShare(), PacedLine(0.01)
     greedy = [share.ask("greedy", line.ask) for _ in range(1 + MOST_WAITING)]
     await asyncio.sleep(0)
@@ -610,7 +622,7 @@ async def test_last_request_of_a_greedy_client_is_dropped_for_another_client() -
     assert await modest
 
 
-async def test_requests_of_a_disconnected_client_are_dropped_but_the_current_one_ends() -> None:
+async def test_waiting_requests_of_a_disconnected_client_are_dropped() -> None:
     share, line = LineShare(), PacedLine(0.1)
     gone = [share.ask("gone", line.ask) for _ in range(3)]
     stays = share.ask("stays", line.ask)
@@ -622,7 +634,7 @@ async def test_requests_of_a_disconnected_client_are_dropped_but_the_current_one
     assert line.begun[1] - line.begun[0] >= 0.1
 
 
-async def test_a_failed_request_raises_for_its_client_and_the_next_request_is_sent() -> None:
+async def test_a_failed_request_raises_for_its_own_client_and_the_next_one_is_sent() -> None:
     async def fails(left: float) -> list[int]:
         raise TimeoutError("no reply")
 
@@ -633,7 +645,7 @@ async def test_a_failed_request_raises_for_its_client_and_the_next_request_is_se
     assert await second == [1]
 
 
-async def test_closing_refuses_the_current_and_all_waiting_requests() -> None:
+async def test_closing_the_line_refuses_the_current_and_all_waiting_requests() -> None:
     share, line = LineShare(), PacedLine(0.1)
     current, waits = share.ask("one", line.ask), share.ask("one", line.ask)
     await asyncio.sleep(0.01)

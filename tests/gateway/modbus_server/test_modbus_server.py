@@ -1,4 +1,4 @@
-"""The answer to each request: values, exception codes, and writes that reach a drive."""
+"""The Modbus server's answer to each request: values, exception codes, and writes that reach a drive."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ BLOCK = 0xF000
 
 
 class Meter(Drive):
-    """A user's own device."""
+    """A user's own drive class."""
 
     level = reading(0, "m", step=0.1)
     energy = setting(2, "kWh", number_format=NumberFormat.U32, order="CDAB", span=(0, 4e9), kept=Kept.RAM)
@@ -64,7 +64,7 @@ def plant() -> Any:
 
 @pytest.fixture
 def gateway() -> Iterator[Gateway]:
-    """A server whose clients may write, with values of the mill and the meter."""
+    """A server whose clients may write, with values of the drives "mill" and "meter"."""
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", may="write")) as found:
         found.hub.values.update(
             {("mill", "output_voltage"): 231.0, ("meter", "level"): 12.5, ("meter", "relay"): 1.0}
@@ -80,7 +80,7 @@ def code(gateway: Gateway, unit: int, function: int, *words: int, data: bytes = 
 # ---- reads ----
 
 
-def test_a_polled_value_needs_no_request_on_the_line(gateway: Gateway) -> None:
+def test_a_polled_value_is_answered_without_a_request_on_the_line(gateway: Gateway) -> None:
     with gateway.client() as client:
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
         assert client.ask(2, 3, 0, 1).words == [125]
@@ -89,7 +89,7 @@ def test_a_polled_value_needs_no_request_on_the_line(gateway: Gateway) -> None:
 
 
 @pytest.mark.parametrize("why", ["a miss", "old", "never asked", "from before the machine slept"])
-def test_stale_values_are_requested_from_the_drive(gateway: Gateway, why: str) -> None:
+def test_a_stale_value_is_read_again_from_the_drive(gateway: Gateway, why: str) -> None:
     key = "mill", "output_voltage"
     if why == "a miss":
         gateway.hub.values[key] = None
@@ -104,28 +104,29 @@ def test_stale_values_are_requested_from_the_drive(gateway: Gateway, why: str) -
     assert gateway.line.asked == [("mill", 3, CHE_OUTPUT_VOLTAGE, 1)]
 
 
-def test_bits_read_from_a_drive_are_packed_from_the_lowest_bit_on() -> None:
+def test_bits_read_from_a_drive_are_packed_with_the_first_bit_lowest() -> None:
     with (
         serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="any")) as gateway,
         gateway.client() as client,
     ):
-        assert client.ask(2, 2, 1, 10).data == bytes([2, 0b01010101, 0b01])  # inputs at odd addresses are 1
+        # the simulated inputs at odd addresses are 1
+        assert client.ask(2, 2, 1, 10).data == bytes([2, 0b01010101, 0b01])
 
 
 def test_undeclared_addresses_are_refused_by_default(gateway: Gateway) -> None:
     assert code(gateway, 1, 3, 0x7000, 1) == 2
     assert code(gateway, 1, 4, CHE_OUTPUT_VOLTAGE, 1) == 2  # declared only for function 3
-    assert code(gateway, 4, 3, 0, 1) == 2  # this unit's drive speaks no Modbus
+    assert code(gateway, 4, 3, 0, 1) == 2  # the drive of unit id 4 does not use Modbus
     assert gateway.line.asked == []
 
 
-def test_with_passing_any_undeclared_addresses_are_read_from_the_drive() -> None:
+def test_passing_any_lets_clients_read_undeclared_addresses_from_the_drive() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="any")) as gateway:
         assert code(gateway, 1, 4, 0x7000, 2) is None
         assert gateway.line.asked == [("mill", 4, 0x7000, 2)]
 
 
-def test_with_passing_off_no_read_is_sent_to_the_drive() -> None:
+def test_passing_off_answers_reads_without_requests_on_the_line() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="off")) as gateway:
         gateway.hub.values["mill", "output_voltage"] = 231.0
         assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) is None
@@ -135,31 +136,31 @@ def test_with_passing_off_no_read_is_sent_to_the_drive() -> None:
         assert gateway.line.asked == []
 
 
-def test_read_of_a_silent_drive_is_answered_without_a_request(gateway: Gateway) -> None:
+def test_a_read_from_a_silent_drive_is_answered_without_a_request_on_the_line(gateway: Gateway) -> None:
     gateway.hub.values["mill", "output_voltage"] = None
     gateway.hub.states["mill"] = "silent"
     assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) == 0x0B
     assert gateway.line.asked == []
 
 
-def test_value_from_before_a_write_is_not_used_after_the_write(gateway: Gateway) -> None:
+def test_values_polled_before_a_write_are_not_used_after_it(gateway: Gateway) -> None:
     gateway.hub.values["mill", "setpoint"] = 10.0
     gateway.hub.ages["mill", "output_voltage"] = 0.2
     with gateway.client() as client:
         assert client.ask(1, 6, CHE_SETPOINT, 5000).code is None
-        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]  # passed on to the drive
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]  # the drive's own answer
         gateway.hub.ages["mill", "output_voltage"] = 0.0
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
 
 
-def test_value_from_before_a_command_is_not_used_after_a_reload(gateway: Gateway) -> None:
-    """The command was sent through another interface."""
+def test_values_polled_before_a_command_are_not_used_after_a_reload(gateway: Gateway) -> None:
+    """The command came from another interface than Modbus."""
     gateway.hub.ages["mill", "output_voltage"] = 0.2
     with gateway.client() as client:
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
         gateway.commands.ended["mill"] = time.monotonic_ns()
         gateway.server.adopt(plant())
-        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]  # passed on to the drive
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]  # the drive's own answer
 
 
 @table("function", [1, 2, 3, 4])
@@ -176,7 +177,9 @@ def test_read_of_126_words_is_refused(gateway: Gateway) -> None:
 
 @table("function", [1, 3, 5, 6])
 @table("data", [b"", b"\0", b"\0\0\0", b"\0\0\0\1\0"])
-def test_request_of_a_wrong_length_is_an_illegal_value(gateway: Gateway, function: int, data: bytes) -> None:
+def test_a_request_of_a_wrong_length_is_answered_as_an_illegal_value(
+    gateway: Gateway, function: int, data: bytes
+) -> None:
     assert code(gateway, 1, function, data=data) == 3
 
 
@@ -190,14 +193,14 @@ def test_unsupported_functions_are_refused(gateway: Gateway, function: int) -> N
     assert (gateway.line.asked, gateway.commands.written, gateway.commands.stopped) == ([], [], [])
 
 
-def test_an_unknown_unit_id_is_answered_with_the_exception_for_no_path(gateway: Gateway) -> None:
+def test_an_unknown_unit_id_is_answered_with_gateway_path_unavailable(gateway: Gateway) -> None:
     for unit in (5, 247, 255):
         assert code(gateway, unit, 3, 0, 1) == 0x0A
         assert code(gateway, unit, 6, 0, 1) == 0x0A
 
 
 @table("function", [3, 5, 6, 16, 8])
-def test_broadcast_closes_the_connection_and_is_not_passed_on(gateway: Gateway, function: int) -> None:
+def test_a_broadcast_closes_the_connection_and_is_not_passed_on(gateway: Gateway, function: int) -> None:
     with gateway.client() as client:
         client.send(request(1, 0, function, BLOCK + 10, 1))
         assert client.receive() is None
@@ -223,7 +226,7 @@ FAILURES = [
 
 
 @pytest.mark.parametrize(("failure", "expected"), FAILURES, ids=lambda one: type(one).__name__)
-def test_a_failed_read_from_a_drive_has_the_exception_code_of_its_error(
+def test_a_failed_read_from_a_drive_is_answered_with_the_exception_of_its_error(
     gateway: Gateway, failure: Exception, expected: int
 ) -> None:
     gateway.hub.values.clear()
@@ -232,21 +235,21 @@ def test_a_failed_read_from_a_drive_has_the_exception_code_of_its_error(
 
 
 @pytest.mark.slow
-def test_reads_that_find_the_queue_full_are_answered_busy(gateway: Gateway) -> None:
+def test_reads_beyond_the_clients_share_of_line_time_are_answered_busy(gateway: Gateway) -> None:
     gateway.hub.values.clear()
-    gateway.line.seconds = 0.6  # three times BURST_S
+    gateway.line.seconds = 0.6  # three times BURST_S, the line time that clients may use at once
     with gateway.client() as client:
         client.send(b"".join(request(number, 1, 3, CHE_OUTPUT_VOLTAGE, 1) for number in range(12)))
         replies = [client.receive() for _ in range(12)]
     codes = {reply.transaction: reply.code for reply in replies if reply is not None}
     assert codes == {0: None, **dict.fromkeys(range(1, 12), 6)}
-    assert len(gateway.line.asked) == 1  # no line time is left for 2 s, so the other reads expire
+    assert len(gateway.line.asked) == 1  # No line time is left for 2 s, so the other reads expire.
 
 
 # ---- writes ----
 
 
-def test_write_is_carried_out_by_commands_and_echoed(gateway: Gateway) -> None:
+def test_a_write_is_carried_out_by_the_gateways_commands_and_echoed(gateway: Gateway) -> None:
     with gateway.client() as client:
         assert client.ask(1, 6, CHE_SETPOINT, 5000).data == bytes.fromhex("20 00 13 88")
         reply = client.ask(1, 16, CHE_SETPOINT, 1, data=bytes.fromhex("02 13 88"))
@@ -268,13 +271,13 @@ def test_write_is_carried_out_by_commands_and_echoed(gateway: Gateway) -> None:
 @table(
     ("function", "words", "data", "expected"),
     [
-        (6, (0x7000, 1), b"", 2),  # 2: no register at this address
-        (6, (0, 1), b"", 2),  # a read-only register
-        (6, (2, 1), b"", 3),  # the first half of a register
-        (6, (3, 1), b"", 2),  # the second half of a register
+        (6, (0x7000, 1), b"", 2),  # 2: there is no register
+        (6, (0, 1), b"", 2),  # the register is read-only
+        (6, (2, 1), b"", 3),  # only the first half of a 32-bit register
+        (6, (3, 1), b"", 2),  # only the second half of a 32-bit register
         (16, (2, 1), b"\2\0\1", 3),
-        (16, (2, 3), b"\6" + bytes(6), 3),  # more than one register
-        (16, (2, 2), b"\4\0\0\0", 3),  # fewer bytes than announced
+        (16, (2, 3), b"\6" + bytes(6), 3),  # one word more than the register has
+        (16, (2, 2), b"\4\0\0\0", 3),  # two bytes fewer than announced
         (16, (2, 2), b"\2\0\0\0\0", 3),
         (16, (2, 0), b"\0", 3),
         (16, (2, 124), b"\xf8" + bytes(247), 3),
@@ -304,7 +307,8 @@ OUTCOMES = [
     (Unconfirmed("mill", "setpoint", "no reply"), 0x0B),
     (NoReply("mill"), 0x0B),
     (NotVerified("mill", "setpoint", "it holds 49"), 4),
-    (BusError("mill: setpoint was taken as 49"), 4),  # raised for Effect.TAKEN_AS
+    # raised if the drive changed the value (Effect.TAKEN_AS)
+    (BusError("mill: setpoint was taken as 49"), 4),
     (DriveException("mill", 6, "busy"), 6),
     (DriveException("mill", 4, "failure"), 4),
     (PortLost("/dev/ttyUSB0", "vanished"), 0x0A),
@@ -312,12 +316,14 @@ OUTCOMES = [
 
 
 @pytest.mark.parametrize(("failure", "expected"), OUTCOMES, ids=lambda one: str(one)[:40])
-def test_each_result_of_a_write_has_its_exception_code(gateway: Gateway, failure: Any, expected: int) -> None:
+def test_each_result_of_a_write_has_its_modbus_exception(
+    gateway: Gateway, failure: Any, expected: int
+) -> None:
     gateway.commands.told = CommandResult(CommandOutcome.FAILED, str(failure), failure)
     assert code(gateway, 1, 6, CHE_SETPOINT, 5000) == expected
 
 
-def test_write_that_waited_while_the_gateway_stood_still_is_refused(gateway: Gateway) -> None:
+def test_a_write_that_waited_while_the_gateway_was_suspended_is_refused(gateway: Gateway) -> None:
     standstill, now_ns = gateway.server._standstill, [10**12]
     with gateway.client() as client:
         standstill._clock = lambda: now_ns[0]
@@ -332,12 +338,12 @@ def test_write_that_waited_while_the_gateway_stood_still_is_refused(gateway: Gat
         now_ns[0] += 1
         assert client.ask(1, 6, CHE_SETPOINT, 5000).code is None
     assert len(gateway.commands.written) == 2
-    ((drive, what, why),) = gateway.commands.refused  # at most one record per second
+    ((drive, what, why),) = gateway.commands.refused  # at most one record a second
     assert (drive, what) == ("mill", "request 01 06 20 00 13 88")
     assert "the gateway stood still" in why
 
 
-def test_read_only_gateway_refuses_writes_as_illegal_function() -> None:
+def test_a_read_only_gateway_refuses_writes_as_illegal_function() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0")) as gateway:
         for function, words in (
             (5, (5, 0xFF00)),
@@ -349,7 +355,7 @@ def test_read_only_gateway_refuses_writes_as_illegal_function() -> None:
         assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
 
 
-def test_clients_with_the_role_stop_can_only_stop() -> None:
+def test_clients_with_the_right_to_stop_can_only_stop() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", may="stop")) as gateway:
         for address, value in ((CHE_SETPOINT, 5000), (CHE_CONTROL, 1), (0x7000, 1)):
             assert code(gateway, 1, 6, address, value) == 1
@@ -363,21 +369,22 @@ def test_clients_with_the_role_stop_can_only_stop() -> None:
 
 
 @table("value", [v for v in range(20) if v not in (5, 6, 8)])
-def test_only_stops_are_accepted_in_a_control_register(gateway: Gateway, value: int) -> None:
+def test_a_control_register_accepts_only_values_that_stop(gateway: Gateway, value: int) -> None:
     assert code(gateway, 1, 6, CHE_CONTROL, value) == 3
     assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
 
 
-def test_every_write_that_means_stop_calls_a_stop(gateway: Gateway) -> None:
+def test_each_write_that_means_stop_calls_a_stop(gateway: Gateway) -> None:
     with gateway.client() as client:
         assert client.ask(1, 6, CHE_CONTROL, 5).data == bytes.fromhex("10 00 00 05")
         assert client.ask(1, 16, CHE_CONTROL, 1, data=bytes.fromhex("02 00 05")).code is None
         assert client.ask(1, 6, CHE_CONTROL, 6).code is None  # coast
         assert client.ask(1, 6, CHE_CONTROL, 8).code is None  # jog stop
         assert client.ask(3, 6, IBD_CONTROL, IBD_STOP).code is None
-        assert client.ask(3, 6, IBD_CONTROL, 0).code == 3  # 0 means "no command" and stops no motor
-        for yes in (1, 2, 0xFF00, 0xFFFF):  # values that masters use for "true"
-            assert client.ask(4, 6, BLOCK + 10, yes).code is None  # also with Delixi's own protocol
+        assert client.ask(3, 6, IBD_CONTROL, 0).code == 3  # 0 is "no command", which stops no motor
+        for yes in (1, 2, 0xFF00, 0xFFFF):  # values that masters write for "true"
+            # accepted although this drive uses Delixi's own protocol
+            assert client.ask(4, 6, BLOCK + 10, yes).code is None
     stopped = [drives for drives, _ in gateway.commands.stopped]
     assert stopped == [["mill"]] * 4 + [["pump"]] + [["belt"]] * 4
 
@@ -392,14 +399,14 @@ def test_every_write_that_means_stop_calls_a_stop(gateway: Gateway) -> None:
         (16, (BLOCK + 11, 1), b"\2\0\1", 2),
     ],
 )
-def test_other_writes_to_the_common_block_are_refused_and_do_not_stop(
+def test_writes_to_other_words_of_the_common_block_are_refused_and_do_not_stop(
     gateway: Gateway, function: int, words: tuple[int, ...], data: bytes, expected: int
 ) -> None:
     assert code(gateway, 1, function, *words, data=data) == expected
     assert gateway.commands.stopped == []
 
 
-MIXED = {  # unit, address and words of writes that contain a stop
+MIXED = {  # unit id, address and words; each write contains a stop
     "the stop first": (1, CHE_CONTROL, (5, 0)),
     "amid others": (1, CHE_CONTROL - 1, (7, 5, 7)),
     "a coast": (1, CHE_CONTROL, (6, 1)),
@@ -412,32 +419,32 @@ MIXED = {  # unit, address and words of writes that contain a stop
 
 @table("mixed", MIXED)
 @table("may", ["stop", "write"])
-def test_stop_in_a_write_of_several_words_is_sent_alone(mixed: str, may: str) -> None:
+def test_of_a_write_of_several_words_only_the_stop_is_sent(mixed: str, may: str) -> None:
     unit, address, words = MIXED[mixed]
     data = struct.pack(f">B{len(words)}H", 2 * len(words), *words)
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", may=may)) as gateway:
         for _ in range(MOST_STOPS + 1):
             assert code(gateway, unit, 16, address, len(words), data=data) == 3
-        until(lambda: bool(gateway.commands.stopped))  # the answer does not wait for the stop
+        until(lambda: bool(gateway.commands.stopped))  # the request is answered before the stop is sent
         names = {1: "mill", 3: "pump", 4: "belt"}
         assert {str(drives) for drives, _ in gateway.commands.stopped} == {f"['{names[unit]}']"}
         assert gateway.commands.written == []
 
 
-def test_stop_in_a_write_of_several_coils_is_sent_alone() -> None:
-    """The write sets start off, stop on, emergency stop off: coils 0 to 2 of the ER-G-220."""
+def test_of_a_write_of_several_coils_only_the_stop_is_sent() -> None:
+    """Coils 0 to 2 of the ER-G-220 are start, stop, and emergency stop. The write sets only stop."""
     drives = plant_of(("hall", ErmanERG220(1, name="mixer")))
     with serving(drives, ModbusSettings(listen="127.0.0.1:0", may="write")) as gateway:
-        assert code(gateway, 1, 15, 0, 3, data=b"\1\1") == 3  # this write contains a start but no stop
+        assert code(gateway, 1, 15, 0, 3, data=b"\1\1") == 3  # this write sets start and not stop
         assert gateway.commands.stopped == []
         assert code(gateway, 1, 15, 0, 3, data=b"\1\2") == 3
-        until(lambda: bool(gateway.commands.stopped))  # the answer does not wait for the stop
+        until(lambda: bool(gateway.commands.stopped))  # the request is answered before the stop is sent
         assert [drives for drives, _ in gateway.commands.stopped] == [["mixer"]]
         assert gateway.commands.written == []
 
 
 @table(("address", "words"), [(CHE_CONTROL, (1, 5)), (CHE_CONTROL - 1, (5, 1)), (CHE_SETPOINT, (5, 5))])
-def test_write_of_several_words_without_a_stop_is_refused(
+def test_a_write_of_several_words_without_a_stop_is_refused(
     gateway: Gateway, address: int, words: tuple[int, ...]
 ) -> None:
     data = struct.pack(f">B{len(words)}H", 2 * len(words), *words)
@@ -445,14 +452,14 @@ def test_write_of_several_words_without_a_stop_is_refused(
     assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
 
 
-def test_read_only_gateway_ignores_a_stop_in_a_write_of_several_words() -> None:
+def test_a_read_only_gateway_ignores_a_stop_in_a_write_of_several_words() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0")) as gateway:
         assert code(gateway, 1, 16, CHE_CONTROL, 2, data=b"\4\0\5\0\0") == 1
         assert gateway.commands.stopped == []
 
 
 class HeldCommands:
-    """Makes commands wait until `release` is set; with `only_writes`, stops end immediately."""
+    """Commands that wait until `release` is set. With `only_writes`, stops do not wait."""
 
     def __init__(self, gateway: Gateway, *, only_writes: bool = False) -> None:
         self.release, self.ended = threading.Event(), threading.Event()
@@ -468,14 +475,14 @@ class HeldCommands:
 
 
 @pytest.mark.parametrize("is_disconnected", [False, True])
-def test_slow_stop_is_answered_with_acknowledge_and_continues(
+def test_a_slow_stop_is_answered_with_acknowledge_and_continues(
     gateway: Gateway, is_disconnected: bool
 ) -> None:
     held = HeldCommands(gateway)
     with gateway.client() as client:
         client.send(request(1, 1, 6, CHE_CONTROL, 5))
         if is_disconnected:
-            client.send(b"\xff" * 20)  # garbage: the server closes the connection
+            client.send(b"\xff" * 20)  # invalid bytes, so the server closes the connection
         reply = client.receive()
         assert (reply and reply.code) == (None if is_disconnected else 5)
     assert not held.ended.is_set()
@@ -484,7 +491,7 @@ def test_slow_stop_is_answered_with_acknowledge_and_continues(
 
 
 def test_a_stop_does_not_wait_for_earlier_requests_of_its_client(gateway: Gateway) -> None:
-    """Sixteen writes hang; the stop that follows them is called immediately."""
+    """Sixteen writes hang. The stop that the client sends after them is called immediately."""
     held = HeldCommands(gateway, only_writes=True)
     with gateway.client() as client:
         for number in range(16):
@@ -501,7 +508,7 @@ def test_a_stop_does_not_wait_for_earlier_requests_of_its_client(gateway: Gatewa
         assert {reply.transaction for _ in range(16) if (reply := client.receive())} == set(range(16))
 
 
-def test_concurrent_stops_are_limited_and_each_request_is_answered(gateway: Gateway) -> None:
+def test_number_of_concurrent_stops_is_limited_and_each_request_is_answered(gateway: Gateway) -> None:
     held = HeldCommands(gateway)
     with gateway.client() as client:
         for number in range(100):
@@ -516,12 +523,14 @@ def test_concurrent_stops_are_limited_and_each_request_is_answered(gateway: Gate
     ("failure", "expected"),
     [(BusError("not seen to stand"), 0x0B), (NoReply("mill"), 0x0B), (PortLost("/dev/x", "gone"), 0x0A)],
 )
-def test_failed_stop_has_an_exception_code(gateway: Gateway, failure: BusError, expected: int) -> None:
+def test_a_failed_stop_is_answered_with_an_exception_code(
+    gateway: Gateway, failure: BusError, expected: int
+) -> None:
     gateway.commands.told = CommandResult(CommandOutcome.FAILED, str(failure), failure)
     assert code(gateway, 1, 6, CHE_CONTROL, 5) == expected
 
 
-def test_unexpected_exception_in_a_stop_is_logged_and_answered(
+def test_an_unexpected_error_of_a_stop_is_logged_and_answered(
     gateway: Gateway, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def fails() -> CommandResult:
@@ -532,7 +541,7 @@ def test_unexpected_exception_in_a_stop_is_logged_and_answered(
     assert "a mistake of ours" in caplog.text
 
 
-def test_drive_reply_of_a_wrong_length_is_answered_as_no_reply(
+def test_a_drives_reply_of_a_wrong_length_is_answered_as_no_reply(
     gateway: Gateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def short(*request: object) -> list[int]:
@@ -554,7 +563,7 @@ def block(gateway: Gateway, unit: int = 1, function: int = 3) -> list[int]:
 UNKNOWN = [0x8000, 0]
 
 
-def test_common_block_of_a_running_drive_has_its_values(gateway: Gateway) -> None:
+def test_the_common_block_contains_the_values_of_a_running_drive(gateway: Gateway) -> None:
     gateway.hub.states["mill"] = "runs"
     gateway.hub.values.update(
         {("mill", "output_frequency"): 49.99, ("mill", "output_current"): 12.3, ("mill", "setpoint"): -5.0}
@@ -564,7 +573,8 @@ def test_common_block_of_a_running_drive_has_its_values(gateway: Gateway) -> Non
         found = block(gateway, function=function)
         assert found[:8] == [2, 0, 0, 4999, 0, 1230, 0xFFFF, 0xFFFF - 499]
         assert found[8] == 0
-        assert 250 <= found[9] < 5000  # age in ms; the hub and the server read the clock one after the other
+        # Age in ms. The test's hub and the server read the clock one after the other.
+        assert 250 <= found[9] < 5000
         assert found[10] == 0
     assert gateway.line.asked == []
 
@@ -574,7 +584,7 @@ def test_large_numbers_use_both_words_in_the_common_block(gateway: Gateway) -> N
     assert block(gateway)[2:4] == [2, 0x49F0]  # 150000
 
 
-def test_unknown_values_read_as_reserved_numbers(gateway: Gateway) -> None:
+def test_unknown_values_in_the_common_block_read_as_reserved_numbers(gateway: Gateway) -> None:
     gateway.hub.values.clear()
     assert block(gateway) == [0, 0xFFFF, *UNKNOWN, *UNKNOWN, *UNKNOWN, 0xFFFF, 0xFFFF, 0]
     gateway.hub.states["mill"] = "silent"
@@ -585,16 +595,16 @@ def test_unknown_values_read_as_reserved_numbers(gateway: Gateway) -> None:
     assert 69_990 <= found[8] << 16 | found[9] < 80_000
 
 
-def test_values_from_before_a_sleep_read_as_unknown(gateway: Gateway) -> None:
+def test_values_read_before_the_machine_slept_are_unknown_in_the_common_block(gateway: Gateway) -> None:
     gateway.hub.values["mill", "output_frequency"] = 49.99
     gateway.hub.woken_ns = time.monotonic_ns() + 3600 * 10**9
     found = block(gateway)
     assert found[2:4] == UNKNOWN
-    assert found[8:10] == [0xFFFF, 0xFFFE]  # the longest age
+    assert found[8:10] == [0xFFFF, 0xFFFE]  # the largest age that fits
 
 
 @table(("number", "expected"), [(5.0, 5), (None, 0xFFFE), (0.0, 0xFFFE)])
-def test_fault_has_the_number_of_the_drives_family(
+def test_the_common_block_has_the_fault_number_of_the_drives_family(
     gateway: Gateway, number: float | None, expected: int
 ) -> None:
     gateway.hub.states["mill"] = "fault"
@@ -612,7 +622,7 @@ def test_reads_across_the_ends_of_the_common_block_are_refused(gateway: Gateway)
         assert client.ask(1, 3, BLOCK - 1, 18).code == 2
 
 
-def test_every_family_has_the_common_block(gateway: Gateway) -> None:
+def test_drives_of_every_family_have_the_common_block(gateway: Gateway) -> None:
     for unit, drive in enumerate(("mill", "meter", "pump", "belt"), 1):
         gateway.hub.states[drive] = "runs"
         assert block(gateway, unit)[0] == 2
@@ -621,7 +631,7 @@ def test_every_family_has_the_common_block(gateway: Gateway) -> None:
 # ---- ports of lines, and a plant that changes ----
 
 
-def test_line_with_its_own_port_is_served_there() -> None:
+def test_a_line_with_its_own_tcp_port_is_served_there() -> None:
     found = plant_of(("hall", InvtCHE(1, name="mill")), ("yard", Meter(1, name="meter")))
     with serving(found, ModbusSettings(listen="127.0.0.1:0", ports={"yard": 0})) as gateway:
         gateway.hub.values.update({("mill", "output_voltage"): 231.0, ("meter", "level"): 12.5})
@@ -630,7 +640,7 @@ def test_line_with_its_own_port_is_served_there() -> None:
             assert yard.ask(1, 3, 0, 1).words == [125]
 
 
-def test_adopt_replaces_the_plant_unless_unit_ids_clash(gateway: Gateway) -> None:
+def test_the_server_adopts_a_new_plant_unless_its_unit_ids_clash(gateway: Gateway) -> None:
     with gateway.client() as client:
         with pytest.raises(ValueError, match="unit 1 would be"):
             gateway.server.adopt(plant_of(("hall", InvtCHE(1, name="a")), ("yard", InvtCHE(1, name="b"))))

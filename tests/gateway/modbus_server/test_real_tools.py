@@ -1,4 +1,4 @@
-"""Tools by other authors on a tool port of a polled line: mbpoll, libmodbus, pymodbus and minimalmodbus."""
+"""mbpoll, libmodbus, pymodbus and minimalmodbus on a gateway's tool port, which imitates a polled line."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ timeout = 9
 
 @contextmanager
 def connected(name: str, folder: Path, serve: str) -> Iterator[tuple[Served, Any]]:
-    """Yield a gateway whose drives are polled, and a tool on its tool port."""
+    """Yield a gateway with polled drives, and a tool that is connected to its tool port."""
     with ExitStack() as stack:
         gateway = stack.enter_context(served(folder, serve))
         gateway.sims["pump-1"]["output_voltage"] = VOLTAGE
@@ -113,7 +113,7 @@ def connected(name: str, folder: Path, serve: str) -> Iterator[tuple[Served, Any
 
 
 def read(tool: Any, start: int, count: int) -> list[int]:
-    """Return words of pump-1, repeating the request if a busy machine lost a reply."""
+    """Return words of pump-1. Repeats the request if a busy machine loses the reply."""
     found: list[list[int] | int] = []
     until(lambda: (found.append(tool.read(1, 3, start, count)), isinstance(found[-1], list))[1])
     assert isinstance(found[-1], list)
@@ -127,7 +127,7 @@ def writes(tool: Any, address: int, value: int) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", usually(*TOOLS))
-def test_a_tool_reads_the_drives_and_cannot_write(name: str, tmp_path: Path) -> None:
+def test_a_tool_reads_the_drives_and_cannot_write_by_default(name: str, tmp_path: Path) -> None:
     with connected(name, tmp_path, SERVE) as (gateway, tool):
         sim, polled = gateway.sims["pump-1"], gateway.gateway.poller.statistics()  # type: ignore[union-attr]
         assert read(tool, OUTPUT_VOLTAGE, 2) == [VOLTAGE, 0]
@@ -147,7 +147,7 @@ def test_a_tool_reads_the_drives_and_cannot_write(name: str, tmp_path: Path) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", usually(*TOOLS))
-def test_a_tool_with_rights_can_write_and_stop_but_cannot_start_a_drive(name: str, tmp_path: Path) -> None:
+def test_a_tool_with_the_right_to_write_can_stop_but_not_start_a_drive(name: str, tmp_path: Path) -> None:
     with connected(name, tmp_path, SERVE.replace("[serve.tool]", '[serve.tool]\nmay = "write"')) as (
         gateway,
         tool,

@@ -1,4 +1,4 @@
-"""The Modbus server as a part of the gateway, set up by the table `[serve.modbus]` of a plant file."""
+"""The gateway's Modbus server, as set up by the table `[serve.modbus]` of a plant file."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def simulated_plant(folder: Path) -> Iterator[tuple[SimulatedDrive, Path]]:
 
 
 def reply_to(client: RawClient, *words: int) -> RawReply:
-    """Return the reply to a request, which is repeated if the line is busy or a reply was lost."""
+    """Return the reply to a request. Repeats the request if the line is busy or a reply was lost."""
     found: list[RawReply] = []
 
     def ask() -> bool:
@@ -77,13 +77,14 @@ def reply_to(client: RawClient, *words: int) -> RawReply:
 
 
 @pytest.mark.slow
-def test_drives_of_a_plant_file_are_read_written_and_stopped(tmp_path: Path) -> None:
+def test_drives_of_a_plant_file_can_be_read_written_and_stopped_by_modbus(tmp_path: Path) -> None:
     with simulated_plant(tmp_path) as (drive, path), gateway_of(path) as gateway:
         drive["output_voltage"] = 231
         server: Any = gateway.feeds["modbus"]
         with RawClient(server.ports[""]) as client:
             until(lambda: reply_to(client, 3, OUTPUT_VOLTAGE, 1).words == [231])
-            assert reply_to(client, 3, OUTPUT_CURRENT, 1).words == [0]  # not polled, so read from the drive
+            # read from the drive, because this register is not polled
+            assert reply_to(client, 3, OUTPUT_CURRENT, 1).words == [0]
             assert reply_to(client, 6, SETPOINT, 5000).code is None
             assert reply_to(client, 3, SETPOINT, 1).words == [5000]
             assert reply_to(client, 6, CONTROL, 1).code == 3
@@ -98,7 +99,7 @@ def test_drives_of_a_plant_file_are_read_written_and_stopped(tmp_path: Path) -> 
     assert any("modbus from 127.0.0.1" in str(entry) and "setpoint" in str(entry) for entry in audit)
 
 
-def test_a_port_in_use_is_reported_before_polling(tmp_path: Path) -> None:
+def test_a_tcp_port_in_use_is_reported_before_polling_starts(tmp_path: Path) -> None:
     with simulated_plant(tmp_path) as (drive, path), socket.create_server(("127.0.0.1", 0)) as taken:
         number = taken.getsockname()[1]
         path.write_text(path.read_text().replace(':0"\nmay', f':{number}"\nmay'))
@@ -108,7 +109,7 @@ def test_a_port_in_use_is_reported_before_polling(tmp_path: Path) -> None:
         assert drive.counters.requests == 0
 
 
-def test_mistakes_in_the_modbus_table_are_reported_with_their_place(tmp_path: Path) -> None:
+def test_mistakes_in_the_table_serve_modbus_are_reported_with_their_place(tmp_path: Path) -> None:
     with simulated_plant(tmp_path) as (_, path):
         text = path.read_text()
         path.write_text(
@@ -146,7 +147,7 @@ def test_mistakes_in_the_modbus_table_are_reported_with_their_place(tmp_path: Pa
         ({"common": 0xFFF8}, "is not an address"),
     ],
 )
-def test_a_mistake_in_the_settings_is_reported_in_one_sentence(
+def test_each_mistake_in_the_modbus_settings_is_reported_in_one_sentence(
     settings: dict[str, object], sentence: str
 ) -> None:
     with pytest.raises(ValueError, match=r"^[\w\"]+") as mistake:
@@ -154,13 +155,13 @@ def test_a_mistake_in_the_settings_is_reported_in_one_sentence(
     assert sentence in str(mistake.value)
 
 
-def test_all_mistakes_are_reported_together() -> None:
+def test_all_mistakes_in_the_modbus_settings_are_reported_together() -> None:
     with pytest.raises(ValueError, match="listen") as mistake:
         ModbusSettings(listen="x", passing="all", may="root", clients=("y",))
     assert len(str(mistake.value).splitlines()) == 4
 
 
-def test_only_listed_clients_may_connect_or_local_ones_without_a_list() -> None:
+def test_only_listed_clients_may_connect_or_local_clients_without_a_list() -> None:
     alone = ModbusSettings()
     assert [alone.may_connect(address) for address in ("127.0.0.1", "::1", "10.0.0.5")] == [True, True, False]
     named = ModbusSettings(listen="0.0.0.0:1502", clients=("10.0.0.0/24", "fe80::1"))
@@ -184,7 +185,7 @@ PLANTS = re.findall(r"```toml\n# ([\w-]+\.toml)\n(.*?)```", PAGE, re.DOTALL)
 
 
 @table(("name", "text"), PLANTS, ids=[name for name, _ in PLANTS])
-def test_plant_files_in_the_how_to_page_load(tmp_path: Path, name: str, text: str) -> None:
+def test_plant_files_on_the_documentation_page_of_modbus_load(tmp_path: Path, name: str, text: str) -> None:
     path = tmp_path / name
     path.write_text(text)
     assert isinstance(read_settings(Plant.load(path), {}).parts["modbus"], ModbusSettings)
@@ -196,7 +197,7 @@ def rows(heading: str) -> dict[str, str]:
     return {name.strip("` "): rest for name, rest in found}
 
 
-def test_every_settings_key_has_a_row_in_the_page() -> None:
+def test_each_settings_key_is_in_a_table_of_the_documentation() -> None:
     assert list(rows("`[serve.modbus]`")) == [one.name for one in fields(ModbusSettings)]
     for name, rest in rows("`[serve.modbus]`").items():
         default = getattr(ModbusSettings(), name)
@@ -204,11 +205,11 @@ def test_every_settings_key_has_a_row_in_the_page() -> None:
             assert f'"{default}"' in rest
 
 
-def test_every_exception_code_has_a_row_in_the_page() -> None:
+def test_each_exception_code_is_in_a_table_of_the_documentation() -> None:
     assert set(rows("Exceptions")) == {f"{code:02X}" for code in ModbusCode} | {"others"}
 
 
-def test_the_common_block_is_laid_out_as_the_page_says() -> None:
+def test_the_common_block_has_the_layout_in_the_documentation() -> None:
     offsets = [int(address.rstrip("H"), 16) - ModbusSettings().common for address in rows("The common block")]
     layout = words
     assert offsets == [
@@ -221,7 +222,7 @@ def test_the_common_block_is_laid_out_as_the_page_says() -> None:
     assert {name: int(number) for number, name in states} == words.STATES
 
 
-def test_the_limits_of_clients_are_as_the_page_says() -> None:
+def test_the_limits_of_clients_are_those_in_the_documentation() -> None:
     text = REFERENCE.partition("## Clients")[2]
     numbers = [int(number) for number in re.findall(r"\d+", text)]
     assert numbers == [
@@ -241,7 +242,7 @@ def numbers(units: Units) -> dict[tuple[str, int], str]:
     return {(port, number): unit.drive.name for port, number, unit in units}
 
 
-def test_unit_id_is_the_drives_address() -> None:
+def test_the_default_unit_id_is_the_drives_address() -> None:
     units = Units(
         plant_of(("hall", InnovertIBD(1, name="pump")), ("yard", InvtCHE(9, name="mill"))), ModbusSettings()
     )
@@ -253,7 +254,7 @@ def test_unit_id_is_the_drives_address() -> None:
     assert units.find("yard", 9) is None
 
 
-def test_all_clashing_unit_ids_are_reported_with_the_free_ones() -> None:
+def test_all_clashing_unit_ids_are_reported_with_free_unit_ids() -> None:
     plant = plant_of(
         ("hall", InnovertIBD(1, name="pump")),
         ("hall", InnovertIBD(2, name="fan")),
@@ -270,7 +271,7 @@ def test_all_clashing_unit_ids_are_reported_with_the_free_ones() -> None:
     assert last.endswith("free numbers: 3 to 4, 6 to 247")
 
 
-def test_configured_unit_id_or_port_resolves_a_clash() -> None:
+def test_a_configured_unit_id_or_port_resolves_a_clash_of_unit_ids() -> None:
     plant = plant_of(("hall", InnovertIBD(1, name="pump")), ("yard", InvtCHE(1, name="mill")))
     assert numbers(Units(plant, ModbusSettings(units={"mill": 21}))) == {
         (MAIN, 1): "pump",
@@ -280,20 +281,20 @@ def test_configured_unit_id_or_port_resolves_a_clash() -> None:
     assert numbers(own) == {(MAIN, 1): "pump", ("yard", 1): "mill"}
 
 
-def test_configured_unit_id_that_clashes_is_reported() -> None:
+def test_a_configured_unit_id_that_clashes_is_reported() -> None:
     plant = plant_of(("hall", InnovertIBD(1, name="pump")), ("yard", InvtCHE(9, name="mill")))
     with pytest.raises(ValueError, match=r"unit 1 would be pump .* and mill"):
         Units(plant, ModbusSettings(units={"mill": 1}))
 
 
-def test_unknown_drives_and_lines_in_the_settings_are_reported() -> None:
+def test_unknown_drives_and_lines_in_the_modbus_settings_are_reported() -> None:
     plant = plant_of(("hall", InnovertIBD(1, name="pump")))
     with pytest.raises(ValueError, match="units: there is no drive 'pumb'") as mistake:
         Units(plant, ModbusSettings(units={"pumb": 3}, ports={"hal": 1503}))
     assert str(mistake.value).splitlines()[1].endswith("there is no line 'hal'; did you mean hall?")
 
 
-def test_drive_with_address_0_cannot_be_a_unit() -> None:
+def test_address_0_is_reported_as_an_invalid_unit_id() -> None:
     class Behind(Drive):
         addresses = range(256)
         level = reading(0, "m")
@@ -305,7 +306,7 @@ def test_drive_with_address_0_cannot_be_a_unit() -> None:
     }
 
 
-def test_common_block_must_not_overlap_registers() -> None:
+def test_a_common_block_that_overlaps_registers_is_reported() -> None:
     class Parameters(Drive):
         frequency_source = setting(0xF003)
 
@@ -315,7 +316,7 @@ def test_common_block_must_not_overlap_registers() -> None:
     Units(plant, ModbusSettings(common=0xE000))
 
 
-def test_no_family_has_registers_in_the_range_of_the_common_block() -> None:
+def test_no_family_has_registers_in_the_address_range_of_the_common_block() -> None:
     families = [find_model(name) for name in MODELS] + [load_family(path) for path in FAMILIES.glob("*.toml")]
     assert len(families) > 10
     common = set(ModbusSettings().common_addresses)
@@ -329,7 +330,7 @@ def test_no_family_has_registers_in_the_range_of_the_common_block() -> None:
 
 @table(
     ("model", "register", "raw"),
-    [  # stop commands as the manuals print them
+    [  # values of the control register that stop, as printed in the manuals
         ("erman-er-g-220", "stop_coil", 1),
         ("invt-che", "control", 5),
         ("invt-che", "control", 6),  # coast
@@ -342,17 +343,17 @@ def test_no_family_has_registers_in_the_range_of_the_common_block() -> None:
         ("delta-ms300", "control", 1),
     ],
 )
-def test_unit_has_the_stop_writes_of_its_family(model: str, register: str, raw: int) -> None:
+def test_a_unit_knows_the_writes_that_stop_a_drive_of_its_family(model: str, register: str, raw: int) -> None:
     unit = Unit("hall", PolledDrive(find_model(model)(1), ()))
     assert StopWrite(register, raw) in unit.stops
 
 
-def test_raw_value_without_effect_is_not_a_stop() -> None:
+def test_a_control_value_that_means_no_command_is_not_a_stop() -> None:
     unit = Unit("hall", PolledDrive(InnovertIBD(1), ()))
-    assert unit.stops == {StopWrite("control", 1)}  # 0 means "no command", and is not a stop
+    assert unit.stops == {StopWrite("control", 1)}  # not 0, which means "no command"
 
 
-def test_addresses_of_registers_texts_and_readable_gaps_count_as_declared() -> None:
+def test_addresses_of_registers_and_texts_and_readable_gaps_count_as_declared() -> None:
     class Meter(Drive):
         readable_gaps = {HOLDING: range(10, 20)}
         level = reading(9, "m")

@@ -1,4 +1,4 @@
-"""Tool ports on fake lines: which requests are answered, when, and which writes are refused."""
+"""Tool ports, on fake lines: which requests are answered, when, and which writes are refused."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ from multidrop.gateway.modbus_server.tool_ports import MOST_SHARE, Tool, ToolPor
 from multidrop.gateway.settings import read_settings
 
 SETPOINT, CONTROL, START, STOP = 0x2000, 0x1000, 1, 5  # CHE100 manual v1.4, p. 117
-TIMEOUT = 10.0  # in s; long, so that every answer is in time even on a busy machine
-QUIET = 0.1  # in s; if no byte comes for this long, there is no reply
+TIMEOUT = 10.0  # s; long, so that every answer of a drive is in time even on a busy machine
+QUIET = 0.1  # s; if no byte arrives for so long, there is no reply
 
 
 class Rig(NamedTuple):
@@ -56,7 +56,7 @@ class Rig(NamedTuple):
 
 @contextmanager
 def serving(folder: Path, *, ask: Any = None, **settings: Any) -> Iterator[Rig]:
-    """Run the tool ports of a line with three drives: a pseudo-terminal and a TCP port."""
+    """Run the tool port of a line with three drives, as a pseudo-terminal and as a TCP port."""
     plant = plant_of(
         ("hall", InvtCHE(1, name="mill")),
         ("hall", InnovertIBD(3, name="pump")),
@@ -82,14 +82,14 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
 
 @pytest.fixture(params=["pty", "tcp"])
 def tool(request: pytest.FixtureRequest, rig: Rig) -> Iterator[int]:
-    """The file descriptor of a tool's end of the connection."""
+    """Yield the file descriptor by which a tool uses the tool port."""
     where = str(rig.link) if request.param == "pty" else f"socket://127.0.0.1:{rig.ports.ports['hall']}"
     with opened(where) as fd:
         yield fd
 
 
 def reply_to(tool: int, patience: float) -> bytes:
-    """Return the next reply without its checksum; b"" if none comes within `patience` s."""
+    """Return the next reply without its checksum, or b"" if none arrives within `patience` s."""
     reply = receive(tool, 5, patience)
     while reply and checksums.rtu(reply[:-2]) != reply:
         more = receive(tool, 1, patience)
@@ -99,7 +99,7 @@ def reply_to(tool: int, patience: float) -> bytes:
 
 
 def ask(tool: int, body: str) -> bytes:
-    """Send a request; return its reply without the checksum."""
+    """Send a request, and return its reply without the checksum."""
     os.write(tool, checksums.rtu(body))
     reply = reply_to(tool, PATIENCE)
     assert reply
@@ -107,13 +107,13 @@ def ask(tool: int, body: str) -> bytes:
 
 
 def is_unanswered(tool: int, body: str) -> bool:
-    """Send a request; return True if no reply comes."""
+    """Send a request, and return True if no reply arrives."""
     os.write(tool, checksums.rtu(body))
     return reply_to(tool, QUIET) == b""
 
 
 def code(tool: int, body: str) -> int | None:
-    """Return the exception code of a request's reply; None for a good reply."""
+    """Send a request, and return the exception code of the reply; None for a normal reply."""
     reply = ask(tool, body)
     return reply[2] if reply[1] & 0x80 else None
 
@@ -121,14 +121,14 @@ def code(tool: int, body: str) -> int | None:
 # ---- reads ----
 
 
-def test_a_read_gets_the_drives_reply_by_each_function(rig: Rig, tool: int) -> None:
+def test_a_read_by_each_modbus_function_gets_the_drives_reply(rig: Rig, tool: int) -> None:
     assert ask(tool, "01 03 00 10 00 02") == bytes.fromhex("01 03 04 0010 0011")
     assert ask(tool, "01 04 70 00 00 01") == bytes.fromhex("01 04 02 7000")  # undeclared
     assert ask(tool, "01 01 00 01 00 0A") == bytes.fromhex("01 01 02 5501")
     assert rig.line.asked == [("mill", 3, 16, 2), ("mill", 4, 0x7000, 1), ("mill", 1, 1, 10)]
 
 
-def test_a_failed_read_is_answered_by_silence_or_an_exception_as_on_a_wire(rig: Rig) -> None:
+def test_a_failed_read_is_answered_by_silence_or_an_exception_as_on_a_real_line(rig: Rig) -> None:
     with opened(str(rig.link)) as tool:
         for failure, answer in (
             (DriveException("mill", 0x12, "write not allowed"), 0x12),
@@ -147,7 +147,7 @@ def test_a_failed_read_is_answered_by_silence_or_an_exception_as_on_a_wire(rig: 
                 assert code(tool, "01 03 00 10 00 02") == answer
 
 
-def test_no_reply_comes_for_other_addresses_silent_drives_and_broadcasts(rig: Rig, tool: int) -> None:
+def test_other_addresses_silent_drives_and_broadcasts_are_not_answered(rig: Rig, tool: int) -> None:
     assert is_unanswered(tool, "02 03 00 10 00 02")
     assert is_unanswered(tool, "00 06 20 00 00 00")
     rig.hub.states["mill"] = "silent"
@@ -157,14 +157,14 @@ def test_no_reply_comes_for_other_addresses_silent_drives_and_broadcasts(rig: Ri
     assert rig.commands.stopped == []
 
 
-def test_a_drive_without_modbus_and_an_unknown_function_get_exception_01(rig: Rig, tool: int) -> None:
+def test_a_drive_without_modbus_and_an_unknown_function_answer_exception_01(rig: Rig, tool: int) -> None:
     assert code(tool, "04 03 00 10 00 02") == 1
     assert code(tool, "01 41 01 02 03") == 1
-    assert code(tool, "01 08 00 04 00 00") == 1  # "force listen only mode" would silence the drive
+    assert code(tool, "01 08 00 04 00 00") == 1  # "force listen only mode", which would silence a drive
     assert rig.line.asked == []
 
 
-def test_a_request_that_fails_unexpectedly_is_logged_and_those_after_it_are_answered(
+def test_a_request_that_fails_unexpectedly_is_logged_and_later_ones_are_answered(
     rig: Rig, tool: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     serve = rig.ports.lines["hall"].serve
@@ -182,7 +182,7 @@ def test_a_request_that_fails_unexpectedly_is_logged_and_those_after_it_are_answ
     assert ask(tool, "01 03 00 10 00 01") == bytes.fromhex("01 03 02 0010")
 
 
-def test_only_the_newest_of_several_requests_is_answered(rig: Rig, tool: int) -> None:
+def test_only_the_newest_of_several_pending_requests_is_answered(rig: Rig, tool: int) -> None:
     rig.line.seconds = 0.05
     requests = [checksums.rtu(f"01 03 00 {at:02X} 00 01") for at in (1, 2, 3)]
     os.write(tool, b"".join(requests))
@@ -190,7 +190,7 @@ def test_only_the_newest_of_several_requests_is_answered(rig: Rig, tool: int) ->
     assert receive(tool, 1, QUIET) == b""
 
 
-def test_no_reply_reaches_a_tool_after_the_timeout(tmp_path: Path) -> None:
+def test_a_tool_gets_no_reply_after_the_timeout_of_its_port(tmp_path: Path) -> None:
     with serving(tmp_path, timeout=0.05) as rig, opened(str(rig.link)) as tool:
         rig.ports.lines["hall"].share.share = 100.0  # no pauses
         rig.line.seconds = 0.2
@@ -198,14 +198,14 @@ def test_no_reply_reaches_a_tool_after_the_timeout(tmp_path: Path) -> None:
         until(lambda: rig.line.asked)
         assert receive(tool, 1, 0.4) == b""
         rig.line.seconds = 0.0
-        while len(rig.line.asked) < 2:  # on a busy computer, a request may be answered "busy"
+        while len(rig.line.asked) < 2:  # a busy machine may answer the request with "busy"
             os.write(tool, checksums.rtu("01 03 00 02 00 01"))
             time.sleep(0.05)
         time.sleep(0.2)  # longer than the port's timeout
         assert receive(tool, 1, QUIET) == b""
 
 
-def test_a_tool_that_reads_without_pause_gets_exception_06_beyond_its_share(tmp_path: Path) -> None:
+def test_a_tool_that_exceeds_its_share_of_line_time_gets_exception_06(tmp_path: Path) -> None:
     with serving(tmp_path, timeout=1.0) as rig, opened(str(rig.link)) as tool:
         rig.ports.lines["hall"].share.share = 0.01
         rig.line.seconds = 0.06
@@ -214,8 +214,8 @@ def test_a_tool_that_reads_without_pause_gets_exception_06_beyond_its_share(tmp_
         assert len(rig.line.asked) == found.count(None)
 
 
-def test_eight_flooding_tools_have_one_request_at_a_time_on_the_line(tmp_path: Path) -> None:
-    """A stop then waits for at most one exchange of a tool, as it waits for one exchange of polling."""
+def test_eight_flooding_tools_have_one_request_on_the_line_at_a_time(tmp_path: Path) -> None:
+    """So a stop waits for at most one exchange of a tool."""
     under_way = most = 0
 
     async def ask(drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:
@@ -239,7 +239,7 @@ def test_eight_flooding_tools_have_one_request_at_a_time_on_the_line(tmp_path: P
 
 
 @pytest.mark.slow
-def test_a_tool_with_random_timeouts_never_gets_another_requests_reply(tmp_path: Path) -> None:
+def test_a_tool_with_random_timeouts_never_gets_the_reply_to_another_request(tmp_path: Path) -> None:
     chance, answered = random.Random(43), 0
 
     async def ask(drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:
@@ -256,7 +256,7 @@ def test_a_tool_with_random_timeouts_never_gets_another_requests_reply(tmp_path:
     assert answered > 20
 
 
-def test_serial_settings_of_a_tool_have_no_effect_and_echo_is_turned_off(rig: Rig) -> None:
+def test_a_tools_serial_settings_have_no_effect_and_echo_is_turned_off(rig: Rig) -> None:
     import termios
 
     with opened(str(rig.link)) as tool:
@@ -265,7 +265,7 @@ def test_serial_settings_of_a_tool_have_no_effect_and_echo_is_turned_off(rig: Ri
         attributes[3] |= termios.ECHO | termios.ICANON
         attributes[4] = attributes[5] = termios.B1200
         termios.tcsetattr(tool, termios.TCSANOW, attributes)
-        os.write(tool, checksums.rtu("01 06 20 00 0A 0A"))  # 0A is a line feed
+        os.write(tool, checksums.rtu("01 06 20 00 0A 0A"))  # 0A is a line feed, which a terminal could change
         assert receive(tool, 8) == checksums.rtu("01 06 20 00 0A 0A")
         assert receive(tool, 1, QUIET) == b""
     assert len(rig.commands.written) == 1
@@ -274,7 +274,7 @@ def test_serial_settings_of_a_tool_have_no_effect_and_echo_is_turned_off(rig: Ri
 # ---- writes ----
 
 
-def test_by_default_each_write_is_refused_and_recorded(tmp_path: Path) -> None:
+def test_a_tool_port_refuses_and_records_each_write_by_default(tmp_path: Path) -> None:
     with serving(tmp_path) as rig, opened(str(rig.link)) as tool:
         for body in (
             f"01 06 {CONTROL:04X} {START:04X}",
@@ -288,10 +288,10 @@ def test_by_default_each_write_is_refused_and_recorded(tmp_path: Path) -> None:
         assert rig.commands.written == rig.commands.stopped == []
         why = "answered with exception 01H"
         assert rig.commands.refused[0] == ("mill", "request 01 06 10 00 00 01", why)
-        assert len(rig.commands.refused) < 6  # at most one record per second
+        assert len(rig.commands.refused) < 6  # at most one record a second
 
 
-def test_with_the_right_a_setpoint_is_written_and_a_motor_is_stopped_but_never_started(
+def test_a_tool_with_the_right_to_write_writes_setpoints_and_stops_but_never_starts(
     rig: Rig, tool: int
 ) -> None:
     assert code(tool, f"01 06 {SETPOINT:04X} 1388") is None
@@ -305,7 +305,7 @@ def test_with_the_right_a_setpoint_is_written_and_a_motor_is_stopped_but_never_s
     assert len(rig.commands.written) == 1
 
 
-def test_each_stop_is_sent_although_the_tool_sends_other_requests_right_after_it(rig: Rig, tool: int) -> None:
+def test_each_stop_is_sent_although_a_tool_sends_other_requests_right_after_it(rig: Rig, tool: int) -> None:
     stop, read = checksums.rtu(f"01 06 {CONTROL:04X} {STOP:04X}"), checksums.rtu("01 03 00 01 00 01")
     os.write(tool, stop + read + stop + read)
     assert receive(tool, 7) == checksums.rtu("01 03 02 0001")
@@ -323,7 +323,7 @@ def test_a_stop_right_after_an_incomplete_request_is_sent(rig: Rig, tool: int) -
     assert len(rig.commands.stopped) == 1
 
 
-def test_a_stop_in_a_write_of_several_registers_is_sent_and_the_rest_refused(rig: Rig, tool: int) -> None:
+def test_a_stop_in_a_write_of_several_registers_is_sent_and_the_rest_is_refused(rig: Rig, tool: int) -> None:
     assert code(tool, f"01 10 {CONTROL:04X} 0002 04 {STOP:04X} 0000") == 3
     assert len(rig.commands.stopped) == 1
 
@@ -367,7 +367,7 @@ def test_eight_tools_on_tcp_are_served_and_a_ninth_is_refused(rig: Rig) -> None:
             tool.close()
 
 
-def test_a_connection_that_cannot_be_accepted_yet_is_accepted_later(
+def test_a_connection_that_failed_to_be_accepted_is_accepted_later(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     failures: list[None] = []
@@ -383,12 +383,12 @@ def test_a_connection_that_cannot_be_accepted_yet_is_accepted_later(
         until(lambda: failures)
         with opened(str(rig.link)) as other:
             assert ask(other, "01 03 00 10 00 01") == bytes.fromhex("01 03 02 0010")
-        assert len(failures) < 10  # few attempts: the event loop is not kept busy
+        assert len(failures) < 10  # few attempts, so the event loop stays free
     with tool:
         assert ask(tool.fileno(), "01 03 00 10 00 01") == bytes.fromhex("01 03 02 0010")
 
 
-def test_a_link_is_replaced_only_if_a_killed_gateway_made_it(tmp_path: Path) -> None:
+def test_a_symlink_is_replaced_only_if_a_killed_gateway_made_it(tmp_path: Path) -> None:
     link = tmp_path / "port"
     link.write_text("a file")
     with pytest.raises(OSError, match="it exists, and no gateway made it"):
@@ -403,10 +403,10 @@ def test_a_link_is_replaced_only_if_a_killed_gateway_made_it(tmp_path: Path) -> 
     with pytest.raises(OSError, match=f"the link {link} cannot be made: another gateway uses it"):
         Terminal(link)
     assert killed._lock is not None
-    killed._lock.close()  # as the kernel does when a process is killed
+    killed._lock.close()  # the kernel also releases the lock of a killed process
     present = Terminal(link)
     killed.close()
-    assert link.is_symlink()  # the link of the present terminal
+    assert link.is_symlink()  # this link belongs to the terminal `present`
     present.close()
     assert not link.is_symlink()
     with pytest.raises(OSError, match="No such file or directory"):
@@ -432,7 +432,7 @@ def test_a_link_is_replaced_only_if_a_killed_gateway_made_it(tmp_path: Path) -> 
         ('pty = { hall = "p" }\nbaud = 9600', "baud"),
     ],
 )
-def test_each_mistake_in_the_table_is_reported_in_one_sentence(
+def test_each_mistake_in_the_tool_port_settings_is_reported_in_one_sentence(
     text: str, sentence: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "plant.toml"
@@ -465,8 +465,8 @@ address = 1
 # ---- requests are cut out of a tool's bytes by length and checksum, whatever else the tool sends ----
 
 
-# Frames printed in manuals: ERMAN ER-G-220 1.7, INVT CHE100 p. 122, INNOVERT IBD part 9; the last two are the
-# examples of the application protocol V1.1b3, 6.13 and 6.21, with checksums that were computed separately.
+# Frames printed in manuals: ERMAN ER-G-220 1.7, INVT CHE100 p. 122, INNOVERT IBD part 9. The last two are
+# examples of the Modbus application protocol V1.1b3 (6.13 and 6.21), with separately computed checksums.
 FRAMES = [
     bytes.fromhex(text)
     for text in (
@@ -485,7 +485,7 @@ EVERY_FRAME = [*FRAMES, REPORT_ID, READ_IDENTITY]
 
 
 def taken(cutter: RequestCutter) -> list[bytes]:
-    """Take all requests from the cutter; return them as frames, with checksums of an independent function."""
+    """Take all requests from the cutter; return them as frames. Another function computes the checksums."""
     found: list[bytes] = []
     while (request := cutter.take()) is not None:
         found.append(checksums.rtu(bytes([request.unit, request.function]) + request.data))
@@ -516,7 +516,7 @@ def test_a_request_after_noise_or_a_damaged_frame_is_recognised(noise: bytes) ->
 
 
 def test_a_request_after_an_incomplete_frame_is_recognised_after_silence() -> None:
-    """The request may be a stop, and the incomplete frame may be from a tool that was closed."""
+    """The request may be a stop. The incomplete frame may come from a tool that was closed."""
     cutter = RequestCutter()
     cutter.add(bytes.fromhex("01 10 00 00 00 7B F6") + FRAMES[6])
     assert taken(cutter) == []
@@ -526,7 +526,7 @@ def test_a_request_after_an_incomplete_frame_is_recognised_after_silence() -> No
     assert found == [FRAMES[6]]
 
 
-def test_an_incomplete_frame_is_dropped_after_silence() -> None:
+def test_an_incomplete_request_is_dropped_after_silence() -> None:
     cutter = RequestCutter()
     cutter.add(FRAMES[4][:7])
     assert taken(cutter) == []
@@ -537,8 +537,8 @@ def test_an_incomplete_frame_is_dropped_after_silence() -> None:
     assert taken(cutter) == [FRAMES[0]]
 
 
-def test_random_bytes_give_no_request_and_few_of_them_are_kept() -> None:
-    """By chance, one position in 65,536 has a good checksum; the bytes of this seed have no such position."""
+def test_random_bytes_are_no_request_and_few_of_them_are_kept() -> None:
+    """By chance, one position in 65,536 has a valid checksum; the bytes of this seed have none."""
     chance, cutter = random.Random(43), RequestCutter()
     for _ in range(400):
         cutter.add(chance.randbytes(chance.randrange(1, 64)))
@@ -546,8 +546,7 @@ def test_random_bytes_give_no_request_and_few_of_them_are_kept() -> None:
         assert len(cutter._came) <= MOST_FRAME
 
 
-def test_frames_between_random_bytes_are_never_changed() -> None:
-    """Requests are cut out of random mixtures of requests and noise, unchanged and in order."""
+def test_requests_between_random_bytes_are_recognised_unchanged_and_in_order() -> None:
     chance = random.Random(44)
     for _ in range(200):
         put_in = [chance.choice(EVERY_FRAME) for _ in range(4)]
@@ -565,6 +564,6 @@ def test_frames_between_random_bytes_are_never_changed() -> None:
         assert all(frame in left for frame in found)
 
 
-def test_a_reply_has_the_standards_checksum() -> None:
-    reply = bytes.fromhex("01 03 02 18 00 B2 44")  # INNOVERT IBD part 9
+def test_a_reply_has_the_modbus_rtu_checksum() -> None:
+    reply = bytes.fromhex("01 03 02 18 00 B2 44")  # frame printed in the INNOVERT IBD manual, part 9
     assert rtu_reply(bytes(6) + reply[:-2]) == reply

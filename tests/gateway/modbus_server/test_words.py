@@ -1,6 +1,6 @@
-"""Words computed from rows are the drive's words bit for bit, or unknown.
+"""Words computed from polled values equal the drive's words bit for bit, or are unknown.
 
-The core decodes random bytes into rows, and the words computed from these rows must equal the bytes.
+The core decodes random bytes into values, and the words computed from these values must equal the bytes.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def declared(**details: Any) -> Register[Any]:
 
 
 def value_of(register: Register[Any], data: bytes) -> float | None:
-    """Return the value in the core's row for these bytes; None for a miss."""
+    """Return the value that the core decodes from these bytes, or None if it has no value."""
     words = struct.unpack(f">{len(data) // 2}H", data)
     columns = Columns(1)
     assert add_rows(
@@ -74,18 +74,20 @@ def sent(draw: st.DrawFn) -> tuple[NumberFormat, str, float, float, bytes]:
 
 
 @given(sent())
-@example((NumberFormat.F32, "ABCD", 1, 0, b"\x80\0\0\0"))  # -0.0, whose row has 0.0
+@example((NumberFormat.F32, "ABCD", 1, 0, b"\x80\0\0\0"))  # -0.0, which the core returns as 0.0
 @example((NumberFormat.F32, "ABCD", 1, 0, bytes(4)))
 @example((NumberFormat.F32, "ABCD", 1, 0, b"\x7f\x80\0\0"))  # infinity
 @example((NumberFormat.F32, "ABCD", 1, 0, b"\0\0\0\x01"))  # the smallest positive float
 @example((NumberFormat.U64, "ABCD", 1, 0, (2**53 + 1).to_bytes(8)))  # not representable as float64
 @example((NumberFormat.U64, "ABCD", 0.1, 0, (2**53 + 1).to_bytes(8)))
-@example((NumberFormat.U64, "ABCD", 60, 0, (2**53 + 1).to_bytes(8)))  # nor is its raw count
+# its raw count is not representable either
+@example((NumberFormat.U64, "ABCD", 60, 0, (2**53 + 1).to_bytes(8)))
 @example((NumberFormat.I64, "ABCD", 1, 0, (-(2**53) - 1).to_bytes(8, signed=True)))
 @example((NumberFormat.F64, "ABCD", 0.1, 0, struct.pack(">d", 0.30000000000000004)))
-@example((NumberFormat.F64, "ABCD", 1, 1000, struct.pack(">d", 1e-20)))  # adding the offset loses this value
+# lost in the sum with the offset of 1000
+@example((NumberFormat.F64, "ABCD", 1, 1000, struct.pack(">d", 1e-20)))
 @example((NumberFormat.F32, "ABCD", 1, 273.15, struct.pack(">f", 1e-20)))
-def test_words_computed_from_a_row_are_the_drives_words_or_unknown(
+def test_words_computed_from_a_value_are_the_drives_words_or_unknown(
     case: tuple[NumberFormat, str, float, float, bytes],
 ) -> None:
     number_format, order, step, offset, data = case
@@ -96,7 +98,7 @@ def test_words_computed_from_a_row_are_the_drives_words_or_unknown(
 
 
 @given(st.sampled_from(WHOLE), st.sampled_from(STEPS), st.sampled_from(OFFSETS), st.data())
-def test_words_are_known_for_all_integer_values(
+def test_words_can_be_computed_for_each_integer_value(
     number_format: NumberFormat, step: float, offset: float, data: st.DataObject
 ) -> None:
     size = BYTES[number_format]
@@ -109,8 +111,8 @@ def test_words_are_known_for_all_integer_values(
 
 
 @pytest.mark.slow
-def test_the_bytes_of_every_16_bit_number_are_known() -> None:
-    """By default, only every 19th raw count is tested."""
+def test_words_can_be_computed_for_each_16_bit_number() -> None:
+    """A usual run tests only every 19th raw count."""
     for step in (0.1, 0.01, -0.25):
         register = declared(step=step)
         for raw in range(0, 0x10000, 2 * PART - 1):
@@ -119,7 +121,7 @@ def test_the_bytes_of_every_16_bit_number_are_known() -> None:
 
 
 @given(st.floats(width=32, allow_nan=False).filter(bool), st.sampled_from(ORDERS))
-def test_words_are_known_for_floats_other_than_zero(number: float, order: str) -> None:
+def test_words_can_be_computed_for_each_float_other_than_zero(number: float, order: str) -> None:
     register = declared(number_format=NumberFormat.F32, order=order)
     data = struct.pack(">f", number)
     places = {"ABCD": (0, 1, 2, 3), "CDAB": (2, 3, 0, 1), "BADC": (1, 0, 3, 2), "DCBA": (3, 2, 1, 0)}[order]
@@ -144,11 +146,11 @@ def test_no_words_are_computed_for_a_value_that_the_register_cannot_hold(value: 
         {"invalid": 5},  # the raw count that means "no value"
     ],
 )
-def test_words_are_unknown_for_a_format_that_leaves_bits_undefined(details: dict[str, Any]) -> None:
+def test_no_words_are_computed_for_a_format_that_leaves_bits_undefined(details: dict[str, Any]) -> None:
     assert exact_data(declared(**details), 5.0) is None
 
 
-def test_words_are_unknown_for_a_register_with_a_scale_register() -> None:
+def test_no_words_are_computed_for_a_register_with_a_scale_register() -> None:
     family = type(
         "Scaled",
         (Drive,),
@@ -169,7 +171,7 @@ class Status(IntEnum):
 
 
 class Meter(Drive):
-    """A device with adjacent registers of all kinds."""
+    """A drive with registers of all kinds at adjacent addresses."""
 
     speed = reading(0, "rpm")
     energy = reading(1, "kWh", number_format=NumberFormat.U32, order="CDAB", step=0.1)
@@ -218,24 +220,25 @@ def read(
     return cached().read(function, range(start, start + count), rows.get, NOW, since_ns)
 
 
-def test_range_is_answered_with_the_drives_words() -> None:
+def test_a_range_of_addresses_is_answered_with_the_drives_words() -> None:
     assert read(3, 0, 4) == [1450, 0x0002, 0x0001, 3]
-    assert read(3, 2, 1) == [0x0001]  # half of a 32-bit number
+    assert read(3, 2, 1) == [0x0001]  # the second half of a 32-bit register
     assert read(4, 0, 1) == [12]
     assert read(3, 5, 2) == [0x3FC0, 0]
     assert read(1, 7, 1) == [1]
     assert read(2, 8, 1) == [0]
 
 
-def test_range_with_one_unknown_word_is_not_answered() -> None:
-    assert read(3, 3, 2) is Unavailable.UNPOLLED  # includes a register that is part of a word
+def test_a_range_of_addresses_with_one_unknown_word_is_not_answered() -> None:
+    # this range contains a register that has only some bits of its word
+    assert read(3, 3, 2) is Unavailable.UNPOLLED
     assert read(3, 9, 1) is Unavailable.UNPOLLED
     assert read(4, 0, 2) is Unavailable.UNPOLLED
     assert read(1, 0, 1) is Unavailable.UNPOLLED
-    assert read(3, 5, 2, level=FakeRow(NOW, 0.0)) is Unavailable.UNPOLLED  # a float zero may be +0 or -0
+    assert read(3, 5, 2, level=FakeRow(NOW, 0.0)) is Unavailable.UNPOLLED  # 0.0, whose sign is unknown
 
 
-def test_range_with_a_stale_row_or_a_miss_is_not_answered() -> None:
+def test_a_range_with_an_old_value_or_a_failed_read_is_not_answered() -> None:
     assert read(3, 0, 4, status=FakeRow(NOW, None)) is Unavailable.STALE
     assert read(3, 0, 4, status=FakeRow(NOW - S, 3.0)) == [1450, 2, 1, 3]
     assert read(3, 0, 4, status=FakeRow(NOW - S - 1, 3.0)) is Unavailable.STALE
@@ -244,12 +247,12 @@ def test_range_with_a_stale_row_or_a_miss_is_not_answered() -> None:
     assert cached().read(3, range(1), lambda name: None, NOW) is Unavailable.STALE
 
 
-def test_rows_from_before_a_write_are_not_used() -> None:
+def test_values_polled_before_a_write_are_not_used_for_words() -> None:
     assert read(3, 1, 1, since_ns=NOW) == [2]
     assert read(3, 1, 1, since_ns=NOW + 1) is Unavailable.STALE
 
 
-def test_newest_row_of_registers_at_the_same_address_is_used() -> None:
+def test_of_two_registers_at_the_same_address_the_newest_value_is_used() -> None:
     assert read(3, 0, 1, again=FakeRow(NOW, 14.49)) == [1449]
     assert read(3, 0, 1, speed=FakeRow(NOW, None)) == [1450]
 
@@ -257,12 +260,12 @@ def test_newest_row_of_registers_at_the_same_address_is_used() -> None:
 # ---- MBAP: requests are parsed correctly however their bytes are divided ----
 
 
-# MODBUS Messaging on TCP/IP Implementation Guide V1.0b, 4.4.2.1 and the example of section 3.1.3:
+# From the MODBUS Messaging on TCP/IP Implementation Guide V1.0b, 4.4.2.1 and the example of section 3.1.3:
 # transaction 1501H, protocol 0, length 6, unit FFH, function 03, start 0004H, count 0001H
 PRINTED = bytes.fromhex("15 01 00 00 00 06 FF 03 00 04 00 01")
 
 
-def test_example_of_the_modbus_guide_is_parsed_and_answered() -> None:
+def test_the_example_of_the_modbus_guide_is_parsed_and_answered() -> None:
     buffer = bytearray(PRINTED)
     found = take_request(buffer)
     assert found == MbapRequest(0x1501, 0xFF, 3, bytes.fromhex("00 04 00 01"))
@@ -271,7 +274,7 @@ def test_example_of_the_modbus_guide_is_parsed_and_answered() -> None:
     assert found.exception(2) == bytes.fromhex("15 01 00 00 00 03 FF 83 02")
 
 
-def test_request_that_arrives_byte_by_byte_is_parsed() -> None:
+def test_a_request_that_arrives_byte_by_byte_is_parsed() -> None:
     buffer = bytearray()
     for byte in PRINTED[:-1]:
         buffer.append(byte)
@@ -283,17 +286,17 @@ def test_request_that_arrives_byte_by_byte_is_parsed() -> None:
 @table(
     "header",
     [
-        "00 01 00 01",  # another protocol id
+        "00 01 00 01",  # the protocol id is not 0
         "00 01 FF FF 00 06 01 03",
         "47 45 54 20",  # GET
         "16 03 01 02",  # TLS
         "00 01 00 00 00 00",
         "00 01 00 00 00 01",
-        "00 01 00 00 00 FF",  # one byte longer than the longest frame
+        "00 01 00 00 00 FF",  # one byte longer than the longest allowed frame
         "00 01 00 00 FF FF",
     ],
 )
-def test_an_invalid_header_raises_garbage_as_soon_as_it_arrives(header: str) -> None:
+def test_address_0_is_reported_as_an_invalid_unit_id(header: str) -> None:
     with pytest.raises(InvalidHeader):
         take_request(bytearray.fromhex(header))
 
@@ -310,7 +313,7 @@ frames = st.builds(
 
 
 @given(st.lists(frames, max_size=6), st.lists(st.integers(1, 40), min_size=1, max_size=40))
-def test_requests_are_parsed_the_same_however_their_bytes_arrive(sent: list[bytes], cuts: list[int]) -> None:
+def test_requests_are_parsed_equally_however_their_bytes_arrive(sent: list[bytes], cuts: list[int]) -> None:
     whole = b"".join(sent)
     buffer, found, at = bytearray(), [], 0
     while at < len(whole):
