@@ -6,7 +6,10 @@ import math
 import os
 import random
 import re
+import sys
 from collections.abc import Iterator
+from types import FrameType
+from typing import Any
 
 import pytest
 from tables import table
@@ -252,3 +255,35 @@ def test_any_text_as_an_expression_is_computed_or_refused_with_bounded_work(coun
             assert value is None or math.isfinite(value)
         computed += 1
     assert computed > count / 20
+
+
+LONGEST = {  # near the limits of length and depth
+    "sum": "power" + "+power" * 160,
+    "depth": "abs(" * 15 + "power" + ")" * 15,
+    "arguments": f"max({', '.join(['power'] * 130)})",
+    "table": f'table(frequency, "kW"{"".join(f", {at}, 2" for at in range(64))})',
+}
+
+
+@pytest.mark.parametrize("kind", LONGEST)
+def test_work_of_an_evaluation_is_bounded_by_the_length_of_the_text(kind: str) -> None:
+    """Count the lines of Python code that one evaluation executes, instead of its time."""
+    text = LONGEST[kind]
+    series = SeriesTable(PUMPS)
+    program = Program(text, "pump-1", series, "kW")
+    values: list[float | None] = [NOW.get(name, 700.0) for _, name in series.slots]
+    lines = 0
+
+    def counted(frame: FrameType, event: str, argument: object) -> Any:
+        nonlocal lines
+        lines += event == "line"
+        return counted
+
+    before = sys.gettrace()
+    sys.settrace(counted)
+    try:
+        value = program.run(values, set(range(len(values))), 0)
+    finally:
+        sys.settrace(before)
+    assert value is not None
+    assert lines <= 5 * len(text)
