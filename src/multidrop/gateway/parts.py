@@ -270,7 +270,7 @@ class LiveParts:
 
 
 async def _close_when_built(built: Mapping[str, Building]) -> None:
-    """Close the parts that are built. Those that are still being built are closed when they are built."""
+    """Close the parts that are built, and the others as soon as they are built."""
 
     async def close(name: str, part: asyncio.Future[Part]) -> None:
         await asyncio.wait([part])

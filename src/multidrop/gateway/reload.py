@@ -1,4 +1,4 @@
-"""Reload: read the plant file again while polling continues. A file with mistakes is ignored."""
+"""Reload: read the plant file again while polling continues. A file with mistakes does not take effect."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Read = Callable[[], "tuple[Plant, ServeSettings]"]
 # keys of the table [serve] that a reload can change without a restart
 AT_ONCE = ("names", "tokens", "may", "limit", *PARTS)
 READ_S = 10.0  # time limit, in s, for reading the plant file
-# in s: a later reload cancels the reading of the plant file only if it has taken longer than this
+# in s: a later reload cancels a read of the plant file only after this time
 QUICK_S = 1.0
 MOST_READS = 8  # limit of concurrent reads of the plant file, because each may hang
 # time limit, in s, for putting a plant into effect, which opens ports and stops removed drives
@@ -143,7 +143,7 @@ class Reload:
         self.coming = plant
         try:
             unopened = await supervisor().thread("adoption", ADOPTION_S, partial(poller.adopt, plant))
-            if is_followed:  # a plant whose lines come from a fleet: the file has no lines
+            if is_followed:  # the lines come from a fleet, and the plant file has none
                 planned = await supervisor().thread("plan", ADOPTION_S, partial(_planned, poller.plant))
             self._take_up(poller, settings, planned)
             gateway.parts.take_up()

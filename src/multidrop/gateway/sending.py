@@ -74,7 +74,7 @@ class _Answer(HTTPResponse):
 class _TimedBytes(io.RawIOBase):
     """The bytes that arrive at a socket.
 
-    Reading raises TimeoutError later than SEND_S after this object was made.
+    Reading raises TimeoutError once this object is older than SEND_S.
     """
 
     def __init__(self, raw: io.RawIOBase, sock: socket.socket) -> None:

@@ -343,7 +343,7 @@ def _part(name: str, table: Mapping[str, Any], plant: Plant, place: TomlPlace) -
         return None
     before = len(place.config_errors)
     given = place.check(dict(table), keys)
-    # keys with an invalid value: a value that is left out here must not be reported as missing too
+    # keys with invalid values: they must not be reported as missing too
     refused = tuple(table.keys() - given.keys())
     try:
         found = made(**given)
@@ -423,7 +423,7 @@ def serve_schema() -> dict[str, Any]:
         ],
     )
     for name in PARTS:
-        with suppress(ImportError):  # without its library, a part's keys are left out of the schema
+        with suppress(ImportError):  # if a part's library is missing, the schema lacks the part's keys
             schema["properties"][name] |= json_schema(_settings_of(name)[1])
     return schema
 

@@ -251,7 +251,7 @@ class Hub:
         return watched.cells.get(register) or watched.channels.get(register) if watched else None
 
     def now_ns(self) -> int:
-        """Return the present time in ns by CLOCK_MONOTONIC, which also dates the rows."""
+        """Return the present time (CLOCK_MONOTONIC, ns). Rows have their times from the same clock."""
         return self._times()[0]
 
     def woke_ns(self) -> int:
