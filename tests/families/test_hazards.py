@@ -462,7 +462,7 @@ def test_at_most_four_innovert_ibd_registers_are_read_at_once_erratum_n3_n6(
     assert reply_to(Message(1, 3, 0x16, 1), "01 03 02 18 00 B2 44")[1] is not None
 
 
-def test_innovert_ibd_with_other_outputs_is_never_reported_stopped_erratum_n9(
+def test_innovert_ibd_with_unprogrammed_outputs_never_reports_stopped_erratum_n9(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     _, drive, sim = one(monkeypatch, InnovertIBD(1))

@@ -133,7 +133,7 @@ def test_yd1000_factory_values_and_locks_while_running_are_as_documented(row: tu
     assert register.kept is Kept.EEPROM
 
 
-def test_yd1000_limits_are_those_of_the_notes() -> None:
+def test_yd1000_limits_are_those_of_the_document() -> None:
     spans = {name: each.span for name, each in YD1000.registers.items() if each.span}
     assert spans["acceleration_time"] == spans["deceleration_time"] == (0.1, 3600)
     assert spans["maximum_frequency"] == (30, 320)
@@ -149,7 +149,7 @@ def test_yd1000_registers_are_declared_as_ram_or_eeprom() -> None:
     assert ram == {"control", "frequency", "panel_frequency"}
 
 
-def test_yd1000_registers_that_are_never_written_are_those_of_the_notes() -> None:
+def test_yd1000_registers_that_are_never_written_are_those_of_the_document() -> None:
     never: dict[str, set[int]] = {}
     for register in YD1000.registers.values():
         never.setdefault(register.never, set()).add(register.address)
@@ -235,7 +235,7 @@ def test_no_yd1000_control_word_has_both_reset_and_run() -> None:
         YD1000.control.encode(YD1000Control(0x8010))
 
 
-def test_yd1000_line_settings_and_limits_are_those_of_the_notes() -> None:
+def test_yd1000_line_settings_and_limits_are_those_of_the_document() -> None:
     drive = YD1000(63)
     assert str(drive.settings) == "9600 8E1"
     assert drive.needed_silence() == pytest.approx(24 * 11 / 9600)
@@ -495,7 +495,7 @@ def test_yd1000_terminals_without_a_run_function_do_not_block_a_reset(closed: In
     assert wire.sent == [frame(YD1000(1), YD1000.control, YD1000Control(0xE000)), STOP]
 
 
-def test_yd1000_limit_that_the_notes_do_not_state_names_its_source() -> None:
+def test_yd1000_limit_that_the_document_does_not_state_names_its_source() -> None:
     """The notes limit UL to at most FH, but not FH to at least UL. The library infers the second limit."""
     wire = Wire(YD1000(1), {**STANDING, "upper_limit_frequency": 60.0})
     with pytest.raises(

@@ -33,7 +33,7 @@ def places(device: ImportedDevice) -> list[tuple[str, int]]:
     return [(register.name, register.address) for register in device.registers]
 
 
-def test_registers_of_a_wb_subdevice_are_shifted_for_each_channel_that_uses_it(tmp_path: Path) -> None:
+def test_registers_of_a_wb_mqtt_subdevice_are_shifted_for_each_channel_that_uses_it(tmp_path: Path) -> None:
     first = {"name": "First", "device_type": "ch", "shift": 256}
     second = {"name": "Second", "device_type": "ch", "shift": "0x200", "stride": 2}
     device = only(tmp_path, "w.json", with_subdevice(first, second))
@@ -55,7 +55,7 @@ def test_shifts_of_nested_wb_mqtt_serial_subdevices_are_added(tmp_path: Path) ->
     assert places(only(tmp_path, "w.json", document)) == [("outer_inner_voltage", 16 + 103)]
 
 
-def test_wb_subdevice_that_contains_itself_is_cut_off(tmp_path: Path) -> None:
+def test_wb_mqtt_subdevice_that_contains_itself_is_cut_off(tmp_path: Path) -> None:
     again = {"name": "Again", "device_type": "ch", "shift": 1}
     device = only(tmp_path, "w.json", with_subdevice(again, channels=[VOLTAGE, again]))
     assert len(device.registers) == 8
@@ -73,7 +73,7 @@ def test_wb_subdevice_that_contains_itself_is_cut_off(tmp_path: Path) -> None:
         ({"name": "X", "address": 1}, "subdevice ch: no channel uses it, so its address is not known"),
     ],
 )
-def test_wb_subdevices_of_unknown_address_are_reported_as_not_imported(
+def test_wb_mqtt_subdevices_of_unknown_address_are_reported_as_not_imported(
     tmp_path: Path, used: dict[str, Any], reason: str
 ) -> None:
     document = with_subdevice({"name": "Known", "address": 7}, used)
@@ -125,7 +125,7 @@ def test_8_bit_format_of_a_written_wb_mqtt_serial_register_selects_its_low_byte(
         ({"format": "s16", "error_value": "0x7FFF", "unsupported_value": "0xFFFE"}, [0x7FFF, 0xFFFE]),
     ],
 )
-def test_wb_error_value_is_decoded_in_the_registers_format(
+def test_wb_mqtt_error_value_is_decoded_in_the_registers_format(
     tmp_path: Path, keys: dict[str, Any], invalid: Any
 ) -> None:
     device = channel(tmp_path, **keys)
@@ -149,13 +149,13 @@ def test_wb_error_value_is_decoded_in_the_registers_format(
         ({"format": "bcd8"}, "its format bcd8 has fewer digits than its registers hold"),
     ],
 )
-def test_wb_keys_that_are_not_imported_are_marked_as_gaps(
+def test_wb_mqtt_keys_that_are_not_imported_are_marked_as_gaps(
     tmp_path: Path, keys: dict[str, Any], gap: str
 ) -> None:
     assert gaps(channel(tmp_path, **keys), "a") == [gap]
 
 
-def test_wb_text_without_its_size_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_wb_mqtt_text_without_its_size_is_marked_as_a_gap(tmp_path: Path) -> None:
     assert gaps(channel(tmp_path, format="string8"), "a") == ["string_data_size is not stated; 1 was assumed"]
 
 
@@ -181,7 +181,7 @@ def test_names_of_values_with_numbers_as_text_are_imported(tmp_path: Path) -> No
         ({"format": "string8", "word_order": "little_endian"}, "a text whose word_order is little_endian"),
     ],
 )
-def test_wb_text_in_an_unsupported_order_is_reported_as_not_imported(
+def test_wb_mqtt_text_in_an_unsupported_order_is_reported_as_not_imported(
     tmp_path: Path, keys: dict[str, Any], reason: str
 ) -> None:
     with pytest.raises(ValueError, match=f"a: {reason}"):
@@ -216,7 +216,7 @@ CONFIG = {
 }
 
 
-def test_wb_configuration_gives_a_device_for_each_slave(tmp_path: Path) -> None:
+def test_wb_mqtt_configuration_gives_a_device_for_each_slave(tmp_path: Path) -> None:
     meter, relay, net = devices(tmp_path, "wb-mqtt-serial.json", CONFIG)
     assert [(each.title, each.address, each.line.port) for each in (meter, relay, net)] == [
         ("Meter", 10, "/dev/ttyRS485-1"),
