@@ -135,7 +135,7 @@ int md_unpack(struct md_capture *capture)
 
 enum { MOST_NOISE = 3 }; /* limit of noise bytes between request and reply; more may be a damaged request */
 
-/* Return the start of the next piece that comes after a pause; the stream's length if there is none. */
+/* Return the index of the first byte after the next pause; the stream's length if there is no later pause. */
 static size_t end_of_run(const struct md_stream *stream, size_t piece)
 {
     while (++piece < stream->count)
@@ -379,7 +379,7 @@ static uint64_t key_of(int framing, const struct md_message *request)
            start << 24 | (uint64_t)request->count << 40;
 }
 
-/* Return the slot that holds the key, or else the empty slot for the key. */
+/* Return the slot of the table that holds this key, or else the empty slot in which the key belongs. */
 static struct md_known *place_of(const struct md_decoder *decoder, uint64_t key)
 {
     size_t place = (size_t)(key * 0x9E3779B97F4A7C15u >> 32);

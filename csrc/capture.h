@@ -83,7 +83,7 @@ struct md_span {
 /* The splitter's position in a stream; all zero: the start. */
 struct md_splitter {
     size_t at, piece;          /* index of the next byte, and of its piece */
-    size_t junk;               /* bytes since the last frame */
+    size_t junk;               /* number of bytes since the last frame */
     /* 1: a frame ended at `at`; 0: junk came, so an apparent request may be a reply */
     int is_in_step;
     int awaited, framing;      /* `awaited`: the reply to `request` is due, in this framing */
@@ -116,7 +116,7 @@ struct md_decoder {
     int64_t asked_ns;
     /* is_sure: 1: the last frame was surely a request; failure: the result without a reply */
     int is_sure, failure;
-    int is_due;                   /* `span` is not processed yet */
+    int is_due;                   /* 1: `span` is not processed yet */
     uint64_t frames, exchanges, junk, strays;
     struct md_completion completion;
 };

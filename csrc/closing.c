@@ -4,7 +4,7 @@
  * root may change). A signal to the closing thread ends the wait, and the driver then discards the bytes. A
  * timer sends this signal to the closing thread only. The program does not otherwise use the signal.
  *
- * The port is closed by dup2(2): it needs no free descriptor, and leaves a valid one for pyserial to close. */
+ * The port is closed by dup2(2). It needs no free descriptor, and leaves one for pyserial to close. */
 #define _GNU_SOURCE
 #include "internal.h"
 

@@ -87,7 +87,7 @@ static void (*const steps[STEPS_AHEAD])(const struct md_port *port) = {
     bring_rest, bring_drives, bring_exchanges, bring_port,
 };
 
-/* Prefetch one stage for ports next .. next + 3; `next` may be negative. */
+/* Carry out one prefetch step for each of the ports next .. next + 3; `next` may be negative. */
 static void prefetch(struct md_port *const *ports, int n, int next)
 {
     for (int step = 0; step < STEPS_AHEAD; step++, next++)

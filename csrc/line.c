@@ -131,7 +131,7 @@ static void tap_bytes(const struct md_line *line, int side, int64_t time_ns, con
         md_tap_put(line->tap, side, time_ns ? time_ns : line->completion->sent_ns, bytes, len);
 }
 
-/* Pass to the tap all bytes that came since the request was sent: the good or bad reply, and, as noise, the
+/* Copy to the tap all bytes that came since the request was sent: the good or bad reply, and, as noise, the
  * bytes before and after the reply. */
 static void tap_received(const struct md_line *line, struct md_ending ending)
 {

@@ -166,7 +166,7 @@ struct md_drive {
     int64_t patience_ns;               /* a longer timeout, learnt from late replies; 0: none */
     int64_t interval_ns;               /* least time between an exchange and the next request */
     int64_t ready_ns;                  /* earliest time of the next request */
-    uint32_t failures;                 /* number of consecutive failures */
+    uint32_t failures;                 /* number of consecutive exchanges without a reply */
     uint8_t owed_count, proof_count;
     uint8_t is_doubted;                /* 1: the drive's first reply may answer another process's request */
     uint8_t sure_looks;                /* how many of the next replies are read only when complete */

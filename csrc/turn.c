@@ -365,7 +365,7 @@ static void finish(struct md_turn *turn)
     }
 }
 
-/* Put the postponed exchange back, because a stop must not wait for it. */
+/* Put the postponed exchange back into its queue, because a stop must not wait for it. */
 static void give_way(struct md_turn *turn)
 {
     int source = turn->source;

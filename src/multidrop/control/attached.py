@@ -110,7 +110,7 @@ class Attached:
         self, bus: Any, exchanges: Exchanges, latches: Latches, performer: Performer, stopper: Stopper
     ) -> None:
         self.drives: list[Drive] = []
-        self.lock = threading.RLock()  # held while a drive is added or removed
+        self.lock = threading.RLock()  # held by a thread while it adds or removes a drive
         self._bus = bus
         self._exchanges = exchanges
         self._latches = latches
@@ -177,7 +177,8 @@ class Leaving:
         self._stopper = stopper
         self._stop_all = stop_all
         self._last_act: LastAct | None = None
-        self.found: Mapping[str, Stopped] = {}  # results of the stops by `stop_on_exit`
+        # by drive name: the results of the stops that `stop_on_exit` has caused
+        self.found: Mapping[str, Stopped] = {}
 
     @property
     def stops(self) -> bool:
@@ -199,7 +200,7 @@ class Leaving:
         _warn_of(self.found)
 
     def begin(self) -> None:
-        """Cancel all calls; if `stop_on_exit` was called, start stopping the drives without waiting."""
+        """Cancel all calls on the bus. If `stop_on_exit` was called, start to stop the drives."""
         self._latches.shut()
         if self._last_act is not None:
             self._last_act.begin()

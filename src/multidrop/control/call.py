@@ -35,7 +35,7 @@ class Latches:
         self._exchanges = exchanges
         self._latches: dict[Drive, Latch] = {}
         self.is_shut = False
-        # by unfinished stop: the identifier of the stop's thread, and the stop's drives
+        # by unfinished stop: the identifier of the thread that called it, and the drives to stop
         self._stops: dict[object, tuple[int, frozenset[Drive]]] = {}
 
     def forked(self) -> None:
@@ -45,7 +45,8 @@ class Latches:
 
     def add(self, drive: Drive) -> Latch:
         latch = self._latches[drive] = Latch()
-        if self.is_shut:  # checked after adding the latch: a later `shut` sees the latch
+        # checked after the latch was added, so that a `shut` on another thread is never missed
+        if self.is_shut:
             latch.shut(LEFT)
         return latch
 
@@ -73,7 +74,8 @@ class Latches:
             thread != own and (asked is None or not asked.isdisjoint(stopped))
             for thread, stopped in self._stops.copy().values()
         ):
-            time.sleep(POLL_S)  # no Condition: an exception of a signal handler could leave its lock locked
+            # not a Condition, whose lock could stay locked if a signal handler raises an exception
+            time.sleep(POLL_S)
 
     def latch(self, drive: Drive) -> Latch:
         """Return a drive's latch. Raises NotAttached if the drive is not on this bus."""
@@ -129,7 +131,7 @@ class Call:
         self.drive = drive
         self.permit = permit
         self.verb = verb
-        self.sent = ""  # the latest write that may have been sent
+        self.sent = ""  # description of the latest write that may have been sent
         self.is_confirmed = False  # whether the drive confirmed the write in `sent`
         # outcome of the write in `sent`; None once a later read has succeeded
         self.unverified: Outcome | None = None

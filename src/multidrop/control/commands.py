@@ -303,7 +303,7 @@ class RepeatedStops:
 
     async def _send_after(self, before: StopFuture, drive: Drive) -> Results:
         await asyncio.wait([before])
-        del self._waiting[drive]  # a call from now on needs another stop, sent after this stop
+        del self._waiting[drive]  # later calls need another stop, because this one is already being sent
         return await self._send(drive)
 
     def _forget(self, drive: Drive, sent: StopFuture) -> None:

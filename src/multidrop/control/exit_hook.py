@@ -26,7 +26,7 @@ from multidrop.errors import BusError
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 IMPATIENT = 3  # this many signals within a second end the wait for the stops
-HANDLING_S = 0.05  # s; duration of each short wait, so that signals are handled in between
+HANDLING_S = 0.05  # s; longest delay in handling a signal that the kernel gave to another thread
 PACKAGE = __name__.partition(".")[0]
 MOST_NAMES = 20  # limit of drives named in a message
 CUT_SHORT = "the stops were cut short by a third signal: motors may still be turning"
@@ -137,8 +137,8 @@ class ExitHook:
         # by signal: the handler of the program that ours replaced
         self._before: dict[signal.Signals, Any] = {}
         self._has_taken = False
-        self._held: int | None = None  # number of the first signal, while the signal's effect is delayed
-        self._came: list[float] = []  # times of recent signals
+        self._held: int | None = None  # number of the signal whose effect is delayed; None: no signal came
+        self._came: list[float] = []  # s; times of the signals that came within the last second
         self._passing = threading.Lock()
         self._has_passed = False
         self._is_passing_on = False

@@ -214,7 +214,7 @@ class IdentityCheck:
         rivals = run_by(register, count)
         suspicion = self._suspicion(drive, rivals) if self._is_in_step(drive) else None
         before, findings.suspicion = findings.suspicion, None
-        # the drive has answered SURE times as this make
+        # the registers have shown SURE times that the drive is of the make `suspicion.make`
         if suspicion is not None and suspicion.make is not None:
             raise _withheld(drive, suspicion.why, suspicion.make)
         if suspicion is not None and before is None:

@@ -98,7 +98,7 @@ class Stopped:
 # ---- results of commands ----
 
 
-# the first type that the exception is an instance of counts
+# the first matching type of exception decides
 _OUTCOMES: tuple[tuple[type[BaseException], CommandOutcome], ...] = (
     (WriteForbidden, CommandOutcome.REFUSED),
     (Unsupported, CommandOutcome.REFUSED),
@@ -107,7 +107,8 @@ _OUTCOMES: tuple[tuple[type[BaseException], CommandOutcome], ...] = (
     (CancelledByStop, CommandOutcome.NOT_SENT),
     (DriveException, CommandOutcome.FAILED),
     (NotVerified, CommandOutcome.FAILED),
-    (NoReply, CommandOutcome.NOT_SENT),  # raised only by a read before the first write
+    # raised only by a read before the first write, so nothing was written
+    (NoReply, CommandOutcome.NOT_SENT),
     (BadReply, CommandOutcome.NOT_SENT),
 )
 _STOP_OUTCOMES = {

@@ -32,7 +32,7 @@ class _Over(Exception):
 
 
 class Performer:
-    """Carries out scripts on one bus. A write expires unless it is sent within `expiry` s of its call."""
+    """Carries out the scripts of verbs on one bus. A write expires if it is not sent within `expiry` s."""
 
     def __init__(
         self, exchanges: Exchanges, writer: Writer, stopper: Stopper, latches: Latches, expiry: float

@@ -219,7 +219,8 @@ class WriteRecords:
         self._uncounted: deque[LedgerCell] = deque()
         # queued audit records, each with its time: UTC in ns
         self._unlogged: deque[tuple[int, dict[str, Any]]] = deque()
-        self._writers: list[None] = []  # one item for each thread in `catch_up`; a list needs no lock
+        # one item for each thread that writes records; a list, because its operations need no lock
+        self._writers: list[None] = []
 
     def count(self, drive: Drive, register: Register[Any], kept: Kept) -> None:
         """Count a write in the ledger before it is sent. Raises WriteForbidden if the budget is used up.

@@ -145,7 +145,7 @@ class RowLayout:
     def refusals(self, count: int) -> None:
         self.c.refusals = count
 
-    refusal = number_at("c.refusal")  # code of the newest exception reply; `refusals` counts these replies
+    refusal = number_at("c.refusal")  # exception code of the drive's newest refusal
     failures = number_at("c.failures")  # number of consecutive exchanges without a good reply
     is_answered = flag_at("c.is_answered")  # whether a good reply came, not only exceptions
 

@@ -85,7 +85,8 @@ class Status(IntEnum):
 
 
 UNASKED = "not "  # the status texts of values that were not requested start with this
-EXCEPTION_STATUS: int = lib.MD_EXCEPTION  # status of an exception, to which its code is added
+# the status of an exception is this number plus the exception's code
+EXCEPTION_STATUS: int = lib.MD_EXCEPTION
 
 _STATUS_OF: dict[int, Status] = {status.value: status for status in Status}
 STATUSES = (
@@ -116,7 +117,7 @@ class Counters(NamedTuple):
     ended: Counter[Status] = Counter()  # exchanges without a reply, by status; broadcasts count as OK
     missed: Counter[Status] = Counter()  # number of missing values, by status
     refused: Counter[int] = Counter()  # number of values missing because of an exception, by its code
-    delays: Counter[int] = Counter()  # number of replies, by the bucket of their response delay
+    delays: Counter[int] = Counter()  # number of replies in each bucket of the histogram of response delays
 
 
 DELAY_BUCKETS: int = lib.MD_DELAY_BUCKETS

@@ -463,11 +463,11 @@ class Port:
     def repeat(self, exchanges: Sequence[Exchange]) -> int:
         """Carry out these exchanges in turn, whenever no queued exchange is due, until the next call.
 
-        Return the index of the exchange that the replaced round would have sent next; 0 on a closed port.
+        Return the index of the exchange that would have come next before this call; 0 on a closed port.
         """
         if self.c is None:
             return 0
-        # keep all exchanges alive: one may still be in flight after a new round has replaced it
+        # keep old exchanges alive too: one may still be in flight after new exchanges have replaced it
         self._memory.lasting.update(exchanges)
         rounds = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
         with self._memory.replacing("round", rounds):

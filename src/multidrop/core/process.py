@@ -94,7 +94,7 @@ class _Act:
                 raise failure
             return found
         finally:
-            del failure  # its traceback refers to this frame: a reference cycle
+            del failure  # avoids a reference cycle: the exception's traceback refers to this frame
 
 
 def undisturbed(function: Callable[P, R]) -> Callable[P, R]:

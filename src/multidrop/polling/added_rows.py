@@ -25,7 +25,7 @@ from multidrop.transport.aside_log import AsideThread, log_aside
 from multidrop.transport.port_identity import is_simulated, of_name
 from multidrop.whole_file import whole_file
 
-# in an event's row this takes the place of the drive name; the kind of event takes that of the register
+# rows of events have this as drive name, and the kind of event as register name
 EVENT = "event"
 COMMENT, OUTAGE, TRIGGER = "comment", "outage", "trigger"  # kinds of events
 # status of a computed channel's row if one of its inputs has no recent row
@@ -178,7 +178,7 @@ class AddedRows:
         outages, self._channels.outages = self._channels.outages, []
         for number, outage in enumerate(outages):
             log_aside(_log, logging.WARNING, "%s", outage)
-            # each event has another time: InfluxDB keeps one row of a series and time
+            # events get different times, because InfluxDB keeps only one row for each series and time
             end_ns = outage.end_ns + number
             # raised if there are too many different event texts: then the outage is only logged
             with suppress(ValueError):
@@ -237,7 +237,7 @@ class TotalsFile:
         self.path = path
         self._thread = AsideThread("multidrop totals")
         self._failure = ""
-        self._waiting: dict[str, Any] | None = None  # the newest totals, until they are written
+        self._waiting: dict[str, Any] | None = None  # the newest totals, if they are not written yet
 
     def read(self) -> dict[str, Any]:
         """Return the kept totals; {} if the file does not exist or is damaged.

@@ -93,10 +93,11 @@ class _WideColumn:
 class WideRows(ArrowTable):
     """Rows by time: columns `time`, `monotonic_ns`, and `drive.register` for each register of each drive.
 
-    Rows of the long form that have the same time to the nanosecond become one row. These are the rows of one
-    request, because the registers of a request share the time at which it was sent. Other values are not
-    joined, filled or interpolated: a row has values for the registers of one request, and null for all
-    others. A miss is also null; only the long form has its reason. Rows are sorted by `monotonic_ns`.
+    Rows of the long form (one row for each value) that have the same time to the nanosecond become one row.
+    These are the rows of one request, because the registers of a request share the time at which it was sent.
+    Other values are not joined, filled or interpolated: a row has values for the registers of one request,
+    and null for all others. A miss is also null; only the long form has its reason. Rows are sorted by
+    `monotonic_ns`.
     """
 
     def __init__(self, rows: Iterable[Row], chosen: Sequence[str] = (), known: Collection[str] = ()) -> None:

@@ -141,13 +141,15 @@ class PolledLine:
         self._maker = JobMaker(bus, names)
         self._queue = PortQueue(self._schedule)
         self._refusals = Refusals(self._schedule, self._maker)
-        self._planned: dict[PolledDrive, PlannedJobs] = {}  # plans, also of removed drives until `forget`
+        # plans of the drives; those of removed drives stay until `forget` is called
+        self._planned: dict[PolledDrive, PlannedJobs] = {}
         self._present: dict[Drive, PolledDrive] = {}  # the drives on the line
         self._since_ns: dict[Drive, int] = {}  # when each drive's polls were last changed
         # by address: the peer of a removed drive, with which an exchange may still be in flight
         self._gone: dict[int, Peer] = {}
         self._polled: list[tuple[Drive, Peer]] = []  # the present drives that have jobs
-        self._observed: list[tuple[int, int, bool]] = []  # the last observation of each drive in `_polled`
+        # failures, late replies and whether it has answered, for each drive in `_polled`
+        self._observed: list[tuple[int, int, bool]] = []
         self._is_started = False
         self._learnt_ns = 0
         # After reopening, send the next request at once: some servers close a connection that stays idle.

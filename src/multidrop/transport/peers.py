@@ -73,7 +73,7 @@ class Peers:
     def __init__(self, line: Line) -> None:
         self._line = line
         self.present: dict[Drive, Peer] = {}  # peers of the drives that are on the line now
-        self._asked: dict[object, Peer] = {}  # by exchange that a thread carries out: its peer
+        self._asked: dict[object, Peer] = {}  # the peer of each exchange that a thread is carrying out
         # Peers of present and removed drives, by the drive's address and description.
         self._known: dict[tuple[int, *tuple[object, ...]], Peer] = {}
 

@@ -165,7 +165,8 @@ class PreparedReads:
         self.of = of
         self.newest = NOTHING  # the plan that was used last; to use it again, no registers are hashed
         self.prepare = prepare
-        self.parts: dict[Block, tuple[Block, ...]] = {}  # smaller blocks to read instead of a block
+        # by block that the drive does not answer as a whole: the smaller blocks to read instead
+        self.parts: dict[Block, tuple[Block, ...]] = {}
         # blocks that may be too long for the drive, but that it has answered
         self.answered: set[Block] = set()
 
