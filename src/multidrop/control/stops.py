@@ -80,7 +80,7 @@ class StopAttempt:
         self._seconds = seconds
         self._make = script
         self.times_sent = 0  # number of stops sent, including those that the drive refused
-        self._unanswered = 0  # steps without a good reply
+        self._unanswered = 0  # number of steps without a good reply
         self.is_over = False
         self.ended = begun  # time in s at which the attempt ended
         # SystemExit or similar, raised by the script; kept until all stops are over
@@ -244,7 +244,7 @@ class StopAttempt:
         """
         self._begin()
         is_written = False
-        with suppress(Exception):  # includes StopIteration, the script's end
+        with suppress(Exception):  # any failure, or StopIteration at the script's end
             for _ in range(MOST_STEPS):
                 step = self._next_step()
                 if isinstance(step, Wait):

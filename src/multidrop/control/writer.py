@@ -216,7 +216,7 @@ class Writer:
     def _outcome(
         self, drive: Drive, register: Register[Any], asked: Any, completion: Completion, call: Call | None
     ) -> Outcome:
-        """Return the outcome according to the reply and the value read back."""
+        """Return the outcome of a write, from its reply and the value read back."""
         lost: BusError | None = None
         held, unread = None, None
         try:

@@ -108,7 +108,10 @@ class Decoder:
         return Framing(self._c.span.framing), from_c(self._c.span.message)
 
     def know(self, block: RowLayout | None) -> bool:
-        """Store the layout of replies to that request (None: no rows); return False if the table is full."""
+        """Store the layout of replies to the `asked` request; return False if the table is full.
+
+        If `block` is None, the replies to this request make no rows.
+        """
         if block:
             self._blocks.append(block)
         c = block.c if block else ffi.NULL

@@ -96,7 +96,7 @@ class Field(NamedTuple):
 
 @lru_cache(maxsize=1024)
 def _shared(fields: tuple[Field, ...]) -> tuple[Any, Any]:
-    """Return C arrays of the fields and their extras, cached because all drives of a model share them."""
+    """Return C arrays of the fields and their `Extra`s, cached because all drives of a model share them."""
     extras = list(dict.fromkeys(field.extra for field in fields if field.extra is not None))
     places = {extra: place for place, extra in enumerate(extras, 1)}
     return (
@@ -147,7 +147,7 @@ class RowLayout:
 
     refusal = number_at("c.refusal")  # exception code of the drive's newest refusal
     failures = number_at("c.failures")  # number of consecutive exchanges without a good reply
-    is_answered = flag_at("c.is_answered")  # whether a good reply came, not only exceptions
+    is_answered = flag_at("c.is_answered")  # whether a good reply has come so far, not only exceptions
 
     def forget(self) -> None:
         """Reset `refusals`, `failures` and `is_answered`, as before the first exchange."""

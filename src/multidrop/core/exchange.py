@@ -186,8 +186,9 @@ class Completion:
         self.numbers = memoryview(ffi.buffer(self.values)).cast("d") if room else _NO_NUMBERS
 
     result = number_at("c.result")  # > 0: length of the reply; 0: a broadcast; < 0: a Failure or FrameFault
-    error = number_at("c.error")  # the errno of a lost line, or the mask of refused settings (REFUSALS)
-    begun_ns = number_at("c.begun_ns")  # start of the exchange's turn
+    # errno if the line was lost; mask of the refused settings (REFUSALS) if the port refused any
+    error = number_at("c.error")
+    begun_ns = number_at("c.begun_ns")  # when the exchange's turn on the line started
     sent_ns = number_at("c.sent_ns")  # when the request was sent; 0: never
     first_ns = number_at("c.first_ns")  # when the first byte after the request arrived; 0: none came
     last_ns = number_at("c.last_ns")  # when the last byte arrived; 0: none came
@@ -371,7 +372,7 @@ class Exchange:
     ) -> None:
         least, most = answer or (0, -1)  # (0, -1): any raw value is accepted
         frame = build_request(framing, request)
-        # not stored if longer: the core then builds the frame for each exchange
+        # a longer frame is not stored: the core builds it for each exchange
         kept = frame if len(frame) <= lib.MD_KEPT_FRAME else b""
         self.framing = framing
         self.request = request

@@ -128,7 +128,7 @@ class KeptLine:
         self.line.bus.part_with(self.leaving, [one for one in self.leaving if one.address not in taken])
 
     def let_leave(self, names: Collection[str]) -> None:
-        """Remove the drives that leave. Of drives in `names`, first wait for the last exchange to end."""
+        """Remove the drives that leave, and wait for the last exchange of each whose name is in `names`."""
         for drive in self.leaving:
             self.line.remove(drive)
             self.line.forget(drive)

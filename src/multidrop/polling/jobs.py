@@ -16,7 +16,7 @@ from multidrop.planning.schedule import Job, Schedule, Turn
 from multidrop.plant.model import PolledDrive
 from multidrop.transport.prepared import make_read
 
-MOST_NAMES = 1 << 16  # limit of the uint16 name codes
+MOST_NAMES = 1 << 16  # number of names that uint16 codes can distinguish
 
 
 class RowNames:
@@ -51,7 +51,7 @@ class RowNames:
 
 @dataclass(eq=False, kw_only=True)
 class PolledJob(Job):
-    """A job of the schedule, with its exchange and the layout of its rows."""
+    """A job of the schedule (a block that is polled), with its exchange and the layout of its rows."""
 
     owner: Drive
     block: Block
@@ -170,9 +170,10 @@ class PortQueue:
         self._schedule = schedule
         self.port: Port | None = None
         self._done = 0  # number of the port's completed exchanges, as of the last `conclude`
-        self._queued: deque[Turn[PolledJob]] = deque()  # turns that the core has not carried out yet
+        # queued turns (exchanges of jobs) that the core has not carried out yet
+        self._queued: deque[Turn[PolledJob]] = deque()
         self._ahead_ns = 0  # total duration of the queued turns
-        self._newest: Turn[PolledJob] | None = None  # the last turn carried out
+        self._newest: Turn[PolledJob] | None = None  # the last turn that was carried out
         self._cycle: list[PolledJob] = []  # the jobs of the bus cycle that the core repeats
 
     @property

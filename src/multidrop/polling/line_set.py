@@ -190,7 +190,7 @@ class LineSet:
 
     @contextmanager
     def tended(self) -> Iterator[None]:
-        """In the `with` block, the poller reopens lost ports; after it, stops reopen them."""
+        """In the `with` block, the poller reopens lost ports. After the block, stops reopen them."""
         try:
             yield
         finally:

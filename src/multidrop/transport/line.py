@@ -416,7 +416,7 @@ class Line:
         return now_ns if (core := self.queue) is None else min(now_ns, core.counted_ns())
 
     def overruns(self) -> int | None:
-        """Return the number of overruns since the driver was loaded; None if it is unknown."""
+        """Return how many received characters the UART has lost (overruns); None if that is unknown."""
         return self._opened.overruns()
 
     @property

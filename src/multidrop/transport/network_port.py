@@ -27,7 +27,7 @@ from multidrop.transport.aside_log import log_aside, traceback_of
 
 
 class SocketPort(Serial):
-    """pyserial's port for socket://, with a faster `close`: pyserial's sleeps for 300 ms."""
+    """pyserial's port for socket://, with a faster `close`: pyserial's own method sleeps for 300 ms."""
 
     _socket: socket.socket | None = None
 
@@ -40,7 +40,7 @@ class SocketPort(Serial):
             connection.close()
 
     def reset_input_buffer(self) -> None:
-        """Discard received bytes. pyserial's own uses `select`, which fails for descriptors above 1023."""
+        """Discard received bytes. pyserial's own method uses select, which fails above descriptor 1023."""
         with suppress(BlockingIOError):
             while self._socket and self._socket.recv(4096):
                 pass

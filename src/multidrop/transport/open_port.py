@@ -51,7 +51,10 @@ _OVERRUN, _BUF_OVERRUN = 7, 10
 
 
 def overruns(fd: int) -> int:
-    """Return the number of overruns since the driver was loaded. Raises OSError if it is not counted."""
+    """Return how many received characters the UART has lost (overruns) since its driver was loaded.
+
+    Raises OSError if the driver does not count them.
+    """
     if sys.platform != "linux":
         raise OSError("only Linux counts overruns")
     import fcntl  # Windows lacks this module
@@ -206,7 +209,7 @@ def failing_refusals(device: str) -> int:
 
 TOLERANCE = 0.02  # greatest relative error of a baud rate that the core and the kernel accept
 CLOSING_S = 0.75  # s; longest time that closing a port waits for the adapter to take the driver's bytes
-_UNNOTICED_S = 0.05  # s; time in which a healthy adapter takes all bytes
+_UNNOTICED_S = 0.05  # s; a healthy adapter takes all bytes of the driver within this time
 BY_PLACE = "/dev/serial/by-path/"  # links whose names state the USB socket, not the adapter
 _NO_SETTINGS = -1
 _TRANSACTIONS = {TransactionIds.MATCH: Transactions.MATCHED, TransactionIds.IGNORE: Transactions.IGNORED}
@@ -411,7 +414,7 @@ class OpenPort:
         )
 
     def overruns(self) -> int | None:
-        """Return the number of overruns since the driver was loaded; None if unknown or while closed."""
+        """Return how many characters the UART has lost (overruns); None if unknown or while closed."""
         try:
             return None if self.bridge or not self._serial else overruns(self._serial.fileno())
         except (*PORT_FAILURES, TypeError, AttributeError):  # another thread may close the port meanwhile

@@ -191,7 +191,8 @@ class LineStatistics(Statistics):
     def since(self, earlier: LineStatistics) -> LineStatistics:
         """Return the statistics of the time since `earlier`, an earlier reading of this line.
 
-        A line or drive with another epoch than in `earlier` was reset or replaced: it counts from zero.
+        An epoch is a number that changes at each reset. A line or drive whose epoch differs from that in
+        `earlier` was reset or replaced: it counts from zero.
         """
         if self.epoch != earlier.epoch:
             return self
@@ -324,7 +325,7 @@ class LineMeter:
             counted = sum(counters.exchanges for counters in counters_by_drive.values())
             if counted == sum(
                 peer.exchanges for peer in peers.values()
-            ):  # no exchange ended between the readings
+            ):  # no exchange ended between the two readings of its counters
                 break
         seconds, counted_s = ((at_ns - self._opened_ns) / 1e9 for at_ns in (now_ns, counted_ns))
         epochs = {name: peer.number for name, peer in peers.items()}
