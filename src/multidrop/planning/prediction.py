@@ -26,7 +26,7 @@ from multidrop.planning.schedule import TURN_SHARE, Job, Schedule
 LATENESS = 100e-6  # s that a typical computer adds to each exchange, to wake up and to write
 ENOUGH = 0.97  # a rate counts as reached from this fraction of the wanted rate on
 LEAST_EXCHANGES = 1000  # least number of simulated exchanges
-LEAST_ROUNDS = 3  # least number of simulated exchanges of each job
+LEAST_ROUNDS = 3  # least number of simulated exchanges per job
 FAR_NS = 1 << 62
 
 
