@@ -22,7 +22,7 @@ enum md_side {
 /* A ring buffer with one writer and one reader. It is empty if all fields except `ring` and `room` are 0. */
 struct md_tap {
     uint8_t *ring;
-    uint32_t room;       /* bytes, a power of two */
+    uint32_t room;       /* size of `ring` in bytes, a power of two */
     uint32_t put, taken; /* bytes written and read so far, modulo 2^32; each is changed by one thread */
     uint64_t lost;       /* bytes dropped because the ring was full */
     int64_t ahead_ns;    /* UTC - CLOCK_MONOTONIC for the next bytes; 0: use md_tap_take()'s argument */
@@ -59,7 +59,7 @@ struct md_stream {
     uint8_t *bytes;
     struct md_piece *pieces;
     size_t len, room, count, most; /* number and limit of bytes; number and limit of pieces */
-    int is_all;                    /* no more bytes will come */
+    int is_all;                    /* 1: no more bytes will come */
     int is_tcp;                    /* 1: all frames are Modbus TCP; 0: no frame is */
 };
 

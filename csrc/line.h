@@ -128,8 +128,8 @@ struct md_slot {
 /* An urgent request; it lives on the stack of its waiting caller. */
 struct md_urgent {
     const struct md_exchange *exchange;
-    int64_t not_before_ns; /* earliest time to send it; 0: immediately */
-    int64_t expires_ns;    /* latest time to send it, by CLOCK_BOOTTIME; 0: no limit */
+    int64_t not_before_ns; /* earliest time to send the request; 0: immediately */
+    int64_t expires_ns;    /* latest time to send the request, by CLOCK_BOOTTIME; 0: no limit */
     struct md_completion *completion;
     struct md_urgent *next;
     int is_done;
@@ -140,7 +140,8 @@ struct md_before {
     const struct md_exchange *then; /* the exchange itself */
     uint64_t replies;               /* the drive's reply count before the last proof */
     uint32_t proofs, is_probed;     /* number of proofs sent; 1: the echo probe was sent */
-    uint32_t failures;              /* the drive's failures before the first of these requests */
+    /* the drive's number of failures before the first request was sent ahead */
+    uint32_t failures;
 };
 
 struct md_turn {
@@ -157,7 +158,7 @@ struct md_turn {
     struct md_before before;
     struct md_row_queue *row_queue;
     uint32_t number; /* the port's number in row_queue */
-    struct md_progress progress; /* each counter has one writer; readers use atomics */
+    struct md_progress progress; /* each counter is written by one thread; readers use atomics */
     struct md_line line;
     struct md_completion completion;
 };
@@ -235,7 +236,7 @@ struct md_ending md_reply_missed(struct md_line *line, int64_t now_ns);
 /* Find late replies among stray bytes, from index `from` on. The search for the reply starts after them. */
 void md_reply_find_late(struct md_line *line, size_t from, int64_t now_ns);
 
-/* Return 1 if the reply at `at` ends the exchange; 0 if that reply was late and was cut out. */
+/* Return 1 if the reply at `at` ends the exchange; 0 if it was late and was removed from rx. */
 int md_reply_judge(struct md_line *line, size_t at, int used, const struct md_message *reply, int64_t now_ns,
                    struct md_ending *ending);
 void md_reply_accept(struct md_line *line, size_t at, int used, const struct md_message *reply);
@@ -248,7 +249,8 @@ void md_reply_cut_out(struct md_line *line, size_t at, size_t len);
 /* Return the transmission time of a frame on the drive's own wire, which may be behind a gateway. */
 static inline int64_t md_wire_ns(const struct md_exchange *exchange, int64_t len)
 {
-    enum { LONGER_THAN_RTU = 4 }; /* six more bytes for the header, two fewer for the CRC */
+    /* a Modbus TCP frame has six more bytes for the header, and two fewer for the CRC */
+    enum { LONGER_THAN_RTU = 4 };
     return (exchange->framing == MD_TCP ? len - LONGER_THAN_RTU : len) * exchange->character_ns;
 }
 
@@ -307,7 +309,7 @@ void md_late_expect(struct md_line *line, int64_t window_ns);
 /* The drive's first reply may have been to another process's request. So record that the reply to this
  * process's request may still come. */
 void md_late_doubt(struct md_line *line);
-/* Add a drive with outstanding requests to the line's list. */
+/* Add a drive with outstanding requests to the line's list of drives whose late replies may still come. */
 void md_late_link(struct md_line *line, struct md_drive *drive);
 /* Settle the earliest outstanding request that the reply at `at` fits. Return the reply's length,
  * MD_INCOMPLETE or MD_NO_START. If the reply also fits the exchange in flight, pass `since_ns`: it is set to

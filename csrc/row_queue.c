@@ -21,7 +21,7 @@ struct md_row_queue {
     size_t lent;                /* number of chunks that clients hold, plus ports that report to the queue */
     int is_done;                /* the client has freed the queue */
     uint64_t dropped;
-    uint64_t called[WORDS];     /* a bit for each called number */
+    uint64_t called[WORDS];     /* one bit for each port number that was called */
     uint32_t calls;             /* number of bits that are set in `called` */
 };
 

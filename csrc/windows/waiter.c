@@ -72,7 +72,7 @@ int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t tim
     do {
         ended = WaitForMultipleObjectsEx(count, waiter->objects, FALSE, most, TRUE);
         n += md_files_ready(ready + n, most_files - n);
-    } while (ended == WAIT_IO_COMPLETION && !n && most); /* only a write has completed */
+    } while (ended == WAIT_IO_COMPLETION && !n && most); /* wait again if only a write has completed */
     if (ended == WAIT_OBJECT_0 + WAKEUP)
         ready[n++] = NULL;
     return n;

@@ -325,12 +325,12 @@ def test_widening_reads_only_valid_numbers() -> None:
     floats = struct.pack("<4f", 7.0, float("nan"), float("inf"), 1e30)
     assert list(widen(memoryview(floats), memoryview(b"\x01"), 4).cast("q")) == [7, 0, 0, 0]
     for bit in (2, 4, 8):
-        with pytest.raises(ValueError, match="an uncertainty is not a number"):
+        with pytest.raises(ValueError, match="an uncertainty is not a finite number"):
             widen(memoryview(floats), memoryview(bytes([bit])), 4)
     for cut in (floats[:15], b""):
-        with pytest.raises(ValueError, match="stated lengths do not match the data"):
+        with pytest.raises(ValueError, match="stated length of a column does not match its data"):
             widen(memoryview(cut), None, 4)
-    with pytest.raises(ValueError, match="stated lengths do not match the data"):
+    with pytest.raises(ValueError, match="stated length of a column does not match its data"):
         widen(memoryview(floats), memoryview(b""), 4)
 
 
@@ -348,7 +348,7 @@ def test_one_byte_codes_are_assigned_in_the_order_of_use() -> None:
 def test_one_byte_codes_are_widened_to_two_bytes() -> None:
     assert list(wide_codes(memoryview(bytes([0, 255, 7])), 3, 1)) == [0, 255, 7]
     assert list(wide_codes(memoryview(b"x" + struct.pack("=2H", 1, 65535))[1:], 2, 2)) == [1, 65535]
-    with pytest.raises(ValueError, match="stated lengths do not match the data"):
+    with pytest.raises(ValueError, match="stated length of a column does not match its data"):
         wide_codes(memoryview(b"123"), 2, 2)
 
 

@@ -83,12 +83,12 @@ def typed_value(register: Register[Any], value: float | str) -> Any:
 
 
 def stop_drive(drive: Drive, seconds: float | None) -> Results:
-    """Stop one drive; return a dict of the result by the drive's name."""
+    """Stop one drive; return a dict that maps the drive's name to the result."""
     return stop_drive_by("stop", drive, seconds)
 
 
 def stop_drive_by(verb: str, drive: Drive, seconds: float | None) -> Results:
-    """Stop one drive with this verb, such as `coast`; return a dict of the result by the drive's name."""
+    """Stop one drive with this verb, such as `coast`; return a dict that maps its name to the result."""
     try:
         return {drive.name: getattr(drive, verb)(seconds=seconds)}
     except Exception as failure:  # any failure: the result reports it to the caller

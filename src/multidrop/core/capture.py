@@ -61,7 +61,7 @@ class Stream:
         """Append bytes received at `time_ns`. If `after_pause` is True, a frame probably starts here."""
         piece = {"time_ns": time_ns, "side": side, "is_after_pause": after_pause}
         if not lib.md_stream_put(self.c, received, len(received), ffi.new("struct md_piece *", piece)[0]):
-            raise BufferError("the stream is full: split it first")
+            raise BufferError("the stream is full: take its frames with Splitter.spans first")
 
     def end(self, is_end: bool) -> None:
         """Set whether the stream is complete; if it is, an incomplete frame at its end becomes junk."""

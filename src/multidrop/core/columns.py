@@ -334,18 +334,18 @@ def widen(
     Raises ValueError if a number is not finite or too large.
     """
     if len(numbers) < 4 * rows or (valid is not None and len(valid) < (rows + 7) // 8):
-        raise ValueError("the stated lengths do not match the data")
+        raise ValueError("the stated length of a column does not match its data")
     out = ffi.new("int64_t[]", max(rows, 1))
     bits = ffi.NULL if valid is None else ffi.from_buffer("uint8_t[]", valid)
     if lib.md_widen(_copy("float[]", numbers[: 4 * rows], 4), bits, rows, out):
-        raise ValueError("an uncertainty is not a number")
+        raise ValueError("an uncertainty is not a finite number that fits int64")
     return memoryview(ffi.buffer(out, 8 * rows))
 
 
 def wide_codes(codes: bytes | memoryview[Any], rows: int, size: int) -> memoryview[Any]:
     """Return codes of `size` bytes (1 or 2) as uint16."""
     if len(codes) < rows * size:
-        raise ValueError("the stated lengths do not match the data")
+        raise ValueError("the stated length of a column does not match its data")
     if size == 2:
         out = _copy("uint16_t[]", codes[: 2 * rows], 2)
     else:
