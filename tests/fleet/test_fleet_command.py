@@ -255,7 +255,7 @@ async def test_an_interrupted_stop_reports_that_its_outcome_is_unknown(
             return self
 
         async def __aexit__(self, *error: object) -> None:
-            """Do nothing."""
+            pass
 
         async def stop(self, *what: object, **more: object) -> None:
             task = asyncio.current_task()

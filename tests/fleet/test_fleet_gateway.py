@@ -253,17 +253,17 @@ def test_a_view_older_than_5_s_makes_the_part_fleet_unhealthy() -> None:
         now[0] += seconds
         return part.health()
 
-    assert health_after(0) == "it was never read: the first read is in progress"
+    assert health_after(0) == "the fleet was never read: the first read is in progress"
     view.failure = OSError("no server")
     asyncio.run(watch.look())
-    assert health_after(0) == "it was never read: no server"
+    assert health_after(0) == "the fleet was never read: no server"
     view.failure = None
     asyncio.run(watch.look())
     assert health_after(5) == ""
-    assert health_after(1) == "it was read 6 s ago: the first read is in progress"
+    assert health_after(1) == "the fleet was read 6 s ago: the first read is in progress"
     view.failure = OSError("no server")
     asyncio.run(watch.look())
-    assert health_after(0) == "it was read 6 s ago: no server"
+    assert health_after(0) == "the fleet was read 6 s ago: no server"
     assert watch.state()["age_s"] == 6.0
 
 
@@ -361,7 +361,7 @@ def test_the_page_cannot_stop_the_fleet_without_a_commanders_key_or_servers(tmp_
 def test_missing_fleet_servers_are_reported_on_the_page(tmp_path: Path) -> None:
     [port] = free_ports(1)
     with served(tmp_path, f'[serve.fleet]\nnats = ["nats://127.0.0.1:{port}"]\n') as gateway:
-        wanted = f"it was never read: no NATS server can be reached at nats://127.0.0.1:{port}"
+        wanted = f"the fleet was never read: no NATS server can be reached at nats://127.0.0.1:{port}"
         until(lambda: wanted == gateway.get("/health").json["parts"]["fleet"])
         assert gateway.get("/api/fleet").json["age_s"] is None
         assert gateway.frame()["drives"]  # the gateway's own drives are still shown

@@ -147,7 +147,7 @@ class FleetPart:
         age = self._watch.age_s
         if age is not None and age <= OLD_S:
             return self.source.health() if self.source is not None else ""
-        seen = "it was never read" if age is None else f"it was read {age:.0f} s ago"
+        seen = "the fleet was never read" if age is None else f"the fleet was read {age:.0f} s ago"
         return f"{seen}: {self._watch.trouble or 'the first read is in progress'}"
 
     def state(self) -> dict[str, Any]:

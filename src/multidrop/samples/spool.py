@@ -54,7 +54,7 @@ class StoredMessage(NamedTuple):
 
     sequence: int
     rows: int
-    size: int  # size of the file in bytes
+    size: int
     path: Path
 
 
@@ -336,7 +336,7 @@ class Spool:
             _log.exception("%d rows could not be packed", buffer.rows)
             with self._changing:
                 self._taken -= buffer.rows
-                self._lose(buffer.rows, "they could not be packed")
+                self._lose(buffer.rows, "they could not be packed into a message")
 
     def _is_due(self) -> bool:
         if self._over or self._packed or (self._waiting and self._wanted > self._written):

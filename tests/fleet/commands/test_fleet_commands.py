@@ -316,7 +316,7 @@ def test_a_command_whose_preview_has_changed_is_not_sent(tmp_path: Path) -> None
 
     told = asked(tmp_path, path, agreed)
     assert told.outcome is NOT_SENT
-    assert "the plant has changed, and it would be pump-1: frequency = 20.00 Hz now" in told.text
+    assert "the plant has changed, and the command would be pump-1: frequency = 20.00 Hz now" in told.text
     assert path.asked == ["cmd"]
 
 

@@ -262,7 +262,7 @@ async def test_a_late_answer_to_an_ended_session_does_not_count_for_the_next_ses
 
 
 async def test_a_process_suspended_before_it_sets_the_timer_survives() -> None:
-    """The deadline has passed when the timer is set, so the engine refuses it: it would kill the process."""
+    """The engine refuses a timer whose deadline has passed, because it would kill the process."""
 
     class StandingStill(RecordingMastership):
         def extend(self, until_ns: int) -> None:
@@ -454,7 +454,7 @@ def test_a_machine_without_a_machine_id_or_boot_id_has_no_id(
 # ---- observers ----
 
 
-async def test_a_dead_session_is_ended_after_a_lease_by_the_observers_clock() -> None:
+async def test_an_observer_ends_a_dead_session_when_its_own_clock_shows_the_expiry() -> None:
     trial, _ = await begun()
     observer = trial.observer()
     trial.clock.pass_s(100)  # an observer that starts late cannot know when the lease record was written

@@ -212,7 +212,7 @@ async def test_lines_that_a_gateway_cannot_open_move_to_others_and_return_later(
     async with gateways(fleet, "a", "b", "c", terms=LONG) as running:
         await until(running.are_shared, "shares")
         ports = {name: Ports(member) for name, member in running.members.items()}
-        a, b, c = (running.members[name] for name in "abc")  # sorted by name
+        a, b, c = (running.members[name] for name in "abc")
         ports["a"].is_cut = True
         await until(lambda: len(b.polled) + len(c.polled) == len(LINES), "others have those of a")
         assert a.lease.is_valid
@@ -468,7 +468,7 @@ def test_a_gateway_whose_lease_record_has_no_rules_version_is_incompatible(trial
     assert trial.trouble == SENTENCE.format("first")
 
 
-def test_a_killed_incompatible_gateway_counts_for_at_most_its_lease(trial: Trial) -> None:
+def test_a_killed_incompatible_gateway_is_ignored_once_its_lease_has_expired(trial: Trial) -> None:
     trial.begin("older", RULES - 1)
     assert trial.trouble
     trial.clock.now += USUAL.lease - 1

@@ -71,7 +71,7 @@ class SlowLines:
         self.is_going = False
 
     async def take(self, line: str, description: Any) -> None:
-        """Do nothing."""
+        pass
 
     async def let_go(self, line: str) -> None:
         self.is_going = True

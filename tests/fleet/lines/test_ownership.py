@@ -105,7 +105,7 @@ CASES = {
 
 
 @table("case", CASES)
-def test_a_gateway_claims_and_releases_the_expected_lines_in_each_case(case: str) -> None:
+def test_claims_and_releases_follow_from_the_owners_in_the_records(case: str) -> None:
     found, wanted = CASES[case]
     assert found == wanted
 

@@ -245,7 +245,7 @@ def test_after_a_successful_trial_the_other_reported_lines_are_tried_at_once() -
 
 
 def test_a_gateway_tries_its_own_reported_lines_first() -> None:
-    """A trial of a line that is assigned to another gateway would not bring the line back."""
+    """If it tried a line that is assigned to another gateway, it would not get the line back."""
     clock = HandClock()
     unopened = UnopenedLines(clock)
     for line in "abcd":

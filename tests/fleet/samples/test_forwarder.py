@@ -240,7 +240,7 @@ async def test_a_stream_that_refuses_messages_is_logged_once(
     spool.close()
     assert [record.getMessage() for record in caplog.records] == [
         "samples are not forwarded: the stream 'samples' refuses a message: no room",
-        "samples are forwarded again, behind message 1",
+        "samples are forwarded again, after message 1",
     ]
 
 
@@ -300,7 +300,7 @@ async def test_forwarding_continues_after_an_outage(tmp_path: Path, caplog: pyte
     told = [record.getMessage() for record in caplog.records if "forwarder" in record.name]
     assert told[0].startswith("samples are not forwarded: ")
     # The servers may have stored message 4 before they ended, without answering.
-    assert re.fullmatch("samples are forwarded again, behind message [34]", told[-1])
+    assert re.fullmatch("samples are forwarded again, after message [34]", told[-1])
 
 
 @pytest.mark.slow

@@ -277,7 +277,7 @@ def test_init_warns_if_this_computers_clock_differs_from_the_servers(
     asyncio.run(_check(fleet))
     [said] = caplog.messages
     assert words in said
-    assert said.endswith("set it, because samples have its time")
+    assert said.endswith("set it, because samples get its time")
 
 
 async def _check(fleet: Cluster) -> None:

@@ -184,9 +184,9 @@ class CommandDesk:
         if offer.why_void:
             return offer.why_void
         if self._lines.for_command(line) is not offer.held:
-            return f"since the offer line {line} was released, or its plant has changed"
+            return f"line {line} was released, or its plant has changed, since the offer"
         if self._under_way[line] > MOST_WRITES:
-            return f"{MOST_WRITES} others are under way on line {line}"
+            return f"{MOST_WRITES} other commands are under way on line {line}"
         return self.offers.why_late(offer)
 
     async def _note(self, offer: Offer, step: str, more: Mapping[str, Any]) -> None:
@@ -240,7 +240,9 @@ class StopDesk:
             return None
         request, why_all = read_stop(data)
         if why_all:
-            _log.warning("a stop is one of all drives of line %s, because %s", line, why_all)
+            _log.warning(
+                "all drives of line %s are stopped, because a stop message is damaged: %s", line, why_all
+            )
         if request.drives is not None:
             request = request._replace(drives=tuple(drive_meant(one, held.drives) for one in request.drives))
         key = (held.number, sha256(data).digest() if request.id else object())
@@ -308,7 +310,7 @@ class StopDesk:
         try:
             await self._log.note(record)
         except Exception as failure:
-            _log.warning("a stop is not in the log of commands: %s", failure)
+            _log.warning("a stop was not written to the log of commands: %s", failure)
 
 
 # ---- NATS ----

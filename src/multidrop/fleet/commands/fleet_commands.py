@@ -128,7 +128,7 @@ class FleetCommands:
         if isinstance(offered, CommandAnswer):
             answer = offered
         elif agreed and offered.text != agreed:
-            why = f"{agreed} was not sent: the plant has changed, and it would be {offered.text} now"
+            why = f"{agreed} was not sent: the plant has changed, and the command would be {offered.text} now"
             answer = CommandAnswer(CommandOutcome.NOT_SENT, why)
         else:
             answer = await self._do(offered)
@@ -307,7 +307,11 @@ class FleetCommands:
         try:
             await self._log.note({**more, **record})
         except OSError as failure:
-            _log.warning("not noted in %s: %s", self._log.path, failure.strerror or failure)
+            _log.warning(
+                "a record of a command or stop was not written to %s: %s",
+                self._log.path,
+                failure.strerror or failure,
+            )
 
 
 # ---- stops that wait for a master ----

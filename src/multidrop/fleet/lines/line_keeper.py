@@ -98,7 +98,7 @@ class LineKeeper:
         self.lines = lines
         self.polled: dict[str, TakenLine] = {}
         self.troubles: dict[str, str] = {}  # by line: why the line could not be opened
-        # by line that is no longer polled: how its port was lost
+        # how the port was lost, by line; only lines that are no longer polled
         self.lost: dict[str, str] = {}
         self.unopened = UnopenedLines(lambda: lease.clock())
         self.releasing: set[str] = set()  # this gateway's lines that it must release to other gateways
@@ -331,7 +331,7 @@ class OwnerRecords:
         return votes >= NEEDED
 
     def doubted(self, line: str) -> set[str]:
-        """Return the buckets to which a release of this line was sent without a known outcome."""
+        """Return the buckets to which this line's release was sent, if its outcome is unknown."""
         return {
             bucket
             for bucket, record in self._records.of(line).items()

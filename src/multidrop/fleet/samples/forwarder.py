@@ -143,7 +143,7 @@ class Forwarder:
         if trouble and trouble != self.trouble:
             _log.error("samples are not forwarded: %s", trouble, exc_info=cause)
         if self.trouble and not trouble:
-            _log.warning("samples are forwarded again, behind message %s", self.last)
+            _log.warning("samples are forwarded again, after message %s", self.last)
         self.trouble = trouble
 
 

@@ -121,7 +121,7 @@ class HubState(NamedTuple):
     behind: int  # messages in the stream that are not stored yet
     rows: int
     alarms: int
-    missing: int  # number of missing messages
+    missing: int
     doubled: int  # number of repeated messages, which are ignored
     trouble: str | None
 

@@ -156,7 +156,7 @@ async def compact_for_ever(folder: Path, every: float = EVERY_S) -> None:
     A child process of low priority does the work. It may be killed at any time.
     """
     if importlib.util.find_spec("duckdb") is None:
-        _log.warning("files are not merged: that needs duckdb: %s", install_command("history"))
+        _log.warning("files are not merged, because duckdb is not installed: %s", install_command("history"))
         await asyncio.Event().wait()
     words = ["-m", "multidrop.history.compact", str(folder), "--below", "0", "--merge-rows"]
     while True:

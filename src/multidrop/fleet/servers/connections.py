@@ -61,7 +61,7 @@ MOST_SILENCE_S = 1.0  # limit of the wait before a repeat, because requests time
 FORGET = 0.97
 # Limit of saved repeats: twice as many as are needed until servers notice a dead route (3 s).
 MOST_REPEATS = 300.0
-EARNED = 0.5  # number of repeats that the budget gains by each timely answer
+EARNED = 0.5  # each timely answer allows this many further repeats
 
 _log = logging.getLogger("multidrop.fleet")
 
@@ -76,7 +76,7 @@ class ServerPath:
         self._full = dict(zip(self.urls, urls, strict=True))  # URLs with users and passwords, by masked URL
         self.url = ""  # URL of the present server
         self.others: Sequence[ServerPath] = ()  # the other connections of this process, for repeated reads
-        self.budget = RepeatBudget()  # shared by all connections of this process
+        self.budget = RepeatBudget()  # limits repeated reads; shared by all connections of this process
         self._options = options or {}
         self._pong_s = pong_s
         self._client: BatchClient | None = None
@@ -304,7 +304,7 @@ async def _close(client: BatchClient) -> None:
 
 
 def _abort(client: BatchClient) -> None:
-    """Close the client's socket, and end tasks that nats-py leaves if cancelled or without its server."""
+    """Close the client's socket, and end the tasks that nats-py does not end itself."""
     for subscription in client._subs.values():
         subscription._stop_processing()
     reading = client._reading_task

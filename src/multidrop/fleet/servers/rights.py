@@ -56,8 +56,8 @@ LAST_ANSWER = "10s"  # how long the server forwards further answers to one reque
 ANSWER = '{ max: 1, expires: "1m" }'  # limits of answers to one request; a stop of many drives may take long
 _STORED = ("$JS.", "$KV.", f"{STREAM}.")
 _MANY = "$JS.API.DIRECT.GET."  # prefix of JetStream requests that get several answers
-# Without this import, a server answers every JetStream request in a user's account with "not enabled".
-# No user has the right to send this request.
+# A request that each account imports but no user may send: without the import, a server answers every
+# JetStream request in the account with "not enabled".
 _INFO = "$JS.API.INFO"
 CLUSTER = "multidrop"
 # a server's port for routes to other servers is its client port plus this, such as 6222 for 4222
