@@ -461,7 +461,7 @@ def test_invalid_moves_in_a_gateways_answer_are_ignored(moves: Any) -> None:
     assert found["gateways"]["gw-1"]["says"] == STATE
 
 
-def test_a_gateway_whose_session_was_ended_by_others_is_listed_as_missing() -> None:
+def test_a_gateway_whose_session_another_gateway_ended_is_listed_as_missing() -> None:
     now_ms = time.time_ns() // 1_000_000
     made = view()
     died = {  # by gateway: its newest record in each lease bucket, and whether the gateway counts as missing

@@ -479,7 +479,7 @@ def test_no_order_of_renewals_and_takeovers_gives_two_masters() -> None:
 
 
 @pytest.mark.nightly
-def test_no_order_of_steps_gives_two_masters_with_a_longer_lease() -> None:
+def test_no_order_of_renewals_and_takeovers_of_longer_leases_gives_two_masters() -> None:
     states, wrong = LeaseModel(WHOLE).search()
     assert wrong is None
     assert states > 500_000

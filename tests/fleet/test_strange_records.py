@@ -83,7 +83,7 @@ def test_a_valid_record_may_have_fields_of_a_newer_version(
     assert parsed(bucket, key, b"") == (None, "")  # empty: the record was removed
 
 
-async def test_an_invalid_record_is_logged_once_and_others_are_read(
+async def test_an_invalid_record_is_logged_once_and_valid_records_are_read(
     one: Cluster, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with connected_path(one) as path:
@@ -110,7 +110,7 @@ async def test_servers_reject_huge_records_and_rollup_headers(one: Cluster) -> N
         assert (await bucket.get("stays")).value == OWNER
 
 
-async def test_a_lease_record_written_by_another_gateway_counts_as_an_end(one: Cluster) -> None:
+async def test_a_lease_record_written_by_another_gateway_ends_the_session(one: Cluster) -> None:
     async with connected_path(one) as path:
         own, rogue = (LeaseBucket("lease_0", lambda: path, name) for name in ("gw-1", "gw-2"))
         revision = await own.put("gw-1", {**LEASE, "by": "me"}, 0)
@@ -162,7 +162,7 @@ async def test_a_gateway_survives_invalid_records(one: Cluster, monkeypatch: pyt
 
 
 @pytest.mark.long
-async def test_an_early_end_written_by_another_gateway_counts_once_the_lease_has_expired(
+async def test_a_sessions_end_written_early_by_another_gateway_counts_after_the_lease(
     one: Cluster,
 ) -> None:
     """The gateway's process may hang. Its engine then continues to poll until the lease expires."""

@@ -85,7 +85,7 @@ def test_an_uncertainty_is_rounded_up(ns: int, told: int) -> None:
 
 
 @pytest.mark.long
-def test_a_message_keeps_its_size_limit() -> None:
+def test_messages_are_not_larger_than_their_size_limit() -> None:
     found = packed(numbered(0, 2000), most=8_000)
     assert len(found) > 2
     assert all(len(message.data) <= 8_000 for message in found)
@@ -211,14 +211,14 @@ def test_a_message_with_too_many_rows_is_rejected() -> None:
 
 BOMB = 1 << 28  # bytes
 ZSTD = pa.ipc.IpcWriteOptions(compression="zstd")
-# each: columns of this many rows, which are small, but large after conversion to the right type
+# functions that return columns of this many rows: small, but large once converted to the column's type
 OF_ONE_TEXT = {
     "unit": lambda rows: pa.RunEndEncodedArray.from_arrays([rows], pa.array(["f" * 9000])),
     "value": lambda rows: pa.DictionaryArray.from_arrays(pa.repeat(0, rows), pa.array(["1" * 9000])),
     "clock_ns": lambda rows: pa.RunEndEncodedArray.from_arrays([rows], pa.array([5])),
 }
 
-# keeps memory pools alive, because memory of a test may be freed after the test
+# keeps the pools alive, because memory of a test may be freed after the test
 POOLS: list[pa.MemoryPool] = []
 
 

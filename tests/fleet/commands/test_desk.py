@@ -122,7 +122,7 @@ def do_after(desk: Desks, deed: Callable[[], object], waited_s: float = 0.0) -> 
 
 @patient
 def test_a_command_whose_thread_is_slow_is_not_sent_after_a_second(tmp_path: Path) -> None:
-    """The bus waits only for the rest of the second in which an offered command may be sent."""
+    """A command must be sent within a second of its offer. The bus waits only for the rest of this second."""
     with desks(tmp_path, patience_s=0) as desk:
         answer = do_after(desk, lambda: time.sleep(0.2), waited_s=0.95)
         assert answer.outcome is NOT_SENT
@@ -312,7 +312,10 @@ LOSSES: dict[str, Callable[[Desks], object]] = {
 def test_a_gateway_that_loses_a_line_does_not_answer_the_lines_stop(
     desk: Desks, monkeypatch: pytest.MonkeyPatch, loss: str
 ) -> None:
-    """The next master gets a copy of the stop, and answers it. So does this gateway if it is master again."""
+    """The line's next master gets a copy of the stop, and answers it.
+
+    If this gateway is the master again later, it answers the next copy.
+    """
 
     def lost(seconds: float | None) -> dict[str, Stopped]:
         LOSSES[loss](desk)
@@ -511,7 +514,7 @@ def test_a_stop_message_with_another_id_is_a_new_stop(
 
 
 @patient
-def test_a_stop_with_an_unknown_drive_stops_the_others(desk: Desks) -> None:
+def test_a_stop_that_names_an_unknown_drive_still_stops_the_known_drives(desk: Desks) -> None:
     answer = asyncio.run(desk.stop(drives=["pump", "fan"]))
     assert answer.outcome is REFUSED
     assert {name: one.outcome for name, one in answer.drives.items()} == {"pump": DONE, "fan": REFUSED}

@@ -200,7 +200,7 @@ async def test_a_late_answer_to_an_earlier_session_does_not_extend_the_lease() -
 
 
 async def test_a_session_ends_even_if_its_last_renewal_is_stored_late() -> None:
-    """Otherwise other gateways would wait until the lease expires."""
+    """If the late renewal prevented the end, other gateways would wait until the lease expires."""
     trial, lease = await begun()
     for bucket, value in zip(trial.buckets, trial.values(), strict=True):
         bucket.store("a", value)
@@ -354,7 +354,7 @@ async def test_if_two_processes_start_the_same_session_at_most_one_is_valid() ->
 
 
 async def test_a_starting_session_replaces_no_record_of_a_living_session() -> None:
-    """The first session renews record 2, and record 0 right before the second session would replace it."""
+    """The first session renews lease record 2, and record 0 right before the second session replaces it."""
     trial = Trial()
     gate = trial.buckets[0] = GatedBucket("lease_0")
     first, second = trial.lease(), trial.lease()
@@ -571,7 +571,7 @@ async def test_a_session_that_is_over_stays_over_after_an_outage() -> None:
     assert observer.sessions().keys() == {"a"}
 
 
-async def test_an_end_that_was_written_during_an_outage_counts_after_a_lease() -> None:
+async def test_a_sessions_end_written_during_an_outage_counts_after_a_lease() -> None:
     """Right before another gateway wrote the session's end, its own gateway may have renewed it unseen."""
     trial, _lease, observer = await watched()
     await observer.end_the_dead()
@@ -636,7 +636,7 @@ async def test_an_observer_without_answers_counts_no_gateway_as_dead() -> None:
     assert observer.dead().keys() == {"a"}
 
 
-async def test_an_end_written_by_another_gateway_counts_once_the_lease_has_expired() -> None:
+async def test_a_sessions_end_written_by_another_gateway_counts_after_the_lease() -> None:
     """The end may be wrong: until the lease expires, the session's own gateway may still send."""
     trial = Trial()
     lease, observer, late = trial.lease(), trial.observer(), trial.observer("c")
@@ -666,7 +666,7 @@ async def test_a_session_that_its_own_gateway_has_ended_is_over_immediately() ->
     assert await trial.lease().try_to_begin()
 
 
-async def test_a_gateways_next_session_waits_for_the_lease_if_others_ended_the_last() -> None:
+async def test_a_gateways_new_session_waits_if_another_gateway_ended_the_previous_one() -> None:
     trial, lease = await begun()
     second = trial.lease()
     trial.store_ends()
@@ -732,7 +732,7 @@ async def test_a_session_later_writes_the_lease_record_in_a_bucket_that_was_down
     assert lease.held[2] is not None
 
 
-async def test_a_session_takes_the_lease_record_of_a_dead_rival_with_its_number() -> None:
+async def test_a_session_replaces_the_lease_record_of_a_dead_session_of_its_number() -> None:
     """Another process of this gateway left the record, and died before it had written a second record."""
     trial = Trial()
     trial.buckets[2].is_down = True
@@ -745,7 +745,7 @@ async def test_a_session_takes_the_lease_record_of_a_dead_rival_with_its_number(
     assert trial.values()[2]["nonce"] == trial.values()[0]["nonce"]
 
 
-async def test_a_session_is_weak_if_others_ended_the_record_of_a_bucket_that_was_down() -> None:
+async def test_a_session_is_weak_if_its_lease_record_in_a_late_bucket_was_ended() -> None:
     trial = Trial()
     trial.buckets[2].loses_answers = True
     lease = trial.lease()

@@ -200,7 +200,7 @@ class Ports:
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_lines_that_a_gateway_cannot_open_move_to_others_and_return_later(
+async def test_lines_that_a_gateway_cannot_open_move_to_other_gateways_and_return(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A gateway is cut off from its lines but not from the servers, so its lease stays valid."""
@@ -544,7 +544,7 @@ def test_there_is_a_pause_of_10_ms_between_steps_however_often_records_change() 
 
 @pytest.mark.parametrize(("left_s", "ends"), [(2.0, True), (0.9, False), (-1.0, False)])
 def test_a_gateway_whose_own_lease_expires_soon_ends_no_other_session(left_s: float, ends: bool) -> None:
-    """Then the servers may be failing for all gateways. A session that was ended could not continue."""
+    """If its own lease expires, all servers may be failing. A session that it ended could not continue."""
 
     async def main() -> bool:
         member = a_member()

@@ -82,7 +82,7 @@ async def settled(subjects: CommandSubjects) -> None:
     await asyncio.gather(*supervisor().started)
 
 
-async def test_a_closing_line_answers_its_stops_until_it_is_closed(desk: Desks) -> None:
+async def test_a_gateway_answers_stops_of_a_closing_line_until_it_is_closed(desk: Desks) -> None:
     path, lines = HeardPath(), SlowLines()
     subjects = CommandSubjects("gw-1", [path], desk.lines, desk.log)
     commanded = CommandedLines(lines, subjects)

@@ -323,7 +323,7 @@ async def test_a_bucket_whose_home_server_may_have_failed_is_written_last() -> N
 
 
 async def test_if_all_lease_records_are_renewed_late_buckets_keep_their_order() -> None:
-    """Then the servers are busy, and no single home server has failed."""
+    """If all records are renewed late, the servers are busy, and no single home server has failed."""
     trial = DeadTrial()
     await trial.read_and_begin()
     trial.clock.pass_s(1.5)

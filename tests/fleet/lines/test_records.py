@@ -143,7 +143,7 @@ def moves_of(records: ShareRecords) -> list[tuple[str | None, str]]:
     return [(move.before, move.after) for move in records.moves.newest(9)]
 
 
-def test_a_move_names_the_former_master_if_two_records_agree_on_it() -> None:
+def test_a_move_names_the_former_master_if_two_ownership_records_named_it() -> None:
     records = followed()
     take(records, 1, owner_value(("b", 1), 1, 0, NEEDED), FIRST_BUCKET)
     assert moves_of(records) == [("", "b")]
@@ -264,7 +264,7 @@ def test_the_move_of_a_released_line_has_no_new_master() -> None:
     assert told(OWNER_1, move(2, "gw-1", "")) == [("gw-1", ""), ("", "gw-1")]
 
 
-def test_a_report_with_the_former_master_replaces_one_without_it() -> None:
+def test_a_report_of_a_move_with_the_former_master_replaces_one_without() -> None:
     assert told(move(2, None, "gw-2"), move(2, "gw-1", "gw-2")) == [("gw-1", "gw-2")]
     assert told(move(2, "gw-1", "gw-2"), move(2, None, "gw-2")) == [("gw-1", "gw-2")]
 

@@ -186,7 +186,9 @@ def test_a_polled_line_is_reported_when_its_port_is_lost_for_6_s() -> None:
     ("silent_s", "named_after_s"),
     [(2.0, 4.0), (REPLY_NS / SECOND, 3.0), (60.0, 6.0), (None, 6.0)],  # None: the line never had a reply
 )
-def test_a_port_counts_as_lost_from_its_last_reply(silent_s: float | None, named_after_s: float) -> None:
+def test_the_6_s_until_a_lost_port_is_reported_start_at_its_last_reply(
+    silent_s: float | None, named_after_s: float
+) -> None:
     """A gateway notices a cut line only after seconds, so the 6 s start at the last reply before the cut."""
     clock = HandClock()
     unopened = UnopenedLines(clock)
@@ -300,7 +302,7 @@ def test_a_reported_line_moves_to_a_gateway_that_has_not_reported_it() -> None:
     assert {found[line] for line in OF_A} == {"c"}
 
 
-def test_a_gateway_that_reports_no_list_gets_no_lines_that_others_reported() -> None:
+def test_a_gateway_without_a_list_of_unopened_lines_gets_no_reported_lines() -> None:
     """A gateway of another version reports no list, and would not take lines that others could not open."""
     assert hand_over(SHARED, {"a": OF_A}) == SHARED
     assert set(hand_over(SHARED, {"a": OF_A, "c": []}).values()) == {"b", "c"}

@@ -450,7 +450,8 @@ def test_writing_fails_if_another_hub_has_changed_the_stored_position(empty: Pos
     sink = PostgresSink(empty.where)
     sink.begin("then")
     empty.ask("update multidrop.hub set place = 7 returning place")
-    for first in (1, 7, 9):  # 1 and 7 are stored already, and 9 would skip message 8
+    # messages 1 and 7 are stored already; a commit from message 9 on would skip message 8
+    for first in (1, 7, 9):
         with pytest.raises(SinkError, match="another hub writes into this database: stop one of them"):
             sink.write(commit_of(first=first, last=first))
     sink.close()

@@ -393,7 +393,7 @@ def test_a_single_remaining_server_hands_no_bucket_over(servers: Servers) -> Non
     assert set(servers.terms.values()) == {1}
 
 
-def test_buckets_of_a_silent_leader_do_not_delay_the_others_hand_overs(servers: Servers) -> None:
+def test_a_leader_that_does_not_answer_delays_no_hand_over_of_other_buckets(servers: Servers) -> None:
     servers.silent = {"n2"}
 
     async def main() -> None:

@@ -101,7 +101,7 @@ def test_a_missing_right_is_reported_in_one_sentence(
     said = multidrop(servers, user, *words, *folder.get(words[1], ()))
     assert said.returncode == 1
     lines = said.stderr.splitlines()
-    assert len(lines) == 1 + (words[0] == "hub")  # a hub also logs the sentence
+    assert len(lines) == 1 + (words[0] == "hub")  # the hub also logs the sentence, so it prints two lines
     assert sentence.lower() in lines[-1].lower()
 
 

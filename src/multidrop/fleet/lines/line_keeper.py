@@ -404,9 +404,9 @@ class OwnerRecords:
         refused: set[str],
         within_s: float | None = None,
     ) -> set[asyncio.Task[set[str]]]:
-        """Wait until each line is owned or refused, for at most `within_s`; return the unanswered writes.
+        """Wait until each line is claimed or its claim refused, for at most `within_s`.
 
-        Add the lines of refused writes to `refused`.
+        Return the unanswered writes. Add the lines of refused writes to `refused`.
         """
         late = set(writes)
         with suppress(TimeoutError):

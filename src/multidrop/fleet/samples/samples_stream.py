@@ -57,7 +57,7 @@ class StreamInfo(NamedTuple):
 class LastMessage(NamedTuple):
     """The newest message of a subject."""
 
-    place: int  # position in the stream
+    place: int  # the message's position in the stream
     sequence: int  # number in the gateway's log; 0 if a client has directed a server's answer to this subject
     digest: str
 

@@ -1,9 +1,10 @@
-"""Connections to NATS: three paths. Each uses its own home server while that server answers.
+"""Connections to NATS: each process has three, called paths, so that one failed server stops only one path.
 
-A direct get is a read that a server forwards to a random server that has the records: to itself, or to
-another one. A server that is cut off still gets its share of the reads for seconds, until the others notice.
-So a read without an early answer is repeated on all paths together. Each answer may be out of date. A write
-that depends on such an answer therefore names the revision that was read.
+Each path uses its own home server while that server answers, otherwise another server. A direct get is a read
+that a server forwards to a random server that has the records: to itself, or to another one. A server that is
+cut off still gets its share of the reads for seconds, until the others notice. So a read without an early
+answer is repeated on all paths together. Each answer may be out of date. A write that depends on such an
+answer therefore names the revision that was read.
 
 A user's key is an Ed25519 key pair (an "nkey"). The secret key is in a file that only its user has; servers
 know the public key. Answers to a user go to an inbox that is named after the public key. No other user may
