@@ -371,7 +371,7 @@ def test_concurrent_writes_on_a_line_are_limited(desk: Desks) -> None:
 
     answers = asyncio.run(main())
     unsent = [answer.text for answer in answers if answer.outcome is NOT_SENT]
-    assert sum(f"{MOST_WRITES} others are under way" in text for text in unsent) == 3
+    assert sum(f"{MOST_WRITES} other commands are under way" in text for text in unsent) == 3
     assert len(setpoints(desk)) == len(answers) - len(unsent)
 
 
