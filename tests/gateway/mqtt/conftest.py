@@ -1,4 +1,4 @@
-"""Fixtures: an MQTT broker, its listeners, and parts of a gateway that are connected to it."""
+"""Fixtures: an MQTT broker, listeners on it, and the gateway's MQTT part connected to it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _paho() -> Iterator[None]:
 
 @pytest.fixture
 def broker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Broker]:
-    """A running broker: mosquitto, unless the test's parameter makes another one."""
+    """A running broker: mosquitto, unless the test's parameter gives another."""
     require_module("paho.mqtt.client")
     with getattr(request, "param", mosquitto)(tmp_path) as broker:
         yield broker
@@ -48,7 +48,7 @@ def host(broker: Broker) -> Iterator[Host]:
 def start(
     request: pytest.FixtureRequest, broker: Broker, tmp_path: Path
 ) -> Iterator[Callable[..., tuple[Any, Running]]]:
-    """Return a function that starts a part with settings and returns the part's context and the part."""
+    """Return a function that starts the MQTT part with settings, and returns its context and the part."""
     running: list[Running] = []
     fan = FAN if request.node.path.stem == "test_mqtt" else PLAIN_FAN
 

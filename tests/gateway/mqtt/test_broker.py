@@ -1,4 +1,4 @@
-"""The connection to a broker: outbox, acknowledgements, and brokers that freeze or disappear."""
+"""The gateway's connection to an MQTT broker: outbox, acknowledgements, frozen and lost brokers."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from multidrop.sim import Simulator, Wire, simulated
 
 
 class BreakableConnection:
-    """A connection that a test can break."""
+    """A connection that a test can break and restore."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[str, bytes]] = []
@@ -62,7 +62,7 @@ def said(topic: str, text: bytes = b"") -> Publication:
     return Publication(topic, lambda: text)
 
 
-def test_unacknowledged_messages_are_limited_and_only_the_newest_is_sent() -> None:
+def test_number_of_unacknowledged_messages_is_limited_and_only_the_newest_is_sent() -> None:
     wire = BreakableConnection()
     outbox = Outbox(wire.send)
     for round in range(100):
@@ -80,7 +80,7 @@ def test_unacknowledged_messages_are_limited_and_only_the_newest_is_sent() -> No
     assert outbox.is_idle
 
 
-def test_payload_of_a_pending_message_is_made_when_it_is_sent() -> None:
+def test_the_payload_of_a_pending_message_is_made_when_it_is_sent() -> None:
     wire, now = BreakableConnection(), [b"old"]
     outbox = Outbox(wire.send)
     wire.is_open = False
@@ -90,7 +90,7 @@ def test_payload_of_a_pending_message_is_made_when_it_is_sent() -> None:
     assert wire.sent == [("state", b"new")]
 
 
-def test_message_whose_payload_fails_is_dropped_and_others_are_sent() -> None:
+def test_a_message_whose_payload_cannot_be_made_is_dropped_and_the_next_is_sent() -> None:
     wire = BreakableConnection()
     outbox = Outbox(wire.send)
     outbox.put(Publication("told", "\ud800".encode))
@@ -101,7 +101,7 @@ def test_message_whose_payload_fails_is_dropped_and_others_are_sent() -> None:
     assert outbox.is_idle
 
 
-def test_lost_connection_drops_and_counts_pending_messages() -> None:
+def test_a_lost_connection_drops_and_counts_pending_messages() -> None:
     wire = BreakableConnection()
     outbox = Outbox(wire.send)
     for topic in range(MOST_UNDER_WAY + 3):
@@ -112,26 +112,27 @@ def test_lost_connection_drops_and_counts_pending_messages() -> None:
     assert wire.sent[-1] == ("next", b"")
 
 
-def test_acknowledged_messages_make_room_immediately() -> None:
+def test_acknowledged_messages_make_room_in_the_outbox_immediately() -> None:
     wire = BreakableConnection()
     outbox = Outbox(wire.send)
     for topic in range(3 * MOST_UNDER_WAY):
         outbox.put(said(f"{topic}"))
     outbox.acknowledge(range(1, MOST_UNDER_WAY + 1))
     assert len(wire.sent) == 2 * MOST_UNDER_WAY
-    outbox.acknowledge([1, 2, 3 * MOST_UNDER_WAY])  # message numbers of an earlier connection
+    # numbers of messages that were sent on an earlier connection
+    outbox.acknowledge([1, 2, 3 * MOST_UNDER_WAY])
     assert len(wire.sent) == 2 * MOST_UNDER_WAY
 
 
-def test_messages_beyond_the_limit_are_dropped_and_counted() -> None:
-    """Without a limit, commands that choose a new topic for each answer could fill the memory."""
+def test_pending_messages_beyond_the_limit_are_dropped_and_counted() -> None:
+    """Commands can choose a new topic for each answer, so a broker could otherwise fill the memory."""
     wire = BreakableConnection()
     outbox = Outbox(wire.send)
     wire.is_open = False
     for at in range(MOST_WAITING + 10):
         outbox.put(said(f"{at}"))
     assert outbox.dropped == 10
-    outbox.put(said("0", b"newer"))  # replaces the topic's pending message
+    outbox.put(said("0", b"newer"))  # replaces the pending message of the same topic
     assert outbox.dropped == 11
     wire.is_open = True
     outbox.flush()
@@ -142,7 +143,7 @@ def test_messages_beyond_the_limit_are_dropped_and_counted() -> None:
 
 
 class Silent:
-    """A publisher without messages."""
+    """A publisher that has no messages."""
 
     def will(self) -> Publication:
         return Publication("gone", bytes)
@@ -156,7 +157,7 @@ class Silent:
 
 
 class Loop:
-    """An event loop that runs its scheduled calls when the test requests it."""
+    """A fake event loop. It runs its scheduled calls when the test calls `step`."""
 
     def __init__(self) -> None:
         self.calls: list[Callable[[], None]] = []
@@ -171,7 +172,7 @@ class Loop:
         self.calls.pop(0)()
 
 
-def test_event_loop_is_woken_once_for_a_burst_of_acknowledgements(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_burst_of_acknowledgements_wakes_the_event_loop_once(monkeypatch: pytest.MonkeyPatch) -> None:
     require_module("paho.mqtt.client")
     broker, loop, told = Broker(parse_broker("mqtt://localhost"), Login(), "a", Silent()), Loop(), list[int]()
     monkeypatch.setattr(broker, "loop", loop)
@@ -194,13 +195,13 @@ SERVE = '[serve.may]\nstop = "anyone"\n[serve.mqtt]\nbroker = "{}"\nevery = "0.1
 
 
 class Slot(NamedTuple):
-    at_ns: int  # time of the request (CLOCK_MONOTONIC)
+    at_ns: int  # time of the poll (CLOCK_MONOTONIC)
     status: str
-    late_s: float  # time from the request until the part received the row
+    late_s: float  # from the poll until the gateway part received the row
 
 
 class Slots:
-    """A part that records each poll of each drive, and how long after the request the part gets the row."""
+    """A gateway part that records each poll of each drive, and how late the part received the row."""
 
     def __init__(self) -> None:
         self._found: dict[str, list[Slot]] = defaultdict(list)
@@ -247,7 +248,7 @@ def figures(gateway: Served) -> dict[str, float]:
 
 
 def watched(slots: Slots) -> dict[str, list[Slot]]:
-    """Wait for OUT_S seconds, and return the slots of that time."""
+    """Wait for OUT_S seconds, and return the polls of that time."""
     begin = time.monotonic_ns()
     end = begin + int(OUT_S * SECOND_NS)
     until(lambda: slots.seen_until() > end, patience=OUT_S + 120)
@@ -257,7 +258,7 @@ def watched(slots: Slots) -> dict[str, list[Slot]]:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", usually("gone", "frozen"))
-def test_polling_is_unchanged_while_the_broker_is_frozen_or_gone(tmp_path: Path, kind: str) -> None:
+def test_polling_is_unchanged_while_the_mqtt_broker_is_frozen_or_gone(tmp_path: Path, kind: str) -> None:
     require_module("paho.mqtt.client")
     with mosquitto(tmp_path) as broker, gateway_of(tmp_path, broker) as (gateway, slots):
         until(lambda: figures(gateway)["connected"] == 2.0)
@@ -274,7 +275,8 @@ def test_polling_is_unchanged_while_the_broker_is_frozen_or_gone(tmp_path: Path,
             told = gateway.get("/health").json["parts"]["mqtt"]
             assert told.startswith(f"no connection to 127.0.0.1:{broker.port}")
             lost = figures(gateway)["dropped_total"]
-            until(lambda: figures(gateway)["dropped_total"] >= lost + 2 * len(DRIVES))  # in each period
+            # messages of two publishing periods
+            until(lambda: figures(gateway)["dropped_total"] >= lost + 2 * len(DRIVES))
         stopped = gateway.post("/api/stop").json
         assert {name: one["done"] for name, one in stopped.items()} == dict.fromkeys(DRIVES, True)
 
@@ -295,7 +297,7 @@ def test_polling_is_unchanged_while_the_broker_is_frozen_or_gone(tmp_path: Path,
     for phase, found in phases.items():
         for name in DRIVES:
             statuses = {one.status for one in found[name]}
-            assert abs(len(found[name]) - wanted) <= 1, (phase, name)  # every poll has a row
+            assert abs(len(found[name]) - wanted) <= 1, (phase, name)  # every poll gave a row
             assert statuses <= {"ok", *HOST_LATE}, (phase, name)
             assert median(one.late_s for one in found[name]) < PERIOD_S, (phase, name)
 
@@ -308,7 +310,7 @@ NOW_MS = 1_000_000
 
 
 class HeldCommands:
-    """Commands that end when the test releases them; stops end immediately."""
+    """Commands that wait until the test sets `go_on`. Stops do not wait."""
 
     plant_ns = None
 
@@ -330,7 +332,7 @@ class HeldCommands:
         return {"pump-1": CommandResult(CommandOutcome.DONE, "stopped")}
 
 
-async def test_concurrent_broker_writes_are_limited_and_stops_are_not() -> None:
+async def test_concurrent_commands_from_a_broker_are_limited_and_stops_are_not() -> None:
     told: list[tuple[str, str]] = []
     commands: Any = HeldCommands()
     orders = BrokerCommands(
@@ -338,7 +340,7 @@ async def test_concurrent_broker_writes_are_limited_and_stops_are_not() -> None:
     )
     for value in range(MOST_COMMANDS + 2):
         orders.write("pump-1", "setpoint", value, NOW_MS)
-    await asyncio.sleep(0)  # the commands start
+    await asyncio.sleep(0)  # starts the commands
     assert commands.begun == [*range(MOST_COMMANDS)]
     refused = f"not sent: {MOST_COMMANDS} other commands are under way"
     assert told == [(f"setpoint = {MOST_COMMANDS + at}", refused) for at in range(2)]
@@ -360,7 +362,7 @@ Start = Callable[..., tuple[Any, Running]]
 
 
 def nats_of(program: Callable[[], str]) -> Any:
-    """Return a test parameter: the fixture `broker` then runs this nats-server."""
+    """Return a test parameter that makes the fixture `broker` run this nats-server."""
     return pytest.mark.parametrize("broker", [lambda folder: nats(folder, program())], indirect=True)
 
 
@@ -373,7 +375,7 @@ def now_ms() -> int:
 
 @pytest.mark.slow
 @on_nats
-def test_state_is_retained_and_the_will_reports_a_lost_gateway(
+def test_values_are_retained_and_the_will_message_reports_a_lost_gateway(
     broker: RunningBroker, listener: Listener, start: Start
 ) -> None:
     _, running = start()
@@ -391,7 +393,7 @@ def test_state_is_retained_and_the_will_reports_a_lost_gateway(
 
 @pytest.mark.slow
 @on_nats
-def test_delayed_and_repeated_commands_are_refused_and_stops_are_not(
+def test_delayed_and_repeated_commands_over_nats_are_refused_and_stops_are_not(
     broker: RunningBroker, listener: Listener, start: Start
 ) -> None:
     def told() -> Any:
@@ -417,7 +419,7 @@ def test_delayed_and_repeated_commands_are_refused_and_stops_are_not(
 
 @pytest.mark.slow
 @on_nats
-def test_retained_command_is_refused(broker: RunningBroker, listener: Listener, start: Start) -> None:
+def test_a_retained_command_is_refused(broker: RunningBroker, listener: Listener, start: Start) -> None:
     body = json.dumps({"value": 25.0, "time": now_ms() + 1000}).encode()
     publish(broker, "multidrop/pump-1/set/setpoint", body, "-r")
     known, _ = start(commands=True)
@@ -428,10 +430,10 @@ def test_retained_command_is_refused(broker: RunningBroker, listener: Listener, 
 
 @pytest.mark.slow
 @nats_of(old_server_program)
-def test_rejected_topics_do_not_delay_other_topics(
+def test_a_broker_that_rejects_sparkplug_topics_does_not_delay_json_topics(
     broker: RunningBroker, listener: Listener, start: Start
 ) -> None:
-    """Sparkplug's topics have a dot; nats-server before 2.10 closes connections because of it."""
+    """Sparkplug's topics contain a dot. Because of it, nats-server before 2.10 closes the connection."""
     known, running = start(sparkplug="works", node="line")
     listener.wait_for(has("multidrop/pump-1"))
     until(lambda: running._part.health().startswith(f"no connection to 127.0.0.1:{broker.port}"))
@@ -448,7 +450,7 @@ def test_rejected_topics_do_not_delay_other_topics(
 
 @pytest.mark.slow
 @on_nats
-def test_sparkplug_host_receives_births_data_and_deaths_and_sends_commands(
+def test_a_sparkplug_host_gets_births_data_and_deaths_and_sends_commands_over_nats(
     broker: RunningBroker, host: Host, start: Start
 ) -> None:
     known, running = start(sparkplug="works", node="line", commands=True)

@@ -1,4 +1,4 @@
-"""MQTT through a real broker; mosquitto's own clients receive values and send commands."""
+"""MQTT through a real broker: mosquitto's own clients receive values and send commands."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ def now_ms() -> int:
 
 
 def now_on_both_clocks() -> tuple[int, int]:
-    """Return the UTC in ms and CLOCK_BOOTTIME in ns, read within 10 ms."""
+    """Return UTC in ms and CLOCK_BOOTTIME in ns, read within 10 ms of each other."""
     while True:
         boot_ns, utc_ms = boottime_ns(), now_ms()
         if boottime_ns() - boot_ns < 10_000_000:
             return utc_ms, boot_ns
 
 
-def test_newest_values_are_published_as_retained_messages(
+def test_the_newest_values_are_published_as_retained_messages(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
     start()
@@ -75,7 +75,9 @@ def test_newest_values_are_published_as_retained_messages(
     }
 
 
-def test_stale_value_is_null_and_silent_drive_is_offline(listener: Listener, start: Start) -> None:
+def test_a_stale_value_is_published_as_null_and_a_silent_drive_as_offline(
+    listener: Listener, start: Start
+) -> None:
     known, running = start()
     listener.wait_for(has("multidrop/pump-1/available", b"online"))
     known.hub.values[("pump-1", "output_frequency")] = None
@@ -87,7 +89,7 @@ def test_stale_value_is_null_and_silent_drive_is_offline(listener: Listener, sta
 
 
 @pytest.mark.slow
-def test_broker_publishes_offline_when_the_gateway_disappears(listener: Listener, start: Start) -> None:
+def test_the_broker_publishes_offline_when_the_gateway_disappears(listener: Listener, start: Start) -> None:
     _, running = start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     running.cut(0)
@@ -95,7 +97,7 @@ def test_broker_publishes_offline_when_the_gateway_disappears(listener: Listener
     listener.wait_for(has("multidrop/gateway", b"online"))
 
 
-def test_offline_message_is_retained(broker: Broker, listener: Listener, start: Start) -> None:
+def test_the_message_offline_is_retained(broker: Broker, listener: Listener, start: Start) -> None:
     _, running = start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     running._part._brokers[0]._client.reconnect_delay_set(3600, 3600)
@@ -108,7 +110,7 @@ def test_offline_message_is_retained(broker: Broker, listener: Listener, start: 
         later.close()
 
 
-def test_messages_without_a_connection_are_counted(tmp_path: Path) -> None:
+def test_messages_without_a_connection_are_counted_as_dropped(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     part: Any = build(MqttSettings(f"mqtt://127.0.0.1:{free_port()}", sparkplug="works"), inside(tmp_path))
     running = Running(part)
@@ -116,7 +118,8 @@ def test_messages_without_a_connection_are_counted(tmp_path: Path) -> None:
         of_json, of_sparkplug = (broker.outbox for broker in part._brokers)
         assert (of_json.dropped, of_sparkplug.dropped) == (0, 0)
         running.step()
-        assert (of_json.dropped, of_sparkplug.dropped) == (2, 0)  # two drives; Sparkplug sends only changes
+        # JSON has one message for each of two drives; Sparkplug sends only changes
+        assert (of_json.dropped, of_sparkplug.dropped) == (2, 0)
         for frequency in (1.0, 2.0):
             part._speakers[0]._hub.values["pump-1", "output_frequency"] = frequency
             running.step()
@@ -127,27 +130,27 @@ def test_messages_without_a_connection_are_counted(tmp_path: Path) -> None:
         running.close()
 
 
-def test_closing_publishes_offline(broker: Broker, listener: Listener, tmp_path: Path) -> None:
+def test_closing_the_gateway_publishes_offline(broker: Broker, listener: Listener, tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     running = Running(build(MqttSettings(broker.address), inside(tmp_path)))
     listener.wait_for(has("multidrop/gateway", b"online"))
     running.close()
     listener.wait_for(has("multidrop/gateway", b"offline"))
-    for drive in ("pump-1", FAN.name):  # each drive, because the next plant file may lack it
+    for drive in ("pump-1", FAN.name):  # for each drive, because the next plant file may not have it
         listener.wait_for(has(f"multidrop/{drive}/available", b"offline"))
 
 
-def test_failing_publisher_is_offline_and_still_carries_out_stops(
+def test_a_gateway_that_fails_to_publish_is_offline_and_still_carries_out_stops(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
-    """Without "offline", the broker's retained values would look current while the connection is up."""
+    """Without "offline", the values that the broker retains would look current."""
     known, running = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     state = known.hub.states.pop("pump-1")
     running.step()
     listener.wait_for(has("multidrop/gateway", b"offline"))
     assert running._part.health() == "publishing fails: KeyError: 'pump-1'"
-    running.step()  # publishes "offline" only once
+    running.step()  # does not publish "offline" again
     publish(broker, "multidrop/pump-1/stop", b"now")
     listener.wait_for(has("multidrop/pump-1/told"))
     assert known.commands.noted == [("stop", ["pump-1"])]
@@ -161,12 +164,15 @@ def test_failing_publisher_is_offline_and_still_carries_out_stops(
 
 
 @pytest.mark.slow
-def test_failing_publisher_is_offline_on_a_new_connection_too(listener: Listener, start: Start) -> None:
+def test_a_gateway_that_fails_to_publish_is_offline_after_a_reconnection_too(
+    listener: Listener, start: Start
+) -> None:
     known, running = start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     state = known.hub.states.pop("pump-1")
     running.cut(0)
-    for said in (b"offline", b"online", b"offline"):  # will, reconnection, failed publication
+    # the will message, the reconnection, the failed publication
+    for said in (b"offline", b"online", b"offline"):
         listener.wait_for(has("multidrop/gateway", said))
     known.hub.states["pump-1"] = state
     running.step()
@@ -198,7 +204,7 @@ def test_publishing_does_not_wait_for_a_frozen_broker(
 
 
 @pytest.mark.slow
-def test_everything_is_published_again_to_a_restarted_broker(
+def test_all_messages_are_published_again_to_a_restarted_broker(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
     start()
@@ -216,7 +222,7 @@ def test_everything_is_published_again_to_a_restarted_broker(
 
 @pytest.fixture
 def commanded(listener: Listener, start: Start) -> Any:
-    """The context of a part that is online and carries out commands."""
+    """The context of an MQTT part that is online and carries out commands."""
     known, _ = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     return known
@@ -230,7 +236,7 @@ def write_of(value: object, time_ms: int, **more: object) -> bytes:
     return json.dumps({"value": value, "time": time_ms, **more}).encode()
 
 
-def test_a_fresh_write_is_carried_out_but_its_copy_is_not(
+def test_a_recent_write_is_carried_out_once_and_its_copy_is_refused(
     broker: Broker, listener: Listener, commanded: Any
 ) -> None:
     fresh = write_of(25, now_ms(), id="order-7")
@@ -242,7 +248,9 @@ def test_a_fresh_write_is_carried_out_but_its_copy_is_not(
 
 
 @pytest.mark.parametrize("age_ms", [60_000, -60_000])
-def test_delayed_command_is_refused(broker: Broker, listener: Listener, commanded: Any, age_ms: int) -> None:
+def test_a_delayed_command_is_refused(
+    broker: Broker, listener: Listener, commanded: Any, age_ms: int
+) -> None:
     sent_ms = now_ms() - age_ms
     publish(broker, "multidrop/pump-1/set/setpoint", write_of(25, sent_ms))
     assert "s ago by the clocks of sender and gateway" in told(listener)["text"]
@@ -253,7 +261,7 @@ def test_delayed_command_is_refused(broker: Broker, listener: Listener, commande
 
 
 @pytest.mark.parametrize("topic", ["multidrop/pump-1/set/setpoint", "multidrop/pump-1/act"])
-def test_retained_command_is_refused(broker: Broker, listener: Listener, start: Start, topic: str) -> None:
+def test_a_retained_command_is_refused(broker: Broker, listener: Listener, start: Start, topic: str) -> None:
     sent = {"value": 25, "verb": "start", "drive": "pump-1", "time": now_ms() + 1000}
     publish(broker, topic, json.dumps(sent).encode(), "-r")
     known, _ = start(commands=True)
@@ -262,7 +270,9 @@ def test_retained_command_is_refused(broker: Broker, listener: Listener, start: 
 
 
 @pytest.mark.slow
-def test_a_stop_is_always_carried_out(broker: Broker, listener: Listener, start: Start) -> None:
+def test_a_stop_is_carried_out_even_if_retained_or_for_all_drives(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
     publish(broker, "multidrop/pump-1/stop", b"stop", "-r")
     known, _ = start(commands=True)
     assert told(listener)["what"] == "stop"
@@ -284,10 +294,10 @@ def test_a_stop_is_always_carried_out(broker: Broker, listener: Listener, start:
     ],
     ids=range(5),
 )
-def test_stop_is_carried_out_whatever_its_payload(
+def test_a_stop_is_carried_out_whatever_its_payload(
     broker: Broker, listener: Listener, commanded: Any, topic: str, payload: bytes, stopped: list[str] | None
 ) -> None:
-    """The payloads are too long, truncated, or not text."""
+    """The payloads are too long, truncated, or not valid text."""
     publish(broker, f"multidrop/{topic}", payload)
     assert told(listener)["what"] == "stop"
     assert commanded.commands.noted == [("stop", stopped)]
@@ -308,19 +318,19 @@ def test_stop_is_carried_out_whatever_its_payload(
         STOPS,
     ),
 )
-def test_stop_verb_is_carried_out_whatever_its_age(
+def test_a_stop_verb_is_carried_out_whatever_its_time_and_options(
     broker: Broker, listener: Listener, commanded: Any, verb: str, more: dict[str, Any]
 ) -> None:
     commanded.commands.stopped_at["pump-1"] = commanded.commands.plant_ns = boottime_ns()
     for _ in range(2):
         publish(broker, "multidrop/pump-1/act", json.dumps({"verb": verb, "id": [], **more}).encode())
         answer = told(listener)
-        assert COMMAND_ID.fullmatch(answer.pop("id"))  # the gateway made an id in place of the invalid one
+        assert COMMAND_ID.fullmatch(answer.pop("id"))  # the gateway replaced the invalid id by its own
         assert answer == {"what": verb, "done": True, "text": "done"}
     assert commanded.commands.noted == [("act", "pump-1", verb, {})] * 2
 
 
-def test_retained_stop_verb_is_carried_out(broker: Broker, listener: Listener, start: Start) -> None:
+def test_a_retained_stop_verb_is_carried_out(broker: Broker, listener: Listener, start: Start) -> None:
     publish(broker, "multidrop/pump-1/act", b'{"verb": "coast", "drive": "pump-1", "time": 1}', "-r")
     known, _ = start(commands=True)
     assert told(listener)["done"]
@@ -331,7 +341,7 @@ def test_retained_stop_verb_is_carried_out(broker: Broker, listener: Listener, s
     ("named", "verb"),
     in_turn([FAN.name, "no-such-drive", "pump-1", 7, ["pump-1"], {}, None, "", "#", "pump-1/+"], STOPS),
 )
-def test_stop_verb_stops_the_drive_of_its_topic_and_the_drive_it_names(
+def test_a_stop_verb_stops_the_drive_of_its_topic_and_the_drive_in_its_payload(
     broker: Broker, listener: Listener, commanded: Any, verb: str, named: object
 ) -> None:
     publish(broker, "multidrop/pump-1/act", json.dumps({"verb": verb, "drive": named, "time": 1}).encode())
@@ -346,11 +356,11 @@ def test_stop_verb_stops_the_drive_of_its_topic_and_the_drive_it_names(
     ("topic", "named", "stopped"),
     [
         ("pump-1", "Lu\u0308fter", ["pump-1", "L\u00fcfter"]),
-        ("Lu\u0308fter", "L\u00fcfter", ["Lu\u0308fter"]),  # one drive in two spellings
+        ("Lu\u0308fter", "L\u00fcfter", ["Lu\u0308fter"]),  # two Unicode spellings of the same name
         ("L\u00fcfter", "Lu\u0308fter", ["L\u00fcfter"]),
     ],
 )
-async def test_stop_verb_finds_drives_by_another_spelling(
+async def test_a_stop_verb_finds_drives_by_another_unicode_spelling(
     tmp_path: Path, topic: str, named: str, stopped: list[str]
 ) -> None:
     known = inside(tmp_path, InvtCHE(2, name="L\u00fcfter"))
@@ -363,7 +373,9 @@ async def test_stop_verb_finds_drives_by_another_spelling(
     assert known.commands.noted == [("act", drive, "coast", {}) for drive in stopped]
 
 
-def test_unknown_verb_or_other_drive_is_refused(broker: Broker, listener: Listener, commanded: Any) -> None:
+def test_a_verb_for_another_drive_or_an_unknown_verb_is_refused(
+    broker: Broker, listener: Listener, commanded: Any
+) -> None:
     order = {"verb": "start", "drive": FAN.name, "time": now_ms()}
     publish(broker, "multidrop/pump-1/act", json.dumps(order).encode())
     assert f"the message names drive '{FAN.name}'" in told(listener)["text"]
@@ -372,8 +384,10 @@ def test_unknown_verb_or_other_drive_is_refused(broker: Broker, listener: Listen
     assert commanded.commands.noted == []
 
 
-def test_command_older_than_a_reload_is_refused(broker: Broker, listener: Listener, commanded: Any) -> None:
-    """After a reload, the name may mean another drive."""
+def test_a_command_sent_before_a_reload_is_refused(
+    broker: Broker, listener: Listener, commanded: Any
+) -> None:
+    """After a reload, the drive's name may mean another drive."""
     for after_ms, text in ((1900, "not sent: it may have been sent before the plant"), (2500, "done")):
         sent_ms, sent_ns = now_on_both_clocks()
         commanded.commands.plant_ns = sent_ns - after_ms * 1_000_000
@@ -382,10 +396,10 @@ def test_command_older_than_a_reload_is_refused(broker: Broker, listener: Listen
 
 
 @pytest.mark.parametrize(("after_ms", "is_taken"), [(-3000, False), (0, False), (1900, False), (2500, True)])
-def test_command_older_than_a_stop_is_refused(
+def test_a_command_sent_before_a_stop_is_refused(
     broker: Broker, listener: Listener, commanded: Any, after_ms: int, is_taken: bool
 ) -> None:
-    """A broker may deliver a delayed command after the stop. The sender's clock may be up to 2 s fast."""
+    """A broker may deliver a delayed command after a stop. The sender's clock may be up to 2 s fast."""
     sent_ms, sent_ns = now_on_both_clocks()
     commanded.commands.stopped_at["pump-1"] = sent_ns - after_ms * 1_000_000
     for topic, payload in (
@@ -402,7 +416,7 @@ def test_command_older_than_a_stop_is_refused(
     assert len(commanded.commands.noted) == (3 if is_taken else 1)
 
 
-def test_verb_that_does_not_name_the_drive_of_its_topic_is_refused(
+def test_a_verb_whose_payload_names_another_drive_than_its_topic_is_refused(
     broker: Broker, listener: Listener, commanded: Any
 ) -> None:
     act = {"verb": "start", "drive": "pump-1", "options": {"direction": "forward"}, "time": now_ms()}
@@ -427,7 +441,7 @@ def test_verb_that_does_not_name_the_drive_of_its_topic_is_refused(
         (b'{"value": 25, "time": 1}' + b" " * 70_000, "the message has 70024 bytes"),
     ],
 )
-def test_invalid_commands_are_reported(
+def test_invalid_commands_are_answered_with_the_reason(
     broker: Broker, listener: Listener, commanded: Any, payload: bytes, why: str
 ) -> None:
     publish(broker, "multidrop/pump-1/set/setpoint", payload)
@@ -436,10 +450,10 @@ def test_invalid_commands_are_reported(
 
 
 @pytest.mark.parametrize(("drive", "verb"), [("pump-1", "\ud800"), ("x" * 65_521, "")])
-def test_an_unsendable_answer_does_not_affect_other_messages(
+def test_an_answer_that_cannot_be_sent_does_not_affect_other_messages(
     broker: Broker, listener: Listener, start: Start, drive: str, verb: str
 ) -> None:
-    """One answer contains a verb that is not UTF-8. The other's topic is too long (65,536 bytes)."""
+    """One answer has a verb that is not UTF-8; the other has a topic of 65,536 bytes, too long for MQTT."""
     known, running = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
     outbox = running._part._brokers[0].outbox
@@ -454,8 +468,8 @@ def test_an_unsendable_answer_does_not_affect_other_messages(
     )
 
 
-def test_infinite_value_is_published_as_null(listener: Listener, start: Start) -> None:
-    """JSON has no infinity: a reader would have to reject the whole message."""
+def test_an_infinite_value_is_published_as_null(listener: Listener, start: Start) -> None:
+    """JSON has no infinity, so a reader would have to reject the whole message."""
     known, running = start()
     listener.wait_for(has("multidrop/pump-1"))
     known.hub.values[("pump-1", "output_frequency")] = float("inf")
@@ -464,7 +478,9 @@ def test_infinite_value_is_published_as_null(listener: Listener, start: Start) -
     assert b'"output_frequency": null' in said.payload
 
 
-def test_commands_are_not_subscribed_unless_enabled(broker: Broker, listener: Listener, start: Start) -> None:
+def test_command_topics_are_not_subscribed_unless_commands_are_enabled(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
     known, running = start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     publish(broker, "multidrop/stop", b"stop", "-q", "1")
@@ -474,18 +490,21 @@ def test_commands_are_not_subscribed_unless_enabled(broker: Broker, listener: Li
     assert known.commands.noted == []
 
 
-def test_without_commands_only_node_commands_are_subscribed(tmp_path: Path) -> None:
+def test_without_commands_the_only_command_topic_is_that_of_the_sparkplug_node(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     part: Any = build(MqttSettings(sparkplug="works", node="line"), inside(tmp_path))
     assert [speaker.topics() for speaker in part._speakers] == [
-        [("multidrop/gateway", 0), ("multidrop/+/available", 0)],  # to find topics of removed drives
+        # for finding retained topics of removed drives
+        [("multidrop/gateway", 0), ("multidrop/+/available", 0)],
         [("spBv1.0/works/NCMD/line", 1)],
     ]
 
 
 @pytest.mark.parametrize("is_retained", [False, True])
-async def test_commands_are_ignored_unless_enabled(tmp_path: Path, is_retained: bool) -> None:
-    """A broker may send messages even on topics to which the gateway has not subscribed."""
+async def test_received_commands_are_ignored_unless_commands_are_enabled(
+    tmp_path: Path, is_retained: bool
+) -> None:
+    """A broker may send messages of topics to which the gateway has not subscribed."""
     require_module("paho.mqtt.client")
     known = inside(tmp_path)
     part: Any = build(MqttSettings(sparkplug="works", node="line"), known)
@@ -525,7 +544,7 @@ def test_home_assistant_discovers_each_drive(broker: Broker, listener: Listener,
     assert parts["setpoint_set"]["command_topic"] == "multidrop/pump-1/set/setpoint"
 
 
-def test_write_by_the_home_assistant_template_is_carried_out(
+def test_a_write_made_by_the_home_assistant_template_is_carried_out(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
     jinja2 = require_module("jinja2")
@@ -542,7 +561,7 @@ def test_write_by_the_home_assistant_template_is_carried_out(
     assert known.commands.noted == [("write", "pump-1", "setpoint", 12.5)]
 
 
-def test_object_ids_of_different_drives_differ(listener: Listener, start: Start) -> None:
+def test_home_assistant_object_ids_of_different_drives_differ(listener: Listener, start: Start) -> None:
     start(home_assistant=True)
     ids = {
         listener.wait_for(lambda received: received.topic.startswith("homeassistant/")).topic
@@ -564,8 +583,9 @@ def rendered(part: dict[str, Any], said: dict[str, Any]) -> str:
     return str(jinja2.Environment().from_string(part["value_template"]).render(value_json=said))
 
 
-# By platform: the keys that Home Assistant requires, and the other keys used here. Source: Home Assistant's
-# documentation of MQTT, version 2026.11 (device discovery, sensor, binary sensor, number, select, button).
+# For each platform: the keys that Home Assistant requires, and the optional keys that we use. Source: Home
+# Assistant's documentation of MQTT, version 2026.11 (device discovery, sensor, binary sensor, number, select,
+# button).
 HA_KEYS = {
     "sensor": (
         {"state_topic"},
@@ -574,7 +594,7 @@ HA_KEYS = {
     ),
     "binary_sensor": ({"state_topic"}, {"value_template", "expire_after", "device_class"}),
     "number": (
-        {"command_topic", "min", "max"},  # without min and max, the range is 1 to 100
+        {"command_topic", "min", "max"},  # without min and max, Home Assistant allows 1 to 100
         {"state_topic", "value_template", "command_template", "retain", "step", "mode", "entity_category"}
         | {"unit_of_measurement"},
     ),
@@ -587,7 +607,8 @@ HA_KEYS = {
 
 
 def check_components(found: Any) -> None:
-    assert not {"state_topic", "command_topic", "value_template"} & found.keys()  # only components have them
+    # only the components of a device may have these keys
+    assert not {"state_topic", "command_topic", "value_template"} & found.keys()
     assert found["dev"]["ids"]
     for part in found["cmps"].values():
         needed, known = HA_KEYS[part["p"]]
@@ -617,7 +638,10 @@ def test_components_of_each_family_have_valid_home_assistant_keys(model: str) ->
 
 
 class Awkward(Drive):
-    """A user's drive class whose registers are named like the gateway's Home Assistant components."""
+    """A user's drive class.
+
+    Its registers have the names of Home Assistant components that the gateway adds.
+    """
 
     title = "ACME A-1"
     running = reading(1, "Hz")
@@ -628,7 +652,7 @@ class Awkward(Drive):
     mode = setting(6, values=IntEnum("Mode", {"SLOW": 1, "FAST": 7}), moves=False)
 
 
-def test_registers_whose_names_home_assistant_components_have_get_other_keys() -> None:
+def test_registers_named_like_home_assistant_components_get_other_keys() -> None:
     found = configured(Awkward(1, name="a"), [*Awkward.registers], ["level", "mode"], page="http://hall:8750")
     check_components(found)
     assert found["dev"] == {
@@ -646,7 +670,7 @@ def test_registers_whose_names_home_assistant_components_have_get_other_keys() -
     assert json.loads(command.render(value="FAST", now=lambda: datetime.now(UTC)))["value"] == 7
 
 
-def test_home_assistant_number_of_an_unpolled_register_has_no_state() -> None:
+def test_a_home_assistant_number_of_an_unpolled_register_has_no_state() -> None:
     drive = InvtCHE(1, name="a")
     assert (
         not {"state_topic", "value_template"}
@@ -664,25 +688,27 @@ def test_home_assistant_number_of_an_unpolled_register_has_no_state() -> None:
         ("silent", "None", "None"),
     ],
 )
-def test_binary_sensors_follow_the_state_of_the_drive(state: str, problem: str, running: str) -> None:
+def test_home_assistant_binary_sensors_follow_the_state_of_the_drive(
+    state: str, problem: str, running: str
+) -> None:
     parts = configured(InvtCHE(1, name="a"), [], [])["cmps"]
     assert [rendered(parts[key], {"state": state}) for key in ("problem", "running")] == [problem, running]
     assert rendered(parts["state"], {"state": state}) in parts["state"]["options"]
 
 
-def test_a_number_without_a_name_is_shown_as_unknown_in_home_assistant() -> None:
-    """Home Assistant ignores a state that is not in its options, and keeps showing the previous one."""
+def test_a_value_without_a_name_is_shown_as_unknown_in_home_assistant() -> None:
+    """Home Assistant ignores a state outside the options, and would keep showing the previous one."""
     part = configured(InvtCHE(1, name="a"), ["status"], [])["cmps"]["status"]
     values = [rendered(part, {"values": {"status": value}}) for value in ("FORWARD", "77", None)]
     assert values == ["FORWARD", "None", "None"]
 
 
-def test_stop_button_is_available_while_its_drive_is_silent() -> None:
+def test_the_home_assistant_stop_button_is_available_while_its_drive_is_silent() -> None:
     parts = configured(InvtCHE(1, name="a"), [], [])["cmps"]
     assert parts["stop"]["availability"] == [{"topic": "multidrop/gateway"}]
 
 
-def test_ids_of_two_gateways_differ() -> None:
+def test_home_assistant_ids_of_two_gateways_differ() -> None:
     names = [("a-b", "c"), ("a", "b-c"), ("a_2d_b", "c"), ("a", "b_c"), ("a", "b c")]
     assert len({discovery_topic(*one) for one in names}) == len(names)
 
@@ -690,7 +716,7 @@ def test_ids_of_two_gateways_differ() -> None:
 # ---- settings ----
 
 
-def test_all_mistakes_of_the_settings_are_reported(tmp_path: Path) -> None:
+def test_all_mistakes_in_the_mqtt_settings_are_reported(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="broker = ") as told:
         MqttSettings("http://x", prefix="a/+", every="soon", sparkplug="a/b", node="#")
     sentences = str(told.value).splitlines()
@@ -698,7 +724,7 @@ def test_all_mistakes_of_the_settings_are_reported(tmp_path: Path) -> None:
     assert sentences[0].startswith('broker = "http://x" is not a broker\'s URL; write broker = "mqtt://')
 
 
-def test_invalid_authorities_are_reported_before_polling(tmp_path: Path) -> None:
+def test_invalid_certificate_authorities_are_reported_before_polling_starts(tmp_path: Path) -> None:
     certificate(tmp_path, "own")
     (tmp_path / "text.pem").write_text("no certificate\n", "ascii")
     plant = inside(tmp_path).plant
@@ -712,7 +738,7 @@ def test_invalid_authorities_are_reported_before_polling(tmp_path: Path) -> None
         assert [one for one in settings.check(plant) if "authorities" in one] == told
 
 
-def test_drive_name_that_cannot_be_a_topic_is_reported(tmp_path: Path) -> None:
+def test_a_drive_name_that_cannot_be_a_topic_is_reported(tmp_path: Path) -> None:
     plant = inside(tmp_path).plant
     odd = tuple(PolledDrive(InvtCHE(3, name=name), ()) for name in ("a/b", "fine", "gateway", "stop"))
     plant = replace(plant, lines=(replace(plant.lines[0], drives=odd),))
@@ -729,19 +755,19 @@ def test_drive_name_that_cannot_be_a_topic_is_reported(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "topics", [{"prefix": "homeassistant/x"}, {"prefix": "spBv1.0"}, {"sparkplug": "STATE"}]
 )
-def test_reserved_topics_are_refused(topics: dict[str, str]) -> None:
+def test_reserved_topics_in_the_mqtt_settings_are_refused(topics: dict[str, str]) -> None:
     with pytest.raises(ValueError, match=r"reserved topic|another group"):
         MqttSettings(**topics)
 
 
-def test_file_name_that_cannot_be_an_edge_node_is_reported(tmp_path: Path) -> None:
+def test_a_plant_file_name_that_cannot_be_an_edge_node_is_reported(tmp_path: Path) -> None:
     plant = replace(inside(tmp_path).plant, path=tmp_path / "a+b.toml")
     assert MqttSettings().check(plant) == MqttSettings(sparkplug="works", node="hall").check(plant) == []
     (sentence,) = MqttSettings(sparkplug="works").check(plant)
     assert sentence == "the plant file's name 'a+b' cannot be an edge node; add node = \"hall-1\""
 
 
-def test_all_fixed_levels_of_topics_are_reserved_names(tmp_path: Path) -> None:
+def test_drives_cannot_have_the_fixed_words_of_topics_as_names(tmp_path: Path) -> None:
     topics = JsonTopics(MqttSettings(commands=True), inside(tmp_path), now_ms)
     topics.outbox = PutMessages()
     topics.connected()
@@ -757,7 +783,7 @@ def test_all_fixed_levels_of_topics_are_reserved_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_metrics_count_sent_messages(broker: Broker, tmp_path: Path) -> None:
+def test_metrics_count_sent_mqtt_messages(broker: Broker, tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     with served(tmp_path, f'[serve.mqtt]\nbroker = "{broker.address}"\n') as gateway:
 
@@ -772,7 +798,7 @@ def test_metrics_count_sent_messages(broker: Broker, tmp_path: Path) -> None:
         until(lambda: figures()["connected"] == 0.0)
 
 
-def test_metrics_have_help_texts(broker: Broker, tmp_path: Path) -> None:
+def test_mqtt_metrics_have_help_texts(broker: Broker, tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     with served(tmp_path, f'[serve.history]\n[serve.mqtt]\nbroker = "{broker.address}"\n') as gateway:
         lines = gateway.get("/metrics").body.decode().splitlines()
@@ -791,7 +817,7 @@ def test_metrics_have_help_texts(broker: Broker, tmp_path: Path) -> None:
 
 
 class PutMessages:
-    """An outbox that records its messages."""
+    """An outbox that records the messages put into it."""
 
     def __init__(self) -> None:
         self.put_in: list[Any] = []
@@ -803,8 +829,8 @@ class PutMessages:
         return {one.topic for one in self.put_in if one.is_retained and one.make() == b""}
 
 
-def test_topics_of_a_drive_removed_while_disconnected_are_deleted_later(tmp_path: Path) -> None:
-    """Pending deletions are dropped when a connection breaks, so they must be repeated on the next one."""
+def test_topics_of_a_drive_removed_without_a_connection_are_deleted_later(tmp_path: Path) -> None:
+    """A broken connection drops pending deletions, so they must be repeated on the next connection."""
     known = inside(tmp_path)
     whole = known.plant
     topics = JsonTopics(MqttSettings(home_assistant=True), known, now_ms)
@@ -824,7 +850,9 @@ def test_topics_of_a_drive_removed_while_disconnected_are_deleted_later(tmp_path
 
 
 @pytest.mark.parametrize("is_known", [True, False])
-def test_no_topic_is_deleted_before_the_lines_of_a_fleet_are_read(tmp_path: Path, is_known: bool) -> None:
+def test_no_topic_is_deleted_before_the_gateway_of_a_fleet_knows_its_lines(
+    tmp_path: Path, is_known: bool
+) -> None:
     known = inside(tmp_path)
     plant = known.plant if is_known else replace(known.plant, lines=())
     topics = JsonTopics(MqttSettings(), known._replace(plant=plant), now_ms)
@@ -834,7 +862,7 @@ def test_no_topic_is_deleted_before_the_lines_of_a_fleet_are_read(tmp_path: Path
     assert bool(topics.outbox.emptied()) is is_known
 
 
-def test_retained_messages_of_a_removed_drive_are_deleted(
+def test_retained_messages_of_a_drive_removed_by_a_reload_are_deleted(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
     known, running = start(home_assistant=True)

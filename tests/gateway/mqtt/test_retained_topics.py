@@ -1,4 +1,4 @@
-"""Retained messages of removed drives are deleted; commands delayed by a frozen broker are refused."""
+"""Retained messages of removed drives are deleted. Commands that a frozen broker delays are refused."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ THERE = {"pump-1"}
 
 
 def heard(*messages: tuple[str, bytes], prefix: str = "works") -> list[str]:
-    """Return the topics that a gateway with one pump deletes if the broker has these retained messages."""
+    """Return the topics that a gateway with one pump deletes when it receives these retained messages."""
     left_behind = RetainedTopics(prefix, home_assistant=True)
     return [topic for message in messages for topic in left_behind.hear(*message, THERE)]
 
@@ -54,7 +54,7 @@ def test_topics_of_a_removed_drive_are_deleted_in_any_message_order() -> None:
     assert heard(*messages, GATEWAY) == expected
 
 
-def test_retained_messages_of_present_drives_stay() -> None:
+def test_retained_messages_of_present_drives_are_kept() -> None:
     mine = [
         ("works/pump-1/available", b"online"),
         ("homeassistant/device/works-pump-1/config", configuration("works/pump-1")),
@@ -62,10 +62,10 @@ def test_retained_messages_of_present_drives_stay() -> None:
     assert heard(GATEWAY, *mine) == []
     back = RetainedTopics("works", home_assistant=True)
     assert back.hear("works/old/available", b"offline", THERE) == []
-    assert back.hear(*GATEWAY, {*THERE, "old"}) == []  # in the meantime a reload has added the drive
+    assert back.hear(*GATEWAY, {*THERE, "old"}) == []  # meanwhile, a reload has added the drive "old"
 
 
-def test_no_topic_is_deleted_while_another_gateway_has_the_prefix() -> None:
+def test_no_topic_is_deleted_while_another_gateway_uses_the_prefix() -> None:
     old = ("works/old/available", b"online")
     assert heard(("works/gateway", b"online"), old) == []
     assert heard(old) == []
@@ -82,7 +82,7 @@ def test_no_topic_is_deleted_while_another_gateway_has_the_prefix() -> None:
         (
             "works/old/available",
             b'{"state": "runs"}',
-        ),  # values of the drive "available" of a gateway with the prefix works/old
+        ),  # values of a drive named "available", from a gateway with the prefix works/old
         ("works/old/available", b""),
         ("works/old", b"online"),
         ("available", b"online"),
@@ -92,7 +92,7 @@ def test_no_topic_is_deleted_while_another_gateway_has_the_prefix() -> None:
         (
             "homeassistant/device/works-hall-fan/config",
             configuration("works-hall/fan"),
-        ),  # a gateway with the prefix works-hall
+        ),  # from a gateway with the prefix works-hall
         ("homeassistant/device/works-old/config", configuration("works/new")),
         ("homeassistant/device/works-old/config", configuration(["works/old"])),
         ("homeassistant/device/works-old/config", b"[" * 100_000),
@@ -101,11 +101,11 @@ def test_no_topic_is_deleted_while_another_gateway_has_the_prefix() -> None:
         ("homeassistant/sensor/works-old/config", configuration("works/old")),
     ],
 )
-def test_topics_other_than_those_of_own_removed_drives_are_kept(topic: str, payload: bytes) -> None:
+def test_topics_that_are_not_of_a_removed_drive_of_this_gateway_are_kept(topic: str, payload: bytes) -> None:
     assert heard(GATEWAY, (topic, payload)) == []
 
 
-def test_number_of_examined_retained_messages_is_limited() -> None:
+def test_number_of_retained_messages_that_are_examined_is_limited() -> None:
     drives = [(f"works/{number}/available", b"online") for number in range(10 * MOST_KEPT)]
     assert len(heard(GATEWAY, *drives)) == 2 * MOST_KEPT
     left_behind = RetainedTopics("works", home_assistant=True)
@@ -120,7 +120,7 @@ def test_number_of_examined_retained_messages_is_limited() -> None:
 
 
 def kept_at(broker: Broker) -> set[str]:
-    """Return the topics with a retained message."""
+    """Return the topics for which the broker has a retained message."""
     listener = Listener(broker)
     publish(broker, "the/end", b"x", "-q", "1")
     listener.wait_for(lambda received: received.topic == "the/end")
@@ -129,7 +129,7 @@ def kept_at(broker: Broker) -> set[str]:
 
 
 def live_and_die(broker: Broker, folder: Path, listener: Listener) -> None:
-    """Let a gateway with pump and fan publish all messages, then cut its connection permanently."""
+    """Let a gateway with two drives publish all its messages, then cut its connection for good."""
     part: Any = build(MqttSettings(broker.address, home_assistant=True), inside(folder))
     with closing(Running(part)) as running:
         listener.wait_for(lambda one: one.topic == "multidrop/pump-1/available")
@@ -139,7 +139,7 @@ def live_and_die(broker: Broker, folder: Path, listener: Listener) -> None:
         listener.wait_for(lambda one: (one.topic, one.payload) == ("multidrop/gateway", b"offline"))
 
 
-def test_messages_left_by_a_killed_gateway_are_deleted(broker: Broker, tmp_path: Path) -> None:
+def test_retained_messages_of_a_killed_gateway_are_deleted(broker: Broker, tmp_path: Path) -> None:
     for topic in ("elsewhere/old/available", "multidrop/hall/old/available"):
         publish(broker, topic, b"online", "-r")
     foreign = discovery_topic("multidrop", "old")
@@ -177,7 +177,7 @@ commands = true
 
 
 @pytest.mark.long
-def test_start_delayed_by_a_broker_until_after_a_stop_is_refused(tmp_path: Path) -> None:
+def test_a_start_that_a_broker_delivers_after_a_stop_is_refused(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     with mosquitto(tmp_path) as broker, served(tmp_path, SERVE.format(broker.address)) as gateway:
         listener = Listener(broker, "multidrop/#")
@@ -241,7 +241,7 @@ rows = true
 
 
 @pytest.mark.long
-def test_values_and_alarms_of_a_channel_reach_a_broker(tmp_path: Path) -> None:
+def test_values_and_alarms_of_a_computed_channel_are_published(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     with mosquitto(tmp_path) as broker, served(tmp_path, CHANNEL.format(broker.address)):
         listener = Listener(broker, "multidrop/#")
@@ -271,7 +271,7 @@ FLOW: list[dict[str, Any]] = json.loads((PAGES / "node-red-flow.json").read_text
 
 
 class Noted:
-    """An outbox that records topics."""
+    """An outbox that records the topics of messages."""
 
     def __init__(self) -> None:
         self.topics: list[str] = []
@@ -284,7 +284,7 @@ def topics_of(kind: str) -> list[str]:
     return [node["topic"] for node in FLOW if node["type"] == kind]
 
 
-def test_each_topic_of_the_flow_is_published_or_subscribed(tmp_path: Path) -> None:
+def test_the_gateway_publishes_or_subscribes_each_topic_of_the_node_red_flow(tmp_path: Path) -> None:
     matches = require_module("paho.mqtt.client").topic_matches_sub
     topics = JsonTopics(MqttSettings(commands=True), inside(tmp_path), lambda: 7)
     topics.outbox = noted = Noted()
@@ -300,13 +300,13 @@ def test_each_topic_of_the_flow_is_published_or_subscribed(tmp_path: Path) -> No
         assert any(matches(one, topic) for one in taken), topic
 
 
-def test_command_of_the_flow_is_a_valid_write() -> None:
+def test_the_command_of_the_node_red_flow_is_a_valid_write() -> None:
     [rule] = next(node["rules"] for node in FLOW if node["type"] == "change")
     given = json.loads(rule["to"].replace("$millis()", "1795262400000"))
     assert _read_write(given) == (25, 1_795_262_400_000)
 
 
-def test_flow_is_complete_and_the_page_lists_its_topics() -> None:
+def test_the_node_red_flow_is_complete_and_its_page_lists_the_topics() -> None:
     ids = {node["id"] for node in FLOW}
     assert {to for node in FLOW for wire in node.get("wires", []) for to in wire} <= ids
     assert {

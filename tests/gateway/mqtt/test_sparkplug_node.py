@@ -1,4 +1,4 @@
-"""An edge node through a real broker: births, data, deaths and rebirth, as a host sees them."""
+"""A Sparkplug edge node through a real broker: births, data, deaths and rebirths, as a host sees them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def node(broker: Broker, host: Host, tmp_path: Path) -> Iterator[tuple[Any, Runn
     running.close()
 
 
-def test_node_sends_births_data_and_deaths(host: Host, node: tuple[Any, Running]) -> None:
+def test_a_node_sends_births_data_and_deaths_of_its_drives(host: Host, node: tuple[Any, Running]) -> None:
     known, running = node
     birth = host.values(host.wait_for("NBIRTH"))
     assert birth == {"bdSeq": 0, "Node Control/Rebirth": False}
@@ -65,8 +65,8 @@ def test_node_sends_births_data_and_deaths(host: Host, node: tuple[Any, Running]
     assert (born["state"], born["fault"]) == ("fault", "перегрев")
 
 
-def test_fault_text_is_published_without_a_polled_fault_register(tmp_path: Path) -> None:
-    """The values of this drive's register `fault` are numbers without names. The register is not polled."""
+def test_the_text_of_a_fault_is_published_without_a_polled_fault_register(tmp_path: Path) -> None:
+    """The register `fault` of this drive is not polled, and its values have no names."""
     known = inside(tmp_path, VfdEl(2, name="mill"))
     known.hub.states["mill"], known.hub.faults["mill"] = "fault", "it shows a fault"
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line"), known, lambda: 7)
@@ -75,8 +75,10 @@ def test_fault_text_is_published_without_a_polled_fault_register(tmp_path: Path)
 
 
 @pytest.mark.parametrize("family", [VfdEl, InvtCHE, DelixiModbus])
-def test_register_named_fault_gets_its_own_metric(tmp_path: Path, family: type[Drive]) -> None:
-    """The metric `fault` is a text for every family; the register's own metric has its own type."""
+def test_a_register_named_fault_gets_a_metric_besides_the_metric_fault(
+    tmp_path: Path, family: type[Drive]
+) -> None:
+    """The metric `fault` is the text of a fault. The register's metric has the type of the register."""
     known = inside(tmp_path, family(2, name="mill"))
     known.hub.states["mill"], known.hub.faults["mill"] = "fault", "it shows a fault"
     register = family.registers["fault"]
@@ -91,7 +93,7 @@ def test_register_named_fault_gets_its_own_metric(tmp_path: Path, family: type[D
     assert len({metric.alias for metric in birth.metrics}) == 3
 
 
-def test_birth_has_the_units_of_metrics(host: Host, node: tuple[Any, Running]) -> None:
+def test_a_birth_has_the_units_of_metrics(host: Host, node: tuple[Any, Running]) -> None:
     birth = host.wait_for("DBIRTH", "pump-1")
     units = {
         metric.name: dict(
@@ -109,7 +111,7 @@ def test_birth_has_the_units_of_metrics(host: Host, node: tuple[Any, Running]) -
     assert not host.wait_for("DDATA", "pump-1").metrics[0].HasField("properties")
 
 
-def test_unchanged_values_are_not_sent(host: Host, node: tuple[Any, Running]) -> None:
+def test_unchanged_values_are_not_sent_again(host: Host, node: tuple[Any, Running]) -> None:
     known, running = node
     host.wait_for("DBIRTH", FAN.name)
     for _ in range(5):
@@ -121,7 +123,7 @@ def test_unchanged_values_are_not_sent(host: Host, node: tuple[Any, Running]) ->
 
 
 @pytest.mark.long
-def test_sequence_numbers_restart_at_0_after_255(host: Host, node: tuple[Any, Running]) -> None:
+def test_sequence_numbers_of_messages_restart_at_0_after_255(host: Host, node: tuple[Any, Running]) -> None:
     known, running = node
     host.wait_for("DBIRTH", FAN.name)
     for value in range(300):
@@ -132,7 +134,7 @@ def test_sequence_numbers_restart_at_0_after_255(host: Host, node: tuple[Any, Ru
     assert host.seq < 256
 
 
-def test_rebirth_command_sends_all_births_again(
+def test_a_rebirth_command_makes_the_node_send_all_births_again(
     broker: Broker, host: Host, node: tuple[Any, Running]
 ) -> None:
     host.wait_for("DBIRTH", FAN.name)
@@ -143,7 +145,7 @@ def test_rebirth_command_sends_all_births_again(
 
 
 @pytest.mark.slow
-def test_lost_connection_sends_a_death_and_a_birth_with_the_next_bdseq(
+def test_a_lost_connection_sends_a_death_and_a_birth_with_the_next_bdseq(
     host: Host, node: tuple[Any, Running]
 ) -> None:
     host.wait_for("DBIRTH", FAN.name)
@@ -153,7 +155,7 @@ def test_lost_connection_sends_a_death_and_a_birth_with_the_next_bdseq(
     host.wait_for("DBIRTH", "pump-1")
 
 
-def test_only_the_final_birth_or_death_of_pending_messages_is_sent(tmp_path: Path) -> None:
+def test_of_several_pending_births_and_deaths_of_a_drive_only_the_last_is_sent(tmp_path: Path) -> None:
     known, sent, is_open = inside(tmp_path), [], [True]
 
     def send(message: Publication) -> int | None:
@@ -163,7 +165,8 @@ def test_only_the_final_birth_or_death_of_pending_messages_is_sent(tmp_path: Pat
         return len(sent)
 
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line"), known, lambda: 7)
-    node.outbox = outbox = Outbox(send)  # the test sends fewer messages than MOST_UNDER_WAY
+    # the test sends fewer messages than MOST_UNDER_WAY, so none waits for acknowledgements
+    node.outbox = outbox = Outbox(send)
     node.will()
     node.connected()
     assert [kind for kind, _ in sent] == ["NBIRTH", "DBIRTH", "DBIRTH"]
@@ -183,7 +186,7 @@ def test_only_the_final_birth_or_death_of_pending_messages_is_sent(tmp_path: Pat
     assert [kind for kind, _ in sent[4:]] == ["DBIRTH", "DDATA"]
 
 
-def test_closing_sends_a_death(broker: Broker, host: Host, tmp_path: Path) -> None:
+def test_closing_the_gateway_sends_a_death(broker: Broker, host: Host, tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     settings = MqttSettings(broker.address, sparkplug="works", node="line")
     running = Running(build(settings, inside(tmp_path)))
@@ -192,7 +195,7 @@ def test_closing_sends_a_death(broker: Broker, host: Host, tmp_path: Path) -> No
     assert host.values(host.wait_for("NDEATH")) == {"bdSeq": 0}
 
 
-def test_fresh_write_and_any_stop_of_a_host_are_carried_out(
+def test_a_recent_write_and_any_stop_of_a_host_are_carried_out(
     broker: Broker, host: Host, node: tuple[Any, Running]
 ) -> None:
     known, _ = node
@@ -215,10 +218,10 @@ def test_fresh_write_and_any_stop_of_a_host_are_carried_out(
 @pytest.mark.parametrize(
     ("name", "noted"), [(b"Device Control/Stop", [("stop", ["pump-1"])]), (b"setpoint", [])]
 )
-async def test_stop_in_an_invalid_payload_is_sent(
+async def test_a_stop_in_an_invalid_payload_is_carried_out(
     tmp_path: Path, damage: bytes, name: bytes, noted: list[object]
 ) -> None:
-    """A boolean metric is followed by an invalid field, a name that is not UTF-8, or a truncated metric."""
+    """A metric is followed by an invalid field, by a name that is not UTF-8, or by a truncated metric."""
     known = inside(tmp_path)
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line", commands=True), known, lambda: 7)
     metric = b"\x0a" + bytes([len(name)]) + name + b"\x70\x01"
@@ -229,10 +232,10 @@ async def test_stop_in_an_invalid_payload_is_sent(
 
 
 @pytest.mark.parametrize("is_retained", [False, True])
-async def test_retained_write_is_refused_and_retained_stop_is_sent(
+async def test_a_retained_write_is_refused_and_a_retained_stop_is_carried_out(
     tmp_path: Path, *, is_retained: bool
 ) -> None:
-    """A broker repeats a retained write at every connection, so even a recent one is refused."""
+    """A broker sends a retained write at each connection, so even a recent one is refused."""
     known = inside(tmp_path)
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line", commands=True), known, lambda: 1_000)
     given = [Metric(DataType.DOUBLE, 25.0, 1_000, "setpoint"), Metric(DataType.BOOLEAN, 1, 1_000, STOP)]
@@ -243,7 +246,7 @@ async def test_retained_write_is_refused_and_retained_stop_is_sent(
     assert known.commands.noted == [*written, ("stop", ["pump-1"])]
 
 
-def test_reload_sends_deaths_of_removed_drives_and_births_of_others(
+def test_a_reload_sends_deaths_of_removed_drives_and_births_of_all_others(
     broker: Broker, host: Host, node: tuple[Any, Running]
 ) -> None:
     known, running = node
@@ -283,7 +286,7 @@ metrics = st.sampled_from(DataType).flatmap(
 
 
 def value_of(metric: Any) -> object:
-    """Return a metric's value as a Sparkplug host reads it."""
+    """Return the value that a Sparkplug host reads from a metric."""
     if metric.is_null:
         return None
     value = getattr(metric, metric.WhichOneof("value"))
@@ -292,7 +295,7 @@ def value_of(metric: Any) -> object:
 
 @pytest.mark.long
 @given(st.integers(0, 2**63), st.lists(metrics, max_size=5), st.none() | st.integers(0, 255))
-def test_a_host_can_decode_all_payloads(time_ms: int, said: list[Metric], seq: int | None) -> None:
+def test_a_sparkplug_host_can_decode_all_payloads(time_ms: int, said: list[Metric], seq: int | None) -> None:
     received = sparkplug_messages().Payload.FromString(payload(time_ms, said, seq))
     assert received.timestamp == time_ms
     assert (received.seq if received.HasField("seq") else None) == seq
@@ -318,7 +321,7 @@ def test_a_host_can_decode_all_payloads(time_ms: int, said: list[Metric], seq: i
         ("string_value", "жар"),
     ],
 )
-def test_command_of_a_sparkplug_host_is_decoded(field: str, value: object) -> None:
+def test_a_command_of_a_sparkplug_host_is_decoded(field: str, value: object) -> None:
     messages = sparkplug_messages()
     sent = messages.Payload(timestamp=1234, seq=3)
     sent.metrics.add(name="setpoint", alias=9, datatype=10, timestamp=5, **{field: value})
@@ -330,7 +333,7 @@ def test_command_of_a_sparkplug_host_is_decoded(field: str, value: object) -> No
 
 
 @given(st.binary(max_size=300))
-def test_any_bytes_are_decoded_or_refused(data: bytes) -> None:
+def test_any_bytes_are_decoded_or_refused_as_a_command(data: bytes) -> None:
     try:
         time_ms, found = read_command(data)
     except ValueError:
@@ -340,11 +343,11 @@ def test_any_bytes_are_decoded_or_refused(data: bytes) -> None:
 
 
 @given(st.data())
-def test_damaged_command_is_decoded_or_raises_value_error(data: st.DataObject) -> None:
+def test_a_damaged_command_is_decoded_or_raises_value_error(data: st.DataObject) -> None:
     whole = bytearray(payload(5, [Metric(DataType.DOUBLE, 2.5, 5, "setpoint", 3)], 1))
     whole[data.draw(st.integers(0, len(whole) - 1))] = data.draw(st.integers(0, 255))
     del whole[data.draw(st.integers(0, len(whole))) :]
-    test_any_bytes_are_decoded_or_refused.hypothesis.inner_test(bytes(whole))  # type: ignore[attr-defined]
+    test_any_bytes_are_decoded_or_refused_as_a_command.hypothesis.inner_test(bytes(whole))  # type: ignore[attr-defined]
 
 
 # ---- all rows over MQTT: JSON on a topic of each drive, and historical values of a Sparkplug node ----
@@ -356,7 +359,7 @@ DRIVES, REGISTERS = Names(["pump-1", FAN.name, "gone"]), Names(["output_frequenc
 
 
 def batch(*given: tuple[int, int, int, int]) -> Batch:
-    """Return a batch of rows, each given as ms after noon, drive code, register code and value."""
+    """Return a batch of rows. Each is given as (ms after noon, drive code, register code, value)."""
     columns = Columns(len(given))
     for ms, drive, register, value in given:
         found = new_completion(result=7, sent_ns=ms * 1_000_000, first_ns=ms * 1_000_000 + 1)
@@ -369,7 +372,7 @@ def batch(*given: tuple[int, int, int, int]) -> Batch:
 
 @pytest.fixture
 def row_node(broker: Broker, host: Host, tmp_path: Path) -> Iterator[tuple[Any, Any, Running]]:
-    """Return the context, the part, and the running part of a node that sends all rows."""
+    """A node that sends all rows: its context, the MQTT part, and the running part."""
     known = inside(tmp_path)
     part = build(MqttSettings(broker.address, sparkplug="works", node="line", rows=True), known)
     running = Running(part)
@@ -378,7 +381,7 @@ def row_node(broker: Broker, host: Host, tmp_path: Path) -> Iterator[tuple[Any, 
 
 
 def history(host: Host, kind: str, drive: str) -> list[tuple[str, int, Any]]:
-    """Wait for a message; return name, ms after noon, and value of its historical metrics."""
+    """Wait for a message, and return (name, ms after noon, value) of its historical metrics."""
     found = host.wait_for(kind, drive)
     values = host.values(found)
     return [
@@ -388,7 +391,7 @@ def history(host: Host, kind: str, drive: str) -> list[tuple[str, int, Any]]:
     ]
 
 
-def test_failed_start_leaves_no_spool_open(tmp_path: Path) -> None:
+def test_a_failed_start_of_the_mqtt_part_leaves_no_spool_open(tmp_path: Path) -> None:
     settings = MqttSettings("mqtt://127.0.0.1:9", sparkplug="works", node="line", rows=True)
     other = tmp_path / settings.spool / "sparkplug" / "rows.csv"
     other.parent.mkdir(parents=True)
@@ -399,13 +402,13 @@ def test_failed_start_leaves_no_spool_open(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_rows_polled_while_the_broker_was_away_are_historical(
+def test_rows_polled_while_the_broker_was_away_are_sent_as_historical(
     broker: Broker, host: Host, row_node: tuple[Any, Any, Running]
 ) -> None:
     _, part, _ = row_node
     host.wait_for("DBIRTH", FAN.name)
     for one in part._brokers:
-        one._client.reconnect_delay_set(3, 3)  # no reconnection until the second host listens
+        one._client.reconnect_delay_set(3, 3)  # delays the reconnection until the second host listens
     broker.kill()
     until(lambda: "no connection" in part.health())
     part.take(batch((1, 0, 0, 40), (2, 1, 0, 41), (3, 2, 0, 42), (4, 0, 2, 43), (5, 0, 1, 1)))
@@ -421,7 +424,7 @@ def test_rows_polled_while_the_broker_was_away_are_historical(
 
 
 @pytest.mark.slow
-def test_a_silent_drive_gets_a_birth_before_its_historical_values(
+def test_a_silent_drive_gets_a_birth_before_its_historical_values_are_sent(
     host: Host, row_node: tuple[Any, Any, Running]
 ) -> None:
     known, part, running = row_node

@@ -1,4 +1,4 @@
-"""An OPC UA server whose clients are hostile, greedy or read no answers, and its encryption."""
+"""The OPC UA server with hostile and greedy clients and clients that read no answers; its encryption."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ PLANT, PLANT_STOP = "ns=2;i=1", "ns=2;i=2"
 @pytest.fixture(scope="module")
 def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     with pytest.MonkeyPatch.context() as patch, served(tmp_path_factory.mktemp("opcua"), SERVE) as gateway:
-        patch.setattr(server, "MOST_WAITING", 1 << 20)  # so that only MOST_UNREAD limits clients
+        patch.setattr(server, "MOST_WAITING", 1 << 20)  # so that MOST_UNREAD is the only limit of the clients
         part: Any = gateway.gateway.feeds["opcua"]
         until(lambda: part.is_ready)
         yield gateway
@@ -54,7 +54,7 @@ def port_of(gateway: Served) -> int:
 
 
 def stop_all(url: str) -> None:
-    """Stop all drives by OPC UA, with a new client."""
+    """Stop all drives by OPC UA, through a new connection."""
     with Client(url, timeout=PATIENCE) as client:
         assert "stop" in client.get_node(PLANT).call_method(client.get_node(PLANT_STOP).nodeid)
 
@@ -65,7 +65,7 @@ def connected(gateway: Served) -> socket.socket:
 
 @contextmanager
 def recorded(port: int) -> Iterator[tuple[str, bytearray]]:
-    """Yield the URL of a proxy for one client, and the bytes that the client sends."""
+    """Yield the URL of a proxy for one client, and the bytes that this client sends through it."""
     sent = bytearray()
 
     def passed(source: socket.socket, target: socket.socket, note: bytearray) -> None:
@@ -93,7 +93,7 @@ def recorded(port: int) -> Iterator[tuple[str, bytearray]]:
 
 
 def chunks_of(data: bytes) -> list[bytes]:
-    """Return the chunks of OPC UA's binary protocol (OPC 10000-6, 7.1.2) in these bytes."""
+    """Return the message chunks (OPC 10000-6, 7.1.2) in these bytes."""
     found = []
     while data:
         (size,) = struct.unpack_from("<I", data, 4)
@@ -111,8 +111,8 @@ def read_chunk(peer: socket.socket) -> bytes:
     return data
 
 
-def test_the_server_survives_damaged_conversations(gateway: Served) -> None:
-    """A recorded conversation is replayed on a new channel, with random bytes changed in one message."""
+def test_the_server_survives_replayed_messages_with_changed_bytes(gateway: Served) -> None:
+    """A client's recorded messages are replayed on a new channel, with random bytes of one changed."""
     with recorded(port_of(gateway)) as (url, sent), Client(url, timeout=PATIENCE) as client:
         plant = client.get_node(PLANT)
         plant.get_children()
@@ -145,14 +145,14 @@ def test_the_server_survives_damaged_conversations(gateway: Served) -> None:
     assert gateway.get("/health").json["parts"]["opcua"] == "ok"
 
 
-def test_a_client_that_sends_an_endless_message_is_disconnected(gateway: Served) -> None:
+def test_a_client_that_sends_a_message_without_end_is_disconnected(gateway: Served) -> None:
     with closing(connected(gateway)) as peer:
         peer.sendall(b"HELF" + struct.pack("<I", 0xFFFF_FFFF))
         with pytest.raises(ConnectionError):
             peer.sendall(bytes(1 << 26))
 
 
-def test_client_that_leaves_answers_unread_is_disconnected(
+def test_an_opc_ua_client_that_reads_no_answers_is_disconnected(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(server, "MOST_UNREAD", 1 << 16)
@@ -182,7 +182,7 @@ def test_client_that_leaves_answers_unread_is_disconnected(
 
 
 @pytest.mark.parametrize("interval", [0.0, -1.0, 1e-9, 1e300, float("nan")])
-def test_interval_of_a_subscription_is_limited(gateway: Served, interval: float) -> None:
+def test_the_interval_of_a_subscription_is_kept_within_limits(gateway: Served, interval: float) -> None:
     with Client(f"opc.tcp://127.0.0.1:{port_of(gateway)}/", timeout=PATIENCE) as client:
         parameters = ua.CreateSubscriptionParameters(RequestedPublishingInterval=interval)
         found = client.tloop.post(client.aio_obj.uaclient.create_subscription(parameters, callback=None))
@@ -190,7 +190,7 @@ def test_interval_of_a_subscription_is_limited(gateway: Served, interval: float)
 
 
 async def subscribe_and_vanish(url: str, timeout_ms: float) -> None:
-    """Subscribe to a value a thousand times; then abort the connection without closing the session."""
+    """Subscribe to a value a thousand times, then abort the connection without closing the session."""
     client = AsyncClient(url, timeout=PATIENCE)
     client.session_timeout = timeout_ms
     await client.connect()
@@ -213,7 +213,7 @@ def test_subscriptions_of_a_vanished_client_end_with_its_session(gateway: Served
     until(lambda: set(there) == before)
 
 
-def test_request_for_too_many_nodes_is_refused(gateway: Served) -> None:
+def test_a_request_for_too_many_nodes_is_refused(gateway: Served) -> None:
     with Client(f"opc.tcp://127.0.0.1:{port_of(gateway)}/", timeout=PATIENCE) as client:
         state = client.get_node("ns=2;s=pump-1.State")
         limit = client.get_node(ua.ObjectIds.Server_ServerCapabilities_OperationLimits_MaxNodesPerRead)
@@ -249,7 +249,8 @@ def test_with_a_certificate_only_encrypted_sessions_are_accepted(
         until(lambda: part.is_ready)
         url = f"opc.tcp://127.0.0.1:{port_of(gateway)}/"
         plain = Client(url, timeout=PATIENCE)
-        with monkeypatch.context() as patch:  # else the client gives up before it connects
+        # otherwise the client finds no endpoint of its security mode and does not connect
+        with monkeypatch.context() as patch:
             patch.setattr(AsyncClient, "find_endpoint", staticmethod(lambda endpoints, *rest: endpoints[0]))
             with pytest.raises(ua.UaStatusCodeError, match="BadSecurityModeRejected"):
                 plain.connect()
@@ -264,7 +265,7 @@ def test_with_a_certificate_only_encrypted_sessions_are_accepted(
             assert "stop" in secured.get_node(PLANT).call_method(secured.get_node(PLANT_STOP).nodeid)
 
 
-def test_a_key_of_another_certificate_is_reported_in_one_sentence(tmp_path: Path) -> None:
+def test_a_private_key_of_another_certificate_is_reported_in_one_sentence(tmp_path: Path) -> None:
     for name in ("plant", "other"):
         make_certificate(tmp_path, name)
     files = 'certificate = "plant.pem"\nkey = "other-key.pem"\n'

@@ -1,4 +1,4 @@
-"""The OPC UA server of a gateway, with asyncua's client."""
+"""The OPC UA server of a gateway, used by asyncua's client."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def logged_in(gateway: Served, right: Right) -> Iterator[Any]:
 
 
 def read(client: Any, node: str) -> Any:
-    """Return the data value of a node, whose status may be bad."""
+    """Return the data value of a node, even if its status is bad."""
     return client.get_node(f"ns=2;s={node}").read_data_value(raise_on_bad_status=False)
 
 
@@ -113,7 +113,7 @@ def stands(gateway: Served, drive: str) -> bool:
 
 
 def stop(client: Any, drive: str = "") -> str:
-    """Stop a drive, or all drives; return the answer's text."""
+    """Call the stop of a drive, or of all drives; return the text of the answer."""
     place, method = (f"ns=2;s={drive}", f"ns=2;s={drive}.Stop") if drive else (PLANT, PLANT_STOP)
     return str(client.get_node(place).call_method(client.get_node(method).nodeid))
 
@@ -122,10 +122,10 @@ def stop(client: Any, drive: str = "") -> str:
 
 
 @pytest.mark.slow
-async def test_a_server_that_was_closed_during_its_start_accepts_no_client(
+async def test_an_opc_ua_server_that_was_closed_while_starting_accepts_no_client(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A reload waits at most 3 s for the end of the old server, which may then still be starting."""
+    """A reload waits at most 3 s for the old server to end, so that server may still be starting."""
     from multidrop.gateway.opcua.server import PlantServer
 
     begun, may_start, start = threading.Event(), threading.Event(), PlantServer.start
@@ -148,14 +148,17 @@ async def test_a_server_that_was_closed_during_its_start_accepts_no_client(
     try:
         await asyncio.wait_for(asyncio.shield(part._serving), PATIENCE)
     finally:
-        part._end_server()  # a thread that still serves would keep the tests from ending
+        part._end_server()  # a server thread that still runs would keep the tests from ending
 
 
 @pytest.mark.slow
-async def test_end_of_the_last_server_frees_its_nodes_and_restores_the_process(
+async def test_closing_the_last_server_frees_its_nodes_and_restores_python_settings(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Nodes are freed without a garbage collection. At first, `serving` also has a fake server."""
+    """The nodes are freed without a garbage collection.
+
+    During the first run, another server is registered.
+    """
     serving, switch_s = {object()}, sys.getswitchinterval()
     monkeypatch.setattr("multidrop.gateway.opcua.part._unended", serving)
     context: Any = SimpleNamespace(plant=Plant(()), version="1", hub=SimpleNamespace(drives=[]))
@@ -187,9 +190,9 @@ async def test_end_of_the_last_server_frees_its_nodes_and_restores_the_process(
 
 
 @pytest.mark.slow
-def test_the_address_space_is_excluded_from_garbage_collection(gateway: Served) -> None:
-    """A garbage collection stops all threads. With the address space, each full one would take 0.2 s."""
-    url_of(gateway)  # waits until the drives' nodes exist
+def test_opc_ua_nodes_are_excluded_from_garbage_collection(gateway: Served) -> None:
+    """A garbage collection stops all threads; with the nodes, a full collection would take 0.2 s."""
+    url_of(gateway)  # waits until the nodes of the drives exist
     assert gc.isenabled()
     assert gc.get_freeze_count() > 400_000
     assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
@@ -199,7 +202,7 @@ def test_the_address_space_is_excluded_from_garbage_collection(gateway: Served) 
 
 
 @pytest.mark.slow
-def test_each_drive_is_an_object_with_typed_values(client: Any) -> None:
+def test_each_drive_is_an_opc_ua_object_with_typed_values(client: Any) -> None:
     assert client.get_namespace_array()[2:] == ["urn:multidrop:plant"]
     plant = client.get_node("i=85").get_child("2:Plant")
     assert plant.nodeid.to_string() == PLANT
@@ -213,11 +216,11 @@ def test_each_drive_is_an_object_with_typed_values(client: Any) -> None:
     unit = current.get_child("0:EngineeringUnits").read_value()
     assert (unit.DisplayName.Text, unit.UnitId) == ("A", 4279632)
     assert pump.get_child("2:status").read_data_type_as_variant_type() is ua.VariantType.String
-    until(lambda: code(client, "pump-2.half") == "Good")  # a computed channel
+    until(lambda: code(client, "pump-2.half") == "Good")  # `half` is a computed channel
 
 
 @pytest.mark.slow
-def test_values_have_the_time_of_their_request(gateway: Served, client: Any) -> None:
+def test_opc_ua_values_have_the_time_of_their_request(gateway: Served, client: Any) -> None:
     until(lambda: code(client, "pump-1.output_frequency") == "Good")
     first = read(client, "pump-1.output_frequency")
     assert abs(first.SourceTimestamp.timestamp() - time.time()) < PATIENCE
@@ -229,9 +232,7 @@ def test_values_have_the_time_of_their_request(gateway: Served, client: Any) -> 
 
 
 @pytest.mark.slow
-def test_values_have_the_status_bad_no_communication_while_their_drive_is_silent(
-    gateway: Served, client: Any
-) -> None:
+def test_values_of_a_silent_drive_have_the_status_bad_no_communication(gateway: Served, client: Any) -> None:
     gateway.sims["pump-2"].deaf_until = float("inf")
     try:
         until(lambda: code(client, "pump-2.output_frequency") == "BadNoCommunication")
@@ -246,7 +247,7 @@ def test_values_have_the_status_bad_no_communication_while_their_drive_is_silent
 
 
 @pytest.mark.slow
-def test_opc_ua_clients_can_write_no_value(client: Any) -> None:
+def test_opc_ua_clients_cannot_write_values(client: Any) -> None:
     frequency = client.get_node("ns=2;s=pump-1.output_frequency")
     with pytest.raises(ua.UaStatusCodeError, match="BadUserAccessDenied"):
         frequency.write_value(25.0)
@@ -259,7 +260,9 @@ def test_opc_ua_clients_can_write_no_value(client: Any) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("drive", "drives"), [("pump-1", ["pump-1"]), ("", ["pump-1", "pump-2"])])
-def test_opc_ua_stop_stops_the_motors(gateway: Served, client: Any, drive: str, drives: list[str]) -> None:
+def test_the_opc_ua_stop_method_stops_the_motors(
+    gateway: Served, client: Any, drive: str, drives: list[str]
+) -> None:
     start(gateway, *drives)
     assert "stop" in stop(client, drive)
     until(lambda: all(stands(gateway, one) for one in drives))
@@ -267,7 +270,9 @@ def test_opc_ua_stop_stops_the_motors(gateway: Served, client: Any, drive: str, 
 
 
 @pytest.mark.slow
-def test_stop_of_another_object_is_sent_but_not_confirmed(gateway: Served, client: Any) -> None:
+def test_a_stop_method_called_on_another_drives_object_is_sent_but_not_confirmed(
+    gateway: Served, client: Any
+) -> None:
     start(gateway, "pump-1", "pump-2")
     with pytest.raises(ua.UaStatusCodeError, match="BadMethodInvalid"):
         client.get_node("ns=2;s=pump-2").call_method(client.get_node("ns=2;s=pump-1.Stop").nodeid)
@@ -277,10 +282,10 @@ def test_stop_of_another_object_is_sent_but_not_confirmed(gateway: Served, clien
 
 
 @pytest.mark.slow
-def test_stop_of_another_object_is_not_confirmed_while_many_stops_are_in_progress(
+def test_a_stop_on_another_drives_object_is_not_confirmed_during_many_stops(
     gateway: Served, client: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # with this limit, the server answers as if enough stops were in progress already
+    # With the limit 0, the server answers as if the limit of concurrent stops were reached.
     monkeypatch.setattr("multidrop.gateway.opcua.part.MOST_STOPS", 0)
     with pytest.raises(ua.UaStatusCodeError, match="BadMethodInvalid"):
         client.get_node("ns=2;s=pump-2").call_method(client.get_node("ns=2;s=pump-1.Stop").nodeid)
@@ -288,7 +293,7 @@ def test_stop_of_another_object_is_not_confirmed_while_many_stops_are_in_progres
 
 
 @pytest.mark.slow
-def test_stops_of_one_request_do_not_wait_for_each_other(gateway: Served, client: Any) -> None:
+def test_stops_in_one_opc_ua_request_do_not_wait_for_each_other(gateway: Served, client: Any) -> None:
     start(gateway, "pump-1")
     gateway.sims["pump-2"].deaf_until = float("inf")
     try:
@@ -307,7 +312,7 @@ def test_stops_of_one_request_do_not_wait_for_each_other(gateway: Served, client
 
 
 @pytest.mark.slow
-def test_client_that_reads_nothing_delays_no_poll_and_no_stop(gateway: Served, client: Any) -> None:
+def test_an_opc_ua_client_that_reads_nothing_delays_no_poll_and_no_stop(gateway: Served, client: Any) -> None:
     words = [sys.executable, str(SUBSCRIBER), url_of(gateway), "50"]
     start(gateway, "pump-1", "pump-2")
     with BoundProcess(words, stdout=subprocess.PIPE, text=True) as subscriber:
@@ -342,7 +347,7 @@ def test_opc_ua_clients_have_the_rights_of_their_tokens(tmp_path: Path) -> None:
         wrong.disconnect()
         with logged_in(gateway, Right.STOP) as stopper:
             assert "stop" in stop(stopper)
-            gateway.gateway.tokens.replace([])  # as a reload does
+            gateway.gateway.tokens.replace([])  # removes the tokens, as a reload can do
             gateway.gateway.commands.may = gateway.gateway.commands.may._replace(look="token")
             with pytest.raises(ua.UaStatusCodeError, match="BadUserAccessDenied"):
                 read(stopper, "pump-1.State")
@@ -352,7 +357,7 @@ def test_opc_ua_clients_have_the_rights_of_their_tokens(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_reload_removes_and_adds_drives(tmp_path: Path) -> None:
+def test_a_reload_removes_and_adds_opc_ua_objects_of_drives(tmp_path: Path) -> None:
     class Notes:
         codes: list[str] = []
 
@@ -377,13 +382,13 @@ def test_reload_removes_and_adds_drives(tmp_path: Path) -> None:
 
 
 class Cyclic:
-    """An object that refers to itself, like each drive of a plant."""
+    """An object that refers to itself, as the node of a drive does."""
 
     def __init__(self) -> None:
         self.own = self
 
 
-async def test_excluded_cycles_are_freed_once_many_drives_were_removed(
+async def test_reference_cycles_are_freed_after_many_drives_were_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def remove(nodes: PlantNodes, name: str) -> None:
@@ -429,7 +434,7 @@ CHANNEL = '[[line.drive.channel]]\nname = "{}"\nvalue = "output_frequency / 2"\n
         (CHANNEL.format("half"), ("a.half", "a"), 'drive "a.half" has the node id of a value of "a"'),
     ],
 )
-def test_mistakes_in_the_opc_ua_table_are_reported(
+def test_mistakes_in_the_opc_ua_settings_are_reported(
     tmp_path: Path, serve: str, drives: tuple[str, ...], sentence: str
 ) -> None:
     with pytest.raises(PlantError) as mistakes:
@@ -437,7 +442,7 @@ def test_mistakes_in_the_opc_ua_table_are_reported(
     assert sentence in str(mistakes.value)
 
 
-def test_opc_ua_accepts_only_this_computer_by_default(tmp_path: Path) -> None:
+def test_opc_ua_accepts_only_clients_on_this_computer_by_default(tmp_path: Path) -> None:
     settings = read_settings(written(tmp_path, "[serve.opcua]\n"), {})
     assert settings.parts["opcua"] == OpcUaSettings("127.0.0.1:4840")
 
@@ -446,7 +451,7 @@ def test_opc_ua_accepts_only_this_computer_by_default(tmp_path: Path) -> None:
 
 
 GOOD_ROW, MISS = (5, 50, 24.5, 0), (7, 70, 0.0, 1)
-NAMES = {  # names of status codes, from OPC 10000-6, A.2 (StatusCode.csv)
+NAMES = {  # names of OPC UA status codes (OPC 10000-6, A.2, StatusCode.csv)
     0x00000000: "Good",
     0x40900000: "Uncertain_LastUsableValue",
     0x408F0000: "Uncertain_NoCommunicationLastUsableValue",
@@ -474,7 +479,7 @@ NAMES = {  # names of status codes, from OPC 10000-6, A.2 (StatusCode.csv)
         (MISS, None, False, "no valid value", ("Bad_SensorFailure", None, 7)),
     ],
 )
-def test_each_row_has_the_expected_opc_ua_status_code(
+def test_without_commands_the_only_command_topic_is_that_of_the_sparkplug_node(
     newest: tuple[int, int, float, int] | None,
     good: tuple[int, int, float, int] | None,
     is_current: bool,
@@ -496,23 +501,23 @@ def test_each_row_has_the_expected_opc_ua_status_code(
         (hub.Shown(hub.SILENT, "no reply"), ("Bad_NoCommunication", None)),
     ],
 )
-def test_a_drive_counts_as_free_of_faults_only_if_its_values_show_it(
+def test_a_drive_is_shown_without_fault_only_if_its_values_prove_it(
     shown: hub.Shown, expected: tuple[str, str | None]
 ) -> None:
     code, text = fault_of(shown)
     assert (NAMES[code], text) == expected
 
 
-@pytest.mark.parametrize(  # ids of the OPC Foundation's list UNECE_to_OPCUA.csv
+@pytest.mark.parametrize(  # ids from the OPC Foundation's list UNECE_to_OPCUA.csv
     ("unit", "number"),
     [("Hz", 4740186), ("V", 5655636), ("A", 4279632), ("%", 20529), ("kW", 4937556), ("°C", 4408652)],
 )
-def test_unit_has_the_id_of_unece(unit: str, number: int) -> None:
+def test_a_unit_of_measurement_has_its_unece_id(unit: str, number: int) -> None:
     found = unit_of(unit)
     assert (found.UnitId, found.DisplayName.Text) == (number, unit)
 
 
-def test_every_unit_of_a_family_has_an_id() -> None:
+def test_each_unit_of_measurement_of_a_family_has_a_unece_id() -> None:
     families = map(find_model, (*MODELS, *SHIPPED))
     units = {register.unit for family in families for register in family.registers.values() if register.unit}
     assert len(units) > 10

@@ -1,4 +1,4 @@
-"""Fixtures: Chromium, a gateway with invented values, and its pages. Without Chromium, tests are skipped."""
+"""Fixtures: Chromium, a fake gateway, and web pages of it. Without Chromium, these tests are skipped."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from fake_gateway import FakeGateway
 from namespaces import steady_network
 from watching import LIVE, PATIENCE_S, SIZES, Opener, missing, note_requests, until
 
-# The first program draws no windows, so it needs a third of the processor time of the others.
+# The first program has no windows, so it needs a third of the others' processor time.
 BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
-OPTIONS = ("--no-sandbox", "--host-resolver-rules=MAP evil.example 127.0.0.1")  # for DNS rebinding
+# evil.example resolves to this machine, for tests of DNS rebinding
+OPTIONS = ("--no-sandbox", "--host-resolver-rules=MAP evil.example 127.0.0.1")
 
 
-# Scope "module": playwright keeps an event loop running in this thread, which would break other tests.
+# Once per file, because playwright keeps an event loop running in this thread, which would break other tests.
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     try:
@@ -46,7 +47,7 @@ def _steady() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def port() -> Iterator[int]:
-    """Reserve a port for all gateways of a file, so that the browser's cache keeps the page's files."""
+    """Reserve a port for the gateways of a test file, so that the browser's cache keeps the page's files."""
     with socket.socket() as reserved:
         reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         reserved.bind(("127.0.0.1", 0))
@@ -61,7 +62,7 @@ def gateway(port: int) -> Iterator[FakeGateway]:
 
 
 class Tab:
-    """A page of the browser that many tests use, one after the other: a new page costs a process."""
+    """A browser tab that tests use one after the other, because each new tab costs a process."""
 
     def __init__(self, context: Any) -> None:
         self.page = context.new_page()
@@ -71,9 +72,9 @@ class Tab:
         note_requests(self.page)
 
     def leave(self) -> None:
-        """Leave the gateway's page, and reset all that a test may have changed."""
+        """Leave the gateway's web page, and reset everything that a test may have changed."""
         self.page.unroute_all(behavior="ignoreErrors")
-        with suppress(Exception):  # the test may have forbidden storage
+        with suppress(Exception):  # storage may be forbidden in this test
             self.page.evaluate("localStorage.clear()")
         self.page.context.clear_cookies()
         self.page.mouse.move(0, 0)
@@ -82,7 +83,7 @@ class Tab:
 
 @pytest.fixture(scope="module")
 def tab_with(browser: Any) -> Iterator[Callable[..., AbstractContextManager[Tab]]]:
-    """Yield a function that takes a context's options and returns an unused tab of such a context."""
+    """Yield a function that takes options for a browser context, and returns an unused tab with these."""
     contexts: dict[str, Any] = {}
     unused: defaultdict[str, list[Tab]] = defaultdict(list)
 
@@ -108,15 +109,16 @@ def tab_with(browser: Any) -> Iterator[Callable[..., AbstractContextManager[Tab]
 
 @pytest.fixture
 def many_drives(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Give the plant 31 drives, as many as a line may have."""
+    """Give the fake plant 31 drives, the most on one line."""
     monkeypatch.setattr(fake_plant, "NAMES", fake_plant.MANY_NAMES)
 
 
 @pytest.fixture
 def opened(tab_with: Callable[..., AbstractContextManager[Tab]], gateway: FakeGateway) -> Iterator[Opener]:
-    """Return a function that opens a view; the test fails if the page had an error or violated its CSP.
+    """Return a function that opens a view of the web page.
 
-    `prepare` is called with the page before it is loaded.
+    The test fails if the page had an error or violated its content security policy (CSP). The page is passed
+    to `prepare` before it is loaded.
     """
     with ExitStack() as tabs:
         problems: list[list[str]] = []
@@ -147,7 +149,7 @@ def opened(tab_with: Callable[..., AbstractContextManager[Tab]], gateway: FakeGa
 
 @pytest.fixture
 def page(browser: Any) -> Iterator[Any]:
-    """A page without a gateway; the test fails if the page had an error or violated its CSP."""
+    """An empty browser page without a gateway. The test fails if it has an error or violates its CSP."""
     context = browser.new_context(viewport={"width": 1440, "height": 900}, locale="en-US")
     context.set_default_timeout(PATIENCE_S * 1000)
     page, problems = context.new_page(), list[str]()
@@ -158,19 +160,19 @@ def page(browser: Any) -> Iterator[Any]:
 
 
 def note_problems(page: Any, problems: list[str]) -> None:
-    """Append the page's errors, and its violations of the CSP, to a list."""
+    """Append the page's errors and CSP violations to a list, as they occur."""
     page.on("pageerror", lambda error: problems.append(str(error)))
     page.on("console", lambda said: problems.append(said.text) if is_problem(said) else None)
 
 
 def is_problem(said: Any) -> bool:
-    """Return True for errors other than failed requests, which some tests cause."""
+    """Return True unless the message is about a failed request, which some tests cause."""
     return said.type in ("error", "warning") and "Failed to load resource" not in said.text
 
 
 @pytest.fixture(scope="module")
 def axe() -> str:
-    """The script of axe-core."""
+    """Return the script of axe-core, which checks accessibility."""
     try:
         return (files("axe_playwright_python") / "axe.min.js").read_text("utf-8")
     except ImportError:

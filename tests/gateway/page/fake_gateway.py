@@ -1,4 +1,4 @@
-"""A small gateway for tests of the page. A test may set its answers, and may kill it."""
+"""A small fake gateway for tests of the web page. A test may set its answers, and may kill it."""
 
 from __future__ import annotations
 
@@ -24,48 +24,49 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-FRAMES_A_SECOND = 5  # the real gateway's limit
-REMEMBERED = 5  # number of newest frames kept
-HOLD_S = 20  # time after which a request for a frame is answered with 304
+FRAMES_A_SECOND = 5  # page frames a second, as the real gateway's limit
+REMEMBERED = 5  # number of page frames kept
+HOLD_S = 20  # s until a request that waits for a page frame is answered with 304
 
 
 class FakeGateway:
-    """A server on a free port of 127.0.0.1. Tests may change its attributes at any time."""
+    """An HTTP server on 127.0.0.1. Tests may change its attributes at any time."""
 
     def __init__(self, port: int = 0) -> None:
         self.renamed: dict[str, str] = {}
-        self.stuck: dict[str, float] = {}  # by drive: time (s) since which its values are constant
-        self.clocked: str | None = None  # name of a drive whose frequency shows the time
-        self.plant_changes: dict[str, Any] = {}  # replaced keys of the plant description
-        self.changes: dict[str, Any] = {}  # replaced keys of the frame
-        self.drive_changes: dict[str, dict[str, Any]] = {}  # by drive: replaced keys in the frame
+        self.stuck: dict[str, float] = {}  # by drive: time (s) since which it has not been polled
+        self.clocked: str | None = None  # name of a drive whose frequency is the time
+        self.plant_changes: dict[str, Any] = {}  # keys of the plant description to replace
+        self.changes: dict[str, Any] = {}  # keys of the page frame to replace
+        self.drive_changes: dict[str, dict[str, Any]] = {}  # by drive: keys to replace in the page frame
         self.posts: list[tuple[str, Any]] = []  # path and body of each POST request
-        self.seen: list[int] = []  # for each command: number of the newest frame on the page
-        self.stops: dict[str, int] = {}  # by drive: number of stops called
-        self.is_held: threading.Event | None = None  # answers to stops wait for this event
-        self.confirms = False  # True: the HTTP head of a waiting answer is sent immediately
-        self.token: str | None = None  # token that POST requests need; None: no token
+        self.seen: list[int] = []  # for each command: number of the page frame that it names
+        self.stops: dict[str, int] = {}  # by drive: number of stops called so far
+        self.is_held: threading.Event | None = None  # if set, answers to stops wait for this event
+        self.confirms = False  # True: send the HTTP head of an answer before the rest is ready
+        self.token: str | None = None  # token that POST requests must have; None: any caller may send them
         self.has_history = True
-        self.recorded: dict[str, dict[str, object]] = {}  # by series: additional keys of its history
+        self.recorded: dict[str, dict[str, object]] = {}  # by series: keys to add to its history
         self.triggers: list[dict[str, Any]] = []  # the last triggers, newest first
-        self.knows_since = 0  # since when the gateway knows all alarms, UTC in ms
-        self.maximum_hz = 50.0  # value of the maximum frequency of drives
-        self.has_changed = False  # True: acknowledging any alarm fails with "unknown"
-        self.parameters: list[dict[str, Any]] = []  # successive answers; the last one is repeated
-        self.fleet: dict[str, Any] = {}  # replaced keys of /api/fleet
-        self.fleet_outcomes: dict[str, dict[str, Any]] = {}  # outcomes of a stop of the fleet
+        self.knows_since = 0  # UTC in ms since which all alarms are known
+        self.maximum_hz = 50.0  # maximum frequency of all drives
+        self.has_changed = False  # True: acknowledging an alarm fails, because there is no such alarm
+        # successive answers about parameters; the last is repeated
+        self.parameters: list[dict[str, Any]] = []
+        self.fleet: dict[str, Any] = {}  # keys of /api/fleet to replace
+        self.fleet_outcomes: dict[str, dict[str, Any]] = {}  # answer to a stop of the fleet
         self.reloaded: dict[str, Any] = {
             "done": True,
             "text": "plant.toml is in effect",
             "mistakes": [],
             "restart": [],
         }
-        self.is_silent = False  # True: requests for frames are not answered
-        self.stands_still = False  # True: no newer frames are made
+        self.is_silent = False  # True: requests for page frames get no answer
+        self.stands_still = False  # True: no further page frames are made
         self.began = time.time()
         self.outcomes: dict[str, dict[str, Any]] = {}
         self._lock = threading.Lock()
-        self._made: dict[int, dict[str, Any]] = {}  # by number: the newest frames
+        self._made: dict[int, dict[str, Any]] = {}  # by number: the page frames kept
         self._sockets: set[socket.socket] = set()
         self._server = _Server(("127.0.0.1", port), _handler(self))
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.02,), daemon=True)
@@ -82,11 +83,11 @@ class FakeGateway:
                 connection.shutdown(socket.SHUT_RDWR)
 
     def number(self) -> int:
-        """Return the number of the newest frame."""
+        """Return the number of the newest page frame."""
         return 1 if self.stands_still else int((time.time() - self.began) * FRAMES_A_SECOND) + 1
 
     def encoded(self, after: int) -> bytes:
-        """Return the newest frame, or only its changes since frame `after` if that frame is still kept."""
+        """Return the newest page frame; only its changes since frame `after`, if that frame is kept."""
         with self._lock:
             number = self.number()
             if number not in self._made:
@@ -304,7 +305,7 @@ def alarms(handler: Any, gateway: FakeGateway, asked: dict[str, list[str]]) -> N
 
 
 def as_answer(alarm: dict[str, Any]) -> dict[str, Any]:
-    """Return an alarm with its times as ISO text, as the gateway sends it."""
+    """Return an alarm as the gateway sends it, with times as ISO text."""
     return alarm | {
         key: alarm[key] and iso_time(alarm[key]) for key in ("time", "ended", "acknowledged") if key in alarm
     }
@@ -325,7 +326,7 @@ def audit(handler: Any, gateway: FakeGateway, _: object) -> None:
         entry(900, write="stop", outcome="confirmed", by="anna by page from 10.0.0.14"),
         *(entry(7200 + n, drive=("labeller", "mixer-2")[n % 2], write="stop", outcome="unconfirmed",
                 why="no reply", by="anna by page from 10.0.0.14") for n in range(84)),
-        # More than a day ago: the page shows its date too.
+        # More than a day ago, so the page shows its date.
         entry(90000, write="start", outcome="unconfirmed", why="no reply", by="scada by http from 10.0.0.2"),
     ]})  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""A plant of three lines with changing values, in the format of the gateway's answers."""
+"""A fake plant of three lines with changing values, as JSON answers of the gateway."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from multidrop.gateway.clock import iso_time
 
-# by line: drives of every state; few, because Chromium draws each of them several times a second
+# Names by line: one drive in each state. Few, because Chromium draws each of them several times a second.
 NAMES = ("pump-1 pump-2 pump-3 pump-4 conveyor-2", "filler-1 filler-2 labeller", "booster-1 tower-fan-2")
 MANY_NAMES = (
     "pump-1 pump-2 pump-3 pump-4 fan-north fan-south mixer-1 mixer-2 conveyor-1 conveyor-2 screw",
@@ -20,7 +20,7 @@ FAMILIES = ("innovert-ibd", "invt-che", "yd1000", "delixi-modbus", "erman-er-g-2
 STANDING = {"pump-4", "mixer-2", "screw", "capper-2", "chilled-2", "exhaust-2"}
 FAULTS = {"conveyor-2": ("overcurrent in acceleration", 240), "booster-1": ("undervoltage", 5220)}
 SILENT = {"labeller": 42}
-KINDS = ("fault", "stopped", "port", "silent")  # kinds of alarms, the gravest first
+KINDS = ("fault", "stopped", "port", "silent")  # kinds of alarms, most serious first
 SPEEDS = ("38400 8N1", "9600 8N1", "38400 8N1")
 
 UNPOLLED: dict[str, Any] = {"period_s": None, "holds_s": None}
@@ -107,7 +107,7 @@ def state(name: str) -> str:
 
 
 def values(name: str, number: int, now: float) -> dict[str, float]:
-    """Return the values of all registers of a drive at this time (s)."""
+    """Return the values of a drive's registers at the time `now` (s)."""
     runs = state(name) == "runs"
     set_to = 20 + number * 7 % 28
     swing = math.sin(now / 9 + number * 1.7)
@@ -130,7 +130,7 @@ def values(name: str, number: int, now: float) -> dict[str, float]:
 
 
 def alarms(renamed: dict[str, str], now: float) -> list[dict[str, Any]]:
-    """Return the active alarms and two ended ones, newest first."""
+    """Return the active alarms, and two alarms that have ended; newest first."""
     since = {**{name: (text, age, "fault") for name, (text, age) in FAULTS.items()}}
     since |= {name: ("no reply", age, "silent") for name, age in SILENT.items()}
     lasting = [
@@ -163,7 +163,7 @@ def ms(seconds: float) -> int:
 
 
 def frame(n: int, began: float, renamed: dict[str, str], stuck: dict[str, float]) -> dict[str, Any]:
-    """Return a frame. A drive in `stuck` was last polled at the time given there (s)."""
+    """Return a page frame. `stuck`: drives that are no longer polled, with the time (s) of the last poll."""
     now = time.time()
     drives = {}
     for number, name in enumerate(" ".join(NAMES).split()):
@@ -207,9 +207,9 @@ def lines() -> dict[str, Any]:
 
 
 def fleet(began: float) -> dict[str, Any]:
-    """Return the answer to `GET /api/fleet`: twelve lines and three gateways, one of which has just died.
+    """Return the answer to `GET /api/fleet`: twelve lines, and three gateways, one of them just died.
 
-    Some times are more than a day ago, so that the page shows their dates too.
+    Some times are more than a day ago, so that the page shows their dates.
     """
     at = int(began * 1000)
     spool = {"bytes": 81_234_567, "lost": 0, "behind": 2, "lag_s": 1.4, "trouble": None}
@@ -227,7 +227,7 @@ def fleet(began: float) -> dict[str, Any]:
             "master": f"gw-{n % 3 + 1}" if n > 1 else None,
             "since_ms": at - 10_000_000 * n if n > 1 else None,
         }
-        for n in sorted(range(1, 13), key=str)  # in the gateway's order
+        for n in sorted(range(1, 13), key=str)  # the gateway sorts lines as text
     }  # fmt: skip
     moves = [
         {"line": f"hall-{n}", "revision": n, "at_ms": at - 10_000_000 * n, "from": before, "to": "gw-1"}

@@ -1,4 +1,4 @@
-"""Accessibility: axe-core finds no violation in any view, size and theme."""
+"""Accessibility: axe-core finds no violation in any view of the web page, at any size and theme."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from fake_gateway import FakeGateway
 from watching import Opener, press_enter, until, until_settled, violations
 
-pytestmark = pytest.mark.long  # each file starts Chromium, which takes time
+pytestmark = pytest.mark.long  # starts Chromium, which takes time
 
 VIEWS = (
     "#/drives",
@@ -25,14 +25,14 @@ LOOKS = [("desk", "light"), ("tablet", "light"), ("phone", "dark")]
 
 
 @pytest.mark.parametrize(("size", "theme"), LOOKS)
-def test_axe_finds_no_violation(
+def test_axe_core_finds_no_accessibility_violation(
     opened: Opener, gateway: FakeGateway, axe: str, size: str, theme: str
 ) -> None:
     gateway.reloaded |= {"done": False, "mistakes": ["plant.toml: a mistake"] * 40}
     page = opened(size=size, color_scheme=theme)
     page.evaluate(axe)
     found = {}
-    for view in VIEWS if size == "phone" else VIEWS[:-1]:  # only a phone has to scroll the last view
+    for view in VIEWS if size == "phone" else VIEWS[:-1]:  # the last view scrolls only on a phone
         if view == "settings":
             page.get_by_role("button", name="Settings").click()
         elif view == "stop":
@@ -52,10 +52,10 @@ def test_axe_finds_no_violation(
 
 
 @pytest.mark.parametrize(("size", "theme"), [("desk", "dark"), ("phone", "light")])
-def test_axe_finds_no_violation_in_rare_states(
+def test_axe_core_finds_no_accessibility_violation_in_rare_states(
     opened: Opener, gateway: FakeGateway, axe: str, size: str, theme: str
 ) -> None:
-    """Dialogs of commands, results of writes, a drive without values, a single drive, no gateway."""
+    """The states: dialogs, results of writes, a drive without values, a single drive, a lost gateway."""
     gateway.token = "right"
     page = opened("#/drives/pump-1", size=size, color_scheme=theme)
     page.evaluate(axe)
@@ -90,7 +90,7 @@ def test_axe_finds_no_violation_in_rare_states(
         "alarms": [],
         "troubles": ["history: the disk is full"],
     }
-    page.goto(f"{gateway.url}?again#/drives/pump-2")  # a page that has received no values
+    page.goto(f"{gateway.url}?again#/drives/pump-2")  # a newly loaded page that has no values yet
     page.evaluate(axe)
     page.get_by_text("10 in unknown state").wait_for()
     look("nothing known")

@@ -1,4 +1,4 @@
-"""The page's files: no markup made from texts, no violation of the CSP, no missing file."""
+"""Files of the web page: scripts make no markup from texts, the CSP is kept, and no file is missing."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ MARKUP = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|createContextu
 CODE = r"\beval\(|new Function|javascript:|setAttribute\(\s*[\"']style|cssText"
 
 
-def test_page_scripts_use_no_function_that_makes_markup_or_code() -> None:
+def test_page_scripts_use_no_function_that_makes_markup_or_code_from_text() -> None:
     for path in SCRIPTS:
         assert re.findall(f"{MARKUP}|{CODE}", path.read_text("utf-8")) == [], path.name
 
 
-def test_the_page_has_no_inline_style_script_or_handler() -> None:
+def test_the_html_has_no_inline_style_script_or_event_handler() -> None:
     html = (PAGE / "index.html").read_text("utf-8")
     assert re.findall(r"\sstyle\s*=|<style|\son\w+\s*=|<script(?![^>]*\ssrc=)|https?://|data:", html) == []
 
@@ -37,18 +37,19 @@ def test_page_files_are_short_and_start_with_a_comment() -> None:
         assert path.suffix == ".html" or re.match(r"// [A-Z]|/\* [A-Z]", lines[0]), path.name
 
 
-def test_page_refers_to_all_its_files_and_to_no_other_files() -> None:
+def test_the_web_page_refers_to_all_its_files_and_to_no_others() -> None:
     named = set(re.findall(r'"page/([\w./-]+)"', (PAGE / "index.html").read_text("utf-8")))
     for script in SCRIPTS:
         imports = re.findall(r'from "(\.[\w./-]+)"', script.read_text("utf-8"))
         named |= {(script.parent / path).resolve().relative_to(PAGE.resolve()).as_posix() for path in imports}
     there = FILES.keys()
-    served = {"prometheus/alerts.yml", "prometheus/dashboard.json"}  # for users of Prometheus and Grafana
+    # for Prometheus and Grafana instead of the page
+    served = {"prometheus/alerts.yml", "prometheus/dashboard.json"}
     assert there - named == {"index.html", "texts.toml", "vendor/uPlot-LICENSE", *served}
     assert named - there == set()
 
 
-def test_each_kind_of_alarm_has_a_shape_a_colour_a_word_and_a_bar() -> None:
+def test_each_kind_of_alarm_has_its_shape_colour_word_and_trend_bar() -> None:
     index, strip, lanes, table, bars, words = (
         (PAGE / name).read_text("utf-8")
         for name in (

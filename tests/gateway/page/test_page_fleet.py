@@ -1,4 +1,4 @@
-"""The view of a fleet: old data are marked, and missing answers are dashes."""
+"""The web page's view of a fleet of gateways: old values are marked, and missing values are dashes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fake_gateway import FakeGateway
 from watching import Opener, until, until_met
 
 NONE = "\u2013"  # a dash
-pytestmark = pytest.mark.long  # each file starts Chromium, which takes time
+pytestmark = pytest.mark.long  # starts Chromium, which takes time
 
 
 def cells(page: Any, table: str) -> list[list[str]]:
@@ -22,7 +22,7 @@ def await_note(page: Any, text: str) -> None:
     until(page, f"document.querySelector('#fleet-age').textContent.includes({text!r})")
 
 
-def test_fleet_view_shows_gateways_lines_and_moves(opened: Opener) -> None:
+def test_fleet_view_shows_gateways_lines_and_changes_of_masters(opened: Opener) -> None:
     page = opened("#/fleet")
     await_note(page, "Updated once a second")
     first, second, third = cells(page, "gateways")
@@ -53,7 +53,8 @@ def test_fleet_tables_fit_a_small_screen(opened: Opener) -> None:
         page.set_viewport_size({"width": width, "height": 844})
         until_met(page, lambda: tables.count() == 3)
         until_met(page, lambda: max(tables.evaluate_all(wide)) <= 0)
-        until(page, f"{lag} === '\"Lag \"'")  # each cell starts with its column's title
+        # on small screens, each cell starts with the title of its column
+        until(page, f"{lag} === '\"Lag \"'")
 
 
 def test_old_fleet_values_show_their_age_and_the_reason(opened: Opener, gateway: FakeGateway) -> None:
@@ -80,14 +81,14 @@ def test_fleet_values_are_marked_as_old_when_the_gateway_is_lost(
     assert "The gateway cannot be reached" in page.locator("#fleet-age").inner_text()
 
 
-def test_fleet_view_is_empty_before_the_first_answer(opened: Opener, gateway: FakeGateway) -> None:
+def test_fleet_view_is_empty_before_the_fleet_was_seen(opened: Opener, gateway: FakeGateway) -> None:
     gateway.fleet = {"age_s": None, "trouble": "no such server", "gateways": {}, "lines": {}, "moves": []}
     page = opened("#/fleet")
     await_note(page, "The fleet has not been seen yet: no such server")
     assert cells(page, "gateways") == []
 
 
-def test_problems_of_gateways_are_shown(opened: Opener, gateway: FakeGateway) -> None:
+def test_fleet_view_shows_problems_of_gateways(opened: Opener, gateway: FakeGateway) -> None:
     spool = {"bytes": 5, "lost": 7, "behind": None, "lag_s": None, "trouble": "the disk is full"}
     says = {"state": "working", "margin_s": 2.0, "trouble": "", "spool": spool}
     says["troubles"] = {"hall-1": "cannot be opened"}
@@ -101,7 +102,7 @@ def test_problems_of_gateways_are_shown(opened: Opener, gateway: FakeGateway) ->
     assert cells(page, "gateways")[0][5:9] == ["5 B", NONE, NONE, "7"]
 
 
-def test_fleet_view_draws_a_limited_number_of_lines(opened: Opener, gateway: FakeGateway) -> None:
+def test_fleet_view_draws_at_most_200_lines(opened: Opener, gateway: FakeGateway) -> None:
     line = {"port": "socket://h:1", "master": "gw-1", "since_ms": 0}
     gateway.fleet = {"lines": {f"l{n}": line | ({"master": None} if n == 999 else {}) for n in range(1000)}}
     page = opened("#/fleet")
@@ -111,7 +112,7 @@ def test_fleet_view_draws_a_limited_number_of_lines(opened: Opener, gateway: Fak
     assert note == "1000 lines, 1 without a master; the first 200 are shown"
 
 
-def test_fleet_view_is_hidden_without_a_fleet(opened: Opener, gateway: FakeGateway) -> None:
+def test_fleet_view_is_hidden_for_a_plant_without_a_fleet(opened: Opener, gateway: FakeGateway) -> None:
     gateway.plant_changes = {"fleet": False}
     page = opened()
     assert page.locator("nav a:visible").all_inner_texts()[-1] == "Log"
@@ -121,14 +122,16 @@ def test_fleet_view_is_hidden_without_a_fleet(opened: Opener, gateway: FakeGatew
     assert page.evaluate("location.hash") == "#/log"
 
 
-def test_the_view_fleet_is_opened_by_a_key(opened: Opener) -> None:
+def test_key_6_opens_the_fleet_view(opened: Opener) -> None:
     page = opened()
     page.keyboard.press("6")
     await_note(page, "Updated once a second")
     assert page.locator("nav a[aria-current]").inner_text() == "Fleet"
 
 
-def test_stop_all_in_the_fleet_view_names_and_stops_this_plant(opened: Opener, gateway: FakeGateway) -> None:
+def test_stop_all_in_the_fleet_view_stops_only_the_plant_and_says_so(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened("#/fleet")
     stopall = page.locator("#stopall")
     assert stopall.inner_text() == "Stop this plant"
@@ -145,7 +148,7 @@ def test_stop_all_in_the_fleet_view_names_and_stops_this_plant(opened: Opener, g
     until(page, "document.querySelector('#stopall').textContent === 'Stop all'")
 
 
-def test_stop_all_stops_the_fleet_with_a_commanders_key(opened: Opener, gateway: FakeGateway) -> None:
+def test_stop_all_stops_the_whole_fleet_if_the_gateway_may(opened: Opener, gateway: FakeGateway) -> None:
     gateway.plant_changes = {"fleet_stop": True}
     gateway.fleet_outcomes = {"hall-9.pump": {"done": True, "text": "stopped"}}
     page = opened("#/fleet")
@@ -158,10 +161,10 @@ def test_stop_all_stops_the_fleet_with_a_commanders_key(opened: Opener, gateway:
     assert sorted(gateway.posts) == [("/api/fleet/stop", {}), ("/api/stop", {"drives": None})]
 
 
-def test_a_failed_stop_of_the_fleet_is_reported_in_addition_to_the_own_drives(
+def test_a_failed_stop_of_the_fleet_is_reported_besides_the_gateways_own_drives(
     opened: Opener, gateway: FakeGateway
 ) -> None:
-    """The fleet's servers do not answer, but the gateway's own drives are stopped."""
+    """The servers of the fleet do not answer, but the gateway's own drives are stopped."""
     gateway.plant_changes = {"fleet_stop": True}
     gateway.fleet_outcomes = {"the fleet": {"done": False, "text": "the stop was NOT sent"}}
     page = opened("#/fleet")

@@ -1,4 +1,4 @@
-"""The page with a real gateway, which polls and stops a simulated plant."""
+"""The web page with a real gateway that polls and stops simulated drives."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from watching import LIVE, STALE, Opener, cell, press_enter, until, until_met
 
 from multidrop.gateway.http.rights import Right
 
-pytestmark = pytest.mark.long  # each file starts Chromium, which takes time
+pytestmark = pytest.mark.long  # starts Chromium, which takes time
 
 
-def test_page_shows_a_polled_plant_and_stops_it_with_a_token(page: Any, tmp_path: Path) -> None:
+def test_the_web_page_shows_a_polled_plant_and_stops_it_with_a_token(page: Any, tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         page.goto(f"http://localhost:{gateway.gateway.port}/")
         until(page, LIVE)
@@ -67,8 +67,8 @@ def test_a_killed_gateway_is_reported(page: Any) -> None:
         process.stdout.close()
 
 
-def test_delay_of_a_viewer_with_8_kb_a_second_does_not_grow(page: Any, tmp_path: Path) -> None:
-    """The delay itself is measured by `python -m bench.questions.page`."""
+def test_the_delay_of_values_over_a_network_of_8_kb_a_second_does_not_grow(page: Any, tmp_path: Path) -> None:
+    """`python -m bench.questions.page` measures the delay itself."""
     with served(tmp_path, "", *(f"drive-{n}" for n in range(1, 13))) as gateway:
         page.goto(f"http://localhost:{gateway.gateway.port}/")
         until(page, LIVE)
@@ -96,7 +96,7 @@ READ_AGAIN = "Reload the plant file"
 
 
 def tab_to(page: Any, name: str) -> None:
-    """Move the focus to a button by the Tab key alone."""
+    """Press Tab until the button of this name has the focus."""
     for _ in range(30):
         page.keyboard.press("Tab")
         if page.evaluate("document.activeElement.textContent") == name:
@@ -108,7 +108,9 @@ def told(page: Any, title: str) -> None:
     page.get_by_role("heading", name=title, exact=True).wait_for()
 
 
-def test_reload_by_keyboard_lists_all_mistakes(opened: Opener, gateway: FakeGateway) -> None:
+def test_reload_by_keyboard_shows_all_mistakes_in_the_plant_file(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     mistakes = [f"plant.toml: [[line]] {n}: port is missing" for n in range(30)]
     text = "the previous plant stays in use: the file has mistakes"
     gateway.reloaded = {"done": False, "text": text, "mistakes": mistakes, "restart": []}
@@ -118,7 +120,7 @@ def test_reload_by_keyboard_lists_all_mistakes(opened: Opener, gateway: FakeGate
     tab_to(page, READ_AGAIN)
     press_enter(page)
     told(page, "Reload bottling plant.toml?")
-    press_enter(page)  # Cancel has the focus
+    press_enter(page)  # presses Cancel, which has the focus
     assert gateway.posts == []
     page.locator("#more").focus()
     press_enter(page)
@@ -134,7 +136,9 @@ def test_reload_by_keyboard_lists_all_mistakes(opened: Opener, gateway: FakeGate
     assert gateway.posts == [("/api/reload", {"confirm": True})]
 
 
-def test_reload_is_not_offered_without_a_file_or_right(opened: Opener, gateway: FakeGateway) -> None:
+def test_reload_is_not_offered_without_a_plant_file_or_the_right(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     for changed in ({"file": False}, {"may": {"role": "stop", "write": [], "verbs": []}}):
         gateway.plant_changes = changed
         page = opened()
@@ -143,7 +147,7 @@ def test_reload_is_not_offered_without_a_file_or_right(opened: Opener, gateway: 
         assert page.get_by_role("button", name=READ_AGAIN).count() == 0
 
 
-def test_real_gateway_refuses_a_broken_file_and_reloads_a_valid_file(page: Any, tmp_path: Path) -> None:
+def test_reload_refuses_a_broken_plant_file_and_accepts_a_valid_one(page: Any, tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         path = gateway.gateway.plant.path
         good = path.read_text()
@@ -178,5 +182,6 @@ def test_real_gateway_refuses_a_broken_file_and_reloads_a_valid_file(page: Any, 
         told(page, "plant.toml is in effect")
         assert page.locator("#ask .outcome li").all_inner_texts() == list(gateway.gateway.reload.restart)
         page.keyboard.press("Escape")
-        page.get_by_role("link", name="fan-2", exact=True).wait_for()  # the drive's link, not an alarm's
+        # exact, because an alarm also links to fan-2
+        page.get_by_role("link", name="fan-2", exact=True).wait_for()
         notice.wait_for(state="hidden")

@@ -1,4 +1,4 @@
-"""Hostile pages in Chromium can read no data, and no write from them reaches the simulated wire."""
+"""Web pages of other sites, in Chromium, can neither read data nor make the gateway write to a drive."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from gateways import Served, served
 from lines import until as until_here
 from watching import AT_ITS_PLACE, LIVE, SIZES, VIEWS, Opener, until, until_settled
 
-pytestmark = pytest.mark.long  # each file starts Chromium, which takes time
+pytestmark = pytest.mark.long  # starts Chromium, which takes time
 
 MAY = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
-# Try all ways in which a page could send or read data without permission; return [way, outcome] for each.
+# Try all ways by which a page could read or send without permission; return (way, outcome) for each.
 ATTACK = """async gateway => {
   const stop = '{"drives": null}', found = [];
   const note = (what, came) => found.push([what, came]);
@@ -47,8 +47,8 @@ ATTACK = """async gateway => {
   note('image', await loads('img', 'page/icon.svg'));
   return found;
 }"""
-# A form that sends JSON as text, unlike our own forms. A timer submits it, so that the script returns its
-# result before the browser leaves the page.
+# This form sends JSON as plain text, as a hostile page could. A timer submits it, so that the script can
+# return before the browser leaves the page.
 FORM = """gateway => {
   const form = document.createElement('form'), field = document.createElement('input');
   Object.assign(form, { method: 'POST', action: gateway + 'api/stop', enctype: 'text/plain' });
@@ -61,7 +61,7 @@ FORM = """gateway => {
 
 @pytest.fixture
 def elsewhere() -> Iterator[int]:
-    """Run a server with an empty page on another port of this machine; yield its port."""
+    """Run a web server with an empty page on another port of this machine, and yield the port."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -101,7 +101,9 @@ def sent_by_form(page: Any, gateway: str) -> int:
     return int(answer.value.status)
 
 
-def test_only_the_gateways_page_can_read_or_send(strange: Any, elsewhere: int, tmp_path: Path) -> None:
+def test_only_the_gateways_own_page_can_read_values_or_send_commands(
+    strange: Any, elsewhere: int, tmp_path: Path
+) -> None:
     with served(tmp_path, MAY) as gateway:
         gateway.await_state("pump-1", "stands")
         port = gateway.gateway.port
@@ -113,8 +115,8 @@ def test_only_the_gateways_page_can_read_or_send(strange: Any, elsewhere: int, t
             own = f"http://{ours}:{port}/"
             assert dict(strange.evaluate(ATTACK, own)) == refused, host
             assert sent_by_form(strange, own) == 403
-        # DNS rebinding: another site's name resolves to this machine, so the browser takes the gateway's
-        # answers for that site's.
+        # DNS rebinding: the name of another site resolves to this machine, so the browser takes the gateway's
+        # answers for answers of that site.
         rebound = f"http://evil.example:{port}/"
         assert strange.goto(rebound).status == 421
         came = dict(strange.evaluate(ATTACK, rebound))
@@ -129,10 +131,10 @@ def test_only_the_gateways_page_can_read_or_send(strange: Any, elsewhere: int, t
         setpoint = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
         start = {"drive": "pump-1", "verb": "start"}
         assert strange.evaluate(send, ["api/write", setpoint]) == 401
-        assert strange.evaluate(send, ["api/act", start]) == 403  # the token has only the right to stop
+        assert strange.evaluate(send, ["api/act", start]) == 403  # this token has only the right to stop
         assert strange.evaluate(send, ["api/reload", {"confirm": True}]) == 401
         assert written(gateway) == []
-        # the same request from our own page is accepted
+        # the gateway's own page may send the same request
         assert strange.evaluate(send, ["api/stop", {"drives": None}]) == 200
         until_here(lambda: written(gateway))
 
@@ -158,7 +160,7 @@ def elements(page: Any) -> list[int]:
 
 
 @pytest.mark.usefixtures("hostile")
-def test_hostile_names_are_shown_as_text_and_break_no_layout(opened: Opener) -> None:
+def test_hostile_names_of_drives_are_shown_as_text_and_break_no_layout(opened: Opener) -> None:
     page = opened()
     shown = page.locator("td.name").all_text_contents()
     assert set(HOSTILE.values()) <= set(shown)
@@ -173,7 +175,7 @@ def test_hostile_names_are_shown_as_text_and_break_no_layout(opened: Opener) -> 
             assert page.evaluate(AT_ITS_PLACE)[0], (width, view)
 
 
-def test_drive_with_a_hostile_name_is_stopped(opened: Opener, hostile: FakeGateway) -> None:
+def test_a_drive_with_a_hostile_name_can_be_stopped(opened: Opener, hostile: FakeGateway) -> None:
     page = opened()
     for name in HOSTILE.values():
         page.evaluate("name => { location.hash = `#/drives/${encodeURIComponent(name)}` }", name)

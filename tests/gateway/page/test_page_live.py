@@ -1,4 +1,4 @@
-"""The page shows the newest values of the drives and their ages."""
+"""The web page shows the newest value of each drive, and its age if it is old."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from fake_gateway import FakeGateway
 from watching import LIVE, STALE, Opener, aborting, await_new_value, cell, link, until, until_met
 
-pytestmark = pytest.mark.long  # each file starts Chromium, which takes time
+pytestmark = pytest.mark.long  # starts Chromium, which takes time
 
 DASH = "\u2013"
 OVER = "cell => cell.scrollWidth - cell.clientWidth"
@@ -21,15 +21,15 @@ FRESH = "tr.drive td.frequency .value:not(.old)"
 
 
 @pytest.mark.usefixtures("many_drives")
-def test_page_shows_live_values_of_all_drives(opened: Opener, gateway: FakeGateway) -> None:
-    gateway.clocked = "pump-1"  # this drive's frequency shows the time
+def test_the_web_page_shows_live_values_of_all_drives(opened: Opener, gateway: FakeGateway) -> None:
+    gateway.clocked = "pump-1"  # the frequency of this drive is the time
     page = opened()
     assert page.locator("tr.drive").count() == 31
     number = cell(page, "pump-1", "frequency").locator(".number")
     for _ in range(5):
         await_new_value(page, lambda: float(number.inner_text()))
     old = page.locator("tr.drive .old")
-    until_met(page, lambda: old.count() == 2)  # the silent drive's frequency and current
+    until_met(page, lambda: old.count() == 2)  # frequency and current of the silent drive
 
 
 def test_a_killed_gateway_is_reported(opened: Opener, gateway: FakeGateway) -> None:
@@ -47,7 +47,9 @@ def test_a_killed_gateway_is_reported(opened: Opener, gateway: FakeGateway) -> N
     assert page.locator("#said").inner_text() == "Values are old: no new values arrive."
 
 
-def test_hanging_gateway_is_reported_and_values_become_old(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_hanging_gateway_is_reported_and_its_values_become_old(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened()
     gateway.is_silent = True
     until(page, STALE)
@@ -58,10 +60,11 @@ def test_hanging_gateway_is_reported_and_values_become_old(opened: Opener, gatew
     page.locator("#notice").wait_for(state="hidden")
 
 
-def test_old_values_stay_old_when_the_viewers_clock_is_set_back(
+def test_old_values_stay_old_when_the_clock_of_the_browser_is_set_back(
     opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fake_gateway, "HOLD_S", 120)  # no answer arrives that would show the gateway's clock
+    # no answer must arrive, because answers contain the gateway's time
+    monkeypatch.setattr(fake_gateway, "HOLD_S", 120)
     page = opened()
     gateway.is_silent = True
     page.evaluate("(now => { Date.now = () => now() - 3600e3; })(Date.now)")
@@ -71,11 +74,13 @@ def test_old_values_stay_old_when_the_viewers_clock_is_set_back(
     until_met(page, lambda: float(age.inner_text().removesuffix(" s")) >= 2)
 
 
-def test_page_is_live_again_when_the_gateway_is_restarted(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_web_page_is_live_again_after_a_restart_of_the_gateway(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened()
     gateway.kill()
     until(page, "document.body.classList.contains('dead')")
-    again = FakeGateway(gateway.port)  # frame numbers restart at 1
+    again = FakeGateway(gateway.port)  # numbers page frames from 1 again
     try:
         until(page, LIVE)
         until_met(page, lambda: page.locator(FRESH).count() == 9)
@@ -83,7 +88,7 @@ def test_page_is_live_again_when_the_gateway_is_restarted(opened: Opener, gatewa
         again.kill()
 
 
-def test_old_value_is_never_shown_as_new(opened: Opener, gateway: FakeGateway) -> None:
+def test_an_old_value_is_never_shown_as_new(opened: Opener, gateway: FakeGateway) -> None:
     gateway.stuck = {"pump-2": time.time()}
     page = opened("#/drives/pump-2")
     until(
@@ -122,7 +127,8 @@ def test_values_stay_old_when_the_gateways_clock_is_set_back(opened: Opener) -> 
     assert 42_000 <= age < 3_000_000
     assert is_old
     until(page, LIVE)
-    value, age, is_old = page.evaluate(SET_BACK, ["labeller", "output_frequency", False])  # after a restart
+    # as after a restart
+    value, age, is_old = page.evaluate(SET_BACK, ["labeller", "output_frequency", False])
     assert value is None
     assert is_old
     until(page, LIVE)
@@ -131,10 +137,10 @@ def test_values_stay_old_when_the_gateways_clock_is_set_back(opened: Opener) -> 
     assert not is_old
 
 
-def test_values_of_a_slow_line_stay_fresh_for_seconds(
+def test_values_of_a_slow_line_stay_current_as_long_as_the_gateway_reports(
     opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The gateway reports how long each register's values stay current: here for ten minutes."""
+    """Here the gateway reports that values stay current for ten minutes."""
     held = [one | {"holds_s": one["holds_s"] and 600.0} for one in fake_plant.REGISTERS]
     monkeypatch.setattr(fake_plant, "REGISTERS", held)
     gateway.stuck = {"pump-2": time.time() - 20}
@@ -156,7 +162,7 @@ def test_problems_other_than_lost_lines_are_shown(opened: Opener, gateway: FakeG
 
 def test_a_silent_drive_keeps_its_last_value_with_its_age(opened: Opener) -> None:
     page = opened("#/drives/labeller")
-    state = cell(page, "labeller", "state")  # may be "last: silent for ..." if the machine is busy
+    state = cell(page, "labeller", "state")  # the text may be "last: silent for ..." if the machine is busy
     until_met(page, lambda: state.inner_text().strip().startswith("silent for "))
     assert re.search(r"Hz\d\d s old", cell(page, "labeller", "frequency").inner_text().replace("\n", ""))
     assert "since then: no reply" in cell(page, "labeller", "frequency").locator(".value").get_attribute(
@@ -185,7 +191,7 @@ def test_unknown_values_are_shown_as_a_dash_and_never_as_zero(opened: Opener, ga
 
 
 @pytest.mark.parametrize("off_s", [-90, 90])
-def test_viewers_wrong_clock_is_shown_and_ages_stay_right(opened: Opener, off_s: int) -> None:
+def test_a_wrong_clock_of_the_browser_is_reported_and_ages_stay_right(opened: Opener, off_s: int) -> None:
     wrong = f"const now = Date.now; Date.now = () => now() + {off_s * 1000}"
     page = opened(prepare=lambda page: page.add_init_script(wrong))
     notice = page.locator("#notice")
@@ -195,7 +201,7 @@ def test_viewers_wrong_clock_is_shown_and_ages_stay_right(opened: Opener, off_s:
     until_met(page, lambda: page.locator(FRESH).count() == 9)
 
 
-def test_times_have_24_hours_in_utc_or_local_time_as_chosen(opened: Opener) -> None:
+def test_times_are_shown_with_24_hours_in_utc_or_local_time_as_chosen(opened: Opener) -> None:
     page = opened(timezone_id="Asia/Kolkata", locale="en-US")
     clock = page.locator("#clock")
     assert re.fullmatch(r"\d\d:\d\d:\d\d UTC", clock.inner_text())
@@ -215,7 +221,8 @@ def test_times_have_24_hours_in_utc_or_local_time_as_chosen(opened: Opener) -> N
     assert not re.search(r"\b[ap]m\b", page.locator("body").inner_text(), re.IGNORECASE)
     page.keyboard.press("u")
     page.reload()
-    until(page, "document.querySelector('#clock').textContent.endsWith('local')")  # the choice is kept
+    # the choice survives a reload of the page
+    until(page, "document.querySelector('#clock').textContent.endsWith('local')")
 
 
 # ---- while the page is loaded ----
@@ -226,7 +233,7 @@ FORBIDDEN = """for (const name of ['sessionStorage', 'localStorage'])
 
 
 def test_page_reloads_itself_if_a_network_change_aborts_its_scripts(opened: Opener) -> None:
-    """Chromium aborts all requests when the network changes. Here the browser also forbids storage."""
+    """Chromium aborts all requests if the network changes. Here it also forbids storage."""
     broken = []
 
     def break_two_off(route: Any) -> None:
@@ -254,8 +261,8 @@ def test_page_without_scripts_says_that_stop_all_does_not_work(opened: Opener) -
     assert page.locator("#stopall").is_disabled()
 
 
-def test_no_line_is_drawn_over_missed_time(opened: Opener) -> None:
-    """The page missed an hour, as on a laptop that slept."""
+def test_a_plot_draws_no_line_over_a_time_without_values(opened: Opener) -> None:
+    """The page received no values for an hour, as on a laptop that slept."""
     page = opened()
     seen = page.evaluate("""() => import('/page/data/store.js').then(({ store, takeFrame }) => {
         const ring = store.drives.get('pump-1').pasts.get('output_frequency');
@@ -287,7 +294,7 @@ KEPT = """import('/page/data/store.js').then(({ store }) => {
 })"""
 
 
-def test_values_are_dropped_if_a_name_means_another_drive_or_unit(opened: Opener) -> None:
+def test_old_values_are_dropped_if_a_drive_or_unit_changes_under_the_same_name(opened: Opener) -> None:
     page = opened("#/drives/pump-1")
     changes: list[tuple[dict[str, Any], list[bool]]] = [
         ({}, [True, True]),
@@ -302,7 +309,7 @@ def test_values_are_dropped_if_a_name_means_another_drive_or_unit(opened: Opener
         assert page.evaluate(TAKEN_ANEW, change) == kept, change
 
 
-def test_phone_shows_ages_and_misses_of_each_drive(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_phone_shows_ages_and_failed_reads_of_each_drive(opened: Opener, gateway: FakeGateway) -> None:
     gateway.renamed["pump-2"] = "a" * 40
     page = opened(size="phone")
     for name in ("pump-1", "conveyor-2", "labeller", "tower-fan-2", "a" * 40):

@@ -1,4 +1,4 @@
-"""The button Stop all: it never moves, asks one question, sends immediately, and shows the result."""
+"""The button "Stop all" of the web page: it never moves, asks one question, and sends immediately."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from watching import (
 
 from multidrop.control.stops import LEAST_S
 
-pytestmark = pytest.mark.long  # each file starts Chromium, which takes time
+pytestmark = pytest.mark.long  # starts Chromium, which takes time
 
 
 def title(page: Any) -> Any:
@@ -34,11 +34,11 @@ def title(page: Any) -> Any:
 
 
 def told(page: Any, title: str) -> None:
-    """Wait until the dialog has this heading."""
+    """Wait until the dialog has this title."""
     page.get_by_role("heading", name=title, exact=True).wait_for()
 
 
-def test_stop_all_is_at_the_same_place_and_never_covered(opened: Opener) -> None:
+def test_stop_all_is_always_at_the_same_place_and_never_covered(opened: Opener) -> None:
     page = opened()
     for size, (wide, high) in SIZES.items():
         page.set_viewport_size({"width": wide, "height": high})
@@ -56,7 +56,9 @@ def test_stop_all_is_at_the_same_place_and_never_covered(opened: Opener) -> None
         assert 0 <= y <= y + height <= high
 
 
-def test_stop_all_works_with_an_open_panel_on_a_phone(opened: Opener, gateway: FakeGateway) -> None:
+def test_stop_all_works_on_a_phone_while_the_view_of_a_drive_is_open(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened("#/drives/filler-2", "phone", has_touch=True)
     page.locator("#panel.open h2").wait_for()
     page.locator("#stopall").tap()
@@ -66,7 +68,7 @@ def test_stop_all_works_with_an_open_panel_on_a_phone(opened: Opener, gateway: F
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
-def test_one_drive_is_stopped_by_keyboard_alone(opened: Opener, gateway: FakeGateway) -> None:
+def test_one_drive_can_be_stopped_by_keyboard_alone(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     for _ in range(40):
         page.keyboard.press("Tab")
@@ -75,7 +77,7 @@ def test_one_drive_is_stopped_by_keyboard_alone(opened: Opener, gateway: FakeGat
     page.keyboard.press("ArrowDown")
     page.keyboard.press("s")
     assert title(page).inner_text() == "Stop pump-2?"
-    press_enter(page)  # Cancel has the focus
+    press_enter(page)  # presses Cancel, which has the focus
     assert gateway.posts == []
     page.keyboard.press("s")
     page.keyboard.press("Tab")
@@ -86,7 +88,7 @@ def test_one_drive_is_stopped_by_keyboard_alone(opened: Opener, gateway: FakeGat
     assert not page.locator("#ask").evaluate("dialog => dialog.open")
 
 
-def test_all_drives_are_stopped_by_keyboard_alone(opened: Opener, gateway: FakeGateway) -> None:
+def test_all_drives_can_be_stopped_by_keyboard_alone(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/log")
     page.keyboard.press("Shift+S")
     press_enter(page)
@@ -98,8 +100,8 @@ def test_all_drives_are_stopped_by_keyboard_alone(opened: Opener, gateway: FakeG
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
-def test_stop_key_works_as_soon_as_a_dialog_is_closed(opened: Opener) -> None:
-    """The browser moves the focus out of a closed dialog only after some milliseconds."""
+def test_the_stop_key_works_as_soon_as_a_dialog_is_closed(opened: Opener) -> None:
+    """The browser takes some milliseconds to move the focus out of a closed dialog."""
     page = opened()
     page.keyboard.press("Shift+S")
     assert title(page).inner_text() == "Stop all 10 drives?"
@@ -113,7 +115,7 @@ def test_stop_key_works_as_soon_as_a_dialog_is_closed(opened: Opener) -> None:
 
 
 def test_stop_all_accepts_a_click_right_after_a_dialog_closed(opened: Opener, gateway: FakeGateway) -> None:
-    """Even the second click of a double click is accepted, because it only opens a question."""
+    """Even the second click of a double click is accepted, because it only opens the question."""
     page = opened("#/drives/pump-1")
     box = page.locator("#stopall").bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -123,12 +125,13 @@ def test_stop_all_accepts_a_click_right_after_a_dialog_closed(opened: Opener, ga
             position: 'fixed', left: `${x - 20}px`, top: `${y - 20}px`, width: '40px', height: '40px' })""",
         [x, y],
     )
-    page.mouse.dblclick(x, y)  # the first click hits Cancel, the second the button behind the dialog
+    # the first click hits Cancel, and the second hits Stop all, which is behind the dialog
+    page.mouse.dblclick(x, y)
     assert title(page).inner_text() == "Stop all 10 drives?"
     assert gateway.posts == []
 
 
-def test_stop_all_works_while_a_dialog_is_open(opened: Opener, gateway: FakeGateway) -> None:
+def test_stop_all_works_while_another_dialog_is_open(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     box = page.locator("#stopall").bounding_box()
     page.get_by_role("button", name="Change frequency setpoint").click()
@@ -139,10 +142,10 @@ def test_stop_all_works_while_a_dialog_is_open(opened: Opener, gateway: FakeGate
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
-def test_outcome_of_a_stop_waits_until_the_open_question_is_answered(
+def test_the_result_of_a_stop_does_not_replace_the_question_of_another_stop(
     opened: Opener, gateway: FakeGateway
 ) -> None:
-    """The outcome of one drive's stop arrives while the question of Stop all is open."""
+    """The result of the stop of one drive arrives while the question of Stop all is open."""
     page = opened("#/drives/pump-1")
     gateway.is_held = threading.Event()
     page.get_by_role("button", name="Stop pump-1").click()
@@ -159,8 +162,8 @@ def test_outcome_of_a_stop_waits_until_the_open_question_is_answered(
     assert [body for _, body in gateway.posts] == [{"drives": ["pump-1"]}, {"drives": None}]
 
 
-def test_stop_works_if_other_parts_of_the_page_fail_to_load(opened: Opener, gateway: FakeGateway) -> None:
-    """If one view cannot be loaded, all views fail, but stops work."""
+def test_stops_work_if_another_script_of_the_page_fails_to_load(opened: Opener, gateway: FakeGateway) -> None:
+    """If one view cannot be loaded, no view is shown, but stops work."""
     broken = ("**/page/views/drives/table.js", "**/page/vendor/*", "**/api/frame*")
     page = opened(live=False, prepare=aborting(*broken))
     page.locator("#notice").get_by_text("was not fully loaded").wait_for()
@@ -171,13 +174,15 @@ def test_stop_works_if_other_parts_of_the_page_fail_to_load(opened: Opener, gate
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
-def test_the_page_works_without_its_plot_library(opened: Opener) -> None:
+def test_the_web_page_works_without_its_plot_library(opened: Opener) -> None:
     page = opened("#/drives/pump-1", prepare=aborting("**/page/vendor/*.js"))
     page.get_by_text("Plots could not be loaded.").wait_for()
     assert page.locator(".registers tbody tr").count() == 12
 
 
-def test_result_of_a_stop_names_drives_that_did_not_stop(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_result_of_a_stop_names_the_drives_that_did_not_stop(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     gateway.outcomes = {"pump-3": {"done": False, "text": "no reply; it may still run"}}
     page = opened()
     page.locator("#stopall").click()
@@ -190,7 +195,7 @@ def test_result_of_a_stop_names_drives_that_did_not_stop(opened: Opener, gateway
     told(page, "All 10 drives are stopped")
 
 
-def test_stop_with_a_lost_answer_is_shown_as_unknown(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_stop_without_an_answer_is_shown_as_unknown(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     gateway.kill()
     page.locator("#stopall").click()
@@ -201,7 +206,7 @@ def test_stop_with_a_lost_answer_is_shown_as_unknown(opened: Opener, gateway: Fa
 
 
 UNTAKEN = "The gateway has not accepted the stop"
-# Close the next dialog with the button "Close" as soon as it is drawn.
+# Clicks "Close" in the next dialog as soon as the button is drawn.
 CLOSED = """() => new MutationObserver((_, observer) => {
   const close = [...document.querySelectorAll('#ask button')].find(one => one.textContent === 'Close');
   if (close) { observer.disconnect(); close.click(); window.wasClosed = true; }
@@ -209,7 +214,7 @@ CLOSED = """() => new MutationObserver((_, observer) => {
 
 
 @pytest.mark.parametrize("is_closed", [False, True])
-def test_stop_at_a_frozen_gateway_shows_a_warning_within_two_seconds(
+def test_a_stop_at_a_frozen_gateway_shows_a_warning_within_two_seconds(
     opened: Opener, gateway: FakeGateway, is_closed: bool
 ) -> None:
     gateway.is_held = threading.Event()
@@ -226,8 +231,8 @@ def test_stop_at_a_frozen_gateway_shows_a_warning_within_two_seconds(
     told(page, "All 10 drives are stopped")
 
 
-def test_page_waits_for_the_result_of_an_accepted_stop(opened: Opener, gateway: FakeGateway) -> None:
-    """The stop of silent drives may take half a minute."""
+def test_the_web_page_waits_for_the_result_of_an_accepted_stop(opened: Opener, gateway: FakeGateway) -> None:
+    """A stop of silent drives may take half a minute."""
     gateway.is_held, gateway.confirms = threading.Event(), True
     page = opened()
     page.locator("#stopall").click()
@@ -240,7 +245,7 @@ def test_page_waits_for_the_result_of_an_accepted_stop(opened: Opener, gateway: 
     told(page, "All 10 drives are stopped")
 
 
-def test_stop_verb_at_a_frozen_gateway_shows_a_warning(opened: Opener, gateway: FakeGateway) -> None:
+def test_an_emergency_stop_at_a_frozen_gateway_shows_a_warning(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     held: list[Any] = []
     page.route("**/api/act", lambda route: held.append(route))
@@ -251,7 +256,9 @@ def test_stop_verb_at_a_frozen_gateway_shows_a_warning(opened: Opener, gateway: 
     page.locator("#outcomes li").wait_for()
 
 
-def test_time_for_typing_a_token_does_not_show_a_frozen_gateway(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_user_who_types_a_token_slowly_gets_no_warning_of_a_frozen_gateway(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     gateway.token = "right"
     page = opened()
     page.locator("#stopall").click()
@@ -263,7 +270,7 @@ def test_time_for_typing_a_token_does_not_show_a_frozen_gateway(opened: Opener, 
     told(page, "All 10 drives are stopped")
 
 
-def test_stop_without_the_right_asks_for_a_token_and_is_then_sent(
+def test_a_stop_without_the_right_asks_for_a_token_and_is_then_sent(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     gateway.token = "right"
@@ -296,7 +303,7 @@ SECOND_CLICK = """([x, y]) => document.querySelector('#ask form button:not(.calm
         ("#/drives/pump-1", "button:text-is('start')", "start pump-1", []),
     ],
 )
-def test_double_click_confirms_a_sign_in_only_for_a_stop(
+def test_a_double_click_confirms_a_sign_in_only_if_it_is_for_a_stop(
     opened: Opener, gateway: FakeGateway, view: str, asks: str, confirms: str, sent: list[Any]
 ) -> None:
     """A password manager may fill in the token immediately."""
@@ -310,11 +317,11 @@ def test_double_click_confirms_a_sign_in_only_for_a_stop(
     page.evaluate(SECOND_CLICK, [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])
     if sent:
         until_met(page, lambda: gateway.posts)
-    page.wait_for_timeout(300)  # no other request is sent
+    page.wait_for_timeout(300)  # time in which a further request would be sent
     assert gateway.posts == sent
 
 
-def test_refused_stop_is_shown_as_not_sent(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_refused_stop_is_shown_as_not_sent(opened: Opener, gateway: FakeGateway) -> None:
     gateway.token = "right"
     page = opened()
     page.locator("#stopall").click()
@@ -324,14 +331,16 @@ def test_refused_stop_is_shown_as_not_sent(opened: Opener, gateway: FakeGateway)
     assert gateway.posts == []
 
 
-def test_tabs_that_share_six_connections_are_live_and_stop_drives(
+def test_eight_tabs_with_six_connections_show_live_values_and_can_stop_drives(
     browser: Any, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All tabs of a browser have six connections to a host. The stop is sent while no new frame is made, so
-    that other tabs hold all six.
+    """A browser allows six connections to a host, for all its tabs together.
+
+    The stop is sent while no new page frame is made, so the requests of other tabs hold all six.
     """
-    monkeypatch.setattr(fake_gateway, "HOLD_S", 2 * PATIENCE_S)  # a waiting stop would come too late
-    gateway.clocked = "pump-1"  # this drive's frequency shows the time
+    # so long that a stop which waits for these requests would fail the test
+    monkeypatch.setattr(fake_gateway, "HOLD_S", 2 * PATIENCE_S)
+    gateway.clocked = "pump-1"  # the frequency of this drive is the time
     context = browser.new_context(viewport={"width": 390, "height": 844})  # without plots
     pages = [context.new_page() for _ in range(8)]
     for page in pages:
@@ -354,10 +363,10 @@ def test_tabs_that_share_six_connections_are_live_and_stop_drives(
 
 
 @pytest.mark.parametrize("case", ["a write that wants a token", "a reload"])
-def test_no_later_dialog_replaces_the_question_of_a_stop(
+def test_a_later_dialog_does_not_replace_the_question_of_a_stop(
     opened: Opener, gateway: FakeGateway, case: str
 ) -> None:
-    """The answer to an earlier request arrives while the question of the stop is open."""
+    """The answer to an earlier request arrives while the question is open."""
     path = "api/reload" if case == "a reload" else "api/write"
     held: list[Any] = []
     if case == "a reload":
@@ -376,7 +385,8 @@ def test_no_later_dialog_replaces_the_question_of_a_stop(
         page.get_by_label("New value, Hz").fill("31.5")
         page.get_by_role("button", name="Write to pump-1").click()
     until_met(page, lambda: held)
-    page.evaluate("document.querySelector('#stopall').click()")  # works also behind a dialog
+    # a script can click the button behind the dialog
+    page.evaluate("document.querySelector('#stopall').click()")
     assert title(page).inner_text() == "Stop all 10 drives?"
     with page.expect_response(f"**/{path}"):
         held[0].fulfill(status=401, json={"error": "This wants a token."})
@@ -387,14 +397,14 @@ def test_no_later_dialog_replaces_the_question_of_a_stop(
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
-KEYS = {  # (key, its place on the keyboard, is Shift held): question that the page then asks
+KEYS = {  # (key, its position on the keyboard, is Shift held): title of the dialog that the page then opens
     ("S", "KeyS", True): "Stop all 10 drives?",
     ("s", "KeyS", False): "Stop pump-1?",
-    ("s", "KeyS", True): "Stop all 10 drives?",  # with caps lock on
+    ("s", "KeyS", True): "Stop all 10 drives?",  # with caps lock
     ("S", "KeyS", False): "Stop all 10 drives?",
-    ("Ы", "KeyS", True): "Stop all 10 drives?",  # a Russian layout
+    ("Ы", "KeyS", True): "Stop all 10 drives?",  # Russian layout
     ("ы", "KeyS", False): "Stop pump-1?",
-    ("Process", "KeyS", True): "Stop all 10 drives?",  # a Chinese input method
+    ("Process", "KeyS", True): "Stop all 10 drives?",  # Chinese input method
     ("S", "Semicolon", True): "Stop all 10 drives?",  # Dvorak
     ("o", "KeyS", False): None,
     ("O", "KeyS", True): None,
@@ -410,14 +420,14 @@ PRESSED = """([key, code, shiftKey]) => {
 }"""
 
 
-def test_stop_keys_work_on_every_keyboard_layout(opened: Opener) -> None:
+def test_the_stop_keys_work_on_every_keyboard_layout(opened: Opener) -> None:
     page = opened("#/drives/pump-1")
     assert {key: page.evaluate(PRESSED, key) for key in KEYS} == {
         key: [asks, False] for key, asks in KEYS.items()
     }
 
 
-def test_stop_key_works_behind_a_dialog_but_not_while_typing(opened: Opener) -> None:
+def test_the_stop_key_works_behind_a_dialog_but_not_in_a_text_field(opened: Opener) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="Change frequency setpoint").click()
     page.keyboard.press("Shift+S")  # typed into the text field
@@ -428,10 +438,10 @@ def test_stop_key_works_behind_a_dialog_but_not_while_typing(opened: Opener) -> 
 
 
 @pytest.mark.parametrize("verb", ["stop", "emergency stop"])
-def test_page_waits_longer_than_the_gateway_repeats_a_stop(
+def test_the_web_page_waits_longer_for_a_stop_than_the_gateway_repeats_it(
     opened: Opener, gateway: FakeGateway, verb: str
 ) -> None:
-    """Otherwise, with one dead drive, the page would never report which drives have stopped."""
+    """With one dead drive, the page could otherwise never show which drives have stopped."""
     page = opened("#/drives/pump-1")
     page.evaluate("""() => {
         const make = AbortSignal.timeout;

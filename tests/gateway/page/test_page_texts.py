@@ -1,4 +1,4 @@
-"""The page's texts: each is in the catalogue, in all languages and with the same placeholders."""
+"""Texts of the web page: each is in the catalogue, in all languages, with the same placeholders."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LANGUAGES = {"ru", "zh"}
 CATALOGUE = (PAGE / "texts.toml").read_text("utf-8")
 TEXTS: dict[str, dict[str, str]] = tomllib.loads(CATALOGUE)
 OWN_PART, GATEWAY_PART = map(tomllib.loads, re.split(r"^# ====.*$", CATALOGUE, flags=re.MULTILINE))
-# by path relative to the page
+# scripts by path, relative to the page's folder
 SCRIPTS = {
     name: file.body.decode()
     for name, file in read_files(PAGE).items()
@@ -41,7 +41,7 @@ OTHERS = {"danger stop", "Etc/UTC", "px system-ui, sans-serif", "11px system-ui,
 
 
 def lack_of(register: str, polled: list[str]) -> str:
-    """Return the gateway's text for a state that is unknown because this register has no value."""
+    """Return the gateway's text for "state unknown, because this register has no value"."""
     watched: Any = SimpleNamespace(reader=SimpleNamespace(has_state=True, lacks=register), cells=polled)
     return hub._lack(watched)
 
@@ -54,10 +54,11 @@ GATEWAY_WORDS = {
     *(alarms.UNCALLED, hub.UNNAMED, hub.NOT_ASKED, hub.INCOMPLETE, RAW),
     *(lack_of("{name}", cells) for cells in ([], ["{name}"])),
 }
-TRANSLATING = {"t", "pieces", "said"}  # functions whose first argument is a key of the catalogue
-# by function: index of the first argument that the function shows
+# names of functions whose first argument is a key of the catalogue of texts
+TRANSLATING = {"t", "pieces", "said"}
+# By function of the page: index of the first argument that it shows to the user.
 SHOWING = {"make": 2, "put": 1, "fill": 1, "named": 0, "say": 0, "Error": 0, "Refused": 1}
-SHOWN = {"title", "aria-label", "placeholder", "alt", "data-head"}  # attributes that a person reads
+SHOWN = {"title", "aria-label", "placeholder", "alt", "data-head"}  # HTML attributes that the user can read
 TECHNICAL = {"class", "find", "closest", "matches", "matchMedia", "querySelector", "querySelectorAll"}
 
 TOKEN = re.compile(
@@ -82,7 +83,7 @@ PLACEHOLDER = re.compile(r"\{\w+\}")
 
 
 class Bracket(NamedTuple):
-    """An open bracket: name of the called function, number of the argument, and key in an object."""
+    """An open bracket in a script: the called function, the argument's number, and the key in an object."""
 
     call: str = ""
     argument: int = 0
@@ -90,19 +91,19 @@ class Bracket(NamedTuple):
 
 
 class Literal(NamedTuple):
-    """A literal of a script, with the brackets around it from outside to inside."""
+    """A string in a script, with the brackets around it from outside to inside."""
 
     text: str
     around: tuple[Bracket, ...]
 
     @property
     def is_key(self) -> bool:
-        """True if the literal is a key of the catalogue."""
+        """True if the string is a key of the catalogue of texts."""
         return self.around[-1].call in TRANSLATING and self.around[-1].argument == 0
 
     @property
     def is_shown(self) -> bool:
-        """True if the literal is at a place that a person sees, or if it looks like a text."""
+        """True if the user sees the string at its place, or if it looks like a text."""
         inner = next((one for one in reversed(self.around) if one.call or one.key), Bracket())
         if inner.call in TECHNICAL or inner.key in TECHNICAL:
             return False
@@ -112,7 +113,7 @@ class Literal(NamedTuple):
 
 
 def literals(script: str) -> Iterator[Literal]:
-    """Yield the string literals of a script, and the texts between the values of its templates."""
+    """Yield the strings of a script, including the parts of templates between their values."""
     script = COMPARED.sub(r"\1 0", re.sub(r'"\s*\+\s*"', "", script))
     brackets, call, at = [Bracket()], "", 0
     while at < len(script):
@@ -140,13 +141,13 @@ def literals(script: str) -> Iterator[Literal]:
 
 
 def strangers(script: str) -> list[str]:
-    """Return the visible texts of a script that the catalogue does not translate."""
+    """Return the texts in a script that the user sees and that are not in the catalogue."""
     found = [one.text for one in literals(script) if not one.is_key and one.is_shown]
     return [text for text in found if text not in NAMES | OTHERS] + ASSIGNED.findall(script)
 
 
 class HtmlTexts(HTMLParser):
-    """Collects the page's readable attributes, and its texts except those in `noscript`."""
+    """Collects the readable attributes and texts of index.html, except those in `noscript`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -166,7 +167,7 @@ class HtmlTexts(HTMLParser):
             self.texts.add(data.strip())
 
 
-# keys of the catalogue that the page itself names, in its scripts or its HTML
+# keys of the catalogue in the page's own scripts and HTML
 PAGE_TEXTS = {one.text for script in SCRIPTS.values() for one in literals(script) if one.is_key}
 PAGE_TEXTS |= HtmlTexts().texts
 
@@ -192,11 +193,11 @@ def test_each_visible_text_of_a_script_is_in_the_catalogue(script: str) -> None:
         't("Stop {what}", { what: "a drive" })',
     ],
 )
-def test_literal_outside_the_catalogue_is_found(script: str) -> None:
+def test_a_visible_text_outside_the_catalogue_is_found(script: str) -> None:
     assert strangers(script) != []
 
 
-def test_each_text_of_the_html_and_no_text_of_the_css_is_shown_from_the_catalogue() -> None:
+def test_each_text_of_the_html_comes_from_the_catalogue_and_css_has_none() -> None:
     assert HtmlTexts().texts - TEXTS.keys() - NAMES == set()
     styles = "".join(path.read_text("utf-8") for path in PAGE.glob("style/*.css"))
     assert [text for text in re.findall(r"content:([^;]*);", styles) if re.search(r'"[^"]*\w', text)] == []
@@ -211,11 +212,11 @@ def test_each_text_has_all_languages_with_the_same_placeholders() -> None:
             assert text.strip() == text != "", (english, language)
 
 
-def test_closed_lists_of_the_gateway_are_in_the_catalogue() -> None:
+def test_each_fixed_word_of_the_gateway_is_in_the_catalogue() -> None:
     assert GATEWAY_WORDS - TEXTS.keys() == set()
 
 
-def test_catalogue_has_no_unused_text() -> None:
+def test_the_catalogue_has_no_unused_text() -> None:
     assert OWN_PART.keys() - PAGE_TEXTS == set()
     sources = "".join(
         path.read_text("utf-8")
@@ -227,7 +228,7 @@ def test_catalogue_has_no_unused_text() -> None:
     assert [text for text in others if PLACEHOLDER.split(text)[0] not in sources] == []
 
 
-def test_each_language_is_served_as_one_file() -> None:
+def test_each_language_of_the_page_is_served_as_one_file() -> None:
     files = read_files(PAGE)
     assert {name for name in files if name.startswith("texts.")} == {
         "texts.js",
@@ -245,8 +246,8 @@ VIEWS = ("#/drives", "#/drives/pump-1", "#/trends", "#/faults", "#/lines", "#/lo
 NARROW = {"width": 360, "height": 780}
 STOP_ALL = {"en": "Stop all", **TEXTS["Stop all"]}
 LIVE = {"en": "live", **TEXTS["live"]}
-# Return two lists: visible texts and attributes, without the plant's names; elements that are too wide, and
-# words of drives' names and of outcomes that are broken into two lines.
+# Return two lists. First: visible texts and attributes, without the plant's own names. Second: elements that
+# are too wide, and words that are broken into two lines.
 READ = """() => {
   const attributes = ["title", "aria-label", "placeholder", "data-head"];
   const visible = element => element.checkVisibility({ visibilityProperty: true });
@@ -278,10 +279,10 @@ READ = """() => {
 
 
 def english_in(texts: list[str]) -> set[str]:
-    """Return the pieces of the page's English texts, with four letters or more, that these texts contain."""
+    """Return the English texts of the page, of four letters or more, that occur in these texts."""
     joined = "\n".join(texts)
     pieces = {piece.strip(" .,:;()") for text in PAGE_TEXTS - NAMES for piece in PLACEHOLDER.split(text)}
-    pieces.remove("table")  # references to manuals, such as "table 9-2", stay English
+    pieces.remove("table")  # references to manuals, such as "table 9-2", are always in English
     return {
         piece
         for piece in pieces
@@ -291,7 +292,7 @@ def english_in(texts: list[str]) -> set[str]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("language", ["ru", "zh"])
-def test_each_view_fits_a_narrow_screen_and_has_no_english_text(
+def test_each_view_fits_a_narrow_screen_and_has_no_english_text_left(
     opened: Opener, axe: str, language: str
 ) -> None:
     page = opened(live=False, locale=language)
@@ -304,7 +305,7 @@ def test_each_view_fits_a_narrow_screen_and_has_no_english_text(
         until_settled(page)
         texts, wide = page.evaluate(READ)
         assert len(texts) > 10, view
-        # Colours are the same in all languages.
+        # The colours are the same in all languages, so their contrast is tested only once.
         found[view] = [*english_in(texts), *wide, *violations(page, "color-contrast")]
 
     for view in VIEWS:
@@ -324,7 +325,7 @@ def test_each_view_fits_a_narrow_screen_and_has_no_english_text(
 
 @pytest.mark.long
 @pytest.mark.parametrize(("locale", "language"), [("ru-RU", "ru"), ("zh-TW", "zh"), ("de-DE", "en")])
-def test_browser_chooses_the_language(opened: Opener, locale: str, language: str) -> None:
+def test_the_page_has_the_language_of_the_browser(opened: Opener, locale: str, language: str) -> None:
     page = opened(live=False, locale=locale)
     page.locator("#link").get_by_text(LIVE[language], exact=True).wait_for()
     assert page.locator("html").get_attribute("lang") == language
@@ -332,7 +333,7 @@ def test_browser_chooses_the_language(opened: Opener, locale: str, language: str
 
 
 @pytest.mark.long
-def test_choice_on_the_page_wins_and_is_kept(opened: Opener) -> None:
+def test_the_language_chosen_on_the_page_has_precedence_and_is_kept(opened: Opener) -> None:
     page = opened(live=False, locale="ru-RU")
     page.locator("#link").get_by_text(LIVE["ru"], exact=True).wait_for()
     for title, language in (("中文", "zh"), ("English", "en")):
@@ -361,7 +362,9 @@ def test_titles_of_registers_are_shown_in_the_language_of_the_gateways_answer(
 
 
 @pytest.mark.long
-def test_page_without_its_texts_is_in_english_and_stops_drives(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_page_without_its_texts_is_in_english_and_stops_drives(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened(live=False, locale="ru-RU", prepare=aborting("**/page/texts.ru.json"))
     page.locator("#link").get_by_text("live", exact=True).wait_for()
     assert page.locator("html").get_attribute("lang") == "en"
@@ -371,7 +374,7 @@ def test_page_without_its_texts_is_in_english_and_stops_drives(opened: Opener, g
 
 
 @pytest.mark.long
-def test_texts_of_the_gateway_are_translated_in_parts(opened: Opener) -> None:
+def test_composed_texts_of_the_gateway_are_translated_piece_by_piece(opened: Opener) -> None:
     page = opened(live=False, locale="zh-CN")
     said = "texts => import('/page/texts.js').then(({ said }) => texts.map(said))"
     expected = {

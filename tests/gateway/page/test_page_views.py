@@ -1,4 +1,4 @@
-"""Each view: a drive, trends, faults, lines, and the log."""
+"""Each view of the web page: drives, one drive, trends, faults, lines, and the log."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from watching import Opener, cell, until, until_met
 
 from multidrop.gateway.clock import iso_time
 
-pytestmark = pytest.mark.long  # each file starts Chromium, which takes time
+pytestmark = pytest.mark.long  # starts Chromium, which takes time
 
 DRAWN = "document.querySelectorAll('#trend-plots canvas').length === 2"
 
 
 def asked(page: Any) -> list[dict[str, list[str]]]:
-    """Return a list that collects the query parameters of the page's history requests."""
+    """Return a list to which the query of each later history request is appended."""
     questions: list[dict[str, list[str]]] = []
     page.on(
         "request",
@@ -29,7 +29,7 @@ def asked(page: Any) -> list[dict[str, list[str]]]:
 
 
 def asked_width(questions: list[dict[str, list[str]]]) -> int:
-    """Return the time range of the latest history request, in ms."""
+    """Return the width in ms of the time range in the last history request."""
     return int(questions[-1]["to"][0]) - int(questions[-1]["from"][0])
 
 
@@ -56,7 +56,9 @@ def test_the_filter_hides_lines_without_matches(opened: Opener) -> None:
     assert page.locator("#table tbody tr:visible").count() == 0
 
 
-def test_lines_of_a_large_plant_are_folded_except_for_problems(opened: Opener, gateway: FakeGateway) -> None:
+def test_lines_of_a_large_plant_are_folded_unless_they_have_problems(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     lines = [line_of_one(n, 50) for n in range(2)]
     for n, line in enumerate(lines):
         line["drives"] = [line["drives"][0] | {"name": f"fan-{n}-{i}"} for i in range(40)]
@@ -78,7 +80,7 @@ def test_lines_of_a_large_plant_are_folded_except_for_problems(opened: Opener, g
 
 
 def test_frequency_bars_of_all_drives_have_one_labelled_scale(opened: Opener, gateway: FakeGateway) -> None:
-    """Drives at the same frequency have bars of equal length, whatever their maximum frequencies."""
+    """Bars of equal frequency have equal length, whatever the maximum frequencies of the drives."""
     gateway.plant_changes = {"lines": [line_of_one(0, 50), line_of_one(1, 320)]}
     rows = {"output_frequency": [41.0, 0], "frequency_setpoint": [48.0, 0]}
     one = {"state": "runs", "fault": None, "seen": 0, "ages_ms": [0], "values": rows}
@@ -96,7 +98,7 @@ def test_frequency_bars_of_all_drives_have_one_labelled_scale(opened: Opener, ga
 
 
 def line_of_one(number: int, most: float) -> dict[str, Any]:
-    """Return a line with only its first drive, whose setpoint may be up to this many hertz."""
+    """Return a line with only its first drive, whose highest setpoint is `most` Hz."""
     line = fake_plant.plant({})["lines"][number]
     drive = line["drives"][0]
     registers = [
@@ -123,7 +125,7 @@ def test_parameters_are_read_when_the_user_asks(opened: Opener, gateway: FakeGat
     assert link == "api/parameters/pump-1?format=csv"
 
 
-def test_motor_speed_is_not_labelled_frequency(opened: Opener, gateway: FakeGateway) -> None:
+def test_motor_speed_in_rpm_is_not_labelled_as_frequency(opened: Opener, gateway: FakeGateway) -> None:
     line = line_of_one(0, 50)
     (drive,) = line["drives"]
     names = {"output_frequency": "motor_speed"}
@@ -140,7 +142,7 @@ def resize(page: Any, width: int, height: int) -> None:
     page.set_viewport_size({"width": width, "height": height})
 
 
-def test_the_unit_raw_count_stays_within_its_column(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_unit_raw_count_stays_within_its_table_column(opened: Opener, gateway: FakeGateway) -> None:
     line = fake_plant.plant({})["lines"][0]
     raw = [
         r | {"unit": "raw count", "digits": 3} if r["unit"] == "A" else r
@@ -155,25 +157,27 @@ def test_the_unit_raw_count_stays_within_its_column(opened: Opener, gateway: Fak
     for size in ((1440, 900), (1366, 768), (1200, 800), (1181, 800), (820, 1180), (390, 844)):
         resize(page, *size)
         until_met(page, lambda: max(cells.evaluate_all(wide)) <= 0)
-        until_met(page, lambda: min(states.evaluate_all(width)) >= 120)  # px, for "overcurrent"
+        # px; wide enough for the word "overcurrent"
+        until_met(page, lambda: min(states.evaluate_all(width)) >= 120)
 
 
-def test_words_of_states_are_not_cut_off(opened: Opener) -> None:
+def test_words_about_a_drives_state_are_not_cut_off(opened: Opener) -> None:
     page = opened()
     words = page.locator("#table .word", has_text="overcurrent in acceleration")
     parts = "([word]) => [word.scrollWidth - word.clientWidth, word.clientHeight]"
 
     def is_whole() -> bool:
         too_wide, height = words.evaluate_all(parts)
-        return bool(too_wide <= 0 and height <= 2 * 14 * 1.2 + 1)  # px of two lines: no word is broken
+        # height of two lines in px, so no word is broken
+        return bool(too_wide <= 0 and height <= 2 * 14 * 1.2 + 1)
 
     for size in ((1440, 900), (768, 1024), (390, 844)):
         resize(page, *size)
         until_met(page, lambda: words.count() == 1)
-        until_met(page, is_whole)  # the layout follows a change of size with a delay
+        until_met(page, is_whole)  # the page's layout needs a moment after a change of size
 
 
-def test_the_reason_of_a_lost_port_is_shown_completely(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_reason_for_a_lost_port_is_shown_completely(opened: Opener, gateway: FakeGateway) -> None:
     lines = fake_plant.lines()
     why = "could not open port /dev/serial/by-id/usb-FTDI_FT232R_USB_UART-if00: No such file or directory"
     gateway.changes = {"lines": lines | {"hall-3": lines["hall-3"] | {"lost": why}}}
@@ -185,7 +189,7 @@ def test_the_reason_of_a_lost_port_is_shown_completely(opened: Opener, gateway: 
         until_met(page, lambda: head.evaluate("head => head.scrollWidth - head.clientWidth") <= 0)
 
 
-def test_problems_are_marked_by_shape_and_word_besides_colour(opened: Opener) -> None:
+def test_problems_are_marked_by_shape_and_word_as_well_as_colour(opened: Opener) -> None:
     page = opened()
     state = cell(page, "conveyor-2", "state")
     assert state.inner_text().strip() == "overcurrent in acceleration"
@@ -197,7 +201,7 @@ def test_problems_are_marked_by_shape_and_word_besides_colour(opened: Opener) ->
     until_met(page, lambda: page.locator("#panel h2").inner_text() == "booster-1")
 
 
-def test_the_page_of_a_drive_lists_all_registers_with_unit_and_manual_section(opened: Opener) -> None:
+def test_the_view_of_a_drive_lists_all_registers_with_unit_and_manual_section(opened: Opener) -> None:
     page = opened("#/drives/filler-2")
     rows = page.locator(".registers tbody tr")
     assert rows.count() == 12
@@ -207,13 +211,14 @@ def test_the_page_of_a_drive_lists_all_registers_with_unit_and_manual_section(op
     assert rows.nth(8).locator(".value").inner_text() == "ready, at setpoint"
     page.get_by_text("50 % within 4.1 ms, 99 % within 6.1 ms").wait_for()
     assert "Missed 4 of 5120 values" in page.locator("#delays").inner_text()
-    looked_at = rows.nth(10).locator(".value")  # unpolled register, read just now
+    looked_at = rows.nth(10).locator(".value")  # an unpolled register, which was read just now
     until_met(page, lambda: looked_at.get_attribute("class") == "value")
-    assert rows.nth(9).locator(".value").get_attribute("class") == "value old"  # read an hour ago
+    # an unpolled register, which was read an hour ago
+    assert rows.nth(9).locator(".value").get_attribute("class") == "value old"
     assert page.locator("#plots canvas").count() == 3
 
 
-def test_trends_zoom_in_by_dragging_and_back_out(opened: Opener) -> None:
+def test_dragging_zooms_into_trends_and_escape_zooms_out(opened: Opener) -> None:
     page = opened("#/lines")
     questions = asked(page)
     page.evaluate("location.hash = '#/trends?drive=pump-2'")
@@ -228,7 +233,8 @@ def test_trends_zoom_in_by_dragging_and_back_out(opened: Opener) -> None:
     page.mouse.down()
     page.mouse.move(box["x"] + box["width"] * 0.3, y, steps=4)
     seen = len(questions)
-    until_met(page, lambda: len(questions) > seen + 1)  # the page waits for an answer before it asks again
+    # waits for two requests, because the page sends one after the other
+    until_met(page, lambda: len(questions) > seen + 1)
     page.mouse.move(box["x"] + box["width"] * 0.5, y, steps=4)
     page.mouse.up()
     until_met(page, lambda: abs(asked_width(questions) - width / 4) < width / 50)
@@ -237,7 +243,7 @@ def test_trends_zoom_in_by_dragging_and_back_out(opened: Opener) -> None:
     until_met(page, lambda: abs(asked_width(questions) - width) < 1000)
 
 
-def test_trends_zoom_and_move_by_keyboard_and_have_markers(opened: Opener) -> None:
+def test_trends_can_be_zoomed_and_moved_and_marked_by_keyboard(opened: Opener) -> None:
     page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
     until(page, DRAWN)
     span = "25 Nov 2025, 13:00:00 \u2013 25 Nov 2025, 14:00:00 UTC"
@@ -258,7 +264,7 @@ def test_trends_zoom_and_move_by_keyboard_and_have_markers(opened: Opener) -> No
 
 
 def trigger(name: str, ms: int, *registers: str) -> dict[str, Any]:
-    """Return a trigger as the gateway answers it, with a range from 5 s before to 10 s after its moment."""
+    """Return a trigger as in /api/triggers. Its range is from 5 s before to 10 s after its moment `ms`."""
     times = {"time": iso_time(ms), "from": iso_time(ms - 5000), "to": iso_time(ms + 10000)}
     signals = [{"drive": "pump-2", "register": register} for register in registers]
     return {"name": name, "condition": f"pump-2.{registers[0]} > 30", "signals": signals, **times}
@@ -296,8 +302,10 @@ def test_trends_show_the_last_trigger_with_a_mark_at_its_moment(opened: Opener, 
     over, canvas = page.locator("#trend-plots .u-over"), page.locator("#trend-plots canvas")
     left = over.bounding_box()["x"] - canvas.bounding_box()["x"]
     x = page.evaluate("window.written.findLast(([text]) => text === 'trigger')[1]")
-    assert abs(x - 3 - left - over.bounding_box()["width"] / 3) < 1.5  # 5 s of 15 s
-    gateway.triggers[0] = trigger("trip", at + 100_000, "output_current")  # the view follows
+    # the mark is 5 s after the start of a range of 15 s
+    assert abs(x - 3 - left - over.bounding_box()["width"] / 3) < 1.5
+    # the view shows the newest moment of the chosen trigger
+    gateway.triggers[0] = trigger("trip", at + 100_000, "output_current")
     until_met(page, lambda: questions[-1]["from"] == [str(at + 95_000)])
     page.get_by_role("button", name="Zoom in").click()
     assert choice.input_value() == ""
@@ -309,7 +317,7 @@ def test_trends_show_the_last_trigger_with_a_mark_at_its_moment(opened: Opener, 
     [(False, "No history is kept"), (True, "The history has no values in this time range.")],
     ids=["no history", "a trigger that is older than the history"],
 )
-def test_trigger_whose_values_are_missing_has_a_sentence(
+def test_a_trigger_without_values_in_the_history_shows_a_sentence(
     opened: Opener, gateway: FakeGateway, has_history: bool, sentence: str
 ) -> None:
     gateway.has_history = has_history
@@ -329,10 +337,10 @@ def test_trigger_whose_values_are_missing_has_a_sentence(
     until_met(page, lambda: sentence in note.inner_text())
 
 
-def test_markers_and_cursor_show_each_drives_newest_current_value(
+def test_markers_and_cursor_show_the_newest_current_value_of_each_drive(
     opened: Opener, gateway: FakeGateway
 ) -> None:
-    """In a short range, the drives' samples have different times."""
+    """In a short range, the samples of the two drives have different times."""
     begin = 1764075600000
     for drive, offset in (("pump-1", 0), ("pump-2", 400)):
         times = [begin + offset + 1000 * n for n in range(10) if n < 5 or drive == "pump-1"]
@@ -345,11 +353,12 @@ def test_markers_and_cursor_show_each_drives_newest_current_value(
     page.get_by_label("pump-2", exact=True).check()
     until(page, "document.querySelectorAll('#trend-plots .plothead .wide').length === 3")
     for name in ("A", "B"):
-        page.get_by_role("button", name=f"Marker {name}").click()  # markers at 1/3 and 2/3 of the range
+        page.get_by_role("button", name=f"Marker {name}").click()  # sets markers at 1/3 and 2/3 of the range
     rows = page.locator("#marks tbody tr")
     until_met(page, lambda: rows.count() == 2)
     assert rows.nth(0).locator("td").all_inner_texts()[:2] == ["23.00", "26.00"]
-    assert rows.nth(1).locator("td").all_inner_texts()[:2] == ["22.00", "\u2013"]  # old after a second
+    # at marker B, the last value of pump-2 is more than a second old
+    assert rows.nth(1).locator("td").all_inner_texts()[:2] == ["22.00", "\u2013"]
     plot = page.locator("#trend-plots .u-over").first
     box = plot.bounding_box()
     page.mouse.move(box["x"] + box["width"] * 0.3, box["y"] + 20)
@@ -358,7 +367,7 @@ def test_markers_and_cursor_show_each_drives_newest_current_value(
 
 
 def test_an_unpolled_register_has_no_empty_plot(opened: Opener, gateway: FakeGateway) -> None:
-    """The list has no checkbox for this register, so users could not remove its plot."""
+    """The list has no checkbox for an unpolled register, so users could not remove the plot."""
     gateway.plant_changes = {"lines": fake_plant.plant({})["lines"]}
     for line in gateway.plant_changes["lines"]:
         for drive in line["drives"]:
@@ -375,7 +384,7 @@ def test_an_unpolled_register_has_no_empty_plot(opened: Opener, gateway: FakeGat
     assert "output frequency, Hz" not in page.locator("#plots .legend").all_inner_texts()
 
 
-def test_dates_can_be_chosen_and_an_end_before_the_start_is_refused(opened: Opener) -> None:
+def test_a_date_range_can_be_chosen_and_an_end_before_its_start_is_refused(opened: Opener) -> None:
     page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
     until(page, DRAWN)
     page.locator("#span").click()
@@ -391,28 +400,28 @@ def test_dates_can_be_chosen_and_an_end_before_the_start_is_refused(opened: Open
     until_met(page, lambda: page.locator("#span").inner_text() == span)
 
 
-def test_on_a_phone_several_drives_can_be_selected_and_their_lines_differ(opened: Opener) -> None:
+def test_on_a_phone_several_drives_can_be_plotted_with_different_line_styles(opened: Opener) -> None:
     page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000", size="phone")
     until(page, DRAWN)
     heads = page.locator("#trend-plots .plothead output")
-    assert heads.all_inner_texts() == ["", ""]  # one drive needs no legend
+    assert heads.all_inner_texts() == ["", ""]  # a plot of one drive needs no legend
     page.get_by_text("Drives and quantities").click()
     for name in ("pump-1", "filler-1"):
-        page.get_by_label(name, exact=True).check()  # checking a drive must not close the list
+        page.get_by_label(name, exact=True).check()  # the list stays open
     page.get_by_text("Drives and quantities").click()
     until_met(page, lambda: heads.first.locator("canvas").count() == 3)
     assert heads.first.inner_text().split() == ["pump-2", "pump-1", "filler-1"]
     marks = "marks => new Set(marks.map(mark => mark.toDataURL())).size"
-    assert heads.first.locator("canvas").evaluate_all(marks) == 3  # each line differs from the others
+    assert heads.first.locator("canvas").evaluate_all(marks) == 3  # three different line styles
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     plot = page.locator("#trend-plots .plotbox").first
     before = plot.bounding_box()
     plot.hover(position={"x": 200, "y": 40})
-    until_met(page, lambda: ":" in heads.first.inner_text())  # the time at the cursor
-    assert plot.bounding_box() == before  # the plot does not move
+    until_met(page, lambda: ":" in heads.first.inner_text())  # shows the time at the cursor
+    assert plot.bounding_box() == before  # the plot has not moved
 
 
-# Check one drive after the other: each click renews the list. The plots follow after the last click.
+# Click one checkbox after the other, because each click draws the list again. Plots follow the last click.
 CHECK = """boxes => {
   for (let at = 1; at < 25; at++) document.querySelectorAll(boxes)[at].click();
   return [...document.querySelectorAll(boxes)].map(box => box.checked);
@@ -420,14 +429,14 @@ CHECK = """boxes => {
 
 
 @pytest.mark.usefixtures("many_drives")
-def test_selection_is_limited_to_the_number_of_different_line_styles(opened: Opener) -> None:
+def test_number_of_selected_drives_is_limited_to_the_number_of_line_styles(opened: Opener) -> None:
     page = opened("#/trends?drive=pump-1&from=1764075600000&to=1764079200000")
     until(page, DRAWN)
     checked = page.evaluate(CHECK, "#picker [aria-label=Drives] input")
     assert checked == [True] * 24 + [False] * 7
 
 
-def test_time_before_the_gateway_started_is_not_shown_as_fault_free(
+def test_time_before_the_start_of_the_gateway_is_not_shown_as_free_of_faults(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     """The gateway started in the middle of the shown hour."""
@@ -443,7 +452,7 @@ def test_time_before_the_gateway_started_is_not_shown_as_fault_free(
     assert all(abs(part - 0.5) < 0.02 for part in lanes.evaluate_all(part))
 
 
-def test_other_units_have_their_own_plot_and_omissions_are_listed(
+def test_values_in_another_unit_have_their_own_plot_and_omitted_units_are_listed(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     gateway.recorded = {
@@ -463,7 +472,7 @@ def test_other_units_have_their_own_plot_and_omissions_are_listed(
     assert " %, last " in said
 
 
-def test_values_in_a_previous_unit_are_not_drawn(opened: Opener, gateway: FakeGateway) -> None:
+def test_values_recorded_in_a_previous_unit_are_not_drawn(opened: Opener, gateway: FakeGateway) -> None:
     gateway.recorded = {"pump-2.output_current": {"unit": "%", "left_out": ["A"]}}
     page = opened("#/drives/pump-2")
     page.locator(".panel .ranges button", has_text="1 h").click()
@@ -507,16 +516,16 @@ DOTS = """async values => {
 
 
 def test_value_between_two_gaps_is_drawn_as_a_dot(opened: Opener) -> None:
-    """The plot has ten points a second. The register is read once a second, and has three values."""
+    """The plot has ten points a second. The register is read once a second and has three values."""
     page = opened()
     nothing = [None] * 9
     assert page.evaluate(DOTS, [None, *nothing, None, *nothing, None]) == 0
     assert page.evaluate(DOTS, [20, *nothing, 21, *nothing, 20]) > 3 * 9  # pixels
 
 
-def test_rarely_polled_register_has_no_gaps_between_its_values(opened: Opener) -> None:
-    """Values come every 0.6 s, one is missed, then none is requested for 3 s. Values are current for 1 s."""
-    answers = {0: 20.0, 600: 21.0, 1200: None, 1800: 22.0, 4800: 23.0}  # by time in ms
+def test_a_rarely_polled_register_has_no_gaps_between_its_values(opened: Opener) -> None:
+    """Values arrive every 0.6 s. One is missing, and later none is requested for 3 s."""
+    answers = {0: 20.0, 600: 21.0, 1200: None, 1800: 22.0, 4800: 23.0}  # values by time in ms
     times = list(range(0, 4801, 300))
     mean = [answers.get(at) for at in times]
     told = {
@@ -535,7 +544,7 @@ def test_rarely_polled_register_has_no_gaps_between_its_values(opened: Opener) -
     assert drawn["mean"] == drawn["least"] == [20.0, 21.0, None, 22.0, *(None for _ in gap), 23.0]
 
 
-def test_axis_numbers_have_a_decimal_point_and_no_digit_groups(opened: Opener) -> None:
+def test_numbers_at_an_axis_have_a_decimal_point_and_no_digit_groups(opened: Opener) -> None:
     """In some countries "1,000" means one thousand, in others one."""
     page = opened(locale="de-DE")
     told = page.evaluate("""async () => {
@@ -551,7 +560,7 @@ def test_axis_numbers_have_a_decimal_point_and_no_digit_groups(opened: Opener) -
     assert "0.5" in told[1]
 
 
-def test_page_without_history_shows_a_message_and_works(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_page_without_a_history_shows_a_message_and_works(opened: Opener, gateway: FakeGateway) -> None:
     gateway.has_history = False
     asked: list[str] = []
     page = opened("#/drives")
@@ -564,7 +573,7 @@ def test_page_without_history_shows_a_message_and_works(opened: Opener, gateway:
     page.locator("#past-note").get_by_text("No history is kept").wait_for()
     page.get_by_role("button", name="1 min").click()
     until(page, "document.querySelector('#past-note').hidden")
-    assert [url for url in asked if "api/history" in url] == []  # a 404 would appear in the browser's console
+    assert [url for url in asked if "api/history" in url] == []  # the browser would show a 404 as an error
 
 
 def test_active_and_ended_faults_are_listed_separately(opened: Opener) -> None:
@@ -586,7 +595,7 @@ def test_active_and_ended_faults_are_listed_separately(opened: Opener) -> None:
     page.locator("#lane .fault", has_text="overheating").wait_for()
 
 
-def test_lines_view_shows_utilisation_misses_by_reason_and_delays(opened: Opener) -> None:
+def test_the_view_of_lines_shows_utilisation_failed_reads_and_delays(opened: Opener) -> None:
     page = opened("#/lines")
     line = page.locator("article", has=page.get_by_role("heading", name="hall-2"))
     line.wait_for()
@@ -598,7 +607,7 @@ def test_lines_view_shows_utilisation_misses_by_reason_and_delays(opened: Opener
     assert "3 of 5120" in line.locator("tr", has_text="labeller").inner_text()
 
 
-def test_log_shows_callers_writes_and_results(opened: Opener) -> None:
+def test_the_view_of_the_log_shows_callers_writes_and_results(opened: Opener) -> None:
     page = opened("#/log")
     rows = page.locator("#log-list tbody tr")
     rows.first.wait_for()
@@ -608,5 +617,5 @@ def test_log_shows_callers_writes_and_results(opened: Opener) -> None:
     assert rows.nth(4).locator(".bad").inner_text().strip() == "unconfirmed; no reply"
     for repeated, drive in ((rows.nth(2), "labeller"), (rows.nth(3), "mixer-2")):
         assert drive in repeated.inner_text()
-        written = repeated.locator("td").nth(2).inner_text()  # with the number of repetitions
+        written = repeated.locator("td").nth(2).inner_text()  # contains how often the entry was repeated
         assert re.search(r"^stop\s+42 times since .*\d\d:\d\d:\d\d", written)

@@ -1,4 +1,4 @@
-"""Words, numbers and marks on the page: digits, a single drive, a new plant, a lost gateway."""
+"""Words, numbers and marks on the web page: digits, one drive, alarms, and a lost gateway."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ from fake_gateway import FakeGateway
 from fake_plant import alarm, lines, ms
 from watching import SIZES, Opener, cell, until, until_met, until_settled
 
-pytestmark = pytest.mark.long  # each file starts Chromium, which takes time
+pytestmark = pytest.mark.long  # starts Chromium, which takes time
 
 MINUTE_MS = 60_000
-# Draw a plot of one minute, with a tick at the minute's end. Return True if anything is drawn at the right
-# edge of the canvas.
+# Draw a plot of one minute with a tick at its end; return True if a pixel at the right edge is drawn.
 EDGE = """async () => {
   const { makePlot, line } = await import("/page/ui/plots.js");
   const place = document.querySelector("#lines");
@@ -36,8 +35,9 @@ TELL_NUMBERS = """async numbers => {
 }"""
 
 
-def test_numbers_have_the_digits_of_their_register_and_floats_all_digits(opened: Opener) -> None:
-    single = struct.unpack(">f", struct.pack(">f", 0.1))[0]  # as the core delivers it: 0.10000000149011612
+def test_numbers_have_the_digits_of_their_register_and_floats_have_all_digits(opened: Opener) -> None:
+    # 0.1 as float32, which the core delivers as 0.10000000149011612
+    single = struct.unpack(">f", struct.pack(">f", 0.1))[0]
     told = {
         (12.5, 1): "12.5",
         (12.0, 2): "12.00",
@@ -50,7 +50,7 @@ def test_numbers_have_the_digits_of_their_register_and_floats_all_digits(opened:
     assert opened().evaluate(TELL_NUMBERS, [list(each) for each in told]) == list(told.values())
 
 
-def test_plots_and_markers_show_floats(opened: Opener, gateway: FakeGateway) -> None:
+def test_plots_and_markers_show_float_values(opened: Opener, gateway: FakeGateway) -> None:
     line = fake_plant.plant({})["lines"][0]
     floats = [r | {"digits": None, "step": None} for r in line["drives"][0]["registers"]]
     gateway.plant_changes = {
@@ -73,7 +73,7 @@ def test_lost_gateway_is_reported_in_one_sentence(opened: Opener, gateway: FakeG
     assert re.fullmatch(told, page.locator("#notice").inner_text())
 
 
-def test_figures_of_a_dead_gateway_look_old_and_misses_are_hidden(
+def test_figures_of_a_lost_gateway_look_old_and_failed_reads_are_hidden(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     page = opened()
@@ -88,7 +88,7 @@ def test_figures_of_a_dead_gateway_look_old_and_misses_are_hidden(
     assert "counted yet" not in page.locator("#lines").inner_text()
 
 
-def test_durations_of_faults_fetched_before_the_first_frame_are_right(
+def test_durations_of_faults_are_right_if_faults_arrive_before_the_first_values(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     gateway.is_silent = True
@@ -100,7 +100,7 @@ def test_durations_of_faults_fetched_before_the_first_frame_are_right(
     assert 87 <= int(minutes[1]) < 120
 
 
-def test_durations_freeze_when_the_gateway_is_lost(opened: Opener, gateway: FakeGateway) -> None:
+def test_durations_of_faults_freeze_when_the_gateway_is_lost(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/faults")
     lasted = page.locator("#faults td").get_by_text("so far").first
     lasted.wait_for()
@@ -108,13 +108,14 @@ def test_durations_freeze_when_the_gateway_is_lost(opened: Opener, gateway: Fake
     until(page, "document.body.classList.contains('dead')")
     told = []
     for _ in range(2):
-        page.evaluate("(now => { Date.now = () => now() + 5100 })(Date.now)")  # redrawn after 5 s
+        # the page draws durations again after 5 s
+        page.evaluate("(now => { Date.now = () => now() + 5100 })(Date.now)")
         page.evaluate("import('/page/views/faults.js').then(m => m.show())")
         told.append(lasted.inner_text())
     assert told[0] == told[1]
 
 
-def test_single_drive_is_named_in_the_singular(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_plant_with_one_drive_is_described_in_the_singular(opened: Opener, gateway: FakeGateway) -> None:
     first = fake_plant.plant({})["lines"][0]
     gateway.plant_changes = {"lines": [first | {"drives": first["drives"][:1]}], "fleet": False}
     gateway.changes = {"alarms": []}
@@ -132,7 +133,7 @@ def test_single_drive_is_named_in_the_singular(opened: Opener, gateway: FakeGate
     page.get_by_text(re.compile("· 1 drive$")).wait_for()
 
 
-def test_the_strip_has_the_colour_of_a_fault_whose_text_does_not_fit(
+def test_the_alarm_strip_has_the_colour_of_a_fault_whose_text_does_not_fit(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     now = fake_plant.ms(time.time())
@@ -149,8 +150,10 @@ def test_the_strip_has_the_colour_of_a_fault_whose_text_does_not_fit(
     assert page.locator("#strip.bad").count() == 1
 
 
-def test_newest_minute_is_at_the_right_end_of_the_hour(opened: Opener, gateway: FakeGateway) -> None:
-    """Two minutes after the start, the two bars are at the right end of the hour, not at the left."""
+def test_the_newest_minute_is_at_the_right_end_of_the_chart_of_an_hour(
+    opened: Opener, gateway: FakeGateway
+) -> None:
+    """The chart of a gateway that started two minutes ago has two bars, both at the right end."""
     newest = 1_764_115_200_000  # 00:00 UTC
     minutes = [
         {"time": newest - MINUTE_MS, "asked": 90, "misses": {"no reply": 2}},
@@ -169,7 +172,9 @@ def test_newest_minute_is_at_the_right_end_of_the_hour(opened: Opener, gateway: 
     assert "No full minute counted yet." in begun.inner_text()
 
 
-def test_names_that_differ_at_their_ends_look_different(opened: Opener, gateway: FakeGateway) -> None:
+def test_long_names_that_differ_only_at_their_ends_are_shown_whole(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     names = [f"conveyor-of-the-bottling-hall-south-no-{n:02}" for n in (1, 2)]
     gateway.renamed = dict(zip(("pump-1", "pump-2"), names, strict=True))
     page = opened()
@@ -180,7 +185,7 @@ def test_names_that_differ_at_their_ends_look_different(opened: Opener, gateway:
         assert all(page.locator("td.name a", has_text=name).evaluate(is_whole) for name in names)
 
 
-def test_time_label_at_the_end_of_a_plot_is_not_cut_off(opened: Opener) -> None:
+def test_the_time_label_at_the_end_of_a_plot_is_not_cut_off(opened: Opener) -> None:
     assert opened().evaluate(EDGE) is False
 
 
@@ -190,8 +195,10 @@ def test_the_age_of_an_old_value_is_shown(opened: Opener) -> None:
     until_met(page, lambda: bool(re.fullmatch(r"\d+ min", row.locator(".age").inner_text())))
 
 
-def test_values_of_viewed_registers_become_old_without_answers(opened: Opener, gateway: FakeGateway) -> None:
-    """A viewed register may be read only once a minute; its value stays current while the drive answers."""
+def test_values_read_for_a_viewer_become_old_only_if_the_drive_stops_answering(
+    opened: Opener, gateway: FakeGateway
+) -> None:
+    """A viewed register may be read only once a minute. Its value stays current while the drive answers."""
     page = opened()
     value = page.locator("#panel tr", has_text="run hours").locator(".value")
     until_met(page, lambda: value.inner_text() == "4012h")
@@ -207,7 +214,7 @@ def test_values_of_viewed_registers_become_old_without_answers(opened: Opener, g
     page.locator("#panel .value.old", has_text="4012").wait_for()
 
 
-def test_fault_text_that_is_cut_off_in_its_lane_ends_with_an_ellipsis(opened: Opener) -> None:
+def test_a_fault_text_that_does_not_fit_its_bar_ends_with_an_ellipsis(opened: Opener) -> None:
     page: Any = opened("#/trends?drive=pump-1")
     bar = page.locator(".lane .fault")
     bar.wait_for()
@@ -245,7 +252,7 @@ def strip(page: Any) -> list[str]:
     return [text.split(":")[0] for text in found]
 
 
-def test_gravest_alarm_is_listed_first(opened: Opener, alarmed: FakeGateway) -> None:
+def test_the_most_serious_alarm_is_listed_first(opened: Opener, alarmed: FakeGateway) -> None:
     page = opened("#/faults")
     wanted = ["conveyor-2", "pump-4", "line hall-4", "labeller", "booster-1"]
     assert strip(page) == wanted
@@ -254,7 +261,7 @@ def test_gravest_alarm_is_listed_first(opened: Opener, alarmed: FakeGateway) -> 
     assert rows.locator(".who").all_inner_texts() == wanted
     kinds = ["fault", "stopped by itself", "line lost", "silent", "fault"]
     assert [kind.strip() for kind in rows.locator(".kind").all_inner_texts()] == kinds
-    assert page.locator("#count").inner_text() == "4"  # number of unacknowledged alarms
+    assert page.locator("#count").inner_text() == "4"  # alarms that are not acknowledged
     assert "acknowledged" in rows.last.inner_text()
     assert "by anna: fuse" in rows.last.inner_text()
     assert rows.last.get_by_role("button").count() == 0
@@ -277,7 +284,7 @@ def test_an_alarm_is_acknowledged_with_a_note(opened: Opener, alarmed: FakeGatew
     assert "there is no such alarm" in page.locator("#ask").inner_text()
 
 
-def test_many_misses_show_a_warning_and_a_single_miss_shows_none(
+def test_many_failed_reads_show_a_warning_and_a_single_one_does_not(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     gateway.drive_changes = {"pump-1": {"missed": 0.0003}, "pump-2": {"missed": 0.05}}
@@ -292,7 +299,9 @@ def test_many_misses_show_a_warning_and_a_single_miss_shows_none(
     page.locator(".linehead .warn").first.wait_for()
 
 
-def test_drive_at_rest_with_unknown_state_is_not_shown_as_fault(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_drive_at_rest_whose_state_is_unknown_is_not_shown_as_faulty(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     why = "the outputs are not programmed"
     gateway.drive_changes = {name: {"state": "unknown", "note": why} for name in ("pump-4", "pump-1")}
     page = opened("#/drives/pump-4")

@@ -1,4 +1,4 @@
-"""A write to one register of one drive: the user confirms it, it is sent once, its result is shown."""
+"""Writes through the web page: the user confirms each, it is sent once, and its result is shown."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pytest
 from fake_gateway import FakeGateway
 from watching import Opener, press_enter, until, until_met, until_still
 
-pytestmark = pytest.mark.long  # each file starts Chromium, which takes time
+pytestmark = pytest.mark.long  # starts Chromium, which takes time
 
-# When a dialog opens, move its confirming button to this point.
+# Moves the confirming button of the next dialogs to this point.
 CONFIRMED_AT = """([x, y]) => new MutationObserver(() => {
   const yes = document.querySelector('#ask button.danger');
   const place = { position: 'fixed', left: `${x - 20}px`, top: `${y - 20}px`, width: '40px', height: '40px' };
@@ -19,9 +19,12 @@ CONFIRMED_AT = """([x, y]) => new MutationObserver(() => {
 }).observe(document.querySelector('#ask'), { childList: true })"""
 
 
-def test_a_write_is_confirmed_by_name_and_sent_once(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_user_confirms_a_write_by_the_drives_name_and_it_is_sent_once(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened("#/drives/pump-1")
-    assert page.get_by_role("button", name="Change").count() == 1  # the plant file allows one register
+    # the plant file allows writes to one register
+    assert page.get_by_role("button", name="Change").count() == 1
     page.get_by_role("button", name="Change frequency setpoint").click()
     assert page.locator("#ask-title").inner_text() == "Change frequency setpoint of pump-1?"
     assert "frequency setpoint is 20.0 Hz. Allowed: from 0 to 50 Hz." in page.locator("#ask").inner_text()
@@ -35,7 +38,7 @@ def test_a_write_is_confirmed_by_name_and_sent_once(opened: Opener, gateway: Fak
     assert "frequency setpoint = 31.5 Hz: held by the drive" in page.locator("#outcomes").inner_text()
 
 
-def test_result_of_a_write_is_shown_in_the_gateways_words(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_result_of_a_write_is_shown_in_the_gateways_words(opened: Opener, gateway: FakeGateway) -> None:
     gateway.outcomes = {"pump-1": {"done": False, "text": "the drive took 30.0 Hz instead"}}
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="Change frequency setpoint").click()
@@ -45,7 +48,9 @@ def test_result_of_a_write_is_shown_in_the_gateways_words(opened: Opener, gatewa
     assert "the drive took 30.0 Hz instead" in page.locator("#outcomes").inner_text()
 
 
-def test_write_with_a_lost_answer_is_unknown_and_not_repeated(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_command_without_an_answer_is_shown_as_unknown_and_not_repeated(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened("#/drives/pump-1")
     page.route("**/api/act", lambda route: route.abort())
     page.get_by_role("button", name="start").click()
@@ -57,7 +62,7 @@ def test_write_with_a_lost_answer_is_unknown_and_not_repeated(opened: Opener, ga
 CUT_SHORT = '{"done": tr'
 
 
-def test_write_with_a_truncated_answer_is_unknown(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_command_with_a_truncated_answer_is_shown_as_unknown(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     page.route("**/api/act", lambda route: route.fulfill(status=200, body=CUT_SHORT))
     page.route("**/api/audit*", lambda route: route.fulfill(status=200, body=CUT_SHORT))
@@ -69,7 +74,7 @@ def test_write_with_a_truncated_answer_is_unknown(opened: Opener, gateway: FakeG
     page.locator("#writes").get_by_text("The gateway's answer was cut off.").wait_for()
 
 
-def test_start_shows_a_warning_and_enter_alone_does_not_confirm_it(
+def test_the_dialog_of_a_start_warns_and_pressing_enter_does_not_confirm_it(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     page = opened("#/drives/pump-1")
@@ -84,7 +89,7 @@ def test_start_shows_a_warning_and_enter_alone_does_not_confirm_it(
     assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]
 
 
-def test_enter_alone_does_not_write_the_present_value_back(opened: Opener, gateway: FakeGateway) -> None:
+def test_pressing_enter_in_an_unchanged_dialog_writes_no_value(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="Change frequency setpoint").click()
     page.keyboard.press("Enter")
@@ -92,24 +97,24 @@ def test_enter_alone_does_not_write_the_present_value_back(opened: Opener, gatew
     assert gateway.posts == []
 
 
-def test_held_key_counts_as_one_press(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_key_that_is_held_down_counts_as_one_press(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     change = page.get_by_role("button", name="Change frequency setpoint")
     change.click()
     page.get_by_label("New value, Hz").fill("31.5")
     for _ in range(9):
-        page.keyboard.down("Enter")  # the first press, then its automatic repetitions
+        page.keyboard.down("Enter")  # the first press and eight automatic repetitions
     page.keyboard.up("Enter")
     page.locator("#outcomes li").wait_for()
     assert len(gateway.posts) == 1
     assert not page.locator("#ask").evaluate("dialog => dialog.open")
-    change.press("Enter")  # a separate press is accepted immediately
+    change.press("Enter")  # a new press is accepted immediately
     assert page.locator("#ask").evaluate("dialog => dialog.open")
 
 
 @pytest.mark.parametrize("size", ["desk", "phone"])
 def test_a_double_click_on_start_does_not_confirm_it(opened: Opener, gateway: FakeGateway, size: str) -> None:
-    """The dialog's confirming button covers the panel's start button, as on a scrolled phone."""
+    """The confirming button of the dialog covers the start button, as on a scrolled phone."""
     page = opened("#/drives/pump-1", size)
     until_still(page)
     start = page.get_by_role("button", name="start", exact=True)
@@ -120,14 +125,14 @@ def test_a_double_click_on_start_does_not_confirm_it(opened: Opener, gateway: Fa
     start.dblclick()
     assert page.locator("#ask").evaluate("dialog => dialog.open")
     assert gateway.posts == []
-    page.wait_for_timeout(600)  # makes the next click a separate one
+    page.wait_for_timeout(600)  # so that the next click is not part of a double click
     page.mouse.click(x, y)
     page.locator("#outcomes li").wait_for()
     assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]
 
 
 def tap(page: Any, x: float, y: float, made_s: float) -> None:
-    """Dispatch a tap with the time stamp `made_s`, as if it had waited in the browser's queue since then."""
+    """Send a tap to the page with the time stamp `made_s`, as if it had waited in a queue since then."""
     session = page.context.new_cdp_session(page)
     for kind, points in (("touchStart", [{"x": x, "y": y}]), ("touchEnd", [])):
         touch = {"type": kind, "touchPoints": points, "timestamp": made_s}
@@ -146,7 +151,7 @@ SLOW_AT_CLICKS = f"""button => button.addEventListener('click', () => {{
 def test_a_second_tap_on_start_does_not_confirm_it(
     opened: Opener, gateway: FakeGateway, slows: bool, later_s: float
 ) -> None:
-    """A slow page draws its dialog only after the second tap, which waits in the browser's queue."""
+    """On a slow page, the second tap waits in the browser's queue until the dialog is drawn."""
     page = opened("#/drives/pump-1", "phone", has_touch=True)
     until_still(page)
     start = page.get_by_role("button", name="start", exact=True)
@@ -161,14 +166,14 @@ def test_a_second_tap_on_start_does_not_confirm_it(
     tap(page, x, y, made_s + later_s)
     assert page.locator("#ask").evaluate("dialog => dialog.open")
     assert gateway.posts == []
-    page.wait_for_timeout(600)  # makes the next tap a separate one
+    page.wait_for_timeout(600)  # so that the next tap is not part of a double tap
     tap(page, x, y, time.time())
     page.locator("#outcomes li").wait_for()
     assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]
 
 
 def press(page: Any, key: str, made_s: float, text: str = "") -> None:
-    """Dispatch a key press with the time stamp `made_s`."""
+    """Send a key press to the page with the time stamp `made_s`."""
     session = page.context.new_cdp_session(page)
     code = {"Enter": 13, "Tab": 9, " ": 32}[key]
     named = {"key": key, "code": "Space" if key == " " else key, "windowsVirtualKeyCode": code}
@@ -182,7 +187,7 @@ def press(page: Any, key: str, made_s: float, text: str = "") -> None:
 def test_keys_pressed_before_a_dialog_is_drawn_do_not_confirm_it(
     opened: Opener, gateway: FakeGateway, key: str, text: str
 ) -> None:
-    """On a slow page, Tab and Enter could confirm a dialog before the user has seen it."""
+    """On a slow page, Tab and Enter could otherwise confirm a dialog before the user has seen it."""
     page = opened("#/drives/pump-1")
     until_still(page)
     start = page.get_by_role("button", name="start", exact=True)
@@ -195,13 +200,15 @@ def test_keys_pressed_before_a_dialog_is_drawn_do_not_confirm_it(
     press(page, key, made_s + 0.6, text)
     assert page.locator("#ask").evaluate("dialog => dialog.open")
     assert gateway.posts == []
-    page.wait_for_timeout(600)  # waits until the dialog is drawn
+    page.wait_for_timeout(600)  # until the dialog is drawn
     press(page, key, time.time(), text)
     page.locator("#outcomes li").wait_for()
     assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]
 
 
-def test_command_names_the_newest_frame_at_its_confirmation(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_command_names_the_page_frame_that_was_shown_at_its_confirmation(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened("#/drives/pump-1")
     newest = "import('/page/data/store.js').then(m => m.store.frame.n)"
     page.get_by_role("button", name="start").click()
@@ -213,7 +220,9 @@ def test_command_names_the_newest_frame_at_its_confirmation(opened: Opener, gate
     assert before <= gateway.seen[0] <= page.evaluate(newest)
 
 
-def test_stop_while_the_dialog_is_open_prevents_a_start(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_stop_while_the_dialog_of_a_start_is_open_prevents_the_start(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="start").click()
     gateway.stops = {"pump-1": 1}
@@ -228,8 +237,10 @@ def test_stop_while_the_dialog_is_open_prevents_a_start(opened: Opener, gateway:
     until_met(page, lambda: gateway.posts)
 
 
-def test_reload_while_the_dialog_is_open_prevents_a_start(opened: Opener, gateway: FakeGateway) -> None:
-    """After the reload, the confirmed name may mean another drive."""
+def test_a_reload_while_the_dialog_of_a_start_is_open_prevents_the_start(
+    opened: Opener, gateway: FakeGateway
+) -> None:
+    """After the reload, the name in the dialog may mean another drive."""
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="start", exact=True).click()
     gateway.changes = gateway.plant_changes = {"revision": 2}
@@ -244,7 +255,9 @@ def test_reload_while_the_dialog_is_open_prevents_a_start(opened: Opener, gatewa
     until_met(page, lambda: gateway.posts)
 
 
-def test_stop_verb_is_sent_after_a_stop_or_reload(opened: Opener, gateway: FakeGateway) -> None:
+def test_an_emergency_stop_is_sent_although_a_stop_came_during_its_dialog(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="emergency stop").click()
     gateway.stops = {"pump-1": 1}
@@ -265,14 +278,14 @@ def test_no_button_moves_when_values_grow_old(opened: Opener, gateway: FakeGatew
     assert start.bounding_box() == before
 
 
-def test_forbidden_commands_are_not_offered(opened: Opener) -> None:
+def test_commands_that_the_settings_forbid_are_not_offered(opened: Opener) -> None:
     page = opened("#/drives/pump-2")
     page.locator(".registers").wait_for()
     assert page.locator(".verbs button, .change").count() == 0
     assert page.get_by_role("button", name="Stop pump-2").is_visible()
 
 
-def test_set_frequency_shows_value_and_range_and_checks_the_input(
+def test_the_dialog_set_frequency_shows_value_and_range_and_checks_the_input(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     gateway.maximum_hz = 45.0
@@ -294,7 +307,7 @@ def test_set_frequency_shows_value_and_range_and_checks_the_input(
     ]
 
 
-def test_values_outside_the_limits_of_other_registers_are_not_sent(
+def test_a_value_above_the_maximum_frequency_register_is_not_sent(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     gateway.maximum_hz = 45.0

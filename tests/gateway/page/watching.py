@@ -1,4 +1,4 @@
-"""Functions that wait for a state of a page."""
+"""Functions by which tests wait for a state of the web page."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ Opener = Callable[..., Any]
 
 
 def missing(what: str) -> NoReturn:
-    """Skip the test on a user's machine; fail it in CI, where all tests must run."""
+    """Report a missing program. Skips the test on a user's machine, and fails it in CI."""
     if os.environ.get("CI") == "true":
         pytest.fail(what)
     pytest.skip(what)
 
 
-PATIENCE_S = 60.0  # time limit for events that are immediate on an idle machine
+PATIENCE_S = 60.0  # for events that happen immediately on an idle machine
 LOOK_MS = 60  # polling interval
 LIVE = "document.querySelector('#link').textContent.trim() === 'live'"
 STALE = "document.body.classList.contains('stale')"
@@ -36,7 +36,7 @@ AT_ITS_PLACE = """() => {
 
 
 AXE_TAGS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
-# Report violations only: other results would list all elements of the page.
+# Return only violations, because the other results would list all elements of the page.
 RUN_AXE = """([tags, without]) => axe.run(document, {
   runOnly: tags,
   rules: Object.fromEntries(without.map(rule => [rule, { enabled: false }])),
@@ -44,7 +44,7 @@ RUN_AXE = """([tags, without]) => axe.run(document, {
 }).then(found => found.violations)"""
 
 
-# Poll inside the page, which costs less than messages. The CSP forbids `page.wait_for_function`.
+# The page polls by itself, which costs less than messages. Its CSP forbids `page.wait_for_function`.
 POLLED = """new Promise((done, fail) => {
   let left = %(looks)d;
   const look = async () => {
@@ -61,9 +61,9 @@ POLLED = """new Promise((done, fail) => {
 
 
 def until(page: Any, expression: str) -> None:
-    """Wait until this expression is true on the page, which may reload meanwhile.
+    """Wait until this JavaScript expression is true.
 
-    Raises AssertionError after PATIENCE_S.
+    The page may reload meanwhile. Raises AssertionError after PATIENCE_S.
     """
 
     def met() -> object:
@@ -78,10 +78,7 @@ def until(page: Any, expression: str) -> None:
 
 
 def until_met(page: Any, met: Callable[[], object], what: str = "") -> None:
-    """Wait until a condition is met, because the page may change with a delay.
-
-    Raises AssertionError after PATIENCE_S.
-    """
+    """Wait until `met` returns a true value. Raises AssertionError after PATIENCE_S."""
     end = time.monotonic() + PATIENCE_S
     while not met():
         assert time.monotonic() < end, f"not within {PATIENCE_S:g} s: {what}; {told(page)}"
@@ -91,7 +88,7 @@ def until_met(page: Any, met: Callable[[], object], what: str = "") -> None:
 def await_new_value(page: Any, shown: Callable[[], float]) -> None:
     """Wait until the page shows a value that the gateway made after this call.
 
-    The shown register belongs to the drive `FakeGateway.clocked`: its value is the time in s, modulo 1000.
+    `shown` must return the frequency of the drive `FakeGateway.clocked`, which is the time in s, modulo 1000.
     """
     called_s = time.time()
     until_met(page, lambda: (shown() - called_s) % 1000 < 500)
@@ -110,7 +107,7 @@ PENDING: WeakKeyDictionary[Any, set[Any]] = WeakKeyDictionary()
 
 
 def note_requests(page: Any) -> None:
-    """Note the page's pending requests, except requests for frames, for `until_settled`."""
+    """Keep a set of the page's pending requests for `until_settled`, without requests for page frames."""
     pending = PENDING[page] = set[Any]()
     page.on("request", lambda request: "/api/frame" in request.url or pending.add(request))
     for event in ("requestfinished", "requestfailed"):
@@ -118,14 +115,14 @@ def note_requests(page: Any) -> None:
 
 
 def until_settled(page: Any) -> None:
-    """Wait until the page has all answers except the next frame, and all animations have ended."""
-    page.wait_for_timeout(200)  # views fetch up to 150 ms after they are opened
+    """Wait until no request is pending except that for the next page frame, and all animations have ended."""
+    page.wait_for_timeout(200)  # a view may send its requests up to 150 ms after it is opened
     until_met(page, lambda: not PENDING[page], "pending requests")
     until_still(page)
 
 
 def aborting(*urls: str) -> Callable[[Any], None]:
-    """Return a function for `opened` that makes the page's requests for these URLs fail."""
+    """Return a `prepare` for `opened` that makes requests for these URLs fail."""
 
     def prepare(page: Any) -> None:
         for url in urls:
@@ -135,32 +132,32 @@ def aborting(*urls: str) -> Callable[[Any], None]:
 
 
 def press_enter(page: Any) -> None:
-    """Press Enter after the page has drawn an opened or closed dialog: the page ignores earlier keys."""
+    """Press Enter two drawings later, because the page ignores keys until a dialog's change is drawn."""
     page.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
     page.keyboard.press("Enter")
 
 
 def told(page: Any) -> str:
-    """Return the text of the page's head, for the message of a failed wait."""
+    """Return the texts in the page's header, for the message of a failed wait."""
     return str(
         page.evaluate("['link', 'notice'].map(id => document.getElementById(id).textContent).join(', ')")
     )
 
 
 def cell(page: Any, drive: str, part: str) -> Any:
-    """Return a cell of the table of drives, by drive and column."""
+    """Return the cell of a drive and a column in the table of drives."""
     return page.locator("tr.drive", has=page.get_by_role("link", name=drive, exact=True)).locator(
         f"td.{part}"
     )
 
 
 def link(page: Any) -> str:
-    """Return the text about the connection in the page's head."""
+    """Return the text about the connection in the page's header."""
     return str(page.locator("#link").inner_text().strip())
 
 
 def violations(page: Any, *without: str) -> list[str]:
-    """Return the violations that axe-core finds in the present view, without these rules.
+    """Return the violations that axe-core finds in the open view, except for the rules in `without`.
 
     The page must have loaded axe-core.
     """
