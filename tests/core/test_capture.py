@@ -193,7 +193,7 @@ def test_bytes_that_cannot_be_a_frame_are_reported_as_junk_immediately() -> None
 def test_putting_bytes_into_a_full_stream_raises() -> None:
     stream = Stream()
     stream.put(bytes(STREAM_ROOM), 0)
-    with pytest.raises(BufferError, match="split it first"):
+    with pytest.raises(BufferError, match=r"take its frames with Splitter\.spans first"):
         stream.put(b"\0", 1)
 
 
