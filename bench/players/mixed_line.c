@@ -36,7 +36,8 @@ static struct {
     long requests, early, refused, cycles; /* a cycle ends when the first request comes again */
     struct md_message first;
     int64_t first_ns, last_ns, cycles_ns;
-    int64_t exchange_ns, ideal_ns; /* least times: last exchange, no silence; sum of earlier ones, with it */
+    int64_t exchange_ns; /* least time of the latest exchange, without silence */
+    int64_t ideal_ns;    /* sum of the earlier exchanges' least times, with silences */
 } seen;
 
 static int64_t now_ns(void)

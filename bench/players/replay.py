@@ -54,7 +54,7 @@ class Unreliable(Unpaced):
     u0, u1, u2, u3, u4, u5, u6, u7, u8, u9 = (reading(address, table=INPUT) for address in range(10))
 
     def needed_silence(self) -> float:
-        return 3e-4  # long enough for the second copy of a reply
+        return 3e-4  # s; long enough for the second copy of a doubled reply
 
     @classmethod
     def held(cls, address: int, name: str) -> int:

@@ -35,9 +35,9 @@ struct line {
     uint8_t received[256];
 };
 
-/* Pending replies: a heap, with the earliest one at 0. */
+/* Pending replies are in a heap, whose element 0 is due first. */
 struct reply {
-    int64_t due_ns, last_ns; /* when to send it; after last_ns it counts as lost */
+    int64_t due_ns, last_ns; /* time to send the reply; time after which it counts as lost */
     int fd;
     uint16_t len;
     uint8_t bytes[MOST_REPLY];

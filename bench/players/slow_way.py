@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-PIECE = 64  # bytes that are forwarded at a time, at most
+PIECE = 64  # most bytes that are forwarded at once
 
 
 class SlowWay:

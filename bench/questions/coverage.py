@@ -45,7 +45,8 @@ class Coverage:
 
     def __init__(self, devices: Iterable[ImportedDevice]) -> None:
         self.by_device = [(device, holdings(device)) for device in devices]
-        self.refused = Counter[str]()  # devices by reason: each entry is representable, but not all together
+        # reason: devices whose entries a family can declare one by one, but not all together
+        self.refused = Counter[str]()
         self.whole = sum(self._is_whole(entries) for _, entries in self.by_device)
 
     def _is_whole(self, entries: list[Holding]) -> bool:

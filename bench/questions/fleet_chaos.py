@@ -34,9 +34,9 @@ from multidrop.fleet.samples.samples_stream import create_stream, last_of, sampl
 
 ROOT = Path(__file__).parents[2]
 GATEWAYS = ("gateway-1", "gateway-2")
-PATIENCE_S = 300.0  # limit from the last kill until every sample is stored
+PATIENCE_S = 300.0  # longest wait after the last kill until every sample is stored
 
-Numbers = dict[str, Counter[int]]  # by gateway: the number of copies of each exchange
+Numbers = dict[str, Counter[int]]  # gateway: how many copies of each exchange are stored
 
 
 class Process:

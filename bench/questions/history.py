@@ -39,7 +39,7 @@ from multidrop.recording.segments import SegmentWriter
 SECOND = 1_000_000_000
 SEGMENT_S = 600
 MIDNIGHT = 1_795_219_200 * SECOND  # 2026-11-21
-FULL_S = 3600  # first part of the day, with rows at 10 Hz
+FULL_S = 3600  # s from the start of the day in which rows are at 10 Hz
 DRIVES, REGISTERS = 31, 10
 UNIT = "Hz"
 DESCRIBED = {f"value_{number}": {"unit": UNIT} for number in range(REGISTERS)}

@@ -32,7 +32,7 @@ from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 POLL = ("status", "output_frequency", "output_current", "fault")
 TOOLS_FUNCTION = 4  # polling does not use this function, so each such request is the tool's
 OUTPUT_VOLTAGE, CONTROL, STOP = 0x3003, 0x1000, 5  # CHE100 manual v1.4, p. 117
-SETTLE_S = 8.0  # after a start: time to learn response delays
+SETTLE_S = 8.0  # time after the start in which the poller learns response delays, in s
 PATIENCE_S = 30.0
 
 PLANT = """

@@ -25,7 +25,8 @@ BARE = "bare C"
 QUIET = "multidrop, quiet"  # name of the row for multidrop without busy loops
 BARE_REALTIME = "bare C, realtime"
 TCP_START_MS = 1500  # start of a run, not counted: a new connection delays single bytes
-ASLEEP = "bare C, asleep"  # sleeps until 1.5 characters before a reply's end, as multidrop does
+# minimal C master that sleeps until 1.5 characters before a reply's end, as multidrop does
+ASLEEP = "bare C, asleep"
 BESIDE = (BARE, BARE_REALTIME, "multidrop", "multidrop, realtime", "pymodbus", "minimalmodbus")
 
 

@@ -124,7 +124,8 @@ _CAUSES = (
 def syntax_mistake(text: str, message: str) -> tuple[int, str]:
     """Return the number of the wrong line, and a sentence about it; `message` is that of tomllib."""
     lines = text.removesuffix("\n").split("\n")
-    message, _, place = message.rpartition(" (at ")  # the last one, because a key may have this text too
+    # split at the last " (at ", because a key may have this text too
+    message, _, place = message.rpartition(" (at ")
     number, column = map(int, re.findall(r"\d+", place) or (len(lines) + 1, 1))
     rest = "the end of the file" if number > len(lines) else lines[number - 1][column - 1 :].strip()
     number = min(number, len(lines))

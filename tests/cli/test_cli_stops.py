@@ -313,4 +313,5 @@ def test_a_stop_is_repeated_for_the_given_seconds(run: Run, che: Che) -> None:
     assert status == 1
     assert "it was never confirmed" in err
     assert received.writes[0].data == b"\0\5"
-    assert {write.data for write in received.writes} <= {b"\0\5", b"\0\x08"}  # stops of a run and of a jog
+    # commands that stop a run, and that end a jog
+    assert {write.data for write in received.writes} <= {b"\0\5", b"\0\x08"}

@@ -48,7 +48,8 @@ def test_on_a_terminal_poll_shows_the_newest_values_in_a_table(plant: Path) -> N
     with on_terminal("poll", plant, "--seconds", "1", size=(120, 24)) as terminal:
         terminal.wait_for("DRIVE   SAMPLES  MISSES  NEWEST VALUES")
         terminal.wait_for("output_current 0.00 A, mystery 0 raw, fault NONE, status none")
-        terminal.wait_for("output_frequency: no")  # the other drive's text: "no reply" or "not asked"
+        # the line of the second drive says "no reply" or "not asked"
+        terminal.wait_for("output_frequency: no")
         terminal.wait_for("utilisation")
         assert terminal.process.wait(timeout=60) == 0
         assert b"\x1b[4F\x1b[J" in terminal.written  # table, head and note are drawn over the previous ones

@@ -45,7 +45,7 @@ def test_a_closed_terminal_is_noted_but_does_not_interrupt(hangup_is_deadly: Non
         for _ in range(2):  # a shell and the system send one signal each
             hang_up()
         assert interruption.came
-        signal.raise_signal(signal.SIGTERM)  # sent by a system that ends the session
+        signal.raise_signal(signal.SIGTERM)  # a system that ends the session sends SIGTERM too
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGTERM)
 

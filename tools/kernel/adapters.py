@@ -332,7 +332,8 @@ class LineCoding(Adapter):
     def on_control(self, kind: int, request: int, value: int, index: int, size: int, data: bytes) -> bytes:
         if kind == 0x21 and request == 0x20:
             baudrate, stop, parity, bits = struct.unpack("<IBBB", data[:7])
-            if baudrate & 1 << 31:  # PL2303: a divisor of 12 MHz * 32
+            # the driver of the PL2303 sends a divisor of 12 MHz * 32 instead of a baud rate
+            if baudrate & 1 << 31:
                 shift = baudrate >> 12 & 14 | baudrate >> 16 & 1
                 baudrate = round((384000000 >> shift) / (baudrate & 0x7FF))
             self.set(baudrate=baudrate, format=f"{bits}{PARITIES[parity]}{STOP_BITS[stop]}")

@@ -172,7 +172,7 @@ def _guarded(run: Callable[[], int]) -> int:
     except BusError as failure:
         return _fail(str(failure), FAILED)
     except ImportError as missing:
-        if missing.name != "nanoarrow":  # some machines have no build of this library
+        if missing.name != "nanoarrow":  # for some kinds of machines, there is no build of nanoarrow
             raise
         return _fail(str(missing), MISTAKE)
     return status

@@ -298,7 +298,7 @@ def _text(findings: list[Finding]) -> Iterator[str]:
     width = max(len(finding.topic) for finding in findings) + 2
     for finding in findings:
         yield from wrapped(finding.what, f"{finding.topic:<{width}}", " " * width)
-        if finding.advice:  # may contain a command to copy, so words are not broken
+        if finding.advice:  # do not break words, because the advice may contain a command to copy
             indent = " " * width
             yield from wrapped(finding.advice, f"{indent}-> ", f"{indent}   ", breaks_words=False)
 

@@ -158,7 +158,7 @@ def _both(one: Target | ParameterSet, other: Target | ParameterSet) -> tuple[Par
         ParameterSet(each.drive.model, {}, source=each.drive.name) if isinstance(each, Target) else each
         for each in (one, other)
     ]
-    check_same_model(*sides)  # before the parameters are read, because reading takes long
+    check_same_model(*sides)  # checked before the parameters are read, because reading takes long
     codes = [[*each.values] if isinstance(each, ParameterSet) else None for each in (one, other)]
     first = _read(one, codes[1]) if isinstance(one, Target) else one
     second = _read(other, codes[0]) if isinstance(other, Target) else other

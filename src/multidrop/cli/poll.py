@@ -368,7 +368,7 @@ class Keys:
         self._poller = poller
         self._table = table
         self._wait_for_key = wait_for_key
-        self._text: str | None = None  # the comment so far; None: no comment is being typed
+        self._text: str | None = None  # the comment's text so far; None if the user is not typing one
         self._begun = 0.0
         self._show()
 

@@ -125,7 +125,7 @@ def _listen(listener: Listener, printer: TrafficPrinter, seconds: float | None) 
             if seconds is not None and now - begun >= seconds:
                 break
             if listener.receive():
-                received_at = time.monotonic()  # read again, because receiving may have taken long
+                received_at = time.monotonic()  # read the clock again, because receiving may have taken long
             listener.stream.end(now - received_at > _SILENT_S)
             printer.show(listener.stream)
             if now - received_at > _GIVEN_UP_S:

@@ -81,7 +81,7 @@ def plan(
     given = values if isinstance(values, ParameterSet) else ParameterSet("", values, source="values")
     family: Any = type(drive)
     check_same_model(ParameterSet(drive.model, {}, source=drive.name), given)
-    parameters_of(family)  # raises Unsupported for a family without a rule
+    parameters_of(family)  # called because it raises Unsupported for a family without parameter addresses
     space = family.parameter_space
     known = {code: parameter_of(family, code) for code in given.values if not space.is_monitor(code)}
     _check_also(family, also, given)

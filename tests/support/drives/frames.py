@@ -118,7 +118,7 @@ for _text, _start, _value in (
     _write = Message(1, 0x06, _start, data=words(_value))
     MEANING[_text] = _write, {"same": _write}
 
-# Delixi's packets that set a value: K, P1P0, D3..D0.
+# Delixi's packets that set a value, with the fields K, P1P0 and D3..D0 of the manual.
 for _text, _k, _p, _d in (
     (_line("010200020000000005"), 2, 2, 0),
     (_line("0104000100001388A1"), 4, 1, 5000),

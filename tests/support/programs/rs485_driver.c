@@ -84,7 +84,7 @@ int ioctl(int fd, unsigned long request, ...)
     if (request == TIOCGRS485 || request == TIOCSRS485)
         return own_mode(request, argument);
     if (request == TIOCMBIS || request == TIOCMBIC)
-        return 0; /* DTR: if it fails, pyserial does not set RTS */
+        return 0; /* succeed for DTR, because pyserial sets RTS only then */
     if (request == TIOCSERGETLSR) {
         *(unsigned *)argument = now_ns() >= end_ns ? TIOCSER_TEMT : 0;
         return 0;

@@ -217,7 +217,8 @@ _HEX = re.compile("0[xX][0-9A-Fa-f]+")
 _BY_PORT = ("PORT", "MODEL", "ADDRESS")
 _BY_PLANT = ("PLANT.toml", "DRIVE")
 _STOPS_AND_LOOKS = ("read", "state", "stop", "coast", "emergency-stop")
-_SETTINGS = ("baudrate", "format", "framing")  # options only for a drive that is given without a plant file
+# options that are allowed only for a drive without a plant file
+_SETTINGS = ("baudrate", "format", "framing")
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ def check_writable(path: Path) -> None:
     The check creates a file and removes it.
     """
     refuse_overwriting(path)
-    if path.exists() and not path.is_dir():  # a device or a pipe is not created
+    # a command writes to an existing device or pipe, and creates nothing
+    if path.exists() and not path.is_dir():
         return
     new_file(path).close()
     path.unlink()

@@ -18,7 +18,7 @@ from multidrop.cli.support.output import logging_by
 from multidrop.printable import masked, printable
 
 MOST_WAITING = 10_000  # limit of the lines in the queue
-ENDING_S = 1.0  # time limit of `close` for the last lines
+ENDING_S = 1.0  # how long `close` waits until the last lines are written, in s
 
 
 class LogThread(logging.Handler):

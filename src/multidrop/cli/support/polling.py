@@ -104,7 +104,7 @@ def polling_session(
 
 
 POINT_S = 0.25  # s between two points of a history
-HISTORY = 240  # limit of a history's points: those of the last minute
+HISTORY = 240  # most points of a history, which are those of the last minute
 RECENT = 5.0  # period in s over which rates are measured
 MISSED = 1.0  # if the last request for a register failed, its value is old after this many s
 FREQUENCY, CURRENT, FAULT, STATE = "output_frequency", "output_current", "fault", "status"

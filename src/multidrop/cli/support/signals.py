@@ -61,7 +61,8 @@ class Interruption:
 
     def __init__(self) -> None:
         self.came = False
-        self._is_asked = False  # True after SIGINT or SIGTERM: the next of these raises
+        # True after the first SIGINT or SIGTERM; the next one raises KeyboardInterrupt
+        self._is_asked = False
 
     def note(self, number: int, frame: FrameType | None) -> None:
         if self._is_asked:
