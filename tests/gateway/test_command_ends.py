@@ -1,4 +1,4 @@
-"""Results of commands, the end time of a drive's latest command, and computed channels in a gateway."""
+"""Results of commands, the end time of each drive's latest command, and computed channels in a gateway."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MAY = May(write=frozenset({"mill.setpoint"}), verbs=frozenset({"mill.start"}))
 
 
 class UnopenedLines:
-    """A plant of two drives whose line is not polled, so that each command ends with a failure."""
+    """The PolledLines of two drives whose line is not open, so each command ends with a failure."""
 
     plant: Plant = plant_of(("hall", InvtCHE(1, name="mill")), ("hall", InvtCHE(2, name="fan")), polled=False)
 
@@ -47,7 +47,7 @@ class UnopenedLines:
 
     @property
     def plant_coming(self) -> None:
-        return None  # no reload is in progress
+        return None  # no reload in progress
 
 
 @table(
@@ -60,7 +60,9 @@ class UnopenedLines:
     ],
     ids=["a write", "a verb", "a stop", "a stop of all"],
 )
-def test_end_time_of_the_latest_command_is_known(command: Callable[[Commands], Awaitable[Any]]) -> None:
+def test_the_end_time_of_a_drives_latest_command_is_known(
+    command: Callable[[Commands], Awaitable[Any]],
+) -> None:
     commands = Commands(UnopenedLines(), MAY)
     assert commands.ended_ns("mill") == 0
     begun_ns = time.monotonic_ns()
@@ -80,7 +82,7 @@ def test_end_time_of_the_latest_command_is_known(command: Callable[[Commands], A
     ],
     ids=["a write", "a verb"],
 )
-def test_result_names_a_drive_that_was_removed_from_its_line(
+def test_the_result_of_a_command_names_a_drive_that_was_removed_from_its_line(
     command: Callable[[Commands], Awaitable[CommandResult]],
 ) -> None:
     async def carry_out() -> CommandResult:
@@ -97,7 +99,9 @@ def test_result_names_a_drive_that_was_removed_from_its_line(
     ids=["huge", "huge below 0", "inf", "nan", "1.5"],
 )
 @table("register", ["setpoint", "control"])
-def test_an_invalid_number_is_reported(register: str, value: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_invalid_number_in_a_write_is_reported(
+    register: str, value: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """JSON allows integers that are too large for a float."""
     line, mill, _ = one(monkeypatch, InvtCHE(1, name="mill", maximum_frequency=50))
     lines = UnopenedLines()
@@ -113,17 +117,17 @@ def test_an_invalid_number_is_reported(register: str, value: float, monkeypatch:
     assert len(line.written) == told.ok
 
 
-async def test_refused_command_has_no_end_time() -> None:
+async def test_a_refused_command_has_no_end_time() -> None:
     commands = Commands(UnopenedLines(), MAY)
     await commands.write("fan", "setpoint", 10.0, CALLER)
     assert commands.ended_ns("fan") == 0
 
 
 @pytest.mark.parametrize("verb", ["stop", "coast"])
-def test_other_unicode_spelling_of_a_drive_works_for_stops_only(
+def test_a_drive_name_in_another_unicode_spelling_works_for_stops_only(
     verb: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Depending on the keyboard, a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
+    """A u with two dots is one character (U+00FC) on some keyboards, and two (U+0075 U+0308) on others."""
     fan, spelt = "L\u00fcfter", "Lu\u0308fter"
     line, known, _ = one(monkeypatch, InvtCHE(1, name=fan, maximum_frequency=50))
     lines = UnopenedLines()
@@ -151,7 +155,7 @@ def test_other_unicode_spelling_of_a_drive_works_for_stops_only(
     assert commands.stopped_ns(fan) is not None
 
 
-async def test_view_of_a_drive_is_found_by_another_unicode_spelling(tmp_path: Path) -> None:
+async def test_the_view_of_a_drive_is_found_by_another_unicode_spelling(tmp_path: Path) -> None:
     gateway: Any = SimpleNamespace(
         plant=plant_of(("hall", InvtCHE(1, name="L\u00fcfter"))),
         ledger=Ledger(tmp_path / "wear.sqlite"),
@@ -184,7 +188,7 @@ above = 10
 
 
 @pytest.mark.slow
-def test_channels_are_on_the_page_in_metrics_and_in_mqtt(tmp_path: Path) -> None:
+def test_computed_channels_are_on_the_page_and_in_metrics_and_in_mqtt(tmp_path: Path) -> None:
     with served(tmp_path, CHANNELS) as gateway:
         until(lambda: gateway.frame()["drives"]["pump-2"]["values"]["half"][0] == 25.0)
         drive = gateway.get("/api/plant").json["lines"][0]["drives"][1]
@@ -208,7 +212,7 @@ def test_channels_are_on_the_page_in_metrics_and_in_mqtt(tmp_path: Path) -> None
 
 
 def with_channels() -> Plant:
-    """Return a plant with a drive that has two channels."""
+    """Return a plant whose drive has two computed channels."""
     drive = InvtCHE(1, name="mill")
     channels = (
         Channel("power", "output_voltage * output_current", "W"),
@@ -218,7 +222,7 @@ def with_channels() -> Plant:
     return Plant([PlantLine("hall", "/dev/hall", drives=[polled])], Path("plant.toml"))
 
 
-def test_a_channel_stays_fresh_as_long_as_its_slowest_input() -> None:
+def test_a_computed_channel_stays_fresh_as_long_as_its_slowest_input() -> None:
     slow = PolledDrive(InvtCHE(1, name="fan"), ["output_voltage"], every=60)
     channels = Channel("other", "fan.output_voltage", "V"), Channel("own", "output_voltage", "V")
     fast = PolledDrive(InvtCHE(1, name="mill"), ["output_voltage"], every=1, channels=channels)
@@ -227,7 +231,7 @@ def test_a_channel_stays_fresh_as_long_as_its_slowest_input() -> None:
     assert [hub.holds_s("mill", name) for name in ("other", "own")] == [180, 3]
 
 
-def test_modbus_clients_read_channels_as_floats() -> None:
+def test_modbus_clients_read_computed_channels_as_floats() -> None:
     with (
         serving(with_channels(), ModbusSettings(listen="127.0.0.1:0")) as gateway,
         gateway.client() as client,
@@ -238,14 +242,14 @@ def test_modbus_clients_read_channels_as_floats() -> None:
         assert power == 1234.5
         assert math.isnan(starts)
         assert client.ask(1, 4, 0xF102, 2).words == [0x7FC0, 0]
-        assert client.ask(1, 3, 0xF103, 2).code == 2  # beyond the last channel
+        assert client.ask(1, 3, 0xF103, 2).code == 2  # there is no further channel
         gateway.hub.values[("mill", "starts")] = 1e300
         assert client.ask(1, 3, 0xF102, 2).words == [0x7F80, 0]
     assert gateway.line.asked == []
 
 
 @pytest.mark.parametrize("channels", [0xF00E, 0xFFFE, 0x3003])
-def test_channels_must_not_overlap_other_addresses(channels: int) -> None:
+def test_modbus_addresses_of_computed_channels_must_not_overlap_others(channels: int) -> None:
     (sentence,) = ModbusSettings(channels=channels).check(with_channels())
     assert sentence.startswith("mill: the 4 words of its channels do not fit at ")
     assert ModbusSettings(channels=channels).check(plant_of(("hall", InvtCHE(1, name="mill")))) == []

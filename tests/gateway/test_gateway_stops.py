@@ -1,4 +1,4 @@
-"""Stops through the gateway are sent and verified, even if other functions are broken or busy."""
+"""Stops through the gateway are sent and verified, even if other functions of the gateway fail or hang."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _broken_parts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def start(gateway: Served, *drives: str) -> None:
-    """Start motors through the gateway's Commands."""
+    """Start the motors of these drives through the gateway's Commands."""
     writer = {"authorization": gateway.bearer(Right.WRITE)}
     for drive in drives:
         value = {"drive": drive, "register": "setpoint", "value": 50.0}
@@ -59,7 +59,7 @@ def start(gateway: Served, *drives: str) -> None:
 
 
 def calling(gateway: Served) -> socket.socket:
-    """Return an HTTP connection to a gateway; a `with` block closes it."""
+    """Return an HTTP connection to a gateway. A `with` block closes it."""
     return socket.create_connection(("127.0.0.1", gateway.gateway.port), PATIENCE)
 
 
@@ -70,10 +70,10 @@ def stands(gateway: Served, drive: str) -> bool:
 @pytest.mark.parametrize(
     ("path", "body"), [("/api/stop", {"drives": None}), ("/api/act", {"drive": "pump-1", "verb": "coast"})]
 )
-def test_the_http_head_of_the_answer_confirms_a_stop_in_progress(
+def test_the_head_of_the_http_answer_arrives_while_a_stop_is_in_progress(
     gateway: Served, monkeypatch: pytest.MonkeyPatch, path: str, body: dict[str, object]
 ) -> None:
-    """If no HTTP head arrives, the page knows that the gateway has not accepted the stop."""
+    """Until the head arrives, the web page assumes that the gateway has not accepted the stop."""
     held = threading.Event()
 
     async def slow(*args: object, **options: object) -> object:
@@ -84,7 +84,7 @@ def test_the_http_head_of_the_answer_confirms_a_stop_in_progress(
     monkeypatch.setattr(gateway.gateway.commands, "act" if path == "/api/act" else "stop", slow)
     connection = http.client.HTTPConnection("127.0.0.1", gateway.gateway.port, timeout=PATIENCE)
     connection.request("POST", path, json.dumps(body), {"content-type": "application/json"})
-    response = connection.getresponse()  # returns after the HTTP head
+    response = connection.getresponse()  # returns when the head has arrived
     assert (response.status, held.is_set()) == (200, False)
     assert response.getheader("x-accel-buffering") == "no"
     held.set()
@@ -94,7 +94,9 @@ def test_the_http_head_of_the_answer_confirms_a_stop_in_progress(
     connection.close()
 
 
-def test_stop_continues_when_its_client_disconnects(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_continues_when_its_client_disconnects(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ends: list[str] = []
     held = threading.Event()
 
@@ -118,7 +120,7 @@ def test_stop_continues_when_its_client_disconnects(gateway: Served, monkeypatch
 
 
 @pytest.mark.slow
-def test_all_drives_are_stopped_and_verified(gateway: Served) -> None:
+def test_a_stop_of_all_drives_is_sent_and_verified(gateway: Served) -> None:
     start(gateway, "pump-1", "pump-2")
     gateway.await_state("pump-1", "runs")
     told = gateway.post("/api/stop", {"drives": None}).json
@@ -130,11 +132,11 @@ def test_all_drives_are_stopped_and_verified(gateway: Served) -> None:
 
 
 @pytest.mark.slow
-def test_command_in_the_page_without_javascript_stops_all_drives(tmp_path: Path) -> None:
+def test_the_command_in_the_page_without_javascript_stops_all_drives(tmp_path: Path) -> None:
     page = (files("multidrop.gateway") / "page" / "index.html").read_text("utf-8")
     without = page[page.index("<noscript") : page.index("</noscript")]
     said, token = (shlex.split(command) for command in re.findall("<code>(.+)</code>", without))
-    with served(tmp_path, "") as gateway:  # a stop needs a token
+    with served(tmp_path, "") as gateway:  # with these settings, a stop needs a token
         assert said[:2] == ["curl", "-H"]
         name, value = said[2].split(": ")
         assert said[3] == "-d"
@@ -167,7 +169,7 @@ def gateway(tmp_path: Path) -> Iterator[Served]:
 @pytest.mark.long
 @pytest.mark.slow
 @table("body", UNREADABLE.values(), ids=UNREADABLE)
-def test_stop_with_an_unreadable_body_stops_all_drives(
+def test_a_stop_with_an_unreadable_body_stops_all_drives(
     gateway: Served, monkeypatch: pytest.MonkeyPatch, body: bytes
 ) -> None:
     monkeypatch.setattr(messages, "STOP_BODY_S", 0.1)
@@ -183,7 +185,7 @@ def test_stop_with_an_unreadable_body_stops_all_drives(
 
 
 @pytest.mark.slow
-def test_stop_accepts_a_single_name(gateway: Served) -> None:
+def test_a_stop_accepts_the_name_of_one_drive_instead_of_a_list(gateway: Served) -> None:
     start(gateway, "pump-1", "pump-2")
     assert [*gateway.request("POST", "/api/stop", {"drives": "pump-1"}).json] == ["pump-1"]
     assert stands(gateway, "pump-1")
@@ -191,8 +193,8 @@ def test_stop_accepts_a_single_name(gateway: Served) -> None:
 
 
 @pytest.mark.slow
-def test_stop_of_unknown_names_stops_known_drives_and_reports_each(gateway: Served) -> None:
-    """The unknown names: a lone surrogate, a terminal's escape sequence, a drive's name in capitals."""
+def test_a_stop_with_unknown_names_stops_the_known_drives_and_reports_each_name(gateway: Served) -> None:
+    """Unknown names: a lone surrogate, an escape sequence for terminals, and a drive's name in capitals."""
     names = ["pump-1", "\ud800", "\x1b[2J\n", "PUMP-2", ""]
     start(gateway, "pump-1")
     told = gateway.request("POST", "/api/stop", {"drives": names}).json
@@ -204,7 +206,7 @@ def test_stop_of_unknown_names_stops_known_drives_and_reports_each(gateway: Serv
 @pytest.mark.long
 @table("verb", ["stop", "coast"])
 @table("options", [None, [], "now", {"direction": "forward"}])
-def test_wrong_options_do_not_prevent_a_stop_verb(gateway: Served, verb: str, options: object) -> None:
+def test_a_stop_verb_with_wrong_options_is_sent(gateway: Served, verb: str, options: object) -> None:
     """Some programs send null instead of an empty object."""
     start(gateway, "pump-1")
     body = {"drive": "pump-1", "verb": verb, "options": options}
@@ -213,7 +215,7 @@ def test_wrong_options_do_not_prevent_a_stop_verb(gateway: Served, verb: str, op
 
 
 @pytest.mark.slow
-def test_stop_with_a_truncated_body_is_sent(gateway: Served) -> None:
+def test_a_stop_with_a_truncated_body_is_sent(gateway: Served) -> None:
     start(gateway, "pump-1", "pump-2")
     with calling(gateway) as client:
         client.sendall(STOP + b'100\r\n\r\n{"drives": ["pump-1", "pu')
@@ -221,7 +223,7 @@ def test_stop_with_a_truncated_body_is_sent(gateway: Served) -> None:
 
 
 @pytest.mark.slow
-def test_stop_without_the_right_is_not_sent(tmp_path: Path) -> None:
+def test_a_stop_without_the_right_is_not_sent(tmp_path: Path) -> None:
     with served(tmp_path, MAY.replace('stop = "anyone"\n', "")) as gateway, calling(gateway) as client:
         start(gateway, "pump-1", "pump-2")
         client.sendall(STOP + UNREADABLE["late"])
@@ -230,7 +232,7 @@ def test_stop_without_the_right_is_not_sent(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_stop_of_one_drive_leaves_the_other_running(gateway: Served) -> None:
+def test_a_stop_of_one_drive_leaves_the_other_running(gateway: Served) -> None:
     start(gateway, "pump-1", "pump-2")
     told = gateway.post("/api/stop", {"drives": ["pump-1", "pump-9"]}).json
     assert told["pump-1"]["done"] is True
@@ -241,7 +243,7 @@ def test_stop_of_one_drive_leaves_the_other_running(gateway: Served) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_broken_parts")
-def test_stop_works_while_all_parts_fail(tmp_path: Path) -> None:
+def test_a_stop_works_while_all_gateway_parts_fail(tmp_path: Path) -> None:
     with served(tmp_path, BROKEN) as gateway:
         assert isinstance(gateway.gateway.feeds["mqtt"], BrokenFeed)
         start(gateway, "pump-1", "pump-2")
@@ -261,7 +263,7 @@ def test_stop_works_while_all_parts_fail(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_stop_works_while_the_hub_and_the_frames_are_broken(
+def test_a_new_drive_is_stopped_while_its_predecessor_is_still_being_stopped(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     start(gateway, "pump-1", "pump-2")
@@ -273,14 +275,14 @@ def test_a_stop_works_while_the_hub_and_the_frames_are_broken(
         name, method = broken.split(".")
         monkeypatch.setattr(getattr(gateway.gateway, name), method, fail)
     until(lambda: gateway.gateway.failures.get("hub", 0) > 3)
-    gateway.gateway.frames._has_news = True  # otherwise no new frame would be made
+    gateway.gateway.frames._has_news = True  # without news, no page frame is made
     assert gateway.get("/api/frame").status == 500
     assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
 
 
 @pytest.mark.slow
-def test_stop_does_not_wait_for_hanging_writes(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    """MOST_WRITES writes hang, and further writes are refused; stops are still sent."""
+def test_a_stop_does_not_wait_for_hanging_writes(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    """MOST_WRITES writes hang, so further writes are refused; stops are still sent."""
     held, entered = threading.Event(), []
     start(gateway, "pump-1", "pump-2")
     pump = gateway.gateway.bus("hall").drives[0]
@@ -319,7 +321,7 @@ def test_stop_does_not_wait_for_hanging_writes(gateway: Served, monkeypatch: pyt
 
 @pytest.mark.slow
 def test_commands_called_before_a_stop_are_not_sent_after_it(gateway: Served) -> None:
-    """A command whose thread starts only after a stop was called is refused because of the stop."""
+    """The thread of each command starts only after the stop was called."""
     begun: list[threading.Thread] = []
 
     class Late(threading.Thread):
@@ -347,7 +349,7 @@ def test_commands_called_before_a_stop_are_not_sent_after_it(gateway: Served) ->
 
 
 @pytest.mark.slow
-def test_stop_is_sent_although_no_thread_can_be_started(gateway: Served) -> None:
+def test_a_stop_is_sent_although_no_thread_can_be_started(gateway: Served) -> None:
     class NoThread(threading.Thread):
         def start(self) -> None:
             raise RuntimeError("can't start new thread")
@@ -365,7 +367,7 @@ def test_stop_is_sent_although_no_thread_can_be_started(gateway: Served) -> None
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_stop_is_repeated_to_a_silent_drive_and_delays_no_other(gateway: Served) -> None:
+def test_a_stop_is_repeated_to_a_silent_drive_without_delaying_other_stops(gateway: Served) -> None:
     start(gateway, "pump-1", "pump-2")
     gateway.sims["pump-2"].deaf_until = float("inf")
     gateway.await_state("pump-2", "silent")
@@ -380,8 +382,8 @@ def test_stop_is_repeated_to_a_silent_drive_and_delays_no_other(gateway: Served)
 
 
 @pytest.mark.long
-def test_many_stops_of_a_silent_drive_delay_no_other(gateway: Served) -> None:
-    """The gateway repeats one of the 40 stops, not each, so it can send another drive's stop immediately."""
+def test_many_stops_of_a_silent_drive_do_not_delay_the_stop_of_another(gateway: Served) -> None:
+    """Of the 40 stops, the gateway repeats only one, so it can send the other drive's stop immediately."""
     with ThreadPoolExecutor(40) as callers:
         start(gateway, "pump-1", "pump-2")
         gateway.sims["pump-2"].deaf_until = float("inf")
@@ -389,14 +391,16 @@ def test_many_stops_of_a_silent_drive_delay_no_other(gateway: Served) -> None:
         until(lambda: gateway.gateway.commands.stops["pump-2"] == 40)
         begun = monotonic()
         assert gateway.post("/api/stop", {"drives": ["pump-1"]}).json["pump-1"]["done"] is True
-        assert monotonic() - begun < 12.0  # s, including a ramp of 3 s
+        assert monotonic() - begun < 12.0  # s; the motor's ramp takes 3 s
         gateway.sims["pump-2"].deaf_until = 0.0
         assert [call.result().json["pump-2"]["done"] for call in calls] == [True] * 40
         assert stands(gateway, "pump-2")
 
 
 @pytest.mark.slow
-def test_only_one_of_many_coasts_is_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_many_coasts_of_a_silent_drive_only_one_is_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     repeated: list[float | None] = []
     stop = commands.stop_drive_by
 
@@ -418,8 +422,8 @@ def test_only_one_of_many_coasts_is_repeated(tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.mark.long
-def test_stop_of_a_restarted_drive_is_sent_as_a_new_stop(gateway: Served) -> None:
-    """The first stop is still repeated for the silent drive, but has ended for the restarted drive."""
+def test_a_stop_of_a_motor_that_was_started_again_is_sent_as_a_new_stop(gateway: Served) -> None:
+    """The first stop is still repeated to the silent drive, but has ended for the other."""
     with ThreadPoolExecutor(1) as caller:
         start(gateway, "pump-1", "pump-2")
         gateway.sims["pump-2"].deaf_until = float("inf")
@@ -427,7 +431,7 @@ def test_stop_of_a_restarted_drive_is_sent_as_a_new_stop(gateway: Served) -> Non
         motor = gateway.sims["pump-1"].motor  # type: ignore[attr-defined]
         bus = gateway.gateway.bus("hall")
         until(lambda: not motor.goal and set(bus.stops_under_way()) == {"pump-2"})
-        motor.run()  # the motor is started at the drive's own panel
+        motor.run()  # a person starts the motor at the drive's own panel
         until(lambda: motor.goal)
         told = gateway.post("/api/stop", {"drives": ["pump-1"]}).json["pump-1"]
         assert told["done"]
@@ -439,7 +443,7 @@ def test_stop_of_a_restarted_drive_is_sent_as_a_new_stop(gateway: Served) -> Non
 
 
 @pytest.mark.slow
-def test_verbs_and_writes_report_their_results(gateway: Served) -> None:
+def test_verbs_and_writes_are_answered_with_their_results(gateway: Served) -> None:
     writer = {"authorization": gateway.bearer(Right.WRITE)}
 
     def act(verb: str, **options: object) -> str:
@@ -514,7 +518,7 @@ def test_only_stops_are_sent_while_the_audit_log_cannot_be_written(
 
 
 @pytest.mark.usefixtures("_broken_parts")
-def test_part_that_cannot_start_is_reported_in_one_sentence(tmp_path: Path) -> None:
+def test_a_gateway_part_that_cannot_start_is_reported_in_one_sentence(tmp_path: Path) -> None:
     for how, sentence in (
         ("library", r"\[serve.mqtt\]: it needs nosuch, which is not installed: pip install 'paho-mqtt"),
         ("port", r"\[serve.mqtt\]: 127.0.0.1:1502 cannot be had"),

@@ -1,4 +1,4 @@
-"""Hung file systems: polling and stops continue, /health reports the problem, and the gateway can end."""
+"""File systems that hang: polling and stops continue, /health reports it, and the gateway can end."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ SETPOINT = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
 
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorten the time limits for starting and closing parts."""
+    """Shorten the time limits for starting and closing gateway parts."""
     for module, name in ((parts, "BUILD_S"), (reload, "QUICK_S")):
         monkeypatch.setattr(module, name, SHORT_S)
     monkeypatch.setattr(historian, "CLOSING_S", SHORT_S)
@@ -52,7 +52,7 @@ def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Fifos:
-    """Named pipes in place of files: opening them hangs until the test releases them."""
+    """Replaces files by named pipes, so that opening them hangs until the test releases them."""
 
     def __init__(self) -> None:
         self._made: list[Path] = []
@@ -102,7 +102,9 @@ def reload_as(gateway: Served, serve: str) -> Any:
 # ---- history ----
 
 
-def test_history_whose_disk_hangs_at_the_start_starts_later(tmp_path: Path, fifos: Fifos) -> None:
+def test_a_history_whose_disk_hangs_at_the_start_starts_when_the_disk_answers(
+    tmp_path: Path, fifos: Fifos
+) -> None:
     fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
     with served(tmp_path, SERVE + HISTORY) as gateway:
         assert_stops_and_polls(gateway)
@@ -115,7 +117,7 @@ def test_history_whose_disk_hangs_at_the_start_starts_later(tmp_path: Path, fifo
         assert gateway.get("/api/history?series=pump-1.status&from=0&to=1").status == 200
 
 
-def test_history_whose_disk_hangs_during_a_reload_starts_later(tmp_path: Path, fifos: Fifos) -> None:
+def test_a_history_whose_disk_hangs_during_a_reload_does_not_delay_it(tmp_path: Path, fifos: Fifos) -> None:
     fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
     with served(tmp_path, SERVE) as gateway:
         assert reload_as(gateway, SERVE + HISTORY)["done"] is True
@@ -125,10 +127,10 @@ def test_history_whose_disk_hangs_during_a_reload_starts_later(tmp_path: Path, f
         assert health(gateway)["parts"] == {}
         fifos.let_go()
         until(lambda: health(gateway)["status"] == "ok")
-        assert gateway.gateway.feeds == {}  # the reloaded plant file has no [serve.history]
+        assert gateway.gateway.feeds == {}  # the second plant file has no [serve.history]
 
 
-def test_history_that_fails_after_its_disk_answers_is_reported_as_dead(tmp_path: Path, fifos: Fifos) -> None:
+def test_a_history_that_fails_to_start_after_a_hang_is_reported_as_dead(tmp_path: Path, fifos: Fifos) -> None:
     fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
     with served(tmp_path, SERVE + HISTORY) as gateway, pytest.MonkeyPatch.context() as patch:
         patch.setattr(historian, "History", fail)
@@ -141,7 +143,7 @@ def fail(*arguments: object) -> NoReturn:
     raise OSError("the disk is broken")
 
 
-def test_hanging_history_query_is_answered_with_an_error_and_reported(
+def test_a_hanging_history_query_is_answered_with_an_error_and_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on = threading.Event()
@@ -149,7 +151,7 @@ def test_hanging_history_query_is_answered_with_an_error_and_reported(
         monkeypatch.setattr(historian, "QUERY_S", SHORT_S)
         monkeypatch.setattr(History, "buckets", lambda *given: go_on.wait(PATIENCE))
         until(lambda: health(gateway)["status"] == "ok")
-        for _ in range(3):  # more than MOST_QUERIES
+        for _ in range(3):  # more queries than MOST_QUERIES
             answer = gateway.get("/api/history?series=pump-1.status&from=0&to=1")
             assert (answer.status, answer.json["error"][:16]) == (503, "history queries:")
         assert list(health(gateway)["hung"]) == ["history queries"]
@@ -158,7 +160,7 @@ def test_hanging_history_query_is_answered_with_an_error_and_reported(
         until(lambda: health(gateway)["status"] == "ok")
 
 
-def test_a_disk_that_hangs_while_rows_are_written_is_reported(
+def test_a_disk_that_hangs_while_the_history_writes_rows_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on = threading.Event()
@@ -172,7 +174,9 @@ def test_a_disk_that_hangs_while_rows_are_written_is_reported(
         go_on.set()
 
 
-def test_hung_export_does_not_prevent_shutdown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hanging_export_does_not_prevent_the_shutdown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     go_on, begun = threading.Event(), threading.Event()
 
     def pieces() -> Iterator[bytes]:
@@ -195,7 +199,7 @@ def test_hung_export_does_not_prevent_shutdown(tmp_path: Path, monkeypatch: pyte
 # ---- the plant file ----
 
 
-def test_hung_plant_file_fails_only_its_reload(
+def test_a_plant_file_that_hangs_fails_only_its_reload(
     tmp_path: Path, fifos: Fifos, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with served(tmp_path, SERVE) as gateway:
@@ -217,7 +221,7 @@ def test_hung_plant_file_fails_only_its_reload(
         until(lambda: health(gateway)["status"] == "ok")
 
 
-def test_a_later_reload_does_not_wait_for_a_hung_reload(tmp_path: Path, fifos: Fifos) -> None:
+def test_a_reload_does_not_wait_for_an_earlier_reload_that_hangs(tmp_path: Path, fifos: Fifos) -> None:
     with served(tmp_path, SERVE) as gateway:
         path, good = gateway.gateway.plant.path, gateway.gateway.plant.path.read_text()
         fifos.put(path)
@@ -251,7 +255,7 @@ def test_only_stops_are_sent_if_the_audit_log_hangs_at_the_start(
         assert gateway.frame()["troubles"][0].startswith("audit log: ")
 
 
-def test_audit_log_that_hangs_during_a_reload_changes_nothing(
+def test_a_reload_fails_without_changes_if_the_audit_log_hangs(
     tmp_path: Path, fifos: Fifos, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with served(tmp_path, SERVE) as gateway:
@@ -265,7 +269,7 @@ def test_audit_log_that_hangs_during_a_reload_changes_nothing(
         assert_stops_and_polls(gateway)
 
 
-def test_a_ledger_and_an_audit_log_that_hang_are_reported(
+def test_an_eeprom_ledger_and_an_audit_log_that_hang_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on = threading.Event()
@@ -291,7 +295,7 @@ def test_a_ledger_and_an_audit_log_that_hang_are_reported(
 # ---- the page's files ----
 
 
-def test_requests_for_hung_page_files_fail_and_delay_no_other_requests(
+def test_requests_for_page_files_on_a_hanging_disk_fail_and_delay_no_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on, read = threading.Event(), Path.read_bytes
@@ -303,7 +307,7 @@ def test_requests_for_hung_page_files_fail_and_delay_no_other_requests(
     monkeypatch.setattr(files, "READ_S", SHORT_S)
     with served(tmp_path, SERVE) as gateway:
         monkeypatch.setattr(Path, "read_bytes", read_bytes)
-        # At most four reads of files may hang concurrently.
+        # more requests than the four reads of files that may hang at once
         for path in ("/", "/page/app.js", "/", "/page/app.js", "/page/boot.js"):
             answer = gateway.get(path)
             assert (answer.status, answer.json["error"][:11]) == (503, "page files:")
@@ -330,8 +334,8 @@ def test_sigterm_ends_a_gateway_whose_disks_hang(tmp_path: Path, fifos: Fifos) -
 
 
 @pytest.mark.long
-def test_sigterm_ends_a_gateway_that_waits_for_a_thread(tmp_path: Path) -> None:
-    """A thread of a library never ends, so Python would not exit by itself."""
+def test_sigterm_ends_a_gateway_although_a_thread_never_ends(tmp_path: Path) -> None:
+    """Python would wait for the thread, such as one of a library, and not exit by itself."""
     script = tmp_path / "hangs.py"
     script.write_text(HANGING)
     with simulated_plant(tmp_path, SERVE) as path:
@@ -362,7 +366,7 @@ FULL = "No space left on device"
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
-    """Mount a file system of 1 MB beside the plant file."""
+    """Mount a file system of 1 MB in the plant file's folder."""
     path = tmp_path / "disk"
     path.mkdir()
     if os.geteuid() != 0 or shutil.which("mount") is None:
@@ -377,7 +381,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def fill(disk: Path) -> Path:
-    """Fill the remaining space with a file, and return its path."""
+    """Fill the free space of the disk with a file, and return its path."""
     path = disk / "filler"
     with path.open("wb", buffering=0) as file:
         while has_room(file):
@@ -396,7 +400,7 @@ def has_room(file: BinaryIO) -> bool:
 
 
 def disk_health(gateway: Served) -> tuple[str, str, str]:
-    """Return from /health the status and the entries about history and audit log."""
+    """Return the status of /health, and its entries about the history and the audit log."""
     found = gateway.get("/health").json
     return found["status"], found["parts"]["history"], found["audit"]
 
@@ -413,7 +417,7 @@ def dropped(gateway: Served) -> float:
 
 
 @pytest.mark.long
-def test_full_disk_is_reported_while_polling_and_stops_continue(disk: Path, tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_while_polling_and_stops_continue(disk: Path, tmp_path: Path) -> None:
     with served(tmp_path, ON_DISK) as gateway:
         gateway.await_state("pump-2", "stands")
         history = gateway.gateway.feeds["history"]
@@ -426,7 +430,8 @@ def test_full_disk_is_reported_while_polling_and_stops_continue(disk: Path, tmp_
         until(lambda: FULL in disk_health(gateway)[1])
         noted = len(gateway.get("/api/audit").json["entries"])
         sent = [sim.counters.requests for sim in gateway.sims.values()]
-        while FULL not in disk_health(gateway)[2]:  # the last block of the log may still have some space
+        # the last block of the audit log may still have room for some records
+        while FULL not in disk_health(gateway)[2]:
             stop(gateway)
             assert len(gateway.get("/api/audit").json["entries"]) < noted + 40
         status, recorded, audit = disk_health(gateway)

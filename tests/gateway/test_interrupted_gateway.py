@@ -1,4 +1,4 @@
-"""A gateway that is interrupted during its start or shutdown ends, and sends no Modbus frame afterwards."""
+"""A gateway that is interrupted while it starts or ends does end, and sends no Modbus request afterwards."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.settings import ServeSettings
 from multidrop.sim import EncodedDrive, Simulator, Wire
 
-# InvalidHeader collection of objects from an earlier interruption may also be interrupted.
+# Python may also interrupt the destructors of objects that an earlier interruption left behind.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 
 class CtrlC(KeyboardInterrupt):
-    """A KeyboardInterrupt that the test raises."""
+    """A KeyboardInterrupt that only this test raises."""
 
 
 class Counting(EncodedDrive):
-    """A simulated drive that counts the requests it receives."""
+    """A simulated drive that counts the requests it received."""
 
     requests = 0
 
@@ -46,7 +46,7 @@ class Counting(EncodedDrive):
 
 @pytest.fixture
 def drive(tmp_path: Path) -> Iterator[Counting]:
-    """Yield a simulated drive, and write a plant.toml with its line."""
+    """Run a simulated drive, and write a plant.toml for its line."""
     drive = Counting(InvtCHE(1, baudrate=38400))
     with Simulator([Wire([drive], unpaced=True)]) as simulator:
         (tmp_path / "plant.toml").write_text(
@@ -59,7 +59,7 @@ def drive(tmp_path: Path) -> Iterator[Counting]:
 def falls_silent(drive: Counting) -> None:
     def has_ended() -> bool:
         before = drive.requests
-        sleep(0.02)  # much longer than a poll, which takes a millisecond
+        sleep(0.02)  # enough time for several polls, each of which takes a millisecond
         return drive.requests == before
 
     until(has_ended, 10.0)
@@ -80,7 +80,7 @@ def test_gateway_interrupted_at_any_bytecode_ends(drive: Counting, tmp_path: Pat
             live()
         falls_silent(drive)
         gc.collect()
-        with Bus(plant.lines[0].port, baudrate=38400) as bus:  # opening succeeds only if the port is free
+        with Bus(plant.lines[0].port, baudrate=38400) as bus:  # fails if the gateway still holds the port
             bus.attach(InvtCHE, 1).read(InvtCHE.registers["output_current"])
         return bool(found)
 
@@ -89,7 +89,7 @@ def test_gateway_interrupted_at_any_bytecode_ends(drive: Counting, tmp_path: Pat
 
 # ---- signals ----
 
-# If KeyboardInterrupt is raised in a callback of Python's import system, Python prints it and continues.
+# If a callback of Python's import system raises KeyboardInterrupt, Python prints the error and continues.
 IN_AN_IMPORT = re.compile(
     r"Exception ignored in: .*\nTraceback \(most recent call last\):\n  File \"<frozen importlib.*\n"
     r"KeyboardInterrupt: *\n"
@@ -109,7 +109,7 @@ sys.exit(main(["serve", {path!r}]))
 
 
 def started(path: Path, number: int, *delays: float) -> BoundProcess[str]:
-    """Run `multidrop serve`, and send it a signal after each of these delays in s, one after the other."""
+    """Run `multidrop serve`, and send it a signal after each delay (s), one after the other."""
     code = SIGNALLED.format(delays=list(delays), number=int(number), path=str(path))
     return BoundProcess(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -125,7 +125,10 @@ def started(path: Path, number: int, *delays: float) -> BoundProcess[str]:
 def test_a_signal_at_any_moment_ends_the_command(
     tmp_path: Path, number: int, again: float | None, stride: int
 ) -> None:
-    """Signals are sent during start, service and shutdown; a second signal ends the command immediately."""
+    """The moments are in the start, in service and in the shutdown.
+
+    A second signal ends the command at once.
+    """
     serve = '[serve]\nlisten = "127.0.0.1:0"\naudit = "audit.jsonl"\n[serve.may]\nstop = "anyone"\n'
     with simulated_plant(tmp_path, serve) as path:
         with started(path, number) as process:
@@ -135,7 +138,8 @@ def test_a_signal_at_any_moment_ends_the_command(
             usual_s = monotonic() - begun
             process.send_signal(number)
             process.communicate(timeout=PATIENCE)
-        for moment in range(1, 13, stride):  # 0 would interrupt the script before it runs the command
+        # not from 0, which would interrupt the script before it runs the command
+        for moment in range(1, 13, stride):
             delays = [usual_s * moment / 9] + ([] if again is None else [again])
             with started(path, number, *delays) as process:
                 _, errors = process.communicate(timeout=PATIENCE)

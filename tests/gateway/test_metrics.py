@@ -1,4 +1,4 @@
-"""Metrics in the OpenMetrics format, checked by prometheus_client's parser and by Prometheus."""
+"""Metrics in the OpenMetrics format, read by the parser of prometheus_client and by Prometheus itself."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ class Prometheus:
             return False
 
     def query(self, text: str) -> dict[tuple[str, ...], float]:
-        """Return the present samples of a query, by the values of their labels."""
+        """Return the present value of each series that a query finds, by the values of its labels."""
         found = self.ask("query", query=text)["result"]
         return {tuple(sorted(one["metric"].values())): float(one["value"][1]) for one in found}
 
     def targets(self) -> dict[str, tuple[str, str]]:
-        """Return health and last error of the target of each job."""
+        """Return the health and the last error of each scrape job's target."""
         found = self.ask("targets")["activeTargets"]
         return {one["labels"]["job"]: (one["health"], one["lastError"]) for one in found}
 
@@ -101,7 +101,7 @@ def values(gateway: Served) -> dict[tuple[str, str], float]:
 
 
 def process_start() -> float:
-    """Return when this process started, by `ps`, in s since 1970."""
+    """Return the start time of this process in s since 1970, as `ps` reports it."""
     age = subprocess.run(["ps", "-o", "etimes=", "-p", str(os.getpid())], capture_output=True, text=True)
     return time.time() - int(age.stdout)
 
@@ -112,8 +112,8 @@ def states(gateway: Served) -> dict[str, str]:
 
 
 @pytest.mark.long
-def test_metrics_have_values_states_and_counters(tmp_path: Path) -> None:
-    odd = 'fan, the \\"old\\" one'  # escaped as in TOML
+def test_metrics_contain_values_states_and_counters(tmp_path: Path) -> None:
+    odd = 'fan, the \\"old\\" one'  # escaped for a TOML string
     with served(tmp_path, "", "pump-1", odd) as gateway:
         until(lambda: len(values(gateway)) == 8)
         found = families(gateway)
@@ -126,7 +126,8 @@ def test_metrics_have_values_states_and_counters(tmp_path: Path) -> None:
         about = {"line": "hall", "drive": "pump-1", "model": "invt-che", "address": "1"}
         assert about in [one.labels for one in found["multidrop_drive"].samples]
         alarms = [one.value for one in found["multidrop_alarm_active"].samples]
-        assert alarms == [0.0] * 9  # kind `port` for the line, all other kinds for each drive
+        # 9 series: the kind `port` for one line, and four other kinds for each of two drives
+        assert alarms == [0.0] * 9
         health = {one.labels["multidrop_health"]: one.value for one in found["multidrop_health"].samples}
         assert health == {"ok": 1.0, "degraded": 0.0, "failed": 0.0}
         assert found["process_open_fds"].samples[0].value > 5
@@ -134,7 +135,7 @@ def test_metrics_have_values_states_and_counters(tmp_path: Path) -> None:
         until(lambda: families(gateway)["multidrop_line_samples"].samples[0].value > 8)
         assert found["multidrop_line_samples"].type == "counter"
         assert found["multidrop_build"].samples[0].labels == {"version": gateway.gateway.version}
-        delays = {  # delays of drives that have replied; updated once a second
+        delays = {  # of drives that have replied; updated once a second
             (one.name.removeprefix("multidrop_response_delay_seconds"), one.labels.get("quantile"))
             for one in families(gateway)["multidrop_response_delay_seconds"].samples
         }
@@ -148,13 +149,13 @@ def unanswered(gateway: Served) -> float:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_metrics_of_a_silent_drive_disappear_and_return(tmp_path: Path) -> None:
+def test_metrics_of_a_silent_drive_disappear_until_it_answers(tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         until(lambda: len(values(gateway)) == 8)
         gateway.sims["pump-2"].deaf_until = float("inf")
         until(lambda: states(gateway)["pump-2"] == "silent")
         assert {drive for drive, _ in values(gateway)} == {"pump-1"}
-        until(lambda: unanswered(gateway) > 0)  # updated once a second
+        until(lambda: unanswered(gateway) > 0)  # the counter is updated once a second
         gateway.sims["pump-2"].deaf_until = 0.0
         until(lambda: len(values(gateway)) == 8)
         assert states(gateway)["pump-2"] == "stands"
@@ -200,21 +201,21 @@ def drives(prometheus: Prometheus) -> set[str]:
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_prometheus_scrapes_each_second_and_a_silent_drive_is_stale(tmp_path: Path) -> None:
+def test_prometheus_scrapes_each_second_and_values_of_a_silent_drive_are_stale(tmp_path: Path) -> None:
     with served(tmp_path, '[serve]\ntokens = "tokens"\n[serve.may]\nlook = "token"\n') as gateway:
         jobs = JOBS.format(port=gateway.gateway.port, secret=gateway.secrets[Right.LOOK])
         with scraping(tmp_path, jobs) as prometheus:
             until(lambda: drives(prometheus) == {"pump-1", "pump-2"})
-            until(lambda: prometheus.targets()["stranger"][0] != "unknown")  # waits for the first scrape
+            until(lambda: prometheus.targets()["stranger"][0] != "unknown")  # until the first scrape
             assert prometheus.targets() == {
                 "known": ("up", ""),
                 "stranger": ("down", "server returned HTTP status 401 Unauthorized"),
             }
             read_as = prometheus.ask("targets/metadata", metric="multidrop_drive_state", limit="1")
-            assert [one["type"] for one in read_as] == ["stateset"]  # only OpenMetrics has this type
+            assert [one["type"] for one in read_as] == ["stateset"]  # this type exists only in OpenMetrics
 
             gateway.sims["pump-2"].deaf_until = float("inf")
-            # Without staleness markers, Prometheus would return the last values for five minutes.
+            # Without staleness markers, Prometheus would return the last values of a drive for five minutes.
             until(lambda: drives(prometheus) == {"pump-1"})
             states = prometheus.query('multidrop_drive_state{job="known", drive="pump-2"} == 1')
             assert [1 for labels in states if "silent" in labels] == [1]
@@ -256,14 +257,14 @@ scrape_configs:
 
 
 def alerts() -> Iterator[tuple[str, str]]:
-    """Yield the name and the expression of each alert."""
+    """Yield the name and the expression of each alert rule."""
     for group in yaml.safe_load(ALERTS.read_text())["groups"]:
         for rule in group["rules"]:
             yield rule["alert"], rule["expr"]
 
 
 def queries() -> Iterator[tuple[str, str]]:
-    """Yield name and text of each query of the dashboard, and of each alert's query without its threshold."""
+    """Yield (name, query) for each query of the dashboard, and for each alert without its threshold."""
     dashboard = json.loads(DASHBOARD.read_text())
     for panel in dashboard["panels"]:
         for target in panel["targets"]:
@@ -278,13 +279,13 @@ def queries() -> Iterator[tuple[str, str]]:
 
 
 def empty(prometheus: Prometheus) -> list[tuple[str, str]]:
-    """Return the queries without data."""
+    """Return the queries that find no data."""
     return [(name, text) for name, text in queries() if not prometheus.query(text)]
 
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_prometheus_has_data_for_each_query_of_dashboard_and_alerts(tmp_path: Path) -> None:
+def test_prometheus_has_data_for_each_query_of_the_dashboard_and_the_alerts(tmp_path: Path) -> None:
     with serving(Path("--demo"), "--no-browser") as (_, url):
         port = int(url.rstrip("/").rpartition(":")[2])
         with scraping(tmp_path, JOB.format(port=port)) as prometheus:
@@ -296,7 +297,7 @@ def test_prometheus_has_data_for_each_query_of_dashboard_and_alerts(tmp_path: Pa
 
 GATEWAY = 'instance="gw"'
 PUMP = f'{GATEWAY}, line="hall", drive="pump-1"'
-FIRING = {  # by alert: series and their values each minute, which make it fire within 15 min
+FIRING = {  # by alert: series, with one value a minute, that make the alert fire within 15 min
     "MultidropGatewayDown": {f'up{{{GATEWAY}, job="multidrop"}}': "0x20"},
     "MultidropGatewayFailed": {f'multidrop_health{{{GATEWAY}, multidrop_health="failed"}}': "1x20"},
     "MultidropGatewayDegraded": {f'multidrop_health{{{GATEWAY}, multidrop_health="degraded"}}': "1x20"},
@@ -314,7 +315,7 @@ FIRING = {  # by alert: series and their values each minute, which make it fire 
     "MultidropPartFailing": {f'multidrop_part_failures_total{{{GATEWAY}, part="mqtt"}}': "0+1x20"},
     "MultidropHistoryLost": {f"multidrop_history_dropped_total{{{GATEWAY}}}": "0+1x20"},
 }
-CALM = {  # by series: values that must make no alert fire
+CALM = {  # series for which no alert must fire
     f'up{{{GATEWAY}, job="multidrop"}}': "1x20",
     f'multidrop_health{{{GATEWAY}, multidrop_health="failed"}}': "0x20",
     f'multidrop_line_up{{{GATEWAY}, line="hall"}}': "1x20",
@@ -327,7 +328,7 @@ CALM = {  # by series: values that must make no alert fire
 
 
 def rule_test(series: dict[str, str], alert: str, count: int) -> dict[str, Any]:
-    """Return a test for promtool: with these series, `count` alerts of this name fire after 15 min."""
+    """Return a test case of promtool: with these series, `count` alerts of this name fire after 15 min."""
     samples = [{"labels": "{}", "value": count}] if count else []
     query = f'count(ALERTS{{alertname=~"{alert}", alertstate="firing"}})'
     return {
@@ -338,7 +339,7 @@ def rule_test(series: dict[str, str], alert: str, count: int) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_each_alert_fires_for_its_series_only(tmp_path: Path) -> None:
+def test_each_alert_fires_for_its_own_series_and_not_for_normal_series(tmp_path: Path) -> None:
     program = require_program("promtool")
     assert {*FIRING} == {name for name, _ in alerts()}
     tests = [rule_test(series, alert, 1) for alert, series in FIRING.items()]

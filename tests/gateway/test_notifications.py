@@ -1,4 +1,4 @@
-"""Notifications: each alarm that begins or ends is sent once, even if targets fail or hang."""
+"""Notifications about alarms: each start and end of an alarm is sent once, even if targets fail or hang."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ def over(alarm: Alarm, ended: int = 2_000) -> Alarm:
 
 
 def flaps(number: int) -> list[Alarm]:
-    """Return the alarms to note if a drive's alarm begins and ends this many times."""
+    """Return the alarms that a drive reports when a fault comes and goes this many times."""
     return [
         one for at in range(number) for one in (BEGUN._replace(time=at), over(BEGUN._replace(time=at), at))
     ]
 
 
 def note(part: Notifications, alarm: Alarm) -> None:
-    """Notify the part that an alarm began or ended."""
+    """Report the start or the end of an alarm to the notifications."""
     part.note_alarm(alarm, AlarmChange.BEGAN if alarm.ended is None else AlarmChange.ENDED)
 
 
@@ -59,7 +59,10 @@ def described(alarm: Alarm, left_out: int) -> dict[str, Any]:
 
 
 class Clocked:
-    """A sender with a simulated clock, `now_s`. It records messages, or fails while `failure` is set."""
+    """A sender of notifications with a simulated clock, `now_s`.
+
+    It records messages; `failure` makes it fail.
+    """
 
     def __init__(self, most: int = 3600) -> None:
         self.now_s = 0.0
@@ -73,7 +76,7 @@ class Clocked:
         self.messages.append(message)
 
     def send_all(self) -> float:
-        """Send all messages that are allowed now; return the seconds until the next attempt."""
+        """Send all messages that the limits allow now; return the seconds until the next attempt."""
         while (pause_s := self.sender.step()) == 0:
             pass
         return pause_s
@@ -82,19 +85,19 @@ class Clocked:
 # ---- which alarms are sent ----
 
 
-def test_each_begin_and_end_of_a_thousand_flaps_is_sent_as_one_message() -> None:
+def test_each_start_and_end_of_a_thousand_alarms_is_sent_as_one_message() -> None:
     target, alarms = Clocked(), flaps(1000)
     part = Notifications([target.sender], [FAULT])
     for alarm in alarms:
         note(part, alarm)
-        target.now_s += 2  # within the limit of 3600 an hour
+        target.now_s += 2  # slowly enough for the limit of 3600 messages an hour
         target.send_all()
     assert [(one["event"], one["id"]) for one in target.messages] == [
         ("begin" if alarm.ended is None else "end", alarm.id) for alarm in alarms
     ]
 
 
-def test_acknowledgements_new_texts_and_other_kinds_are_not_sent() -> None:
+def test_acknowledgements_changed_texts_and_other_kinds_of_alarms_are_not_sent() -> None:
     target = Clocked()
     alarms = Alarms(note=Notifications([target.sender], [PORT]).note_alarm)
     alarms.look(1_000, "pump", Shown(FAULT, "overcurrent"))
@@ -108,7 +111,7 @@ def test_acknowledgements_new_texts_and_other_kinds_are_not_sent() -> None:
     assert [(one["event"], one["line"]) for one in target.messages] == [("begin", "hall"), ("end", "hall")]
 
 
-def test_restart_repeats_no_notification() -> None:
+def test_a_restart_does_not_repeat_notifications() -> None:
     target = Clocked()
     alarms = Alarms(note=Notifications([target.sender], [FAULT, PORT]).note_alarm)
     lost = Alarm(1_000, "", "the port is lost", None, PORT, "hall")
@@ -124,7 +127,7 @@ def test_restart_repeats_no_notification() -> None:
 # ---- limits ----
 
 
-def test_beyond_the_hourly_limit_the_newest_message_is_sent_when_allowed() -> None:
+def test_the_newest_message_beyond_the_hourly_limit_is_sent_when_allowed() -> None:
     target = Clocked(most=60)
     for alarm in (*flaps(100), BEGUN._replace(time=100)):
         target.sender.put(alarm)
@@ -144,7 +147,7 @@ def test_number_of_waiting_notifications_is_limited() -> None:
     assert (len(queue), queue.left_out) == (MOST_WAITING, 100)
 
 
-def test_failed_message_is_sent_again_after_growing_pauses() -> None:
+def test_a_failed_message_is_sent_again_after_growing_pauses() -> None:
     target = Clocked()
     target.sender.put(BEGUN)
     target.failure = OSError("500")
@@ -156,7 +159,7 @@ def test_failed_message_is_sent_again_after_growing_pauses() -> None:
     assert (len(target.messages), target.sender.problem) == (1, "")
 
 
-def test_a_message_that_a_target_permanently_refuses_does_not_block_later_messages() -> None:
+def test_a_message_that_its_target_refuses_for_good_does_not_block_later_ones() -> None:
     target = Clocked()
     target.sender.put(BEGUN)
     target.failure = ValueError("no JSON")
@@ -169,7 +172,7 @@ def test_a_message_that_a_target_permanently_refuses_does_not_block_later_messag
     ]
 
 
-def test_a_message_that_is_queued_right_before_the_end_is_sent() -> None:
+def test_a_message_that_is_queued_just_before_the_shutdown_is_sent() -> None:
     target = Clocked()
     thread = threading.Thread(target=target.sender.run)
     thread.start()
@@ -179,7 +182,7 @@ def test_a_message_that_is_queued_right_before_the_end_is_sent() -> None:
     assert len(target.messages) == 1
 
 
-def test_target_that_hangs_delays_no_other_target() -> None:
+def test_a_hanging_target_does_not_delay_other_targets() -> None:
     hang, other = threading.Event(), Clocked()
     hanging = Sender("hanging", lambda message: hang.wait() and None, AlarmQueue(60, 0.0), described)
     threads = [threading.Thread(target=one.run, daemon=True) for one in (hanging, other.sender)]
@@ -202,7 +205,7 @@ def test_target_that_hangs_delays_no_other_target() -> None:
 
 @pytest.fixture
 def webhook() -> Iterator[SimpleNamespace]:
-    """A web server that records what is posted; it answers with `status`."""
+    """A web server that records what is posted to it, and answers with `status`."""
     state = SimpleNamespace(status=200, posted=[], url="")
 
     class Handler(BaseHTTPRequestHandler):
@@ -226,7 +229,7 @@ def webhook() -> Iterator[SimpleNamespace]:
 
 
 @pytest.mark.parametrize("status", [302, 404, 500])
-def test_webhook_gets_json_and_its_refusal_is_an_error(webhook: SimpleNamespace, status: int) -> None:
+def test_a_webhook_gets_json_and_its_refusal_is_an_error(webhook: SimpleNamespace, status: int) -> None:
     send = sender_to(AlarmTarget("target", webhook.url))
     send(described(BEGUN, 0))
     webhook.status = status
@@ -249,15 +252,15 @@ def test_webhook_gets_json_and_its_refusal_is_an_error(webhook: SimpleNamespace,
     }
 
 
-def test_refused_connection_is_reported_in_one_sentence() -> None:
+def test_a_refused_connection_of_a_webhook_is_reported_in_one_sentence() -> None:
     with socket.socket() as unused:
-        unused.bind(("127.0.0.1", 0))  # bound, but not listening
+        unused.bind(("127.0.0.1", 0))  # nothing listens on this port
         send = sender_to(AlarmTarget("target", f"http://127.0.0.1:{unused.getsockname()[1]}/"))
         with pytest.raises(OSError, match=r"^Connection refused$"):
             send(described(BEGUN, 0))
 
 
-def test_answer_that_is_not_http_is_reported_in_one_sentence() -> None:
+def test_an_answer_of_a_webhook_that_is_not_http_is_reported_in_one_sentence() -> None:
     def answer() -> None:
         peer, _ = listener.accept()
         with peer:
@@ -272,13 +275,13 @@ def test_answer_that_is_not_http_is_reported_in_one_sentence() -> None:
         thread.join()
 
 
-def test_the_wait_for_an_answer_that_arrives_byte_by_byte_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waiting_for_an_answer_that_arrives_byte_by_byte_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sending, "SEND_S", 0.1)
     ends = time.monotonic() + PATIENCE
 
     def trickle() -> None:
         peer, _ = listener.accept()
-        with peer, suppress(OSError):  # raised once the client has closed the connection
+        with peer, suppress(OSError):  # raised when the client closes the connection
             while time.monotonic() < ends:
                 peer.sendall(b"H")
                 time.sleep(0.01)
@@ -303,13 +306,15 @@ def test_the_wait_for_an_answer_that_arrives_byte_by_byte_ends(monkeypatch: pyte
         ("# https://hooks.example/T0K3N", "has no target"),
     ],
 )
-def test_wrong_target_is_refused_without_its_secret(tmp_path: Path, line: str, sentence: str) -> None:
+def test_an_invalid_target_is_refused_without_showing_its_secret(
+    tmp_path: Path, line: str, sentence: str
+) -> None:
     (tmp_path / "targets").write_text(f"{line}\n")
     found, [mistake] = read_targets(tmp_path / "targets")
     assert (found, sentence in mistake, "T0K3N" in mistake) == ([], True, False)
 
 
-def test_name_of_a_target_shows_no_secret(tmp_path: Path) -> None:
+def test_the_shown_name_of_a_target_contains_no_secret(tmp_path: Path) -> None:
     (tmp_path / "targets").write_text("https://hooks.example/T0K3N?key=T0K3N\ntgram://T0K3N/1\n")
     found, _ = read_targets(tmp_path / "targets")
     assert [one.name for one in found] == [
@@ -318,7 +323,9 @@ def test_name_of_a_target_shows_no_secret(tmp_path: Path) -> None:
     ]
 
 
-def test_missing_apprise_is_reported_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_apprise_library_is_reported_in_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "apprise", None)
     (tmp_path / "targets").write_text("ntfy://alarms\n")
     context: Any = SimpleNamespace(plant=SimpleNamespace(path=tmp_path / "plant.toml"), page="")
@@ -328,8 +335,8 @@ def test_missing_apprise_is_reported_in_one_sentence(tmp_path: Path, monkeypatch
 
 
 @pytest.mark.long
-@pytest.mark.filterwarnings("ignore:.*imghdr:DeprecationWarning")  # Apprise imports imghdr
-def test_apprise_sends_title_and_text(webhook: SimpleNamespace) -> None:
+@pytest.mark.filterwarnings("ignore:.*imghdr:DeprecationWarning")  # Apprise imports the deprecated imghdr
+def test_apprise_sends_the_title_and_the_text(webhook: SimpleNamespace) -> None:
     pytest.importorskip("apprise")
     send = sender_to(AlarmTarget("target", webhook.url.replace("http://", "json://")))
     send(described(BEGUN, 0))
@@ -341,7 +348,7 @@ def test_apprise_sends_title_and_text(webhook: SimpleNamespace) -> None:
 
 
 @pytest.mark.slow
-def test_gateway_sends_messages_about_faults_and_exceeded_limits(
+def test_a_gateway_sends_messages_about_faults_and_exceeded_limits(
     tmp_path: Path, webhook: SimpleNamespace
 ) -> None:
     (tmp_path / "targets").write_text(webhook.url)
@@ -358,5 +365,5 @@ def test_gateway_sends_messages_about_faults_and_exceeded_limits(
     found = {(one["drive"], one["kind"]): one["alarm"] for one in webhook.posted[:2]}
     assert found.keys() == {("pump-1", "limit"), ("pump-1", "fault")}
     assert found["pump-1", "limit"] == "output_frequency below 1 Hz"
-    # The status may be read before the register with the fault's number.
+    # The status may be read before the register that has the number of the fault.
     assert found["pump-1", "fault"] in ("overcurrent while accelerating (OC1)", "it shows a fault")

@@ -1,4 +1,4 @@
-"""Reload of the plant file: a file with mistakes changes no line; a valid file is polled."""
+"""Reload of the plant file: a file with mistakes changes nothing, and a valid file is polled."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ def edit(gateway: Served, old: str, new: str) -> None:
 
 
 class Rows:
-    """A part that records the rows it receives."""
+    """A gateway part that records the rows it receives."""
 
     def __init__(self) -> None:
-        self.found: list[tuple[str, str, int]] = []  # drive, status, time of the request
+        self.found: list[tuple[str, str, int]] = []  # (drive, status, time of the request in ns) of each row
         self.adopted: list[Plant] = []
 
     def take(self, batch: Batch) -> None:
@@ -69,7 +69,7 @@ def two_lines(
 ) -> Iterator[tuple[Served, Rows]]:
     """Yield a gateway with the lines hall (pump-1) and roof (`fans`), and its rows.
 
-    Fans other than fan-1 are silent.
+    Only fan-1 answers there.
     """
     secrets, known = tokens()
     sims = {name: simulated(InvtCHE(1, name=name, baudrate=38400)) for name in ("pump-1", "fan-1")}
@@ -92,7 +92,7 @@ def two_lines(
 
 
 @pytest.mark.slow
-def test_a_file_with_mistakes_changes_nothing(tmp_path: Path) -> None:
+def test_a_plant_file_with_mistakes_changes_nothing(tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         revision = gateway.gateway.revision
         gateway.await_state("pump-2", "stands")
@@ -142,7 +142,7 @@ def test_a_file_with_mistakes_changes_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_reload_adds_and_removes_drives_and_keeps_unchanged_lines(tmp_path: Path) -> None:
+def test_a_reload_adds_and_removes_drives_and_keeps_unchanged_lines(tmp_path: Path) -> None:
     with two_lines(tmp_path) as (gateway, rows):
         revision = gateway.gateway.revision
         gateway.await_state("fan-1", "stands")
@@ -157,13 +157,13 @@ def test_reload_adds_and_removes_drives_and_keeps_unchanged_lines(tmp_path: Path
         frame = gateway.frame()
         assert (frame["revision"], frame["drives"].keys()) == (revision + 1, {"pump-1", "fan-2"})
         ended = [one["ended"] for one in frame["alarms"] if one["drive"] == "fan-1"]
-        assert ended  # on a busy machine, fan-1 may have several alarms
+        assert ended  # on a busy machine, fan-1 may have had several alarms
         assert None not in ended
         names = [line["drives"][0]["name"] for line in gateway.get("/api/plant").json["lines"]]
         assert names == ["pump-1", "fan-2"]
         assert rows.adopted == [gateway.gateway.plant]
         assert gateway.gateway.plant.lines[0].drives[0].drive is pump.drive
-        adopted_ns = time.monotonic_ns()  # rows of earlier requests may still arrive
+        adopted_ns = time.monotonic_ns()  # rows requested before this time may still arrive
 
         def later() -> list[str]:
             return [drive for drive, _, at_ns in rows.found if at_ns > adopted_ns]
@@ -180,13 +180,13 @@ def test_reload_adds_and_removes_drives_and_keeps_unchanged_lines(tmp_path: Path
 
 
 @pytest.mark.slow
-def test_a_missing_port_is_reported(tmp_path: Path) -> None:
+def test_a_port_that_is_missing_after_a_reload_is_reported(tmp_path: Path) -> None:
     with two_lines(tmp_path) as (gateway, _):
         roof = gateway.gateway.plant.lines[1].port
         edit(gateway, roof, str(tmp_path / "nosuch"))
         assert reload(gateway)["done"] is True
         assert gateway.frame()["lines"]["roof"]["lost"] == f"{tmp_path}/nosuch: there is no such port"
-        assert reload(gateway)["done"] is True  # the reason stays after a second reload
+        assert reload(gateway)["done"] is True  # the reason is still reported after another reload
         assert gateway.frame()["lines"]["roof"]["lost"] == f"{tmp_path}/nosuch: there is no such port"
         edit(gateway, str(tmp_path / "nosuch"), roof)
         assert reload(gateway)["done"] is True
@@ -194,7 +194,7 @@ def test_a_missing_port_is_reported(tmp_path: Path) -> None:
         until(lambda: gateway.frame()["lines"]["roof"]["lost"] is None)
 
 
-def test_rights_names_and_tokens_are_reloaded_and_other_keys_need_a_restart(tmp_path: Path) -> None:
+def test_rights_names_and_tokens_are_reloaded_and_other_settings_need_a_restart(tmp_path: Path) -> None:
     with served(tmp_path, f'[serve]\nnames = ["old.example"]\nlisten = "localhost:1"\n{MAY}') as gateway:
         gateway.await_state("pump-1", "stands")
         assert gateway.get("/health", host="old.example").status == 200
@@ -219,14 +219,14 @@ def test_rights_names_and_tokens_are_reloaded_and_other_keys_need_a_restart(tmp_
         assert write("pump-2").json["done"] is True
 
 
-def test_a_reload_gives_local_clients_no_further_rights_before_the_restart(tmp_path: Path) -> None:
+def test_before_a_restart_a_reload_gives_local_clients_no_further_rights(tmp_path: Path) -> None:
     with served(tmp_path, "[serve]\nbehind_proxy = false\n") as gateway:
         edit(gateway, "behind_proxy = false\n", f"behind_proxy = true\n{MAY}")
         assert reload(gateway)["restart"] == ["behind_proxy of [serve] takes effect after a restart"]
         assert gateway.post("/api/stop").status == 401
 
 
-def test_renewed_certificate_is_reported_to_need_a_restart(tmp_path: Path) -> None:
+def test_a_reload_reports_that_a_renewed_certificate_needs_a_restart(tmp_path: Path) -> None:
     """Otherwise users would notice only when the old certificate expires."""
     certificate(tmp_path, "own")
     serve = '[serve]\ncertificate = "own.pem"\nkey = "own.key"\n'
@@ -239,7 +239,7 @@ def test_renewed_certificate_is_reported_to_need_a_restart(tmp_path: Path) -> No
         ]
 
 
-def test_a_removed_token_is_invalid_after_a_reload(tmp_path: Path) -> None:
+def test_a_token_removed_from_the_file_is_invalid_after_a_reload(tmp_path: Path) -> None:
     secrets, known = tokens()
     newer, newcomer = new_token("bert", Right.LOOK)
     file = tmp_path / "tokens"
@@ -261,13 +261,13 @@ def test_a_removed_token_is_invalid_after_a_reload(tmp_path: Path) -> None:
 
             assert answers() == [200, 200, 200, 401]
             file.write_text(f"{known[-1].line}\n{newcomer.line}\n")
-            assert answers() == [200, 200, 200, 401]  # the removed token is valid until the reload
+            assert answers() == [200, 200, 200, 401]  # until the reload, the removed token is valid
             assert gateway.commands.plant_ns is None
             begun_ns = boottime_ns()
             writer = {"authorization": client.bearer(Right.WRITE)}
             assert client.post("/api/reload", {"confirm": True}, **writer).json["done"] is True
             assert answers() == [401, 401, 200, 200]
-            read_ns = gateway.commands.plant_ns  # time of the reload
+            read_ns = gateway.commands.plant_ns  # time of the latest reload
             assert read_ns is not None
             assert begun_ns <= read_ns <= boottime_ns()
 
@@ -275,7 +275,7 @@ def test_a_removed_token_is_invalid_after_a_reload(tmp_path: Path) -> None:
 def test_values_read_before_a_reload_are_not_shown_after_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After the reload the name may mean another drive, which may be silent."""
+    """After the reload, the name may mean another drive, and this drive may be silent."""
     monkeypatch.setattr(drive_reads, "PAUSE_S", 0.0)
     with served(tmp_path, MAY) as gateway:
         gateway.await_state("pump-1", "stands")
@@ -293,8 +293,8 @@ def test_values_read_before_a_reload_are_not_shown_after_it(
         assert values() == []
 
 
-def test_a_reload_grants_no_rights_while_a_new_listen_address_waits_for_a_restart(tmp_path: Path) -> None:
-    """Until the restart the gateway listens on the old address, which other clients can reach."""
+def test_a_reload_grants_no_rights_while_a_changed_address_needs_a_restart(tmp_path: Path) -> None:
+    """Until the restart, the gateway listens on the old address, which other clients may reach."""
     serve = '[serve]\nlisten = "127.0.0.1:0"\ntokens = "tokens"\n[serve.may]\nlook = "token"\n'
     with served(tmp_path, serve) as gateway:
         edit(gateway, "127.0.0.1:0", "127.0.0.2:0")
@@ -325,7 +325,7 @@ def test_a_reload_needs_the_right_to_write_and_a_confirmation(tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_a_start_from_before_a_reload_does_not_reach_a_new_drive_of_that_name(tmp_path: Path) -> None:
+def test_a_start_sent_before_a_reload_does_not_reach_a_new_drive_of_that_name(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         seen = gateway.frame()["n"]
         path = gateway.gateway.plant.path
@@ -343,7 +343,7 @@ def test_a_start_from_before_a_reload_does_not_reach_a_new_drive_of_that_name(tm
 
 
 @pytest.mark.slow
-def test_stop_of_a_drive_that_a_reload_replaces_is_sent_to_the_new_drive(
+def test_a_stop_of_a_drive_that_a_reload_replaces_is_sent_to_the_new_drive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with two_lines(tmp_path, MAY.replace("pump-1", "fan-1")) as (gateway, _):
@@ -370,7 +370,7 @@ def test_stop_of_a_drive_that_a_reload_replaces_is_sent_to_the_new_drive(
         threads = [threading.Thread(target=lambda: told.append(reload(gateway)))]
         threads[0].start()
         assert changed.wait(PATIENCE)
-        assert old.bus is None  # the old drive is detached
+        assert old.bus is None  # the old drive no longer has a bus
         threads += [
             threading.Thread(target=lambda drives=drives: told.append(gateway.post("/api/stop", drives).json))
             for drives in ({"drives": None}, {"drives": ["fan-1"]})
@@ -389,7 +389,7 @@ def test_stop_of_a_drive_that_a_reload_replaces_is_sent_to_the_new_drive(
 
 
 def held_up(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
-    """Delay the opening of each bus; return the events "opening has started" and "opening may continue"."""
+    """Delay the opening of each bus; return the events "opening has started" and "opening may go on"."""
     opening, go_on = threading.Event(), threading.Event()
     open_bus = Bus.__init__
 
@@ -404,10 +404,10 @@ def held_up(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", ["stop", "coast"])
-def test_stop_does_not_wait_for_ports_that_a_reload_opens(
+def test_a_stop_does_not_wait_for_ports_that_a_reload_opens(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
 ) -> None:
-    """The drive has already been replaced. The port of another line is still being opened."""
+    """The drive has been replaced already, and the port of another line is still being opened."""
     verbs = '"fan-1.start", "fan-1.coast"'
     may = MAY.replace("pump-1", "fan-1").replace('"fan-1.start"', verbs)
     with two_lines(tmp_path, may, ("fan-1", "fan-2")) as (gateway, _):
@@ -418,7 +418,8 @@ def test_stop_does_not_wait_for_ports_that_a_reload_opens(
         assert fan.goal
         opening, go_on = held_up(monkeypatch)
         edit(gateway, 'name = "fan-1"', 'name = "fan-1"\nmaximum_frequency = 50.0')
-        edit(gateway, 'name = "hall"', 'name = "hall"\necho = "off"')  # a change that reopens the line
+        # the changed key makes the reload open this line again
+        edit(gateway, 'name = "hall"', 'name = "hall"\necho = "off"')
         told: list[Any] = []
         reloading = threading.Thread(target=lambda: told.append(reload(gateway)))
         reloading.start()
@@ -448,15 +449,15 @@ formats = ["8N1"]
 counts_from = 0
 [reading]
 dc_bus_voltage = { at = 0x3002, unit = "A", step = 0.5, place = "1" }
-"""  # for INVT CHE this register is a raw count
+"""  # in the family INVT CHE, `dc_bus_voltage` is a raw count instead
 
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_rows_of_a_changed_drive_are_never_recorded_with_another_unit(
+def test_values_of_a_replaced_drive_are_never_recorded_with_the_new_drives_unit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The new drive has another family. It is polled already, while another line is still being opened."""
+    """The new drive has another family. It is polled already while another line is still being opened."""
     (tmp_path / "other.toml").write_text(OTHER)
     with two_lines(tmp_path, "[serve.history]\n" + MAY) as (gateway, _):
         path, poller, hub = gateway.gateway.plant.path, gateway.gateway.poller, gateway.gateway.hub
@@ -465,7 +466,8 @@ def test_rows_of_a_changed_drive_are_never_recorded_with_another_unit(
         assert reload(gateway)["done"]
         until(lambda: (newest := hub.newest("fan-1", "dc_bus_voltage")) and newest.value is not None)
         opening, go_on = held_up(monkeypatch)
-        text = path.read_text().replace('name = "hall"', 'name = "hall"\necho = "off"')  # reopens the line
+        # the changed key makes the reload open this line again
+        text = path.read_text().replace('name = "hall"', 'name = "hall"\necho = "off"')
         before, _, roof = text.rpartition('model = "invt-che"')
         path.write_text(f'{before}model = "other.toml"\nformat = "8N1"{roof}')
         told: list[Any] = []
@@ -498,8 +500,8 @@ def test_rows_of_a_changed_drive_are_never_recorded_with_another_unit(
 
 
 @pytest.mark.slow
-def test_stop_in_progress_continues_during_a_reload(tmp_path: Path) -> None:
-    """The reload waits for the stop, and replaces the drive only afterwards."""
+def test_a_stop_in_progress_continues_during_a_reload(tmp_path: Path) -> None:
+    """The reload waits for the stop before it replaces the drive."""
     with two_lines(tmp_path) as (gateway, _):
         revision = gateway.gateway.revision
         gateway.await_state("fan-1", "stands")
@@ -521,7 +523,9 @@ def test_stop_in_progress_continues_during_a_reload(tmp_path: Path) -> None:
         assert gateway.gateway.revision == revision + 1
 
 
-def test_a_reload_survives_unexpected_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unexpected_failure_of_a_reload_does_not_prevent_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class Deaf(BrokenFeed):
         def adopt(self, plant: Plant) -> None:
             raise RuntimeError("no plant")
@@ -536,7 +540,7 @@ def test_a_reload_survives_unexpected_failures(tmp_path: Path, monkeypatch: pyte
         assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
 
 
-def test_reload_is_announced_on_systems_without_posix_clocks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reload_is_announced_on_systems_without_posix_clocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows has neither CLOCK_MONOTONIC nor a service manager's socket."""
     monkeypatch.setattr("multidrop.gateway.gateway.time", SimpleNamespace())
     Notifier("").send_reloading()

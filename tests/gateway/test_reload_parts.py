@@ -1,4 +1,4 @@
-"""Parts that a reloaded plant file adds, changes or removes."""
+"""Gateway parts, such as MQTT or the history, that a reloaded plant file adds, changes or removes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from multidrop.gateway.commands import stop_meant
 from multidrop.gateway.http.rights import Right
 
 MODBUS = '[serve.modbus]\nlisten = "127.0.0.1:{}"\nunits = {{ pump-1 = {} }}\n'
-STATUS = 0x1001  # CHE100 manual v1.4, p. 117: 3 is "standby"
+STATUS = 0x1001  # address of the status register, which reads 3 in standby (CHE100 manual v1.4, p. 117)
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def gateway(tmp_path: Path) -> Iterator[Served]:
 
 
 def reload(gateway: Served, serve: str) -> Any:
-    """Reload the plant file with these tables of [serve]; return the gateway's answer."""
+    """Reload the plant file with these [serve] tables, and return the gateway's answer."""
     path = gateway.gateway.plant.path
     path.write_text(path.read_text().partition("[serve")[0] + serve)
     answer = gateway.post("/api/reload", {"confirm": True}, authorization=gateway.bearer(Right.WRITE))
@@ -61,13 +61,14 @@ def status_of(port: int, unit: int) -> list[int]:
 IN_EFFECT = {"done": True, "text": "plant.toml is in effect", "mistakes": [], "restart": []}
 
 
-def test_reload_starts_changes_and_ends_the_modbus_server(gateway: Served) -> None:
+def test_reloads_start_and_change_and_end_the_modbus_server(gateway: Served) -> None:
     first, second = free_port(), free_port()
     assert reload(gateway, MODBUS.format(first, 21)) == IN_EFFECT
     until(lambda: status_of(first, 21) == [3])
     server = gateway.gateway.feeds["modbus"]
     assert reload(gateway, MODBUS.format(first, 21)) == IN_EFFECT
-    assert gateway.gateway.feeds["modbus"] is server  # the table is unchanged, so clients stay connected
+    # its table has not changed, so its clients stay connected
+    assert gateway.gateway.feeds["modbus"] is server
     assert reload(gateway, MODBUS.format(second, 22)) == IN_EFFECT
     until(lambda: status_of(second, 22) == [3])
     until(lambda: not is_open(first))
@@ -76,7 +77,7 @@ def test_reload_starts_changes_and_ends_the_modbus_server(gateway: Served) -> No
     assert parts(gateway) == {}
 
 
-def test_reload_with_a_part_that_cannot_be_opened_changes_nothing(gateway: Served) -> None:
+def test_a_reload_changes_nothing_if_a_gateway_part_cannot_be_opened(gateway: Served) -> None:
     first = free_port()
     assert reload(gateway, MODBUS.format(first, 21))["done"] is True
     with socket.create_server(("127.0.0.1", 0)) as taken:
@@ -94,7 +95,7 @@ def test_reload_with_a_part_that_cannot_be_opened_changes_nothing(gateway: Serve
 
 
 @pytest.mark.slow
-def test_reload_with_an_unexpected_failure_of_a_part_changes_nothing(
+def test_a_reload_changes_nothing_if_a_gateway_part_fails_unexpectedly(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = free_port()
@@ -113,10 +114,10 @@ def test_reload_with_an_unexpected_failure_of_a_part_changes_nothing(
 
 
 @pytest.mark.slow
-def test_part_that_loses_its_port_during_a_reload_is_reported(
+def test_a_gateway_part_that_loses_its_port_in_a_failed_reload_is_reported(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The reload fails. Another program has opened the part's previous port in the meantime."""
+    """The reload fails. Meanwhile, another program has opened the previous port of the Modbus server."""
     first = free_port()
     assert reload(gateway, MODBUS.format(first, 21))["done"] is True
     others = []
@@ -141,7 +142,9 @@ def test_part_that_loses_its_port_during_a_reload_is_reported(
 
 
 @pytest.mark.slow
-def test_slow_part_delays_no_stop(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gateway_part_that_opens_slowly_does_not_delay_a_stop(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     opens, goes_on = threading.Event(), threading.Event()
     build = parts_module.build
 
@@ -164,7 +167,7 @@ def test_slow_part_delays_no_stop(gateway: Served, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.long
-def test_reload_starts_changes_and_ends_the_history(gateway: Served, tmp_path: Path) -> None:
+def test_reloads_start_and_change_and_end_the_history(gateway: Served, tmp_path: Path) -> None:
     assert gateway.get("/api/export?from=0&to=1&series=pump-1.status").status == 404
     for folder in ("first", "second"):
         assert reload(gateway, f'[serve.history]\nfolder = "{folder}"\n') == IN_EFFECT
@@ -177,7 +180,7 @@ def test_reload_starts_changes_and_ends_the_history(gateway: Served, tmp_path: P
 
 
 @pytest.mark.slow
-def test_reload_starts_changes_and_ends_mqtt(gateway: Served, tmp_path: Path) -> None:
+def test_reloads_start_and_change_and_end_mqtt(gateway: Served, tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     with mosquitto(tmp_path) as broker:
         heard = Listener(broker)
@@ -206,7 +209,7 @@ Names = dict[str, Drive]
 
 @dataclass
 class End:
-    """The result of a stop, with the drive that was stopped."""
+    """The result of a stop, and the drive that was stopped."""
 
     drive: Drive | None
     ok: bool = True
@@ -214,16 +217,17 @@ class End:
 
 @dataclass
 class Lines:
-    """Lines of a poller. The test changes the lines, and can delay their stops."""
+    """Fake lines of a poller. The test can change them, and can delay the stop of a drive."""
 
     plant_now: Plant
     plant_coming: Plant | None = None
-    held: dict[int, asyncio.Event] = field(default_factory=dict)  # by drive address: delays the drive's stop
+    # by drive address: event for which the drive's stop waits
+    held: dict[int, asyncio.Event] = field(default_factory=dict)
     failing: set[int] = field(default_factory=set)
     begun: list[Drive | None] = field(default_factory=list)
 
     async def stop(self, now: Plant, names: list[str]) -> dict[str, End]:
-        """Stop these drives; the stop of a held drive waits for the drive's event."""
+        """Stop these drives. The stop of a drive in `held` waits for its event."""
         there = {polled.drive.name: polled.drive for line in now.lines for polled in line.drives}
         found = {name: there.get(name) for name in names}
         self.begun += found.values()
@@ -237,7 +241,7 @@ class Lines:
 
 
 def plant_of(*drives: Drive) -> Plant:
-    """Return a plant with a line for each drive."""
+    """Return a plant in which each drive has its own line."""
     return plant(
         *(
             line(f"/dev/tty{number}", polled(drive, []), name=f"hall-{number}")
@@ -261,8 +265,8 @@ NEW_FAN = InvtCHE(2, name="fan")
 
 
 @pytest.mark.parametrize("names", [["fan"], None])
-def test_new_drive_is_stopped_while_the_stop_of_its_predecessor_continues(names: list[str] | None) -> None:
-    """The predecessor's stop may take half a minute, for example if that drive is silent."""
+def test_a_new_drive_is_stopped_while_its_predecessor_is_still_being_stopped(names: list[str] | None) -> None:
+    """The stop of the replaced drive may take half a minute, for example if that drive is silent."""
     silent = asyncio.Event()
     lines = Lines(plant_of(PUMP, FAN), held={FAN.address: silent})
 
@@ -277,12 +281,12 @@ def test_new_drive_is_stopped_while_the_stop_of_its_predecessor_continues(names:
         return await stopping
 
     ends = asyncio.run(main())
-    # the result is the new drive's, although the old drive's result came later
+    # the new drive's result, although that of the old drive came later
     assert ends["fan"].drive is NEW_FAN
     assert lines.begun.count(NEW_FAN) == 1
 
 
-def test_a_stop_that_fails_while_lines_change_is_sent_again() -> None:
+def test_a_stop_that_fails_while_a_reload_changes_lines_is_sent_again() -> None:
     silent = asyncio.Event()
     lines = Lines(plant_of(PUMP, FAN), held={FAN.address: silent}, failing={FAN.address})
 
@@ -297,8 +301,8 @@ def test_a_stop_that_fails_while_lines_change_is_sent_again() -> None:
     assert lines.begun == [FAN, FAN]
 
 
-async def test_stop_by_a_name_of_the_new_plant_is_sent_once_the_drive_is_attached() -> None:
-    """The name may have another spelling. Other drives of the present plant are not stopped."""
+async def test_a_stop_of_a_drive_that_a_reload_adds_is_sent_once_it_is_attached() -> None:
+    """The name may have another Unicode spelling. Drives of the present plant are not stopped."""
     new = InvtCHE(2, name="L\u00fcfter")
     lines = Lines(plant_of(PUMP, FAN), plant_of(new, FAN))
     stopping = asyncio.create_task(stop_meant(lines, ["Lu\u0308fter"], lines.stop))
@@ -308,7 +312,7 @@ async def test_stop_by_a_name_of_the_new_plant_is_sent_once_the_drive_is_attache
     assert lines.begun == [None, new]
 
 
-async def test_without_a_reload_only_the_named_drives_are_stopped() -> None:
+async def test_without_a_reload_a_stop_stops_only_the_named_drives() -> None:
     lines = Lines(plant_of(PUMP, FAN))
     assert told(await stop_meant(lines, ["fan", "nobody"], lines.stop)) == {"fan": FAN}
     assert lines.begun == [FAN, None]

@@ -1,4 +1,4 @@
-"""The command `serve` in its own process, as users and the service manager run it."""
+"""The command `multidrop serve` in its own process, as users and the service manager run it."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ UNITS = sorted((Path(__file__).parents[2] / "packaging").glob("*.service"))
 
 
 @pytest.mark.long
-def test_the_service_manager_is_notified_of_ready_alive_and_stopping(tmp_path: Path) -> None:
+def test_serve_notifies_the_service_manager_of_ready_alive_and_stopping(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         manager.settimeout(PATIENCE)
@@ -80,7 +80,7 @@ def test_the_service_manager_is_notified_of_ready_alive_and_stopping(tmp_path: P
 
 
 @pytest.mark.long
-def test_sighup_reloads_and_notifies_systemd(tmp_path: Path) -> None:
+def test_sighup_reloads_the_plant_file_and_notifies_systemd(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         manager.settimeout(PATIENCE)
@@ -107,7 +107,7 @@ def test_sighup_reloads_and_notifies_systemd(tmp_path: Path) -> None:
     assert "the plant file is in effect" in messages
 
 
-def test_plant_without_a_file_cannot_be_reloaded(tmp_path: Path) -> None:
+def test_a_plant_that_was_not_read_from_a_file_cannot_be_reloaded(tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         gateway.gateway.reload._read = None
         writer = {"authorization": gateway.bearer(Right.WRITE)}
@@ -116,7 +116,7 @@ def test_plant_without_a_file_cannot_be_reloaded(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_sigterm_ends_the_gateway_while_viewers_wait(tmp_path: Path) -> None:
+def test_sigterm_ends_the_gateway_while_viewers_wait_for_values(tmp_path: Path) -> None:
     with ExitStack() as stack:
         path = stack.enter_context(simulated_plant(tmp_path, '[serve]\nlisten = "127.0.0.1:0"\n'))
         process, url = stack.enter_context(serving(path))
@@ -138,8 +138,8 @@ def test_sigterm_ends_the_gateway_while_viewers_wait(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_stop_does_not_wait_for_an_unread_log(tmp_path: Path) -> None:
-    """Nothing reads the log if a user pressed Ctrl-S in the terminal, or if the journal hangs."""
+def test_a_stop_does_not_wait_until_the_log_is_read(tmp_path: Path) -> None:
+    """The log is not read while a user has pressed Ctrl-S in the terminal, or while the journal hangs."""
     with simulated_plant(tmp_path, '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\n') as path:
         unread, log = os.pipe()
         patient = f"from multidrop.cli import main, serve; serve.END_S = {PATIENCE}; raise SystemExit(main())"
@@ -152,7 +152,7 @@ def test_stop_does_not_wait_for_an_unread_log(tmp_path: Path) -> None:
             try:
                 assert process.stdout is not None
                 port = int(process.stdout.readline().rstrip("/\n").rpartition(":")[2])
-                os.set_blocking(log, False)  # so that filling the pipe does not block
+                os.set_blocking(log, False)  # so that the test can fill the pipe without hanging
                 with suppress(BlockingIOError):
                     while True:
                         os.write(log, bytes(1))
@@ -177,7 +177,7 @@ def test_serve_with_tls_answers_over_https(tmp_path: Path) -> None:
         assert url.startswith("https://127.0.0.1:")
         port = int(url.rstrip("/").rpartition(":")[2])
         context = ssl.create_default_context(cafile=str(tmp_path / "own.pem"))
-        silent = socket.create_connection(("127.0.0.1", port))  # never sends its TLS handshake
+        silent = socket.create_connection(("127.0.0.1", port))  # a client that never sends its TLS handshake
         connection = http.client.HTTPSConnection("localhost", port, context=context, timeout=PATIENCE)
         connection.request("POST", "/api/token", '{"token": "secret"}', {"content-type": "application/json"})
         response = connection.getresponse()
@@ -188,7 +188,7 @@ def test_serve_with_tls_answers_over_https(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_port_in_use_is_reported_in_one_sentence(tmp_path: Path) -> None:
+def test_an_http_port_in_use_is_reported_in_one_sentence(tmp_path: Path) -> None:
     with listen("127.0.0.1", 0) as taken:
         port = taken.getsockname()[1]
         written(tmp_path, f'[serve]\nlisten = "127.0.0.1:{port}"\n')
@@ -200,7 +200,7 @@ def test_port_in_use_is_reported_in_one_sentence(tmp_path: Path) -> None:
     )
 
 
-def test_serve_check_reports_mistakes(run: Run, tmp_path: Path) -> None:
+def test_serve_check_reports_mistakes_in_the_plant_file(run: Run, tmp_path: Path) -> None:
     plant = written(tmp_path, '[serve]\nlisten = "localhost:80"\n')
     assert run("serve", "--check", plant.path) == (
         0,
@@ -221,7 +221,7 @@ def test_serve_check_reports_mistakes(run: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["check", "plan"])
-def test_other_commands_ignore_the_serve_table(run: Run, tmp_path: Path, command: str) -> None:
+def test_other_commands_ignore_the_table_serve(run: Run, tmp_path: Path, command: str) -> None:
     plant = written(tmp_path, '[serve]\nlisten = "localhost:80"\nnot_known = 1\n')
     status, out, errors = run(command, plant.path)
     assert (status, errors) == (0, "")
@@ -230,7 +230,7 @@ def test_other_commands_ignore_the_serve_table(run: Run, tmp_path: Path, command
         assert out == f"{found}; `multidrop serve --check` checks its [serve].\n"
 
 
-def test_a_new_token_is_shown_once(run: Run) -> None:
+def test_a_newly_made_token_is_shown_once(run: Run) -> None:
     status, line, told = run("serve", "--new-token", "stop", "--for", "anna")
     assert status == 0
     (token,), _ = read_tokens(line)
@@ -255,11 +255,13 @@ def test_a_new_token_is_shown_once(run: Run) -> None:
         ),
     ],
 )
-def test_invalid_serve_options_are_refused(run: Run, words: tuple[str, ...], sentence: str) -> None:
+def test_invalid_options_of_serve_are_refused(run: Run, words: tuple[str, ...], sentence: str) -> None:
     assert run("serve", *words) == (2, "", f"multidrop: {sentence}\n")
 
 
-def test_a_web_demo_warns_about_ignored_options(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_demo_of_the_web_page_warns_about_ignored_options(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(serve_command, "serve_demo", lambda **_: 0)
     code, printed, warned = run("demo", "--web")
     assert (code, printed.split()[0], warned) == (0, "Next:", "")
@@ -271,7 +273,7 @@ def test_a_web_demo_warns_about_ignored_options(run: Run, monkeypatch: pytest.Mo
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [["demo", "--web"], ["serve", "--demo"]])
-def test_demo_is_live_and_anyone_on_this_machine_may_stop_it(words: list[str]) -> None:
+def test_a_demo_of_the_web_page_is_live_and_local_users_may_stop_it(words: list[str]) -> None:
     with BoundProcess([*MULTIDROP, *words, "--no-browser"], stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
@@ -294,7 +296,7 @@ def test_demo_is_live_and_anyone_on_this_machine_may_stop_it(words: list[str]) -
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
 @pytest.mark.parametrize("path", UNITS, ids=lambda path: path.stem)
-def test_systemd_unit_file_is_valid_and_exposes_little(tmp_path: Path, path: Path) -> None:
+def test_the_systemd_unit_file_is_valid_and_restricts_the_service(tmp_path: Path, path: Path) -> None:
     unit = tmp_path / path.name.replace("@", "@hall")
     unit.write_text(path.read_text().replace("/opt/multidrop/bin/multidrop", "/bin/true"))
     verified = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True)
@@ -311,7 +313,7 @@ SERVE = '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\n'
 
 
 @pytest.mark.slow
-def test_line_with_a_missing_port_is_polled_as_soon_as_the_port_appears(tmp_path: Path) -> None:
+def test_a_line_whose_port_is_missing_is_polled_as_soon_as_the_port_appears(tmp_path: Path) -> None:
     port = tmp_path / "late"
     sims = [simulated(InvtCHE(1, name=name, baudrate=38400)) for name in ("pump-1", "fan-1")]
     with Simulator([Wire([sim], unpaced=True) for sim in sims]) as simulator:
@@ -344,7 +346,7 @@ def test_line_with_a_missing_port_is_polled_as_soon_as_the_port_appears(tmp_path
 
 
 @pytest.mark.slow
-def test_reason_of_a_port_lost_later_is_reported(tmp_path: Path) -> None:
+def test_the_reason_of_a_port_that_is_lost_later_is_reported(tmp_path: Path) -> None:
     port = tmp_path / "hall"
     plant = written(tmp_path, SERVE, port=str(port))
     gateway = Gateway(plant, read_settings(plant, {}))
@@ -361,7 +363,8 @@ def test_reason_of_a_port_lost_later_is_reported(tmp_path: Path) -> None:
 
 def test_an_invalid_port_leaves_no_socket_open(tmp_path: Path) -> None:
     plant = written(tmp_path, SERVE)
-    plant = replace(plant, lines=(plant.lines[0].at("nosuch://port"),))  # invalid in a plant file
+    # reading a plant file would refuse this port
+    plant = replace(plant, lines=(plant.lines[0].at("nosuch://port"),))
     gateway = Gateway(plant, read_settings(plant, {}))
     with pytest.raises(ValueError, match="nosuch"), running(gateway):
         pass

@@ -1,4 +1,4 @@
-"""The table `[serve]`: its keys, and the report of all mistakes together."""
+"""The table `[serve]` of a plant file: its keys, and the report of all mistakes together."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def mistakes(folder: Path, serve: str) -> list[str]:
     return [start.sub("", mistake, count=1) for mistake in wrong.value.mistakes]
 
 
-def test_without_the_table_serve_only_this_machine_may_read_values(tmp_path: Path) -> None:
+def test_without_a_table_serve_only_this_machine_may_read_values(tmp_path: Path) -> None:
     settings = read_settings(written(tmp_path), {})
     assert (settings.host, settings.port) == ("127.0.0.1", 8750)
     assert settings.may.without_token(is_loopback=True) is Right.LOOK
@@ -36,7 +36,7 @@ def test_without_the_table_serve_only_this_machine_may_read_values(tmp_path: Pat
     assert not (tmp_path / "audit.jsonl").exists()
 
 
-def test_all_keys_of_the_serve_table_are_read(tmp_path: Path) -> None:
+def test_all_keys_of_the_table_serve_are_read(tmp_path: Path) -> None:
     certificate(tmp_path, "own")
     (tmp_path / "tokens").write_text(f"# people\n\nanna stop {SHA}\nscada write {digest('other')}\n")
     serve = """
@@ -66,7 +66,7 @@ verbs = ["pump-1.start", "pump-2.reset_fault"]
     assert settings.may.without_token(is_loopback=False) is None
 
 
-def test_fourteen_mistakes_are_reported_in_one_run(tmp_path: Path) -> None:
+def test_fourteen_mistakes_in_the_table_serve_are_reported_together(tmp_path: Path) -> None:
     (tmp_path / "tokens").write_text("anna stop 1234\nanna look\n")
     (tmp_path / "key.pem").write_text("no key\n")
     serve = """
@@ -140,7 +140,7 @@ units = { pump-1 = 700 } # wrong
 """
 
 
-def test_each_mistake_of_the_serve_table_names_the_line_of_its_key(tmp_path: Path) -> None:
+def test_each_mistake_in_the_table_serve_names_the_line_of_its_key(tmp_path: Path) -> None:
     plant = written(tmp_path, PLACED)
     with pytest.raises(PlantError) as wrong:
         read_settings(plant, {})
@@ -164,14 +164,14 @@ def test_each_mistake_of_the_serve_table_names_the_line_of_its_key(tmp_path: Pat
         ),
     ],
 )
-def test_patterns_and_families_allow_exactly_the_drives_they_name(
+def test_patterns_and_families_of_drives_allow_exactly_the_drives_they_name(
     tmp_path: Path, may: str, write: set[str], verbs: set[str]
 ) -> None:
     found = read_settings(written(tmp_path, f"[serve.may]\n{may}\n", *NAMES), {}).may
     assert (found.write, found.verbs) == (write, verbs)
 
 
-def test_a_pattern_allows_only_drives_that_have_the_register(tmp_path: Path) -> None:
+def test_a_pattern_allows_a_register_only_for_drives_that_have_it(tmp_path: Path) -> None:
     mixed = plant_text("/dev/ttyUSB0", NAMES, '[serve.may]\nwrite = ["*.setpoint"]\n').replace(
         'name = "fan-1"\nmodel = "invt-che"', 'name = "fan-1"\nmodel = "yd1000"'
     )
@@ -180,7 +180,7 @@ def test_a_pattern_allows_only_drives_that_have_the_register(tmp_path: Path) -> 
     assert found.write == {"pump-1.setpoint", "pump-2.setpoint"}
 
 
-def test_an_entry_equal_to_a_drive_name_with_a_star_allows_only_that_drive(tmp_path: Path) -> None:
+def test_an_entry_equal_to_the_name_of_a_drive_with_a_star_is_no_pattern(tmp_path: Path) -> None:
     plant = written(tmp_path, '[serve.may]\nverbs = ["p*.start"]\n', "p*", "pump-1")
     assert read_settings(plant, {}).may.verbs == {"p*.start"}
 
@@ -209,7 +209,7 @@ def test_an_entry_equal_to_a_drive_name_with_a_star_allows_only_that_drive(tmp_p
         ('family.invt-che = ["start"]', "family invt-che: ['start'] is not a table with write, verbs"),
     ],
 )
-def test_patterns_and_families_that_allow_nothing_are_refused(
+def test_patterns_and_families_that_allow_no_drive_are_refused(
     tmp_path: Path, may: str, sentence: str
 ) -> None:
     with pytest.raises(PlantError) as wrong:
@@ -217,7 +217,7 @@ def test_patterns_and_families_that_allow_nothing_are_refused(
     assert any(sentence in mistake for mistake in wrong.value.mistakes), wrong.value.mistakes
 
 
-def test_mistakes_in_lines_and_serve_table_are_reported_together(tmp_path: Path) -> None:
+def test_mistakes_in_lines_and_in_the_table_serve_are_reported_together(tmp_path: Path) -> None:
     serve = """
 [serve]
 listen = 80
@@ -255,7 +255,7 @@ units = { pump-1 = 7 }
     ],
 )
 @table("address", ["0.0.0.0:80", "[::]:80", "10.0.0.7:80", "plant.example:80"])
-def test_other_machines_need_tokens_and_tls(
+def test_access_from_other_machines_needs_tokens_and_tls(
     tmp_path: Path, certificates: Path, address: str, keys: str, is_right: bool
 ) -> None:
     for name in ("own.pem", "own.key"):
@@ -274,7 +274,7 @@ def test_other_machines_need_tokens_and_tls(
 
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with two pairs of certificate and key."""
+    """A folder with two certificates and their private keys."""
     folder = tmp_path_factory.mktemp("certificates")
     certificate(folder, "own")
     certificate(folder, "other")
@@ -289,7 +289,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (("own.pem", "own.pem"), "must be a certificate and a key in PEM, without password"),
     ],
 )
-def test_mismatched_or_invalid_certificates_are_reported(
+def test_certificates_that_are_invalid_or_do_not_fit_their_key_are_reported(
     tmp_path: Path, certificates: Path, pair: tuple[str, str], why: str
 ) -> None:
     paths = [certificates / name for name in pair]
@@ -346,17 +346,19 @@ def test_mistakes_in_triggers_are_reported(tmp_path: Path, keys: str, sentences:
         ),
     ],
 )
-def test_a_port_that_two_interfaces_would_open_is_reported(tmp_path: Path, serve: str, sentence: str) -> None:
+def test_a_tcp_port_that_two_interfaces_would_open_is_reported(
+    tmp_path: Path, serve: str, sentence: str
+) -> None:
     assert mistakes(tmp_path, f"{serve}\n") == [f"{sentence}; choose another port"]
 
 
-def test_an_address_on_a_port_that_two_interfaces_use_is_reported_once(tmp_path: Path) -> None:
+def test_an_address_on_a_tcp_port_that_two_interfaces_use_is_reported_once(tmp_path: Path) -> None:
     serve = '[serve.modbus]\nlisten = "127.0.0.1:8750"\n[serve.opcua]\nlisten = "127.0.0.1:8750"\n'
     in_use = "listen: port 8750 is in use by listen of [serve]; choose another port"
     assert mistakes(tmp_path, serve) == [f"[serve.modbus]: {in_use}", f"[serve.opcua]: {in_use}"]
 
 
-def test_interfaces_may_use_one_port_number_on_different_addresses(tmp_path: Path) -> None:
+def test_interfaces_may_use_the_same_tcp_port_on_different_addresses(tmp_path: Path) -> None:
     serve = '[serve]\nlisten = "{}"\n[serve.modbus]\nlisten = "{}"\nclients = ["::1"]\n'
     for page, modbus in (("127.0.0.1", "127.0.0.2"), ("[::1]", "127.0.0.1"), ("[::1]", "0.0.0.0")):
         read_settings(written(tmp_path, serve.format(f"{page}:1502", f"{modbus}:1502")), {})
@@ -385,7 +387,7 @@ def test_a_missing_library_of_an_interface_is_reported(
 
 
 @table("host", ["pump 1", "10.0.0", "10.0.0.256", "10.0.0.5:1502", "http://plant", "[10.0.0.5]x", "[::1"])
-def test_an_invalid_host_in_an_address_is_reported(tmp_path: Path, host: str) -> None:
+def test_an_invalid_host_in_a_listen_address_is_reported(tmp_path: Path, host: str) -> None:
     tables = '[serve]\nlisten = "{0}"\n[serve.opcua]\nlisten = "{0}"\n[serve.modbus]\nlisten = "{0}"\n{1}\n'
     clients = 'clients = ["::1"]\n[serve.tool]\nclients = ["::1"]\nrtu = {{ hall = "{0}" }}'
     found = mistakes(tmp_path, tables.format(f"{host}:80", clients.format(f"{host}:80")))
@@ -395,12 +397,12 @@ def test_an_invalid_host_in_an_address_is_reported(tmp_path: Path, host: str) ->
     assert all(f'"{host}:80" is not an address and port; write ' in one for one in found)
 
 
-def test_certificate_without_its_key_is_reported(tmp_path: Path, certificates: Path) -> None:
+def test_a_certificate_without_its_private_key_is_reported(tmp_path: Path, certificates: Path) -> None:
     (only,) = mistakes(tmp_path, f'[serve]\ncertificate = "{certificates}/own.pem"\n')
     assert only == "[serve]: certificate alone is not enough: give certificate and key"
 
 
-def test_unwritable_audit_folder_is_reported(tmp_path: Path) -> None:
+def test_a_folder_in_which_no_audit_log_can_be_written_is_reported(tmp_path: Path) -> None:
     """The test uses /sys, where not even root may create a file."""
     with pytest.raises(PlantError) as wrong:
         read_settings(written(tmp_path), {"STATE_DIRECTORY": "/sys"})
@@ -408,8 +410,8 @@ def test_unwritable_audit_folder_is_reported(tmp_path: Path) -> None:
     assert only.endswith(": [serve]: audit /sys/audit.jsonl cannot be written: Permission denied")
 
 
-def test_credentials_and_state_folder_of_the_service_manager_are_used(tmp_path: Path) -> None:
-    """Credentials are found before files beside the plant file; output files are in the state folder."""
+def test_credentials_and_the_state_folder_of_the_service_manager_are_used(tmp_path: Path) -> None:
+    """Its credentials are used rather than files beside the plant file; output is in its state folder."""
     credentials, state = tmp_path / "credentials", tmp_path / "state"
     credentials.mkdir()
     state.mkdir()
@@ -421,12 +423,12 @@ def test_credentials_and_state_folder_of_the_service_manager_are_used(tmp_path: 
     assert settings.audit == state / "audit.jsonl"
 
 
-def test_look_by_token_without_a_token_file_is_reported(tmp_path: Path) -> None:
+def test_the_setting_look_by_token_needs_a_token_file(tmp_path: Path) -> None:
     (only,) = mistakes(tmp_path, '[serve.may]\nlook = "token"\n')
     assert only == ('[serve]: look = "token" of [serve.may] needs a file of tokens; add tokens = "tokens"')
 
 
-def test_token_file_contains_no_secret() -> None:
+def test_the_token_file_contains_no_secret() -> None:
     secret, token = new_token("anna", Right.STOP)
     assert read_tokens(f"{token.line}\n") == ([token], [])
     assert secret not in token.line
@@ -435,7 +437,7 @@ def test_token_file_contains_no_secret() -> None:
     ]
 
 
-def test_port_in_use_is_reported() -> None:
+def test_a_tcp_port_in_use_is_reported() -> None:
     with listen("127.0.0.1", 0) as first:
         port = first.getsockname()[1]
         with pytest.raises(

@@ -1,4 +1,4 @@
-"""The supervisor, and a gateway's permanent tasks and threads: if a task or thread ends, /health fails."""
+"""The supervisor of a gateway's permanent tasks and threads: if one of them ends, /health fails."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ ALARM = Alarm(1_000, "pump-1", "overcurrent", None, FAULT)
 THREADS = {"multidrop poller", "multidrop history", "paho-mqtt-client"}
 
 
-def test_no_other_module_of_the_gateway_starts_a_task_or_a_thread() -> None:
+def test_gateway_modules_start_tasks_and_threads_only_through_the_supervisor() -> None:
     root = Path(multidrop.gateway.__file__).parent
     found = set()
     for path in root.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in STARTERS:
                 found.add(path.relative_to(root).as_posix())
-    assert found == {"opcua/server.py"}  # the OPC UA server cancels its task when it closes
+    assert found == {"opcua/server.py"}  # when it closes, the OPC UA server cancels its own task
 
 
 # ---- tasks and threads of a gateway ----
@@ -72,7 +72,7 @@ def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]
 
 
 def in_loop(loop: asyncio.AbstractEventLoop, work: Callable[[Supervisor], Any]) -> Any:
-    """Call a function with the supervisor in a gateway's event loop; return the result."""
+    """Call a function in a gateway's event loop with the gateway's supervisor, and return the result."""
     ends: list[Any] = []
     loop.call_soon_threadsafe(lambda: ends.append(work(supervisor())))
     until(lambda: ends)
@@ -80,13 +80,13 @@ def in_loop(loop: asyncio.AbstractEventLoop, work: Callable[[Supervisor], Any]) 
 
 
 def dead(gateway: Served) -> Any:
-    """Return the entry `dead` of /health if the status is "failed"."""
+    """Return the entry `dead` of /health, which must be empty unless the status is "failed"."""
     answer = gateway.get("/health")
     assert (answer.status == 503) == (answer.json["status"] == "failed") == bool(answer.json["dead"])
     return answer.json["dead"]
 
 
-def test_gateway_has_only_the_listed_tasks_and_threads(gateway: Served) -> None:
+def test_a_gateway_has_only_the_tasks_and_threads_in_the_lists(gateway: Served) -> None:
     assert in_loop(gateway.loop, lambda found: set(found.kept)) == TASKS
     assert gateway.get("/health").json["dead"] == {}
     names = {thread.name for thread in threading.enumerate() if "multidrop" in thread.name}
@@ -95,7 +95,7 @@ def test_gateway_has_only_the_listed_tasks_and_threads(gateway: Served) -> None:
 
 
 @pytest.mark.parametrize("name", usually("polling", *sorted(TASKS - {"web", "polling"})))
-def test_after_the_kill_of_a_task_health_fails_but_stops_are_still_sent(
+def test_when_a_task_was_killed_health_fails_and_stops_are_still_sent(
     gateway: Served, name: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert dead(gateway) == {}
@@ -105,7 +105,7 @@ def test_after_the_kill_of_a_task_health_fails_but_stops_are_still_sent(
     assert all(one["done"] for one in gateway.post("/api/stop").json.values())
 
 
-def test_if_the_poller_fails_health_fails_but_stops_are_still_sent(
+def test_when_the_poller_fails_health_fails_and_stops_are_still_sent(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail() -> None:
@@ -114,7 +114,7 @@ def test_if_the_poller_fails_health_fails_but_stops_are_still_sent(
     monkeypatch.setattr(gateway.gateway.poller, "take", fail)
     until(lambda: dead(gateway) == {"polling": "ZeroDivisionError: a bug in a user's class"})
     assert all(one["done"] for one in gateway.post("/api/stop").json.values())
-    monkeypatch.undo()  # the failure was temporary
+    monkeypatch.undo()  # ends the poller's failure
     until(lambda: dead(gateway) == {})
 
 
@@ -127,7 +127,7 @@ def test_a_line_whose_polling_fails_is_reported(gateway: Served, monkeypatch: py
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_thread_of_the_history_that_ends_makes_health_fail(
+def test_a_history_thread_that_ends_makes_health_fail(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     part: Any = gateway.gateway.feeds["history"]
@@ -144,9 +144,9 @@ def test_a_thread_of_the_history_that_ends_makes_health_fail(
 
 
 @pytest.mark.long
-def test_a_thread_of_the_broker_s_connection_that_ends_makes_health_fail(gateway: Served) -> None:
+def test_a_thread_of_the_broker_connection_that_ends_makes_health_fail(gateway: Served) -> None:
     part: Any = gateway.gateway.feeds["mqtt"]
-    part._brokers[0]._client.disconnect()  # the gateway has not requested this disconnect
+    part._brokers[0]._client.disconnect()  # unexpected, because the gateway did not request it
     until(lambda: dead(gateway) == {"mqtt": "RuntimeError: the thread of the broker's connection has ended"})
 
 
@@ -158,7 +158,7 @@ def test_a_watched_thread_that_ends_makes_health_fail(gateway: Served) -> None:
     until(lambda: dead(gateway) == {"log": "its thread has ended"})
 
 
-def test_gateway_ends_if_its_web_server_ends(tmp_path: Path) -> None:
+def test_the_gateway_ends_if_its_web_server_ends(tmp_path: Path) -> None:
     with simulated_plant(tmp_path, "") as path:
         gateway = Gateway(Plant.load(path), ServeSettings(port=0))
         ended = pytest.raises(RuntimeError, match="the web server has ended: it was cancelled")
@@ -190,16 +190,17 @@ conditions = {{ trip = "fault" }}
 """
 ALL_TASKS = {*TASKS, "opcua", "notify", "upload", "influx", "postgres", "tool", "trigger"}
 OTHER_TASKS = {"end", "fleet: ServerPath.keep", "fleet: FleetWatch.run", "main of the test"}
-# Threads that end at an exception, and threads that continue after one.
+# Threads that end when an exception occurs, and threads that continue.
 ENDING = {"alarms", "target", "upload rows", "influx rows", "postgres rows", "opcua server"}
 CONTINUING = {"history", "spool", "totals"}
-# Threads of libraries, and the poller's thread (tests/polling/test_failures.py).
+# Threads of libraries and of the poller, which tests/polling/test_failures.py tests.
 OTHER_THREADS = {"paho-mqtt-client", "multidrop poller", "multidrop-sim", "gateway under test"}
-POSSIBLE_THREADS = {"multidrop log", "asyncio"}  # started when something is logged, or a name is looked up
+# not always there: started when something is logged or a host name is looked up
+POSSIBLE_THREADS = {"multidrop log", "asyncio"}
 
 
 def names_of_threads(before: set[threading.Thread]) -> set[str]:
-    """Return the names of all threads that were not there before, without numbers and addresses."""
+    """Return the names of the threads that were started since `before`, without numbers and addresses."""
     names = {
         re.sub(r"(_\d+| http://.*|-multidrop/.*)$", "", one.name) for one in {*threading.enumerate()} - before
     }
@@ -273,7 +274,7 @@ def test_each_thread_and_task_of_all_parts_is_listed_and_reported_if_it_ends(
 # ---- the supervisor alone ----
 
 
-def test_released_task_is_not_reported_as_dead() -> None:
+def test_a_released_task_that_ends_is_not_reported_as_dead() -> None:
     async def live() -> dict[str, str]:
         supervisor().keep("released", asyncio.sleep(60))
         supervisor().keep("let go of", asyncio.sleep(0))
@@ -286,7 +287,7 @@ def test_released_task_is_not_reported_as_dead() -> None:
     assert asyncio.run(live()) == {}
 
 
-def test_task_that_is_started_again_is_no_longer_reported_as_dead() -> None:
+def test_a_dead_task_that_is_started_again_is_no_longer_reported() -> None:
     async def live() -> list[dict[str, str]]:
         found = []
         await asyncio.wait([supervisor().keep("part", asyncio.sleep(0))])
@@ -301,7 +302,7 @@ def test_task_that_is_started_again_is_no_longer_reported_as_dead() -> None:
 
 
 @pytest.mark.parametrize("failure", [ValueError("no"), SystemExit("no"), StopIteration("no")])
-async def test_within_raises_the_errors_of_the_function_it_runs(failure: BaseException) -> None:
+async def test_supervisor_within_raises_the_errors_of_the_function_it_runs(failure: BaseException) -> None:
     def work() -> None:
         raise failure
 
@@ -309,7 +310,7 @@ async def test_within_raises_the_errors_of_the_function_it_runs(failure: BaseExc
         await supervisor().within("work", 60, work)
 
 
-async def test_hanging_work_raises_hung_and_is_reported_until_work_succeeds() -> None:
+async def test_work_that_hangs_raises_hung_and_is_reported_until_later_work_succeeds() -> None:
     go_on = threading.Event()
     threads = supervisor()
     with pytest.raises(Hung, match=r"history: not done within 0.01 s; does the disk answer\?"):
@@ -319,14 +320,16 @@ async def test_hanging_work_raises_hung_and_is_reported_until_work_succeeds() ->
     with pytest.raises(Hung, match="history: 1 earlier tasks of this name are not done"):
         await threads.within("history", 0.01, go_on.wait, most=1)
     assert threads.under_way == ["history"]
-    assert await threads.within("history", 60, lambda: 4) == 4  # the disk answers again
+    assert await threads.within("history", 60, lambda: 4) == 4  # as if the disk answered again
     assert threads.hung == {}
     go_on.set()
     while threads.under_way:
         await asyncio.sleep(0)
 
 
-def test_within_raises_an_error_if_no_thread_can_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_supervisor_within_raises_an_error_if_no_thread_can_be_started(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def fail(thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 
@@ -339,7 +342,7 @@ def test_within_raises_an_error_if_no_thread_can_be_started(monkeypatch: pytest.
     assert asyncio.run(live()) == []
 
 
-def test_in_time_returns_results_and_raises_hung_after_the_limit() -> None:
+def test_function_in_time_returns_a_result_or_raises_hung_after_the_limit() -> None:
     go_on = threading.Event()
 
     def fail() -> None:
