@@ -1,4 +1,4 @@
-"""Tables of rows in PostgreSQL: one row per exchange, with an array of its values.
+"""Tables of rows in PostgreSQL: one row per exchange (request and reply), with an array of its values.
 
 | table or view             | content                                                                   |
 |---------------------------|---------------------------------------------------------------------------|

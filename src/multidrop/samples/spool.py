@@ -2,14 +2,14 @@
 
 | in the folder         | content                                                              |
 |-----------------------|----------------------------------------------------------------------|
-| `spool.json`          | gateway, and the id of the log whose messages are numbered here      |
-| `NUMBER-ROWS.arrows`  | a message: its sequence in the log, and its rows                     |
-| `NUMBER-ROWS.damaged` | a message that was the newest, and that the disk stored only in part |
+| `spool.json`          | the gateway's name, and the id of this folder's log                  |
+| `NUMBER-ROWS.arrows`  | a message: its sequence number in the log, and its number of rows    |
+| `NUMBER-ROWS.damaged` | the newest message of an earlier run, if the disk stored only a part |
 | `.spool.lock`         | locked by the process that writes here                               |
 
-A file is synced to the disk under a temporary name and then renamed. The newest message is never
-removed, because the next message's number is one above the number of the newest. A log's id is created
-with its folder: a new disk starts a new log.
+A log is the sequence of all messages that were written into one folder. Its id is created with the folder, so
+a new disk starts a new log. A file is synced to the disk under a temporary name and then renamed. The newest
+message is never removed, because the next message's number is one above the number of the newest.
 """
 
 from __future__ import annotations

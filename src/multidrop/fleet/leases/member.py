@@ -6,10 +6,12 @@
     WORKING   The gateway claims and polls every line of its share.
     DRAINING  The gateway releases all lines and claims none.
 
-When the last line is closed before the lease expires, the kernel's timer is cancelled. The engine sends
-nothing after the deadline, even if ports are open. But a port that is still open may hold unsent bytes in the
-system's buffers, and only closing discards them. So the timer kills a process that is suspended before it has
-closed its ports. A session continues if it is renewed before another gateway has ended it.
+A kernel timer kills this process half of the guard time after the lease has expired. The timer is cancelled
+if all lines were closed before the lease expires. The engine sends no byte after the deadline, even if ports
+are open. But a port that is still open may hold unsent bytes in the system's buffers, and only closing
+discards them. So the timer must kill a process that was suspended before it has closed its ports.
+
+A session continues if it is renewed before another gateway has ended it.
 """
 
 from __future__ import annotations
@@ -108,8 +110,9 @@ class Releases:
     def due(self, lines: Set[str], wait_s: float = SILENT_SERVER_S) -> set[str]:
         """Return the lines in `lines` that may be closed now; the other lines must wait.
 
-        At least two buckets must be ready. One of them must be the line's first bucket, whose record may have
-        two votes. A server that is silent for longer than `wait_s` seconds is ignored.
+        A bucket is ready if it has a leader and no silent server. At least two buckets must be ready,
+        including the line's first bucket, whose record may have two votes. A server that is silent for longer
+        than `wait_s` seconds is ignored.
         """
         self._has_lines = bool(lines)
         waited_since = self._clock() - wait_s
@@ -316,7 +319,7 @@ class Member:
             await asyncio.sleep(STEP_S)
 
     async def _guard(self) -> None:
-        """Close the lines before the lease expires; then cancel the kernel's timer."""
+        """Close the lines before the lease expires; then cancel the timer that would kill this process."""
         is_armed = was_late = False
         while True:
             if self.keeper.may_poll:

@@ -365,7 +365,7 @@ class OwnerRecords:
         return {bucket for bucket, moment in zip(names.OWNERS, sent, strict=True) if moment < since}
 
     async def claim(self, claims: Mapping[str, Claim]) -> None:
-        """Write the first records of these claims; also write the spare records if a bucket answers late.
+        """Write the `first` records of these claims, and also the `spare` records if a bucket answers late.
 
         A refused claim is repeated soon with newer records. So after a refusal, do not wait for further
         answers, which a bucket without a leader would not give.

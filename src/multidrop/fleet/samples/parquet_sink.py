@@ -6,9 +6,9 @@
 | `tens/FIRST-LAST.BEGIN-END.parquet`     | the same messages, one row per ten seconds of a register  |
 | `.hub.lock`                             | locked by the process that writes here                    |
 
-A file is renamed to its final name once it is synced to the disk: that commits its rows and LAST. The newest
-file has the number of each source's last message, and must be kept. BEGIN and END are UTC and enclose all
-times.
+FIRST and LAST are stream positions. BEGIN and END are UTC and enclose all times. A file is renamed to its
+final name once it is synced to the disk. This commits its rows, and LAST as the stored position. The newest
+file has the number of each gateway's last message, and must be kept.
 """
 
 from __future__ import annotations
