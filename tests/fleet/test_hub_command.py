@@ -274,15 +274,15 @@ def test_the_files_of_a_past_hour_are_merged_into_one(sink: ParquetSink, tmp_pat
     for path in sorted((tmp_path / "rows").glob("*.parquet"))[3:]:
         path.unlink()
     assert names(tmp_path, "rows")[-1] == "00000017-00000024"
-    assert sink.begin("made") == StoredPosition(
-        24, {"a.x": 24}
-    )  # the hub's stored position is also in merged files
+    # merged files contain the hub's stored position too
+    assert sink.begin("made") == StoredPosition(24, {"a.x": 24})
 
 
+# keeps the normal priority: with the lowest one, the process takes minutes on a busy machine
 USUAL_PRIORITY = """
 import os
 os.nice = os.sched_setscheduler = lambda *details: 0
-"""  # keeps the normal priority: with the lowest one, the process takes minutes on a busy machine
+"""
 
 
 class Broken(Exception):

@@ -359,9 +359,8 @@ class LeaseModel:
         """Return a representative of all states with the same future."""
         if not self.has_cas:
             return path
-        seen = (
-            path.seen if path.seen and path.seen[0] else None
-        )  # the observed revision was replaced, so the taker cannot end it
+        # if the observed revision was replaced, the taker cannot end the record
+        seen = path.seen if path.seen and path.seen[0] else None
         request = path.request if path.ended is None else None
         return path._replace(seen=seen, request=request, ending=path.ending or None)
 
