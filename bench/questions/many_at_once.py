@@ -137,7 +137,7 @@ class Round:
             self.count(rows=len(rows), values=len(values), misattributed=len(wrong))
 
     def come_and_go(self, chance: random.Random) -> None:
-        """Remove a drive and add it again. If another thread has just removed it, count this instead."""
+        """Remove a drive and add it again; only count the attempt if another thread was faster."""
         line = chance.choice(self.plant.lines)
         polled = chance.choice(line.drives[:-1])
         try:

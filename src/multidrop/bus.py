@@ -313,10 +313,11 @@ class Bus:
 
         If `identify` has confirmed that all drives are of one family with a stop broadcast, that broadcast is
         sent first. Then each drive in turn is sent its stop. A stop is repeated until the motor is seen to
-        stand still, for at most `seconds`; by default for at least 30 s, and as long as the ramp may take. An
-        invalid `seconds` is logged and ignored. The failure of one drive's stop is in its result, and never
-        ends the other stops. Calls that move a motor, made before or during this call, raise CancelledByStop.
-        If this call is interrupted, each drive whose motor is not seen to stand still gets one more stop.
+        stand still, for at most `seconds`. By default it is repeated for 30 s, and the last repetition may
+        last as long as the motor's ramp. An invalid `seconds` is logged and ignored. The failure of one
+        drive's stop is in its result, and never ends the other stops. Calls that move a motor, made before or
+        during this call, raise CancelledByStop. If this call is interrupted, each drive whose motor is not
+        seen to stand still gets one more stop.
         """
         run: StopRun | None = None
         tried = 0

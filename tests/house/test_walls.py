@@ -194,7 +194,7 @@ def test_no_import_cycles_between_files() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("client", CLIENTS)
 def test_gateway_and_fleet_import_only_public_names(client: str) -> None:
-    """Check that users could write such a client too, because it imports only public names."""
+    """So a user could write a program such as the gateway."""
     found = {
         str(path.relative_to(PACKAGE)): {
             name for name in _imported(path) if name.startswith("multidrop.") and not _is_public(name, client)

@@ -38,7 +38,7 @@ def look(ramp: Path) -> Recording:
 
 
 def drive_plan(silence_ms: float, reply_characters: int, *registers: str) -> dict[str, Any]:
-    """Return a drive's part of a plan. A character takes 1 ms, and a request has 8 characters."""
+    """Return a drive's entry in a plan. A character takes 1 ms, and a request has 8 characters."""
     block = {"registers": [*registers], "every_ms": None, "request_characters": 8}
     return {
         "exchanges_per_second": 20.0,

@@ -351,7 +351,7 @@ class LiveTable:
 class Keys:
     """The keys of `poll`: `m` starts a comment, which gets the time of this key press; `t` is a trigger.
 
-    A comment is a row of the recording, so without one the key `m` only shows NO_RECORDING.
+    A comment is a row of the recording, so without a recording the key `m` only shows NO_RECORDING.
     """
 
     def __init__(

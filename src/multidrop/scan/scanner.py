@@ -322,7 +322,7 @@ def identify(
 
 
 def _score(drive: Drive, ask: Ask) -> int:
-    """Return the number of identity checks that the drive passes. Raises BusError or ValueError if not."""
+    """Return how many identity checks the drive passes. Raises BusError or ValueError if one fails."""
     score = 0
     if type(drive).identify is not Drive.identify:
         _run(drive, drive.identify.script(), ask)

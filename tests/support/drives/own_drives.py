@@ -16,7 +16,7 @@ class Run(IntEnum):
 
 
 class Fan(Drive):
-    """A fan controller that starts and stops with one ordinary setting."""
+    """A fan controller whose motor is started and stopped by one register, an ordinary setting."""
 
     model = "fan"
     speed = reading(0x0010, "rpm", step=1)

@@ -104,7 +104,10 @@ class FleetProcesses:
 
 
 class FleetDrill(FleetProcesses):
-    """A fleet drill; each round performs an action and measures the resulting gaps on the lines."""
+    """A fleet drill: its rounds attack a fleet.
+
+    Each round measures the longest time without requests on each line.
+    """
 
     def __init__(
         self,
@@ -120,7 +123,7 @@ class FleetDrill(FleetProcesses):
         super().__init__(folder, nats, self.hall.plant(), places)
 
     def settle(self) -> None:
-        """Restart dead processes, and wait until every gateway, lease, path and leader is in place."""
+        """Restart dead processes; wait until lines are polled, and leases and leaders are as at the start."""
         for node in self.nats.nodes:
             with suppress(ProcessLookupError):
                 node.go_on()

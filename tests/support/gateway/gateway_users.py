@@ -231,7 +231,7 @@ async def _get(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, path:
 
 
 class GatewayUsers:
-    """The users' process, seen from its parent."""
+    """Controls the users, who run in a process of their own."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process

@@ -132,7 +132,7 @@ def certificate(folder: Path, name: str) -> None:
 
 
 def tokens() -> tuple[dict[Right, str], tuple[Token, ...]]:
-    """Return a secret by right, and the tokens for these secrets."""
+    """Return a secret for each right, and the tokens that have these secrets."""
     made = {right: new_token(name, right) for right, name in NAMES.items()}
     return {right: secret for right, (secret, _) in made.items()}, tuple(token for _, token in made.values())
 

@@ -25,7 +25,7 @@ CODES = {  # exception code by the text that libmodbus has for it
 
 
 class Mbpoll:
-    """The program mbpoll, started for each request.
+    """A Modbus client that runs the program mbpoll for each request.
 
     `where` is a host or a serial port; `options` are further options of the program.
     """
@@ -60,7 +60,7 @@ def _code(shown: str) -> int:
 
 
 class Libmodbus:
-    """The library libmodbus in a C program; `where` is a port of 127.0.0.1 or the path of a serial port."""
+    """A Modbus client in C with libmodbus; `where` is a port of 127.0.0.1 or the path of a serial port."""
 
     def __init__(self, where: int | str, built: Path) -> None:
         self._process = subprocess.Popen(

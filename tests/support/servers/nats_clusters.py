@@ -106,7 +106,7 @@ class Node:
         self.process.wait()
 
     def pause(self) -> None:
-        """Suspend the server, and wait until all its threads are suspended: until then, one could answer."""
+        """Suspend the server; return when all its threads are suspended, so that none of them answers."""
         os.kill(self.process.pid, signal.SIGSTOP)
         os.waitid(os.P_PID, self.process.pid, os.WSTOPPED)
 

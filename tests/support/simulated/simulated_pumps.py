@@ -100,7 +100,7 @@ def write_plant(folder: Path, drives: Sequence[int], serve: str = "", every: str
 
 
 class SimulatedPumps:
-    """The simulator process, seen from its parent."""
+    """Controls the simulator, which runs in a process of its own."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process

@@ -294,7 +294,10 @@ def bus_over(
 
 
 def read_truly(opened: Bus, line: PathLine, drives: Sequence[Drive]) -> None:
-    """Read four registers of each drive in turn, repeatedly; check that each value is of its register."""
+    """Read four registers of each drive in turn, again and again.
+
+    Check that each value belongs to the register that was read.
+    """
     asked = [(drive, register) for drive in drives for register in drive.readings()[:4]]
     read: Counter[str] = Counter()
     with opened:

@@ -214,7 +214,7 @@ class LiveDrive:
         return not row.value and values is not None and issubclass(values, Flag)
 
     def remember(self) -> None:
-        """Add a point to the history: the frequency, or the first polled register if it is not polled."""
+        """Add a point to the history: the frequency or, if it is not polled, the first polled register."""
         polled = [poll.register.name for poll in self.polled.polls]
         name = FREQUENCY if FREQUENCY in polled else next(iter(polled), "")
         fresh = name in self.newest and name not in self.missed
