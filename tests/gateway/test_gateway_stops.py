@@ -263,7 +263,7 @@ def test_a_stop_works_while_all_gateway_parts_fail(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_new_drive_is_stopped_while_its_predecessor_is_still_being_stopped(
+def test_a_stop_works_while_polled_values_and_page_frames_cannot_be_processed(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     start(gateway, "pump-1", "pump-2")

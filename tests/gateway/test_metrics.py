@@ -135,7 +135,7 @@ def test_metrics_contain_values_states_and_counters(tmp_path: Path) -> None:
         until(lambda: families(gateway)["multidrop_line_samples"].samples[0].value > 8)
         assert found["multidrop_line_samples"].type == "counter"
         assert found["multidrop_build"].samples[0].labels == {"version": gateway.gateway.version}
-        delays = {  # of drives that have replied; updated once a second
+        delays = {  # delays appear when a drive has replied; updated once a second
             (one.name.removeprefix("multidrop_response_delay_seconds"), one.labels.get("quantile"))
             for one in families(gateway)["multidrop_response_delay_seconds"].samples
         }
@@ -206,7 +206,9 @@ def test_prometheus_scrapes_each_second_and_values_of_a_silent_drive_are_stale(t
         jobs = JOBS.format(port=gateway.gateway.port, secret=gateway.secrets[Right.LOOK])
         with scraping(tmp_path, jobs) as prometheus:
             until(lambda: drives(prometheus) == {"pump-1", "pump-2"})
-            until(lambda: prometheus.targets()["stranger"][0] != "unknown")  # until the first scrape
+            until(
+                lambda: prometheus.targets()["stranger"][0] != "unknown"
+            )  # Prometheus has tried this target
             assert prometheus.targets() == {
                 "known": ("up", ""),
                 "stranger": ("down", "server returned HTTP status 401 Unauthorized"),

@@ -67,7 +67,7 @@ def test_reloads_start_and_change_and_end_the_modbus_server(gateway: Served) -> 
     until(lambda: status_of(first, 21) == [3])
     server = gateway.gateway.feeds["modbus"]
     assert reload(gateway, MODBUS.format(first, 21)) == IN_EFFECT
-    # its table has not changed, so its clients stay connected
+    # the table is unchanged, so the server and its clients stay
     assert gateway.gateway.feeds["modbus"] is server
     assert reload(gateway, MODBUS.format(second, 22)) == IN_EFFECT
     until(lambda: status_of(second, 22) == [3])

@@ -86,7 +86,7 @@ def dead(gateway: Served) -> Any:
     return answer.json["dead"]
 
 
-def test_a_gateway_has_only_the_tasks_and_threads_in_the_lists(gateway: Served) -> None:
+def test_a_gateway_has_exactly_the_expected_tasks_and_threads(gateway: Served) -> None:
     assert in_loop(gateway.loop, lambda found: set(found.kept)) == TASKS
     assert gateway.get("/health").json["dead"] == {}
     names = {thread.name for thread in threading.enumerate() if "multidrop" in thread.name}

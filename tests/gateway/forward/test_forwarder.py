@@ -134,7 +134,7 @@ def test_a_full_spool_deletes_its_oldest_rows_and_counts_them_as_lost(tmp_path: 
     full.spool.close()
 
 
-def test_messages_already_sent_do_not_count_as_lost_when_a_full_spool_deletes_them(tmp_path: Path) -> None:
+def test_sent_messages_that_a_full_spool_deletes_do_not_count_as_lost(tmp_path: Path) -> None:
     """The full spool deletes messages 1 to 3. Message 3 had been sent, so only the rows of two are lost."""
     clocked = Clocked(tmp_path / "spool", most=1)
     clocked.spool.acknowledge(3, [(1, 2)])

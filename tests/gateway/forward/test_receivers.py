@@ -252,7 +252,7 @@ def test_broker_that_is_away_for_two_hours_gets_each_row_once(tmp_path: Path) ->
         range(300)
     )
     first = parse_time(received[0]["rows"][0]["time"])
-    assert first >= NOON + 295 * STEP  # from the last of the 60 messages
+    assert first >= NOON + 295 * STEP  # the newest message is sent first
     assert [one["historical"] for one in received] == [*[False] * 4, *[True] * 59 * 4]
 
 

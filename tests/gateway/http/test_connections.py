@@ -184,7 +184,7 @@ def test_a_connection_is_closed_if_it_stays_without_a_request_too_long(
     connections.sweep()
     assert [is_ended(pair) for pair in pairs[1:3]] == [False, True]
     assert (len(connections), connections.ended) == (1, 2)
-    connections.finish(("10.0.0.9", 9))  # unknown client address: ignored
+    connections.finish(("10.0.0.9", 9))  # an unknown client, which is ignored
     assert len(connections) == 1
 
 

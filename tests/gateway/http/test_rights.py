@@ -309,7 +309,7 @@ def test_after_five_wrong_tokens_an_address_is_refused_but_may_stop(tmp_path: Pa
         for at in range(MOST_WRONG):
             assert gateway.get("/api/plant", **anna, authorization=f"Bearer wrong-{at}").status == 401
         assert gateway.get("/api/plant", **wrong).status == 429
-        assert gateway.get("/api/plant", **right).status == 429  # refused although the token is valid
+        assert gateway.get("/api/plant", **right).status == 429
         assert gateway.post("/api/token", {"token": gateway.secrets[Right.STOP]}, **anna).status == 429
         assert gateway.post(*STOP, **right).json["pump-1"]["done"] is True
         assert gateway.post(*STOP, **wrong).status == 401
@@ -323,7 +323,7 @@ def test_after_five_wrong_tokens_an_address_is_refused_but_may_stop(tmp_path: Pa
         assert gateway.get("/api/plant", **right).status == 200
 
 
-def test_callers_behind_a_proxy_are_not_local(tmp_path: Path) -> None:
+def test_callers_behind_a_proxy_do_not_count_as_local(tmp_path: Path) -> None:
     """The proxy runs on this machine, but its clients may be elsewhere."""
     with served(tmp_path, LOOPBACK_STOPS, behind_proxy=True) as gateway:
         for told in ({}, {"x_forwarded_for": "127.0.0.1"}, {"x_forwarded_for": "10.0.0.7, ::1"}):
@@ -439,7 +439,7 @@ def test_callers_with_the_role_stop_can_only_stop(way: str) -> None:
 
 
 @table("way", WAYS)
-def test_writes_not_listed_in_the_settings_are_refused_even_with_the_right_to_write(way: str) -> None:
+def test_writes_not_listed_in_the_settings_are_refused_despite_the_right_to_write(way: str) -> None:
     rules = rules_of(May(), way, Right.WRITE)
     listed = {verb: rules[verb] for verb in VERBS if verb != "stop"}
     assert {*listed.values()} == {NEVER_THIS_WAY if way == "modbus" else NOT_LISTED}

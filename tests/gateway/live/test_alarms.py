@@ -118,7 +118,7 @@ def test_an_unknown_state_has_a_reason_and_a_new_yd1000_fault_record_is_a_fault(
         ("delixi-native", ("status",), True),
     ],
 )
-def test_can_show_fault_depends_on_the_polled_registers(
+def test_ability_to_show_a_fault_depends_on_the_polled_registers(
     model: str, polled: tuple[str, ...], is_seen: bool
 ) -> None:
     assert can_show_fault(MODELS[model](1), polled) is is_seen
@@ -156,10 +156,10 @@ def test_a_motor_that_stops_without_a_command_raises_an_alarm(standing: Shown) -
     events.look(6000, "pump-1", RUNS, 0)
     told = [("pump-1", "stopped", 3000, 6000)]
     assert seen(events) == told
-    # Here a stop was called (stops = 1).
+    # stops = 1: a stop was called
     for time, shown, stops in ((7000, standing, 1), (9000, standing, 1), (10000, RUNS, 1)):
         events.look(time, "pump-1", shown, stops)
-    # None: a jog or setpoint 0 may have ended the run
+    # stops = None: a jog or setpoint 0 may have ended the run
     for time, stops in ((11000, None), (13000, 1)):
         events.look(time, "pump-1", standing, stops)
     assert seen(events) == told
@@ -237,7 +237,7 @@ def test_alarms_from_before_a_restart_continue_or_end() -> None:
     assert [one.note for one in events.between(0, 999) if one.by] == ["seen"]
 
 
-def test_alarms_from_before_a_restart_that_are_read_late_are_merged_with_new_alarms() -> None:
+def test_alarms_from_before_a_restart_are_merged_with_alarms_raised_meanwhile() -> None:
     """A slow disk may return the alarms from before a restart after new alarms were raised."""
     events = Alarms(100)
     events.look(101, "pump-1", Shown("fault", "overheat"))
@@ -277,7 +277,7 @@ def test_the_last_line_of_each_alarm_in_the_alarm_file_is_used(tmp_path: Path) -
         file.write(b'{"id": "trunc')
     assert past_of(path) == [ALARM._replace(ended=5), ALARM._replace(time=9)]
     kept = started(path)
-    kept.note(ALARM._replace(time=10))  # a line after the truncated one
+    kept.note(ALARM._replace(time=10))  # this line follows the truncated line
     kept.close()
     assert len(past_of(path)) == 3
 
@@ -434,7 +434,7 @@ BELOW = Limit("pump", "pressure", "bar", False, 1.0, hysteresis=0.5)
     ("values", "beyond"),
     [
         ([31, 31, 31, 31, 31, 31], [False, False, False, False, False, True]),
-        ([31, 31, 29, 31, 31, 31], [False] * 6),  # 29 A restarts the duration of 5 s
+        ([31, 31, 29, 31, 31, 31], [False] * 6),  # 29 is within the limit, so the duration restarts
         ([31, 31, 31, 31, 31, 31, 28.5, 28.0], [False] * 5 + [True, True, False]),
         ([31, 31, 31, 31, None, 31, 31], [False] * 7),  # a missing value restarts the duration
         ([31, 31, 31, 31, 31, 31, None, 29], [False] * 5 + [True] * 3),

@@ -460,7 +460,7 @@ def test_the_common_block_has_no_number_for_values_of_unknown_scale() -> None:
     assert [number(pump, at) for at in COMMON] == [2500, 2500, NO_NUMBER]
 
 
-def test_the_metric_for_values_of_unknown_scale_is_named_raw() -> None:
+def test_the_prometheus_metric_for_values_of_unknown_scale_is_named_raw() -> None:
     drive = DelixiModbus(1, name="fan")
     hub = FullHub(plant(line("/dev/null", polled(drive, [drive.output_frequency, drive.output_current]))))
     found = {
@@ -474,7 +474,7 @@ def test_the_metric_for_values_of_unknown_scale_is_named_raw() -> None:
     }
 
 
-def test_metrics_are_in_base_units() -> None:
+def test_prometheus_metrics_are_in_base_units() -> None:
     registers = {
         register.value_unit: base_unit(register)
         for family in MODELS.values()

@@ -191,7 +191,7 @@ def test_viewing_does_not_read_a_silent_drive(gateway: Served) -> None:
 
 
 @pytest.mark.long
-def test_lines_show_the_delays_of_each_drive(gateway: Served) -> None:
+def test_api_lines_returns_the_reply_delays_of_each_drive(gateway: Served) -> None:
     until(lambda: gateway.get("/api/lines").json["hall"]["minutes"])
     line = gateway.get("/api/lines").json["hall"]
     assert line["lost"] is None
@@ -323,7 +323,7 @@ def test_figures_of_a_line_without_replies_are_none_instead_of_zero(
 ) -> None:
     assert recent.line("hall")["misses"] is None
     for second in range(100):
-        # these statistics contain no reply
+        # statistics without any reply
         recent.tick(float(second), second * 1000, {"hall": reading(second)})
     assert recent.line("hall")["p99"] is None
     plant = written(tmp_path)

@@ -115,18 +115,18 @@ def test_bits_read_from_a_drive_are_packed_with_the_first_bit_lowest() -> None:
 
 def test_undeclared_addresses_are_refused_by_default(gateway: Gateway) -> None:
     assert code(gateway, 1, 3, 0x7000, 1) == 2
-    assert code(gateway, 1, 4, CHE_OUTPUT_VOLTAGE, 1) == 2  # declared only for function 3
+    assert code(gateway, 1, 4, CHE_OUTPUT_VOLTAGE, 1) == 2  # this register is declared only for function 3
     assert code(gateway, 4, 3, 0, 1) == 2  # the drive of unit id 4 does not use Modbus
     assert gateway.line.asked == []
 
 
-def test_passing_any_lets_clients_read_undeclared_addresses_from_the_drive() -> None:
+def test_the_option_passing_any_lets_clients_read_undeclared_addresses() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="any")) as gateway:
         assert code(gateway, 1, 4, 0x7000, 2) is None
         assert gateway.line.asked == [("mill", 4, 0x7000, 2)]
 
 
-def test_passing_off_answers_reads_without_requests_on_the_line() -> None:
+def test_the_option_passing_off_answers_reads_without_requests_on_the_line() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="off")) as gateway:
         gateway.hub.values["mill", "output_voltage"] = 231.0
         assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) is None
@@ -148,7 +148,9 @@ def test_values_polled_before_a_write_are_not_used_after_it(gateway: Gateway) ->
     gateway.hub.ages["mill", "output_voltage"] = 0.2
     with gateway.client() as client:
         assert client.ask(1, 6, CHE_SETPOINT, 5000).code is None
-        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]  # the drive's own answer
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [
+            CHE_OUTPUT_VOLTAGE
+        ]  # read from the drive, not taken from polled values
         gateway.hub.ages["mill", "output_voltage"] = 0.0
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
 
@@ -160,7 +162,9 @@ def test_values_polled_before_a_command_are_not_used_after_a_reload(gateway: Gat
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
         gateway.commands.ended["mill"] = time.monotonic_ns()
         gateway.server.adopt(plant())
-        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]  # the drive's own answer
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [
+            CHE_OUTPUT_VOLTAGE
+        ]  # read from the drive, not taken from polled values
 
 
 @table("function", [1, 2, 3, 4])

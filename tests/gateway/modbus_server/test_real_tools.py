@@ -127,7 +127,7 @@ def writes(tool: Any, address: int, value: int) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", usually(*TOOLS))
-def test_a_tool_reads_the_drives_and_cannot_write_by_default(name: str, tmp_path: Path) -> None:
+def test_a_modbus_tool_reads_the_drives_and_cannot_write_by_default(name: str, tmp_path: Path) -> None:
     with connected(name, tmp_path, SERVE) as (gateway, tool):
         sim, polled = gateway.sims["pump-1"], gateway.gateway.poller.statistics()  # type: ignore[union-attr]
         assert read(tool, OUTPUT_VOLTAGE, 2) == [VOLTAGE, 0]

@@ -161,7 +161,7 @@ def test_all_mistakes_in_the_modbus_settings_are_reported_together() -> None:
     assert len(str(mistake.value).splitlines()) == 4
 
 
-def test_only_listed_clients_may_connect_or_local_clients_without_a_list() -> None:
+def test_listed_clients_may_connect_and_without_a_list_only_local_clients() -> None:
     alone = ModbusSettings()
     assert [alone.may_connect(address) for address in ("127.0.0.1", "::1", "10.0.0.5")] == [True, True, False]
     named = ModbusSettings(listen="0.0.0.0:1502", clients=("10.0.0.0/24", "fe80::1"))

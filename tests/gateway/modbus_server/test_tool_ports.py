@@ -291,9 +291,7 @@ def test_a_tool_port_refuses_and_records_each_write_by_default(tmp_path: Path) -
         assert len(rig.commands.refused) < 6  # at most one record a second
 
 
-def test_a_tool_with_the_right_to_write_writes_setpoints_and_stops_but_never_starts(
-    rig: Rig, tool: int
-) -> None:
+def test_a_tool_with_the_right_to_write_can_set_and_stop_but_never_start_a_drive(rig: Rig, tool: int) -> None:
     assert code(tool, f"01 06 {SETPOINT:04X} 1388") is None
     drive, register, value, caller = rig.commands.written[0]
     assert (drive, register, value) == ("mill", "setpoint", 50.0)
@@ -406,7 +404,7 @@ def test_a_symlink_is_replaced_only_if_a_killed_gateway_made_it(tmp_path: Path) 
     killed._lock.close()  # the kernel also releases the lock of a killed process
     present = Terminal(link)
     killed.close()
-    assert link.is_symlink()  # this link belongs to the terminal `present`
+    assert link.is_symlink()  # the link of the terminal `present`
     present.close()
     assert not link.is_symlink()
     with pytest.raises(OSError, match="No such file or directory"):

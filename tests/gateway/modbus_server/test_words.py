@@ -296,7 +296,7 @@ def test_a_request_that_arrives_byte_by_byte_is_parsed() -> None:
         "00 01 00 00 FF FF",
     ],
 )
-def test_address_0_is_reported_as_an_invalid_unit_id(header: str) -> None:
+def test_an_invalid_mbap_header_is_refused_before_the_rest_of_its_frame_arrives(header: str) -> None:
     with pytest.raises(InvalidHeader):
         take_request(bytearray.fromhex(header))
 

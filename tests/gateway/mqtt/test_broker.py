@@ -62,7 +62,7 @@ def said(topic: str, text: bytes = b"") -> Publication:
     return Publication(topic, lambda: text)
 
 
-def test_number_of_unacknowledged_messages_is_limited_and_only_the_newest_is_sent() -> None:
+def test_the_outbox_limits_unacknowledged_messages_and_then_sends_only_the_newest() -> None:
     wire = BreakableConnection()
     outbox = Outbox(wire.send)
     for round in range(100):
@@ -275,7 +275,7 @@ def test_polling_is_unchanged_while_the_mqtt_broker_is_frozen_or_gone(tmp_path: 
             told = gateway.get("/health").json["parts"]["mqtt"]
             assert told.startswith(f"no connection to 127.0.0.1:{broker.port}")
             lost = figures(gateway)["dropped_total"]
-            # messages of two publishing periods
+
             until(lambda: figures(gateway)["dropped_total"] >= lost + 2 * len(DRIVES))
         stopped = gateway.post("/api/stop").json
         assert {name: one["done"] for name, one in stopped.items()} == dict.fromkeys(DRIVES, True)
@@ -375,7 +375,7 @@ def now_ms() -> int:
 
 @pytest.mark.slow
 @on_nats
-def test_values_are_retained_and_the_will_message_reports_a_lost_gateway(
+def test_nats_retains_values_and_the_will_message_reports_a_lost_gateway(
     broker: RunningBroker, listener: Listener, start: Start
 ) -> None:
     _, running = start()
@@ -450,7 +450,7 @@ def test_a_broker_that_rejects_sparkplug_topics_does_not_delay_json_topics(
 
 @pytest.mark.slow
 @on_nats
-def test_a_sparkplug_host_gets_births_data_and_deaths_and_sends_commands_over_nats(
+def test_a_sparkplug_host_on_nats_gets_births_data_and_deaths_and_sends_commands(
     broker: RunningBroker, host: Host, start: Start
 ) -> None:
     known, running = start(sparkplug="works", node="line", commands=True)

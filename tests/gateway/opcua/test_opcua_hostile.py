@@ -111,7 +111,7 @@ def read_chunk(peer: socket.socket) -> bytes:
     return data
 
 
-def test_the_server_survives_replayed_messages_with_changed_bytes(gateway: Served) -> None:
+def test_the_opc_ua_server_survives_replayed_messages_with_changed_bytes(gateway: Served) -> None:
     """A client's recorded messages are replayed on a new channel, with random bytes of one changed."""
     with recorded(port_of(gateway)) as (url, sent), Client(url, timeout=PATIENCE) as client:
         plant = client.get_node(PLANT)
@@ -213,7 +213,7 @@ def test_subscriptions_of_a_vanished_client_end_with_its_session(gateway: Served
     until(lambda: set(there) == before)
 
 
-def test_a_request_for_too_many_nodes_is_refused(gateway: Served) -> None:
+def test_an_opc_ua_request_for_too_many_nodes_is_refused(gateway: Served) -> None:
     with Client(f"opc.tcp://127.0.0.1:{port_of(gateway)}/", timeout=PATIENCE) as client:
         state = client.get_node("ns=2;s=pump-1.State")
         limit = client.get_node(ua.ObjectIds.Server_ServerCapabilities_OperationLimits_MaxNodesPerRead)

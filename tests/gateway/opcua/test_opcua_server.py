@@ -152,7 +152,7 @@ async def test_an_opc_ua_server_that_was_closed_while_starting_accepts_no_client
 
 
 @pytest.mark.slow
-async def test_closing_the_last_server_frees_its_nodes_and_restores_python_settings(
+async def test_closing_the_last_opc_ua_server_frees_nodes_and_resets_python_settings(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The nodes are freed without a garbage collection.
@@ -479,7 +479,7 @@ NAMES = {  # names of OPC UA status codes (OPC 10000-6, A.2, StatusCode.csv)
         (MISS, None, False, "no valid value", ("Bad_SensorFailure", None, 7)),
     ],
 )
-def test_without_commands_the_only_command_topic_is_that_of_the_sparkplug_node(
+def test_each_row_has_the_expected_opc_ua_status_code(
     newest: tuple[int, int, float, int] | None,
     good: tuple[int, int, float, int] | None,
     is_current: bool,

@@ -7,7 +7,7 @@ import pytest
 from fake_gateway import FakeGateway
 from watching import Opener, press_enter, until, until_settled, violations
 
-pytestmark = pytest.mark.long  # starts Chromium, which takes time
+pytestmark = pytest.mark.long
 
 VIEWS = (
     "#/drives",

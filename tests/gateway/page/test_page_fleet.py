@@ -9,7 +9,7 @@ from fake_gateway import FakeGateway
 from watching import Opener, until, until_met
 
 NONE = "\u2013"  # a dash
-pytestmark = pytest.mark.long  # starts Chromium, which takes time
+pytestmark = pytest.mark.long
 
 
 def cells(page: Any, table: str) -> list[list[str]]:
@@ -148,7 +148,9 @@ def test_stop_all_in_the_fleet_view_stops_only_the_plant_and_says_so(
     until(page, "document.querySelector('#stopall').textContent === 'Stop all'")
 
 
-def test_stop_all_stops_the_whole_fleet_if_the_gateway_may(opened: Opener, gateway: FakeGateway) -> None:
+def test_stop_all_stops_the_whole_fleet_if_the_gateway_may_command_it(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     gateway.plant_changes = {"fleet_stop": True}
     gateway.fleet_outcomes = {"hall-9.pump": {"done": True, "text": "stopped"}}
     page = opened("#/fleet")

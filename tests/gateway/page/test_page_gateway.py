@@ -19,7 +19,7 @@ from watching import LIVE, STALE, Opener, cell, press_enter, until, until_met
 
 from multidrop.gateway.http.rights import Right
 
-pytestmark = pytest.mark.long  # starts Chromium, which takes time
+pytestmark = pytest.mark.long
 
 
 def test_the_web_page_shows_a_polled_plant_and_stops_it_with_a_token(page: Any, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from gateways import Served, served
 from lines import until as until_here
 from watching import AT_ITS_PLACE, LIVE, SIZES, VIEWS, Opener, until, until_settled
 
-pytestmark = pytest.mark.long  # starts Chromium, which takes time
+pytestmark = pytest.mark.long
 
 MAY = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
 # Try all ways by which a page could read or send without permission; return (way, outcome) for each.

@@ -13,7 +13,7 @@ import pytest
 from fake_gateway import FakeGateway
 from watching import LIVE, STALE, Opener, aborting, await_new_value, cell, link, until, until_met
 
-pytestmark = pytest.mark.long  # starts Chromium, which takes time
+pytestmark = pytest.mark.long
 
 DASH = "\u2013"
 OVER = "cell => cell.scrollWidth - cell.clientWidth"
@@ -127,7 +127,7 @@ def test_values_stay_old_when_the_gateways_clock_is_set_back(opened: Opener) -> 
     assert 42_000 <= age < 3_000_000
     assert is_old
     until(page, LIVE)
-    # as after a restart
+    # as after a restart: the drive has not been polled yet
     value, age, is_old = page.evaluate(SET_BACK, ["labeller", "output_frequency", False])
     assert value is None
     assert is_old
@@ -150,7 +150,9 @@ def test_values_of_a_slow_line_stay_current_as_long_as_the_gateway_reports(
     assert page.locator("tr.drive", has_text="pump-2").locator(".value.old").count() == 0
 
 
-def test_problems_other_than_lost_lines_are_shown(opened: Opener, gateway: FakeGateway) -> None:
+def test_problems_that_the_gateway_reports_are_shown_in_the_notice(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     gateway.changes = {"troubles": ["history: nothing is recorded: No space left on device", "mqtt: <b>"]}
     page = opened()
     notice = page.locator("#notice")

@@ -26,7 +26,7 @@ from watching import (
 
 from multidrop.control.stops import LEAST_S
 
-pytestmark = pytest.mark.long  # starts Chromium, which takes time
+pytestmark = pytest.mark.long
 
 
 def title(page: Any) -> Any:

@@ -13,7 +13,7 @@ from watching import Opener, cell, until, until_met
 
 from multidrop.gateway.clock import iso_time
 
-pytestmark = pytest.mark.long  # starts Chromium, which takes time
+pytestmark = pytest.mark.long
 
 DRAWN = "document.querySelectorAll('#trend-plots canvas').length === 2"
 
@@ -407,18 +407,18 @@ def test_on_a_phone_several_drives_can_be_plotted_with_different_line_styles(ope
     assert heads.all_inner_texts() == ["", ""]  # a plot of one drive needs no legend
     page.get_by_text("Drives and quantities").click()
     for name in ("pump-1", "filler-1"):
-        page.get_by_label(name, exact=True).check()  # the list stays open
+        page.get_by_label(name, exact=True).check()
     page.get_by_text("Drives and quantities").click()
     until_met(page, lambda: heads.first.locator("canvas").count() == 3)
     assert heads.first.inner_text().split() == ["pump-2", "pump-1", "filler-1"]
     marks = "marks => new Set(marks.map(mark => mark.toDataURL())).size"
-    assert heads.first.locator("canvas").evaluate_all(marks) == 3  # three different line styles
+    assert heads.first.locator("canvas").evaluate_all(marks) == 3
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     plot = page.locator("#trend-plots .plotbox").first
     before = plot.bounding_box()
     plot.hover(position={"x": 200, "y": 40})
     until_met(page, lambda: ":" in heads.first.inner_text())  # shows the time at the cursor
-    assert plot.bounding_box() == before  # the plot has not moved
+    assert plot.bounding_box() == before
 
 
 # Click one checkbox after the other, because each click draws the list again. Plots follow the last click.
@@ -525,7 +525,7 @@ def test_value_between_two_gaps_is_drawn_as_a_dot(opened: Opener) -> None:
 
 def test_a_rarely_polled_register_has_no_gaps_between_its_values(opened: Opener) -> None:
     """Values arrive every 0.6 s. One is missing, and later none is requested for 3 s."""
-    answers = {0: 20.0, 600: 21.0, 1200: None, 1800: 22.0, 4800: 23.0}  # values by time in ms
+    answers = {0: 20.0, 600: 21.0, 1200: None, 1800: 22.0, 4800: 23.0}  # value by time (ms)
     times = list(range(0, 4801, 300))
     mean = [answers.get(at) for at in times]
     told = {

@@ -13,7 +13,7 @@ from fake_gateway import FakeGateway
 from fake_plant import alarm, lines, ms
 from watching import SIZES, Opener, cell, until, until_met, until_settled
 
-pytestmark = pytest.mark.long  # starts Chromium, which takes time
+pytestmark = pytest.mark.long
 
 MINUTE_MS = 60_000
 # Draw a plot of one minute with a tick at its end; return True if a pixel at the right edge is drawn.

@@ -9,7 +9,7 @@ import pytest
 from fake_gateway import FakeGateway
 from watching import Opener, press_enter, until, until_met, until_still
 
-pytestmark = pytest.mark.long  # starts Chromium, which takes time
+pytestmark = pytest.mark.long
 
 # Moves the confirming button of the next dialogs to this point.
 CONFIRMED_AT = """([x, y]) => new MutationObserver(() => {
