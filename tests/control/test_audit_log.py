@@ -1,4 +1,4 @@
-"""The audit log has each write with its author, its frame, its outcome and the reason for the outcome."""
+"""The audit log records each write with its author, its frame, its outcome and the reason for the outcome."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_the_outcome_of_a_raw_request_is_recorded(
     assert entry["outcome"] == ("unconfirmed" if is_lost else "done")
 
 
-def test_the_audit_log_has_every_write(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_audit_log_records_every_write(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     log = tmp_path / "audit.jsonl"
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=log)
     drive.set_frequency(20)
@@ -66,7 +66,7 @@ def test_the_audit_log_has_every_write(monkeypatch: pytest.MonkeyPatch, tmp_path
     assert (noted[1]["drive"], noted[1]["address"], noted[1]["port"]) == ("invt-che@1", 1, "hall")
 
 
-def test_a_stop_is_sent_if_the_log_cannot_be_written(
+def test_a_stop_is_sent_even_if_the_audit_log_cannot_be_written(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1), audit="/dev/full")
@@ -155,7 +155,7 @@ def audited(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Audited
         yield made
 
 
-def test_every_kind_of_write_has_its_author(audited: Audited) -> None:
+def test_the_audit_log_names_the_author_of_every_kind_of_write(audited: Audited) -> None:
     bus, drive = audited.bus, audited.drive
     with written_by("anna", "web, 10.0.0.7"):
         drive.set_frequency(20)
@@ -185,8 +185,8 @@ def test_an_unconfirmed_write_is_recorded_with_its_author(audited: Audited) -> N
     assert audited.noted() == [("setpoint = 40.00 %", "anna", None)]
 
 
-def test_stops_after_a_failed_staggered_start_have_the_callers_author(audited: Audited) -> None:
-    """The records of the stops name the caller as author, although the stops run on new threads."""
+def test_stops_after_a_failed_staggered_start_are_recorded_with_the_callers_name(audited: Audited) -> None:
+    """The stops run on new threads, but their records name the author that was set in the caller's thread."""
     drive = audited.drive
     drive.set_frequency(20)
     audited.line.loses = lambda request: request.data == b"\0\1"
@@ -196,7 +196,7 @@ def test_stops_after_a_failed_staggered_start_have_the_callers_author(audited: A
     assert ("stop", "anna", None) in audited.noted()
 
 
-async def test_threads_and_tasks_do_not_mix_their_authors(audited: Audited) -> None:
+async def test_an_author_set_in_one_task_or_thread_does_not_apply_in_others(audited: Audited) -> None:
     drive, turn = audited.drive, asyncio.Lock()  # the simulated bus serves only one caller at a time
 
     async def write(name: str, hz: float, mine: asyncio.Event, other: asyncio.Event) -> None:
@@ -219,7 +219,7 @@ async def test_threads_and_tasks_do_not_mix_their_authors(audited: Audited) -> N
     assert audited.noted()[2:] == [("setpoint = 20.00 %", None, None)]
 
 
-def test_the_innermost_author_block_counts_until_its_end(audited: Audited) -> None:
+def test_a_write_has_the_author_of_the_innermost_written_by_block(audited: Audited) -> None:
     with written_by("anna", "web"):
         with written_by("boris"), suppress(ZeroDivisionError):
             audited.drive.set_frequency(20)
@@ -235,7 +235,7 @@ class Nameless:
         raise ZeroDivisionError
 
 
-NAMES: list[tuple[Any, str | None]] = [  # an author, and the author's name in the record of a stop
+NAMES: list[tuple[Any, str | None]] = [  # an invalid author, and its text in the record of a stop
     ("", None),
     ("  ", None),
     ("a\nb", r"a\nb"),
@@ -255,7 +255,7 @@ def test_with_an_invalid_author_only_a_stop_is_sent(
 ) -> None:
     bus, drive = audited.bus, audited.drive
     if is_way and who == "":
-        return  # an empty `way` is valid
+        return  # an empty way is valid, unlike an empty author
     drive.set_frequency(30)
     with written_by(*(("anna", who) if is_way else (who, "web"))):
         for call in (

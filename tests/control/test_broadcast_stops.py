@@ -1,4 +1,4 @@
-"""Broadcasts are sent only to drives of one confirmed family; no setpoint is broadcast after a stop."""
+"""A broadcast is sent only if all drives are of one confirmed family. A stop cancels earlier setpoints."""
 
 from __future__ import annotations
 
@@ -60,13 +60,13 @@ def broadcasts(line: SimulatedBus) -> list[Message]:
     return [request for request, _ in line.frames if request.address == 0]
 
 
-def test_there_are_families_with_broadcasts() -> None:
+def test_all_families_but_the_erman_have_broadcasts() -> None:
     assert set(BROADCASTING) == set(MODELS) - {"erman-er-g-220"}
 
 
 @every_broadcasting
 def test_stop_all_does_not_broadcast_if_families_differ(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
-    """The stop of one family may run a motor of the other family. Drives are attached in either order."""
+    """One family's stop may start a motor of the other family. Both orders of the drives are tested."""
     models = deque(MAKE)
     models.rotate(-models.index(model))
     check_stopped_without_broadcast(monkeypatch, *models)
@@ -129,7 +129,9 @@ class Quiet(Toy):
 
 
 @pytest.mark.parametrize("confirmed", [0, 1])
-def test_a_stop_broadcasts_only_stop_words(monkeypatch: pytest.MonkeyPatch, confirmed: int) -> None:
+def test_stop_all_broadcasts_no_command_that_is_not_a_stop(
+    monkeypatch: pytest.MonkeyPatch, confirmed: int
+) -> None:
     drives = [Quiet(address, confirmed=confirmed) for address in (1, 2)]
     line = SimulatedBus(monkeypatch, *(simulated(drive) for drive in drives))
     for drive in drives:
@@ -146,7 +148,9 @@ def test_a_stop_broadcasts_only_stop_words(monkeypatch: pytest.MonkeyPatch, conf
 
 
 @every_broadcasting
-def test_only_the_broadcast_of_a_stop_insists(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+def test_only_a_broadcast_stop_does_not_wait_for_late_replies(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
     line, drives, _ = line_of(monkeypatch, model, model)
     register = drives[0].control
     insists: list[bool] = []
@@ -163,7 +167,7 @@ def test_only_the_broadcast_of_a_stop_insists(monkeypatch: pytest.MonkeyPatch, m
 
 
 @pytest.mark.parametrize("is_sent", [False, True])
-def test_a_failed_broadcast_counts_as_sent_only_if_it_may_have_been_sent(
+def test_a_failed_broadcast_is_reported_as_sent_only_if_bytes_were_sent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_sent: bool
 ) -> None:
     audit = tmp_path / "audit"
@@ -191,7 +195,7 @@ def test_a_failed_broadcast_counts_as_sent_only_if_it_may_have_been_sent(
 def test_a_broadcast_is_refused_if_one_drive_is_of_another_family(
     monkeypatch: pytest.MonkeyPatch, address: int
 ) -> None:
-    """The address of a Goodrive's setpoint is that of a CHE's control word."""
+    """At the address of a CHE's control word, a Goodrive has its setpoint."""
     sims = [simulated(InvtCHE(at, maximum_frequency=50)) for at in (1, 2)]
     sims[address - 1]["device"] = 0x010A
     line = SimulatedBus(monkeypatch, *sims)
@@ -251,7 +255,7 @@ def test_a_setpoint_broadcast_is_cancelled_by_a_later_stop(
     monkeypatch: pytest.MonkeyPatch, moment: str
 ) -> None:
     line, drives, _ = line_of(monkeypatch, "invt-che", "invt-che")
-    line.sleep(60)  # after this silence the identities are checked again
+    line.sleep(60)  # after such a silence, the bus checks the identities again
     carry_out, begun = line.carry_out, len(line.frames)
 
     def stop_meanwhile(exchange: Exchange, **details: Any) -> Completion:
@@ -319,7 +323,9 @@ def test_a_stop_that_was_only_broadcast_is_reported_as_sent(monkeypatch: pytest.
         assert "sent 1 times, it was never confirmed" in told.why
 
 
-def test_notes_of_two_interruptions_say_that_the_stop_was_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_notes_of_an_interrupted_stop_all_count_the_broadcast_stop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, _, _ = line_of(monkeypatch, "invt-che", "invt-che")
 
     def press(request: Message) -> bytes | None:
@@ -337,7 +343,7 @@ def test_notes_of_two_interruptions_say_that_the_stop_was_broadcast(monkeypatch:
 # ---- a stop of all drives ----
 
 
-def test_only_stops_and_zeros_are_broadcast_and_nothing_on_a_mixed_line(
+def test_only_stops_and_zero_setpoints_are_broadcast_and_to_one_family_only(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
@@ -398,7 +404,7 @@ def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.Mon
     assert driver.now == over + 100 * MS
 
 
-def test_stop_all_broadcasts_if_safe_and_checks_each_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_all_broadcasts_a_stop_and_then_checks_each_drive(monkeypatch: pytest.MonkeyPatch) -> None:
     line, _, sims = che_drives(monkeypatch, 3, runs_s=1)
     begun = len(line.frames)
     stopped = line.bus.stop_all()

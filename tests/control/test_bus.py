@@ -98,11 +98,11 @@ def test_read_many_returns_values_in_the_requested_order() -> None:
         assert found == {register.name: proof(ours, register) for register in asked}
 
 
-REQUESTS = {  # number of requests that read all readings: from the register maps and limits of the manuals
+REQUESTS = {  # requests for all readings, from the manuals' register maps and limits
     ErmanERG220: 2,  # two reads: 1 to 12, including unused addresses, and 0400H to 0403H
     InvtCHE: 4,  # 1001H; 3000H to 3016H in two reads; 5000H and 5001H
     InnovertIBD: 2,  # PrA.03 and PrA.04 in one read; PrA.22 in another
-    DelixiModbus: 32,  # one at a time
+    DelixiModbus: 32,  # one register per request
     DelixiNative: 33,
     YD1000: 16,
 }
@@ -114,7 +114,7 @@ def test_all_readings_take_as_few_requests_as_the_family_allows(family: type[Dri
     there = EncodedDrive(family(1))
     with unpaced(there) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(family, 1)
-        ours.read(ours.readings()[0])  # the bus reads its first value twice; only later reads are counted
+        ours.read(ours.readings()[0])  # a new bus reads its first value twice: not counted
         before = bus.peer(ours).counters()
         requests = there.counters.requests
         found = ours.read_many(ours.readings())
@@ -156,7 +156,7 @@ def test_baud_rate_and_format_of_a_bus_are_used_by_drives_without_their_own() ->
 
 @patient
 def test_the_silence_of_a_bus_is_used_by_drives_without_their_own() -> None:
-    """A drive without its own silence keeps that of the bus, plus one bit time as for the standard's t3.5."""
+    """One bit time is added to the silence of the bus, as to the standard's t3.5."""
     drives = [simulated(ErmanERG220(at, silence=600e-6)) for at in (1, 2)]
     with Simulator([Wire(drives)]) as sim, Bus(sim.wires[0].path, silence=600e-6) as bus:
         for at in (1, 2):
@@ -171,7 +171,7 @@ def test_the_silence_of_a_bus_is_used_by_drives_without_their_own() -> None:
 
 
 @patient
-def test_eeprom_is_written_on_change_only() -> None:
+def test_a_value_that_the_eeprom_already_holds_is_not_written() -> None:
     rig = simulated(Rig(1))
     rig["limit"] = 10.0
     with unpaced(rig) as sim, Bus(path(sim)) as bus:
@@ -388,12 +388,14 @@ def test_a_wrong_confirmation_confirms_nothing(wrong: str) -> None:
     ("drive", "least_ms", "most_ms"),
     [
         (InvtCHE(1), 20, 400),
-        (YD1000(1), 110, 500),  # answers after 24 characters of 11 bits
+        (YD1000(1), 110, 500),  # the drive takes 24 characters of 11 bits to answer
         (YD1000(1, baudrate=2400), 440, 500),
         (YD1000(1, baudrate=1200), 500, 500),
     ],
 )
-def test_timeouts_are_within_the_document_s_limits(drive: Drive, least_ms: int, most_ms: int) -> None:
+def test_the_shortest_and_longest_timeout_of_a_drive_follow_its_manual(
+    drive: Drive, least_ms: int, most_ms: int
+) -> None:
     with unpaced(simulated(drive)) as sim, Bus(path(sim)) as bus:
         known = bus.peer(bus.attach(drive)).c
     assert (known.least_timeout_ns, known.most_timeout_ns) == (least_ms * 1_000_000, most_ms * 1_000_000)
@@ -456,7 +458,7 @@ def read_until_closed(bus: Bus, rig: Rig) -> None:
 def test_reads_on_a_bus_that_another_thread_closes_end_with_an_error() -> None:
     """Each call after the bus was closed raises an error.
 
-    Each bus has its own line: on the same line, the next bus would wait for late replies to the closed one.
+    Each round has a new line: on the old line, a new bus would wait for late replies to the closed bus.
     """
     for _ in range(20):
         with unpaced(simulated(Rig(1))) as sim:
@@ -506,10 +508,10 @@ def test_a_read_of_several_requests_ends_if_its_drive_is_detached() -> None:
         when_asked(bus, lambda: bus.detach(pump))
         with pytest.raises(NotAttached):
             pump.read(Single.output_frequency, Single.output_current, Single.fault)
-        assert peer.exchanges == 1  # no second request: another family may have its address now
+        assert peer.exchanges == 1  # no second request: another drive may have the address now
 
 
-def test_a_drive_attached_at_a_detached_drive_s_address_expects_its_late_replies() -> None:
+def test_a_new_drive_at_a_used_address_expects_late_replies_of_the_old_drive() -> None:
     """Otherwise the late reply to the old drive's request could be taken for the new drive's reply."""
     sim = simulated(Single(1))
     with Simulator([Wire([sim], unpaced=True)]) as simulator, Bus(simulator.wires[0].path) as bus:
@@ -522,7 +524,7 @@ def test_a_drive_attached_at_a_detached_drive_s_address_expects_its_late_replies
         def exchange_it() -> None:
             bus.detach(pump)
             taking.start()
-            taking.join(0.1)  # without a pending exchange, the attach would end immediately
+            taking.join(0.1)  # `attach` must wait for the pending exchange
             assert not taken
 
         when_asked(bus, exchange_it)

@@ -1,4 +1,4 @@
-"""Commands of a server on a drive: their results, and stops if the system has no thread left."""
+"""Commands that a server sends to a drive: their results, and stops if no thread can be started."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ class Motors:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("failure", [RuntimeError("can't start new thread"), MemoryError()])
-async def test_without_threads_every_stop_is_sent_before_waiting_for_a_motor(
+async def test_without_threads_every_motor_gets_a_stop_before_one_is_repeated(
     threads: Threads, failure: Exception
 ) -> None:
     threads.threads, threads.failure = 1, failure
@@ -173,7 +173,7 @@ async def test_without_threads_every_stop_is_sent_before_waiting_for_a_motor(
 
 
 @pytest.mark.slow
-def test_without_threads_the_event_loop_keeps_running_and_later_threads_are_used(threads: Threads) -> None:
+def test_stops_without_threads_do_not_block_the_event_loop(threads: Threads) -> None:
     motors = Motors(a=3, b=2)
     turns = 0
 
@@ -203,7 +203,7 @@ async def test_a_stop_without_effect_ends_with_the_outcome_unknown(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_patient")
-async def test_a_motor_is_stopped_if_no_thread_can_be_started(threads: Threads, tmp_path: Path) -> None:
+async def test_a_motor_is_stopped_even_if_no_thread_can_be_started(threads: Threads, tmp_path: Path) -> None:
     with desks(tmp_path) as desk:
         stopped = await desk.stop(drives=["pump"])
     assert stopped is not None
@@ -220,7 +220,7 @@ def test_a_command_is_not_sent_if_no_thread_can_be_started(threads: Threads) -> 
     assert result.text == "can't start new thread"
 
 
-async def test_stops_without_threads_go_on_if_their_callers_are_cancelled(threads: Threads) -> None:
+async def test_a_stop_without_threads_continues_if_its_caller_is_cancelled(threads: Threads) -> None:
     motors = Motors(a=2)
 
     (stopping,) = begin_stops([partial(motors.stop, "a")])
@@ -268,19 +268,20 @@ def on_threads(works: Sequence[StopWork]) -> list[StopFuture]:
     return [asyncio.get_running_loop().run_in_executor(None, work, None) for work in works]
 
 
-async def test_a_stop_called_while_another_is_repeated_is_sent_once() -> None:
+async def test_a_stop_called_while_another_stop_is_repeated_is_sent_but_not_repeated() -> None:
     pump, stops = NotedStops(), RepeatedStops(stop_noted, on_threads)
     drive: Any = pump
     repeated = asyncio.get_running_loop().create_future()
     stops.note([drive], repeated)
     called = [stops.send_once(drive) for _ in range(5)]
-    await until_met(lambda: pump.calls == [0.0])  # the first call sends; the other four wait together
+    # The first call sends a stop; the other four share the next stop.
+    await until_met(lambda: pump.calls == [0.0])
     pump.turns.release()
     await until_met(lambda: pump.calls == [0.0, 0.0])
-    called.append(stops.send_once(drive))  # a call after the second stop was sent
+    called.append(stops.send_once(drive))  # too late for the second stop: needs a third
     pump.turns.release(2)
     await until_met(lambda: pump.calls == [0.0, 0.0, 0.0] and not stops._sent)
-    await asyncio.sleep(0.05)  # all calls now wait for the repeated stop
+    await asyncio.sleep(0.05)  # now all calls wait for the result of the repeated stop
     assert not any(one.done() for one in called)
     called[1].cancel()  # the client disconnected
     repeated.set_result({"pump": STANDS})
@@ -288,7 +289,7 @@ async def test_a_stop_called_while_another_is_repeated_is_sent_once() -> None:
     assert stops.of(drive) is None
 
 
-async def test_a_second_stop_is_repeated_once_the_first_gives_up() -> None:
+async def test_a_second_stop_is_repeated_after_the_first_has_given_up() -> None:
     pump, stops = NotedStops(), RepeatedStops(stop_noted, on_threads)
     drive: Any = pump
     before = asyncio.get_running_loop().create_future()
@@ -306,7 +307,7 @@ async def test_a_second_stop_is_repeated_once_the_first_gives_up() -> None:
     assert (await called)["pump"].ok is False
 
 
-def test_a_stop_counts_as_repeated_from_its_call_to_its_end() -> None:
+def test_a_repeated_stop_is_in_progress_from_its_call_to_its_end() -> None:
     async def live() -> None:
         pump, stops = NotedStops(), RepeatedStops(stop_noted, on_threads)
         drive: Any = pump
@@ -331,7 +332,7 @@ def test_a_stop_counts_as_repeated_from_its_call_to_its_end() -> None:
     run_controlled(live())
 
 
-def test_drives_whose_stop_is_already_repeated_are_separated_from_other_drives() -> None:
+def test_divided_separates_the_drives_whose_stop_is_already_repeated() -> None:
     async def live() -> None:
         stops = RepeatedStops(stop_noted, on_threads)
         drives: list[Any] = [NotedStops(), NotedStops(), NotedStops()]
@@ -371,7 +372,7 @@ def test_a_line_is_stopped_as_a_whole_unless_one_of_its_drives_is_being_stopped(
 
 
 class TimedStops:
-    """Stops that last some seconds of the loop's time; the first `given_up` repeated stops do not succeed."""
+    """Stops that take 1 s each on the event loop's clock. The first `given_up` repeated stops fail."""
 
     def __init__(self, drive: Any, given_up: int) -> None:
         self.stops = RepeatedStops(self._stop, self._begin)
@@ -397,20 +398,20 @@ class TimedStops:
         repeated = asyncio.get_running_loop().create_future()
         self.stops.note([self._drive], repeated)
         called = self.stops.send_once(self._drive)
-        assert len(self.stops._tasks) == 1  # the set has the only reference to the task
+        assert len(self.stops._tasks) == 1  # asyncio itself holds no reference to the task
         asyncio.get_running_loop().call_later(seconds, repeated.set_result, {"pump": SILENT})
         told = (await called)["pump"]
         assert not self.stops._tasks
         return told
 
 
-def test_the_result_of_a_replacing_stop_is_returned() -> None:
+def test_a_stop_that_takes_over_from_an_unsuccessful_stop_returns_its_own_result() -> None:
     timed = TimedStops(NotedStops(), 0)
     assert run_controlled(timed.called_beside(10.0)) == STANDS
     assert timed.calls == [0.0, None]
 
 
-def test_a_second_stop_is_not_repeated_if_the_first_took_all_of_its_time() -> None:
+def test_a_stop_is_not_repeated_if_an_earlier_stop_used_up_its_time() -> None:
     timed = TimedStops(NotedStops(), 0)
     assert run_controlled(timed.called_beside(REPEATED_S + 1)) == SILENT
     assert timed.calls == [0.0]

@@ -46,7 +46,7 @@ def writes(ledger: Ledger) -> int:
 
 
 @pytest.mark.parametrize("room", range(0, 90, 10))
-def test_a_record_that_did_not_fit_on_the_disk_damages_no_other(tmp_path: Path, room: int) -> None:
+def test_a_record_that_does_not_fit_on_the_disk_damages_no_other_record(tmp_path: Path, room: int) -> None:
     path = tmp_path / "audit.jsonl"
     log, other = AuditLog(path), AuditLog(path)  # `other` stands for another process
     log.add(0, {"write": "first"})
@@ -138,7 +138,7 @@ def test_a_stop_is_sent_despite_a_full_disk_and_later_records_are_written(
     ]
 
 
-def test_with_noted_first_a_full_disk_prevents_writes_but_not_stops(
+def test_in_a_noted_first_block_a_full_disk_prevents_writes_but_not_stops(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     path = tmp_path / "audit.jsonl"
@@ -251,13 +251,13 @@ def test_an_audit_log_in_a_read_only_directory_is_refused_before_anything_is_sen
 
 
 @pytest.mark.parametrize("room", [0, 512, 4096, 8192, 12288])
-def test_a_full_disk_makes_the_ledger_refuse_writes_until_there_is_room(tmp_path: Path, room: int) -> None:
+def test_the_eeprom_ledger_refuses_writes_while_the_disk_is_full(tmp_path: Path, room: int) -> None:
     ledger = Ledger(tmp_path / "wear.sqlite")
     for at in range(3):
         assert ledger.enter(CELL, NOON + at, 0.0) == ""
     others = 0
     with full_at(room), raises_unkept():
-        while others < 1000:  # writes until the file must grow
+        while others < 1000:  # fill the file until it has to grow
             others += not ledger.enter(LedgerCell("p" * 200, 2, "m", f"r{others}"), NOON, 0.0)
     assert others < 1000
     assert ledger.enter(CELL, NOON + 3, 0.0) == ""
@@ -265,7 +265,7 @@ def test_a_full_disk_makes_the_ledger_refuse_writes_until_there_is_room(tmp_path
 
 
 @pytest.mark.parametrize("room", [0, 512, 4096, 8192])
-def test_a_ledger_created_on_a_full_disk_works_once_there_is_room(tmp_path: Path, room: int) -> None:
+def test_an_eeprom_ledger_created_on_a_full_disk_works_when_there_is_room(tmp_path: Path, room: int) -> None:
     ledger = Ledger(tmp_path / "wear.sqlite")
     with full_at(room), pytest.raises(OSError, match="cannot be kept"):
         ledger.enter(CELL, NOON, 0.0)
@@ -273,18 +273,18 @@ def test_a_ledger_created_on_a_full_disk_works_once_there_is_room(tmp_path: Path
     assert writes(ledger) == 1
 
 
-def test_an_unwritable_ledger_prevents_eeprom_writes_but_not_stops(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unwritable_eeprom_ledger_prevents_writes_but_not_stops(monkeypatch: pytest.MonkeyPatch) -> None:
     with read_only_directory() as directory:
         for path in (directory / "wear.sqlite", directory / "deep" / "wear.sqlite"):
             line, drive, _ = one(monkeypatch, DelixiModbus(1), ledger=path)
             with pytest.raises(OSError, match=r"the ledger of EEPROM writes .*wear\.sqlite cannot be kept"):
                 drive.set_frequency(10)
             assert line.written == []
-            drive.stop()  # needs no ledger
+            drive.stop()  # a stop is sent without the ledger
             assert len(line.written) == 1
 
 
-def test_after_a_clock_is_set_back_by_an_hour_only_one_write_is_allowed(tmp_path: Path) -> None:
+def test_a_clock_set_back_by_an_hour_allows_one_additional_eeprom_write(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path / "wear.sqlite")
     assert ledger.enter(CELL, NOON, 60.0) == ""
     set_back = NOON - HOUR
@@ -295,7 +295,7 @@ def test_after_a_clock_is_set_back_by_an_hour_only_one_write_is_allowed(tmp_path
     assert writes(ledger) == 3
 
 
-def test_after_a_clock_is_set_back_by_a_quarter_second_one_write_is_allowed(tmp_path: Path) -> None:
+def test_a_clock_set_back_by_a_quarter_second_allows_one_additional_eeprom_write(tmp_path: Path) -> None:
     """After a clock is set back, the time since the last write is unknown."""
     ledger = Ledger(tmp_path / "wear")
     assert ledger.enter(CELL, 1000.0, 60.0) == ""
@@ -304,7 +304,7 @@ def test_after_a_clock_is_set_back_by_a_quarter_second_one_write_is_allowed(tmp_
 
 
 def test_the_ledger_counts_all_writes_of_a_stop_or_none_of_them(tmp_path: Path) -> None:
-    """One transaction is used, because each transaction may wait for the disk or for another process."""
+    """All writes are one transaction, because each transaction may wait for the disk or another process."""
     ledger = Ledger(tmp_path / "wear")
     wrong = replace(CELL, register="no text: \udcff")
     with pytest.raises(ValueError, match="surrogates not allowed"):
@@ -314,11 +314,11 @@ def test_the_ledger_counts_all_writes_of_a_stop_or_none_of_them(tmp_path: Path) 
     assert [wear.writes for wear in ledger.wear(1000.0)] == [2]
 
 
-def test_setting_the_clock_back_restores_no_budget(tmp_path: Path) -> None:
+def test_setting_the_clock_back_does_not_restore_the_yearly_eeprom_budget(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path / "wear.sqlite", budget=10)
     for at in range(10):
         assert ledger.enter(CELL, NOON + at, 0.0) == ""
-    for set_back in (HOUR, 86400.0, NOON):  # NOON: back to 1970, the date of a board without a battery
+    for set_back in (HOUR, 86400.0, NOON):  # by NOON: to 1970, as on a board without a battery
         assert "10 times in a year" in ledger.enter(CELL, NOON - set_back, 0.0)
 
 
@@ -352,10 +352,12 @@ def test_a_setpoint_loop_writes_once_a_minute_despite_a_clock_set_back(
     line.bus.close()
     times = [str(each["time"]) for each in read_audit(log)]
     assert len(times) == len(tried)
-    assert times != sorted(times)  # records keep the order of the writes; the clock's times do not
+    assert times != sorted(times)  # the clock was set back between two records
 
 
-def test_ledger_counts_remain_when_the_bus_is_closed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_eeprom_ledger_keeps_its_counts_when_the_bus_is_closed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     for life in range(3):
         _, drive, _ = one(monkeypatch, ErmanERG220(1), ledger=tmp_path / "wear.sqlite")
         drive.set_frequency(10 + life)
@@ -365,7 +367,7 @@ def test_ledger_counts_remain_when_the_bus_is_closed(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     "time", ["'yesterday'", "x'00'", "null", "9e999", "-1e308", "1e308", "1" + "0" * 400]
 )
-def test_a_ledger_with_an_invalid_time_blocks_the_write(tmp_path: Path, time: str) -> None:
+def test_a_write_is_refused_if_the_eeprom_ledger_holds_an_invalid_time(tmp_path: Path, time: str) -> None:
     ledger, cell = Ledger(tmp_path / "wear.sqlite"), LedgerCell("/dev/ttyUSB0", 1, "toy", "acceleration_time")
     assert ledger.enter(cell, 100.0, 60.0) == ""
     with closing(sqlite3.connect(ledger.path)) as file:

@@ -27,7 +27,7 @@ BOTH = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 
 
 class Act:
-    """The two callbacks of an exit hook's entry; `work` returns once the test sets `go_on`."""
+    """One action at exit, with its two callbacks. `work` returns when the test sets `go_on`."""
 
     def __init__(self) -> None:
         self.is_begun = False
@@ -44,7 +44,7 @@ class Act:
 
 @pytest.fixture
 def caught() -> Iterator[list[int]]:
-    """Return a list of the signals that reached the handlers installed before the hook's."""
+    """Return a list of the signals that reached the handlers installed before those of the hook."""
     found: list[int] = []
     before = [
         (each, signal.signal(each, lambda number, frame: found.append(number)))
@@ -63,7 +63,7 @@ def test_a_second_signal_is_delayed_until_all_stops_have_ended(caught: list[int]
     signal.raise_signal(number)
     assert all(act.is_begun for act in acts)  # immediately
     for act in acts:
-        assert act.works.wait(PATIENCE)  # both run in parallel: neither is over
+        assert act.works.wait(PATIENCE)  # both actions run in parallel
     signal.raise_signal(number)
     acts[0].go_on.set()
     assert caught == []
@@ -104,7 +104,7 @@ def test_a_bus_opened_after_the_signal_is_stopped_immediately(caught: list[int])
     until(lambda: caught)
 
 
-def test_a_third_signal_within_a_second_ends_the_wait_with_a_message(
+def test_a_third_signal_within_a_second_ends_the_wait_for_stops(
     caught: list[int], capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = 1000.0
@@ -121,7 +121,7 @@ def test_a_third_signal_within_a_second_ends_the_wait_with_a_message(
         now += 0.1
         assert len(caught) == count
     assert capfd.readouterr().err == f"multidrop: {CUT_SHORT}\n"
-    hook.finish(made)  # no longer waits for the act
+    hook.finish(made)  # returns although the action has not ended
     act.go_on.set()
     until(lambda: exit_threads() <= others)
     assert len(caught) == 1
@@ -152,7 +152,7 @@ def test_repeated_hang_up_signals_do_not_end_the_wait(caught: list[int]) -> None
     try:
         hook, act = ExitHook(), Act()
         made = hook.add(act.begin, act.work)
-        hook._before[signal.SIGHUP] = lambda number, frame: caught.append(number)  # not the default
+        hook._before[signal.SIGHUP] = lambda number, frame: caught.append(number)  # as if set by the program
         for _ in range(4):
             signal.raise_signal(signal.SIGHUP)
         assert act.is_begun
@@ -260,8 +260,8 @@ def test_adding_an_action_at_exit_raises_if_no_signal_handler_can_be_installed(
     assert not acts[1].is_begun
 
 
-def test_our_handler_put_back_after_its_bus_closed_has_the_earlier_effect(caught: list[int]) -> None:
-    """Other code replaced the hook's handler, and put it back after the bus was closed."""
+def test_the_librarys_handler_calls_the_earlier_handler_after_its_bus_was_closed(caught: list[int]) -> None:
+    """Other code may replace the library's handler, and install it again after the bus was closed."""
     hook = ExitHook()
     for comes_again in (False, True):
         made = hook.add(lambda: None, lambda: None)
@@ -297,8 +297,8 @@ def test_a_later_bus_handles_signals_that_the_program_took_over(caught: list[int
 
 
 @pytest.mark.parametrize("effect", ["called", "default", "ignored"])
-def test_a_program_handler_may_call_our_handler(caught: list[int], effect: str) -> None:
-    """After the stops, the signal has its earlier effect once, unless that is the default effect."""
+def test_the_programs_signal_handler_may_call_the_librarys_handler(caught: list[int], effect: str) -> None:
+    """After the stops, the handler from before the library's is called once, if there was one."""
     hook, act, handled = ExitHook(), Act(), list[int]()
     if effect != "called":
         signal.signal(signal.SIGTERM, signal.SIG_DFL if effect == "default" else signal.SIG_IGN)
@@ -317,7 +317,7 @@ def test_a_program_handler_may_call_our_handler(caught: list[int], effect: str) 
     assert caught == ([signal.SIGTERM] if effect == "called" else [])
 
 
-def test_a_replaced_program_handler_may_call_our_earlier_handler(caught: list[int]) -> None:
+def test_a_replaced_program_handler_may_call_the_librarys_earlier_handler(caught: list[int]) -> None:
     hook, handled = ExitHook(), list[int]()
     hook.add(lambda: None, lambda: None)
     ours: Any = signal.getsignal(signal.SIGTERM)
@@ -327,14 +327,14 @@ def test_a_replaced_program_handler_may_call_our_earlier_handler(caught: list[in
         ours(number, frame)
 
     signal.signal(signal.SIGTERM, handle)
-    last = hook.add(lambda: None, lambda: None)  # installs our handler again
+    last = hook.add(lambda: None, lambda: None)  # installs the library's handler again
     signal.raise_signal(signal.SIGTERM)
     until(lambda: handled)
     assert last.is_over
     assert handled == [signal.SIGTERM]
 
 
-def test_a_bus_made_on_a_thread_warns_that_the_program_replaced_our_handler(
+def test_a_bus_made_on_a_thread_warns_if_the_program_replaced_a_signal_handler(
     caught: list[int], caplog: pytest.LogCaptureFixture
 ) -> None:
     hook, handled = ExitHook(), list[int]()
@@ -367,13 +367,13 @@ def test_a_forked_child_has_its_own_actions_at_exit(caught: list[int]) -> None:
     hook.finish(made)
 
 
-def test_a_delayed_signal_is_sent_on_only_once(caught: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two acts may end before the main thread handles the signal that was sent on."""
+def test_a_delayed_signal_is_forwarded_only_once(caught: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two actions may end before the main thread handles the forwarded signal."""
     sent: list[int] = []
     hook, act = ExitHook(), Act()
     monkeypatch.setattr("multidrop.control.exit_hook._send", lambda number, ident: sent.append(number))
     hook.add(act.begin, act.work)
-    for count in (1, 2):  # the next signal is delayed and sent on too
+    for count in (1, 2):  # the second signal is delayed and forwarded too
         signal.raise_signal(signal.SIGTERM)
         act.go_on.set()
         until(lambda count=count: len(sent) == count)
@@ -470,7 +470,7 @@ def test_a_third_signal_ends_the_process_though_a_drive_is_silent() -> None:
             each.loses = lambda request: True
         process.send_signal(signal.SIGINT)
         until(lambda: stops(received[0]))
-        for _ in range(20):  # signals that arrive together are handled as one
+        for _ in range(20):  # more than three, because the system may merge them
             process.send_signal(signal.SIGINT)
             try:
                 process.wait(0.1)
@@ -541,7 +541,7 @@ def test_a_second_bus_does_not_wait_for_the_ramps_of_the_first() -> None:
 
 
 def seen(drive: ReceivedRequests, others: list[ReceivedRequests], found: list[bool]) -> Callable[[Any], bool]:
-    """When this drive is stopped, append to `found` whether all the others still ramp down."""
+    """When this drive is stopped, append to `found` whether all other motors are still ramping down."""
 
     def loses(request: Any) -> bool:
         if request.start == 0x1000 and request.data[-1:] == b"\5" and drive.sim.motor.frequency > 0:

@@ -24,7 +24,7 @@ from multidrop.errors import BusError, DriveException, NoReply, Unconfirmed, Uns
 
 FAMILIES: dict[str, Callable[[int], Drive]] = {**MAKE, **PROFILES}
 STARTED_BY = {**STARTS, **PROFILE_STARTS}
-NO_EXCEPTIONS = "delixi-native"  # its error replies use other codes: see tests/families
+NO_EXCEPTIONS = "delixi-native"  # no Modbus exceptions: its error replies have other codes
 
 VERBS: dict[str, Callable[[Any], Any]] = {
     "set_frequency": lambda drive: drive.set_frequency(25),
@@ -44,7 +44,7 @@ OUTCOMES: dict[str, type[BusError]] = {
     "n": Unsupported,
 }
 # ok: done; ?: unconfirmed; x: refused by the drive; -: no reply, and no write was sent; !: forbidden.
-# A second outcome is that of the families in SECOND. A family without the verb always raises Unsupported.
+# After a slash: the outcome of the families in SECOND. A family without the verb always raises Unsupported.
 TABLE = """
 situation verb          none lost-once lost never damaged exception late silent unreadable deaf echo
 fresh     set_frequency ok   ok/?      ok/? ?     ?       x         ok/? ?      ?          -    -
@@ -72,11 +72,11 @@ SECOND: dict[tuple[str, str], set[str]] = {
     },  # a limit or the present value is read before the write
     ("start", "ok"): SEVERAL_WORDS,
     ("start", "-"): SEVERAL_WORDS,
-    ("start", "?"): {"yd1000"},  # its status does not change after a trip
+    ("start", "?"): {"yd1000"},  # a trip freezes its status
     ("start", "x"): {"yd1000"},
-    ("stop", "x"): {"erman-er-g-220", "innovert-ibd", "delixi-modbus", "yd1000"},  # cannot show a standstill
-    ("reset_fault", "?"): {"invt-che", "delixi-native"},  # resets with a single pulse
-    ("reset_fault", "ok"): {"yaskawa-a1000", "yd1000"},  # resets with a pulse and further control words
+    ("stop", "x"): {"erman-er-g-220", "innovert-ibd", "delixi-modbus", "yd1000"},  # no status of standstill
+    ("reset_fault", "?"): {"invt-che", "delixi-native"},  # the reset is one pulse
+    ("reset_fault", "ok"): {"yaskawa-a1000", "yd1000"},  # the reset is a pulse and further control words
 }
 HEAD, *ROWS = [line.split() for line in TABLE.strip().splitlines()]
 REPEATED = (("fresh", "stop"), ("tripped", "stop"), ("running", "coast"), ("running", "set_frequency"))
@@ -89,11 +89,11 @@ CELLS = [
     for nth, row in enumerate(ROWS)
     for number, (fault, outcomes) in enumerate(zip(HEAD[2:], row[2:], strict=True))
 ]
-NOT_ARRIVING = ("never", "silent", "exception", "deaf", "echo")  # the drive does not act
+NOT_ARRIVING = ("never", "silent", "exception", "deaf", "echo")  # faults with which no write takes effect
 
 
 class Cell:
-    """One drive in its situation; the fault affects the line from the verb's first write on."""
+    """One drive in a situation of TABLE. A fault affects the line from the verb's first write on."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, family: str, situation: str) -> None:
         self.line, self.drive, self.sim = one(monkeypatch, FAMILIES[family](1))
@@ -191,7 +191,7 @@ def check(cell: Cell, situation: str, verb: str, fault: str, outcome: str) -> No
         assert len(cell.writes) <= 1, "a setpoint is sent once"
 
 
-# The short run tries each cell on a third of the built-in families.
+# The short run tries each cell of TABLE on a third of the built-in families.
 @pytest.mark.parametrize("part", usually(0, 1, 2, 3), ids=["a third", "another", "the last", "profiles"])
 @pytest.mark.parametrize("cell", CELLS)
 def test_each_verb_has_the_expected_outcome_during_each_fault(

@@ -41,7 +41,7 @@ def known(model: str) -> Iterator[tuple[Bus, Any, ReceivedRequests]]:
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.1
     received = ReceivedRequests(sim)
     with (
-        patch.object(peers, "LEAST_TIMEOUT", 1.0),  # s, for a busy machine
+        patch.object(peers, "LEAST_TIMEOUT", 1.0),  # s, long enough for a busy computer
         Simulator([Wire([sim], unpaced=True)]) as simulator,
         Bus(simulator.wires[0].path) as bus,
     ):
@@ -57,7 +57,8 @@ def be_silent(bus: Bus, drive: Any, received: ReceivedRequests) -> None:
     received.loses = lambda request: True
     with pytest.raises(NoReply):
         drive.read(next(register for register in drive.registers.values() if register.readable))
-    until(lambda: len(received.requests) == bus.statistics().counters.sent)  # waits for the last request
+    # wait until the simulator has received the last request
+    until(lambda: len(received.requests) == bus.statistics().counters.sent)
     received.loses = lambda request: False
     received.requests.clear()
     timeouts.least_timeout_ns = timeouts.most_timeout_ns = 1_000_000_000
@@ -101,7 +102,7 @@ def test_a_silent_drive_is_identified_once_before_the_next_write(
         monkeypatch.setattr(type(drive).identify, "_script", lambda drive: iter(looks.append("look") or ()))
         before = bus.peers[drive].silences
         drive.set_frequency(10)
-        assert looks == [] or bus.peers[drive].silences > before  # a busy computer may miss a reply
+        assert looks == [] or bus.peers[drive].silences > before  # no check, unless a reply was late
         looks.clear()
         be_silent(bus, drive, received)
         drive.set_frequency(20)
@@ -289,7 +290,7 @@ def test_a_detached_drive_is_identified_again_before_a_stop(monkeypatch: pytest.
     assert len(bus.written) == begun
 
 
-def test_detaching_a_drive_forgets_a_suspicion_about_its_identity(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_detaching_a_drive_forgets_that_its_identity_check_failed(monkeypatch: pytest.MonkeyPatch) -> None:
     bus, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     sim["device"] = GOODRIVE
     check = bus.bus._writer.identity_check
@@ -346,7 +347,7 @@ def test_one_register_is_read_before_the_first_stop_without_waiting(
 
 
 @pytest.mark.parametrize("is_in_step", [True, False])
-def test_the_check_before_a_stop_confirms_the_drive_if_its_reply_is_unambiguous(
+def test_an_unambiguous_identity_check_before_a_stop_confirms_the_drive(
     monkeypatch: pytest.MonkeyPatch, is_in_step: bool
 ) -> None:
     bus, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
@@ -362,7 +363,9 @@ def test_the_check_before_a_stop_confirms_the_drive_if_its_reply_is_unambiguous(
     assert bus.bus.knows_identity(drive) is is_in_step
 
 
-def test_a_weak_identity_check_never_withholds_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_identity_check_by_undocumented_registers_never_withholds_a_stop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The IBD's `identify` reads registers that its manual does not document."""
     bus = SimulatedBus(monkeypatch, simulated(InnovertIBD(1)))
     bus.attach(InvtCHE(1))
@@ -456,7 +459,7 @@ def test_a_lost_identity_check_is_not_repeated_before_the_stop(
     assert first(line, 0, STOPS[model]) == 1
 
 
-def test_one_odd_reply_does_not_prove_another_family(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_unexpected_identity_reply_does_not_prove_another_family(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1))
     odd = build_reply(Framing.RTU, Message(1, 3, data=b"\0\3"))
     line.answers = lambda request: odd if len(line.frames) == 1 else None
@@ -464,7 +467,9 @@ def test_one_odd_reply_does_not_prove_another_family(monkeypatch: pytest.MonkeyP
     assert first(line, 0, STOPS["invt-che"]) is not None
 
 
-def test_two_different_odd_replies_do_not_prove_another_family(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_different_unexpected_replies_do_not_prove_another_family(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1))
     odd = [build_reply(Framing.RTU, Message(1, 3, data=bytes([0, device]))) for device in (3, 4)]
     line.answers = lambda request: odd.pop(0) if odd else None
@@ -473,13 +478,13 @@ def test_two_different_odd_replies_do_not_prove_another_family(monkeypatch: pyte
     assert STOPS["invt-che"](writes(line)[0])
 
 
-def test_a_drive_that_missed_a_reply_is_never_refused_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_is_never_refused_after_a_missed_reply(monkeypatch: pytest.MonkeyPatch) -> None:
     """The drive's next reply may belong to an earlier request."""
     line, drive, sim = one(monkeypatch, InvtCHE(1))
     sim["device"] = 0x010A
     line.bus.peer(drive).c.history.ended[10] = 1
     drive.stop()
-    assert line.frames[0][1] == "01 06 10 00 00 05 4D 09"  # the stop, without an identity check before
+    assert line.frames[0][1] == "01 06 10 00 00 05 4D 09"  # the stop is sent first, without an identity check
 
 
 def test_the_error_of_a_withheld_stop_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -495,7 +500,7 @@ def test_the_error_of_a_withheld_stop_says_what_to_do(monkeypatch: pytest.Monkey
     assert line.written != []
 
 
-OTHERS: Sequence[tuple[Drive, Drive]] = (  # (declared drive, actual drive) of one framing and baud rate
+OTHERS: Sequence[tuple[Drive, Drive]] = (  # (declared drive, drive on the line): equal framing and baud rate
     (InvtCHE(1, maximum_frequency=50), YD1000(1)),
     (InnovertIBD(1, confirmed=0), InvtCHE(1)),
     (YD1000(1), InvtCHE(1)),
@@ -519,7 +524,7 @@ def test_the_error_of_a_withheld_stop_names_the_command_for_the_other_family(
     assert line.written != []
 
 
-OUT_OF_DATE = [  # registers that `identify` reads, with a raw count that even the right drive may hold
+UNEXPECTED_COUNTS = [  # (family, register that `identify` reads, a raw count that the right drive may hold)
     ("delixi-modbus", "baudrate_setting", 4),
     ("delixi-modbus", "address_setting", 7),
     ("delixi-modbus", "fault", 99),
@@ -543,7 +548,7 @@ def shows(line: SimulatedBus, drive: Drive, name: str, count: int) -> None:
     line.answers = lambda request: reply if request.start == register.address else None
 
 
-@table(("model", "name", "count"), OUT_OF_DATE)
+@table(("model", "name", "count"), UNEXPECTED_COUNTS)
 @table("how", ["stop", "stop_all", "write"])
 def test_one_unexpected_value_prevents_a_start_but_no_stop(
     monkeypatch: pytest.MonkeyPatch, model: str, name: str, count: int, how: str
@@ -571,7 +576,7 @@ def test_one_unexpected_value_prevents_a_start_but_no_stop(
 def test_a_drive_that_refuses_the_identity_check_is_sent_its_stop(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
-    """Only function 04 is answered: its reads are all that the ERMAN's identity check needs."""
+    """Reads with function 04 are answered: only the ERMAN's identity check uses them."""
     line, drive, _ = one(monkeypatch, MAKE[model](1))
 
     def refuse(request: Message) -> bytes | None:
@@ -586,7 +591,9 @@ def test_a_drive_that_refuses_the_identity_check_is_sent_its_stop(
     assert STOPS[model](writes(line)[0])
 
 
-def test_no_stop_waits_for_a_second_check_of_another_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_stop_waits_for_the_second_identity_check_of_another_drive(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The stop of an identified drive does not wait for the first check of another drive either."""
     others = [YD1000(1), InvtCHE(2, maximum_frequency=50), InvtCHE(3, maximum_frequency=50)]
     line = SimulatedBus(monkeypatch, *(simulated(drive) for drive in others))
@@ -607,7 +614,7 @@ def test_no_stop_waits_for_a_second_check_of_another_drive(monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("suspicions", [1, 2])
-def test_a_plain_stop_is_withheld_if_another_family_answers_twice(
+def test_a_stop_by_a_plain_write_is_withheld_if_another_family_answers_twice(
     monkeypatch: pytest.MonkeyPatch, suspicions: int
 ) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1))

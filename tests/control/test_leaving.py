@@ -49,13 +49,13 @@ def test_stops_on_exit_says_whether_stop_on_exit_was_called(pair: RunningPair) -
     assert pair.bus.stops_on_exit is True
 
 
-def test_leaving_a_bus_starts_its_stops_immediately(pair: RunningPair) -> None:
+def test_leave_starts_the_stops_of_a_bus_immediately(pair: RunningPair) -> None:
     pair.bus.stop_on_exit()
     pair.bus.leave()
     until(lambda: pair.turning == [False, False])
 
 
-def test_leaving_a_bus_sends_no_stop_by_default(pair: RunningPair) -> None:
+def test_leave_sends_no_stop_by_default(pair: RunningPair) -> None:
     pair.bus.leave()
     pair.bus.part()
     assert pair.turning == [True, True]
@@ -110,7 +110,7 @@ def test_a_drive_being_detached_cannot_be_started_after_its_stop(pair: RunningPa
     pair.line.answers = lambda request: None
 
 
-def test_detaching_waits_for_other_stops_of_the_drives(
+def test_detaching_drives_waits_for_their_stops_on_other_threads(
     pair: RunningPair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waited: list[list[Any]] = []
@@ -120,7 +120,7 @@ def test_detaching_waits_for_other_stops_of_the_drives(
 
 
 @pytest.mark.parametrize("is_cut_short", [False, True])
-def test_closing_waits_for_all_stops_unless_a_third_signal_cuts_them_short(
+def test_closing_a_bus_waits_for_all_stops_unless_a_third_signal_comes(
     pair: RunningPair, monkeypatch: pytest.MonkeyPatch, is_cut_short: bool
 ) -> None:
     pair.bus.stop_on_exit()
@@ -285,9 +285,9 @@ def test_the_motor_of_a_drive_attached_after_leave_cannot_be_started(monkeypatch
 
 
 def test_a_detached_drive_is_freed_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a garbage collection: the memory of a bus does not grow if its drives change for years.
+    """It is freed without a garbage collection, so memory does not grow if drives change for years.
 
-    A program that checks identities in turn may ask for a drive that was detached in the meantime.
+    `knows_identity` accepts a detached drive, because a drive may be detached just before the call.
     """
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)

@@ -44,7 +44,7 @@ def write(port: str, seconds: float, ledger: Ledger | None = None) -> None:
 
 
 @pytest.mark.slow
-def test_one_write_a_minute_is_allowed_under_any_path_of_the_port(
+def test_all_paths_of_a_port_share_one_eeprom_write_a_minute(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -68,7 +68,7 @@ def test_one_write_a_minute_is_allowed_under_any_path_of_the_port(
         assert (wear.cell.port, wear.writes) == (device, 1)
 
 
-def test_one_write_a_minute_is_allowed_under_any_name_of_the_host(tmp_path: Path) -> None:
+def test_all_names_of_a_host_share_one_eeprom_write_a_minute(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path / "wear")
     with toys("socket://127.0.0.1:0") as sim:
         path = sim.wires[0].path
@@ -132,7 +132,7 @@ def test_a_port_without_a_device_is_identified_by_its_name() -> None:
         ("socket://10.0.0.7:4001", "rfc2217://10.0.0.7:4001"),
     ],
 )
-def test_entries_of_older_versions_count_towards_the_budget_of_the_same_port(old: str, spelt: str) -> None:
+def test_ledger_entries_of_older_versions_count_for_the_same_port(old: str, spelt: str) -> None:
     with TemporaryDirectory() as folder:
         Path(folder, "device").touch()
         Path(folder, "link").symlink_to("device")
@@ -185,7 +185,8 @@ def test_a_user_without_a_home_can_stop_drives_but_not_write_eeprom(monkeypatch:
 
     monkeypatch.delenv("XDG_STATE_HOME", raising=False)
     monkeypatch.setattr(Path, "home", home)
-    monkeypatch.setattr(eeprom_ledger, "NO_HOME", Path("/dev/null"), raising=False)  # root could write it
+    # root could create the default path
+    monkeypatch.setattr(eeprom_ledger, "NO_HOME", Path("/dev/null"), raising=False)
     toy = simulated(Toy(1))
     toy["status"] = Status(0)
     line = SimulatedBus(monkeypatch, toy)
@@ -209,7 +210,7 @@ def test_writes_to_a_simulated_drive_are_not_in_the_user_s_ledger(tmp_path: Path
 
 
 @with_names
-def test_an_explicit_ledger_counts_simulated_drives_too(tmp_path: Path) -> None:
+def test_a_ledger_passed_as_argument_counts_simulated_drives_too(tmp_path: Path) -> None:
     with toys() as sim:
         write(sim.wires[0].path, 12.0, Ledger(tmp_path / "wear"))
     assert len(Ledger(tmp_path / "wear").wear(0)) == 1

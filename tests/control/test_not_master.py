@@ -35,7 +35,7 @@ if sys.platform != "linux":
     pytest.skip("masterships are Linux's", allow_module_level=True)
 
 S = 1_000_000_000
-LISTENING = 256 * 10 / 9600  # s; duration of the longest RTU frame at 9600 baud; the timeout is added to it
+LISTENING = 256 * 10 / 9600  # s; the longest RTU frame at 9600 baud
 
 
 def now_ns() -> int:
@@ -135,7 +135,8 @@ def test_before_the_mastership_every_call_raises_and_sends_nothing(
     assert not failure.value.heard
     assert scene.requests == 0
     assert scene.bus.statistics().counters.sent == 0
-    assert not any("sent" in record for record in read_audit(scene.audit))  # only a stop's call is recorded
+    # stops are recorded as called, not as sent
+    assert not any("sent" in record for record in read_audit(scene.audit))
 
 
 @pytest.mark.slow
@@ -221,7 +222,7 @@ def test_a_failed_read_after_a_start_raises_the_lost_mastership(scene: Scene) ->
 
 
 @pytest.mark.slow
-def test_commands_are_sent_again_after_the_mastership_returns(scene: Scene) -> None:
+def test_commands_can_be_sent_after_the_mastership_returns(scene: Scene) -> None:
     scene.become_master()
     scene.drive.start()
     scene.mastership.end()
@@ -236,7 +237,7 @@ def test_commands_are_sent_again_after_the_mastership_returns(scene: Scene) -> N
 
 
 def hold_back(monkeypatch: pytest.MonkeyPatch, scene: Scene, *, sent_ns: int, after: int) -> None:
-    """Let `after` writes pass, then refuse all as NOT_MASTER; `sent_ns` is not 0 if a part was sent."""
+    """After `after` writes, refuse each write as NOT_MASTER; sent in part if `sent_ns` is not 0."""
     carry_out, writes = scene.bus.line.carry_out, count()
 
     def held_back(exchange: Exchange, **details: Any) -> Completion:
@@ -314,7 +315,7 @@ def shared() -> Iterator[tuple[int, Bus, Mastership]]:
 
 
 class Babbler:
-    """Another master, which sends requests until it is told to stop."""
+    """Another master, which sends requests until the test stops it."""
 
     def __init__(self, far: int) -> None:
         self._far, self._is_over = far, threading.Event()
@@ -357,7 +358,7 @@ def waits(far: int, bus: Bus, drive: Slow) -> float:
 @pytest.mark.long
 def test_a_new_master_listens_before_its_first_request(shared: tuple[int, Bus, Mastership]) -> None:
     far, bus, mastership = shared
-    drives = [bus.attach(Slow(address)) for address in (1, 2, 3)]  # no late reply of a new drive is expected
+    drives = [bus.attach(Slow(address)) for address in (1, 2, 3)]  # a new drive has no late replies
     listening = LISTENING + Slow.response_timeout
     assert waits(far, bus, drives[0]) >= listening
     assert waits(far, bus, drives[1]) < listening
@@ -369,7 +370,7 @@ def test_a_new_master_listens_before_its_first_request(shared: tuple[int, Bus, M
 
 
 @pytest.mark.long
-def test_bytes_of_another_master_raise_before_anything_is_sent(
+def test_a_call_raises_before_sending_if_another_master_is_heard(
     shared: tuple[int, Bus, Mastership], caplog: pytest.LogCaptureFixture
 ) -> None:
     far, bus, _ = shared

@@ -102,7 +102,7 @@ def test_verbs_without_a_result_return_a_command_result(monkeypatch: pytest.Monk
     assert isinstance(drive.state(), State)
 
 
-def test_a_start_script_that_ignores_cancelled_by_stop_ends_anyway(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_start_script_that_catches_cancelled_by_stop_ends_anyway(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive = stubborn(monkeypatch)
     call_stop_at(line, drive, 1)
     with pytest.raises(
@@ -170,7 +170,7 @@ def test_no_read_is_sent_for_an_expired_write(monkeypatch: pytest.MonkeyPatch) -
     assert line.frames == []
 
 
-def test_the_watchdog_is_logged_at_the_first_identity_check(
+def test_the_drives_watchdog_setting_is_logged_at_the_first_identity_check(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "multidrop.control")
@@ -210,7 +210,7 @@ def test_a_reversal_returns_once_the_motor_is_seen_to_turn_in_reverse(
     line, drive, sim = turning(monkeypatch, model)
     drive.start(Direction.REVERSE)
     assert drive.state().direction is Direction.REVERSE
-    if model not in ("yd1000", "delta-vfd-el"):  # their simulations show the commanded direction
+    if model not in ("yd1000", "delta-vfd-el"):  # these simulations show the commanded direction
         assert sim.motor.frequency < 0
     begun = line.seconds
     drive.start(Direction.REVERSE)  # the motor already turns in this direction
@@ -283,7 +283,7 @@ def test_a_reset_whose_effect_cannot_be_read_is_unconfirmed(monkeypatch: pytest.
         drive.reset_fault()
 
 
-def test_a_write_refused_to_save_eeprom_is_marked_as_budget(
+def test_a_write_refused_by_the_eeprom_write_budget_sets_is_budget(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     line, drive, _ = one(monkeypatch, DelixiModbus(1), ledger=tmp_path / "wear")
@@ -298,7 +298,7 @@ def test_a_write_refused_to_save_eeprom_is_marked_as_budget(
     assert not refusal.value.is_budget
 
 
-def test_the_text_of_a_stop_s_result_has_its_reason() -> None:
+def test_the_text_of_a_stops_result_includes_the_reason() -> None:
     assert str(Stopped("fan", Seen.STOPPED, 2.04)) == "fan: stopped after 2.0 s"
     assert str(Stopped("fan", Seen.SENT, 30.0, "no reply")) == "fan: sent but unknown after 30.0 s: no reply"
 
@@ -477,7 +477,7 @@ def test_a_plain_write_sets_the_known_setpoint(monkeypatch: pytest.MonkeyPatch) 
 # ---- writes on several threads ----
 
 
-def test_an_unsent_write_does_not_undo_the_setpoint_of_another_write() -> None:
+def test_an_unsent_write_does_not_undo_the_setpoint_of_a_later_write() -> None:
     setpoint = KnownSetpoint()
     setpoint.value = 20.0
     take_back = setpoint.begin_write()
@@ -497,7 +497,7 @@ def test_an_unsent_write_does_not_restore_a_setpoint_that_a_pending_write_made_u
     assert setpoint.value is None
 
 
-def test_after_two_unsent_writes_the_setpoint_from_before_both_is_known() -> None:
+def test_two_unsent_writes_leave_the_known_setpoint_unchanged() -> None:
     setpoint = KnownSetpoint()
     setpoint.value = 20.0
     first, second = setpoint.begin_write(), setpoint.begin_write()

@@ -60,9 +60,9 @@ def test_a_ramp_waits_between_its_steps_but_not_after_the_last(monkeypatch: pyte
 @table(
     ("drive", "before", "to", "rate", "counts"),
     [
-        (YD1000(1), 10, 20.0, 8.0, [1800, 2000]),  # as fast as the drive's own ramp
+        (YD1000(1), 10, 20.0, 8.0, [1800, 2000]),  # at the rate of the drive's own ramp
         (YD1000(1), 10, 11.0, 1 / 3, [1033, 1067, 1100]),  # rounding errors do not accumulate
-        (InvtCHE(1, maximum_frequency=80), 20, 16.0, 2.0, [2250, 2000]),  # 18 Hz and 16 Hz of 80 Hz
+        (InvtCHE(1, maximum_frequency=80), 20, 16.0, 2.0, [2250, 2000]),  # 18 Hz and 16 Hz as shares of 80 Hz
     ],
 )
 def test_the_steps_of_a_ramp_are_written_in_the_drive_s_unit(
@@ -269,7 +269,7 @@ class NotedStop:
 def test_a_failed_staggered_start_stops_the_started_drives_in_parallel(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The stop of a silent drive does not delay the stops of the others."""
+    """The stop of a silent drive does not delay the stops of the other drives."""
     _, drives, sims = che_drives(monkeypatch, 3)
     sims[2].trip(4)
     noted = NotedCalls(drives)
@@ -292,7 +292,7 @@ class NoThread(threading.Thread):
         raise RuntimeError("can't start new thread")
 
 
-def test_without_threads_all_started_drives_are_sent_a_stop_before_waiting(
+def test_without_threads_all_started_drives_get_a_stop_before_any_wait(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     _, drives, sims = che_drives(monkeypatch, 2)
@@ -369,7 +369,7 @@ def test_a_ramp_without_a_known_acceleration_needs_a_rate(monkeypatch: pytest.Mo
     with pytest.raises(WriteForbidden, match="give a rate"):
         ramp(drive, 20.0)
     ramp(drive, 2.0, rate=2.0)
-    assert steps(line) == [200, 400]  # 0.01 % of 50 Hz
+    assert steps(line) == [200, 400]  # 1 Hz and 2 Hz, in 0.01 % of 50 Hz
 
 
 @pytest.mark.parametrize("model", ["yd1000", "invt-che", "innovert-ibd"])

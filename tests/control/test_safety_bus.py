@@ -102,7 +102,7 @@ def test_a_plain_write_may_stop_the_motor(monkeypatch: pytest.MonkeyPatch) -> No
         ),
     ],
 )
-def test_writes_against_a_rule_are_refused_and_not_sent(
+def test_a_write_that_its_register_does_not_allow_is_not_sent(
     monkeypatch: pytest.MonkeyPatch, drive: Drive, name: str, value: float, sentence: str
 ) -> None:
     line, _, _ = one(monkeypatch, drive)
@@ -163,7 +163,7 @@ def test_only_the_first_write_is_preceded_by_an_identity_check(
     assert looks == ["look"]
 
 
-def test_an_ibd_that_cannot_be_identified_needs_its_owner_s_confirmation(
+def test_an_unidentified_innovert_ibd_needs_confirmed_for_writes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for confirmed in (0, 1):
@@ -183,7 +183,7 @@ def test_an_ibd_that_cannot_be_identified_needs_its_owner_s_confirmation(
 # ---- outcomes ----
 
 
-def test_the_outcome_of_a_write_is_done_taken_as_refused_or_unconfirmed(
+def test_try_write_reports_done_taken_as_or_unconfirmed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     line, drive, _ = one(monkeypatch, InnovertIBD(1))
@@ -201,7 +201,8 @@ def test_the_outcome_of_a_write_is_done_taken_as_refused_or_unconfirmed(
     assert str(outcome).startswith("innovert-ibd@1: frequency = 25.00 Hz: unconfirmed: innovert-ibd@1: ")
     with pytest.raises(Unconfirmed, match="no reply"):
         assert outcome.value
-    assert drive.try_write(drive.acceleration_time, 10.0).effect is Effect.DONE  # confirmed by a read back
+    # the reply is lost, but a read back confirms the write
+    assert drive.try_write(drive.acceleration_time, 10.0).effect is Effect.DONE
     line.deafens = line.loses
     outcome = drive.try_write(drive.acceleration_time, 30.0)
     assert (outcome.effect, outcome.held) == (Effect.UNCONFIRMED, 10.0)
@@ -350,7 +351,7 @@ def test_a_trip_during_a_start_raises_not_verified(monkeypatch: pytest.MonkeyPat
 def test_after_a_power_cycle_a_start_is_refused_until_a_setpoint_is_written(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The drive loses its setpoint: it stays off, and the next start is refused."""
+    """The drive loses its setpoint in the power cycle. Its motor stays off, and the next start is refused."""
     line, drive, sim = one(monkeypatch, YD1000(1))
     drive.set_frequency(40)
     drive.start()
@@ -441,7 +442,9 @@ def test_a_register_declared_as_ram_is_not_counted(monkeypatch: pytest.MonkeyPat
         ErmanERG220(1, ram=["frequenzy"])
 
 
-def test_the_ram_alias_is_written_and_not_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_write_through_a_ram_alias_is_not_counted_as_an_eeprom_write(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     class Mine(InvtCHE):
         """A CHE with a parameter declared by its owner."""
 
@@ -458,7 +461,7 @@ def test_the_ram_alias_is_written_and_not_counted(monkeypatch: pytest.MonkeyPatc
 # ---- the watchdog, identity checks of own families ----
 
 
-def test_the_watchdog_is_read_if_readable(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_drives_watchdog_setting_is_read_if_it_is_readable(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(monkeypatch, YD1000(1))
     assert not line.frames  # attaching sends nothing
     assert line.bus.watchdog(drive) == (
@@ -471,7 +474,7 @@ def test_the_watchdog_is_read_if_readable(monkeypatch: pytest.MonkeyPatch) -> No
     assert line.written == []
 
 
-def test_numbers_declared_harmless_only_stop_the_motor_or_cancel_a_command() -> None:
+def test_harmless_raw_counts_only_stop_the_motor_or_withdraw_a_command() -> None:
     """A harmless raw count may be written repeatedly, so it may only stop a motor or withdraw a command."""
     for family in MODELS.values():
         for register in family.registers.values():
@@ -499,7 +502,7 @@ def test_a_write_to_a_silent_drive_without_identify_is_not_sent(monkeypatch: pyt
     assert line.written == []
 
 
-def test_an_identity_check_may_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_identity_check_may_wait_between_its_reads(monkeypatch: pytest.MonkeyPatch) -> None:
     class Sleepy(Toy):
         """A family whose `identify` waits between two reads."""
 

@@ -99,7 +99,7 @@ ALLOWED: dict[str, Callable[[Message], bool]] = {
     "delixi-native": native,
     "yd1000": yd,
 }
-BROADCASTS = {  # function, address, value: a stop, or a setpoint of 0
+BROADCASTS = {  # (function, register address, value) of each allowed broadcast
     (6, 0x1000, 5),
     (6, 0x1000, 0xC000),
     (6, 0x1000, 0x8000),

@@ -122,7 +122,7 @@ print(entered)
 
 
 @pytest.mark.long
-def test_two_processes_share_one_budget(tmp_path: Path) -> None:
+def test_two_processes_share_one_eeprom_write_budget(tmp_path: Path) -> None:
     path = tmp_path / "wear.sqlite"
     words = [sys.executable, "-c", ENTRANT, str(path)]
     both = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(2)]
@@ -273,7 +273,7 @@ def dies_and_echoes(line: SimulatedBus, drive: Drive) -> None:
 
 
 @table("declared", DRIVES)
-def test_a_plain_stop_that_may_be_an_echo_is_not_confirmed(
+def test_an_echo_does_not_confirm_a_stop_sent_as_a_plain_write(
     monkeypatch: pytest.MonkeyPatch, declared: Drive
 ) -> None:
     line, drive, _ = one(monkeypatch, type(declared)(1, **declared.option))
@@ -286,9 +286,7 @@ def test_a_plain_stop_that_may_be_an_echo_is_not_confirmed(
 
 
 @pytest.mark.parametrize("family", [InnovertIBD, DelixiNative])
-def test_a_setpoint_that_may_be_an_echo_is_not_confirmed(
-    monkeypatch: pytest.MonkeyPatch, family: type[Drive]
-) -> None:
+def test_an_echo_does_not_confirm_a_setpoint(monkeypatch: pytest.MonkeyPatch, family: type[Drive]) -> None:
     """The setpoint cannot be read back, so the echo is the only reply."""
     line, drive, _ = one(monkeypatch, family(1))
     drive.set_frequency(20)
@@ -314,9 +312,7 @@ def test_a_write_is_unconfirmed_if_the_next_read_reveals_an_echo(monkeypatch: py
     assert "the reply was the adapter's echo" in str(outcome.failure)
 
 
-def test_a_raw_request_that_may_be_an_echo_is_not_confirmed(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_an_echo_does_not_confirm_a_raw_request(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     line, drive, _ = one(monkeypatch, InnovertIBD(1), audit=tmp_path / "audit")
     drive.send_raw(6, 0x2001, b"\x07\xd0")
     dies_and_echoes(line, drive)
@@ -326,7 +322,7 @@ def test_a_raw_request_that_may_be_an_echo_is_not_confirmed(
     assert [entry["outcome"] for entry in read_audit(tmp_path / "audit")] == ["done", "unconfirmed"]
 
 
-def test_confirmations_are_accepted_if_the_echo_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_write_is_confirmed_on_a_line_that_is_known_to_echo(monkeypatch: pytest.MonkeyPatch) -> None:
     """If the echo is known, the core can distinguish the drive's reply from the echo."""
     line, drive, _ = one(monkeypatch, InnovertIBD(1))
     line.has_echo = True

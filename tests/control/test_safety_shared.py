@@ -159,7 +159,7 @@ def shared(drives: str, baudrate: int, seed: int) -> Iterator[SharedPair]:
 
 
 RTU_FAMILIES = [model for model in MAKE if model != "delixi-native"]
-ROUNDS, MOST_ROUNDS = 3, 60  # the rounds end once there was a collision
+ROUNDS, MOST_ROUNDS = 3, 60  # after ROUNDS, the first collision ends the test
 
 
 @contextmanager
@@ -360,7 +360,7 @@ def test_an_equal_stop_of_another_client_confirms_our_stop() -> None:
 @pytest.mark.slow
 @patient
 @pytest.mark.parametrize("verb", ["stop", "coast"])
-def test_another_clients_equal_request_is_not_our_echo_for_long(verb: str) -> None:
+def test_another_clients_equal_request_is_not_taken_for_an_echo_for_long(verb: str) -> None:
     """Our read is lost. The other client's equal request looks like our echo. A later stop is confirmed."""
     look = rtu("01 03 10 01 00 01")
     with shared_line("invt-che", seed=3) as (drive, pair, received):

@@ -215,7 +215,7 @@ def test_a_failed_staggered_start_stops_all_drives_although_one_stop_raises(
 
 @table("fault", [NO_MEMORY, NO_DESCRIPTORS], ids=["memory", "descriptors"])
 @table("is_sent", [False, True])
-def test_a_stop_is_repeated_if_the_system_had_no_resources_for_it(
+def test_a_stop_is_repeated_after_a_lack_of_memory_or_descriptors(
     monkeypatch: pytest.MonkeyPatch, fault: Exception, is_sent: bool
 ) -> None:
     line, drives, sims = che_drives(monkeypatch, 2, runs_s=10)
@@ -256,7 +256,7 @@ class NoRoom:
 
 @table("fault", [NO_MEMORY, NO_DESCRIPTORS], ids=["memory", "descriptors"])
 @table("all_of_them", [False, True])
-def test_a_stop_is_created_once_the_system_has_resources(
+def test_a_stop_is_created_as_soon_as_the_system_has_memory_and_descriptors(
     monkeypatch: pytest.MonkeyPatch, fault: Exception, all_of_them: bool
 ) -> None:
     line, drives, sims = che_drives(monkeypatch, runs_s=10)
@@ -280,7 +280,9 @@ def test_a_stop_that_cannot_be_created_raises_memory_error_after_30_s(
     assert len(line.written) == before
 
 
-def test_a_stop_without_system_resources_ends_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_of_a_stop_without_system_resources_names_the_reason(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, _, _ = che_drives(monkeypatch, runs_s=10)
 
     def failing(exchange: Exchange, **details: Any) -> Completion:
@@ -315,7 +317,7 @@ def test_a_stop_accepts_any_number_type_for_seconds(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.slow
-def test_a_locked_ledger_is_tried_only_once_for_a_repeated_stop(
+def test_a_repeated_stop_tries_to_open_a_locked_ledger_only_once(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     ledger = Ledger(tmp_path / "wear")
@@ -335,7 +337,7 @@ def test_a_locked_ledger_is_tried_only_once_for_a_repeated_stop(
         line.bus.stop_all()
         line.bus._records.flush(60)
     flush(60)
-    assert 1 <= asked <= 2  # once when each drive's stop ends, or once for both
+    assert 1 <= asked <= 2  # at the end of each stop, or once for both stops
     assert "stops were not counted: " in caplog.text
     before, asked_before = len(line.written), asked
     line.bus.stop_all()
@@ -438,5 +440,5 @@ def check_stops(monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step
 def test_a_motor_is_stopped_although_its_stop_fails_at_any_line(
     monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step: int
 ) -> None:
-    """Steps are prime, so that they hit different lines of loops. Step 1 takes a quarter of an hour."""
+    """Steps are prime, so that they reach different lines of loops. With step 1, a run takes 15 minutes."""
     check_stops(monkeypatch, family, failure, step)

@@ -82,7 +82,7 @@ class Stops(RuleBasedStateMachine):
     # ---- the client ----
 
     def _open(self) -> None:
-        """Open a new client, write the setpoints, and put a mark on the wire."""
+        """Open a new client, write the setpoints, and start the first episode."""
         self.line.troubles.clear()
         family, options = quick(self.kind), KINDS[self.kind].makes
         self.drives = [
@@ -384,7 +384,7 @@ def test_a_stop_during_a_start_wins_at_each_of_its_first_exchanges(kind: str) ->
 
 
 @pytest.mark.parametrize("kind", usually(*KINDS))
-def test_a_start_that_no_stop_ends_turns_the_motor(kind: str) -> None:
+def test_a_start_without_a_stop_turns_the_motor(kind: str) -> None:
     """Without this test, the tests above could pass although no start is ever sent."""
     machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})()
     machine.begin(polling=False, on_exit=False)

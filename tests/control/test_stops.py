@@ -43,7 +43,7 @@ ACTS: dict[str, Callable[[SimulatedBus, Any], object]] = {
     "detach": lambda line, drive: line.bus.detach(drive),
 }
 
-# The short run has each family with two acts, and each act with two families.
+# The long run combines each family with each call in ACTS; the short run has a third of the pairs.
 EACH_AND_EACH = [
     pytest.param(model, act, marks=pytest.mark.long if (number + nth) % 3 else ())
     for number, model in enumerate(MAKE)
@@ -171,7 +171,7 @@ def test_the_stop_of_a_silent_drive_leaves_other_drives_more_than_half_of_the_li
     sent: list[float] = []
 
     def note(request: Message) -> bool:
-        sent.append(line.seconds)  # time at which the wait for its reply starts
+        sent.append(line.seconds)  # the request was sent; its timeout starts
         return True
 
     line.deafens = note
@@ -187,7 +187,9 @@ def test_the_stop_of_a_silent_drive_leaves_other_drives_more_than_half_of_the_li
 
 
 @pytest.mark.slow
-def test_a_stop_ends_after_its_time_and_reports_its_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_ends_after_its_time_limit_and_the_error_states_its_progress(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, (drive,), _ = che_drives(monkeypatch, hz=50, runs_s=20)
     begun = line.seconds
     with pytest.raises(Unconfirmed, match=r"it was not seen to stop within its 2 s"):
@@ -274,7 +276,7 @@ def test_a_stop_script_s_waits_are_cut_off_at_the_stop_s_time_limit(monkeypatch:
     assert len(line.written) == 1
 
 
-def test_stop_all_stops_repeating_after_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_all_repeats_its_stops_for_the_given_seconds_only(monkeypatch: pytest.MonkeyPatch) -> None:
     sims: list[Any] = [simulated(InvtCHE(1, maximum_frequency=50)), simulated(ErmanERG220(2))]
     line = SimulatedBus(monkeypatch, *sims)
     for sim in sims:
@@ -514,7 +516,7 @@ def test_stop_all_stops_other_drives_if_a_script_raises(monkeypatch: pytest.Monk
     assert "division by zero" in found["breaks"].why
 
 
-def test_a_plain_write_that_stops_is_repeated_until_the_drive_hears_it(
+def test_a_stop_that_is_one_plain_write_is_repeated_until_the_drive_answers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     line = SimulatedBus(monkeypatch, simulated(Own(1)))
@@ -538,7 +540,7 @@ class Hanging(logging.Handler):
         self._hang()
 
 
-def test_a_stop_is_sent_if_the_log_hangs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_stop_is_sent_even_if_a_log_handler_hangs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A locked ledger prevents no stop either, and one drive's records do not delay another drive's stop."""
     line = SimulatedBus(monkeypatch, *(simulated(Own(number)) for number in (1, 2)), audit=tmp_path / "audit")
     first, second = (line.attach(Own(address)) for address in (1, 2))

@@ -59,7 +59,7 @@ def test_a_constantly_delayed_line_does_not_prevent_a_stop(model: str) -> None:
         wire.delay = 0.6
         with suppress(BusError):
             drive.read(next(register for register in drive.registers.values() if register.readable))
-        with suppress(Unconfirmed):  # the standstill may not be seen
+        with suppress(Unconfirmed):  # the drive's late replies may not show the standstill
             drive.stop(seconds=1)
         until(lambda: received.writes and not received.sim.motor.energised)
 

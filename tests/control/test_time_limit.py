@@ -67,7 +67,7 @@ def test_a_call_delayed_past_its_time_limit_raises_expired(line: SimulatedBus, s
 
 
 @pytest.mark.parametrize("slept_before", [0, 3600])
-def test_the_limit_counts_the_computers_sleep_only_within_the_block(
+def test_a_time_limit_counts_the_computers_sleep_only_within_its_block(
     line: SimulatedBus, slept_before: float
 ) -> None:
     line.slept += slept_before
@@ -113,7 +113,7 @@ def test_no_verb_starts_after_the_limit_but_a_started_verb_continues(
     assert len(written(line)) == sent
 
 
-def test_an_inner_limit_cannot_extend_the_outer_one_and_ends_with_its_block(line: SimulatedBus) -> None:
+def test_an_inner_time_limit_cannot_extend_the_outer_time_limit(line: SimulatedBus) -> None:
     with within(line, 0.2), within(line, 60):
         line.sleep(0.3)
         with pytest.raises(Expired):
@@ -121,7 +121,7 @@ def test_an_inner_limit_cannot_extend_the_outer_one_and_ends_with_its_block(line
     line.bus.drives[0].set_frequency(20)
 
 
-def test_a_shorter_expiry_of_the_bus_applies(line: SimulatedBus) -> None:
+def test_the_expiry_of_the_bus_applies_if_it_is_shorter_than_the_time_limit(line: SimulatedBus) -> None:
     line.queue_time = 1.5
     with within(line, 60), pytest.raises(Expired):
         line.bus.drives[0].set_frequency(20)
@@ -148,7 +148,7 @@ def test_a_stop_called_by_the_limit_function_cancels_the_call(line: SimulatedBus
     before = len(written(line))
 
     def limit() -> float:
-        drive.stop()  # the latest possible moment for a stop to cancel the call
+        drive.stop()  # the last moment at which a stop can cancel the call
         return inf
 
     with written_before(limit), pytest.raises(CancelledByStop):

@@ -55,14 +55,14 @@ def test_a_suspended_master_sends_nothing_after_it_resumes() -> None:
     with fence(timer=3600) as made:
         found = rounds(made, 6)
     assert not any(each.is_killed for each in found)
-    # once in a thousand suspensions, the master is suspended between check and write, and sends one request
+    # once in a thousand suspensions, the master is suspended after the check and sends one request
     assert sum(each.stale for each in found) <= 1
 
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_master_without_the_deadline_check_does_send() -> None:
-    """This shows that the tests above can fail. The master's deadline is later than its successor assumes."""
+def test_a_suspended_master_with_a_deadline_that_is_too_late_does_send() -> None:
+    """This shows that the tests above can fail: here the master's deadline is too late."""
     with fence(beyond=1000) as made:
         found = rounds(made, 4)
     assert any(each.stale > 0 for each in found)  # on a busy computer, some masters resume too late to send

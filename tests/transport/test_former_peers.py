@@ -78,12 +78,12 @@ def test_a_late_reply_on_a_reopened_port_is_not_read_as_another_register(
     wire: HoldingWire, family: type[Toy], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     leave_a_reply_behind(wire, wire.path)
-    monkeypatch.setattr(Quick, "response_timeout", PATIENCE)  # otherwise replies are late on a busy computer
+    monkeypatch.setattr(Quick, "response_timeout", PATIENCE)  # long enough for a busy computer
     with Bus(wire.path) as bus:
         pump = bus.attach(family, 1)
         assert bus.peer(pump).owes
         assert pump.read(family.output_current) == 1.11
-        assert bus.peer(pump).late >= 1  # more if an earlier reply was late too, as on a busy computer
+        assert bus.peer(pump).late >= 1  # a busy computer may make another reply late
 
 
 def test_a_late_reply_on_a_reopened_port_is_not_polled_as_another_register(wire: HoldingWire) -> None:
@@ -105,7 +105,7 @@ def test_late_replies_are_recognised_under_another_name_of_the_port(
         assert bus.peer(bus.attach(Quick, 1)).owes
 
 
-def test_a_later_pseudo_terminal_of_the_same_number_has_another_identity() -> None:
+def test_a_new_pseudo_terminal_with_a_used_number_has_another_identity() -> None:
     def made() -> set[str]:
         ours, theirs = os.openpty()
         try:
@@ -115,17 +115,17 @@ def test_a_later_pseudo_terminal_of_the_same_number_has_another_identity() -> No
             os.close(ours)
 
     first = made()
-    until(lambda: made() != first)  # until the creation times differ, by some ms
+    until(lambda: made() != first)  # the creation times differ after some ms
 
 
 @patient  # on a busy computer, the reply to the first attempt would come late
-def test_a_peer_without_late_replies_is_not_remembered(wire: HoldingWire) -> None:
+def test_a_drive_without_late_replies_is_not_remembered(wire: HoldingWire) -> None:
     with Bus(wire.path) as bus:
         bus.attach(Quick, 1).read(Quick.output_current)
     assert not peers.identities_of(wire.path) & peers._former.keys()
 
 
-def test_a_peer_is_remembered_exactly_as_long_as_the_core_expects_late_replies(
+def test_a_drive_is_remembered_exactly_as_long_as_late_replies_are_expected(
     wire: HoldingWire, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     leave_a_reply_behind(wire, wire.path)
@@ -141,7 +141,7 @@ def test_a_peer_is_remembered_exactly_as_long_as_the_core_expects_late_replies(
 # ---- an earlier process ----
 
 
-BEGIN = 1000.0  # s; time at which the clock of these lines starts
+BEGIN = 1000.0  # s; start of the simulated clock
 
 DELAY = 0.1  # s; delay of the network between line and drive
 
@@ -163,7 +163,7 @@ def answer_to_another(drive: Drive) -> bytes:
 
 @pytest.mark.long
 @table("name", LINES)
-def test_a_late_reply_to_an_earlier_process_is_never_read_as_a_value(name: str) -> None:
+def test_a_late_reply_to_an_earlier_process_is_never_the_value_of_a_register(name: str) -> None:
     """Every value read belongs to its register, from the first read on."""
     drives = of_one_variant(LINES[name])
     wire = PathWire([EncodedDrive(drive) for drive in drives], Faults())

@@ -1,4 +1,4 @@
-"""Ports of every kind: they open, their failures are one sentence each, and they leave no descriptors."""
+"""Ports of every kind: opening, reopening and closing them, and their errors."""
 
 from __future__ import annotations
 
@@ -62,13 +62,13 @@ def read_at_every_baud_rate(family: type[Drive]) -> None:
 
 
 def test_every_documented_baud_rate_can_be_read() -> None:
-    """The baud rate's code is a known value, so no late reply is mistaken for the reply to its read."""
+    """The library knows this value in advance, so it recognises a late reply to another read."""
     with ThreadPoolExecutor(len(MODELS)) as pool:
         list(pool.map(read_at_every_baud_rate, MODELS.values()))
 
 
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
-def test_a_stalled_connection_is_cut_and_sends_nothing_later(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stalled_connection_is_closed_and_sends_nothing_later(monkeypatch: pytest.MonkeyPatch) -> None:
     """A loopback connection cannot stall, so this test reads the socket options."""
     told: list[int] = []
 
@@ -257,9 +257,9 @@ def test_a_port_that_is_open_cannot_be_opened_by_another_bus() -> None:
         Line(port).open().close()
 
 
-def test_closed_and_unopened_ports_leave_no_descriptors_or_threads(tmp_path: Path) -> None:
+def test_ports_that_were_closed_or_failed_to_open_leave_no_descriptor_or_thread(tmp_path: Path) -> None:
     with Simulator([wire(), wire("socket://127.0.0.1:0")]) as sim:
-        Line(sim.wires[0].path).open().close()  # opens the descriptors that the process keeps
+        Line(sim.wires[0].path).open().close()  # opens descriptors that stay open in each process
         before = descriptors(), threads()
         for each in sim.wires:
             for _ in range(3):
@@ -309,7 +309,7 @@ def test_a_port_lost_during_a_read_raises_line_error(
     thread.start()
     with Bus(path) as bus:
         toy = bus.attach(PatientToy, 1)
-        for _ in range(2):  # at the second read, the port is still lost
+        for _ in range(2):  # the port is still lost at the second read
             with pytest.raises(LineError) as caught:
                 toy.read(toy.output_current)
             assert str(caught.value).startswith(f"{path}: the port was lost (")
@@ -342,7 +342,7 @@ def test_a_port_is_reopened_through_its_device_link(tmp_path: Path) -> None:
     with Simulator([wire(str(link))]), Bus(str(link)) as bus:
         read_and_write(bus)
         first = link.readlink()
-        held = os.open(link, os.O_RDONLY | os.O_NOCTTY)  # keeps the pty's number in use
+        held = os.open(link, os.O_RDONLY | os.O_NOCTTY)  # so that no other pty gets its number
     with Simulator([wire(str(link))]):
         assert link.readlink() != first
         bus.line.reopen()
@@ -351,7 +351,7 @@ def test_a_port_is_reopened_through_its_device_link(tmp_path: Path) -> None:
     os.close(held)
 
 
-def test_a_tap_continues_after_the_port_is_reopened(tmp_path: Path) -> None:
+def test_a_capture_continues_after_the_port_is_reopened(tmp_path: Path) -> None:
     with (
         Simulator([wire()]) as sim,
         Bus(sim.wires[0].path) as bus,
@@ -368,8 +368,8 @@ def test_a_tap_continues_after_the_port_is_reopened(tmp_path: Path) -> None:
         ]
 
 
-def test_a_bridged_port_keeps_its_settings_when_it_is_reopened() -> None:
-    """The port is pyserial's spy://. At another baud rate than before, the drive would not answer."""
+def test_a_port_handled_by_pyserial_keeps_its_settings_when_it_is_reopened() -> None:
+    """The test uses a spy:// port of pyserial. With another baud rate, the drive would not answer."""
     with Simulator([Wire([simulated(Toy(1, baudrate=19200))], unpaced=True)]) as sim:
         path = sim.wires[0].path
         with Bus(f"spy://{path}", baudrate=19200) as bus:
@@ -381,7 +381,7 @@ def test_a_bridged_port_keeps_its_settings_when_it_is_reopened() -> None:
             assert toy.read(toy.output_current) == 0
 
 
-def test_a_bridged_port_that_cannot_be_set_up_raises_a_one_sentence_error() -> None:
+def test_a_pyserial_port_that_cannot_be_set_up_raises_a_one_sentence_error() -> None:
     master, slave = os.openpty()
     port = f"spy://{os.ttyname(slave)}"
     with Bus(port) as bus:
@@ -395,14 +395,16 @@ def test_a_bridged_port_that_cannot_be_set_up_raises_a_one_sentence_error() -> N
     assert "\n" not in str(caught.value)
 
 
-def test_a_port_is_not_freed_while_another_thread_ends_its_exchanges(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closing_a_port_waits_until_another_thread_has_ended_its_exchanges(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     closing: list[threading.Thread] = []
     end = Port.end
 
     def end_slowly(port: Port) -> bool:
         closing.append(threading.Thread(target=ours.close))
         closing[0].start()
-        closing[0].join(0.2)  # without the lock, closing would have ended by then
+        closing[0].join(0.2)  # time in which `close` would end if it did not wait
         assert port.c is not None
         return end(port)
 

@@ -54,7 +54,7 @@ def test_a_port_that_was_never_opened_is_not_logged_as_lost(
 
 
 def test_losing_and_reopening_a_port_is_logged_once(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
-    """The port's loss is logged only once, although several requests fail."""
+    """Several requests fail, but the loss of the port is logged only once."""
     link = tmp_path / "port"
 
     def plugged_in() -> tuple[int, int]:
@@ -83,7 +83,7 @@ def test_losing_and_reopening_a_port_is_logged_once(caplog: pytest.LogCaptureFix
     assert levels[:3] == [("INFO", "opened"), ("WARNING", "lost"), ("INFO", "opened again")]
 
 
-def test_frequent_losses_do_not_fill_the_log(
+def test_frequent_losses_of_a_port_do_not_fill_the_log(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A server may close each connection after a request. The last entry states whether the port is open."""
@@ -172,7 +172,7 @@ def test_a_stop_is_repeated_although_a_log_handler_hangs(monkeypatch: pytest.Mon
         stop.join(PATIENCE)
 
 
-def test_records_waiting_for_a_hanging_handler_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_queue_of_a_log_handler_that_hangs_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     aside = aside_log.AsideThread("log")
     monkeypatch.setattr(aside_log, "_log_thread", aside)
     handler, logger = Hanging(), logging.getLogger("multidrop.line")
@@ -186,4 +186,4 @@ def test_records_waiting_for_a_hanging_handler_are_bounded(monkeypatch: pytest.M
     finally:
         handler.released.set()
         logger.removeHandler(handler)
-        assert aside.flush(PATIENCE)  # also with a full queue; no record may appear during a later test
+        assert aside.flush(PATIENCE)  # so that no record appears during a later test

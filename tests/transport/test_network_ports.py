@@ -70,7 +70,7 @@ def split(chunks: list[bytes]) -> list[tuple[bytes, bytes]]:
 
 @pytest.mark.long
 @given(st.binary(max_size=200), st.lists(st.integers(0, 1000), max_size=20))
-def test_escaped_telnet_data_are_restored(data: bytes, cuts: list[int]) -> None:
+def test_data_escaped_for_telnet_are_the_same_after_decoding(data: bytes, cuts: list[int]) -> None:
     near, far = socket.socketpair()
     stream = b"".join(manager(near).escape(data))
     near.close()
@@ -82,7 +82,7 @@ def test_escaped_telnet_data_are_restored(data: bytes, cuts: list[int]) -> None:
     st.lists(st.sampled_from([IAC, SB, SE, rfc2217.DO, rfc2217.WONT, b"\xf1", b"a", b"\x2c"]), max_size=40),
     st.lists(st.integers(0, 1000), max_size=20),
 )
-def test_a_telnet_stream_is_split_the_same_whatever_its_pieces(stream: list[bytes], cuts: list[int]) -> None:
+def test_a_telnet_stream_may_arrive_in_pieces_of_any_size(stream: list[bytes], cuts: list[int]) -> None:
     whole = b"".join(stream)
     assert split(pieces(whole, cuts)) == split([whole])
 
@@ -100,7 +100,7 @@ def test_an_endless_telnet_suboption_does_not_fill_the_memory() -> None:
         for _ in range(100):
             for _, content in telnet.split(flood):
                 assert len(content) <= len(flood)
-        assert tracemalloc.get_traced_memory()[0] < len(flood)  # bytes: less than one of the hundred floods
+        assert tracemalloc.get_traced_memory()[0] < len(flood)  # less memory than one of the hundred chunks
     finally:
         tracemalloc.stop()
 
@@ -129,7 +129,7 @@ def flooding() -> Iterator[tuple[str, threading.Event]]:
             while received := client.recv(1024):
                 b"".join(far.filter(received))
                 purges += received.count(rfc2217.COM_PORT_OPTION + rfc2217.PURGE_DATA)
-                if purges == 2 and not floods.ident:  # the second purge: the client has opened the port
+                if purges == 2 and not floods.ident:  # the client has opened the port at its second purge
                     floods.start()
         client.close()
         floods.join()
@@ -213,7 +213,7 @@ class AsOnWindows:
 
 
 @pytest.mark.slow
-def test_a_bridge_forwards_requests_without_socket_timestamps(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pyserial_bridge_needs_no_socket_timestamps(monkeypatch: pytest.MonkeyPatch) -> None:
     ours, theirs = socket.socketpair()
     monkeypatch.setattr(network_port, "_STAMPED", False)
     monkeypatch.setattr(network_port, "_pair", lambda: (AsOnWindows(ours), theirs))
@@ -225,7 +225,9 @@ def test_a_bridge_forwards_requests_without_socket_timestamps(monkeypatch: pytes
     bridge.close()
 
 
-def test_a_bridge_without_threads_raises_os_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pyserial_bridge_raises_os_error_if_no_thread_can_be_started(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     started: list[threading.Thread] = []
     start = threading.Thread.start
 
@@ -241,7 +243,7 @@ def test_a_bridge_without_threads_raises_os_error(monkeypatch: pytest.MonkeyPatc
     assert not started[0].is_alive()
 
 
-def test_a_bridge_passes_long_input_in_pieces() -> None:
+def test_a_pyserial_bridge_passes_long_input_in_pieces() -> None:
     port = HeldUp()
     arrived = bytes(range(256)) * 20
     chunks = [arrived[:1], b""]
@@ -261,7 +263,7 @@ def test_a_bridge_passes_long_input_in_pieces() -> None:
     assert taken == arrived
 
 
-def test_a_bridge_with_unread_data_closes() -> None:
+def test_a_pyserial_bridge_with_unread_data_can_be_closed() -> None:
     port = HeldUp()
     port.read = lambda size: bytes(1024)  # type: ignore[method-assign]
     bridge = Bridge(port)  # type: ignore[arg-type]
@@ -269,9 +271,9 @@ def test_a_bridge_with_unread_data_closes() -> None:
     assert not any(thread.is_alive() for thread in bridge._threads)
 
 
-def test_a_write_to_a_full_network_fails_immediately() -> None:
+def test_a_write_fails_immediately_if_the_socket_buffer_is_full() -> None:
     near, far = socket.socketpair()
-    near.settimeout(3600)  # pyserial's timeout is 5 s
+    near.settimeout(3600)  # a write that waited would last an hour
     port = RFC2217Port()
     port.is_open, port._socket, port._write_lock = True, near, threading.Lock()
 
@@ -360,7 +362,7 @@ class FarNetwork:
     def all_received(self) -> str:
         """Return the bytes on the server's serial line, once the network is restored."""
         self.join()
-        until(lambda: not connections(self.port))  # wait until the kernel no longer retransmits
+        until(lambda: not connections(self.port))  # until the kernel has stopped retransmitting
         until(self._ends)
         taken, _ = self._server.communicate()
         return taken
@@ -389,7 +391,7 @@ START = "010600140001"  # writes 1 to the control register of drive 1: its motor
 
 
 def start_into_the_cut(bus: Bus, toy: Toy, network: FarNetwork) -> None:
-    """Send a START that expires. The start is not held back, because no late reply is due."""
+    """Send a START that expires in the cut network. It is not delayed, because no late reply is due."""
     toy.send_raw(6, 0x14, bytes([0, 2]))
     network.cut()
     with pytest.raises(Unconfirmed):
@@ -398,7 +400,9 @@ def start_into_the_cut(bus: Bus, toy: Toy, network: FarNetwork) -> None:
 
 @pytest.mark.long
 @pyserials_own
-def test_a_start_into_a_cut_network_never_arrives_after_closing(far_network: FarNetwork) -> None:
+def test_a_start_sent_into_a_cut_network_never_arrives_after_the_port_is_closed(
+    far_network: FarNetwork,
+) -> None:
     with Bus(far_network.url, echo="off", expiry=PATIENCE) as bus:
         start_into_the_cut(bus, bus.attach(Toy, 1), far_network)
     taken = far_network.all_received()
@@ -409,7 +413,9 @@ def test_a_start_into_a_cut_network_never_arrives_after_closing(far_network: Far
 @pytest.mark.slow
 @pyserials_own
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
-def test_a_start_into_a_cut_network_never_arrives_on_an_open_port(far_network: FarNetwork) -> None:
+def test_a_start_sent_into_a_cut_network_never_arrives_while_the_port_is_open(
+    far_network: FarNetwork,
+) -> None:
     """The network is restored as soon as the call has returned."""
     with Bus(far_network.url, echo="off", expiry=PATIENCE) as bus:
         start_into_the_cut(bus, bus.attach(Toy, 1), far_network)
@@ -420,7 +426,7 @@ def test_a_start_into_a_cut_network_never_arrives_on_an_open_port(far_network: F
     assert START not in taken
 
 
-def test_a_stalled_network_is_cut_before_a_write_times_out() -> None:
+def test_a_stalled_connection_is_closed_before_a_write_times_out() -> None:
     """Otherwise a write could arrive after it was reported as unconfirmed."""
     assert MOST_AGE + MOST_STALL_MS / 1000 <= WRITE_TIMEOUT
 

@@ -1,4 +1,4 @@
-"""If another USB adapter gets the name of a lost port, it is not used: its line has other motors."""
+"""A USB adapter that gets the name of a lost port is not used, because its line has other motors."""
 
 from __future__ import annotations
 
@@ -76,13 +76,10 @@ def sysfs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sysfs:
     [
         (f"{USB}/1-1/1-1:1.0/ttyUSB0", "A50285BI", "0", USBAdapter("1-1:1.0.0", "A50285BI:1.0.0")),
         (f"{USB}/1-4/1-4.2/1-4.2:1.3/ttyUSB3", "FT6", "0", USBAdapter("1-4.2:1.3.0", "FT6:1.3.0")),
-        (
-            f"{USB}/1-1/1-1:1.0/ttyUSB1",
-            "MX",
-            "1",
-            USBAdapter("1-1:1.0.1", "MX:1.0.1"),
-        ),  # several ports on one USB interface
-        (f"{USB}/1-1/1-1:1.0/ttyUSB0", "", "0", USBAdapter("1-1:1.0.0", "")),  # CH340: no serial number
+        # one USB interface has several ports
+        (f"{USB}/1-1/1-1:1.0/ttyUSB1", "MX", "1", USBAdapter("1-1:1.0.1", "MX:1.0.1")),
+        # a CH340 adapter has no serial number
+        (f"{USB}/1-1/1-1:1.0/ttyUSB0", "", "0", USBAdapter("1-1:1.0.0", "")),
         (f"{USB}/1-3/1-3:1.0", "E66", "", USBAdapter("1-3:1.0.0", "E66:1.0.0")),  # ttyACM0
         ("devices/pnp0/00:05", "", "", None),  # ttyS0
     ],
@@ -103,7 +100,7 @@ def test_adapter_of_returns_the_usb_socket_and_the_serial_number(
         (("1-1", "A1"), ("1-1", "A1"), True),
         (("1-1", "A1"), ("1-2", "A1"), True),  # the same adapter in another USB socket
         (("1-1", "A1"), ("1-2", "B2"), False),  # two adapters came back in another order
-        (("1-1", "A1"), ("1-1", "B2"), False),  # another adapter in the same USB port may serve another line
+        (("1-1", "A1"), ("1-1", "B2"), False),  # another adapter in the same socket may serve another line
         (("1-1", ""), ("1-1", ""), True),
         (("1-1", ""), ("1-2", ""), False),
         (("1-1", "A1"), ("1-2", ""), False),
@@ -133,12 +130,14 @@ def test_a_port_is_reopened_only_with_the_same_adapter(
     ("before", "now", "others", "is_found"),
     [
         (("1-1", "A1"), ("1-1", "A1"), [], True),  # the same adapter, renamed to ttyUSB1 after a sleep
-        (("1-1", "A1"), ("1-1", "A1"), [("1-2", "A1")], True),  # its twin has the same serial number
-        (("1-1", "A1"), ("1-2", "A1"), [], False),  # in another USB socket, it may be a twin
+        (("1-1", "A1"), ("1-1", "A1"), [("1-2", "A1")], True),  # another adapter has the same serial number
+        # in another USB socket: this may be another adapter with the same serial number
+        (("1-1", "A1"), ("1-2", "A1"), [], False),
         (("1-1", "A1"), ("1-2", "A1"), [("1-1", "B2")], False),
         (("1-1", ""), ("1-1", ""), [("1-2", "")], True),
         (("1-1", ""), ("1-2", ""), [], False),
-        (("1-1", "A1"), ("1-2", "A1"), [("1-3", "A1")], False),  # one of two twins, in another socket
+        # two adapters with the same serial number are plugged in, both in other USB sockets
+        (("1-1", "A1"), ("1-2", "A1"), [("1-3", "A1")], False),
     ],
 )
 def test_an_adapter_is_followed_to_its_new_name(
@@ -166,8 +165,8 @@ def test_an_adapter_is_followed_to_its_new_name(
         found.close()
 
 
-def test_a_twin_with_the_same_serial_number_is_not_used(tmp_path: Path, sysfs: Sysfs) -> None:
-    """The twin was plugged in when the port was opened; after a USB reset it gets the port's name."""
+def test_another_adapter_with_the_same_serial_number_is_not_used(tmp_path: Path, sysfs: Sysfs) -> None:
+    """Two adapters have one serial number. After a USB reset, the second gets the port name of the first."""
     link, later = tmp_path / "ttyUSB0", tmp_path / "ttyUSB1"
     found = Line(str(link))
     with sysfs.plugged_in(later, "1-2", "A1"), sysfs.plugged_in(link, "1-1", "A1"):
@@ -183,8 +182,8 @@ def test_a_twin_with_the_same_serial_number_is_not_used(tmp_path: Path, sysfs: S
 
 
 @pytest.mark.parametrize("is_replaced", [False, True])
-def test_a_later_pseudo_terminal_of_the_same_number_is_not_opened(tmp_path: Path, is_replaced: bool) -> None:
-    """The later pseudo-terminal may belong to any program. A replaced link leads to the right one."""
+def test_a_new_pseudo_terminal_with_a_used_number_is_not_opened(tmp_path: Path, is_replaced: bool) -> None:
+    """The new pseudo-terminal may belong to any program. With a replaced link, the port is found again."""
     link = tmp_path / "port"
     ends = pty.openpty()
     device = Path(os.ttyname(ends[1]))
@@ -196,7 +195,7 @@ def test_a_later_pseudo_terminal_of_the_same_number_is_not_opened(tmp_path: Path
     with pytest.raises(LineError, match="no such port"):
         found.reopen()
     with ExitStack() as stack:
-        time.sleep(0.05)  # file times advance in steps of some ms
+        time.sleep(0.05)  # file times have a resolution of some ms
         later: list[str] = []
         while not (device.exists() and later):
             ends = pty.openpty()
@@ -205,7 +204,7 @@ def test_a_later_pseudo_terminal_of_the_same_number_is_not_opened(tmp_path: Path
                 stack.callback(os.close, end)
         if is_replaced:
             link.unlink()
-            link.symlink_to(later[-1])  # usually the same number, unless another process has it
+            link.symlink_to(later[-1])  # usually the same number
             found.reopen()
             found.close()
         else:
@@ -214,7 +213,7 @@ def test_a_later_pseudo_terminal_of_the_same_number_is_not_opened(tmp_path: Path
             assert found.is_lost
 
 
-def test_lasting_name_returns_the_name_with_the_serial_number(
+def test_lasting_name_returns_the_link_with_the_adapters_serial_number(
     tmp_path: Path, sysfs: Sysfs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     by_id, names = tmp_path / "by-id", {}
@@ -290,7 +289,7 @@ def test_a_port_that_leads_to_another_line_is_not_polled_and_gets_no_stop(
         ("socket://10.0.0.7:4001", errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT)),
     ],
 )
-def test_why_lost_distinguishes_unplugged_stalled_and_hung_up(port: str, error: int, why: str) -> None:
+def test_why_lost_distinguishes_unplugged_stalled_and_hung_up_ports(port: str, error: int, why: str) -> None:
     assert why_lost(port, error) == why
 
 
@@ -303,7 +302,7 @@ def terminal() -> Iterator[str]:
 
 
 @pytest.mark.parametrize("must_discard", [False, True])
-def test_closing_a_stalled_port_takes_bounded_time_and_discards_a_command(
+def test_closing_a_stalled_port_discards_a_command_and_takes_limited_time(
     must_discard: bool, terminal: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     closed: list[float] = []
@@ -339,7 +338,7 @@ def all_descriptors_in_use() -> Iterator[None]:
             os.close(fd)
 
 
-def test_closing_a_stalled_port_takes_bounded_time_although_all_descriptors_are_in_use(
+def test_closing_a_stalled_port_takes_limited_time_without_free_descriptors(
     terminal: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """If pyserial closed the port itself, it would wait for the adapter for up to 30 s."""
@@ -388,7 +387,7 @@ def test_reads_reopen_a_port_that_was_closed_to_discard_a_command() -> None:
         (1, f"the request was sent only in part: the port took no bytes until the time-out ({STALLED})"),
     ],
 )
-def test_a_command_that_was_held_back_is_not_logged_as_a_lost_port(
+def test_a_command_that_a_stalled_port_does_not_send_is_not_logged_as_a_loss(
     sent_ns: int, said: str, terminal: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     found = Line(terminal).open()
@@ -404,7 +403,7 @@ def test_a_command_that_was_held_back_is_not_logged_as_a_lost_port(
     assert "lost" not in caplog.text
 
 
-def test_ctrl_c_does_not_leave_a_called_off_command_in_the_driver(
+def test_ctrl_c_leaves_no_cancelled_command_in_the_serial_driver(
     terminal: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = Line(terminal).open()
@@ -420,7 +419,7 @@ def test_ctrl_c_does_not_leave_a_called_off_command_in_the_driver(
     found.close()
 
 
-def test_a_driver_that_miscounts_its_unsent_bytes_is_logged_once(
+def test_a_serial_driver_that_miscounts_its_unsent_bytes_is_logged_once(
     terminal: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(Port, "miscounts", True)
@@ -442,7 +441,7 @@ def test_the_error_for_a_silent_drive_behind_a_stalled_adapter_names_the_stall(
             toy.read(toy.output_current)
 
 
-def test_a_read_that_is_not_sent_because_of_a_stall_does_not_lose_the_port(
+def test_a_read_that_a_stalled_port_does_not_send_does_not_lose_the_port(
     terminal: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     held = SimpleNamespace(count=-1, result=Failure.STALLED, error=errno.ETIMEDOUT, raw=b"", reply=None)
@@ -479,7 +478,7 @@ def test_an_impossible_baud_rate_is_refused_and_the_error_names_the_nearest_rate
     ("driver", "is_checked"),
     [("serial8250", True), ("serial", True), ("dw-apb-uart", False), ("ftdi_sio", False)],
 )
-def test_only_uarts_with_whole_divisors_are_checked(
+def test_baud_rates_are_checked_only_for_uarts_with_integer_divisors(
     driver: str, is_checked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for folder in ("tty/ttyS1", "drivers", "devices/card"):

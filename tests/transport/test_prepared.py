@@ -1,4 +1,4 @@
-"""Reads with `Bus` are planned once, and planned again only if port, settings or drive change."""
+"""Reads with `Bus`: plans are reused until the port, the settings or the drive change. Also raw reads."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ WANTED = (Toy.output_frequency, Toy.mystery, Toy.acceleration_time)
 
 
 class Counted:
-    """Counts the plans of blocks, and the exchanges."""
+    """Counts how often blocks are planned and exchanges are created."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.plans = self.made = 0
@@ -61,7 +61,7 @@ class Counted:
         monkeypatch.setattr(prepared_reads, "make_read", make)
 
     def since(self) -> tuple[int, int]:
-        """Return the numbers of plans and exchanges since the last call."""
+        """Return the numbers of plans and new exchanges since the last call."""
         found = self.plans, self.made
         self.plans = self.made = 0
         return found
@@ -82,7 +82,7 @@ def bus() -> Iterator[Bus]:
 def completions_of(
     bus: Bus, monkeypatch: pytest.MonkeyPatch, meet: Callable[[], object] = lambda: None
 ) -> list[Completion]:
-    """Return a list to which the completion of each exchange is appended."""
+    """Return a list to which the result of each exchange is appended."""
     carry_out = bus.line.carry_out
     asked: list[Completion] = []
 
@@ -102,14 +102,14 @@ def test_repeated_reads_of_the_same_registers_are_planned_once(bus: Bus, counted
     assert counted.since() == (1, 2)
     assert [one.read_many(WANTED) for _ in range(5)] == 5 * [first]
     assert counted.since() == (0, 0)
-    one.read(Toy.acceleration_time)  # a new plan, but its block was prepared by the read of WANTED
+    one.read(Toy.acceleration_time)  # a new plan, but an earlier read created its exchange
     assert counted.since() == (1, 0)
     other.read_many(WANTED)
     assert counted.since() == (1, 2)
 
 
 @pytest.mark.slow
-def test_detaching_a_drive_removes_its_prepared_reads(bus: Bus, counted: Counted) -> None:
+def test_detaching_a_drive_removes_its_cached_reads(bus: Bus, counted: Counted) -> None:
     drive = bus.attach(PatientToy, 1)
     drive.read_many(WANTED)
     bus.detach(drive)
@@ -135,7 +135,7 @@ def test_reads_are_planned_again_after_the_port_is_reopened(bus: Bus, counted: C
     ("name", "value"),
     [("settings", Settings(19200, "8N1")), ("agreed_silence", 0.01), ("response_delay", 0.2), ("address", 3)],
 )
-def test_a_prepared_read_follows_changed_settings(bus: Bus, name: str, value: object) -> None:
+def test_a_cached_read_uses_changed_settings(bus: Bus, name: str, value: object) -> None:
     drive = bus.attach(PatientToy, 1)
     before = bus._exchanges._prepare(drive)
     assert bus._exchanges._prepare(drive) is before
@@ -158,7 +158,7 @@ def test_the_number_of_cached_read_plans_is_limited(bus: Bus, monkeypatch: pytes
     assert prepared.of.cache_info().currsize == 3
 
 
-def test_repeated_reads_reuse_their_completion(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_repeated_reads_reuse_the_memory_of_their_result(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     drive = bus.attach(PatientToy, 1)
     asked = completions_of(bus, monkeypatch)
     first = drive.read_many(WANTED)
@@ -168,7 +168,9 @@ def test_repeated_reads_reuse_their_completion(bus: Bus, monkeypatch: pytest.Mon
     assert asked[:2] * 4 == asked
 
 
-def test_concurrent_reads_use_separate_completions(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_concurrent_reads_use_separate_memory_for_their_results(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
     drive = bus.attach(PatientToy, 1)
     value = drive.read(Toy.acceleration_time)
     both = Barrier(2)
@@ -180,7 +182,7 @@ def test_concurrent_reads_use_separate_completions(bus: Bus, monkeypatch: pytest
 
 
 @pytest.mark.slow
-def test_the_completion_of_a_failed_read_is_not_reused(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_result_memory_of_a_failed_read_is_not_reused(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     gone = bus.attach(Toy, 3)
     asked = completions_of(bus, monkeypatch)
     for _ in range(2):
@@ -248,12 +250,12 @@ def expected(data: bytes) -> dict[str, Any]:
         "flow_power": power_of_ten,
         "nibble": part >> 4 & 0xF,
         "decimal": int(f"{digits:x}") if f"{digits:x}".isdecimal() else None,
-        "fine": fine * 123456789 / 10,  # before the division, the number has too many digits for a float
+        "fine": fine * 123456789 / 10,  # more digits than a float has
     }
 
 
 def reply(data: bytes) -> Completion:
-    """Return the completion of a read whose reply has this data."""
+    """Return the result of a read whose reply has this data."""
     return completed(5 + len(data), Message(1, 3, data=data), b"", at_ns=1)
 
 
@@ -265,12 +267,12 @@ def decoder() -> BlockDecoder:
 def test_each_value_is_decoded_from_its_bytes(data: bytes) -> None:
     found = decoder().decode(reply(data))
     assert found == expected(data)
-    assert type(found["pulses"]) is int  # the number has too many digits for a float
+    assert type(found["pulses"]) is int  # it has more digits than a float
 
 
 @example(bytes(2 * WORDS - 1))
 @given(st.binary(max_size=2 * WORDS - 1))
-def test_a_short_reply_has_the_values_that_are_complete(data: bytes) -> None:
+def test_a_short_reply_gives_the_values_whose_bytes_are_complete(data: bytes) -> None:
     block = Block.of(Mixed(1), REGISTERS)
     found = decoder_of(block).decode(reply(data))
     assert found == {one.name: one.value_in(data, one.address - FIRST) for one in REGISTERS}
@@ -281,7 +283,7 @@ def test_the_core_decodes_floats() -> None:
     assert set(decoder().names) == {one.name for one in REGISTERS} - {"pulses", "drift", "flow", "fine"}
 
 
-def test_drives_of_a_model_share_the_decoder_of_equal_blocks_only() -> None:
+def test_drives_of_a_model_share_decoders_only_for_equal_blocks() -> None:
     assert decoder_of(Block.of(Mixed(2), REGISTERS)) is decoder()
     assert decoder_of(Block.of(Mixed(2), REGISTERS[1:])) is not decoder()
 
@@ -301,7 +303,7 @@ def picky(monkeypatch: pytest.MonkeyPatch, **faults: Any) -> tuple[Drive, Picky,
     return drive, sim, bus
 
 
-def test_a_refused_block_is_read_in_parts_until_the_port_is_reopened(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_request_is_split_until_the_port_is_reopened(monkeypatch: pytest.MonkeyPatch) -> None:
     drive, sim, bus = picky(monkeypatch, most=8)
     first = drive.read_many(drive.registers.values())
     assert first == expected_values(range(WIDE))
@@ -315,7 +317,7 @@ def test_a_refused_block_is_read_in_parts_until_the_port_is_reopened(monkeypatch
     assert sim.asked[0] == (0, WIDE)
 
 
-def test_the_error_for_a_refused_block_names_the_refused_register(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_for_a_refused_request_names_the_refused_register(monkeypatch: pytest.MonkeyPatch) -> None:
     drive, sim, _ = picky(monkeypatch, refused={3})
     with pytest.raises(DriveException, match=r"^pump-1 refuses r3: ") as caught:
         drive.read_many(drive.registers.values())
@@ -341,7 +343,7 @@ def test_a_read_is_complete_or_names_the_refused_register(
         bus = SimulatedBus(monkeypatch, Picky(drive, refused, most)).bus
         bus.attach(drive)
         registers = [drive.register(f"r{at}") for at in sorted(asked)]
-        for _ in range(2):  # at the second read, the parts are already known
+        for _ in range(2):  # the second read starts with the parts
             if not refused & asked:
                 assert drive.read_many(registers) == expected_values(asked)
                 continue
@@ -351,7 +353,9 @@ def test_a_read_is_complete_or_names_the_refused_register(
 
 
 @pytest.mark.parametrize("code", [1, 5, 6])
-def test_a_block_refused_as_busy_is_not_split(code: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_request_that_the_drive_refuses_as_busy_is_not_split(
+    code: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     drive, sim, _ = picky(monkeypatch)
     sim.limit = 0
     monkeypatch.setattr(sim, "_code", lambda reason: code)
@@ -380,7 +384,9 @@ def test_a_long_request_without_a_reply_is_split(monkeypatch: pytest.MonkeyPatch
     assert [count for _, count in sim.asked] == [6] * 4
 
 
-def test_a_dead_drive_gets_only_one_additional_request(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dead_drive_gets_only_one_additional_shorter_request(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     drive, sim, _ = picky(monkeypatch, silent_beyond=0)
     with pytest.raises(NoReply):
         drive.read_many(drive.registers.values())
@@ -388,17 +394,17 @@ def test_a_dead_drive_gets_only_one_additional_request(monkeypatch: pytest.Monke
     sim.silent_beyond = 125
     assert drive.read_many(drive.registers.values()) == expected_values(range(WIDE))
     sim.asked.clear()
-    sim.silent_beyond = 1  # the silence may be noise, because the drive has answered the whole block
+    sim.silent_beyond = 1  # the drive has answered the block before: not split
     with pytest.raises(NoReply):
         drive.read_many(drive.registers.values())
     assert sim.asked == [(0, WIDE)] * 3
 
 
 @pytest.mark.parametrize("silent", [{1}, {1, 2}, {0, 2}])
-def test_bytes_received_for_one_attempt_are_reported(
+def test_a_foreign_reply_to_only_one_attempt_is_reported(
     monkeypatch: pytest.MonkeyPatch, silent: set[int]
 ) -> None:
-    """The attempts in `silent` receive no bytes; the others receive a foreign reply, which is reported."""
+    """The attempts in `silent` receive nothing. The other attempts receive a reply from another address."""
     drive = family(2)(1, name="pump-1")
     bus = SimulatedBus(monkeypatch, Picky(drive))
     bus.attach(drive)
@@ -488,7 +494,7 @@ WRONG = {
     (3, 65536, 1): "start = 65536 is not an address",
     (3, 65535, 2): r"start \+ count = 65537: the last address is 65535",
     (3, 1, 0): "count = 0 is outside 1 to 10, the limit of one request to toy@7",
-    (3, 1, 11): "count = 11 is outside 1 to 10",  # a limit of the family
+    (3, 1, 11): "count = 11 is outside 1 to 10",  # the family's limit
     (4, 1, 126): "count = 126 is outside 1 to 125",
     (1, 1, 2001): "count = 2001 is outside 1 to 2000",
 }
@@ -527,7 +533,7 @@ def test_send_raw_rejects_read_functions_before_sending(
     assert simulated.frames == []
 
 
-def test_read_raw_is_limited_by_the_familys_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_raw_respects_the_familys_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     _, native, _ = one(monkeypatch, DelixiNative(1))
     with pytest.raises(ValueError, match="speaks Delixi's own protocol"):
         native.read_raw(3, 1, 1)

@@ -27,7 +27,7 @@ from multidrop.transport.statistics import Diagnostics, LineStatistics, Statisti
 
 __all__ = ["drive", "line"]  # fixtures
 
-LEAST_NS, MOST_NS = 1 << 17, 1 << 32  # between these delays the error is at most 1/16
+LEAST_NS, MOST_NS = 1 << 17, 1 << 32  # delays whose quantiles have an error of at most 1/16
 
 # ---- response delays ----
 
@@ -40,7 +40,7 @@ def counters_of(delays_ns: list[int]) -> Counters:
 
 
 @given(st.lists(st.integers(LEAST_NS, MOST_NS - 1), min_size=1))
-def test_quantiles_are_within_a_part_in_16(delays_ns: list[int]) -> None:
+def test_quantiles_of_delays_have_an_error_of_at_most_one_sixteenth(delays_ns: list[int]) -> None:
     found = Statistics(1.0, counters_of(delays_ns)).delays
     ordered = sorted(delays_ns)
     for told, percent in ((found.p50, 50), (found.p90, 90), (found.p99, 99)):
@@ -51,13 +51,13 @@ def test_quantiles_are_within_a_part_in_16(delays_ns: list[int]) -> None:
 
 
 @table("delay_ns", [0, 1, LEAST_NS - 1, MOST_NS, 10 * MOST_NS, (1 << 63) - 1])
-def test_delays_outside_of_the_buckets_are_counted_too(delay_ns: int) -> None:
+def test_delays_outside_the_range_of_the_buckets_are_counted_too(delay_ns: int) -> None:
     found = Statistics(1.0, counters_of([delay_ns])).delays
     assert (found.replies, found.longest) == (1, delay_ns / 1e9)
     assert 0 <= found.p50 <= found.p99 <= found.longest
 
 
-def test_between_two_buckets_there_is_no_gap() -> None:
+def test_the_buckets_of_delays_have_no_gap_between_them() -> None:
     edges = [delay_edge(bucket) for bucket in range(129)]
     assert edges == sorted(set(edges))
     assert edges[0] == 0
@@ -70,7 +70,9 @@ def test_without_replies_the_delays_are_0() -> None:
     assert (found.replies, found.p50, found.p99, found.longest) == (0, 0, 0, 0)
 
 
-def test_delays_include_only_the_drives_response_time(line: LineDriver, drive: Peer) -> None:
+def test_a_delay_is_the_drives_response_time_without_the_time_on_the_wire(
+    line: LineDriver, drive: Peer
+) -> None:
     for delay in (10, 10, 10, 15):
         answer(line, drive, delay * MS)
     found = Statistics(1.0, drive.counters()).delays
@@ -79,7 +81,9 @@ def test_delays_include_only_the_drives_response_time(line: LineDriver, drive: P
 
 
 @pytest.mark.parametrize("delay_ms", [0, 3, 20])
-def test_utilisation_follows_the_wire_s_settings(line: LineDriver, drive: Peer, delay_ms: int) -> None:
+def test_utilisation_includes_characters_response_delays_and_silences(
+    line: LineDriver, drive: Peer, delay_ms: int
+) -> None:
     for _ in range(10):
         answer(line, drive, delay_ms * MS)
     characters = (8 + 7) * CHARACTER
@@ -96,7 +100,7 @@ def test_the_utilisation_of_a_port_faster_than_its_settings_is_at_most_1(
         line.now += MS // 10
         line.receive(reply())
         line.wait_until_done()
-    line.now += 8 * CHARACTER  # the calculated end of the last request
+    line.now += 8 * CHARACTER  # the time of the last request at its baud rate
     found = Statistics((line.now - begun) / 1e9, drive.counters())
     assert found.samples == 100
     assert 0.9 < found.utilisation <= 1.0 + 1e-9
@@ -135,7 +139,9 @@ def counted(known: Peer) -> Counter[str]:
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_each_outcome_is_counted_in_the_guides_counters(line: LineDriver, drive: Peer, ending: str) -> None:
+def test_each_outcome_is_counted_in_the_counters_of_the_modbus_guide(
+    line: LineDriver, drive: Peer, ending: str
+) -> None:
     request, received, expected = ENDINGS[ending]
     line.echo = lib.MD_NO_ECHO
     ask(line, drive, request)
@@ -170,7 +176,7 @@ def test_unsent_requests_are_not_counted(line: LineDriver, drive: Peer) -> None:
 
 def test_overruns_are_read_from_the_port_s_driver(monkeypatch: pytest.MonkeyPatch) -> None:
     def counts(fd: int, request: int, answer: bytearray) -> None:
-        assert request == 0x545D  # TIOCGICOUNT of asm-generic/ioctls.h
+        assert request == 0x545D  # TIOCGICOUNT (asm-generic/ioctls.h)
         # linux/serial.h: cts dsr rng dcd rx tx frame overrun parity brk buf_overrun
         answer[:] = struct.pack("20i", 1, 2, 3, 4, 5, 6, 7, 100, 9, 10, 20, *[0] * 9)
 
@@ -188,7 +194,7 @@ def line_of(seconds: float, overruns: int | None = None, **drives: Counters) -> 
     return line_statistics(seconds, drives, overruns)
 
 
-def test_statistics_of_a_span_are_the_difference_of_two_readings() -> None:
+def test_since_returns_the_difference_between_two_statistics() -> None:
     one = line_of(10, 5, pump=Counters(sent=100, ideal_ns=4 * 10**9, missed=Counter({10: 3})))
     two = line_of(
         12,
@@ -205,10 +211,10 @@ def test_statistics_of_a_span_are_the_difference_of_two_readings() -> None:
     assert found.drives["pump"].utilisation == 0.5
 
 
-def test_the_longest_delay_of_a_span_is_derived_from_its_buckets() -> None:
+def test_since_derives_the_longest_delay_from_the_buckets() -> None:
     early, late = counters_of([50 * MS]), counters_of([50 * MS, 8 * MS])
     found = line_of(2, pump=late).since(line_of(1, pump=early)).delays
-    assert 8e-3 <= found.longest <= 8e-3 * 9 / 8  # the end of the longest delay's bucket, not the exact delay
+    assert 8e-3 <= found.longest <= 8e-3 * 9 / 8  # the end of the bucket that has 8 ms
     record = counters_of([50 * MS, 8 * MS, 70 * MS])
     assert line_of(2, pump=record).since(line_of(1, pump=early)).delays.longest == 0.070
 
@@ -229,7 +235,7 @@ def test_a_bus_counts_exchanges_and_delays(toy: SimulatedDrive) -> None:
         with pytest.raises(TimeoutError):
             nobody.read(Toy.output_current)
         found = bus.statistics()
-        asked = found.drives["pump"].exchanges  # more than the replies, if the computer was slow
+        asked = found.drives["pump"].exchanges  # includes retries on a slow computer
         assert asked >= found.drives["pump"].delays.replies > 0
         assert found.drives["nobody"].diagnostics.server_no_responses == found.drives["nobody"].exchanges == 3
         assert found.exchanges == asked + 3
@@ -237,7 +243,7 @@ def test_a_bus_counts_exchanges_and_delays(toy: SimulatedDrive) -> None:
         assert bus.statistics().exchanges == 0
         pump.read(Toy.output_current)
         assert bus.statistics().delays.replies == 1
-    assert bus.statistics() == bus.statistics()  # frozen once the bus is closed
+    assert bus.statistics() == bus.statistics()  # constant after the bus is closed
     assert bus.statistics().delays.replies == 1
 
 
@@ -263,8 +269,8 @@ def test_a_poller_counts_its_rows_by_status(toy: SimulatedDrive) -> None:
 
 
 @pytest.mark.usefixtures("_patient")
-def test_renamed_and_replaced_drives_are_counted_since_the_reset(toy: SimulatedDrive) -> None:
-    """Otherwise one drive would have earlier counts, and another drive negative ones."""
+def test_reset_statistics_resets_renamed_and_replaced_drives_too(toy: SimulatedDrive) -> None:
+    """Otherwise a renamed drive would keep earlier counts, and a new drive could have negative counts."""
     others = [simulated(Toy(address, name=f"toy-{address}")) for address in (2, 3)]
     with Simulator([Wire([toy, *others], unpaced=True)]) as simulator, Bus(simulator.wires[0].path) as bus:
         known = [bus.attach(Toy, address=address, name=name) for address, name in ((1, "a"), (2, "b"))]

@@ -110,7 +110,7 @@ def port() -> Iterator[str]:
 
 
 @pytest.mark.usefixtures("_patient")
-def test_a_drive_uses_the_ports_framing_while_it_is_attached(port: str) -> None:
+def test_an_attached_drive_uses_the_framing_of_its_port(port: str) -> None:
     drive = InnovertIBD(1)
     with Bus(port) as bus:
         bus.attach(drive)
@@ -130,7 +130,9 @@ def test_a_drive_uses_the_ports_framing_while_it_is_attached(port: str) -> None:
         (DelixiNative(1), "does not speak Modbus, and a tcp:// port such as tcp://.* carries nothing else"),
     ],
 )
-def test_another_framing_on_tcp_raises_a_one_sentence_error(port: str, drive: Drive, sentence: str) -> None:
+def test_a_drive_with_another_framing_on_a_tcp_port_raises_a_one_sentence_error(
+    port: str, drive: Drive, sentence: str
+) -> None:
     with Bus(port) as bus, pytest.raises(ValueError, match=sentence):
         bus.attach(drive)
 
@@ -148,7 +150,7 @@ def test_tcp_framing_on_a_serial_port_raises_a_one_sentence_error(drive: Drive, 
         bus.attach(drive)
 
 
-def test_unit_ids_of_modbus_tcp_raise_on_other_ports() -> None:
+def test_unit_ids_that_only_modbus_tcp_allows_raise_on_other_ports() -> None:
     class Both(Drive):
         title = "Both"
         addresses = range(256)
@@ -237,7 +239,7 @@ def answer_when_both_asked(listening: socket.socket) -> None:
         threading.Thread(target=serve, args=[listening.accept()[0]], daemon=True).start()
 
 
-def test_two_lines_of_one_gateway_have_concurrent_requests(tmp_path: Path) -> None:
+def test_two_lines_to_one_gateway_have_requests_at_the_same_time(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         threading.Thread(target=answer_when_both_asked, args=[listening], daemon=True).start()
         port = f"tcp://127.0.0.1:{listening.getsockname()[1]}"
@@ -247,7 +249,7 @@ def test_two_lines_of_one_gateway_have_concurrent_requests(tmp_path: Path) -> No
     assert found - {("pump-1", None), ("pump-2", None)} <= {("pump-1", 0.1), ("pump-2", 0.2)}
 
 
-def test_a_unit_on_two_lines_of_one_gateway_is_a_mistake(tmp_path: Path) -> None:
+def test_one_unit_id_on_two_lines_to_one_gateway_is_a_mistake(tmp_path: Path) -> None:
     sentence = r'line "net-2", drive "pump-2": address 1 is already used by line "net-1", drive "pump-1"'
     with pytest.raises(PlantError, match=sentence):
         load_plant(plant_of_two(tmp_path / "plant.toml", "tcp://10.0.0.7", 1))
@@ -258,7 +260,7 @@ def test_a_unit_on_two_lines_of_one_gateway_is_a_mistake(tmp_path: Path) -> None
 READ = Message(1, 3, 3, 1)
 
 
-def test_rtu_frames_behind_a_tcp_url_are_reported_and_end_the_connection() -> None:
+def test_rtu_frames_from_a_tcp_port_are_reported_and_end_the_connection() -> None:
     answer = build_reply(Framing.RTU, Message(1, 3, data=b"\0\7"))
     with responder(answer) as (place, came), Bus(f"tcp://{place}") as bus:
         drive = bus.attach(InnovertIBD, 1)
@@ -271,7 +273,7 @@ def test_rtu_frames_behind_a_tcp_url_are_reported_and_end_the_connection() -> No
         until(lambda: len(came) == 2)  # the second request came on a new connection
 
 
-def test_modbus_tcp_behind_a_socket_url_is_reported() -> None:
+def test_modbus_tcp_frames_from_a_socket_port_are_reported() -> None:
     answer = build_reply(Framing.TCP, Message(1, 3, data=b"\0\7", transaction=3))
     with responder(answer) as (place, _), Bus(f"socket://{place}") as bus:
         drive = bus.attach(InnovertIBD, 1)
@@ -290,7 +292,7 @@ def test_the_error_for_a_silent_port_names_the_other_protocol() -> None:
                     drive.read(drive.output_current)
 
 
-def test_a_gateway_s_unreachable_drive_gives_no_reply() -> None:
+def test_exception_0b_of_a_gateway_raises_no_reply() -> None:
     """The gateway answers each request with exception 0BH and the request's transaction id."""
 
     def serve(connection: socket.socket) -> None:
