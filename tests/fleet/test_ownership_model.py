@@ -290,7 +290,7 @@ class PathState(NamedTuple):
     renewed: int | None = 0  # age of the newest renewal whose success the holder knows
     # the record that the taker has read: whether it is still the newest, and how long ago it was first read
     seen: tuple[bool, int] | None = None
-    ending: bool | None = None  # the taker's write in flight; True if it would replace the present revision
+    ending: bool | None = None  # the taker's write in flight; True if it would replace the newest revision
 
 
 @dataclass(frozen=True)

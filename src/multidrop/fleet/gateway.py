@@ -1,4 +1,7 @@
-"""FleetGateway: a gateway process of a fleet. It polls its share of the lines and forwards their samples."""
+"""FleetGateway: a gateway process of a fleet.
+
+It polls the lines assigned to it and forwards their samples.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +43,7 @@ SPOOL_BYTES = 10_000_000_000
 LINES_AT_ONCE = 32  # limit of lines that are opened or closed concurrently
 STATE = {"state": str, "lines": int, "margin_s": float, "trouble": str, "troubles": dict, "spool": dict}
 SPOOL = {"bytes": int, "lost": int, "behind": int | None, "lag_s": float | None, "trouble": str | None}
-# time limit at shutdown for forwarding samples; the other samples are forwarded after the next start
+# time limit at shutdown for forwarding samples; remaining samples are forwarded after the next start
 FORWARD_S = 10.0
 IN_TROUBLE_S = 3.0  # time limit at shutdown for forwarding samples if the stream has a problem
 SYNC_S = 3.0  # time limit at shutdown for writing the last samples to the disk
@@ -244,7 +247,7 @@ async def ask_gateway(path: ServerPath, gateway: str, wanted: str) -> dict[str, 
 class FleetLines:
     """The lines that a gateway polls, in one Poller that sends only while the lease is valid.
 
-    Lines are added and removed in threads, because both wait for ports.
+    Lines are added and removed in threads, because each call waits for the line's port.
     """
 
     def __init__(self, mastership: Mastership, folder: Path, units: PolledUnits) -> None:

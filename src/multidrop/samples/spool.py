@@ -98,7 +98,7 @@ class SpoolFolder:
             return log
         found = _parsed(path)
         if found.get("format") != FORMAT or not re.fullmatch(r"[0-9a-f]{16}", str(found.get("log"))):
-            raise SpoolError(f"{path} is not the head file of a spool of this version ({FORMAT!r})")
+            raise SpoolError(f"{path} is not a valid {HEAD} of this version ({FORMAT!r})")
         if found.get("gateway") != wanted["gateway"]:
             raise SpoolError(
                 f"{self.path} is the spool of gateway {found.get('gateway')!r}, not of {wanted['gateway']!r}"

@@ -46,8 +46,8 @@ STEP_S = 0.05  # pause between two steps of the state machine while no record ch
 LEAST_STEP_S = 0.01  # least pause between two steps
 TIDY_NS = SECOND // 2  # time between checks of this gateway's lines if no change was reported
 SETTLE_S = 3.0
-# A gateway ends the sessions of others only if its own lease is valid for at least this many seconds. If less
-# is left, the servers may be failing for all gateways.
+# A gateway ends the sessions of other gateways only if its own lease is valid for at least this many seconds.
+# If less is left, the servers may be failing for all gateways.
 SOUND_S = 1.0
 WEAK_LOOK_S = 1.0
 # A session that has lost one of its three lease records is kept for at least this time after STARTING.
@@ -149,7 +149,7 @@ class MemberState(StrEnum):
 
 
 class Member:
-    """One gateway of a fleet: its lease, its share of the lines, and its knowledge of the other gateways."""
+    """One gateway of a fleet: its lease, its lines, and its knowledge of the other gateways."""
 
     def __init__(
         self,

@@ -2,7 +2,7 @@
 
 | user      | may                                                                                          |
 |-----------|----------------------------------------------------------------------------------------------|
-| a gateway | publish its own samples, write leases in its own name, write owners of lines, read all      |
+| a gateway | publish its own samples, write leases in its own name, write owners of lines, read all       |
 |           | records, take commands of any line and requests about itself, answer them, move leaders home |
 | hub       | read the stream of samples                                                                   |
 | viewer    | read all records, ask gateways about themselves                                              |
