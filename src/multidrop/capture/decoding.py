@@ -37,11 +37,11 @@ from multidrop.polling.batch import Batch
 from multidrop.printable import format_time
 
 ROWS = 1 << 16  # limit of rows per batch
-_MOST_NAMES = 60_000  # limit of register names per batch; codes of names have 16 bits
+_MOST_NAMES = 60_000  # limit of register names per batch, because a name's code has 16 bits
 
 
 class Decoding:
-    """Decodes a capture to batches; each batch has rows of one line only."""
+    """Decodes a capture to batches. All rows of a batch are from one line."""
 
     def __init__(self, capture: Capture, known: Plant | None = None) -> None:
         self._capture = capture
@@ -58,7 +58,9 @@ class Decoding:
             yield from line.rest()
 
     def counts(self) -> Counter[str]:
-        """Return the numbers of exchanges, frames, unknown bytes and so on, decoded so far on all lines."""
+        """Return how many exchanges, frames, unknown bytes and so on were decoded so far, on all lines
+        together.
+        """
         return sum((Counter(line.decoder.counts()) for line in self._lines), Counter())
 
 
@@ -124,7 +126,7 @@ _TABLES = {
 _BITS = (0x01, 0x02, 0x05, 0x0F)
 # limit of values per reply, even if the request asks for more
 _MOST = {NumberFormat.BIT: 2000, NumberFormat.U16: 125}
-_WRITES = {  # by a request's function code: the write codes of the tables that it may write to
+_WRITES = {  # a request's function code: the declared write codes of the registers that it may write
     0x05: (0x05,),
     0x06: (0x06,),
     0x0F: (0x05, 0x0F),
@@ -135,7 +137,9 @@ _DELIXI_WRITES = {0x02: (0x02,), 0x04: (0x04,), 0x05: (0x05, 0x06), 0x06: (0x05,
 
 @dataclass(frozen=True)
 class RegisterPlace:
-    """A register (None: unknown) and its offset in the data of an exchange, in 16-bit words or in bits."""
+    """A register (None if unknown) and its offset in an exchange's data. The offset is in words, or in bits
+    for coils.
+    """
 
     name: str
     at: int
@@ -192,7 +196,7 @@ def _known(
 
 
 def _offset(register: Register[Any], request: Message) -> int | None:
-    """Return the register's offset in the request's data; None if the data lack a part of the register."""
+    """Return the register's offset in the request's data, or None unless the data have the whole register."""
     if register.table.carrier is Carrier.NUMBER:
         return 0
     end, reach = request.start + max(request.count, 1), register.reach
@@ -211,7 +215,7 @@ def _raw(framing: Framing, request: Message) -> tuple[RegisterPlace, ...]:
     return tuple(RegisterPlace(f"{table}_{request.start + at}", at, number_format) for at in range(count))
 
 
-_MOST_SHOWN = 16  # limit of raw registers in a line of text
+_MOST_SHOWN = 16  # largest number of raw registers in a line of text
 _MOST_BYTES = 32
 
 
@@ -315,7 +319,7 @@ def _number(place: RegisterPlace, data: bytes) -> float | int | None:
         number = place.register.number_in(data, place.at)
         return number if number is None or place.register.values is None else int(number)
     raw = raw_value(data, place.at, place.number_format)
-    # `raw == raw` is False for NaN, which means that the reply's data end before this register
+    # NaN (`raw != raw`) means that the reply ends before this register
     return int(raw) if raw == raw else None
 
 

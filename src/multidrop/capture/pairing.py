@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from multidrop.core import FrameSpan, Framing, Kind, Message, Side
 
-_MOST_JUNK = 4096  # limit of bytes in one Junk
+_MOST_JUNK = 4096  # largest number of bytes in one Junk
 _COUNTED = ("exchanges", "broadcasts", "unanswered", "strays", "unknown_bytes")
 
 
@@ -30,7 +30,7 @@ class SniffedExchange:
     time_ns: int
     reply_time_ns: int
     is_sure: bool
-    raw: tuple[tuple[Side, bytes, int], ...]  # frames: sender, bytes, time in ns
+    raw: tuple[tuple[Side, bytes, int], ...]  # for each frame: sender, bytes, time in ns
 
     @property
     def is_broadcast(self) -> bool:
@@ -57,7 +57,7 @@ class Pairing:
         self._junk: list[FrameSpan] = []
 
     def pair(self, spans: Iterable[FrameSpan]) -> Iterator[Sniffed]:
-        """Yield the exchanges in the spans.
+        """Yield the exchanges and the junk in these frames.
 
         A request stays pending until its reply or another request follows.
         """

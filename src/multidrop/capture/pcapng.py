@@ -1,7 +1,7 @@
 """Captures: write pcapng files that Wireshark decodes without configuration; read pcap and pcapng files.
 
-A capture is read in pieces, because it may be larger than memory. It is not mapped into memory: if another
-program truncated the file, a mapping would crash the process, whereas reading raises an error.
+A capture is read in pieces, because it may be larger than memory. It is not mapped into memory: a mapping
+crashes the process if another program truncates the file.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class CaptureWriter:
     """
 
     def __init__(self, path: Path | str, lines: Sequence[str] = (), comment: str = "") -> None:
-        from importlib.metadata import version  # a slow import, which few commands need
+        from importlib.metadata import version  # imported here because it is slow
 
         self.path = Path(path)
         self._lines: dict[str, int] = {}
@@ -62,12 +62,12 @@ class CaptureWriter:
         self.append(WRAPPINGS.packet(self._lines[line], side, time_ns, raw))
 
     def append(self, packets: bytes) -> None:
-        """Append packets that are already in pcapng format; their interface n is the n-th name in `lines`."""
+        """Append packets in pcapng format. A packet's interface number is an index into `lines`."""
         with writing(self.path):
             self._file.append(packets)
 
     def report(self, anomalies: list[str]) -> None:
-        """Ignore anomalies: a capture has all packets anyway."""
+        """Do nothing: a capture has all packets, with or without anomalies."""
 
     def _declare(self, line: str) -> None:
         self._lines[line] = len(self._lines)
@@ -118,7 +118,7 @@ _MASTER, _DRIVE = (bytes([10, 0, 0, 1]), 50000), (bytes([10, 0, 0, 2]), 502)
 _FAILED, _NOISE = (bytes([10, 0, 0, 2]), 1), (bytes([10, 0, 0, 3]), 2)
 _OUTBOUND = (_EPB_FLAGS, struct.pack("<I", 2))
 _INBOUND = (_EPB_FLAGS, struct.pack("<I", 1))
-_PACKETS = {  # by side: dissector of binary frames, sender, receiver, packet options
+_PACKETS = {  # for each side of the line: dissector, sender, receiver, packet options
     Side.EITHER: (_BYTES, None, _MASTER, [(_COMMENT, b"no frame")]),
     Side.ASKING: (_RTU, _MASTER, _DRIVE, [_OUTBOUND]),
     Side.ANSWERING: (_RTU, _DRIVE, _MASTER, [_INBOUND]),
@@ -130,8 +130,8 @@ _PACKETS = {  # by side: dissector of binary frames, sender, receiver, packet op
 def _wrappings(frames: bytes, texts: bytes) -> Wrappings:
     """Return the headers and options of a line's packets.
 
-    `frames` is the dissector for most frames. `texts` is that for frames that start with ':', like ASCII
-    frames.
+    `texts` is Wireshark's dissector for frames that start with ':', as ASCII frames do; `frames` is that for
+    all other frames.
     """
     return Wrappings(
         {
@@ -146,7 +146,7 @@ def _wrappings(frames: bytes, texts: bytes) -> Wrappings:
 
 
 WRAPPINGS = _wrappings(_RTU, _BYTES)
-TCP_WRAPPINGS = _wrappings(_TCP_FRAME, _TCP_FRAME)  # for tcp:// ports: there ':' starts no ASCII frame
+TCP_WRAPPINGS = _wrappings(_TCP_FRAME, _TCP_FRAME)  # for tcp:// ports, which have no ASCII frames
 
 
 # ---- reading ----
@@ -157,7 +157,7 @@ _IF_OFFSET = 14
 _BINARY, _MOST_DIGITS, _MOST_BITS = 0x80, 9, 32
 # limit of an interface's time offset in s, because times in ns since 1970 must fit into 64 bits
 _MOST_OFFSET = 1 << 33
-_PCAP = {  # for a file's first four bytes: whether it is big-endian, and its clock ticks per second
+_PCAP = {  # a file's first four bytes: (is big-endian, clock ticks per second)
     b"\xd4\xc3\xb2\xa1": (False, 10**6),
     b"\xa1\xb2\xc3\xd4": (True, 10**6),
     b"\x4d\x3c\xb2\xa1": (False, 10**9),
@@ -209,7 +209,7 @@ class Capture:
     def _begin(self) -> None:
         if not self._file.seekable():  # the path is a serial port or a pipe
             raise CaptureError(f"{self.path} is not a capture: it is not a regular file")
-        # size at the start: bytes that are appended later are not read
+        # bytes that are appended later are not read
         self._size = self._file.seek(0, SEEK_END)
         if not self._size:
             raise CaptureError(f"{self.path} is not a capture: it is empty")
@@ -231,7 +231,7 @@ class Capture:
             raise CaptureError(f"{self.path} is not a capture: it does not start like a pcap or pcapng file")
 
     def __iter__(self) -> Iterator[None]:
-        """Fill `streams` from the file, and yield whenever the caller must take all bytes out of them."""
+        """Fill `streams` from the file. At each yield the caller must empty them."""
         unpacker = self._unpacker
         assert unpacker is not None
         seen = unpacker.at  # position in the file after the last byte read so far

@@ -25,7 +25,7 @@ class CapturedReply(NamedTuple):
 
 
 class Replay:
-    """The exchanges in a capture, by drive. Replay time starts at the first request to a replayed drive.
+    """The exchanges in a capture, by drive. The replay starts at the first request to a replayed drive.
 
     `plant` describes the captured lines. If it has only one line, captured lines may have any name. Raises
     CaptureError for an invalid file, and ValueError if the capture has no exchange with a drive of the plant.
@@ -82,11 +82,11 @@ class Replay:
 
 
 class ReplayedDrive(SimulatedDrive):
-    """A drive with captured values. Until its second captured value is due, a register has its first one.
+    """A drive with captured values. Each register starts with its first captured value.
 
-    The simulation is silent when the captured drive was silent, and always if the capture has no such drive.
-    Registers that were not captured keep their defaults. Replies have the family's response delay, not the
-    captured delay.
+    The simulation is silent when the captured drive was silent. It is always silent if the capture has no
+    such drive. Registers that were not captured keep their defaults. Replies have the family's response
+    delay, not the captured delay.
     """
 
     def __init__(self, drive: Drive, replay: Replay) -> None:
@@ -99,7 +99,7 @@ class ReplayedDrive(SimulatedDrive):
 
     def _store(self, reply: CapturedReply) -> None:
         for name, value in (reply.values or {}).items():
-            with suppress(ValueError):  # raised if the family knows no raw count that means "no value"
+            with suppress(ValueError):  # raised if the family has no raw count for "no value"
                 self.memory.set(self.drive.register(name), value)
 
     def answer(self, request: Message, now: float) -> Message | None:

@@ -64,9 +64,7 @@ class Tapped:
         return sum(tap.lost for tap in self._taps)
 
     def close(self) -> None:
-        """Pass the remaining traffic to the sinks. A port that is already closed is not reported as an
-        anomaly.
-        """
+        """Pass the remaining traffic to the sinks, without a last check for anomalies."""
         self._hand_on()
 
     def __enter__(self) -> Self:
@@ -77,9 +75,9 @@ class Tapped:
 
 
 AFTER_S = 2.0  # a file ends this many seconds after its anomaly
-PAUSE_S = 60.0  # least time in s between two files, so that a noisy line does not fill the disk
+PAUSE_S = 60.0  # minimum time in s between two files, so that a noisy line does not fill the disk
 _NAME = re.compile(r"flight-\d{8}T\d{6}Z\.pcapng")
-_MOST_NAMED = 20  # limit of anomalies in a file's comment
+_MOST_NAMED = 20  # largest number of anomalies in a file's comment
 
 
 class FlightRecorder:
@@ -158,7 +156,7 @@ def _name(second: int) -> str:
     return f"flight-{datetime.fromtimestamp(second, UTC):%Y%m%dT%H%M%SZ}.pcapng"
 
 
-SILENT = 3  # exchanges in a row without a reply after which a drive is reported as silent
+SILENT = 3  # a drive is reported as silent after this many unanswered exchanges in a row
 _BAD = (
     Status.NO_START,
     Status.BAD_CHARACTER,

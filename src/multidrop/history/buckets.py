@@ -1,4 +1,4 @@
-"""Buckets: the least, mean and greatest value of a register in each of many equal time intervals."""
+"""Buckets: equal time intervals, each with the least, mean and greatest value of a register."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from multidrop.history.folder import SECOND_NS, TEN_NS
 
 STEPS_S = (10, 20, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400)
 MOST_POINTS = 100_000
-_BEFORE_ALL, _AFTER_ALL = -(1 << 64), 1 << 64  # ns: earlier and later than any time of a row
-# an empty bucket: number of values, number of misses; sum, least and greatest of the values
+_BEFORE_ALL, _AFTER_ALL = -(1 << 64), 1 << 64  # in ns: before and after the time of every row
+# an empty bucket: number of values, number of failed reads; sum, least and greatest of the values
 _EMPTY = 0, 0, 0.0, math.inf, -math.inf
-# Shorter buckets are computed from rows. Others are computed from ten-second summaries, at a hundredth of the
-# cost.
+# Buckets shorter than this are computed from rows. Longer buckets are computed from ten-second summaries, at
+# a hundredth of the cost.
 FINE_NS = 2 * SECOND_NS
 
 
@@ -26,15 +26,14 @@ class Buckets:
     Bucket i starts at `begin + i * step`, in ns. In a bucket without values, `least`, `mean` and `most`
     are None, and `missed` is above 0 if the register was polled, else 0.
 
-    A register's quantity is that which its values measure. All values are of the newest quantity in the
-    range, and `unit` is its unit, if recorded. `left_out` lists the units of excluded rows, which were
-    recorded while the name belonged to another register.
+    If the register's unit changed in the range, only values with the newest unit are included. `unit` is that
+    unit, if recorded. `left_out` lists the units of the excluded rows.
     """
 
     begin: int  # UTC in ns
     step: int  # in ns
-    n: list[int]  # number of values, for each bucket
-    missed: list[int]  # number of misses, for each bucket
+    n: list[int]  # number of values in each bucket
+    missed: list[int]  # number of failed reads in each bucket
     least: list[float | None]
     mean: list[float | None]
     most: list[float | None]
@@ -95,19 +94,19 @@ def grid_of(begin: int, end: int, points: int) -> Grid:
     for step in _handy_steps(least):
         first = begin // step * step
         needed = -(-(end - first) // step)
-        if needed <= max(points, 2):  # with `points` = 1, a range may lie in two aligned buckets
+        if needed <= max(points, 2):  # even with `points` = 1, the range may overlap two aligned buckets
             return Grid(first, step, needed)
     raise AssertionError("steps grow for ever")
 
 
 def _handy_steps(least: int) -> Iterator[int]:
-    """Yield round bucket lengths in ns, from 10 s to any number of days, that are at least `least`."""
+    """Yield round bucket lengths in ns, such as 10 s, 1 min or 1 day, from `least` upwards."""
     yield from (seconds * SECOND_NS for seconds in STEPS_S if seconds * SECOND_NS >= least)
     yield from (days * 86400 * SECOND_NS for days in count(max(2, least // (86400 * SECOND_NS))))
 
 
 class Accumulator:
-    """Collects one register's values and misses in each bucket of a grid."""
+    """Collects one register's values, and counts its failed reads, in each bucket of a grid."""
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid
@@ -116,8 +115,8 @@ class Accumulator:
         self._least, self._most = [math.inf] * grid.points, [-math.inf] * grid.points
 
     def add(self, bucket: int, n: int, missed: int, total: float, least: float, most: float) -> None:
-        """Add `n` values and `missed` misses to the bucket at this index. `total`, `least` and `most` are the
-        sum, least and greatest of the values.
+        """Add `n` values and `missed` failed reads to the bucket at this index. `total`, `least` and `most`
+        are the sum, least and greatest of the values.
         """
         self._missed[bucket] += missed
         if n:
@@ -127,9 +126,8 @@ class Accumulator:
             self._most[bucket] = max(self._most[bucket], most)
 
     def add_rows(self, times: Iterable[int], values: Iterable[float], valid: Iterable[int]) -> None:
-        """Add rows with times in ns; an invalid row is a miss. Rows outside the grid are skipped.
-
-        Successive rows are mostly in the same bucket, so a run of such rows is summed before it is added.
+        """Add rows with times in ns. A row that is not valid is a failed read. Rows outside the grid are
+        skipped.
         """
         grid, bucket, begin, end = self._grid, -1, 0, 0
         n, missed, total, least, most = _EMPTY
@@ -177,7 +175,9 @@ def _where(has: Sequence[int], values: Sequence[float]) -> list[float | None]:
 
 
 class UnitBuckets:
-    """The buckets of one register, separate for each unit that its rows state (as rows of a hub do)."""
+    """The buckets of one register, separately for each unit that its rows state. Rows of `multidrop hub`
+    state their unit.
+    """
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid

@@ -24,7 +24,7 @@ from multidrop.recording.arrows import ArrowsReader
 from multidrop.recording.segments import FileLock, segments_of
 from multidrop.whole_file import UNFINISHED, whole_file
 
-MEMORY = "100MB"  # limit for DuckDB; the whole process takes about 80 MB more
+MEMORY = "100MB"  # DuckDB's limit; the process takes about 80 MB besides
 WITH_UNITS = """
 create temp view with_units as select recorded.*, unit from recorded left join units using (drive, register)
 """
@@ -37,7 +37,7 @@ from {} group by all order by drive, register, time
 """
 MERGED = "select * exclude filename from {} order by drive, register, time"
 MERGED_ROWS = "select * exclude filename from {} order by drive, time"
-MOST_MERGED = 200_000_000  # limit in bytes for the rows files that are merged into one file
+MOST_MERGED = 200_000_000  # limit in bytes of the files in `rows/` that are merged into one file
 
 
 def main(words: list[str] | None = None) -> int:
@@ -60,10 +60,9 @@ def main(words: list[str] | None = None) -> int:
 
 
 def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
-    """Convert segments with numbers under `below` to Parquet, and merge the tens of each past hour and day.
-
-    "Tens" are ten-second summaries, as in the package's docstring. With `merge_rows`, also merge the rows of
-    each past hour, and compute tens that are missing for files in `rows/`.
+    """Convert segments with numbers under `below` to Parquet, and merge the ten-second summaries of each past
+    hour and day. With `merge_rows`, also merge the rows of each past hour, and compute missing summaries for
+    files in `rows/`.
     """
     for name in ("rows", "tens", "damaged"):
         (folder / name).mkdir(exist_ok=True)
@@ -74,7 +73,7 @@ def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
                 _compact_segment(database, folder, number, path)
         if merge_rows:
             rows = widest(parquet_files(folder / "rows"))
-            # before the merge, because a merged file would hide which of its parts lack tens
+            # before the merge, because a merged file does not show which of its parts lack summaries
             _make_tens(database, folder, rows[:-1])
             for part in (part for run in finished(rows, 3600, set()) for part in _parts(run)):
                 _merge(database, part, MERGED_ROWS, keeps_metadata=True)
@@ -85,7 +84,7 @@ def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
 
 
 def clean(folder: Path) -> None:
-    """Remove the remains of a killed process: incomplete files, and files that newer files replace."""
+    """Remove what a killed compaction left behind: incomplete files, and files that newer files replace."""
     for directory in (folder / "rows", folder / "tens"):
         for path in directory.glob(UNFINISHED):
             path.unlink()
@@ -109,7 +108,7 @@ def _is_whole(path: Path) -> bool:
 
 def _put_away(folder: Path, path: Path, is_damaged: bool) -> None:
     """Remove a compacted segment, or move it to `damaged/` if it is damaged."""
-    with suppress(FileNotFoundError):  # the segment may have been removed already because of its age
+    with suppress(FileNotFoundError):  # the recorder may have removed the old segment already
         if is_damaged and path.stat().st_size:
             path.replace(folder / "damaged" / path.name)
         else:
@@ -125,7 +124,7 @@ def _compact_segment(database: Database, folder: Path, number: int, path: Path) 
             metadata = dict(reader.metadata)
             if reader.truncated:
                 damage.append(f"{path} ends within a batch: its last {reader.truncated} bytes were skipped")
-        except FileNotFoundError:  # the segment was removed because of its age
+        except FileNotFoundError:  # the recorder has removed the old segment
             return
         except ValueError as error:
             damage.append(str(error))
@@ -168,8 +167,8 @@ def _without_tens(folder: Path, tens: list[HistoryFile]) -> set[int]:
 def finished(files: list[HistoryFile], seconds: int, missing: set[int]) -> list[list[HistoryFile]]:
     """Return groups of files to merge: one group for each past period of `seconds`, an hour or a day.
 
-    A group is left out while one of its segments is in `missing`, the numbers of segments without ten-second
-    summaries: a merged file would hide that these summaries are missing.
+    `missing` has the numbers of the segments without ten-second summaries. Groups with such a segment are
+    omitted, because a merged file does not show which summaries are missing.
     """
     runs = [list(run) for _, run in groupby(files, key=lambda file: file.begin // seconds)]
     return [
@@ -180,8 +179,8 @@ def finished(files: list[HistoryFile], seconds: int, missing: set[int]) -> list[
 
 
 def _merge(database: Database, run: list[HistoryFile], query: str, *, keeps_metadata: bool) -> None:
-    """Merge these files into one file in their folder. With `keeps_metadata`, it gets the last file's
-    metadata.
+    """Merge these files into one file in their folder. With `keeps_metadata`, that file gets the metadata of
+    the last of them.
     """
     begin, end = min(file.begin for file in run), max(file.end for file in run)
     path = run[0].path.with_name(file_name(run[0].first, run[-1].last, begin * 10**9, end * 10**9))
@@ -193,7 +192,7 @@ def _merge(database: Database, run: list[HistoryFile], query: str, *, keeps_meta
 
 
 def _parts(run: list[HistoryFile]) -> Iterator[list[HistoryFile]]:
-    """Yield groups of two or more neighbouring files that can be merged into at most MOST_MERGED bytes."""
+    """Yield groups of two or more successive files with at most MOST_MERGED bytes in all."""
     part: list[HistoryFile] = []
     size = 0
     for file in run:
@@ -209,7 +208,7 @@ def _parts(run: list[HistoryFile]) -> Iterator[list[HistoryFile]]:
 
 
 def _make_tens(database: Database, folder: Path, rows: list[HistoryFile]) -> None:
-    """Write the ten-second summaries that `tens/` lacks for these rows files."""
+    """Write those ten-second summaries of these files in `rows/` that are not in `tens/` yet."""
     missing = _without_tens(folder, widest(parquet_files(folder / "tens")))
     for file in rows:
         if file.first in missing:
@@ -220,7 +219,7 @@ def _make_tens(database: Database, folder: Path, rows: list[HistoryFile]) -> Non
 def be_low() -> None:
     """Lower this process's priority, if the system allows it.
 
-    A recorder may use SCHED_RR. This process would inherit SCHED_RR, and delay the recorder's polling.
+    A recorder may have real-time scheduling (SCHED_RR). This process would inherit it, and delay the polling.
     """
     with suppress(OSError, AttributeError):  # Windows and macOS lack sched_setscheduler
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))

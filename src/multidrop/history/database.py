@@ -1,4 +1,6 @@
-"""DuckDB for the history: with bounded memory, one thread, and rows passed as Arrow in both directions."""
+"""Use DuckDB for the history, with limited memory and one thread. Rows are passed as Arrow in both
+directions.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from multidrop.printable import install_command
 from multidrop.recording.format import METADATA_KEY, Metadata
 from multidrop.recording.rows import RecordedRows
 
-MOST_INSERTED = 60_000  # limit of rows per insert; a row takes 70 bytes, because its names are text
+MOST_INSERTED = 60_000  # limit of rows per insert, at 70 bytes per row
 TABLE = (
     "create temp table recorded (time timestamptz_ns, monotonic_ns bigint, uncertainty_ns bigint,"
     " drive varchar, register varchar, value double, status varchar)"
@@ -25,7 +27,7 @@ FORM = "format parquet, compression zstd"
 
 
 class MissingDuckDB(ImportError):
-    """DuckDB is not installed, but compacted files need it."""
+    """DuckDB is not installed, but reading compacted files needs it."""
 
 
 def connect(memory: str, spill: Path | None = None) -> Any:
@@ -43,7 +45,7 @@ def connect(memory: str, spill: Path | None = None) -> Any:
 
 
 class Database:
-    """A database in memory; opened on first use, because opening takes 20 ms of CPU time.
+    """A database in memory. It is opened on first use, because opening takes 20 ms of CPU time.
 
     Data that does not fit into memory goes to the folder `spill`, or to a temporary folder if `spill` is
     None.
@@ -77,7 +79,7 @@ class Database:
 
 
 class ArrowStream:
-    """Batches as an Arrow stream for DuckDB. DuckDB requests a new stream for each query."""
+    """Passes batches to DuckDB as an Arrow stream. DuckDB requests a new stream for each query."""
 
     def __init__(self, batches: Iterable[Rows]) -> None:
         self._arrays = [rows.arrow() for rows in batches]
@@ -108,7 +110,7 @@ def _insert(database: Any, waiting: list[Rows]) -> None:
 
 
 def insert_units(database: Any, units: Mapping[Series, str]) -> None:
-    """Create the table `units`, with the unit of each series."""
+    """Create the table `units`, with the unit of each series (a drive's register)."""
     database.execute("create temp table units (drive varchar, register varchar, unit varchar)")
     columns = [[*part] for part in zip(*(pair for pair in units), strict=True)] or [[], []]
     database.execute(
@@ -132,7 +134,7 @@ def copy_out(
 
 
 def rows_of(database: Any, query: str, values: Mapping[str, Any]) -> Iterator[Rows]:
-    """Yield the rows of a query whose columns are those of a recording."""
+    """Yield the rows of a query. Its columns must be those of a recording."""
     import nanoarrow
 
     for array in nanoarrow.c_array_stream(database.sql(query, params=dict(values))):
@@ -156,7 +158,9 @@ def kept_metadata(database: Any, path: Path) -> dict[str, Any]:
 
 
 def texts_of_metadata(database: Any, paths: Iterable[Path]) -> Iterator[tuple[str, list[str]]]:
-    """Yield each distinct metadata text in these Parquet files, with the names of the files that have it."""
+    """For each different metadata text in these Parquet files, yield the text and the names of the files with
+    it.
+    """
     query = f"""select decode(value), list(file_name) from parquet_kv_metadata({_list(paths)})
         where decode(key) = $key group by value"""
     yield from database.execute(query, {"key": METADATA_KEY}).fetchall()
@@ -172,7 +176,9 @@ def files_of(paths: Iterable[Path]) -> str:
 
 
 def with_units(paths: Iterable[Path]) -> str:
-    """Return the SQL that reads Parquet files as one table with file names; a missing `unit` becomes null."""
+    """Return the SQL that reads Parquet files as one table with the file names. In files without `unit` it is
+    null.
+    """
     files = f"read_parquet({_list(paths)}, union_by_name = true, filename = true)"
     return f"(select * from {files} union all by name select null::varchar as unit where false)"
 

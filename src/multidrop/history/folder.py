@@ -62,7 +62,7 @@ def parquet_files(directory: Path) -> list[HistoryFile]:
 
 
 def widest(files: list[HistoryFile]) -> list[HistoryFile]:
-    """Return the files whose range of segments is not part of another file's range, in order of segments."""
+    """Return the files in order of segments, without those whose segments are all in another file, too."""
     found: list[HistoryFile] = []
     for file in files:
         if not found or file.first > found[-1].last:
@@ -74,7 +74,7 @@ def widest(files: list[HistoryFile]) -> list[HistoryFile]:
 class Listing:
     """The current files of a history; each row is in exactly one file."""
 
-    segments: dict[int, Path] = field(default_factory=dict)  # segments not in `rows`, by number
+    segments: dict[int, Path] = field(default_factory=dict)  # by number: segments that are not in `rows`
     rows: dict[int, HistoryFile] = field(default_factory=dict)
     tens: list[HistoryFile] = field(default_factory=list)
 
@@ -85,7 +85,9 @@ class Listing:
 
 
 def listing(folder: Path) -> Listing:
-    """List a history, or a recording in segments such as run.arrows. Raises OSError if neither exists."""
+    """List the files of a history, or of a recording in segments such as run.arrows. Raises OSError if
+    neither exists.
+    """
     if folder.suffix == ".arrows":
         return Listing(dict(segments_of(folder)))
     # the folder is listed before `rows/` and `tens/`: see rule 3 in the package's docstring

@@ -17,22 +17,22 @@ from multidrop.polling.batch import Row
 from multidrop.recording.arrow_decoder import RecordedColumns
 from multidrop.recording.arrows import ArrowsTail, BatchPlace
 
-MOST_TENS = 4096  # limit of series whose tens are cached, because queries may name unknown series
+MOST_TENS = 4096  # limit of series with cached ten-second summaries, because queries may name unknown series
 
-Ten = list[float]  # a summary: number of values, number of misses; sum, least and greatest of the values
+Ten = list[float]  # a summary: number of values, number of failed reads; sum, least, greatest value
 
 
 class SeriesTens:
-    """The ten-second summaries of one series, computed from all batches whose numbers are below `past`."""
+    """The ten-second summaries of one series. They include all batches with numbers below `past`."""
 
     __slots__ = ("by_number", "past")
 
     def __init__(self) -> None:
         self.past = 0
-        self.by_number: dict[int, Ten] = {}  # by the number of ten-second intervals since 1970
+        self.by_number: dict[int, Ten] = {}  # key: ten-second intervals since 1970
 
     def add(self, time: int, value: float | None) -> None:
-        """Add a row; None is a miss."""
+        """Add a row. None is a failed read."""
         ten = self.by_number.setdefault(time // TEN_NS, [0, 0, 0.0, float("inf"), float("-inf")])
         if value is None:
             ten[1] += 1
@@ -58,7 +58,7 @@ class IndexedBatch(NamedTuple):
 
 
 class GrowingSegment:
-    """A segment, read up to its current end or to its first damaged part, which `damage` describes.
+    """A segment, read up to its current end or to its first damaged part. `damage` describes the damage.
 
     Raises ValueError if the file is not a recording, and OSError.
     """
@@ -79,7 +79,7 @@ class GrowingSegment:
             self._holders += 1
 
     def let_go(self) -> None:
-        """Undo one call of `hold`. Close the file once all calls of `hold` are undone."""
+        """End the effect of one call of `hold`. Close the file after the last of them."""
         with self._changing:
             self._holders -= 1
             if not self._holders:
@@ -131,7 +131,7 @@ class GrowingSegment:
             found[series].add_rows(rows.times, rows.values, rows.valid)
 
     def _batches_between(self, begin: int, end: int) -> range:
-        """Return the numbers from the first to the last batch that may have rows in this time range."""
+        """Return the range of batch numbers that includes all batches with rows in this time range."""
         found = [number for number, batch in enumerate(self._batches) if batch.may_have(begin, end)]
         return range(found[0], found[-1] + 1) if found else range(0)
 
@@ -171,7 +171,9 @@ def _is_valid(columns: RecordedColumns, at: int) -> bool:
 def _codes(
     drives: tuple[str, ...], registers: tuple[str, ...], series: frozenset[Series]
 ) -> frozenset[tuple[int, int]]:
-    """Return a pair of codes for each series: the indexes of its drive and its register in these names."""
+    """Return a pair of codes for each series: the index of its drive in `drives`, and of its register in
+    `registers`.
+    """
     known = {drive for drive, _ in series}
     return frozenset(
         (drive_code, code)
@@ -208,11 +210,11 @@ def _rows(
 
 
 MOST_KEPT = 200_000  # limit of cached rows per segment: 4 MB
-MOST_SERIES = 4096  # limit of cached series, including requested series without rows
+MOST_SERIES = 4096  # limit of cached series; requested series without rows count too
 
 
 class SeriesRow(NamedTuple):
-    """A row of a known series; the value None is a miss."""
+    """A row of a series; the value None is a failed read."""
 
     series: Series
     time: int  # UTC in ns
@@ -223,7 +225,7 @@ class SeriesRows:
     """Rows of one series from a range of batches."""
 
     def __init__(self, first: int) -> None:
-        self.first = self.past = first  # numbers of the first batch, and of the batch after the last one
+        self.first = self.past = first  # first batch number, and last batch number + 1
         self.times = array("q")
         self.values = array("d")
         self.valid = bytearray()
@@ -245,7 +247,7 @@ class KeptSeries:
         self._kept: dict[Series, SeriesRows] = {}  # the least recently requested series first
 
     def rows_of(self, series: Iterable[Series], batches: range) -> dict[Series, SeriesRows]:
-        """Return each series' rows in these batches; cached rows of neighbouring batches may be included."""
+        """Return each series' rows in these batches. The result may include cached rows of other batches."""
         if not batches:
             return {}
         found = {one: self._found(one, batches) for one in series}
@@ -265,8 +267,8 @@ class KeptSeries:
         return sum(len(rows.times) for rows in self._kept.values())
 
     def _found(self, series: Series, batches: range) -> SeriesRows:
-        """Return a series' cached rows if they include, or end just before, the batch `batches.start`; else
-        an empty entry.
+        """Return a series' cached rows if the batch `batches.start` is in them or follows them, else an empty
+        entry.
         """
         rows = self._kept.pop(series, None)
         return rows if rows and rows.first <= batches.start <= rows.past else SeriesRows(batches.start)

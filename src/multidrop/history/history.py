@@ -45,7 +45,7 @@ class History:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder)
-        listing(self.folder)  # raises immediately for a wrong path
+        listing(self.folder)  # raises OSError here if the path is wrong
         self._sources = Sources(self.folder)
 
     def __repr__(self) -> str:
@@ -89,17 +89,17 @@ class History:
     ) -> HistoryRows:
         """Return the rows of the series (None: all series) with begin <= time < end (None: no limit).
 
-        The rows come in the order of recording. In a part of the range, a name may have belonged to another
-        register, with another unit or other names of its numbers. The rows from that part are in a separate
-        column, such as "motor_load [A]", and `metadata` describes both columns. The result is a recording
-        like `multidrop.open_recording` gives: `to_pandas()`, `to_polars()`, `wide()`, batches of rows, Arrow.
+        The rows come in the order of recording. If a register had another unit, or other names of its values,
+        in a part of the range, the rows from that part are in a separate column, such as "motor_load [A]".
+        `metadata` describes both columns. The result is a recording like `multidrop.open_recording` gives:
+        `to_pandas()`, `to_polars()`, `wide()`, batches of rows, Arrow.
         """
         first = ALWAYS[0] if begin is None else ns_of(begin)
         return HistoryRows(self, parsed_series(series), first, ALWAYS[1] if end is None else ns_of(end))
 
     def parting_of(self, series: Sequence[Series] | None, begin: int, end: int) -> Parting:
-        """Return the newest and the earlier quantities of the series (None: all series) in this range's
-        segments.
+        """Return what the series (None: all series) measure in this range: their newest unit, and earlier
+        ones.
         """
         parting = Parting({}, series)
         self._sources.again(lambda found: self._learnt(found, series, begin, end, parting))
@@ -110,7 +110,7 @@ class History:
     ) -> Iterator[Rows]:
         """Yield the rows that `read` returns, for parsed series and times in ns."""
         found = self._sources.again(lambda found: self._learnt(found, series, begin, end, parting))
-        given = 0  # number of the last segment whose rows were yielded
+        given = 0  # number of the newest segment whose rows were yielded
         for number in sorted({*found.segments, *found.rows}):
             if number <= given:
                 continue
@@ -118,7 +118,7 @@ class History:
                 try:
                     yield from self._rows_of_segment(number, found, series, begin, end, parting)
                     break
-                except Replaced:  # raised before the segment's first row, so it can be read from its new file
+                except Replaced:  # no row was yielded yet, so the segment can be read from its new file
                     found = self._sources.listing()
                     self._check_merged(number, found)
             else:
@@ -133,7 +133,7 @@ class History:
     def _learnt(
         self, found: Listing, series: Sequence[Series] | None, begin: int, end: int, parting: Parting
     ) -> Listing:
-        """Add the quantities of all listed segments to `parting`; return the same listing."""
+        """Add the units of all listed segments to `parting`, and return the listing."""
         known = self._sources.known(found, begin, end)
         new = parting.unknown_of(known)
         if files := [found.rows[number] for number in new if number in found.rows and not known[number]]:
@@ -171,8 +171,8 @@ class History:
         more are rounded up to whole tens of seconds, minutes, hours or days of UTC. So the first bucket
         may start before `begin`, and the last bucket may end after `end`.
 
-        In a part of the range, a name may have belonged to another register, with another unit or other
-        names of its numbers. Only values of the newest quantity are included: see `unit` and `left_out`.
+        If a register had another unit, or other names of its values, in a part of the range, only values in
+        the newest unit are included: see `unit` and `left_out`.
         """
         names = parsed_series(series)
         if not names:
@@ -194,8 +194,8 @@ class History:
         self, found: Listing, into: Mapping[Series, UnitBuckets], grid: Grid, parting: Parting
     ) -> None:
         everything = tuple(into)
-        # A file of ten-second summaries may cover many segments. If their quantities differ, read each
-        # segment instead.
+        # A file of ten-second summaries may cover many segments. If a register changed its unit in between,
+        # read each segment instead.
         tens = [file for file in found.tens if grid.is_of_tens and parting.is_whole(file.first, file.last)]
         reckoned = {number for file in tens for number in range(file.first, file.last + 1)}
         parted: dict[tuple[str, tuple[Series, ...]], list[HistoryFile]] = {(OF_TENS, everything): tens}
@@ -296,9 +296,7 @@ class HistoryRows(RecordingReader):
 
 
 def _renamed(rows: list[Row], others: Iterable[OtherColumn]) -> list[Row]:
-    """Return a segment's rows, in which registers with an earlier quantity have the names of their separate
-    columns.
-    """
+    """Return a segment's rows. Registers with an earlier unit are renamed to their separate columns."""
     columns = {other.series: other.column for other in others}
     if not columns:
         return rows

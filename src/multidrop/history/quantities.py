@@ -1,7 +1,6 @@
-"""Series and quantities: the names of series, and what their values measure, from the metadata of segments.
-
-From one segment to the next, a name may pass to another drive or family. Values of two quantities are never
-combined.
+"""The quantity (unit, or names of values) of each series in each segment of a history, from the metadata. A
+series is a register of a drive. In a new segment, its name may belong to another drive or family. Values of
+different quantities are never combined.
 """
 
 from __future__ import annotations
@@ -19,13 +18,15 @@ RAW, NAMED = "raw count", "names"
 
 
 class Quantity(NamedTuple):
-    """The unit of values ("" for none), or, for an enumeration, the names of its numbers."""
+    """What a register's values measure: a unit ("" for none), or, for an enumeration, the names of its
+    numbers.
+    """
 
     unit: str
     names: tuple[tuple[str, object], ...] = ()
 
 
-Known = Mapping[Series, Sequence[Quantity]]  # each series' quantities in one file, the oldest first
+Known = Mapping[Series, Sequence[Quantity]]  # quantities of each series in one file, oldest first
 
 
 def quantities_of(metadata: object) -> dict[Series, Quantity]:
@@ -44,9 +45,7 @@ def known_by(metadata: object) -> Known:
 
 
 def units_of(metadata: object) -> dict[Series, str]:
-    """Return each series' text for the column `unit` of Parquet files. The samples that a fleet sends have
-    the same text.
-    """
+    """Return each series' text for the column `unit` of Parquet files and of messages to `multidrop hub`."""
     found = {}
     drives = _table(_table(metadata).get("drives"))
     for (drive, register), quantity in quantities_of(metadata).items():
@@ -84,10 +83,10 @@ def _number(text: object) -> object:
 
 
 class OtherColumn(NamedTuple):
-    """A column for those rows of one file whose quantity is not the series' newest one."""
+    """A separate column for rows of a series with an earlier quantity, in one file."""
 
     series: Series
-    unit: str | None  # the column has only the file's rows with this unit; None: all its rows
+    unit: str | None  # the unit of the column's rows; None: all rows of the series in this file
     column: str
 
 
@@ -131,11 +130,11 @@ class Parting:
             self._columns[series, quantity] = f"{series[1]} [{words}]"
 
     def unknown_of(self, numbers: Iterable[int]) -> list[int]:
-        """Return the given segment numbers whose quantities were not added yet."""
+        """Return those of these segment numbers whose quantities were not added yet."""
         return [number for number in numbers if number not in self._known]
 
     def renamed(self, number: int) -> list[OtherColumn]:
-        """Return the columns for those values of this segment whose quantity is not the newest one."""
+        """Return the separate columns for values with an earlier quantity in this segment."""
         known = self._known.get(number, {})
         return [
             OtherColumn(series, None if len(known[series]) == 1 else quantity.unit, column)

@@ -31,8 +31,8 @@ T = TypeVar("T")
 ALWAYS = -(2**63), 2**63 - 1  # in ns UTC: a range that includes every time
 MEMORY = "200MB"  # limit for DuckDB
 MOST_TRIES = 50  # limit of attempts to read files that are being replaced
-MOST_GROWING = 4  # limit of segments whose index is cached
-FILES_AT_ONCE = 200  # files per query of metadata; a file's metadata may take 100 kB
+MOST_GROWING = 4  # largest number of segments with a cached index
+FILES_AT_ONCE = 200  # files per query of metadata, because a file's metadata may take 100 kB
 
 
 class Replaced(Exception):
@@ -69,9 +69,7 @@ class Sources:
 
     @contextmanager
     def segment(self, number: int, found: Listing, begin: int, end: int) -> Iterator[GrowingSegment | None]:
-        """Yield a segment whose rows were read up to its current end, and keep its file open during the
-        `with` block.
-
+        """Yield a segment that was read up to its current end. Its file stays open during the `with` block.
         Yield None if the segment has no rows in this range or cannot be read. Raises Replaced.
         """
         segment: GrowingSegment | None = None
@@ -79,7 +77,7 @@ class Sources:
             least, most = self._bounds.get(number, ALWAYS)
             if least < end and begin <= most:
                 segment = self._held(number, found.segments[number])
-            if segment and number < max(found.segments):  # the segment is closed, so its bounds are final
+            if segment and number < max(found.segments):  # a closed segment: its bounds are final
                 self._bounds[number] = segment.bounds
                 if segment.left_out:
                     left_out = (
@@ -103,7 +101,7 @@ class Sources:
                 segment = GrowingSegment(path)
             except FileNotFoundError:
                 raise Replaced from None
-            # an empty file is not damaged: its start was not written yet, or was lost in a power cut
+            # not for an empty file: its start was not written yet, or was lost in a power cut
             except ValueError as error:
                 if path.exists() and path.stat().st_size:
                     self.damage[number] = str(error)
@@ -206,7 +204,7 @@ def rows_of_file(
     """
     condition, values = _condition(series)
     with sources.cursor() as cursor, while_there([file]):
-        # Sorting reads the whole file before the first row is yielded, so Replaced is not raised after that.
+        # Sorting reads the whole file before the first row, so Replaced cannot be raised between rows.
         query = _ROWS.format(_columns(renamed), with_units([file.path]), condition) + " order by monotonic_ns"
         yield from rows_of(cursor, query, {"begin": begin, "end": end, **values})
 
@@ -221,8 +219,8 @@ def gather_files(
 ) -> None:
     """Add the rows, or the ten-second summaries, in these files to the buckets. Raises Replaced.
 
-    The units that rows state are read only if the metadata does not describe all series, because reading
-    them doubles the time.
+    The column `unit` is read only if the metadata does not describe all series, because reading it doubles
+    the time.
     """
     condition, values = _condition(list(into))
     values |= {"begin": grid.begin, "end": grid.end, "step": grid.step}
@@ -239,10 +237,8 @@ def gather_files(
 def units_in_rows(
     sources: Sources, files: Sequence[HistoryFile], series: Sequence[Series] | None, begin: int, end: int
 ) -> dict[int, Known]:
-    """Return the quantities in each file, by the number of its first segment. The file's rows state their
-    units.
-
-    Raises Replaced.
+    """Return the quantities in each file, by the number of its first segment, from the column `unit` of its
+    rows. Raises Replaced.
     """
     condition, values = _condition(series)
     query = _UNITS.format(files=with_units(file.path for file in files), condition=condition)
@@ -290,7 +286,7 @@ def write_parquet(
 
 
 def _columns(renamed: Iterable[OtherColumn]) -> str:
-    """Return the SQL to append to `select *`: it renames registers to these columns."""
+    """Return SQL to append to `select *`, which renames registers to these columns."""
     whens = " ".join(
         f"when drive = {quoted(drive)} and register = {quoted(register)}"
         f"{'' if unit is None else f' and unit = {quoted(unit)}'} then {quoted(name)}"
@@ -309,7 +305,7 @@ def _condition(series: Sequence[Series] | None) -> tuple[str, dict[str, Any]]:
     marks = {name: f"${mark}" for mark, name in values.items() if mark[0] == "d"}
     others = {name: f"${mark}" for mark, name in values.items() if mark[0] == "r"}
     condition = f" and drive in ({', '.join(marks.values())}) and register in ({', '.join(others.values())})"
-    # some pairs of these drives and registers are not wanted, so select by pairs, which is slower
+    # not every drive is wanted with every register, so select pairs, which is slower
     if len(drives) * len(registers) > len(series):
         pairs = ", ".join(f"({marks[drive]}, {others[register]})" for drive, register in series)
         condition += f" and (drive, register) in ({pairs})"

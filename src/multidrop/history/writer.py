@@ -19,8 +19,8 @@ from multidrop.recording.format import Metadata
 from multidrop.recording.segments import SegmentWriter, outlived, segments_of
 from multidrop.transport import clock
 
-MOST_WAITING = 250_000  # limit of unwritten rows (12 MB); while the disk is slow, further rows are dropped
-WRITING_S = 0.4  # time between writes; each write makes a batch, and many small batches slow down queries
+MOST_WAITING = 250_000  # limit of rows (12 MB) that wait for a slow disk; further rows are dropped
+WRITING_S = 0.4  # time between writes: each write makes a batch, and many small batches slow down queries
 TENDING_S = 60.0  # time between removals of old files, in s
 HANGING_S = 5.0  # a write that takes longer than this (in s) is reported
 ENDING_S = 10.0  # how long `close` waits for the disk
@@ -29,7 +29,7 @@ _log = logging.getLogger("multidrop.history")
 
 
 class HistoryState(NamedTuple):
-    """The state of a HistoryWriter: rows written, rows lost, and the present problem or None."""
+    """The state of a HistoryWriter: number of rows written, number lost, and the present problem or None."""
 
     rows: int
     dropped: int
@@ -67,7 +67,7 @@ class HistoryWriter:
         self._waiting_rows = 0
         self._ended: list[
             tuple[list[GatheredRows], Metadata]
-        ] = []  # for each ended segment: its unwritten rows, and the metadata of the segment that follows
+        ] = []  # for each ended segment: its unwritten rows, and the next segment's metadata
         self._changing = threading.Lock()
         self._dropped = 0
         self._trouble: str | None = None
@@ -106,14 +106,14 @@ class HistoryWriter:
         return HistoryState(self._segments.rows, self._dropped, self._hang() or self._trouble)
 
     def _hang(self) -> str:
-        """Return a sentence about the disk access that hangs, or "" if none does."""
+        """Return a sentence about a disk access that takes too long, or "" without one."""
         since_ns = self._busy_since_ns
         seconds = 0.0 if since_ns is None else (clock.now_ns() - since_ns) / 1e9
         return f"the disk has not answered for {seconds:.0f} s" if seconds > HANGING_S else ""
 
     @property
     def is_alive(self) -> bool:
-        """True while the writing thread runs."""
+        """True while the thread that writes the rows runs."""
         return self._thread.is_alive()
 
     def close(self) -> None:
@@ -163,7 +163,7 @@ class HistoryWriter:
                 _log.error("nothing is recorded: %s", failure)
             self._trouble = str(failure)
             self._rotate()
-            self._tended_ns = None  # remove old files at the next opportunity, because that may free space
+            self._tended_ns = None  # remove old files soon, because that may free space
             return
         if self._trouble:
             _log.warning("rows are recorded again; %d were lost so far", self._dropped)
@@ -195,7 +195,7 @@ class HistoryWriter:
 
 
 class Compactor:
-    """Starts a child process that compacts closed segments, and a new one once more segments are closed."""
+    """Compacts closed segments in a child process. When more segments are closed, starts the next child."""
 
     PAUSE_S = 60.0  # pause after a failed compaction
 
@@ -207,7 +207,7 @@ class Compactor:
         self.is_possible = importlib.util.find_spec("duckdb") is not None
 
     def tend(self, below: int) -> None:
-        """Collect a finished child; start a child if segments before `below` are not compacted yet."""
+        """Collect a finished child. Start a child if segments below number `below` are not compacted yet."""
         if self._child and self._child.poll() is not None:
             self._note(self._child)
             self._child = None
@@ -240,7 +240,7 @@ class Compactor:
         self._not_before_ns = clock.now_ns() + round(self.PAUSE_S * 1e9)
 
     def end(self) -> None:
-        """Kill the child process; compaction can safely be interrupted at each step."""
+        """Kill the child process, which is safe: compaction can be interrupted at each step."""
         if self._child:
             self._child.kill()
             self._child.communicate()

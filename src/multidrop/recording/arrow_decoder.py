@@ -24,7 +24,7 @@ from multidrop.recording.arrow_ipc import (
 )
 from multidrop.recording.rows import RecordedRows
 
-# limit in bytes for a column's texts in a batch: a small file may repeat the code of a long text many times
+# limit in bytes of one column's texts in one batch: a small damaged file could expand to gigabytes
 MOST_SPELLED = 1 << 28
 Buffers = tuple[Any, ...]
 
@@ -37,16 +37,16 @@ class RecordedColumns(NamedTuple):
     uncertainty_ns: memoryview  # 0 for a miss
     drive: memoryview
     register: memoryview
-    value: memoryview  # undefined for a miss
+    value: memoryview  # undefined if the row has no value
     status: memoryview
-    valid: bytes | None  # one bit per row, 0 for a miss; None: no row is a miss
+    valid: bytes | None  # one bit per row: 1 if the row has a value; None: every row has a value
     drives: tuple[str, ...]
     registers: tuple[str, ...]
     statuses: tuple[str, ...]
 
 
 class BatchDecoder:
-    """Decodes one file's batches in their order; a batch uses the dictionaries that precede it in the file.
+    """Decodes one file's batches in their order. A batch uses the dictionaries that precede it in the file.
 
     `columns` lists the file's columns, each with the id of its dictionary or None.
     """
@@ -80,9 +80,9 @@ class BatchDecoder:
         return self._names
 
     def columns(self, header: FlatTable, body: memoryview, names_of: dict[int, Names]) -> RecordedColumns:
-        """Return a batch's columns, with valid codes in place of names.
+        """Return a batch's columns, with checked codes in place of names.
 
-        `names_of` are the dictionaries that `known` had before the batch. Raises the errors of `decode`, and
+        `names_of` are the dictionaries before this batch in the file. Raises the errors of `decode`, and
         ValueError for files of earlier versions, whose names have no codes.
         """
         rows, buffers = _parts(header, body, sum(column.buffers for column, _ in self._columns))
@@ -133,7 +133,9 @@ class BatchDecoder:
         return valid, *data
 
     def _learn(self, header: FlatTable, body: memoryview) -> None:
-        """Replace a dictionary, or extend it if the message is a delta."""
+        """Store the dictionary in this message. If the message is a delta, extend the stored dictionary
+        instead.
+        """
         number, table = header.number(0, "<q"), header.table(1)
         if table is None or number not in self._ids:
             raise ValueError("it has a dictionary that no column uses")
@@ -155,13 +157,13 @@ class BatchDecoder:
 def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[bytes]]:
     """Return a batch's number of rows and its `count` buffers.
 
-    The buffers are passed to the C core, so they are copies. Otherwise an error's traceback could keep a
-    memoryview of `body`, and the interpreter would crash when it collects the traceback.
+    The buffers are copies. A memoryview of `body` that survives in an error's traceback would crash the
+    interpreter.
     """
     if batch.table(3):
         raise ValueError("its batches are compressed: only pyarrow and polars can read them")
     rows, places = batch.number(0, "<q"), batch.pairs(2)
-    if not 0 <= rows <= len(body):  # `rows` is checked because sums with it could overflow
+    if not 0 <= rows <= len(body):  # a larger `rows` could overflow the sums below
         raise ValueError(f"a batch states {rows} rows, but has only {len(body)} bytes")
     if len(places) != count:
         raise ValueError(f"a batch has {len(places)} buffers, not {count}")
@@ -180,5 +182,5 @@ def _check_text(offsets: bytes, text: bytes) -> None:
     if str(text, "utf-8").isascii():
         return
     for at in memoryview(offsets)[: len(offsets) // 4 * 4].cast("i"):
-        if 0 <= at < len(text) and text[at] & 0xC0 == 0x80:  # the row's text starts within a character
+        if 0 <= at < len(text) and text[at] & 0xC0 == 0x80:  # the text starts in the middle of a character
             raise ValueError("its text is not UTF-8")

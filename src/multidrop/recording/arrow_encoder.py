@@ -29,14 +29,14 @@ from multidrop.recording.arrow_ipc import (
 )
 from multidrop.recording.rows import texts_of
 
-VERSION = ("<h", 4)  # version of the Arrow format: V5
+VERSION = ("<h", 4)  # version V5 of the Arrow format
 LONGEST_TEXTS = (1 << 31) - 1  # limit in bytes for a dictionary's texts
 DRIVE, REGISTER, STATUS = CODED  # ids of the dictionaries
-MOST_NAMES = {DRIVE: 1 << 16, REGISTER: 1 << 16, STATUS: MOST_NARROW}  # limit of names, by dictionary
+MOST_NAMES = {DRIVE: 1 << 16, REGISTER: 1 << 16, STATUS: MOST_NARROW}  # limit of a dictionary's names, by id
 
 Names = tuple[str, ...]
 Column = Any  # memoryview, array or bytes: anything with a buffer
-Codes = dict[int, tuple[Column, Names]]  # by dictionary id: codes, and the names they stand for
+Codes = dict[int, tuple[Column, Names]]  # id of a dictionary: the rows' codes, the names of codes
 
 
 def schema_message(metadata: dict[bytes, bytes]) -> bytes:
@@ -53,7 +53,7 @@ class Encoder:
         self._dictionaries: dict[int, Names] = {}  # the newest dictionaries in the file, by id
 
     def encode(self, batch: Rows) -> bytes:
-        """Return a record batch of the rows, preceded by the dictionaries that the file still lacks.
+        """Return a record batch of the rows, preceded by new or changed dictionaries.
 
         Call `forget_dictionaries` if the result could not be appended to the file.
         """
@@ -70,7 +70,7 @@ class Encoder:
         return b"".join(parts)
 
     def forget_dictionaries(self) -> None:
-        """Write every dictionary again with the next batch."""
+        """Make the next `encode` write every dictionary again."""
         self._dictionaries = {}
 
 
@@ -81,7 +81,7 @@ class _CodedRows(NamedTuple):
     """The columns of one record batch, with codes in place of names."""
 
     length: int
-    columns: tuple[tuple[bytes, Column], ...]  # a validity bitmap (b"": no nulls), and data, per column
+    columns: tuple[tuple[bytes, Column], ...]  # for each column: validity bitmap (b"": no nulls), data
     names: dict[int, Names]  # by dictionary id
 
 
@@ -89,7 +89,7 @@ def _pieces(source: _BatchCodes | _RowCodes, begin: int, end: int) -> Iterator[_
     """Yield the rows as one batch, or as several batches if a column has more names than there are codes."""
     codes = source.codes(begin, end)
     if codes is None:
-        middle = begin + (end - begin) // 16 * 8  # a multiple of 8 rows, so bitmaps start at a whole byte
+        middle = begin + (end - begin) // 16 * 8  # a multiple of 8 rows, because bitmaps start at whole bytes
         yield from _pieces(source, begin, middle)
         yield from _pieces(source, middle, end)
         return

@@ -110,7 +110,7 @@ def _message(file: BinaryIO, at: int, size: int) -> IpcMessage | None:
 
 
 Table = dict[int, Any]
-_OFFSET = ("<I", 0)  # placeholder of an offset, filled in later
+_OFFSET = ("<I", 0)  # placeholder for an offset that `build` fills in later
 
 
 class Structs(bytes):
@@ -120,7 +120,7 @@ class Structs(bytes):
 def build(root: Table) -> bytes:
     """Return the flatbuffer of this table."""
     out = bytearray(4)
-    waiting: deque[tuple[int, Any]] = deque([(0, root)])  # positions of placeholders, each with its target
+    waiting: deque[tuple[int, Any]] = deque([(0, root)])  # (placeholder's position, its target)
     while waiting:
         place, thing = waiting.popleft()
         if isinstance(thing, dict):
@@ -185,7 +185,9 @@ BUFFERS = {INT: 2, FLOAT: 2, TIMESTAMP: 2, UTF8: 3}  # number of buffers of a co
 
 
 class FileColumn(NamedTuple):
-    """A column: name, type, the first field of the type (bits, precision or unit), and width of its codes."""
+    """A column of a file. `detail` is the type's first field in the Arrow schema: bits, precision or time
+    unit.
+    """
 
     name: bytes
     kind: int
@@ -208,7 +210,7 @@ COLUMNS = (
     FileColumn(b"value", FLOAT, DOUBLE, nullable=True),
     FileColumn(b"status", UTF8, code_bits=8),
 )
-# columns in files written by versions up to 0.1, or made from batches by other programs
+# columns in files of versions up to 0.1, and in files that other programs write
 COLUMNS_BEFORE = (
     *COLUMNS[:2],
     FileColumn(b"uncertainty_ns", INT, 64, nullable=True),

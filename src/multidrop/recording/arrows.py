@@ -48,7 +48,7 @@ class ArrowsWriter(AppendingWriter):
     def write(self, batch: Rows) -> None:
         try:
             self._append(self._encoder.encode(batch))
-        except BaseException:  # a signal handler may raise any exception
+        except BaseException:  # any exception, because a signal handler may raise it
             self._encoder.forget_dictionaries()
             raise
         self.rows += len(batch)
@@ -65,7 +65,7 @@ class ArrowsReader(RecordingReader):
             for message in messages(file, size):
                 if not self._whole:
                     self.metadata = self._read_schema(message)
-                # other libraries fail if a file ends with a dictionary without its batch
+                # a last dictionary without its batch counts as truncated, because other libraries fail on it
                 elif message.kind == DICTIONARY_BATCH:
                     continue
                 self._whole = message.end
@@ -110,9 +110,7 @@ class ArrowsReader(RecordingReader):
 
 
 def _column(field: FlatTable) -> FileColumn:
-    """Return a column as the file describes it; `code_bits` is -1 if its codes have a type that this library
-    never writes.
-    """
+    """Return a column as the file describes it. `code_bits` is -1 if its codes are not unsigned integers."""
     detail, coded = field.table(3), field.table(4)
     index = coded.table(1) if coded else None
     is_unsigned = index is not None and not index.number(1, "<?")
@@ -127,7 +125,7 @@ def _dictionary(field: FlatTable) -> int | None:
 
 
 def _described(*found: FileColumn) -> tuple[FileColumn, ...] | None:
-    """Return COLUMNS or COLUMNS_BEFORE, whichever equals the file's columns; None if neither does."""
+    """Return COLUMNS or COLUMNS_BEFORE if the file has exactly these columns, otherwise None."""
     for known in (COLUMNS, COLUMNS_BEFORE):
         if found == tuple(column._replace(nullable=False) for column in known):
             return known
@@ -152,7 +150,7 @@ class RecordedBatch(NamedTuple):
 
 
 class ArrowsTail:
-    """Reads each complete batch of a growing file once, even if the file is removed while it is open.
+    """Reads each complete batch of a growing file once. It continues if the file is removed while open.
 
     Raises ValueError for a file that is not a recording, and OSError.
     """
@@ -185,7 +183,7 @@ class ArrowsTail:
                 return
             body = self._body(message)
             try:
-                # do not advance past a dictionary without its batch: a failed write removes both
+                # a failed write removes a dictionary and its batch, so read them again together
                 if message.kind != RECORD_BATCH:
                     self._decoder.decode(message, message.header, body)
                     continue

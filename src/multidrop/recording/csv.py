@@ -122,8 +122,8 @@ def lines_of(rows: Rows) -> bytes:
 
 
 def lines_with_units(rows: Rows, units: Mapping[tuple[str, str], str]) -> bytes:
-    """Return the rows as lines of a .csv file whose last column is `unit`; `units` is by (drive,
-    register).
+    """Return the rows as lines of a .csv file whose last column is `unit`. `units` maps (drive, register) to
+    a unit.
     """
     return "".join(
         f"{_line(row)[:-1]},{_quote(units.get((row.drive, row.register), ''))}\n" for row in rows

@@ -95,10 +95,10 @@ class AppendingWriter(RecordingWriter):
             self._file.close()
 
 
-_REASONS = {  # by exception type: texts that replace a library's messages, which describe internals
+_REASONS = {  # for each exception of a library: the message for the user
     UnicodeDecodeError: "its text is not UTF-8",
     struct.error: "the stated lengths do not match the data",
-    RuntimeError: "the stated lengths do not match the data",  # nanoarrow raises it
+    RuntimeError: "the stated lengths do not match the data",  # from nanoarrow
 }
 
 
@@ -108,8 +108,8 @@ class RecordingReader(ArrowTable):
     Tables of pandas or polars and the wide form hold all rows in memory. Arrow libraries accept the
     reader itself: `pyarrow.table(reader)`.
 
-    `truncated` is the number of skipped bytes at the end of the file: an incomplete batch, because the writer
-    was killed or the disk was full.
+    `truncated` is the number of skipped bytes at the end of the file: an incomplete batch, left by a killed
+    writer or a full disk.
     """
 
     metadata: Metadata
@@ -145,8 +145,9 @@ class RecordingReader(ArrowTable):
     def wide(self, *columns: str) -> WideRows:
         """Return a table with a column per `drive.register` (all, or those in `columns`) and a row per time.
 
-        Values share a row only if the same request read them. A miss is null: see `WideRows`. Raises
-        ValueError for a column that is not in the recording, or if the recording is damaged.
+        Values share a row only if the same request read them. A register without a value in a row is null:
+        see `WideRows`. Raises ValueError for a column that is not in the recording, or if the recording is
+        damaged.
         """
         return WideRows((row for rows in self for row in rows), columns, self._registers())
 
@@ -162,7 +163,7 @@ class RecordingReader(ArrowTable):
         ]
 
     def _damaged(self, rows: int, error: Exception | str) -> ValueError:
-        """Return a ValueError that states the damage and the number of readable rows."""
+        """Return a ValueError that describes the damage and states how many rows before it are readable."""
         reason = next((text for kind, text in _REASONS.items() if isinstance(error, kind)), error)
         return ValueError(f"{self.path} is damaged after row {rows}: {reason}")
 
@@ -217,12 +218,11 @@ class AppendFile:
     def __init__(self, path: Path) -> None:
         self._file = new_file(path)
         self._length = 0
-        self._is_truncated = False  # True: the last piece was appended only in part
+        self._is_truncated = False  # True if the last piece was appended only in part
 
     def append(self, piece: bytes | memoryview) -> None:
-        """Append the whole piece. If this fails or a signal handler raises, restore the file's former length.
-
-        If truncating fails too, the file is truncated before the next piece is appended.
+        """Append the whole piece. After an error or a signal handler's exception, truncate the file to its
+        former length. If that fails too, the next `append` truncates the file first.
         """
         if self._is_truncated:
             self._cut()

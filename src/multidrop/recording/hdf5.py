@@ -16,7 +16,7 @@ from multidrop.recording.format import Metadata, already_there, dump_metadata, w
 from multidrop.recording.series import Event, ExportedRows, SeriesWriter, unit_of_register
 
 CHUNK_ROWS = 4096  # rows of a dataset that are compressed together
-# arguments of a new dataset, to which rows can be appended
+# h5py's arguments for a dataset that can grow
 STORED: dict[str, Any] = {
     **{"shape": (0,), "maxshape": (None,), "chunks": (CHUNK_ROWS,)},
     **{"compression": "gzip", "compression_opts": 4, "shuffle": True},
@@ -24,7 +24,7 @@ STORED: dict[str, Any] = {
 
 
 class GuardedFile(FileIO):
-    """A new file that pretends to HDF5 that writes succeed, because a failed write would crash the process.
+    """A new file that hides failed writes from HDF5, because HDF5 would crash the process.
 
     `raise_failure` raises the first failure of a write.
     """
@@ -61,7 +61,7 @@ class Hdf5Writer(SeriesWriter):
         described = dump_metadata(metadata)
         self._file: Any = None
         self._groups: dict[tuple[str, str], Any] = {}
-        self._names: dict[str, str] = {}  # by a group's path: the name of its drive or register
+        self._names: dict[str, str] = {}  # for each group's path: the name of its drive or register
         self._events: list[Event] = []
         with writing(path):
             try:
@@ -89,7 +89,7 @@ class Hdf5Writer(SeriesWriter):
             for name, column in columns.items():
                 group.create_dataset(name, dtype=column.dtype, **STORED)
         for name, column in columns.items():
-            dataset = group[name]  # opened for each piece, because a dataset that stays open keeps a buffer
+            dataset = group[name]  # opened again for each piece, because an open dataset keeps a buffer
             before = len(dataset)
             dataset.resize(before + len(column), axis=0)
             dataset[before:] = column
@@ -107,7 +107,7 @@ class Hdf5Writer(SeriesWriter):
     def _path(self, parent: str, name: str) -> str:
         """Return the path of the group in `parent` that belongs to this drive or register."""
         path = f"{parent}/{_key(name)}"
-        while self._names.setdefault(path, name) != name:  # the group belongs to another name
+        while self._names.setdefault(path, name) != name:  # the path is taken by another name
             path += "_"
         return path
 

@@ -19,8 +19,8 @@ from multidrop.printable import printable
 from multidrop.recording.format import Metadata, dump_metadata, new_file, writing
 from multidrop.recording.series import Array, Event, ExportedRows, SeriesWriter, unit_of_register
 
-STATUS = 2  # index of the status among a group's channels
-UNNAMED = "unnamed"  # text of a number without a name, such as a fault that the manual does not list
+STATUS = 2  # position of the channel "status" in each channel group
+UNNAMED = "unnamed"  # text for a number without a name, such as a fault code that the manual does not list
 
 
 class Mdf4Writer(SeriesWriter):

@@ -28,8 +28,8 @@ from multidrop.recording.rows import RecordedRows
 
 GROUP_ROWS = 1 << 17  # rows per group; a group is collected in memory
 TEXTS = ("drive", "register", "status")
-MOST_TEXT = 1 << 26  # limit in bytes for the texts of one column in a group
-MOST_OF_GROUP = 1 << 29  # limit in bytes for an unpacked group of rows
+MOST_TEXT = 1 << 26  # limit in bytes of one column's texts in a group of rows
+MOST_OF_GROUP = 1 << 29  # limit in bytes of an uncompressed group of rows
 UNREADABLE = "it cannot be read, because a Parquet file is readable only once it is closed"
 ENCODING = {
     "compression": "zstd",
@@ -103,12 +103,12 @@ class ParquetReader(RecordingReader):
         with self._open() as file:
             found = file.schema_arrow
         wanted = self._arrow.schema(schema())
-        has_units = found.names == [*wanted.names, "unit"]  # files of a history have this further column
+        has_units = found.names == [*wanted.names, "unit"]  # the column `unit` is in files of a history
         self._columns = wanted.names
         if found.types[: len(wanted)] != wanted.types or not (has_units or found.names == wanted.names):
             raise self._not_a_recording("it is a Parquet file with other columns")
         self.metadata = self._parse_metadata((found.metadata or {}).get(METADATA_KEY.encode(), b"{}"))
-        if has_units and not self.metadata.get("drives"):  # a fleet's hub writes such files
+        if has_units and not self.metadata.get("drives"):  # `multidrop hub` writes such files
             raise self._not_a_recording(
                 "it is a file of `multidrop hub`: read its folder with multidrop.History"
             )
@@ -117,7 +117,7 @@ class ParquetReader(RecordingReader):
         c_array = nanoarrow().c_array
         rows = 0
         with self._open(read_dictionary=TEXTS) as file:
-            # Do not read whole groups, because a damaged group may state any size.
+            # Read in pieces: a damaged group of rows may claim any size.
             batches = file.iter_batches(GROUP_ROWS, columns=self._columns)
             while (batch := self._next(batches, rows)) is not None:
                 yield RecordedRows(c_array(batch))
@@ -134,8 +134,8 @@ class ParquetReader(RecordingReader):
             yield opened
 
     def _check_sizes(self, described: Any) -> None:
-        """Raise ValueError for a group of rows that would take too much memory when unpacked. The sizes of
-        single columns are not read: pyarrow would abort the process if a group is damaged.
+        """Raise ValueError for a group of rows that is too large for the memory after decompression. The
+        sizes of single columns are not read, because pyarrow would abort the process if they are damaged.
         """
         for number in range(described.num_row_groups):
             size = described.row_group(number).total_byte_size

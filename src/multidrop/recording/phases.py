@@ -1,9 +1,8 @@
 """The phases of a test run in its recording.
 
-Each step of a run has a row at its start. The row's drive is `test`, its register is `phase`, and its value
-is a number. The metadata maps each number to a phase's name, as for registers with named values. Tables made
-from such a recording have a further column, `phase`, with the name of the phase in which a row's request was
-sent.
+At the start of each step, the run records a row. The row's drive is `test`, its register is `phase`, and its
+value is a number. The metadata maps this number to the name of the step's phase. Tables made from such a
+recording have a further column, `phase`, with the name of the phase in which a row's request was sent.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ PHASE_DRIVE, PHASE = "test", "phase"
 
 
 def with_phases(metadata: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
-    """Return the metadata of a plant's recording, extended by these phases, numbered from 0."""
+    """Return the metadata of a plant's recording with these phases added. Phases are numbered from 0."""
     register = {"unit": "", "step": 1, "bits": False, "values": {name: at for at, name in enumerate(names)}}
     test = {"line": "", "model": "test run", "registers": {PHASE: register}}
     return {**metadata, "drives": {**metadata["drives"], PHASE_DRIVE: test}}
@@ -33,7 +32,9 @@ def phase_row(number: int, time_ns: int, monotonic_ns: int) -> RecordedRows:
 
 
 def phase_names(metadata: Mapping[str, Any]) -> dict[float, str]:
-    """Return the names of a recording's phases by number; {} without phases or with damaged metadata."""
+    """Return the names of a recording's phases by number. Return {} if there are none or the metadata is
+    damaged.
+    """
     found: Any = metadata
     for key in ("drives", PHASE_DRIVE, "registers", PHASE, "values"):
         found = found.get(key) if isinstance(found, dict) else None
@@ -41,12 +42,12 @@ def phase_names(metadata: Mapping[str, Any]) -> dict[float, str]:
 
 
 class PhaseColumn:
-    """Adds the column `phase` to a recording's batches, which must come in their order."""
+    """Adds the column `phase` to a recording's batches. The batches must be passed in their order."""
 
     def __init__(self, names: Mapping[float, str]) -> None:
         self._names = names
         self._starts: list[int] = []  # monotonic times at which phases started, in ns
-        self._phases: list[str] = [""]  # "" before the first start, then the phase from each start on
+        self._phases: list[str] = [""]  # "" for the time before the first phase, then the name of each phase
         arrow = nanoarrow()
         fields = {child.name: arrow.Schema(child) for child in schema().children}
         self.schema = arrow.c_schema(
@@ -67,7 +68,7 @@ class PhaseColumn:
         return build(self.schema, len(rows), [None], children=[*columns, phases], move=False)
 
     def _note(self, times: memoryview, drives: Iterable[str], registers: Iterable[str], values: Any) -> None:
-        """Remember the starts of phases found in these rows."""
+        """Remember where phases start in these rows."""
         for at, (drive, register) in enumerate(zip(drives, registers, strict=True)):
             if drive == PHASE_DRIVE and register == PHASE:
                 self._starts.append(times[at])

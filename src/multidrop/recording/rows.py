@@ -20,8 +20,8 @@ class RecordedRows(Rows):
         return int(self._array.length)
 
     def __iter__(self) -> Iterator[Row]:
-        # A generator, because it keeps the array alive: nanoarrow frees the array's buffers even if
-        # memoryviews use them.
+        # This generator keeps the array alive: nanoarrow frees an array's buffers even if memoryviews use
+        # them.
         yield from map(Row._make, zip(*map(_values, self._array.view().children), strict=True))
 
     def __repr__(self) -> str:
@@ -32,7 +32,7 @@ class RecordedRows(Rows):
 
 
 def _values(column: Any) -> Iterable[Any]:
-    """Return a column's values, None for nulls."""
+    """Return the values of a column, with None for each null."""
     if column.n_buffers == 3:
         return texts_of(column)
     numbers = memoryview(column.buffer(1))[: column.length]

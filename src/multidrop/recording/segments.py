@@ -20,7 +20,7 @@ from multidrop.recording.arrows import ArrowsReader, ArrowsWriter
 from multidrop.recording.format import Metadata, RecordingWriter, writing
 from multidrop.transport import clock
 
-MOST_CUT = 1 << 24  # an unreadable end is cut off up to this size in bytes; a longer one is kept
+MOST_CUT = 1 << 24  # in bytes; a longer unreadable end of a file is kept, not cut off
 
 
 def segments_of(path: Path, suffix: str = ".arrows") -> list[tuple[int, Path]]:
@@ -31,13 +31,13 @@ def segments_of(path: Path, suffix: str = ".arrows") -> list[tuple[int, Path]]:
 
 
 class SegmentWriter(RecordingWriter):
-    """A recording that starts a new segment each `every` s of the monotonic clock.
+    """A recording that starts a new segment file every `every` seconds (monotonic clock).
 
     A segment's file is created with its first rows. Whenever a segment starts, segments that ended more than
     `keep` s ago are removed. Then the oldest segments are removed while all segments together take more than
-    `most` bytes. The segment in progress is never removed. New segments have numbers above `after`. Raises
-    ValueError if another process records this recording or the name does not end in .arrows, TypeError for
-    metadata that JSON cannot hold, and RecordingError.
+    `most` bytes. The segment in progress is never removed. The numbers of new segments are greater than
+    `after`. Raises ValueError if another process records this recording or the name does not end in .arrows,
+    TypeError for metadata that JSON cannot hold, and RecordingError.
     """
 
     def __init__(
@@ -75,7 +75,9 @@ class SegmentWriter(RecordingWriter):
 
     @property
     def open_number(self) -> int:
-        """The number of the open segment, or of the next segment. Segments with lower numbers are closed."""
+        """The number of the open segment; if none is open, that of the next. Segments with lower numbers are
+        closed.
+        """
         return self.number if self._segment else self.number + 1
 
     def write(self, batch: Rows) -> None:
@@ -129,7 +131,7 @@ class SegmentWriter(RecordingWriter):
 
 
 def _cut_truncated(path: Path) -> None:
-    """Cut off the incomplete batch that a killed writer has left, because other libraries cannot read it."""
+    """Remove the incomplete batch of a killed writer from the file's end: other libraries cannot read it."""
     with suppress(OSError, ValueError):  # a file that is not a recording is kept
         truncated = ArrowsReader(path).truncated
         if 0 < truncated <= MOST_CUT:
@@ -141,10 +143,10 @@ SIZES = {"kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}  # size in bytes, 
 
 
 class StoredFile(NamedTuple):
-    """A file of a recording in segments: the facts that decide which files to remove."""
+    """The number, newest time and size of a file of a recording in segments."""
 
     path: Path
-    number: int  # number of the segment, or of the file's last segment
+    number: int  # number of the newest segment in the file
     end: float  # time of the file's newest row, in s since 1970
     size: int  # in bytes
 
@@ -155,12 +157,11 @@ def outlived(
     """Return the files to remove: those older than `keep` s, then the oldest until at most `most` bytes are
     left.
 
-    `now` is in s since 1970. None for `keep` or `most` means unlimited. The
-    oldest file is the one with the lowest number, even if the clock was set back.
+    `now` is in s since 1970. None for `keep` or `most` means unlimited. A file with a lower number is older,
+    even if the clock was set back.
 
-    A file's age is the time from its end to `now`: the sum of the intervals between the ends of the later
-    files. An interval longer than `keep` is not counted, so that a clock jump or a pause in recording cannot
-    remove every file.
+    A file's age is the time from its newest row to `now`, without gaps longer than `keep` between the newest
+    rows of successive files. So a clock jump or a pause in recording cannot remove every file.
     """
     in_order = sorted(files, key=lambda file: file.number)
     ages = {} if keep is None else _ages(in_order, now, keep)
@@ -176,10 +177,12 @@ def outlived(
 
 
 def _ages(files: Iterable[StoredFile], now: float, longest: float) -> dict[int, float]:
-    """Return each file's age in s by number, without intervals that are negative or longer than `longest`."""
+    """Return each file's age in s by number. Gaps between files are not counted if negative or longer than
+    `longest`.
+    """
     ends: dict[int, float] = {}
     for file in files:
-        # Use the earlier end of a segment that is in two files, because a copied file may have a later time.
+        # If a segment is in two files, use the earlier end, because a copy may have a later time.
         ends[file.number] = min(file.end, ends.get(file.number, file.end))
     ages, age, later = {}, 0.0, now
     for number in sorted(ends, reverse=True):

@@ -22,7 +22,7 @@ LARGEST_COUNT = 2**53  # largest count that a float64 holds exactly
 LATEST_NS = 230 * 365 * 86400 * 10**9  # ns UTC; libraries cannot convert later times to dates
 RAW = "raw count"  # unit of values without a known scale
 PIECE_ROWS = 1 << 18  # rows that an export collects in memory
-MOST_CODES = 1 << 16  # limit of the number of different names: of drives, of registers, and of statuses
+MOST_CODES = 1 << 16  # largest number of different drives, of different registers, and of different statuses
 Array = NDArray[Any]
 
 
@@ -30,7 +30,7 @@ Array = NDArray[Any]
 
 
 def codes_of(column: Any, known: dict[str, int]) -> Array:
-    """Return each row's text as its code in `known`; texts that `known` lacks are added to `known`."""
+    """Return the code of each row's text. `known` maps texts to codes; new texts are added to it."""
     ends = np.array(column.buffer(1))[: column.length + 1]
     lengths = np.diff(ends)
     if lengths.max(initial=0) > LONGEST_NAME:
@@ -60,9 +60,8 @@ def numbers_of(column: Any) -> Array:
 
 
 def rows_by_series(drive: Array, register: Array, time: Array) -> list[Array]:
-    """Return the indexes of the rows of each series, in the order of time; `drive` and `register` are codes.
-
-    There must be at least one row.
+    """Return the row indexes of each series (a drive's register), in the order of time. `drive` and
+    `register` are codes. There must be at least one row.
     """
     pair = drive.astype(np.int64) * (int(register.max()) + 1) + register
     order = np.lexsort((time, pair))
@@ -73,9 +72,7 @@ def rows_by_series(drive: Array, register: Array, time: Array) -> list[Array]:
 
 
 def checked_drives(drives: object) -> dict[str, Any]:
-    """Return the metadata of drives and registers; omit invalid entries, which `Plant.metadata` never
-    writes.
-    """
+    """Return the metadata of drives and registers without invalid entries."""
     found = {}
     for name, about in _tables(drives):
         registers = {register: _checked(table) for register, table in _tables(about.get("registers"))}
@@ -133,7 +130,7 @@ def trigger_of(metadata: Mapping[str, Any]) -> Event | None:
 
 
 class ExportedRows(NamedTuple):
-    """Successive rows of one register, or of one kind of event."""
+    """Consecutive rows of one register, or of one kind of event."""
 
     drive: str
     register: str
@@ -149,16 +146,15 @@ class SeriesWriter(RecordingWriter):
 
     The writer keeps at most PIECE_ROWS rows in memory, besides the library's own buffers.
 
-    The library runs in a thread of its own. In the main thread, Ctrl-C could raise KeyboardInterrupt within
-    the library, which would catch it and continue. Then the file would lack some rows. An interruption ends
-    the wait for the thread; the thread then removes the file.
+    The library runs in a thread of its own. In the main thread, it could catch a KeyboardInterrupt and
+    continue with some rows missing. After Ctrl-C, that thread removes the file.
     """
 
     def __init__(self, path: Path, metadata: Metadata) -> None:
         super().__init__(path)
         self.drives = checked_drives(metadata.get("drives"))
         self._thread = ThreadPoolExecutor(1, "multidrop export")
-        self._thread.submit(int)  # starts the thread: if Ctrl-C interrupts the start, there is no file yet
+        self._thread.submit(int)  # start the thread before a file exists, in case Ctrl-C interrupts the start
         self._codes: dict[str, dict[str, int]] = {"drive": {}, "register": {}, "status": {}}
         self._waiting: list[list[Array]] = []
         self._waiting_rows = 0
@@ -172,7 +168,7 @@ class SeriesWriter(RecordingWriter):
         return list(self._codes["status"])
 
     def write(self, batch: Rows) -> None:
-        array = batch.arrow()  # keep the array alive: deleting it would free the buffers
+        array = batch.arrow()  # keep a reference: the buffers are freed with the array
         children = dict(zip(ROW_COLUMNS, array.view().children, strict=True))
         columns = [codes_of(children[name], known) for name, known in self._codes.items()]
         numbers = ("time", "monotonic_ns", "uncertainty_ns", "value")
@@ -188,7 +184,9 @@ class SeriesWriter(RecordingWriter):
                 self._in_thread(self._write_piece)
 
     def _in_thread(self, work: Callable[[], Any]) -> None:
-        """Do this work in the library's thread, which completes the work even if the wait is interrupted."""
+        """Do this work in the library's thread and wait for it. The work is completed even if Ctrl-C
+        interrupts the wait.
+        """
         self._thread.submit(work).result()
 
     def _open(self, work: Callable[[], Any]) -> None:
@@ -233,7 +231,7 @@ class SeriesWriter(RecordingWriter):
     def __exit__(self, *error: object) -> None:
         if error[0] is None:
             self.close()
-        else:  # after an exception, the file is not completed, because that could take minutes
+        else:  # after an exception, remove the file instead of completing it, which could take minutes
             self.discard()
 
     def _write_piece(self) -> None:
@@ -255,7 +253,7 @@ class SeriesWriter(RecordingWriter):
 
     @abstractmethod
     def _append(self, rows: ExportedRows, drive: Mapping[str, Any]) -> None:
-        """Append rows to their series; `drive` has the checked metadata of its drive."""
+        """Append rows of one series. `drive` is the checked metadata of the series' drive."""
 
     @abstractmethod
     def _add_event(self, event: Event) -> None:

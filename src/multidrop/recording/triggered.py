@@ -21,8 +21,8 @@ from multidrop.recording import open_writer
 from multidrop.recording.format import Metadata, RecordingWriter, writing
 from multidrop.recording.segments import segments_of
 
-MOST_OPEN = 8  # limit of overlapping recordings; further triggers are not recorded
-LATE_NS = 1_000_000_000  # how long a recording waits after its end for rows of slow exchanges
+MOST_OPEN = 8  # largest number of recordings at the same time; further triggers are not recorded
+LATE_NS = 1_000_000_000  # how long a recording stays open after its end, for rows of slow exchanges
 
 _log = logging.getLogger("multidrop.recording")
 
@@ -36,7 +36,7 @@ class Moment(NamedTuple):
 
 
 class _OpenRecording(NamedTuple):
-    """A recording in progress, and the monotonic time of its end."""
+    """A recording in progress, and the monotonic time at which it ends."""
 
     writer: RecordingWriter
     end_ns: int
@@ -79,10 +79,10 @@ class TriggeredWriter(RecordingWriter):
         return tuple(self._written)
 
     def write(self, batch: Rows) -> None:
-        """Take a batch of a poller."""
+        """Record a batch from a poller."""
         assert isinstance(batch, Batch)
         kept = copied(batch)
-        # Ignore the times of events: the poller may still hold rows that are older than a new event.
+        # Ignore the times of events: rows that are older than an event may still come after it.
         columns = kept.columns()
         times = zip(columns.drive, columns.monotonic_ns, strict=True)
         newest_ns = max((ns for drive, ns in times if columns.drives[drive] != EVENT), default=0)
@@ -146,7 +146,7 @@ class TriggeredWriter(RecordingWriter):
             self.newest = recording.writer.path
 
     def close(self) -> None:
-        """Close the recordings in progress, even those that lack rows after their trigger."""
-        with ExitStack() as stack:  # the stack closes all recordings, even if one cannot be completed
+        """Close the recordings in progress, even if `post` s have not passed since their trigger."""
+        with ExitStack() as stack:  # the stack closes all recordings, even if closing one of them fails
             while self._open:
                 stack.callback(self._open.pop().writer.close)

@@ -11,7 +11,7 @@ from multidrop.runs.model import PlannedStep, RunPlan, timeline
 
 RAMP_EVERY_S = 0.5  # pause between two setpoints of a ramp, in s
 EXCHANGES = 2  # number of exchanges of a write: the write itself, and the read that verifies it
-MOST_SHARE = 0.5  # limit of the share of a line's time that may be used for the setpoints of ramps
+MOST_SHARE = 0.5  # largest part of a line's time for the setpoints of ramps
 CYCLES = 2  # least length of a step and of `silence`, in bus cycles
 # `silence` is by default LEAST_SILENCE_S s, or SILENT_CYCLES times `longest_pause` if that is longer.
 LEAST_SILENCE_S, SILENT_CYCLES = 5.0, 3
@@ -19,7 +19,7 @@ LEAST_SILENCE_S, SILENT_CYCLES = 5.0, 3
 
 @dataclass(frozen=True)
 class _LineTime:
-    """A line of a run with its predicted times in s."""
+    """A line that a test uses, with its predicted bus times in s."""
 
     line: PlantLine
     prediction: Prediction
@@ -43,8 +43,8 @@ def _lines(plan: RunPlan) -> list[_LineTime]:
 
 
 def longest_pause(plan: RunPlan) -> float:
-    """Return the longest planned time in s between two values of the same drive, or of the same compared
-    register or fault code.
+    """Return the longest planned time in s between two values of a drive that the test uses. A compared
+    register or a fault code counts separately.
     """
     compared = {*plan.faults, *((condition.drive, condition.register) for condition in plan.conditions)}
     pauses = [one.prediction.cycle for one in _lines(plan)]
@@ -63,8 +63,8 @@ def silence_of(plan: RunPlan) -> float:
 
 
 def misfits(plan: RunPlan) -> list[str]:
-    """Return a sentence for each part of the test that is too fast for its line, with a value that would
-    fit.
+    """Return a sentence for each part of the test that is too fast for its line. The sentence has a value
+    that would fit.
     """
     found = list(dict.fromkeys(_misfits(plan)))
     least = CYCLES * longest_pause(plan)

@@ -155,7 +155,7 @@ def _steps(table: Any, place: TomlPlace, plant: Plant) -> Iterator[RunStep]:
         within=duration_of(given, "within", place) or 0.0,
         rate=_rate(given, place),
     )
-    if len(place.config_errors) == errors:  # without misspelt keys and ignored values
+    if len(place.config_errors) == errors:  # only if no key is misspelt or has an invalid value
         _check_keys(given, step, place)
     for key, sentence in contradictions(step, given["frequency"]):
         place.wrong(sentence, key)
@@ -192,7 +192,9 @@ def _rate(given: Mapping[str, Any], place: TomlPlace) -> float | None:
 
 
 def _check_keys(given: Mapping[str, Any], step: RunStep, place: TomlPlace) -> None:
-    """Add an error for each key that needs another one, or else for a step that does nothing."""
+    """Add an error for each key that needs another key. If there is none, add an error if the step does
+    nothing.
+    """
     lacking = [(key, needs) for key, needs in NEEDS.items() if given.get(key) and not given.get(needs)]
     for key, needs in lacking:
         place.wrong(f"{key} needs {needs}; add {_STEP[needs].example}", key)
@@ -201,8 +203,8 @@ def _check_keys(given: Mapping[str, Any], step: RunStep, place: TomlPlace) -> No
 
 
 def _each(frequency: Mapping[str, Any], place: TomlPlace) -> Iterator[dict[str, float]]:
-    """Yield the drives' frequencies for each step. A drive has a list with a frequency for each step, or a
-    single number for all steps.
+    """Yield the drives' frequencies for each step. In `frequency`, a drive has a list with a number for each
+    step, or a single number for all steps.
     """
     lists = {name: one if isinstance(one, list) else [one] for name, one in frequency.items()}
     for name, numbers in lists.items():

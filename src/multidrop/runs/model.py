@@ -75,9 +75,9 @@ class ReadingCondition:
 class AbortLimits:
     """The limits that abort a run, besides faults and failed commands.
 
-    `silence` is the longest allowed time in s without a value of a drive or of a limited register; None
-    means the default. `duration` is the longest allowed time in s of the whole run; None means no
-    limit.
+    `silence` is the longest allowed time in s without a value of a drive, or of a register that is compared
+    with a limit. None means the default. `duration` is the longest allowed time in s of the whole run; None
+    means no limit.
     """
 
     conditions: tuple[ReadingCondition, ...] = ()
@@ -89,9 +89,9 @@ class AbortLimits:
 class RunStep:
     """Commands that are sent to some drives at the same time, and the duration of the step.
 
-    A drive is either stopped, or it gets its writes, its frequency in Hz and its start command, in this
-    order. With `rate`, in Hz/s, the frequencies are changed by ramps. After the ramps, the step continues for
-    `dwell` s. Then it waits until the condition `until` holds, but for at most `within` s.
+    A drive is either stopped, or it gets its register writes, its frequency in Hz and its start command, in
+    this order. With `rate`, in Hz/s, the frequencies are changed by ramps. After the ramps, the step
+    continues for `dwell` s. Then it waits for the condition `until`, for at most `within` s.
     """
 
     name: str  # the phase's name, followed by the step's number if the phase has several steps
@@ -106,7 +106,7 @@ class RunStep:
     within: float = 0.0
 
     def __post_init__(self) -> None:
-        # with an infinite time, the step would never end
+        # an infinite time would never end the step
         if not (0 <= self.dwell < inf and 0 <= self.within < inf):
             raise ValueError(f"{self.name}: dwell and within must be 0 s or more, and finite")
 
@@ -168,9 +168,9 @@ class RunPlan:
 
 @dataclass(frozen=True)
 class PlannedStep:
-    """A step with its planned start, in s after the run's start, and its length in s without the wait for
-    `until`. `is_latest` is True if an earlier step waits for a condition. Then `begin` is the latest possible
-    start.
+    """A step with its planned start in s after the run's start. Its length in s does not include the wait for
+    `until`. `is_latest` is True if `begin` is only the latest possible start, because an earlier step waits
+    for a condition.
     """
 
     step: RunStep
@@ -206,5 +206,5 @@ def timeline(steps: Iterable[RunStep]) -> list[PlannedStep]:
 
 
 def length(planned: Sequence[PlannedStep]) -> float:
-    """Return the longest time in s that the run can take, without the time for starts and stops."""
+    """Return the longest time in s that the steps can take. The time for starts and stops is not included."""
     return planned[-1].begin + planned[-1].seconds + planned[-1].step.within if planned else 0.0

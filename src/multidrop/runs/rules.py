@@ -1,4 +1,4 @@
-"""The rules for a step's commands that can be checked without a port."""
+"""Check a step's commands against the rules that need no open port."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ from multidrop.runs.model import RunStep
 
 
 def contradictions(step: RunStep, frequency: Collection[str]) -> Iterator[tuple[str, str]]:
-    """For each command that contradicts another command to the same drive, yield its key and a sentence.
-
-    `frequency` has the drives whose frequency the step sets.
+    """For each command that contradicts another command to the same drive, yield the command's key and a
+    sentence. `frequency` has the names of the drives whose frequency the step sets.
     """
     for name in dict.fromkeys(step.stop):
         if name in (*frequency, *step.write, *step.start):
@@ -46,8 +45,8 @@ def check_step(step: RunStep, plant: Plant) -> None:
 
 
 def _rehearse(script: Any, *arguments: Any) -> Any:
-    """Run a verb's script up to its first step; return that step without carrying it out. Raises ValueError
-    if the family lacks or forbids the verb.
+    """Return the first step of a command's script, such as that of `start`, without carrying it out. Raises
+    ValueError if the family lacks or forbids the command.
     """
     try:
         return next(script(*arguments))
@@ -73,12 +72,12 @@ def check_frequency(drive: Drive, hz: float) -> None:
     check_worn(drive, "steps")
     if isinstance(first, Write):
         value = first.register.decode(raw_count(drive, first.register, first.value))
-        # checks the rules that need no reads from the drive; the run checks the others
+        # only rules that need no reads from the drive; the run checks all
         next(conditions(drive, first.register, value), None)
 
 
 def check_write(drive: Drive, name: str, value: Any) -> None:
-    """Raise ValueError for a value, or the name of a value, that a step may not write."""
+    """Raise ValueError if a step may not write this value (a number or a value's name) to this register."""
     register = drive.register(name)
     if isinstance(value, str):
         value = register.parse(value)

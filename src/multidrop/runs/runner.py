@@ -1,8 +1,7 @@
 """TestRun: carry out the steps of a test while its plant is polled, and abort at a limit.
 
-Each drive's commands run on a separate thread. So do the recording and each taker, a callback that the caller
-passes to `run`. The calling thread compares the rows with the limits, and starts each step at its planned
-time.
+Each drive's commands run on a separate thread. So do the recording and each callback that the caller passes
+to `run`. The calling thread compares the rows with the limits, and starts each step at its planned time.
 """
 
 from __future__ import annotations
@@ -39,11 +38,11 @@ from multidrop.transport.port_identity import is_simulated
 
 LOOK_S = 0.01  # pause between two comparisons of new rows with the limits, in s
 STILL_S = 5.0  # a run ends if it does not compare rows with its limits for longer than this, in s
-LATE_S = 0.5  # s; if a step starts later than this, all later steps are delayed too, so that none is shorter
+LATE_S = 0.5  # s; a greater delay of a step also delays all later steps, so that no step gets shorter
 UNKNOWN = "the stops of its line failed; the log has the error"
 SHORTEST_S = 1e-4  # shortest period of a polled register, in s
-MOST_WAITING = 3000  # limit of batches (30 s or more) that wait for the recording or for a taker
-# A busy computer delays simulated drives, and this process, for longer than the time-outs of real drives.
+MOST_WAITING = 3000  # limit of batches (30 s or more) that wait for the recording or for a callback
+# On a busy computer, a simulated drive may reply later than a real drive's time-out.
 SIMULATED_ATTEMPTS = 20  # number of attempts of a command to a simulated drive
 SIMULATED_SILENCE_S = 60.0  # the default of `silence` if all lines are simulated
 ENDING_S = 10.0  # how long the end of a run waits for the recording and for each taker, in s
@@ -65,7 +64,7 @@ class RunResult:
 
 
 class _Aborted(Exception):
-    """The run must end; the text says why."""
+    """The run must end. The text of the exception says why."""
 
 
 class TestRun:
@@ -113,10 +112,10 @@ class TestRun:
     def run(self, out: Path | str | None = None, *takers: Callable[[Rows], object]) -> RunResult:
         """Carry out all steps, stop all drives, and return the result once the motors are at rest.
 
-        `out` is a new recording. Each of `takers` is called with each batch of rows, on a thread of its
-        own. Limits and stops do not wait for the recording or a taker. If either is too slow, rows
-        are lost: the run is aborted, and the result's `abort` has their number. An error of a taker
-        ends the run and is raised here.
+        `out` is a new recording. Each of `takers` is called with each batch of rows, on a thread of its own.
+        Limits and stops do not wait for the recording or a taker. If the recording or a taker is too slow,
+        rows are lost: the run is aborted, and the result's `abort` has their number. An error of a taker ends
+        the run and is raised here.
 
         Call this in the main thread, which handles signals. Raises ValueError for a command that a rule
         forbids and for a test that does not fit its lines, LineError if a port cannot be opened,
@@ -136,7 +135,7 @@ class TestRun:
             writer: RecordingWriter | None = None
             if out is not None:
                 writer = open_writer(out, with_phases(plant.metadata(), self._phases))
-            # after the checks above, because their errors must not stop running motors
+            # only after the checks above: if one fails, motors that already run are not stopped
             poller.stop_on_exit()
             return _Session(self, poller, writer, takers).carry_out()
 
@@ -233,7 +232,7 @@ class _Session:
         if self._plan.limits.silence is None and all(map(_is_simulated, poller.buses.values())):
             silence = max(silence, SIMULATED_SILENCE_S)
         self._watch = LimitWatch(self._plan, round(silence * 1e9), clock.now_ns())
-        # how long, in ns, the computer had slept before the run
+        # ns that the computer had slept before the run
         self._slept_ns = clock.boottime_ns() - clock.now_ns()
         self._looked_ns = clock.boottime_ns()  # when rows were last compared with the limits
         self._is_stopping = False
@@ -246,7 +245,7 @@ class _Session:
                 abort = self._carry_out_and_stop()
             finally:
                 missing += self._end_rows()
-        except KeyboardInterrupt as interruption:  # the drives were stopped before this exception was raised
+        except KeyboardInterrupt as interruption:  # the drives were already stopped
             for sentence in (*self._stopped().values(), *missing):
                 interruption.add_note(str(sentence))
             raise
@@ -256,7 +255,7 @@ class _Session:
     def _end_rows(self) -> list[str]:
         """Pass on the last rows and close the recording.
 
-        Return a sentence for each consumer that did not get all rows: the recording, or a callback.
+        Return a sentence for the recording, and for each callback, that did not get all rows.
         """
         while self.take():  # pass on the rows that arrived while the poller was being closed
             pass
@@ -296,7 +295,7 @@ class _Session:
         for number, planned in enumerate(self._run.timeline):
             step = planned.step
             self._run.number = number
-            self._check_standstill()  # a suspension just before this line must not delay a start
+            self._check_standstill()  # no start may be sent after a suspension of the process
             self._mark(step.name)
             works = [
                 pool.submit(copy_context().run, self._command, self._poller[name], step)
@@ -305,8 +304,8 @@ class _Session:
             at = self._follow(works, at + planned.seconds, step)
 
     def _follow(self, works: list[Future[Any]], over: float = 0.0, step: RunStep | None = None) -> float:
-        """Wait until the commands `works` are done, the time `over` is reached (s since the run's start), and
-        the step's condition holds.
+        """Wait for three things: the end of the commands `works`, the time `over` in s since the run's start,
+        and the step's condition.
 
         Return the time when the next step is due, in s since the run's start. Raises _Aborted at a limit, and
         if a command fails.
@@ -333,7 +332,8 @@ class _Session:
         """Take one batch of rows. Raises _Aborted if a limit is reached, if a command has failed, or if
         rows were lost. Raises the error of the recording or of a callback.
 
-        If the computer slept, that time counts as silence, because a run must not continue after a sleep.
+        While the computer sleeps, no values come. That time counts too, so that a run does not continue after
+        a sleep.
         """
         self._check_standstill()
         self.take()
@@ -353,7 +353,9 @@ class _Session:
                 raise failure
 
     def _check_standstill(self) -> None:
-        """Raise _Aborted if the run stood still, for example because its process was suspended."""
+        """Raise _Aborted if the run did not compare rows for too long, for example because its process was
+        suspended.
+        """
         before_ns, self._looked_ns = self._looked_ns, clock.boottime_ns()
         still_s = (self._looked_ns - before_ns) / 1e9
         if still_s > STILL_S:
@@ -396,7 +398,9 @@ class _Session:
         self._insist(drive, lambda: _command(drive, step))
 
     def _insist(self, drive: Drive, work: Callable[[], object]) -> object:
-        """Do the work. Repeat it if a simulated drive was late; commands to a real drive are not repeated."""
+        """Do the work. If the drive is simulated and replied too late, repeat the work. Commands to a real
+        drive are not repeated.
+        """
         attempts = SIMULATED_ATTEMPTS if _is_simulated(drive.bus) else 1
         for attempt in range(attempts):
             try:
@@ -421,8 +425,8 @@ class _Session:
             self._mark(STOP)
 
     def _stop(self, pool: ThreadPoolExecutor) -> None:
-        """Stop all drives, and take rows until all stops have ended. Then wait until a pending signal has
-        been handled.
+        """Stop all drives, and take rows until all stops have ended. Then wait until a signal that came
+        meanwhile has been handled.
         """
         self._begin_stops()
         stops = [pool.submit(copy_context().run, bus.part) for bus in self._poller.buses.values()]

@@ -1,4 +1,4 @@
-"""LimitWatch: compare the rows of a run with its limits. Times are arguments: it reads no clock."""
+"""LimitWatch: compare the rows of a run with its limits. All times are arguments; no clock is read."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class LimitWatch:
         self._newest: dict[str, dict[str, Row]] = {name: {} for name in self._drives}
         # newest value of each fault record, by drive and register
         self._records: dict[tuple[str, str], float] = {}
-        # by a drive's name or "drive.register": when its newest value came (monotonic, in ns)
+        # when the newest value of each drive name or "drive.register" came (monotonic, in ns)
         self._heard = dict.fromkeys(self._drives, begin_ns)
         limited = [(limit.drive, limit.register) for limit in self._limits]
         self._heard |= {f"{name}.{register}": begin_ns for name, register in (*limited, *plan.faults)}
