@@ -36,7 +36,7 @@ def test_a_suspended_gateway_is_killed_and_its_lines_are_taken_over(drill: Fleet
     stopped: list[subprocess.Popen[str]] = []
     drill.settle()
     gaps = drill.judge(lambda: stopped.append(drill.stop_gateway()), seconds=1.0)
-    # longer than a hand-over, so the gateway had lines and other gateways took them over
+    # longer than a hand-over takes, so the suspended gateway had lines and other gateways took them over
     assert max(gaps.values()) > 2.0
     assert stopped[0].wait(PATIENCE_S) == -signal.SIGKILL
     assert drill.hall.overlaps() == 0

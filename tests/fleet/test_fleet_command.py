@@ -69,7 +69,9 @@ def _own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ["write", "pump-1", "frequency", "20", "--yes"],
     ),
 )
-def test_no_server_is_reported_in_one_sentence(run: Run, nobody: str, words: list[str]) -> None:
+def test_a_server_that_cannot_be_reached_is_reported_in_one_sentence(
+    run: Run, nobody: str, words: list[str]
+) -> None:
     said = one_sentence(run("fleet", *words, "--nats", nobody))
     assert f"no NATS server answers at {nobody}: Connection refused" in said
 

@@ -145,7 +145,7 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
 
 
 @pytest.mark.slow
-def test_no_server_is_reported_in_one_sentence(
+def test_a_server_that_cannot_be_reached_is_reported_in_one_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     url = f"nats://127.0.0.1:{free_ports(1)[0]}"

@@ -367,10 +367,7 @@ class LeaseModel:
     # ---- all interleavings ----
 
     def deadline(self, renewed: Iterable[int | None]) -> int:
-        """Return until when the holder may send, relative to now.
-
-        `renewed` has the ages of the records' renewals.
-        """
+        """Return until when the holder may send, relative to now. `renewed` has the ages of its renewals."""
         sent = [None if age is None else -age for age in renewed]
         return lease_rules.deadline(sent, self.terms)
 

@@ -105,7 +105,7 @@ def test_a_spool_in_a_new_folder_has_a_new_log_id(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("step", first_in_ci(83, 1))
-def test_a_newest_file_cut_at_any_byte_loses_no_earlier_message(
+def test_if_the_newest_file_is_cut_at_any_byte_no_earlier_message_is_lost(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, step: int
 ) -> None:
     """A power cut may leave a file without some of its last bytes, or leave a temporary file."""

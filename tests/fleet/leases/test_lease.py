@@ -210,7 +210,7 @@ async def test_a_session_ends_even_if_its_last_renewal_is_stored_late() -> None:
 
 
 @pytest.mark.parametrize("later", [{"nonce": "another's"}, {"ended": True, "by": "b"}])
-async def test_a_sessions_end_replaces_only_renewals_of_the_same_session(
+async def test_the_record_that_ends_a_session_replaces_only_its_own_renewals(
     later: dict[str, Any],
 ) -> None:
     trial, lease = await begun()

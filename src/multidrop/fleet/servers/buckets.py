@@ -215,7 +215,7 @@ class Bucket:
         return [self._record(*message) for message in messages]
 
     def _subject(self, key: str) -> str:
-        """Return the subject to write a record to."""
+        """Return the NATS subject on which a record is written."""
         return f"$KV.{self.name}.{key}"
 
     def _pattern(self, key: str) -> str:

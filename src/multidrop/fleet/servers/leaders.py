@@ -1,4 +1,4 @@
-"""Leaders of buckets: each of three buckets has another leader, so one failed server stops only one of them.
+"""Leaders of buckets. Three lease buckets have three different leaders, so one failed server stops only one.
 
 A server that is cut off starts an election every 4 to 9 s, each in a newer term of Raft, although no other
 server receives its messages. When it returns, a leader with an older term steps down, and its bucket has no
