@@ -103,7 +103,7 @@ def test_models_prints_bits_and_addresses_in_the_notation_of_manuals(run: Run, t
     assert "01F3H serial_number input register 8 characters" in words(run("models", path)[1])
 
 
-def test_check_prints_json(run: Run, fan: Path) -> None:
+def test_check_prints_a_family_as_json(run: Run, fan: Path) -> None:
     status, out, _ = run("check", fan, "--json")
     found = json.loads(out)
     assert (status, found["model"], found["declared_in"], found["mistakes"]) == (
@@ -193,7 +193,7 @@ def test_check_does_not_ask_for_the_value_range_of_a_coil(run: Run, tmp_path: Pa
     assert "together = { coil = 20 }" in " ".join(out.split())
 
 
-def test_a_scan_with_two_family_files_of_one_name_is_refused(run: Run, tmp_path: Path) -> None:
+def test_a_scan_with_two_family_files_that_declare_one_model_is_refused(run: Run, tmp_path: Path) -> None:
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
         write_meter(tmp_path / folder)

@@ -53,7 +53,7 @@ def test_plan_prints_the_rates_and_returns_0_if_the_line_can_reach_them(run: Run
     assert len(lines) == 5
 
 
-def test_long_names_are_shortened_to_aligned_columns(run: Run, tmp_path: Path) -> None:
+def test_plan_shortens_long_names_and_aligns_its_columns(run: Run, tmp_path: Path) -> None:
     """Names may differ only at their ends, and Chinese characters are two columns wide."""
     path = tmp_path / "named.toml"
     names = [

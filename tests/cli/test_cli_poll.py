@@ -271,7 +271,7 @@ def test_poll_without_any_sample_returns_1(run: Run, plant: Path) -> None:
     assert (status, json.loads(out)["samples"]) == (1, 0)
 
 
-def test_all_mistakes_of_a_plant_file_are_printed(run: Run, tmp_path: Path) -> None:
+def test_poll_prints_all_mistakes_of_a_plant_file(run: Run, tmp_path: Path) -> None:
     path = plant_file(tmp_path)
     path.write_text(
         path.read_text().replace("port =", "prot =").replace("address = 1", "address = 99\nevery = 5\n")

@@ -429,7 +429,7 @@ def test_simulate_serves_a_line_of_a_plant_over_modbus_tcp(tmp_path: Path, run: 
 
 
 @pytest.mark.long
-def test_a_local_port_is_served_under_its_name_in_the_plant_file(tmp_path: Path, run: Run) -> None:
+def test_simulate_serves_a_local_port_under_its_name_in_the_plant_file(tmp_path: Path, run: Run) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     plant = tmp_path / "plant.toml"

@@ -112,7 +112,7 @@ def test_the_listener_of_sniff_cannot_send(line: tuple[str, str]) -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_an_unanswered_request_is_printed_while_the_line_is_silent() -> None:
+def test_sniff_prints_an_unanswered_request_while_the_line_is_silent() -> None:
     master, slave = pty.openpty()
     with sniffing(os.ttyname(slave)) as sniffer:
         os.write(master, READ.request_frame)

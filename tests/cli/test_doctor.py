@@ -284,7 +284,7 @@ def test_doctor_prints_the_exception_code_of_a_drive_that_refuses(run: Run, resp
 
 
 @pytest.mark.slow
-def test_the_round_trip_counts_only_sent_requests(
+def test_doctor_counts_only_requests_that_were_sent(
     run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A silent drive gets no request while its late reply may come. Held-back requests are not counted."""

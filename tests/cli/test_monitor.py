@@ -167,7 +167,7 @@ def test_the_monitors_history_of_values_has_a_gap_for_a_miss(watched: LivePlant)
     assert sparkline([0, 5e-324], 5) == "▁█"
 
 
-def test_a_history_has_values_of_one_register_only(tmp_path: Path) -> None:
+def test_the_monitors_history_has_values_of_one_register_only(tmp_path: Path) -> None:
     live = LivePlant(a_plant(tmp_path, 1))
     for name, value in (("status", 3.0), ("output_frequency", 50.0)):
         live.add(from_rows([row("drive-1", name, value)]))
@@ -404,7 +404,7 @@ def screened(tmp_path: Path) -> Screened:
     return Screened(monitor, poller)
 
 
-def test_a_stop_is_sent_only_after_a_yes(screened: Screened) -> None:
+def test_the_monitor_sends_a_stop_only_after_a_yes(screened: Screened) -> None:
     for keys, asked in (
         (["s", "n"], []),
         (["s", ENTER], []),
@@ -420,7 +420,7 @@ def test_a_stop_is_sent_only_after_a_yes(screened: Screened) -> None:
         assert screened.poller.asked == asked
 
 
-def test_a_stop_is_sent_even_if_no_thread_can_start(
+def test_the_monitor_sends_a_stop_even_if_no_thread_can_start(
     screened: Screened, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monitor, poller = screened
@@ -435,7 +435,7 @@ def test_a_stop_is_sent_even_if_no_thread_can_start(
     assert not monitor._is_stopping
 
 
-def test_without_threads_stops_are_sent_to_all_lines_before_waiting_for_one(screened: Screened) -> None:
+def test_the_monitor_without_threads_sends_all_stops_before_it_waits_for_one(screened: Screened) -> None:
     monitor, poller = screened
     asked: list[tuple[str, float | None]] = []
 
@@ -491,7 +491,7 @@ def test_the_monitor_counts_stopped_drives_and_lines(screened: Screened) -> None
     assert messages == ["1 of 2 drives stopped, on 1 of 2 lines so far", "2 of 4 drives stopped"]
 
 
-def test_hidden_failures_are_shown_after_visible_ones_are_acknowledged(watched: LivePlant) -> None:
+def test_hidden_failures_of_stops_are_shown_once_visible_ones_are_acknowledged(watched: LivePlant) -> None:
     at = Position(failures=[f"drive-{number}: no reply" for number in range(31)])
     shown: list[str] = []
     for more in (24, 17, 10, 3, 0):

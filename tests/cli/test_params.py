@@ -139,7 +139,7 @@ def test_params_actions_print_json(run: Run, drive: tuple[object, ...], sim: Mot
     assert {row["code"]: row["raw"] for row in listed}["b.003"] == 100
 
 
-def test_two_files_and_two_drives_are_compared(run: Run, drive: tuple[object, ...]) -> None:
+def test_params_compares_two_files_and_two_drives(run: Run, drive: tuple[object, ...]) -> None:
     run("params", "save", *drive, "a.toml")
     run("params", "save", *drive, "b.csv")
     assert run("params", "diff", "a.toml", "b.csv")[0] == 0

@@ -105,7 +105,9 @@ def test_a_file_without_rows_or_not_a_recording_prints_one_sentence(
 
 
 @pytest.mark.parametrize("time", [-(2**63), -1, 2**63 - 1])
-def test_times_outside_the_calendar_print_one_sentence(run: Run, tmp_path: Path, time: int) -> None:
+def test_recordings_with_times_outside_the_calendar_print_one_sentence(
+    run: Run, tmp_path: Path, time: int
+) -> None:
     rows = [
         row(0, "pump", "output_frequency", 1.0),
         row(1, "pump", "output_frequency", 1.0)._replace(time_ns=time),
@@ -119,7 +121,7 @@ def test_times_outside_the_calendar_print_one_sentence(run: Run, tmp_path: Path,
         )
 
 
-def test_metadata_that_is_nested_too_deeply_prints_one_sentence(run: Run, tmp_path: Path) -> None:
+def test_recordings_with_deeply_nested_metadata_print_one_sentence(run: Run, tmp_path: Path) -> None:
     path = record(tmp_path / "it.csv", [row(0, "pump", "output_frequency", 1.0)])
     (tmp_path / "it.csv.json").write_text("[" * 100_000)
     for command in ("plot", "report"):

@@ -182,7 +182,7 @@ def test_communication_parameters_are_written_only_with_the_option_also(
         "F803",
         "F801",
     ]  # F801 (parity) is a communication parameter, so it is written last
-    with pytest.raises(ValueError, match="--also F803: it is not the drive's address"):
+    with pytest.raises(ValueError, match="--also F803: F803 is not the drive's address"):
         params.plan(drive, {"F803": 20}, also=["F803"])
     assert list(params.plan(drive, {"F802": 5}).left) == ["F802"]
     assert sim["communication_timeout"] == 30

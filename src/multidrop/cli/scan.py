@@ -237,7 +237,8 @@ def _planned(arguments: argparse.Namespace, families: Sequence[type[Drive]]) -> 
     fixed = arguments.port.startswith("socket://")
     if fixed and len(arguments.baudrates) != 1:
         raise ValueError(
-            f"the serial server at {arguments.port} sets the baud rate: name it, such as --baudrates 9600"
+            f"the serial server at {arguments.port} sets the baud rate itself: "
+            "name this rate, such as --baudrates 9600"
         )
     planned = sweeps(
         families, addresses=arguments.addresses, baudrates=arguments.baudrates, formats=arguments.formats

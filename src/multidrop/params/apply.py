@@ -125,8 +125,8 @@ def _check_also(family: Any, also: Collection[str], given: ParameterSet) -> None
     for code in also:
         if not parameter_of(family, code).is_line:
             raise ValueError(
-                f"--also {code}: it is not the drive's address, baud rate, format or protocol; only those "
-                "need --also"
+                f"--also {code}: {code} is not the drive's address, baud rate, format or protocol; "
+                "only those need --also"
             )
         if code not in given.values:
             raise ValueError(f"--also {code}: {given.source} has no {code}")

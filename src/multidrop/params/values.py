@@ -54,7 +54,9 @@ def parameter_of(family: Any, code: str) -> Parameter:
     known = parameters_of(family)
     if code not in known:
         first = next(iter(known))
-        raise ValueError(f"{family.model or family.__name__} has no parameter {code}; its first is {first}")
+        raise ValueError(
+            f"{family.model or family.__name__} has no parameter {code}; the first one is {first}"
+        )
     return known[code]
 
 

@@ -358,7 +358,7 @@ def _run(drive: Drive, script: Script[R], ask: Ask) -> R:
 
     def do(step: Step) -> Any:
         if not isinstance(step, Read):
-            raise WriteForbidden(f"the identification of {drive.title} may only read")
+            raise WriteForbidden(f"`identify` of {drive.title} tried to write, but may only read")
         return _read(drive, step.register, ask)
 
     return carry_out(script, do)

@@ -81,7 +81,9 @@ class Stage:
                     self.updated.clear()
                     await self.updated.wait()
         except TimeoutError:
-            raise OSError(f"the demo has failed: {what} not within {WAIT_S:.0f} s") from None
+            raise OSError(
+                f"the demo has failed, because this did not happen within {WAIT_S:.0f} s: {what}"
+            ) from None
 
     async def calm(self, seconds: float) -> None:
         """Wait until two reports of the fleet, `seconds` s apart, show the same master for each line."""
