@@ -1,4 +1,4 @@
-"""Rows that a poller adds: channels, whose totals a file keeps, and comments."""
+"""Rows that a poller adds to those of registers: values of channels, comments and outages."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def pump(*channels: Channel) -> PolledDrive:
 
 
 def polled_rows(made: Plant, least: int = 20, *marks: str) -> list[Row]:
-    """Poll this plant until there are `least` rows; return all rows."""
+    """Poll this plant until there are `least` rows, with the comments `marks`; return all rows."""
     rows: list[Row] = []
     with Poller(made) as poller:
         for text in marks:
@@ -61,7 +61,7 @@ def of(rows: list[Row], register: str) -> list[Row]:
     return [row for row in rows if row.register == register]
 
 
-def test_each_row_of_a_register_has_a_row_of_its_channel(port: str) -> None:
+def test_each_row_of_a_register_adds_a_row_of_the_channel_computed_from_it(port: str) -> None:
     rows = polled_rows(plant(line(port, pump(DOUBLE))))
     inputs, doubles = of(rows, "output_current"), of(rows, "double")
     value = proof(Toy(1), CURRENT)
@@ -71,14 +71,14 @@ def test_each_row_of_a_register_has_a_row_of_its_channel(port: str) -> None:
     ]
 
 
-def test_a_batch_without_channels_is_the_cores_own_batch(port: str) -> None:
+def test_a_plant_without_channels_gets_the_batches_of_the_core_unchanged(port: str) -> None:
     with Poller(plant(line(port, pump()))) as poller:
         assert not poller._added
         until(lambda: (batch := poller.take()) and type(batch.parts()[0]).__name__ == "Columns")
 
 
 @pytest.mark.parametrize("suffix", [".arrows", ".csv", ".parquet"])
-def test_channels_and_comments_are_recorded(port: str, tmp_path: Path, suffix: str) -> None:
+def test_rows_of_channels_and_comments_are_recorded(port: str, tmp_path: Path, suffix: str) -> None:
     made = plant(line(port, pump(DOUBLE)))
     path = tmp_path / f"run{suffix}"
     with Poller(made) as poller, open_writer(path, made.metadata()) as writer:
@@ -105,7 +105,7 @@ def test_an_invalid_comment_is_refused(port: str, text: str) -> None:
 
 
 @patient
-def test_totals_continue_exactly_after_a_restart(port: str, tmp_path: Path) -> None:
+def test_channel_totals_continue_exactly_after_a_restart(port: str, tmp_path: Path) -> None:
     made = replace(plant(line(port, pump(CHARGE))), totals=tmp_path / "totals.json")
     rows = polled_rows(made)
     assert of(rows, "outage")[0].status == "pump-1.charge starts at 0"
@@ -121,7 +121,7 @@ def test_totals_continue_exactly_after_a_restart(port: str, tmp_path: Path) -> N
     assert of(rows, "outage")[0].status == "pump-1.charge starts at 0"
 
 
-def test_an_adopted_plant_continues_totals_and_drops_removed_channels(port: str) -> None:
+def test_adopt_continues_channel_totals_and_drops_removed_channels(port: str) -> None:
     with Poller(plant(line(port, pump(CHARGE, DOUBLE)))) as poller:
         rows: list[Row] = []
         until(lambda: rows.extend(rows_of(poller)) or len(of(rows, "charge")) > 5)
@@ -134,7 +134,7 @@ def test_an_adopted_plant_continues_totals_and_drops_removed_channels(port: str)
 
 
 @patient
-def test_no_channel_combines_values_of_two_drives_of_one_name() -> None:
+def test_no_channel_combines_values_of_two_drives_with_the_same_name() -> None:
     change = Channel("change", "derivative(output_current)", "A/s")
     values = [proof(Toy(address), CURRENT) for address in (1, 2)]
     assert values[0] != values[1]
@@ -142,7 +142,7 @@ def test_no_channel_combines_values_of_two_drives_of_one_name() -> None:
         path, rows = simulator.wires[0].path, list[Row]()
         with Poller(plant(line(path, pump(change, CHARGE, DOUBLE)))) as poller:
             until(lambda: rows.extend(rows_of(poller)) or len(of(rows, "change")) > 5)
-            time.sleep(0.05)  # so that rows of the first drive still wait when the second one is adopted
+            time.sleep(0.05)  # rows of the first drive are still queued when it is replaced
             second = PolledDrive(
                 Toy(2, name="pump-1"), [CURRENT], every=0.005, channels=(change, CHARGE, DOUBLE)
             )
@@ -156,13 +156,13 @@ def test_no_channel_combines_values_of_two_drives_of_one_name() -> None:
     assert {row.value for row in doubles if row.monotonic_ns < since_ns} == {2 * values[0]}
 
 
-def test_values_stay_valid_for_longer_at_a_slower_rate(port: str) -> None:
+def test_a_channel_uses_a_value_for_longer_if_its_register_is_polled_slowly(port: str) -> None:
     with Poller(plant(line(port, pump(CHARGE)))) as poller:
         poller.set_rate("pump-1", "output_current", 60)
         assert poller._added._channels.holds_s == {("pump-1", "charge"): 180}
 
 
-def test_totals_of_a_line_continue_when_it_returns(port: str, tmp_path: Path) -> None:
+def test_channel_totals_of_a_removed_line_continue_when_it_is_added_again(port: str, tmp_path: Path) -> None:
     made = replace(plant(line(port, pump(CHARGE))), totals=tmp_path / "totals.json")
     with Poller(made) as poller:
         rows: list[Row] = []
@@ -196,7 +196,7 @@ def test_a_channel_is_not_computed_if_its_register_is_not_polled(
 
 
 @patient
-def test_damaged_totals_start_at_0(port: str, tmp_path: Path) -> None:
+def test_totals_start_at_0_if_their_file_is_damaged(port: str, tmp_path: Path) -> None:
     for content in ("", "[", "[]", '{"pump-1.charge": {"totals": [[1e999]]}}'):
         (tmp_path / "totals.json").write_text(content)
         made = replace(plant(line(port, pump(CHARGE))), totals=tmp_path / "totals.json")
@@ -205,7 +205,7 @@ def test_damaged_totals_start_at_0(port: str, tmp_path: Path) -> None:
             assert (tmp_path / "totals.json.damaged").read_text() == content
 
 
-def test_totals_are_written_when_the_poller_is_closed(port: str, tmp_path: Path) -> None:
+def test_channel_totals_are_saved_when_the_poller_is_closed(port: str, tmp_path: Path) -> None:
     made = replace(plant(line(port, pump(CHARGE))), totals=tmp_path / "totals.json")
     charges: list[float] = []
 
@@ -218,7 +218,9 @@ def test_totals_are_written_when_the_poller_is_closed(port: str, tmp_path: Path)
     assert kept["totals"] == [[charges[-1]]]
 
 
-def test_a_slow_disk_gets_only_the_newest_totals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_newest_channel_totals_are_written_to_a_slow_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file, queued = TotalsFile(tmp_path / "totals.json"), list[Callable[[], object]]()
     monkeypatch.setattr(file._thread, "put", queued.append)
     file.write({"a": 1})
@@ -231,7 +233,7 @@ def test_a_slow_disk_gets_only_the_newest_totals(tmp_path: Path, monkeypatch: py
     assert not file.path.exists()
 
 
-def test_an_outage_is_only_logged_if_no_status_code_is_free(
+def test_an_outage_is_logged_without_a_row_if_no_status_code_is_free(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("multidrop.polling.batch.MOST_STATUSES", 0)
@@ -239,7 +241,7 @@ def test_an_outage_is_only_logged_if_no_status_code_is_free(
     added = AddedRows(names)
     added.adopt(plant(line("/dev/ttyUSB0", pump(CHARGE))), {})
     codes = names.drives.number("pump-1"), names.registers.number("output_current")
-    # No other test has an outage of 343 s: a status text of this process keeps its code.
+    # No other test has an outage of 343 s, so this status text has no code yet.
     rows = [AddedRow(ns, ns, 0, *codes, 0, 1.0) for ns in (10**9, 344_000_000_000)]
     with caplog.at_level(logging.WARNING):
         batch = added.added_to(Batch(JoinedColumns(None, rows), names.drives, names.registers))
@@ -260,8 +262,8 @@ def test_a_removed_drive_is_freed_at_once() -> None:
     assert known() is None
 
 
-def test_outages_that_end_with_one_row_have_different_times() -> None:
-    """InfluxDB keeps one row for each series and time."""
+def test_outages_that_end_at_the_same_row_have_different_times() -> None:
+    """If two rows have the same series and time, InfluxDB keeps only one of them."""
     names = RowNames()
     added = AddedRows(names)
     added.adopt(plant(line("/dev/ttyUSB0", pump(CHARGE, replace(CHARGE, name="more")))), {})
@@ -276,7 +278,7 @@ def test_outages_that_end_with_one_row_have_different_times() -> None:
     ]
 
 
-def test_totals_of_a_simulation_are_saved_in_a_separate_file(
+def test_channel_totals_of_simulated_drives_are_saved_in_a_separate_file(
     port: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "plant.toml"
@@ -292,7 +294,7 @@ def test_totals_of_a_simulation_are_saved_in_a_separate_file(
     )
 
 
-def test_texts_of_events_follow_the_cores_statuses(port: str) -> None:
+def test_a_comment_is_the_status_of_its_row(port: str) -> None:
     rows = polled_rows(plant(line(port, pump())), 20, "a comment")
     assert "a comment" not in STATUSES
     assert "a comment" in {row.status for row in rows}
@@ -350,10 +352,11 @@ def test_rows_have_the_time_of_their_exchange_although_the_computer_slept(tmp_pa
             check=False,
         )
     assert ran.returncode == 0, ran.stderr
-    # hours by which UTC is ahead of a clock that stops during sleep, for requests before the sleep (True) and
-    # after (False)
+    # hours by which the rows' UTC is ahead of a clock that stops during sleep: for requests before the sleep
+    # (True) and after it (False)
     slept_for = {True: set[int](), False: set[int]()}
-    before_ns, unsure_ns = asked_ns[48], asked_ns[49]  # `unsure_ns`: just before or after the sleep
+    # the request at `unsure_ns` may be before or after the sleep
+    before_ns, unsure_ns = asked_ns[48], asked_ns[49]
     for time_ns, monotonic_ns in json.loads(ran.stdout):
         if not before_ns < monotonic_ns <= unsure_ns:
             slept_for[monotonic_ns <= before_ns].add(round((time_ns - monotonic_ns - ahead_ns) / HOUR_NS))

@@ -1,4 +1,4 @@
-"""`Poller.adopt`: another plant is adopted during polling, on a clock that the test sets."""
+"""`Poller.adopt` replaces the polled plant by another one during polling, on a simulated clock."""
 
 from __future__ import annotations
 
@@ -104,14 +104,14 @@ OTHERS = (
 
 @pytest.mark.long
 @pytest.mark.parametrize("every", usually(None, 0.1, 0.08), ids=str)
-def test_adopting_other_lines_does_not_shift_an_unchanged_line_s_requests(every: float | None) -> None:
+def test_adopting_other_lines_does_not_shift_requests_on_an_unchanged_line(every: float | None) -> None:
     """The unchanged line's requests are sent at exactly the same times as without an adoption."""
 
     def exchanges(*, adopts: bool) -> list[tuple[int, str, str]]:
         with clocked(hall(*pumps(every)), yard(*fans(every))) as made:
             rows = made.run(5)
             for others in OTHERS * 2:
-                if adopts:  # an equal plant with new drive objects
+                if adopts:  # the plant is equal, but has new drive objects
                     adopting = made.beside(lambda o=others: made.poller.adopt(plant(hall(*pumps(every)), *o)))
                 rows += made.run(1.7)
                 if adopts:
@@ -141,7 +141,7 @@ def test_adopting_an_equal_plant_keeps_drive_objects_and_ports() -> None:
 
 
 @pytest.mark.slow
-def test_rates_and_registers_change_on_the_open_port() -> None:
+def test_adopt_changes_rates_and_registers_without_reopening_the_port() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(2)
         first, second = made.poller.bus("hall").drives
@@ -161,7 +161,7 @@ def test_rates_and_registers_change_on_the_open_port() -> None:
 
 
 @pytest.mark.slow
-def test_adoption_adds_removes_and_readdresses_drives() -> None:
+def test_adopt_adds_and_removes_drives_and_changes_their_addresses() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(2)
         stays = made.poller.bus("hall").drives[0]
@@ -178,7 +178,7 @@ def test_adoption_adds_removes_and_readdresses_drives() -> None:
 
 
 @pytest.mark.slow
-def test_a_drive_can_change_to_another_family() -> None:
+def test_adopt_can_replace_a_drive_by_one_of_another_family() -> None:
     drives = [InnovertIBD(7, name="pump"), InvtCHE(7, name="pump")]
     registers = [drive.readings()[:4] for drive in drives]
     wires = {"port of hall": wire(drives[0], Toy(1))}
@@ -197,7 +197,7 @@ def test_a_drive_can_change_to_another_family() -> None:
 
 
 @pytest.mark.slow
-def test_a_line_with_a_new_name_keeps_its_port() -> None:
+def test_adopt_keeps_the_port_of_a_renamed_line_open() -> None:
     with clocked(hall(*pumps()), yard(*fans())) as made:
         made.run(2)
         names = replace(hall(*pumps()), name="yard"), replace(yard(*fans()), name="hall")
@@ -212,7 +212,7 @@ def test_a_line_with_a_new_name_keeps_its_port() -> None:
 
 
 @pytest.mark.long
-def test_adoption_adds_and_removes_lines() -> None:
+def test_adopt_adds_and_removes_lines() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(2)
         assert made.poller.adopt(plant(yard(*fans()))) == {}
@@ -303,8 +303,8 @@ def test_the_cost_of_adding_a_line_grows_linearly_with_the_lines() -> None:
     assert calls_to_add_one_to(24) < 2 * calls_to_add_one_to(12)
 
 
-def test_learnt_timing_survives_a_reopened_port() -> None:
-    """A late reply may still arrive after the port is reopened."""
+def test_late_replies_are_still_expected_after_adopt_reopens_a_port() -> None:
+    """The late reply may arrive after the port is reopened, so the bus must remember it."""
     wires = {"port of hall": wire(Toy(1))}
     with ClockedLines.of_lines(wires, plant(hall(toy("pump-1", 1), toy("gone", 5)))) as made:
         made.run(2)
@@ -318,7 +318,7 @@ def test_learnt_timing_survives_a_reopened_port() -> None:
         check_rates(made, pump_1=0.1)
 
 
-def test_a_drive_inherits_the_late_replies_due_at_its_address() -> None:
+def test_a_replacing_drive_expects_late_replies_to_the_replaced_drive() -> None:
     """The old drive's queued requests are sent first. The new drive then knows which late replies are due."""
     wires = {"port of hall": wire(Toy(1))}
     with ClockedLines.of_lines(wires, plant(hall(toy("pump-1", 1), toy("deaf", 5, 0.05)))) as made:
@@ -341,7 +341,7 @@ def test_a_drive_inherits_the_late_replies_due_at_its_address() -> None:
 
 
 @pytest.mark.slow
-def test_an_absent_port_is_reported_and_opened_once_it_exists() -> None:
+def test_adopt_reports_an_absent_port_and_opens_it_when_it_exists() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         del made.wires["port of yard"]
@@ -358,7 +358,7 @@ def test_an_absent_port_is_reported_and_opened_once_it_exists() -> None:
         check_rates(made, 2, fan_1=0.1)
 
 
-def test_a_line_with_an_absent_port_is_not_added() -> None:
+def test_add_line_raises_if_the_port_is_absent() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         del made.wires["port of yard"]
@@ -419,7 +419,7 @@ def test_adopting_an_invalid_plant_changes_nothing(mistake: str) -> None:
         assert sorted(made.opened) == ["port of hall", "port of yard"]
 
 
-def test_all_mistakes_are_reported_together() -> None:
+def test_adopt_reports_all_mistakes_of_a_plant_together() -> None:
     pump, _ = pumps()
     with clocked(hall(*pumps())) as made, pytest.raises(PlantError) as found:
         made.poller.adopt(plant(hall(pump, toy("pump-1", 1)), hall(toy("v", 3))))
@@ -482,10 +482,8 @@ def test_adopt_rejects_other_types() -> None:
 # ---- batches ----
 
 
-def test_polled_since_distinguishes_rows_of_a_reused_name() -> None:
-    """Two drives on one line swap names, then two drives on different lines. Each drive has a different
-    value.
-    """
+def test_polled_since_separates_the_rows_of_two_drives_with_one_name() -> None:
+    """Three drives on two lines swap their names. Each drive has a different value."""
     wires = {"port of hall": toys(), "port of yard": wire(*(Toy(address) for address in (5, 6)))}
 
     def named(*names: str) -> Plant:
@@ -513,7 +511,7 @@ def test_polled_since_distinguishes_rows_of_a_reused_name() -> None:
 
 
 @pytest.mark.slow
-def test_statistics_of_a_reused_name_start_at_zero() -> None:
+def test_a_new_drive_with_a_used_name_has_its_own_statistics() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(20)
         first = made.poller.statistics()["hall"]
@@ -536,7 +534,7 @@ def test_statistics_of_a_reused_name_start_at_zero() -> None:
 
 
 @pytest.mark.slow
-def test_a_name_keeps_its_code_in_all_batches() -> None:
+def test_a_drive_name_has_the_same_code_in_all_batches() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         meant: dict[int, str] = {}
@@ -592,8 +590,8 @@ def test_memory_is_bounded_over_many_adoptions() -> None:
         assert all(now <= then + 2 for now, then in zip(after, before, strict=True)), (before, after)
 
 
-def test_joining_drives_are_polled_with_the_fewest_changes_of_settings() -> None:
-    """The polling order has as few changes of baud rate as it has if all drives are polled from the start."""
+def test_added_drives_are_polled_with_the_fewest_changes_of_baud_rate() -> None:
+    """The polling order is the same as if all drives had been polled from the start."""
 
     def drives() -> list[PolledDrive]:
         rates = {1: 9600, 2: 19200, 3: 9600, 4: 19200}

@@ -91,7 +91,7 @@ def runs(drive: SimulatedDrive) -> bool:
 
 
 class Blocked:
-    """Blocks calls until the `with` block ends. Then waits for the threads that were started by `start`."""
+    """Blocks calls until its `with` block ends, and then waits for the threads that `start` has started."""
 
     def __init__(self) -> None:
         self._reached, self._go_on = threading.Event(), threading.Event()
@@ -109,9 +109,7 @@ class Blocked:
     def blocking(
         self, act: Callable[..., Any], when: Callable[..., bool] = lambda *_: True
     ) -> Callable[..., Any]:
-        """Return a version of `act` in which calls for which `when` is true wait for the end of the `with`
-        block.
-        """
+        """Return a function that calls `act`. If `when` is true, it first waits for the end of the block."""
 
         def blocked(*arguments: Any, **details: Any) -> Any:
             if when(*arguments):
@@ -160,13 +158,13 @@ def test_with_stop_on_exit_a_drive_is_stopped_before_it_is_removed(both: TwoLine
         assert not runs(both.fans[1])
         assert not runs(both.fans[2])
         poller.adopt(plant(both.hall(1), both.yard()))
-        poller.bus("yard").drives[0].start()  # a drive on the line that was just added
+        poller.bus("yard").drives[0].start()  # on the line that was just added
     assert not runs(both.pumps[1])
     assert not runs(both.fans[1])
 
 
-def test_a_leaving_drive_cannot_be_started_after_its_stop(both: TwoLines) -> None:
-    """Otherwise its motor would keep running, because no further stop is sent to a leaving drive."""
+def test_a_drive_that_is_being_removed_cannot_be_started_after_its_stop(both: TwoLines) -> None:
+    """Otherwise its motor would keep running, because no further stop is sent to a removed drive."""
     with Poller(plant(both.hall())) as poller:
         poller.stop_on_exit()
         bus = poller.bus("hall")
@@ -219,7 +217,7 @@ def test_a_drive_of_a_changed_family_gets_no_stop_of_the_old_family(both: TwoLin
         assert writes == []
         assert runs(both.pumps[1])
         assert runs(both.fans[1])
-    assert not runs(both.pumps[1])  # the new family's stop stopped this motor at exit
+    assert not runs(both.pumps[1])  # the stop of the new family has stopped this motor at exit
     assert not runs(both.fans[1])
 
 
@@ -250,7 +248,7 @@ def blocked_stop(
 
 
 def waited_for(bus: Bus, monkeypatch: pytest.MonkeyPatch, drive: Drive | None = None) -> threading.Event:
-    """Return an event that is set once a caller waits for the stops of the bus, or of this drive."""
+    """Return an event that is set when any thread waits for stops of the bus, or of this drive."""
     found, await_stops = threading.Event(), bus._latches.await_stops
 
     def note_and_wait(drives: Collection[Drive] | None = None) -> None:
@@ -315,7 +313,7 @@ def test_replaced_drives_stay_attached_until_all_stops_have_ended(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("is_circle", [False, True])
-def test_a_drive_stays_attached_until_another_line_releases_the_new_name(
+def test_a_drive_stays_attached_while_its_new_name_is_used_on_another_line(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch, is_circle: bool
 ) -> None:
     """While the adoption waits for a stop on the other line, the drive's motor can still be stopped."""
@@ -342,7 +340,7 @@ def test_a_drive_stays_attached_until_another_line_releases_the_new_name(
             until_sampled(poller, name)
 
 
-def test_a_stop_on_a_leaving_line_does_not_delay_changes_of_other_lines(
+def test_a_stop_on_a_line_being_removed_does_not_delay_changes_of_other_lines(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
@@ -366,7 +364,7 @@ def test_two_concurrent_removals_remove_a_line_once(both: TwoLines) -> None:
         def wait_and_part() -> None:
             with suppress(threading.BrokenBarrierError):
                 both_wait.wait(PATIENCE)
-            both_wait.abort()  # a later removal is alone, and must not block here
+            both_wait.abort()  # a later caller must not wait here
             part()
 
         vars(bus)["part"] = wait_and_part
@@ -438,7 +436,7 @@ def test_closing_waits_for_an_adoption(both: TwoLines, monkeypatch: pytest.Monke
 # ---- the network ----
 
 
-def test_connections_are_made_in_parallel(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_adopt_connects_to_several_servers_in_parallel(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two calls of `create_connection` wait for each other, so connecting one after the other would fail.
     Closing the connections never sleeps.
     """
@@ -463,7 +461,9 @@ def test_connections_are_made_in_parallel(monkeypatch: pytest.MonkeyPatch) -> No
             until_sampled(poller, "fan-1")
 
 
-def test_a_slow_port_does_not_delay_other_ports(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_adopt_opens_other_ports_while_one_port_opens_slowly(
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch
+) -> None:
     nowhere = line("socket://127.0.0.1:1", quick("far", 1), name="far")
     found: dict[str, LineError] = {}
     with Poller(plant(both.hall())) as poller:
@@ -504,7 +504,7 @@ def until_sampled(poller: Poller, drive: str) -> None:
 
 
 class Dawdling(dict[object, object]):
-    """A dict that another thread changes while a caller iterates over its values."""
+    """A dict in which another thread makes a change while a caller iterates over the values."""
 
     def __init__(self, of: dict[object, object], change: Callable[[], object]) -> None:
         super().__init__(of)
@@ -523,7 +523,7 @@ class Dawdling(dict[object, object]):
 
 
 @pytest.mark.slow
-def test_a_summary_during_an_adoption_shows_the_old_or_the_new_plant(both: TwoLines) -> None:
+def test_a_summary_during_adopt_shows_either_the_old_or_the_new_plant(both: TwoLines) -> None:
     with Poller(plant(both.hall())) as poller:
         (polled_line,) = poller._lines
         maker = polled_line._maker
@@ -538,7 +538,7 @@ def test_a_summary_during_an_adoption_shows_the_old_or_the_new_plant(both: TwoLi
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_hundred_adoptions_leave_no_leftovers(both: TwoLines) -> None:
+def test_a_hundred_adoptions_leak_no_thread_descriptor_or_memory(both: TwoLines) -> None:
     """During the adoptions, threads read drives, statistics and batches. No value is misattributed."""
     held_by = {"pump-1": 1.0, "pump-2": 2.0, "fan-1": 3.0, "fan-2": 4.0}
     sims = [*both.pumps.values(), *both.fans.values()]

@@ -47,7 +47,7 @@ def test_an_empty_batch_has_no_rows() -> None:
 
 
 @table("places", [[], [0], [4, 1], [0, 1, 2, 3, 4], [2, 2] * 9])
-def test_at_returns_the_rows_at_the_given_indices(places: list[int]) -> None:
+def test_batch_at_returns_the_rows_at_the_given_indices(places: list[int]) -> None:
     wanted = [EXAMPLE[place] for place in places]
     found = example().at(places)
     assert list(found) == wanted
@@ -123,7 +123,7 @@ def test_duckdb_reads_a_batch() -> None:
     assert [Row(*row) for row in found] == EXAMPLE
 
 
-def test_numpy_reads_a_batch_and_misses_are_nan() -> None:
+def test_numpy_reads_a_batch_with_misses_as_nan() -> None:
     numpy = pytest.importorskip("numpy", reason="needs NumPy")
     taken = nanoarrow.Array(example())
     values = taken.child(5).to_pysequence(handle_nulls=nanoarrow.nulls_as_sentinel())
@@ -151,7 +151,7 @@ def test_every_status_code_has_its_text() -> None:
 # ---- columns as memoryviews ----
 
 
-def test_columns_have_all_rows_and_the_names_of_their_codes() -> None:
+def test_columns_hold_all_rows_and_the_names_for_their_codes() -> None:
     columns = example().columns()
     drives, registers, statuses = columns.drives, columns.registers, columns.statuses
     rows = [
@@ -192,7 +192,7 @@ def test_columns_outlive_their_batch() -> None:
     assert [list(view) for view in kept] == [[at] for at in range(200)]
 
 
-def test_later_names_do_not_change_earlier_codes() -> None:
+def test_names_added_later_do_not_change_the_codes_of_earlier_names() -> None:
     names = Names(["a"])
     first = Batch(Columns(1), names, names).columns()
     assert names.number("b") == 1
@@ -310,7 +310,7 @@ def polled_batches() -> list[Batch]:
 
 
 @pytest.mark.slow
-def test_arrow_libraries_read_polled_rows_and_misses_of_a_poller() -> None:
+def test_arrow_libraries_read_values_and_misses_of_a_poller() -> None:
     polars = pytest.importorskip("polars", reason="needs polars")
     batches = polled_batches()
     rows = [row for batch in batches for row in batch]
@@ -325,8 +325,8 @@ def test_arrow_libraries_read_polled_rows_and_misses_of_a_poller() -> None:
 
 
 @pytest.mark.slow
-def test_arrow_libraries_share_the_memory_of_polled_numbers() -> None:
-    """No library copies the column `value`, or `monotonic_ns`. Names are built for Arrow, from codes."""
+def test_arrow_libraries_share_the_memory_of_a_pollers_numbers() -> None:
+    """No library copies the columns `value` and `monotonic_ns`. Only the names are created for Arrow."""
     polars = pytest.importorskip("polars", reason="needs polars")
     for batch in polled_batches():
         columns, frame = batch.columns(), polars.DataFrame(batch)
@@ -386,7 +386,7 @@ def test_the_error_for_a_missing_library_has_the_install_command(
             getattr(rows, method)()
 
 
-def test_one_command_installs_the_libraries_of_several_extras() -> None:
+def test_the_error_for_missing_extras_has_one_command_that_installs_them_all() -> None:
     """Everything after the `#` is a comment for the shell, so all libraries must come before the `#`."""
     command, _, comment = install_command("serve", "plot").partition("#")
     assert {"matplotlib", "starlette", "uvicorn"} <= {*re.findall(r"[a-z]{3,}", command)}
@@ -401,17 +401,15 @@ def test_no_library_is_imported_before_it_is_needed() -> None:
     )
     told = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     late = {"pandas", "polars", "pyarrow", "numpy", "nanoarrow"}
-    late |= {
-        "importlib.metadata",
-        "multidrop.families.files.loader",
-    }  # modules that most programs do not need: few use family files or captures
+    # Most programs use neither family files nor captures.
+    late |= {"importlib.metadata", "multidrop.families.files.loader"}
     assert late.isdisjoint(told.stdout.split())
 
 
 # ---- the wide form ----
 
 
-def test_registers_of_one_request_share_a_row() -> None:
+def test_registers_of_one_request_share_a_row_of_the_wide_form() -> None:
     wide = example().wide()
     assert wide.columns == [
         *("time", "monotonic_ns", PUMP, SPEED),
@@ -445,8 +443,8 @@ def test_pandas_and_polars_read_the_wide_form() -> None:
     assert frame[SPEED].to_list() == [0.3]
 
 
-def test_chosen_columns_are_all_present_in_the_chosen_order() -> None:
-    """Then all batches have the same columns: a column is present even if the batch has no row for it."""
+def test_the_wide_form_has_all_chosen_columns_in_the_chosen_order() -> None:
+    """All batches then have the same columns, even if a batch has no row of a register."""
 
     never = "насос.output_frequency"
     wide = example().wide(never, SPEED, PUMP)
@@ -456,7 +454,7 @@ def test_chosen_columns_are_all_present_in_the_chosen_order() -> None:
     assert table.column(PUMP).to_pylist() == [49.99]
 
 
-def test_an_unknown_column_raises_value_error() -> None:
+def test_choosing_an_unknown_column_of_the_wide_form_raises_value_error() -> None:
     with pytest.raises(ValueError, match=r"no column 'pump-1\.motor_sped'; did you mean pump-1\.motor_"):
         example().wide("pump-1.motor_sped")
     with pytest.raises(ValueError, match=r"there is no column 'x'; a column is DRIVE\.REGISTER"):
@@ -473,7 +471,7 @@ def test_rows_of_the_wide_form_are_sorted_by_time() -> None:
     assert table.column("monotonic_ns").to_pylist() == [SECOND, 2 * SECOND, 3 * SECOND]
 
 
-def test_only_rows_with_equal_times_are_joined() -> None:
+def test_the_wide_form_joins_only_rows_with_equal_times() -> None:
     early = row(1.0, "pump", "a", 1.0)
     rows = [
         early,
@@ -485,7 +483,7 @@ def test_only_rows_with_equal_times_are_joined() -> None:
     assert table.column("pump.b").to_pylist() == table.column("fan.b").to_pylist() == [None, 1.0]
 
 
-def test_rows_with_equal_utc_but_different_monotonic_times_are_not_joined() -> None:
+def test_the_wide_form_joins_no_rows_with_different_monotonic_times() -> None:
     """If UTC repeats, the monotonic time still distinguishes the rows."""
 
     first = row(1.0, "pump", "a", 1.0)
@@ -493,7 +491,7 @@ def test_rows_with_equal_utc_but_different_monotonic_times_are_not_joined() -> N
     assert table.column("pump.a").to_pylist() == [1.0, 2.0]
 
 
-def test_a_miss_is_null_and_does_not_replace_a_sample() -> None:
+def test_a_miss_is_null_in_the_wide_form_and_replaces_no_value() -> None:
     columns = Columns(4)
     assert add_rows(columns, block(0, 0), completion(SECOND, first_ns=SECOND, words=(100,)), UTC_0)
     assert add_miss(columns, block(0, 0), Status.NOT_ASKED, SECOND, UTC_0)
@@ -509,7 +507,7 @@ def test_an_empty_batch_has_an_empty_wide_form() -> None:
     assert pa.table(Batch(Columns(4), Names(["p"]), Names(["r"])).wide("p.r")).num_rows == 0
 
 
-def test_equal_column_names_of_two_drives_raise_value_error() -> None:
+def test_equal_column_names_of_two_drives_in_the_wide_form_raise_value_error() -> None:
     rows = from_rows([row(1.0, "a.b", "c", 1.0), row(1.0, "a", "b.c", 2.0)])
     with pytest.raises(ValueError, match=r"'a\.b' and 'a' both have a column that is called 'a\.b\.c'"):
         rows.wide()

@@ -25,7 +25,7 @@ from multidrop.sim import EncodedDrive, Simulator, Wire, proof, simulated
 ROOT = Path(__file__).parents[2]
 CURRENT = Toy.registers["output_current"]
 EVERY_S = 0.02
-QUEUED = round(AHEAD_NS / 1e9 / EVERY_S) + 2  # limit of queued requests of one drive
+QUEUED = round(AHEAD_NS / 1e9 / EVERY_S) + 2  # highest number of queued requests of one drive
 
 
 def pump(address: int, name: str = "", every: float | None = None) -> PolledDrive:
@@ -73,14 +73,14 @@ def test_a_drive_is_added_and_removed_while_others_are_polled(port: str, every: 
             assert "pump-2" not in poller.summary()["lines"]["line"]["drives"]
             first = len(seen.of("pump-1"))
             until(lambda first=first: len(seen.of("pump-1")) > first + QUEUED)
-            settled_ns = time.monotonic_ns()  # rows of earlier requests may still arrive
+            settled_ns = time.monotonic_ns()  # by now, all earlier requests are over
             until(lambda first=first: len(seen.of("pump-1")) > first + 2 * QUEUED)
             assert seen.last_asked_ns["pump-2"] < settled_ns
     assert {*seen.of("pump-1")} == {proof(Toy(1), CURRENT)}
     assert {*seen.of("pump-2")} == {proof(Toy(2), CURRENT)}
 
 
-def test_polling_continues_after_all_drives_left_and_one_was_added(port: str) -> None:
+def test_a_drive_added_after_all_drives_were_removed_is_polled(port: str) -> None:
     first = pump(1)
     with Poller(plant(line(port, first))) as poller:
         seen = Seen(poller)
@@ -138,12 +138,12 @@ def test_calls_of_a_detached_drive_raise_and_send_nothing(port: str) -> None:
             with pytest.raises(ValueError, match="pump-1 is not attached to this bus"):
                 do()
         again = bus.attach(Toy, address=1, name="pump-1")
-        assert bus.peer(again) is peer  # the same peer, which knows the late replies that are due
-        assert peer.proofs is proofs  # kept, because the core may be reading a proof's register
+        assert bus.peer(again) is peer  # the peer that knows which late replies are due
+        assert peer.proofs is proofs  # the core may still be using them
 
 
 @pytest.mark.slow
-def test_a_drive_attached_at_a_used_address_expects_late_replies(port: str) -> None:
+def test_a_drive_attached_at_a_used_address_expects_late_replies_to_the_old_one(port: str) -> None:
     with Bus(port) as bus:
         gone = bus.attach(Toy, address=9)
         with pytest.raises(NoReply):

@@ -35,7 +35,7 @@ class Ill(Exception):
 
 
 class Two:
-    """A poller of the lines "ill" and "well". Each line has one drive, with the line's name."""
+    """A poller with the lines "ill" and "well". Each line has one drive, which has the name of its line."""
 
     def __init__(self, simulator: Simulator, every: float | None) -> None:
         drives = (Toy(1, name="ill"), Toy(1, name="well"))
@@ -60,7 +60,7 @@ class Two:
         until(is_seen)
 
     def fails(self, *details: object) -> None:
-        """Raise Ill, in place of a method of the line "ill"."""
+        """Raise Ill. Tests put this function in the place of a method."""
         raise Ill("of this line")
 
 
@@ -111,7 +111,7 @@ def test_a_failure_on_one_line_does_not_affect_other_lines(
     method: str,
     failure: BaseException,
 ) -> None:
-    for name in ("RETRY_NS", "LONGEST_RETRY_NS"):  # pauses that allow a batch of misses before each retry
+    for name in ("RETRY_NS", "LONGEST_RETRY_NS"):  # long enough for a batch of misses before each retry
         monkeypatch.setattr(polled_line, name, 200_000_000)
     two.until(("ill", "ok"), ("well", "ok"))
     with monkeypatch.context() as broken:
@@ -128,7 +128,7 @@ def test_a_failure_on_one_line_does_not_affect_other_lines(
     assert two.poller.failure is None
 
 
-def test_a_line_without_further_failures_is_no_longer_listed_as_failing(
+def test_a_line_that_works_again_is_removed_from_line_failures(
     two: Two, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as broken:
@@ -154,7 +154,7 @@ def test_a_failing_line_is_retried_at_growing_intervals(
 def test_requests_queued_when_a_line_failed_are_carried_out(
     two: Two, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If a line fails right after queueing, the poller does not know how many requests are queued."""
+    """If a line fails while it queues requests, the poller does not know how many requests are queued."""
     submit, repeat = Port.submit, Port.repeat
     left = 3
 
@@ -203,23 +203,23 @@ def failed(two: Two, monkeypatch: pytest.MonkeyPatch) -> Two:
     """A poller whose thread has ended with a failure, and that has rows queued."""
     two.until(("ill", "ok"), ("well", "ok"))
     taken = exchanges(two)
-    until(lambda: exchanges(two) >= taken + 2)  # waits until rows are queued for the end of polling
+    until(lambda: exchanges(two) >= taken + 2)  # now there are rows that were not taken
     monkeypatch.setattr(clock, "sleep", lambda seconds: None)
     monkeypatch.setattr(RowQueue, "await_calls", two.fails)
     two.poller._call_thread()
     until(lambda: two.poller.failure and not two.poller._thread.is_alive())
     flush(PATIENCE)
-    two.poller._is_failure_raised = True  # then the fixture's call of `close` does not raise
+    two.poller._is_failure_raised = True  # so that `close` does not raise in the fixture
     return two
 
 
-def test_every_call_of_a_failed_poller_raises_polling_failed(
+def test_take_batches_adopt_and_close_of_a_failed_poller_raise_polling_failed(
     failed: Two, caplog: pytest.LogCaptureFixture
 ) -> None:
     poller = failed.poller
     assert repr(poller).startswith("<Poller polling has ended on all lines: Ill: of this line;")
     rows: list[Row] = []
-    with pytest.raises(PollingFailed) as raised:  # raised once the queued rows have been taken
+    with pytest.raises(PollingFailed) as raised:  # after the rows that were not taken yet
         rows.extend(row for batch in poller.batches() for row in batch)
     assert rows
     assert isinstance(raised.value.__cause__, Ill)
@@ -245,7 +245,9 @@ def test_a_failed_poller_stops_polling_but_sends_commands(failed: Two) -> None:
     assert exchanges(failed) - before <= 2  # the read, and an exchange that may have been in flight
 
 
-def test_waiting_callers_wake_when_polling_fails(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_caller_that_waits_for_batches_wakes_when_polling_fails(
+    two: Two, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ended = threading.Event()
 
     def wait() -> None:
@@ -300,7 +302,7 @@ def test_an_unexpected_exception_from_pyserial_counts_as_a_lost_port(
 
 
 @pytest.mark.parametrize("method", ["_take", "_hand_over"])
-def test_a_failed_bridge_counts_as_a_lost_port(
+def test_a_failure_of_a_pyserial_bridge_counts_as_a_lost_port(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, method: str
 ) -> None:
     port = serial.serial_for_url("loop://", timeout=0)
@@ -364,7 +366,7 @@ def test_on_batch_rejects_async_and_generator_functions(two: Two, function: Any)
 
 
 @pytest.mark.parametrize("function", [wait, give, give_later])
-def test_a_wrapped_async_callback_fails_with_its_first_batch(
+def test_a_wrapped_async_on_batch_function_fails_with_its_first_batch(
     two: Two, function: Callable[[object], Any]
 ) -> None:
     two.poller.on_batch(lambda batch: function(batch))
@@ -375,7 +377,7 @@ def test_a_wrapped_async_callback_fails_with_its_first_batch(
         two.poller.close()
 
 
-def test_a_user_s_class_that_fails_during_polling_only_affects_its_line(
+def test_an_exception_of_a_users_drive_class_affects_only_its_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A class that a user wrote may work when the poller is made, and fail during polling."""
@@ -391,7 +393,8 @@ def test_a_user_s_class_that_fails_during_polling_only_affects_its_line(
 
     assert issubclass(Own, Drive)
     monkeypatch.setattr(polled_line, "LEARN_NS", 10_000_000)
-    monkeypatch.setattr(polled_line, "MARGIN", -1.0)  # plan again at each update of delays
+    # the poller plans again at each update of the measured delays
+    monkeypatch.setattr(polled_line, "MARGIN", -1.0)
     with Simulator([Wire([simulated(Toy(1))], unpaced=True) for _ in range(2)]) as simulator:
         ill, well = (wire.path for wire in simulator.wires)
         poller = Poller(
@@ -426,7 +429,7 @@ def counted(poller: Poller) -> int:
     return int(summary["samples"]) + int(summary["misses"])
 
 
-def test_on_batch_gets_every_row_once_and_all_before_close_returns(poller: Poller) -> None:
+def test_on_batch_gets_every_row_once_before_close_returns(poller: Poller) -> None:
     rows: list[Row] = []
     threads: set[str] = set()
 
@@ -447,7 +450,7 @@ def test_on_batch_gets_every_row_once_and_all_before_close_returns(poller: Polle
 
 
 @pytest.mark.slow
-def test_a_slow_callback_does_not_delay_polling(poller: Poller) -> None:
+def test_a_slow_on_batch_function_does_not_delay_polling(poller: Poller) -> None:
     go_on, entered = threading.Event(), threading.Event()
     rows: list[Row] = []
 
@@ -466,7 +469,7 @@ def test_a_slow_callback_does_not_delay_polling(poller: Poller) -> None:
 
 
 @pytest.mark.slow
-def test_an_exception_of_the_callback_is_logged_immediately_and_raised_by_close(
+def test_an_exception_of_the_on_batch_function_is_logged_and_raised_by_close(
     poller: Poller, caplog: pytest.LogCaptureFixture
 ) -> None:
     calls: list[int] = []
@@ -487,11 +490,11 @@ def test_an_exception_of_the_callback_is_logged_immediately_and_raised_by_close(
     (record,) = caplog.records
     assert record.getMessage() == "on_batch: the function failed and is no longer called"
     left = rows_of(poller)
-    assert calls[0] + len(left) == counted(poller)  # `left` has all later rows
+    assert calls[0] + len(left) == counted(poller)  # all rows after the failure
     poller.close()  # the failure is raised only once
 
 
-def test_an_exception_of_the_with_block_takes_precedence_over_the_callback_s(
+def test_an_exception_of_the_with_block_precedes_that_of_on_batch(
     poller: Poller, caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail(batch: Batch) -> None:
@@ -508,7 +511,7 @@ def test_an_exception_of_the_with_block_takes_precedence_over_the_callback_s(
     poller.close()
 
 
-def test_the_callback_may_close_the_poller(poller: Poller) -> None:
+def test_the_on_batch_function_may_close_the_poller(poller: Poller) -> None:
     rows: list[Row] = []
 
     def end(batch: Batch) -> None:
@@ -538,7 +541,7 @@ def test_batches_end_when_the_poller_is_closed(poller: Poller) -> None:
     assert len(rows) == counted(poller)
 
 
-def test_on_batch_rejects_invalid_callbacks(poller: Poller) -> None:
+def test_on_batch_rejects_invalid_functions(poller: Poller) -> None:
     with pytest.raises(TypeError, match="on_batch takes a function with one argument, the batch, not 3"):
         poller.on_batch(3)  # type: ignore[arg-type]
     with poller:

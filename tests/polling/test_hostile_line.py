@@ -72,7 +72,7 @@ def resident_kb() -> int:
     return pages * os.sysconf("SC_PAGESIZE") // 1024
 
 
-# The short run tests one line with each fault, and one or two faults on each line.
+# The short run tests an eighth of all pairs of a line and a fault.
 EACH_ON_EACH = [
     pytest.param(name, kind, marks=pytest.mark.long if (number + nth) % 8 else ())
     for number, name in enumerate(LINES)
@@ -95,11 +95,11 @@ def test_polling_recovers_from_each_fault_without_misattributed_values(name: str
 @pytest.mark.story
 @pytest.mark.long
 @table("name", LINES)
-def test_a_permanent_echo_is_detected_and_removed(name: str) -> None:
+def test_a_permanent_echo_is_detected_and_costs_no_value(name: str) -> None:
     story = Story(of_one_variant(LINES[name]))
     story.wire.faults = KINDS["echo"]
     with story.clocked:
-        begun = len(story.run(2))  # skips the first 2 s, in which each first value is read twice
+        begun = len(story.run(2))  # in the first 2 s, some values are read twice
         story.run(HEALTHY)
     story.rows += rows_of(story.clocked.poller)
     story.judge()
@@ -133,7 +133,7 @@ def test_an_echo_of_a_silent_delixi_drive_is_not_read_as_0_for_long() -> None:
         assert {(row.value, row.status) for row in rows} == {(0, "ok")}
         wire.faults = Faults(echo=1)
         wire.drives[0].deaf_until = inf
-        deaf_ns = clocked.now  # one reply may still be in flight
+        deaf_ns = clocked.now  # the drive's last reply may still be in flight
         rows = clocked.run(HEALTHY)
     assert len(rows) > 4
     assert sum(row.status == "ok" and row.monotonic_ns >= deaf_ns for row in rows) <= 2
@@ -143,8 +143,8 @@ def test_an_echo_of_a_silent_delixi_drive_is_not_read_as_0_for_long() -> None:
 @pytest.mark.story
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", usually(*KINDS))
-def test_polling_recovers_from_a_fault_while_the_core_repeats_the_cycle(kind: str) -> None:
-    """Without rates the core repeats the bus cycle by itself until a fault occurs."""
+def test_polling_without_rates_recovers_from_a_fault(kind: str) -> None:
+    """Without rates, the core repeats the bus cycle without the poller until a fault occurs."""
     story = Story(of_one_variant(LINES["innovert-ibd rtu"]), every=None)
     story.run_with_fault(KINDS[kind])
     assert story.wire.struck.total()
@@ -227,8 +227,8 @@ def check(rows: list[Row], drives: list[PolledDrive], summary: dict[str, Any]) -
     assert (len(samples), misses) == (summary["samples"], summary["misses"])
 
 
-def test_all_polled_registers_hold_different_values() -> None:
-    """The raw counts of any two drives differ, so that other tests can detect a misattributed value."""
+def test_the_polled_registers_of_any_two_drives_hold_different_values() -> None:
+    """The other tests need this to detect a value of another drive."""
     for drives in (real_drives(), fast_drives()):
         asked = [polled(drive, drive.readings()) for drive in drives]
         truth = proofs(*asked)
@@ -243,7 +243,7 @@ def test_all_polled_registers_hold_different_values() -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_all_variants_on_one_line_are_polled_at_real_baud_rates() -> None:
+def test_all_family_variants_on_one_line_are_polled_at_real_baud_rates() -> None:
     drives = []
     for drive in real_drives():
         at_a_rate, *others = drive.readings()

@@ -79,7 +79,7 @@ def ended(poller: Poller, hall: Received) -> None:
     poller.close()
     assert not any(bus.is_open for bus in poller.buses.values())
     falls_silent(lambda: hall.drive.requests)
-    with Bus(hall.path) as bus:  # the port is free
+    with Bus(hall.path) as bus:  # raises if the port is still open
         bus.attach(Toy, 1).read(CURRENT)
 
 
@@ -95,7 +95,9 @@ STEPS = [*usually(STRIDE, 7), pytest.param(1, marks=NIGHTLY)]
         pytest.param("__exit__", 1, marks=NIGHTLY),
     ],
 )
-def test_an_interrupted_close_of_a_poller_can_be_completed(hall: Received, step: int, end: str) -> None:
+def test_a_second_close_completes_an_interrupted_close_of_a_poller(
+    hall: Received, step: int, end: str
+) -> None:
     places: set[str] = set()
 
     def act(nth: int) -> bool:
@@ -121,7 +123,7 @@ def test_an_interrupted_close_of_a_poller_can_be_completed(hall: Received, step:
         pytest.param("__exit__", 1, ZeroDivisionError, marks=NIGHTLY),
     ],
 )
-def test_an_interrupted_end_with_stop_on_exit_stops_the_motors_and_a_second_close_ends_all_requests(
+def test_an_interrupted_close_with_stop_on_exit_stops_the_motors(
     end: str, step: int, failure: type[BaseException]
 ) -> None:
     details = () if end == "close" else (None, None, None)
@@ -187,7 +189,7 @@ def test_a_bus_can_be_closed_after_an_interrupted_open_or_close(hall: Received, 
     def act(nth: int) -> bool:
         if deed == "open":
             was = interrupted(lambda: Bus(hall.path), nth, set())
-            gc.collect()  # closes a bus that was made, but not returned
+            gc.collect()  # closes a bus whose constructor was interrupted
         else:
             bus = Bus(hall.path)
             bus.attach(Toy, 1).read(CURRENT)
@@ -271,7 +273,7 @@ def test_a_poller_left_open_at_exit_does_not_corrupt_memory(hall: Received, end:
 def test_an_interrupted_opening_of_several_ports_leaves_none_open(
     monkeypatch: pytest.MonkeyPatch, interrupted: int
 ) -> None:
-    """Ports opened before the interruption are closed, and so are ports opened while it propagates."""
+    """All ports are closed, even those that other threads open after the interruption."""
     wires = [Wire([simulated(Toy(1))], unpaced=True, port=ANY_PORT) for _ in range(3)]
     buses: list[Bus] = []
     open_bus, others_are_open = Bus.__init__, threading.Semaphore(0)

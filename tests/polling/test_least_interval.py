@@ -1,4 +1,4 @@
-"""A drive that needs a pause between its requests: other drives on the line do not wait."""
+"""Drives with a least interval between requests: it is kept, and other drives do not wait for it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SLACK = 1e-6
 
 
 class Slow(Picky):
-    """A drive that records the times of requests. It counts requests that come too soon after its reply."""
+    """A simulated drive that records when requests arrive, and counts those too soon after its last reply."""
 
     def __init__(self, drive: Drive) -> None:
         super().__init__(drive)
@@ -59,7 +59,9 @@ def quick(address: int) -> tuple[Drive, Picky]:
 @pytest.mark.long
 @table("every", [None, 0.01, 0.5])
 @table("others", [0, 2])
-def test_a_drive_s_registers_share_its_least_interval(every: float | None, others: int) -> None:
+def test_the_registers_of_a_drive_with_a_least_interval_are_polled_equally_often(
+    every: float | None, others: int
+) -> None:
     drive, sim = slow()
     rest = [quick(address) for address in range(2, 2 + others)]
     drives = [
@@ -95,7 +97,7 @@ def test_a_drive_with_a_least_interval_hardly_slows_the_other_drives() -> None:
 
 
 @pytest.mark.slow
-def test_a_stop_is_the_first_request_after_the_least_interval() -> None:
+def test_a_stop_is_the_first_request_to_its_drive_after_the_least_interval() -> None:
     (drive, sim), (other, its_sim) = slow(), quick(2)
     drives = [polled(drive, drive.readings()), polled(other, other.readings())]
     with ClockedLines(ClockedWire([sim, its_sim], Faults()), drives) as clocked:
@@ -112,12 +114,12 @@ def test_a_stop_is_the_first_request_after_the_least_interval() -> None:
             before = len(sim.times)
             while len(sim.times) == before:
                 clocked.run(0.001)
-            assert len(its_sim.asked) - asked <= 1  # at most the request in flight
+            assert len(its_sim.asked) - asked <= 1  # only the request in flight delays the stop
             assert sim.times[-1] <= called + INTERVAL + 0.06  # 0.06 s: one exchange with each drive
     assert sim.early == 0
 
 
-def test_manual_reads_keep_the_least_interval() -> None:
+def test_reads_with_bus_keep_the_least_interval() -> None:
     (drive, sim), (other, its_sim) = slow(), quick(2)
     with ClockedLines(ClockedWire([sim, its_sim], Faults()), [polled(other, other.readings())]) as clocked:
         bus = clocked.poller.bus("line")
@@ -160,7 +162,7 @@ def test_the_predicted_rate_includes_the_least_interval() -> None:
     assert not hasty.fits
 
 
-def test_jobs_of_a_drive_with_a_least_interval_take_turns() -> None:
+def test_the_schedule_alternates_the_blocks_of_a_drive_with_a_least_interval() -> None:
     """Takes ten thousand turns from a schedule, without a clock."""
     schedule: Schedule[Job] = Schedule()
     jobs = [Job(drive=1, period_ns=None, duration_ns=10, interval_ns=1000) for _ in range(5)]

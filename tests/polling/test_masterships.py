@@ -39,7 +39,7 @@ if sys.platform != "linux":
 
 S = 1_000_000_000
 CURRENT, STATUS = Toy.registers["output_current"], Toy.registers["status"]
-LONGEST = 256 * 10 / 9600  # s, duration of the longest frame
+LONGEST = 256 * 10 / 9600  # s, duration of the longest RTU frame at 9600 baud
 NOT_MASTER, OTHER_MASTER = "not sent: not master", "not sent: another master"
 paces = pytest.mark.parametrize("every", usually(0.02, None), ids=["on a grid", "as fast as it goes"])
 
@@ -102,7 +102,7 @@ class Rows:
         until(lambda: status in self.statuses(drive))
 
     def settle_unpolled(self, drive: str) -> None:
-        """Wait for several miss rows of this drive; by then, its earlier requests have ended."""
+        """Wait until this drive has had several misses. By then, its earlier requests have ended."""
         for _ in range(3):
             rows_of(self._poller)
             self.until(drive, NOT_MASTER)
@@ -140,7 +140,9 @@ def test_a_plant_is_polled_while_its_mastership_holds(mastership: Mastership, ev
 
 @pytest.mark.slow
 @paces
-def test_without_mastership_a_line_has_few_miss_rows(mastership: Mastership, every: float | None) -> None:
+def test_a_line_without_mastership_has_few_rows_of_misses(
+    mastership: Mastership, every: float | None
+) -> None:
     """The poller must not run a busy loop while it is not the master."""
     with lines(every) as (_, made), Poller(plant(*made), mastership=mastership) as poller:
         Rows(poller).until("pump", NOT_MASTER)
@@ -153,7 +155,7 @@ def test_without_mastership_a_line_has_few_miss_rows(mastership: Mastership, eve
         assert 0 < found <= most
 
 
-def test_without_a_mastership_the_summary_has_no_count_of_foreign_bytes() -> None:
+def test_the_summary_of_a_plant_without_mastership_counts_no_foreign_bytes() -> None:
     with lines(None) as (_, made), Poller(plant(*made)) as poller:
         Rows(poller).settle("pump")
         assert "foreign_bytes" not in poller.summary()["lines"]["hall"]
@@ -184,7 +186,9 @@ def wait_for_bytes(far: int) -> bytes:
 
 @pytest.mark.slow
 @paces
-def test_a_poller_listens_before_its_first_request(mastership: Mastership, every: float | None) -> None:
+def test_a_new_master_listens_to_the_line_before_its_first_poll(
+    mastership: Mastership, every: float | None
+) -> None:
     hold(mastership)
     begun = time.monotonic()
     with seen_line(mastership, every) as (far, _):
@@ -214,7 +218,7 @@ def test_nothing_is_sent_during_the_guard_time_of_the_previous_master(port: str)
 
 @pytest.mark.long
 @paces
-def test_another_master_is_reported_and_polling_starts_once_it_is_silent(
+def test_another_master_is_reported_and_polling_starts_when_it_falls_silent(
     mastership: Mastership, every: float | None
 ) -> None:
     hold(mastership)
@@ -283,7 +287,9 @@ def far() -> Iterator[Listener]:
 
 
 @pytest.mark.long
-def test_a_removed_line_is_closed_and_receives_no_byte(mastership: Mastership, far: Listener) -> None:
+def test_the_port_of_a_removed_line_is_closed_and_receives_no_byte(
+    mastership: Mastership, far: Listener
+) -> None:
     hold(mastership)
     yard = line(far.url, quick("fan", 1, None), name="yard")
     with lines(0.02) as (_, (hall, _)), Poller(plant(hall), mastership=mastership) as poller:
@@ -324,7 +330,7 @@ def taken_of(poller: Poller, rows: list[Row]) -> list[Row]:
 
 
 @pytest.mark.long
-def test_other_lines_have_rows_while_lines_are_added_and_removed(
+def test_adding_and_removing_a_line_does_not_interrupt_polling_of_other_lines(
     mastership: Mastership, far: Listener
 ) -> None:
     hold(mastership)
@@ -339,7 +345,7 @@ def test_other_lines_have_rows_while_lines_are_added_and_removed(
             until(lambda n=n: len(taken_of(poller, rows)) >= 10 * n)
         assert {row.status for row in rows} <= {"ok", *HOST_LATE}
         due = [row.monotonic_ns for row in rows]
-        assert max(later - at for at, later in pairwise(due)) < S  # generous: the period is 0.02 s
+        assert max(later - at for at, later in pairwise(due)) < S  # far more than the period, 0.02 s
 
 
 @pytest.mark.slow
@@ -447,7 +453,7 @@ class Busy:
 
 
 @table(("left_ns", "waited_ns"), [(0, S), (S // 5, S // 5), (-S, 0), (5 * S, S)])
-def test_closing_waits_for_a_request_no_longer_than_the_mastership(
+def test_closing_waits_for_a_request_in_flight_until_the_mastership_ends(
     monkeypatch: pytest.MonkeyPatch, left_ns: int, waited_ns: int
 ) -> None:
     """The mastership ends `left_ns` after the start, and soon afterwards the kernel kills the process. With

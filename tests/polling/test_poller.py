@@ -142,7 +142,7 @@ def port(pump: SimulatedDrive) -> Iterator[str]:
 
 
 @pytest.mark.slow
-def test_requests_at_a_rate_stay_on_their_grid_without_bursts(port: str) -> None:
+def test_requests_with_a_period_are_sent_in_their_time_slots_without_bursts(port: str) -> None:
     periods = {"output_current": 0.02, "output_frequency": 0.05}
     polls = [polled(drive(), [Quick.registers[name]], every).polls for name, every in periods.items()]
     before_ns = clock.now_ns()
@@ -162,7 +162,7 @@ def test_requests_at_a_rate_stay_on_their_grid_without_bursts(port: str) -> None
     assert len(polling.rows) + left_out >= slots
 
 
-def test_without_a_rate_all_registers_are_polled_continuously(port: str) -> None:
+def test_registers_without_a_rate_are_polled_continuously(port: str) -> None:
     with Polling(line(port, polled(drive(), READINGS))) as polling:
         polling.until("ok", 100 * len(READINGS))
     assert len({row.register for row in polling.rows}) == len(READINGS)
@@ -181,7 +181,9 @@ def test_registers_with_and_without_a_rate_are_both_polled(port: str) -> None:
     [[{"baudrate": 9600}, {"baudrate": 19_200}], [{"silence": None}, {"silence": 0.01}]],
     ids=["two baud rates", "two silences"],
 )
-def test_drives_with_equal_settings_are_polled_next_to_each_other(kinds: list[dict[str, Any]]) -> None:
+def test_drives_with_equal_baud_rate_and_format_are_polled_one_after_another(
+    kinds: list[dict[str, Any]],
+) -> None:
     drives = [Toy(at, name=f"drive-{at}", **kinds[at % 2]) for at in range(1, 7)]
     wire = ClockedWire([simulated(drive) for drive in drives], Faults())
     with ClockedLines(wire, [polled(drive, [Toy.fault]) for drive in drives]) as clocked:
@@ -224,7 +226,9 @@ def test_an_asyncio_program_can_wait_for_rows_with_fileno(port: str) -> None:
     assert {row.value for row in rows if row.register == "output_current"} - {None} == {3.25}
 
 
-def test_untaken_rows_are_bounded_and_counted(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_queue_of_rows_is_bounded_and_dropped_rows_are_counted(
+    port: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(poller_module, "RowQueue", lambda: RowQueue(chunk_rows=200, most_chunks=2))
     with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
         until(lambda: poller.dropped > 0)
@@ -241,7 +245,7 @@ def test_untaken_rows_are_bounded_and_counted(port: str, monkeypatch: pytest.Mon
 def sixteen_lines(
     registers: Sequence[Register[Any]], every: float | None = None
 ) -> Iterator[tuple[list[PolledDrive], list[PlantLine]]]:
-    """Yield sixteen polled drives, and the declarations of their lines, one for each drive."""
+    """Yield sixteen polled drives and the declarations of sixteen lines, with one drive each."""
     with Simulator([Wire([EncodedDrive(Quick(at))], unpaced=True) for at in range(1, 17)]) as sim:
         drives = [polled(Quick(at, name=f"drive-{at}"), registers, every) for at in range(1, 17)]
         pairs = zip(sim.wires, drives, strict=True)
@@ -263,8 +267,8 @@ def test_sixteen_lines_are_polled_concurrently() -> None:
 
 
 @pytest.mark.long
-def test_calls_of_one_line_do_not_cause_checks_of_other_lines(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lines with a rate are checked once per interval, however often the core calls for other lines."""
+def test_events_of_one_line_do_not_cause_checks_of_other_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A line with a rate is checked once per interval, however often other lines have events."""
     looks: list[int] = []
     is_steady = PolledLine.is_steady
 
@@ -323,20 +327,21 @@ FAULTS = {  # for each fault: the bytes sent instead of the reply, and the statu
     "lost": (lambda reply: b"", {"no reply"}),
     "an exception": (lambda reply: checksums.rtu("01 83 02"), {"exception 02"}),
 }
-PIECES = {  # further statuses that are possible if this computer delivers the remaining bytes too late
+PIECES = {  # further possible statuses, if this computer is too slow to deliver a reply as one piece
     "noise before": {"bad checksum", "reply from another address", "reply to another function"},
     "of another drive, then its own": {"reply from another address"},
 }
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_each_fault_of_a_reply_gives_rows_with_its_status(fault: str, pump: SimulatedDrive) -> None:
+def test_each_fault_of_a_reply_gives_rows_with_the_status_of_that_fault(
+    fault: str, pump: SimulatedDrive
+) -> None:
     fate, said = FAULTS[fault]
     # A socket, because a pty's buffer is too small for the noise.
     wire = Faulty([pump], fate, unpaced=True, port="socket://127.0.0.1:0")
     with Simulator([wire]) as sim, Polling(line(sim.wires[0].path, polled(drive(), ONE))) as polling:
-        # Count all rows since the start, because after three refusals a block is requested only once a
-        # minute.
+        # all rows since the start count: after three refusals, a block is requested only once a minute
         until(lambda: all(polling.statuses()[status] >= 2 for status in said))
     assert {row.value for row in polling.rows if row.status == "ok"} == ({3.25} if "ok" in said else set())
     polling.check(*said, *PIECES.get(fault, ()))
@@ -355,15 +360,13 @@ def test_a_drive_that_answers_every_second_request_has_values_and_misses(pump: S
 
 @pytest.mark.slow
 def test_a_silence_too_short_for_the_drive_causes_misses() -> None:
-    """The drive needs a longer silence. It takes a request that comes too soon for a part of the previous
-    frame.
-    """
+    """The drive needs a longer silence, and appends a request that comes too soon to the previous frame."""
     strict = simulated(Brisk(1, name="pump-1"))
     strict.needs_silence = True
     hasty = polled(Brisk(1, name="pump-1", silence=400e-6), ONE)
     with Simulator([Wire([strict])]) as sim, Polling(line(sim.wires[0].path, hasty)) as polling:
         polling.until("ok")
-        until(lambda: strict.counters.early > 0)  # this may take a while on a busy computer
+        until(lambda: strict.counters.early > 0)  # may take a while on a busy computer
         polling.until("not asked: late reply due", 2)
         polling.until("ok")
     polling.check("ok")
@@ -377,7 +380,7 @@ def test_replies_at_9600_baud_are_read_without_early_requests(pump: SimulatedDri
         polling.until("ok", 10 * len(Slow.readings()))
     misses = polling.statuses().total() - polling.statuses()["ok"]
     assert slow.counters.damaged == 0
-    assert slow.counters.early <= misses  # early requests follow only replies that came after their timeout
+    assert slow.counters.early <= misses  # only a late reply can make the next request early
     polling.check("ok")
 
 
@@ -388,13 +391,13 @@ def test_a_port_lost_during_a_reply_gives_misses_with_that_status() -> None:
         os.write(master, b"\x01\x03\x0a\0")
         os.close(master)
         polling.until("port lost", 2 * len(READINGS))
-    os.close(slave)  # closed only now: another test's line could get the same pty, and would be polled
+    os.close(slave)  # only now, so that no other test gets this pty while it is polled
     assert polling.statuses().keys() == {"port lost"}
     polling.check()
 
 
 @pytest.mark.long
-def test_a_port_that_returns_under_its_link_is_reopened(tmp_path: Path) -> None:
+def test_a_lost_port_is_reopened_when_its_device_link_returns(tmp_path: Path) -> None:
     link = tmp_path / "by-id"
     asked = [polled(drive(), ONE), polled(drive(2, "pump-2"), ONE, 0.05)]
     targets: set[Path] = set()
@@ -416,9 +419,7 @@ def test_a_port_that_returns_under_its_link_is_reopened(tmp_path: Path) -> None:
 
 
 def queued_before_a_stop(hall: PolledLine) -> int:
-    """Reopen the port, like a stop that comes before the poller. Return the number of slots that were still
-    queued.
-    """
+    """Reopen the port before the poller does, as a stop does. Return the number of slots still queued."""
     with hall._lock:  # keeps the poller's thread from refilling the queue
         core, noted, queued = hall.bus.line.queue, hall._queue._done, len(hall._queue.slots())
         assert core
@@ -438,7 +439,7 @@ def test_polling_continues_after_a_stop_reopened_the_port(port: str) -> None:
         while not queued:  # on a busy computer, all queued requests may be over already
             polling.until("ok", 3)
             queued = queued_before_a_stop(hall)
-        polling.until("ok", 100)  # more values than there were queued requests
+        polling.until("ok", 100)  # more values than queued requests
     assert polling.statuses().keys() <= {"ok"} | HOST_LATE
     assert hall._ended_ns
     slots = (hall._ended_ns - hall.started_ns) / 1e9 // every
@@ -491,7 +492,7 @@ def test_a_slow_reopening_or_closing_does_not_delay_other_lines(
         assert is_held_up.wait(PATIENCE)
         late = threading.Thread(target=polling.poller.add, args=("hall-2", polled(drive(2, "fan-2"), ONE)))
         late.start()
-        polling.until("ok", 50, "pump-1")  # more values than there were queued requests
+        polling.until("ok", 50, "pump-1")  # more values than queued requests
         may_go_on.set()
         late.join(PATIENCE)
         polling.until("port lost", 1, "fan-2")
@@ -587,10 +588,10 @@ def test_closing_waits_for_exchanges_in_flight(
     polling.check()
 
 
-def test_a_request_unanswered_at_the_end_has_a_row(
+def test_a_request_without_reply_when_polling_ends_has_a_row(
     responder: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The request in flight has a row. A queued slot has one only if it is over when polling ends."""
+    """A slot that is still queued has a row only if its time is over when polling ends."""
     monkeypatch.setattr(line_set, "ENDING_NS", 10_000_000)
     master, path = responder
     short = polled(Patient(2, name="pump-2"), [Patient.fault], 0.0002)
@@ -605,8 +606,10 @@ def test_a_request_unanswered_at_the_end_has_a_row(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("leaves", ["the poll", "the drive"])
-def test_a_slot_that_is_not_over_at_the_end_has_no_row(responder: tuple[int, str], leaves: str) -> None:
-    """A slot that is not over when polling ends does not count as a miss."""
+def test_a_slot_whose_period_has_not_ended_when_polling_ends_has_no_row(
+    responder: tuple[int, str], leaves: str
+) -> None:
+    """Such a slot does not count as a miss either."""
     master, path = responder
     first = polled(Patient(1, name="pump-1"), [Patient.fault], 60.0)
     second = polled(Patient(2, name="pump-2"), [Patient.fault], 60.0)
@@ -645,7 +648,7 @@ def test_an_unopenable_port_raises_and_leaves_no_descriptor_or_thread(port: str)
     assert (descriptors(), threads()) == before
 
 
-def test_rows_can_be_read_after_the_poller_is_closed(port: str) -> None:
+def test_rows_can_be_taken_after_the_poller_is_closed(port: str) -> None:
     with Poller(plant(line(port, polled(drive(), ONE)))) as poller:
         until(lambda: poller.summary()["samples"])
     poller.close()  # a second call is allowed

@@ -43,7 +43,7 @@ def values(rows: list[Row]) -> dict[str, float]:
 # ---- halves ----
 
 
-def test_a_split_block_keeps_registers_of_one_address_or_group_together() -> None:
+def test_splitting_a_block_separates_no_registers_that_must_be_read_together() -> None:
     class Kind(Drive):
         read_together = (("high", "low"),)
         a = reading(0)
@@ -82,7 +82,7 @@ def test_one_refused_register_hardly_delays_its_neighbours(every: float | None) 
     assert values(rows) == expected_values(set(range(WIDE)) - {7})
     assert told == ["pump-1.r7"]
     asked = {span for span in sim.asked if span != (7, 1)}
-    assert len(asked) <= 5  # 5 halvings of 24 registers isolate r7, and leave 5 blocks
+    assert len(asked) <= 5  # r7 is isolated by 5 halvings of 24 registers, which leave 5 blocks
     assert all(row.value is not None for row in rows if row.register != "r7")
 
 
@@ -101,7 +101,9 @@ def test_a_device_with_a_smaller_limit_is_read_in_smaller_blocks() -> None:
 
 
 @pytest.mark.slow
-def test_a_temporarily_refused_block_is_later_read_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_block_that_was_split_is_read_as_a_whole_when_it_is_accepted_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 2_000_000_000)
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
@@ -120,7 +122,7 @@ def test_a_temporarily_refused_block_is_later_read_as_a_whole(monkeypatch: pytes
 
 
 @pytest.mark.slow
-def test_retries_of_a_split_block_add_no_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_attempts_to_read_a_split_block_as_a_whole_add_no_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 1_000_000_000)
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, most=12)
@@ -154,13 +156,13 @@ def test_a_device_that_ignores_long_requests_is_read_with_shorter_ones(
 
 @pytest.mark.long
 def test_probes_of_a_device_that_ignores_long_requests_keep_the_rate() -> None:
-    """The probe reads a single register, with the same period as the block."""
+    """A probe is a read of a single register, with the same period as the block."""
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, silent_beyond=1)
     with clocked_line_of(drive, sim, every=5.0) as clocked:
         rows = clocked.run(600)
     assert len(values(rows)) == WIDE
-    assert max(Counter(sim.asked).values()) <= 2 * 600 / 5  # r0 is read by the probe, later in a block
+    assert max(Counter(sim.asked).values()) <= 2 * 600 / 5  # r0 is read by the probe, and later in a block
 
 
 @pytest.mark.long
@@ -194,7 +196,7 @@ def test_blocks_of_a_drive_that_falls_silent_are_not_split() -> None:
 
 
 @pytest.mark.long
-def test_a_block_that_was_answered_once_is_not_split_by_silence() -> None:
+def test_a_block_that_was_answered_before_is_not_split_if_the_drive_falls_silent() -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
     with ClockedLines(ClockedWire([sim], Faults()), [polled(drive, drive.registers.values())]) as clocked:
@@ -212,8 +214,8 @@ def test_a_block_that_was_answered_once_is_not_split_by_silence() -> None:
 @example({2, 4}, 5, 1)
 @given(st.sets(st.integers(1, 5), max_size=3), st.integers(1, 6), st.integers(1, 6))
 def test_every_register_that_can_be_read_alone_is_polled(refused: set[int], most: int, silent: int) -> None:
-    """No example refuses register 0. Its reply proves that no late reply is due, and without that proof, each
-    missing reply would delay the next request by two minutes.
+    """Register 0 is never refused, because its reply proves that no late reply is due. Without that proof,
+    each missing reply would delay the next request by two minutes.
     """
     drive = family(6)(1, name="pump-1")
     sim = Picky(drive, refused, most, silent)
@@ -244,7 +246,7 @@ class Stubborn(SimulatedDrive):
 
 @pytest.mark.slow
 @patient
-def test_a_refused_register_is_set_aside_and_its_neighbours_are_read() -> None:
+def test_a_refused_register_is_skipped_and_its_neighbours_are_polled() -> None:
     with Simulator([Wire([Stubborn(Toy(1))], unpaced=True)]) as simulator:
         drive = Toy(1, name="pump-1")
         polls = tuple(Polled(drive.register(name), None) for name in POLLED)
@@ -265,7 +267,7 @@ def test_a_refused_register_is_set_aside_and_its_neighbours_are_read() -> None:
     assert set(seen) == set(POLLED) - {REFUSED.name}
     assert told["set_aside"] == ["pump-1.mystery"]
     queued_ahead = 256 * len(POLLED)
-    assert refused <= 2 * queued_ahead  # only requests that were already queued
+    assert refused <= 2 * queued_ahead  # not more than the requests that were already queued
 
 
 class Moody(SimulatedDrive):
@@ -335,16 +337,16 @@ def rows_by_register(sim: SimulatedDrive) -> tuple[dict[str, Row], Poller, list[
                 return len({row.register for row in rows if row.status in ANSWERED}) == len(Meter.registers)
 
             until(all_there)
-        rows += rows_of(poller)  # the last rows
+        rows += rows_of(poller)  # rows queued before the poller was closed
         return {row.register: row for row in rows if row.status in ANSWERED}, poller, rows
 
 
-def test_all_registers_of_the_meter_are_read_by_one_request() -> None:
+def test_registers_of_all_number_formats_are_read_by_one_request() -> None:
     (block,) = blocks(Meter(1), Meter.readings())
     assert (block.start, block.count, len(block.registers)) == (0, 11, 8)
 
 
-def test_parts_of_a_word_share_one_request() -> None:
+def test_registers_that_are_bit_fields_of_one_word_share_one_request() -> None:
     class Single(Drive):
         """A device with a limit of one register per request."""
 
@@ -363,7 +365,7 @@ def test_a_scale_register_is_read_with_its_register() -> None:
     assert (block.start, block.count, block.offset(Meter.power)) == (8, 2, 0)
 
 
-def test_polled_values_of_all_number_formats_are_right() -> None:
+def test_polled_values_of_all_number_formats_are_correct() -> None:
     sim = SimulatedDrive(Meter(1))
     sim["voltage"], sim["energy"], sim["probe"], sim["tariff"] = 230.5, 2**53, 21.5, 3
     sim["runs"], sim["power_scale"] = 1, -2
@@ -382,7 +384,7 @@ def test_polled_values_of_all_number_formats_are_right() -> None:
     assert {row.status for row in last.values()} == {"ok"}
 
 
-def test_an_invalid_value_is_a_miss_with_its_reason() -> None:
+def test_a_no_value_code_is_a_miss_with_its_reason() -> None:
     sim = SimulatedDrive(Meter(1))
     sim["voltage"], sim["energy"], sim["probe"], sim["tariff"] = math.nan, None, None, None
     sim["power_scale"] = -32768
@@ -451,7 +453,7 @@ def registers_with_values(rows: list[Row]) -> set[str]:
     "name, refusal, lost",
     [("yaskawa-a1000", more_than_four, set()), ("delta-cp2000", at_210b, {"output_torque"})],
 )
-def test_a_refused_read_costs_no_other_value(
+def test_a_refused_request_costs_only_the_values_of_refused_registers(
     name: str, refusal: Callable[[Message], int], lost: set[str]
 ) -> None:
     drive = shipped(name, 1)

@@ -65,7 +65,7 @@ def hall(tmp_path: Path, _turns_awaited: None) -> Iterator[Plant]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("failure", usually(RuntimeError("can't start new thread"), MemoryError()))
-def test_a_stop_reopens_the_port_if_no_thread_can_and_polling_continues(
+def test_a_stop_reopens_a_lost_port_if_no_thread_can_be_started(
     hall: Plant, monkeypatch: pytest.MonkeyPatch, failure: Exception
 ) -> None:
     tried = 0
@@ -88,10 +88,10 @@ def test_a_stop_reopens_the_port_if_no_thread_can_and_polling_continues(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("threads", [0, 1])
-def test_all_lines_are_opened_even_with_few_threads(
+def test_adopt_opens_all_lines_even_if_few_threads_can_be_started(
     hall: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int
 ) -> None:
-    """If a reload failed here, running motors would get no stop."""
+    """If `adopt` failed here, running motors would get no stop."""
     left = threads
 
     def start(thread: threading.Thread) -> None:
@@ -195,13 +195,13 @@ class Scattered(Drive):
 
 @table("every", [None, 0.1])
 @table("most", [1, 2, 3])
-def test_every_register_is_read_although_connections_end_early(
+def test_every_register_is_read_although_the_server_closes_connections_early(
     every: float | None, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An interrupted request is the first one on the next connection, unless it was also the first on the old
     one.
     """
-    monkeypatch.setattr(poller_module, "LOOK_NS", 5_000_000)  # notice each lost port soon
+    monkeypatch.setattr(poller_module, "LOOK_NS", 5_000_000)  # so that each lost port is noticed soon
     seen = Counter[tuple[str, float | None]]()
     with server(lambda nth, address: nth == most) as port:
         drive = polled(Scattered(1, name="pump"), list(Scattered.registers.values()), every)
@@ -216,7 +216,7 @@ def test_every_register_is_read_although_connections_end_early(
 
 
 @pytest.mark.usefixtures("_patient")
-def test_a_connection_that_its_peer_closes_between_slow_polls_costs_no_value() -> None:
+def test_a_server_that_closes_idle_connections_costs_no_value() -> None:
     """Reported as home-assistant/core#101982 and zivillian/esp32-modbus-gateway#2.
 
     On a busy machine the server may close late, after the next request. Only that request may fail.
@@ -237,7 +237,7 @@ def test_a_connection_that_its_peer_closes_between_slow_polls_costs_no_value() -
 
 
 def test_values_of_a_server_that_closes_each_connection_at_once_are_misses() -> None:
-    """Many devices do this while they already have as many connections as they can serve."""
+    """Many devices close a new connection at once if they already serve as many clients as they can."""
     with server(lambda nth, address: False, idle_s=0.0) as port:
         drive = polled(Scattered(1, name="pump"), [Scattered.registers["near"]], 0.1)
         with Poller(plant(line(port, drive))) as poller:

@@ -53,7 +53,7 @@ def only_line(made: ClockedLines) -> PolledLine:
 
 def test_set_rate_of_one_register_changes_no_other_rate(two: ClockedLines) -> None:
     two.poller.set_rate("pump-1", "output_current", 1.0)
-    two.run(1)  # until the requests already queued have been sent
+    two.run(1)  # until all queued requests have been sent
     counts = values(two.run(10))
     assert counts.pop(("pump-1", "output_current")) in (10, 11)
     assert len(counts) == 7
@@ -91,7 +91,7 @@ def test_the_first_value_at_a_new_rate_is_read_immediately(two: ClockedLines) ->
 
 
 def test_registers_with_an_unchanged_rate_keep_their_slots() -> None:
-    """The registers keep their slots although their new block lacks the register whose rate changed."""
+    """The registers keep their slots, although the register with the new rate is no longer in their block."""
     with clocked(polled(toy(), ALL, 0.1)) as made:
         begun = made.run(3)[0].monotonic_ns
         made.poller.set_rate("pump-1", "output_frequency", 0.25)
@@ -104,7 +104,7 @@ def test_registers_with_an_unchanged_rate_keep_their_slots() -> None:
 
 
 @pytest.mark.long
-def test_no_value_is_misattributed_while_rates_change() -> None:
+def test_changes_of_rates_attribute_no_value_to_another_register() -> None:
     """Every value is of the right register, and each register has rows after each change."""
     chance = random.Random(7)
     drives = [polled(toy(address), ALL, 0.05) for address in (1, 2)]
@@ -121,7 +121,7 @@ def test_no_value_is_misattributed_while_rates_change() -> None:
         made.run(1)
         last = made.run(1)
     for row in rows:
-        assert row.status in ("ok", "not sent: expired")  # expired if the rates exceed the line's capacity
+        assert row.status in ("ok", "not sent: expired")  # the rates may exceed the line's capacity
         if row.value is not None:
             pump = next(each.drive for each in drives if each.drive.name == row.drive)
             assert row.value == proof(pump, pump.register(row.register))
@@ -173,7 +173,7 @@ class Stubborn(EncodedDrive):
         return super().read(function, start, count)
 
 
-def test_a_refused_register_remains_set_aside_at_a_new_rate() -> None:
+def test_a_register_that_the_drive_refuses_is_still_skipped_at_a_new_rate() -> None:
     pump = toy()
     with ClockedLines(ClockedWire([Stubborn(pump)], Faults()), [polled(pump, ALL, 0.1)]) as made:
         made.run(3)
@@ -181,7 +181,7 @@ def test_a_refused_register_remains_set_aside_at_a_new_rate() -> None:
         made.poller.set_rate(pump, None, 0.2)
         rows = made.run(3)
         missed = {row.register for row in rows if row.value is None}
-        assert missed <= {"fault", "status"}  # the block's refusal is remembered at all rates
+        assert missed <= {"fault", "status"}  # the refusal is still known at the new rate
         assert only_line(made).summary()["set_aside"] == ["pump-1.fault"]
         counts = Counter(row.register for row in made.run(10) if row.value is not None)
     assert {counts[register.name] for register in (CURRENT, FREQUENCY, STATUS)} <= {49, 50, 51}

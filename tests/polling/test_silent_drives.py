@@ -20,12 +20,12 @@ from multidrop.polling.polled_line import PolledLine
 from multidrop.sim import Faults, SimulatedDrive, simulated
 
 DRIVES = 31
-FIRST, LATER = 8, 30  # consecutive durations in s, in each of which values are counted
-BACK = 45  # limit in s until drives that were dead from the start are polled again, once they have power
+FIRST, LATER = 8, 30  # s; values are counted in the first 8 s and in the 30 s after them
+BACK = 45  # s; time limit until dead drives are polled again after they get power
 
 
-def test_the_row_of_a_skipped_slot_does_not_appear_before_the_slot() -> None:
-    """Skipped slots are planned in advance, but their rows must not appear before the slots."""
+def test_the_row_of_a_slot_skipped_in_advance_appears_only_at_the_slots_time() -> None:
+    """The poller decides in advance which slots of a silent drive it skips."""
     toy = Toy(1, name="pump-1")
     silent = simulated(toy)
     silent.deaf_until = float("inf")
@@ -62,7 +62,8 @@ def test_a_line_is_checked_more_often_while_a_drive_is_silent(
         looked.clear()
         rows = clocked.run(2)
         assert len([row for row in rows if row.value is not None]) == (20 if is_silent else 40)
-        assert abs(len(looked) - looks) <= 3  # further checks: a drive falls silent or answers again
+        # a few further checks when a drive falls silent or answers again
+        assert abs(len(looked) - looks) <= 3
 
 
 @pytest.mark.long
@@ -80,11 +81,11 @@ def test_silent_drives_hardly_slow_the_others_and_return_soon(dead: int, back_s:
         return sum(1 for row in clocked.run(seconds) if row.value is not None)
 
     with clocked:
-        clocked.run(5)  # the response delays are measured in this time
+        clocked.run(5)  # the poller measures the response delays
         healthy = answered(10)
         for sim in sims[:dead]:
             sim.deaf_until = float("inf")
-        clocked.run(10)  # in this time the poller notices that they are silent
+        clocked.run(10)  # the poller notices that these drives are silent
         assert answered(50) >= 0.97 * 5 * healthy
         for sim in sims[:dead]:
             sim.deaf_until = 0.0
@@ -160,7 +161,7 @@ def asked_together(rows: list[Row]) -> set[bool]:
 @pytest.mark.slow
 @table(("document", "truth"), [(SOON, LATE), (LATE, SOON)], ids=["later", "sooner"])
 @table("every", [None, 0.75], ids=["in turn", "at a rate"])
-def test_blocks_are_planned_again_for_the_measured_response_delay(
+def test_blocks_are_planned_again_if_the_response_delay_differs_from_the_manual(
     document: float, truth: float, every: float | None
 ) -> None:
     drive = Wide(1, name="pump-1")
@@ -210,7 +211,9 @@ def test_memory_is_bounded_if_a_response_delay_keeps_changing() -> None:
 
 
 @pytest.mark.slow
-def test_a_drives_blocks_change_only_if_other_blocks_are_faster(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_blocks_of_a_drive_change_only_if_other_blocks_are_faster(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Measured delays always vary a little. That alone must not change the blocks."""
     drive = Wide(1, name="pump-1")
     sim = SimulatedDrive(Wide(1), response_delay=SOON)

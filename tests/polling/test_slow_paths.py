@@ -98,11 +98,11 @@ def check_stop(opened: Bus, line: PathLine, sim: SimulatedDrive, seconds: float)
 
     received.loses = note
     with opened:
-        line.wire.advance(line.now / S)  # sets the wire's clock
+        line.wire.advance(line.now / S)  # the clock of the wire follows that of the line
         sim.motor.run(1)
         opened.drives[0].stop()
     assert not sim.motor.energised
-    assert sent_after[0] < 1  # s; the identity check's reads come first, and one of them may get no reply
+    assert sent_after[0] < 1  # s; time for the identity check, of which one read may get no reply
     assert (line.now - begun) / S < 8 * seconds + 3
     return len(sent_after)
 
@@ -133,7 +133,7 @@ class OneByOne(Drive):
 
 
 @pytest.mark.parametrize("delay", usually(constant(4.0), constant(0.6), stalling(0.9), stalling(15.0)))
-def test_late_replies_that_look_alike_are_never_misattributed(delay: Delay) -> None:
+def test_late_replies_that_look_alike_are_never_taken_for_each_other(delay: Delay) -> None:
     """A reply to a read of another table, even an exception, proves that no earlier reply is still due."""
     drives = [OneByOne(address, name=f"meter-{address}") for address in (1, 2)]
     story = Path(drives)
@@ -153,7 +153,7 @@ def path_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Bus, PathLin
 def test_reads_over_a_slow_path_return_the_right_values(
     name: str, slow: tuple[Callable[[float], Delay], float], path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
-    """A client reads four registers of two drives alternately, and retries failed reads."""
+    """A client reads four registers of each of two drives in turn, and retries failed reads."""
     path, seconds = slow
     drives = of_one_variant(LINES[name])
     opened, line = path_of([EncodedDrive(drive) for drive in drives], path(seconds))
@@ -203,7 +203,7 @@ WRITTEN = {
 
 @pytest.mark.parametrize("seconds", usually(0.6, 0.0, 0.3, 4.0))
 @pytest.mark.parametrize("name", WRITTEN)
-def test_outcomes_of_writes_over_a_slow_path_are_right(
+def test_the_reported_outcomes_of_writes_over_a_slow_path_are_true(
     name: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
     sim = simulated(WRITTEN[name])
@@ -211,7 +211,7 @@ def test_outcomes_of_writes_over_a_slow_path_are_right(
 
 
 @pytest.mark.parametrize("name", WRITTEN)
-def test_a_write_may_be_answered_more_slowly_than_reads(
+def test_a_drive_may_answer_a_write_more_slowly_than_reads(
     name: str, path_of: Callable[..., tuple[Bus, PathLine]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Only the reply to the write is slow. The bus waits for it, and does not read the value back."""
@@ -235,7 +235,9 @@ def test_a_write_may_be_answered_more_slowly_than_reads(
         assert (opened.peer(drive).counters().late, opened.peer(drive).silences) == (0, 0)
 
 
-def test_timeouts_of_a_delixi_are_at_least_80_ms(path_of: Callable[..., tuple[Bus, PathLine]]) -> None:
+def test_the_timeout_of_a_delixi_drive_is_never_shorter_than_80_ms(
+    path_of: Callable[..., tuple[Bus, PathLine]],
+) -> None:
     for drive in (DelixiModbus(1), DelixiNative(1)):
         opened, _ = path_of([simulated(drive)], constant(0.0))
         with opened:
@@ -275,7 +277,7 @@ TCP_PATHS = [
     for seconds in delays
 ]
 ON_TCP_PATHS = every_fourth(FAMILIES, TCP_PATHS, [("innovert-ibd", (constant, 0.6))])
-KINDS = ("delay", "twice", "merge")  # faults of a gateway that leave the stream's frames intact
+KINDS = ("delay", "twice", "merge")  # faults after which each frame of the stream is still complete
 
 
 class TrueIds(PathWire):
@@ -377,7 +379,7 @@ def test_reads_over_a_slow_gateway_return_the_right_values(
 
 @pytest.mark.slow
 @table("seconds", [0.0, 0.6, 4.0])
-def test_outcomes_of_writes_over_a_slow_gateway_are_right(
+def test_the_reported_outcomes_of_writes_over_a_slow_gateway_are_true(
     seconds: float, gateway_path_of: Callable[..., tuple[Bus, PathLine]]
 ) -> None:
     sim = simulated(InnovertIBD(1, ram=["acceleration_time"]))
