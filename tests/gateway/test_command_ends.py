@@ -34,7 +34,7 @@ MAY = May(write=frozenset({"mill.setpoint"}), verbs=frozenset({"mill.start"}))
 
 
 class UnopenedLines:
-    """The PolledLines of two drives whose line is not open, so each command ends with a failure."""
+    """Fake lines with two drives and no open port, so that each command ends with a failure."""
 
     plant: Plant = plant_of(("hall", InvtCHE(1, name="mill")), ("hall", InvtCHE(2, name="fan")), polled=False)
 

@@ -1,4 +1,4 @@
-"""A gateway that is interrupted while it starts or ends does end, and sends no Modbus request afterwards."""
+"""A gateway interrupted during its start or shutdown ends, and sends no Modbus request afterwards."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def two_lines(
 ) -> Iterator[tuple[Served, Rows]]:
     """Yield a gateway with the lines hall (pump-1) and roof (`fans`), and its rows.
 
-    Only fan-1 answers there.
+    Of the fans, only fan-1 answers.
     """
     secrets, known = tokens()
     sims = {name: simulated(InvtCHE(1, name=name, baudrate=38400)) for name in ("pump-1", "fan-1")}

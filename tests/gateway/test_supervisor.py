@@ -54,7 +54,7 @@ def test_gateway_modules_start_tasks_and_threads_only_through_the_supervisor() -
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in STARTERS:
                 found.add(path.relative_to(root).as_posix())
-    assert found == {"opcua/server.py"}  # when it closes, the OPC UA server cancels its own task
+    assert found == {"opcua/server.py"}  # the OPC UA server cancels its own task when it closes
 
 
 # ---- tasks and threads of a gateway ----

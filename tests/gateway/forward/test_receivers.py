@@ -88,7 +88,7 @@ def receiver(kind: str, folder: Path) -> Iterator[Receiver]:
 
 
 def wanted(exchanges: range) -> Counter[Key]:
-    """Return the key of each row of these exchanges, with the count 1."""
+    """Return a Counter that has the key of each row of these exchanges once."""
     return Counter(
         (NOON + number * STEP, f"pump-{number % 4 + 1}", f"value_{at}")
         for number in exchanges

@@ -391,7 +391,7 @@ WAYS = ("page", "http", "mqtt", "modbus")
 
 
 class GuardedLines:
-    """The PolledLines of a plant with one drive. Each command must be refused before it needs the bus."""
+    """Fake lines with one drive. Each command must be refused before it needs the drive's bus."""
 
     plant: Plant = plant_of(("hall", InvtCHE(1, name="mill")), polled=False)
 

@@ -185,7 +185,7 @@ def test_a_port_counts_as_lost_if_the_newest_row_of_each_register_says_so(hub: H
 
 
 def test_values_become_stale_if_no_new_rows_arrive(hub: Hub, clock: HubClock) -> None:
-    """The event loop does not run meanwhile, as in a suspended process."""
+    """The event loop does not run, as in a suspended process."""
     hub.take(all_of(10, FORWARD, 25))
     clock.now_ns += SECOND
     assert is_fresh(hub)

@@ -1,4 +1,4 @@
-"""Commands that a network delays or repeats are refused, by the page frame that each command names."""
+"""Each command names a page frame, by which delayed and repeated commands are recognised and refused."""
 
 from __future__ import annotations
 

@@ -425,7 +425,7 @@ def test_identity_of_a_silent_drive_is_not_read() -> None:
 
 @pytest.mark.usefixtures("_at_once")
 def test_known_identity_is_not_read_again() -> None:
-    """A drive whose identity is known needs no thread either."""
+    """No thread is started for a drive whose identity is known."""
     bus = AskedBus({})
     bus.known.add("pump-1")
     assert ask_all(bus, lambda name: True, "pump-1", "pump-2") == []

@@ -1,4 +1,4 @@
-"""mbpoll, libmodbus and pyModbusTCP read and write drives through the gateway: words equal the drives'."""
+"""mbpoll, libmodbus and pyModbusTCP read and write the words of drives through the gateway."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ PATIENCE = 60.0  # s
 
 
 class Lines(NamedTuple):
-    """A poller with the protocol PolledLines, which Commands needs."""
+    """Adapts a poller to PolledLines, the protocol that Commands needs."""
 
     plant: Plant
     poller: Poller

@@ -495,7 +495,7 @@ def test_each_of_a_million_answers_has_the_transaction_id_of_its_request(gateway
 
 @pytest.mark.long
 def test_a_client_that_reads_its_answers_late_gets_all_of_them(gateway: Gateway) -> None:
-    """The client sends all requests before it reads any answer. The server keeps the answers meanwhile."""
+    """The client sends all requests before it reads any answer. Until then, the server keeps the answers."""
     requests = 20_000
     with gateway.client() as client:
         frames = b"".join(request(number, 1, 3, 0, 120) for number in range(requests))

@@ -275,7 +275,7 @@ def test_a_write_is_carried_out_by_the_gateways_commands_and_echoed(gateway: Gat
 @table(
     ("function", "words", "data", "expected"),
     [
-        (6, (0x7000, 1), b"", 2),  # 2: there is no register
+        (6, (0x7000, 1), b"", 2),  # 2: no register has this address
         (6, (0, 1), b"", 2),  # the register is read-only
         (6, (2, 1), b"", 3),  # only the first half of a 32-bit register
         (6, (3, 1), b"", 2),  # only the second half of a 32-bit register

@@ -215,7 +215,7 @@ def test_a_tool_that_exceeds_its_share_of_line_time_gets_exception_06(tmp_path: 
 
 
 def test_eight_flooding_tools_have_one_request_on_the_line_at_a_time(tmp_path: Path) -> None:
-    """So a stop waits for at most one exchange of a tool."""
+    """A stop therefore waits for at most one request of a tool."""
     under_way = most = 0
 
     async def ask(drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:

@@ -433,7 +433,7 @@ def test_a_retained_command_is_refused(broker: RunningBroker, listener: Listener
 def test_a_broker_that_rejects_sparkplug_topics_does_not_delay_json_topics(
     broker: RunningBroker, listener: Listener, start: Start
 ) -> None:
-    """Sparkplug's topics contain a dot. Because of it, nats-server before 2.10 closes the connection."""
+    """Sparkplug's topics contain a dot, for which nats-server before 2.10 closes the connection."""
     known, running = start(sparkplug="works", node="line")
     listener.wait_for(has("multidrop/pump-1"))
     until(lambda: running._part.health().startswith(f"no connection to 127.0.0.1:{broker.port}"))

@@ -1,4 +1,4 @@
-"""The OPC UA server with hostile and greedy clients and clients that read no answers; its encryption."""
+"""The OPC UA server: hostile and greedy clients, clients that read no answers, and encryption."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def read_chunk(peer: socket.socket) -> bytes:
 
 
 def test_the_opc_ua_server_survives_replayed_messages_with_changed_bytes(gateway: Served) -> None:
-    """A client's recorded messages are replayed on a new channel, with random bytes of one changed."""
+    """Messages recorded from a client are replayed, with random bytes of one message changed."""
     with recorded(port_of(gateway)) as (url, sent), Client(url, timeout=PATIENCE) as client:
         plant = client.get_node(PLANT)
         plant.get_children()

@@ -83,7 +83,7 @@ class Tab:
 
 @pytest.fixture(scope="module")
 def tab_with(browser: Any) -> Iterator[Callable[..., AbstractContextManager[Tab]]]:
-    """Yield a function that takes options for a browser context, and returns an unused tab with these."""
+    """Yield a function that takes options for a browser context, and returns an unused tab that has them."""
     contexts: dict[str, Any] = {}
     unused: defaultdict[str, list[Tab]] = defaultdict(list)
 

@@ -207,9 +207,9 @@ def lines() -> dict[str, Any]:
 
 
 def fleet(began: float) -> dict[str, Any]:
-    """Return the answer to `GET /api/fleet`: twelve lines, and three gateways, one of them just died.
+    """Return the answer to `GET /api/fleet`: twelve lines and three gateways.
 
-    Some times are more than a day ago, so that the page shows their dates.
+    One gateway has just died. Some times are more than a day ago, so that the page shows their dates.
     """
     at = int(began * 1000)
     spool = {"bytes": 81_234_567, "lost": 0, "behind": 2, "lag_s": 1.4, "trouble": None}

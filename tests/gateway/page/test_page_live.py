@@ -235,7 +235,7 @@ FORBIDDEN = """for (const name of ['sessionStorage', 'localStorage'])
 
 
 def test_page_reloads_itself_if_a_network_change_aborts_its_scripts(opened: Opener) -> None:
-    """Chromium aborts all requests if the network changes. Here it also forbids storage."""
+    """Chromium aborts all requests if the network changes. In this test, it also forbids storage."""
     broken = []
 
     def break_two_off(route: Any) -> None:

@@ -132,7 +132,7 @@ def aborting(*urls: str) -> Callable[[Any], None]:
 
 
 def press_enter(page: Any) -> None:
-    """Press Enter two drawings later, because the page ignores keys until a dialog's change is drawn."""
+    """Press Enter after the page was drawn twice: it ignores keys until an opened dialog is drawn."""
     page.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
     page.keyboard.press("Enter")
 
