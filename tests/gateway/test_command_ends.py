@@ -242,7 +242,7 @@ def test_modbus_clients_read_computed_channels_as_floats() -> None:
         assert power == 1234.5
         assert math.isnan(starts)
         assert client.ask(1, 4, 0xF102, 2).words == [0x7FC0, 0]
-        assert client.ask(1, 3, 0xF103, 2).code == 2  # there is no further channel
+        assert client.ask(1, 3, 0xF103, 2).code == 2  # beyond the last computed channel
         gateway.hub.values[("mill", "starts")] = 1e300
         assert client.ask(1, 3, 0xF102, 2).words == [0x7F80, 0]
     assert gateway.line.asked == []

@@ -269,7 +269,7 @@ def batch_at(time_ns: int) -> Any:
     return Batch(columns, Names(["pump-1"]), Names(["load"]))
 
 
-def test_rows_get_the_units_of_the_present_plant_or_are_left_out(
+def test_rows_whose_unit_is_unknown_after_a_reload_are_not_sent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sent: list[Any] = []

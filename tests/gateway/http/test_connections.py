@@ -222,7 +222,7 @@ def test_new_connection_is_not_closed_before_its_first_request(
 
 
 @pytest.mark.parametrize("is_stalled", [False, True], ids=["sends ahead", "reads nothing"])
-def test_greedy_connections_are_closed_first_and_those_that_sent_stops_last(
+def test_connections_of_greedy_clients_are_closed_first_and_those_with_stops_last(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]], is_stalled: bool
 ) -> None:
     connections = Connections(clock)

@@ -47,7 +47,7 @@ def hub_of(folder: Path, model: str, poll: str) -> Hub:
     return Hub(Plant.load(path), lambda: (now_ns[0], 0))
 
 
-now_ns = [0]  # the present time of the hub's clock, in ns
+now_ns = [0]  # present time of the clock that the Hub reads, in ns
 
 
 def take(hub: Hub, at_s: float, **values: int) -> None:
@@ -441,7 +441,7 @@ BELOW = Limit("pump", "pressure", "bar", False, 1.0, hysteresis=0.5)
         ([30] * 7, [False] * 7),  # equal to the limit is not above it
     ],
 )
-def test_a_limit_is_exceeded_after_its_duration_until_the_hysteresis_is_passed(
+def test_an_alarm_limit_has_a_duration_and_a_hysteresis(
     values: list[float | None], beyond: list[bool]
 ) -> None:
     limits, text, seen = Limits([ABOVE]), "", []
@@ -451,7 +451,7 @@ def test_a_limit_is_exceeded_after_its_duration_until_the_hysteresis_is_passed(
     assert seen == beyond
 
 
-def test_a_second_exceeded_limit_raises_a_new_alarm_and_its_end_does_not() -> None:
+def test_a_second_exceeded_limit_raises_a_new_alarm_but_its_end_does_not() -> None:
     limits = Limits([ABOVE._replace(lasting_s=0.0), BELOW])
     noted: list[Alarm] = []
     alarms = Alarms(note=lambda alarm, change: noted.append(alarm))
@@ -483,7 +483,7 @@ def test_a_limit_that_was_exceeded_before_a_restart_stays_exceeded() -> None:
         ('drive = "pump-1"\nregister = "fault"\nabove = 1\nfor = "5"', "is not a duration"),
     ],
 )
-def test_invalid_limit_is_refused(tmp_path: Path, limit: str, sentence: str) -> None:
+def test_an_invalid_alarm_limit_is_refused(tmp_path: Path, limit: str, sentence: str) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(plant_text("/dev/ttyUSB0", ["pump-1"]) + f"\n[[serve.limit]]\n{limit}\n")
     with pytest.raises(PlantError, match=f"limit number 1: .*{sentence}"):

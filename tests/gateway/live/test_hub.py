@@ -91,7 +91,7 @@ def is_fresh(hub: Hub) -> bool:
     return next(current for one, _, _, current in hub.known("pump-1") if one.name == "output_frequency")
 
 
-def test_registers_are_unknown_before_their_first_request(hub: Hub) -> None:
+def test_values_of_registers_are_unknown_before_their_first_request(hub: Hub) -> None:
     assert hub.newest("pump-1", "status") is None
     assert {good for _, _, good, _ in hub.known("pump-1")} == {None}
     assert hub.state("pump-1") == "unknown"
@@ -450,7 +450,7 @@ def test_only_scaled_values_have_a_unit(model: str) -> None:
             assert (register["at_least"], register["at_most"]) == (known.at_least, known.at_most)
 
 
-def test_the_common_block_has_no_number_for_values_of_unknown_scale() -> None:
+def test_the_common_register_block_has_no_number_for_values_of_unknown_scale() -> None:
     delixi, che = DelixiModbus(1, name="fan"), InvtCHE(2, name="pump", maximum_frequency=50)
     names = ("output_frequency", "output_current")
     drives = [polled(drive, [drive.registers[name] for name in names]) for drive in (delixi, che)]

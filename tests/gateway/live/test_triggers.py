@@ -75,8 +75,8 @@ def test_a_fault_of_any_drive_fires_a_trigger_and_the_newest_is_listed_first(tmp
     assert {"drive": "pump-2", "register": "output_current"} in second["signals"]
 
 
-def test_a_trigger_condition_uses_the_values_of_a_channel_in_the_order_of_time(tmp_path: Path) -> None:
-    """In a batch, the rows of channels follow those of all registers."""
+def test_a_trigger_condition_uses_values_of_a_computed_channel_in_time_order(tmp_path: Path) -> None:
+    """In a batch of rows, those of computed channels follow those of all registers."""
     found = triggers(tmp_path, {"odd": "pump-2.load != pump-2.output_current * 2"}, CHANNEL)
     for times in ((0,), (1, 2, 3)):
         currents = [(at, "output_current", float(at)) for at in times]

@@ -177,7 +177,7 @@ def test_unpolled_registers_are_read_while_a_drive_is_viewed(
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_viewing_does_not_read_a_silent_drive(gateway: Served) -> None:
+def test_viewing_a_silent_drive_reads_none_of_its_unpolled_registers(gateway: Served) -> None:
     gateway.sims["pump-2"].deaf_until = float("inf")
     gateway.await_state("pump-2", "silent")
     asked: list[object] = []
@@ -290,7 +290,7 @@ def recent(tmp_path: Path) -> RecentStatistics:
 
 
 @pytest.mark.slow
-def test_the_last_hour_has_figures_for_60_minutes_but_few_readings_are_stored(
+def test_the_last_hour_has_statistics_of_60_minutes_from_few_stored_readings(
     recent: RecentStatistics,
 ) -> None:
     alive: list[weakref.ref[LineStatistics]] = []
@@ -308,7 +308,7 @@ def test_the_last_hour_has_figures_for_60_minutes_but_few_readings_are_stored(
     assert recent.hour("roof") == []
 
 
-def test_figures_of_a_line_cover_the_last_seconds(recent: RecentStatistics) -> None:
+def test_statistics_of_a_line_cover_the_last_seconds(recent: RecentStatistics) -> None:
     for second in range(200):
         recent.tick(float(second), second * 1000, {"hall": reading(second)})
         if second == 100:
@@ -318,7 +318,7 @@ def test_figures_of_a_line_cover_the_last_seconds(recent: RecentStatistics) -> N
     assert recent.line("roof")["rate"] is None
 
 
-def test_figures_of_a_line_without_replies_are_none_instead_of_zero(
+def test_statistics_of_a_line_without_replies_are_none_instead_of_zero(
     recent: RecentStatistics, tmp_path: Path
 ) -> None:
     assert recent.line("hall")["misses"] is None
@@ -335,7 +335,7 @@ def test_figures_of_a_line_without_replies_are_none_instead_of_zero(
     assert delays.samples == [("_count", {"line": "hall", "drive": "pump-1"}, 0.0)]
 
 
-def test_a_reopened_line_has_figures_from_its_second_reading_on(recent: RecentStatistics) -> None:
+def test_a_reopened_line_has_statistics_from_its_second_reading_on(recent: RecentStatistics) -> None:
     recent.tick(100.0, 100_000, {"hall": replace(reading(100), epoch=1)})
     recent.tick(101.0, 101_000, {"hall": replace(reading(1), epoch=2)})
     assert (recent.line("hall")["rate"], recent.line("hall")["used"]) == (None, None)
@@ -343,7 +343,7 @@ def test_a_reopened_line_has_figures_from_its_second_reading_on(recent: RecentSt
     assert recent.line("hall")["rate"] == 10.0
 
 
-def test_removing_a_drive_makes_no_rate_negative(recent: RecentStatistics) -> None:
+def test_no_rate_becomes_negative_when_a_drive_is_removed(recent: RecentStatistics) -> None:
     recent.tick(100.0, 100_000, {"hall": reading(100)})
     recent.tick(101.0, 101_000, {"hall": replace(reading(1), seconds=101.0)})
     assert recent.line("hall")["rate"] == 0.0

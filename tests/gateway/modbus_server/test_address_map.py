@@ -116,7 +116,7 @@ class Client:
             found = read(address, count=count, device_id=row["unit_id"])
             if not found.isError():
                 return list(found.registers if function in (3, 4) else found.bits[:count])
-            # Exception 6: the share of the line's time that clients may use is used up.
+            # Exception 6: the share of line time that clients may use is used up.
             if found.exception_code not in (6, 11):
                 return int(found.exception_code)
 

@@ -313,7 +313,7 @@ def test_a_master_gets_the_exception_codes_of_refused_writes(rig: Rig, master: M
     assert len(rig.drives[COMMANDED].counters.writes) == writes
 
 
-def test_a_master_stops_a_motor_by_its_control_register_and_by_the_common_block(
+def test_a_master_stops_a_motor_by_control_register_and_by_common_register_block(
     rig: Rig, master: Master
 ) -> None:
     drive = rig.drives[COMMANDED]
@@ -325,7 +325,7 @@ def test_a_master_stops_a_motor_by_its_control_register_and_by_the_common_block(
         assert [(one.name, one.raw) for one in drive.counters.writes][-1] == ("control", STOP)
 
 
-def test_each_master_reads_the_common_block(rig: Rig, master: Master) -> None:
+def test_each_master_reads_the_common_register_block(rig: Rig, master: Master) -> None:
     for unit in rig.drives:
         found = patiently(master.read, unit, 3, 0xF000, 11)
         assert isinstance(found, list)

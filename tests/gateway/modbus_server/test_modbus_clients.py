@@ -85,7 +85,7 @@ def transactions(written: bytes) -> list[int]:
     return found
 
 
-async def test_answers_have_their_requests_ids_and_are_sent_when_ready() -> None:
+async def test_answers_have_the_ids_of_their_requests_and_are_sent_when_ready() -> None:
     async def slow(found: MbapRequest) -> bytes:
         await asyncio.sleep(found.transaction)
         return found.reply(bytes([found.transaction]))
@@ -434,7 +434,7 @@ def expected(unit: int, start: int, count: int) -> list[int]:
 
 
 def drawn(chance: random.Random) -> tuple[int, int]:
-    """Return a random address and count. One range in fifty is not polled, and needs the line."""
+    """Return a random address and count. One range in fifty is not polled, but read from the drive."""
     if chance.random() < 0.02:
         return POLLED + chance.randrange(PASSED - 4), chance.randint(1, 4)
     return chance.randrange(POLLED - 4), chance.randint(1, 4)
@@ -453,7 +453,7 @@ def pipeline(client: RawClient, unit: int, requests: int) -> int:
             start, count = asked.pop(reply.transaction)
             assert reply.unit == unit
             if start >= POLLED and reply.code == 6:
-                continue  # the share of the line's time for clients is used up
+                continue  # the share of line time that clients may use is used up
             assert (reply.function, reply.words) == (3, expected(unit, start, count))
             passed += start >= POLLED
         assert asked == {}
@@ -579,7 +579,7 @@ async def test_line_time_used_in_any_second_is_at_most_the_clients_share_plus_a_
         assert len(window) * 0.01 <= SHARE + BURST_S + 0.01 + 1e-6
 
 
-async def test_ninth_waiting_request_is_refused_immediately() -> None:
+async def test_a_ninth_request_that_waits_for_the_line_is_refused_immediately() -> None:
     share, line = LineShare(), PacedLine(0.5)
     # one request in progress, and MOST_WAITING waiting requests
     asked = [share.ask("one", line.ask) for _ in range(1 + MOST_WAITING)]
@@ -588,7 +588,7 @@ async def test_ninth_waiting_request_is_refused_immediately() -> None:
         share.ask("one", line.ask)
     results = await asyncio.gather(*asked, return_exceptions=True)
     assert results[0] == [1]
-    # because the clients' share of the line's time is used up
+    # the share of line time that clients may use is used up
     assert all(isinstance(result, PassingBusy) for result in results[1:])
 
 

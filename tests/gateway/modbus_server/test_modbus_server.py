@@ -120,13 +120,13 @@ def test_undeclared_addresses_are_refused_by_default(gateway: Gateway) -> None:
     assert gateway.line.asked == []
 
 
-def test_the_option_passing_any_lets_clients_read_undeclared_addresses() -> None:
+def test_the_setting_passing_any_lets_clients_read_undeclared_addresses() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="any")) as gateway:
         assert code(gateway, 1, 4, 0x7000, 2) is None
         assert gateway.line.asked == [("mill", 4, 0x7000, 2)]
 
 
-def test_the_option_passing_off_answers_reads_without_requests_on_the_line() -> None:
+def test_the_setting_passing_off_answers_reads_without_requests_on_the_line() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="off")) as gateway:
         gateway.hub.values["mill", "output_voltage"] = 231.0
         assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) is None
@@ -169,7 +169,7 @@ def test_values_polled_before_a_command_are_not_used_after_a_reload(gateway: Gat
 
 @table("function", [1, 2, 3, 4])
 @table(("start", "count", "expected"), [(0, 0, 3), (0, 2001, 3), (0xFFFF, 2, 2), (0x7000, 1, 2)])
-def test_invalid_address_ranges_have_exception_codes(
+def test_invalid_address_ranges_are_answered_with_exception_codes(
     gateway: Gateway, function: int, start: int, count: int, expected: int
 ) -> None:
     assert code(gateway, 1, function, start, count) == expected
@@ -277,8 +277,8 @@ def test_a_write_is_carried_out_by_the_gateways_commands_and_echoed(gateway: Gat
     [
         (6, (0x7000, 1), b"", 2),  # 2: no register has this address
         (6, (0, 1), b"", 2),  # the register is read-only
-        (6, (2, 1), b"", 3),  # only the first half of a 32-bit register
-        (6, (3, 1), b"", 2),  # only the second half of a 32-bit register
+        (6, (2, 1), b"", 3),  # this write has only the first half of a 32-bit register
+        (6, (3, 1), b"", 2),  # this write has only the second half of a 32-bit register
         (16, (2, 1), b"\2\0\1", 3),
         (16, (2, 3), b"\6" + bytes(6), 3),  # one word more than the register has
         (16, (2, 2), b"\4\0\0\0", 3),  # two bytes fewer than announced
@@ -403,7 +403,7 @@ def test_each_write_that_means_stop_calls_a_stop(gateway: Gateway) -> None:
         (16, (BLOCK + 11, 1), b"\2\0\1", 2),
     ],
 )
-def test_writes_to_other_words_of_the_common_block_are_refused_and_do_not_stop(
+def test_other_writes_to_the_common_register_block_are_refused_and_do_not_stop(
     gateway: Gateway, function: int, words: tuple[int, ...], data: bytes, expected: int
 ) -> None:
     assert code(gateway, 1, function, *words, data=data) == expected
@@ -567,7 +567,7 @@ def block(gateway: Gateway, unit: int = 1, function: int = 3) -> list[int]:
 UNKNOWN = [0x8000, 0]
 
 
-def test_the_common_block_contains_the_values_of_a_running_drive(gateway: Gateway) -> None:
+def test_the_common_register_block_contains_the_values_of_a_running_drive(gateway: Gateway) -> None:
     gateway.hub.states["mill"] = "runs"
     gateway.hub.values.update(
         {("mill", "output_frequency"): 49.99, ("mill", "output_current"): 12.3, ("mill", "setpoint"): -5.0}
@@ -583,12 +583,12 @@ def test_the_common_block_contains_the_values_of_a_running_drive(gateway: Gatewa
     assert gateway.line.asked == []
 
 
-def test_large_numbers_use_both_words_in_the_common_block(gateway: Gateway) -> None:
+def test_large_numbers_use_both_words_in_the_common_register_block(gateway: Gateway) -> None:
     gateway.hub.values["mill", "output_frequency"] = 1500.0
     assert block(gateway)[2:4] == [2, 0x49F0]  # 150000
 
 
-def test_unknown_values_in_the_common_block_read_as_reserved_numbers(gateway: Gateway) -> None:
+def test_unknown_values_in_the_common_register_block_read_as_reserved_numbers(gateway: Gateway) -> None:
     gateway.hub.values.clear()
     assert block(gateway) == [0, 0xFFFF, *UNKNOWN, *UNKNOWN, *UNKNOWN, 0xFFFF, 0xFFFF, 0]
     gateway.hub.states["mill"] = "silent"
@@ -599,7 +599,9 @@ def test_unknown_values_in_the_common_block_read_as_reserved_numbers(gateway: Ga
     assert 69_990 <= found[8] << 16 | found[9] < 80_000
 
 
-def test_values_read_before_the_machine_slept_are_unknown_in_the_common_block(gateway: Gateway) -> None:
+def test_values_from_before_a_sleep_are_unknown_in_the_common_register_block(
+    gateway: Gateway,
+) -> None:
     gateway.hub.values["mill", "output_frequency"] = 49.99
     gateway.hub.woken_ns = time.monotonic_ns() + 3600 * 10**9
     found = block(gateway)
@@ -608,7 +610,7 @@ def test_values_read_before_the_machine_slept_are_unknown_in_the_common_block(ga
 
 
 @table(("number", "expected"), [(5.0, 5), (None, 0xFFFE), (0.0, 0xFFFE)])
-def test_the_common_block_has_the_fault_number_of_the_drives_family(
+def test_the_common_register_block_has_the_fault_number_of_the_drives_family(
     gateway: Gateway, number: float | None, expected: int
 ) -> None:
     gateway.hub.states["mill"] = "fault"
@@ -616,7 +618,7 @@ def test_the_common_block_has_the_fault_number_of_the_drives_family(
     assert block(gateway)[:2] == [3, expected]
 
 
-def test_reads_across_the_ends_of_the_common_block_are_refused(gateway: Gateway) -> None:
+def test_reads_across_the_ends_of_the_common_register_block_are_refused(gateway: Gateway) -> None:
     gateway.hub.states["mill"] = "stands"
     with gateway.client() as client:
         assert client.ask(1, 3, BLOCK, 1).words == [1]
@@ -626,7 +628,7 @@ def test_reads_across_the_ends_of_the_common_block_are_refused(gateway: Gateway)
         assert client.ask(1, 3, BLOCK - 1, 18).code == 2
 
 
-def test_drives_of_every_family_have_the_common_block(gateway: Gateway) -> None:
+def test_drives_of_every_family_have_the_common_register_block(gateway: Gateway) -> None:
     for unit, drive in enumerate(("mill", "meter", "pump", "belt"), 1):
         gateway.hub.states[drive] = "runs"
         assert block(gateway, unit)[0] == 2

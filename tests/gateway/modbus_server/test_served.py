@@ -197,7 +197,7 @@ def rows(heading: str) -> dict[str, str]:
     return {name.strip("` "): rest for name, rest in found}
 
 
-def test_each_settings_key_is_in_a_table_of_the_documentation() -> None:
+def test_each_modbus_setting_is_in_a_table_of_the_documentation() -> None:
     assert list(rows("`[serve.modbus]`")) == [one.name for one in fields(ModbusSettings)]
     for name, rest in rows("`[serve.modbus]`").items():
         default = getattr(ModbusSettings(), name)
@@ -209,7 +209,7 @@ def test_each_exception_code_is_in_a_table_of_the_documentation() -> None:
     assert set(rows("Exceptions")) == {f"{code:02X}" for code in ModbusCode} | {"others"}
 
 
-def test_the_common_block_has_the_layout_in_the_documentation() -> None:
+def test_the_common_register_block_has_the_layout_in_the_documentation() -> None:
     offsets = [int(address.rstrip("H"), 16) - ModbusSettings().common for address in rows("The common block")]
     layout = words
     assert offsets == [
@@ -306,7 +306,7 @@ def test_address_0_is_reported_as_an_invalid_unit_id() -> None:
     }
 
 
-def test_a_common_block_that_overlaps_registers_is_reported() -> None:
+def test_a_common_register_block_that_overlaps_registers_is_reported() -> None:
     class Parameters(Drive):
         frequency_source = setting(0xF003)
 
@@ -316,7 +316,7 @@ def test_a_common_block_that_overlaps_registers_is_reported() -> None:
     Units(plant, ModbusSettings(common=0xE000))
 
 
-def test_no_family_has_registers_in_the_address_range_of_the_common_block() -> None:
+def test_no_family_has_registers_in_the_address_range_of_the_common_register_block() -> None:
     families = [find_model(name) for name in MODELS] + [load_family(path) for path in FAMILIES.glob("*.toml")]
     assert len(families) > 10
     common = set(ModbusSettings().common_addresses)
@@ -343,7 +343,9 @@ def test_no_family_has_registers_in_the_address_range_of_the_common_block() -> N
         ("delta-ms300", "control", 1),
     ],
 )
-def test_a_unit_knows_the_writes_that_stop_a_drive_of_its_family(model: str, register: str, raw: int) -> None:
+def test_the_modbus_server_knows_the_writes_that_stop_a_drive_of_each_family(
+    model: str, register: str, raw: int
+) -> None:
     unit = Unit("hall", PolledDrive(find_model(model)(1), ()))
     assert StopWrite(register, raw) in unit.stops
 

@@ -1,4 +1,4 @@
-"""Tool ports, on fake lines: which requests are answered, when, and which writes are refused."""
+"""Ports for Modbus tools, on fake lines: which requests are answered, when, and which writes are refused."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
 
 @pytest.fixture(params=["pty", "tcp"])
 def tool(request: pytest.FixtureRequest, rig: Rig) -> Iterator[int]:
-    """Yield the file descriptor by which a tool uses the tool port."""
+    """Yield a file descriptor of the tool port, as a Modbus tool opens it."""
     where = str(rig.link) if request.param == "pty" else f"socket://127.0.0.1:{rig.ports.ports['hall']}"
     with opened(where) as fd:
         yield fd
@@ -147,7 +147,7 @@ def test_a_failed_read_is_answered_by_silence_or_an_exception_as_on_a_real_line(
                 assert code(tool, "01 03 00 10 00 02") == answer
 
 
-def test_other_addresses_silent_drives_and_broadcasts_are_not_answered(rig: Rig, tool: int) -> None:
+def test_unknown_addresses_silent_drives_and_broadcasts_are_not_answered(rig: Rig, tool: int) -> None:
     assert is_unanswered(tool, "02 03 00 10 00 02")
     assert is_unanswered(tool, "00 06 20 00 00 00")
     rig.hub.states["mill"] = "silent"
@@ -190,7 +190,7 @@ def test_only_the_newest_of_several_pending_requests_is_answered(rig: Rig, tool:
     assert receive(tool, 1, QUIET) == b""
 
 
-def test_a_tool_gets_no_reply_after_the_timeout_of_its_port(tmp_path: Path) -> None:
+def test_a_modbus_tool_gets_no_reply_after_the_timeout_of_its_port(tmp_path: Path) -> None:
     with serving(tmp_path, timeout=0.05) as rig, opened(str(rig.link)) as tool:
         rig.ports.lines["hall"].share.share = 100.0  # no pauses
         rig.line.seconds = 0.2
@@ -205,7 +205,7 @@ def test_a_tool_gets_no_reply_after_the_timeout_of_its_port(tmp_path: Path) -> N
         assert receive(tool, 1, QUIET) == b""
 
 
-def test_a_tool_that_exceeds_its_share_of_line_time_gets_exception_06(tmp_path: Path) -> None:
+def test_a_modbus_tool_that_exceeds_its_share_of_line_time_gets_exception_06(tmp_path: Path) -> None:
     with serving(tmp_path, timeout=1.0) as rig, opened(str(rig.link)) as tool:
         rig.ports.lines["hall"].share.share = 0.01
         rig.line.seconds = 0.06
@@ -214,8 +214,8 @@ def test_a_tool_that_exceeds_its_share_of_line_time_gets_exception_06(tmp_path: 
         assert len(rig.line.asked) == found.count(None)
 
 
-def test_eight_flooding_tools_have_one_request_on_the_line_at_a_time(tmp_path: Path) -> None:
-    """A stop therefore waits for at most one request of a tool."""
+def test_eight_flooding_modbus_tools_have_one_request_on_the_line_at_a_time(tmp_path: Path) -> None:
+    """A stop therefore waits for at most one request of a Modbus tool."""
     under_way = most = 0
 
     async def ask(drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:
@@ -239,7 +239,7 @@ def test_eight_flooding_tools_have_one_request_on_the_line_at_a_time(tmp_path: P
 
 
 @pytest.mark.slow
-def test_a_tool_with_random_timeouts_never_gets_the_reply_to_another_request(tmp_path: Path) -> None:
+def test_a_modbus_tool_with_random_timeouts_gets_only_replies_to_its_last_request(tmp_path: Path) -> None:
     chance, answered = random.Random(43), 0
 
     async def ask(drive: str, function: int, start: int, count: int, expiry: float) -> list[int]:
@@ -256,7 +256,7 @@ def test_a_tool_with_random_timeouts_never_gets_the_reply_to_another_request(tmp
     assert answered > 20
 
 
-def test_a_tools_serial_settings_have_no_effect_and_echo_is_turned_off(rig: Rig) -> None:
+def test_serial_settings_of_a_modbus_tool_have_no_effect_and_echo_is_turned_off(rig: Rig) -> None:
     import termios
 
     with opened(str(rig.link)) as tool:
@@ -274,7 +274,7 @@ def test_a_tools_serial_settings_have_no_effect_and_echo_is_turned_off(rig: Rig)
 # ---- writes ----
 
 
-def test_a_tool_port_refuses_and_records_each_write_by_default(tmp_path: Path) -> None:
+def test_a_port_for_modbus_tools_refuses_and_records_each_write_by_default(tmp_path: Path) -> None:
     with serving(tmp_path) as rig, opened(str(rig.link)) as tool:
         for body in (
             f"01 06 {CONTROL:04X} {START:04X}",
@@ -291,7 +291,9 @@ def test_a_tool_port_refuses_and_records_each_write_by_default(tmp_path: Path) -
         assert len(rig.commands.refused) < 6  # at most one record a second
 
 
-def test_a_tool_with_the_right_to_write_can_set_and_stop_but_never_start_a_drive(rig: Rig, tool: int) -> None:
+def test_a_modbus_tool_with_the_right_to_write_may_set_and_stop_but_not_start_drives(
+    rig: Rig, tool: int
+) -> None:
     assert code(tool, f"01 06 {SETPOINT:04X} 1388") is None
     drive, register, value, caller = rig.commands.written[0]
     assert (drive, register, value) == ("mill", "setpoint", 50.0)
@@ -303,7 +305,7 @@ def test_a_tool_with_the_right_to_write_can_set_and_stop_but_never_start_a_drive
     assert len(rig.commands.written) == 1
 
 
-def test_each_stop_is_sent_although_a_tool_sends_other_requests_right_after_it(rig: Rig, tool: int) -> None:
+def test_each_stop_is_sent_although_a_modbus_tool_sends_requests_right_after_it(rig: Rig, tool: int) -> None:
     stop, read = checksums.rtu(f"01 06 {CONTROL:04X} {STOP:04X}"), checksums.rtu("01 03 00 01 00 01")
     os.write(tool, stop + read + stop + read)
     assert receive(tool, 7) == checksums.rtu("01 03 02 0001")
@@ -345,7 +347,7 @@ def test_a_failed_write_is_answered_with_an_exception_or_not_at_all(rig: Rig) ->
 # ---- connections ----
 
 
-def test_hostile_bytes_from_a_tool_do_not_affect_the_next_tool(rig: Rig, tool: int) -> None:
+def test_hostile_bytes_from_a_modbus_tool_do_not_affect_the_next_tool(rig: Rig, tool: int) -> None:
     for noise in (bytes(4096), b"\xff" * 3000, bytes(range(256)) * 8, b"\x01\x10\x00"):
         with suppress(BlockingIOError):
             os.write(tool, noise)
@@ -354,7 +356,7 @@ def test_hostile_bytes_from_a_tool_do_not_affect_the_next_tool(rig: Rig, tool: i
     assert {*rig.line.asked} == {("mill", 3, 16, 1)}
 
 
-def test_eight_tools_on_tcp_are_served_and_a_ninth_is_refused(rig: Rig) -> None:
+def test_eight_modbus_tools_on_tcp_are_served_and_a_ninth_is_refused(rig: Rig) -> None:
     tools = [socket.create_connection(("127.0.0.1", rig.ports.ports["hall"])) for _ in range(9)]
     try:
         for tool in tools[:8]:

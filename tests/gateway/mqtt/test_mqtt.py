@@ -696,7 +696,7 @@ def test_home_assistant_binary_sensors_follow_the_state_of_the_drive(
     assert rendered(parts["state"], {"state": state}) in parts["state"]["options"]
 
 
-def test_a_value_without_a_name_is_shown_as_unknown_in_home_assistant() -> None:
+def test_a_status_value_without_a_name_is_shown_as_unknown_in_home_assistant() -> None:
     """Home Assistant ignores a state outside the options, and would keep showing the previous one."""
     part = configured(InvtCHE(1, name="a"), ["status"], [])["cmps"]["status"]
     values = [rendered(part, {"values": {"status": value}}) for value in ("FORWARD", "77", None)]

@@ -101,7 +101,7 @@ def test_no_topic_is_deleted_while_another_gateway_uses_the_prefix() -> None:
         ("homeassistant/sensor/works-old/config", configuration("works/old")),
     ],
 )
-def test_topics_that_are_not_of_a_removed_drive_of_this_gateway_are_kept(topic: str, payload: bytes) -> None:
+def test_topics_of_other_gateways_and_unknown_topics_are_kept(topic: str, payload: bytes) -> None:
     assert heard(GATEWAY, (topic, payload)) == []
 
 
