@@ -123,7 +123,7 @@ def test_frames_are_read_as_they_were_written(tmp_path: Path) -> None:
     ]
 
 
-def test_captured_noise_is_still_decoded_as_noise(tmp_path: Path) -> None:
+def test_noise_in_a_capture_is_read_back_as_noise(tmp_path: Path) -> None:
     with CaptureWriter(tmp_path / "a.pcapng") as capture:
         capture.write(b"\xff\x00\xff", Side.EITHER, BEGIN, "hall-1")
         capture.write(RTU[0].frame[:-1], Side.ANSWERING, BEGIN, "hall-1")
@@ -174,7 +174,9 @@ def test_frames_split_over_packets_and_several_in_one_packet_are_read(tmp_path: 
 
 
 def test_a_reply_in_pieces_with_pauses_is_one_frame(tmp_path: Path) -> None:
-    """Reported as alerighi/modbus-sniffer#9: an adapter delivers a reply of 165 bytes in pieces of 32."""
+    """An adapter delivers a reply of 165 bytes in pieces of 32, as in the report
+    alerighi/modbus-sniffer#9.
+    """
     reply = checksums.rtu("0B 03 A0" + bytes((at * 7 + 3) % 256 for at in range(160)).hex())
     pieces = [checksums.rtu("0B 03 08 36 00 50"), *(reply[at : at + 32] for at in range(0, len(reply), 32))]
     path = tmp_path / "a.pcap"
@@ -325,7 +327,7 @@ def test_unit_id_0_of_modbus_tcp_is_not_a_broadcast() -> None:
 def captured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path, list[Row]]:
     """Return a plant file, the capture of its poll with one silent drive, and the poll's rows.
 
-    The answering drive has a long timeout, so no reply is late, even on a busy machine.
+    The drive that answers has a long timeout, so that no reply comes too late on a busy machine.
     """
     monkeypatch.setattr(InnovertIBD, "response_timeout", PATIENCE)
     monkeypatch.setattr(InnovertIBD, "answering_time", PATIENCE)
@@ -375,7 +377,9 @@ def test_wireshark_decodes_modbus_tcp(captured: tuple[Path, Path, list[Row]]) ->
 
 
 @pytest.mark.slow
-def test_our_capture_reader_returns_the_values_of_the_poll(captured: tuple[Path, Path, list[Row]]) -> None:
+def test_decoding_a_capture_of_modbus_tcp_gives_the_polled_values(
+    captured: tuple[Path, Path, list[Row]],
+) -> None:
     plant, path, polled = captured
     known = load_plant(plant)
     with Capture(path) as capture:
@@ -457,8 +461,8 @@ BIG_ENDIAN_SECTION = struct.pack(">IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -
             ": byte 28: its time stamps are finer than a nanosecond, and cannot be read",
         ),
         (described() + packet(1, READ), NO_PACKET),  # the file has no interface 1
-        (described() + packet(0, READ, stated=9), NO_PACKET),  # the stated length exceeds the block
-        (described() + packet(0, READ)[:-4] + bytes(4), NO_PACKET),  # its two length fields differ
+        (described() + packet(0, READ, stated=9), NO_PACKET),  # its stated length exceeds the block
+        (described() + packet(0, READ)[:-4] + bytes(4), NO_PACKET),  # its block has two different lengths
         (
             described() + SECTION,
             ": byte 48: a second section starts here, and only the first one can be read",
@@ -488,7 +492,7 @@ def test_a_file_that_is_no_valid_capture_raises_a_one_sentence_error(
     assert str(mistake.value) == f"{path}{sentence}"
 
 
-def test_a_capture_cut_within_an_interface_is_read_up_to_it(tmp_path: Path) -> None:
+def test_a_capture_cut_within_an_interface_block_is_read_up_to_that_block(tmp_path: Path) -> None:
     path = tmp_path / "a.pcapng"
     path.write_bytes(described()[:-6])
     with Capture(path) as capture:
@@ -498,8 +502,8 @@ def test_a_capture_cut_within_an_interface_is_read_up_to_it(tmp_path: Path) -> N
 
 @table("tags", [b"\0\x0c\0\x05mb", b"\0\x0c\0\x05mbrtu", b"\0\x0c\xff\xff", b"\0\0\0\0", b"\0"])
 def test_a_packet_that_ends_within_its_tags_is_empty(tmp_path: Path, tags: bytes) -> None:
-    """In a packet, tags precede the frame and describe it. This packet ends within its tags or right after
-    them.
+    """A packet of the link type "exported PDU" starts with tags that describe its frame. This packet ends
+    within its tags, or directly after them.
     """
     path = tmp_path / "a.pcapng"
     interface = block(1, struct.pack("<HHI", 252, 0, 0))
@@ -548,7 +552,7 @@ def test_a_cut_capture_is_read_up_to_the_last_whole_packet(tmp_path: Path, forma
 
 
 @pytest.mark.parametrize("piece", [200, 256, 333, 512])
-def test_the_size_of_the_read_pieces_does_not_change_what_is_decoded(
+def test_decoded_rows_do_not_depend_on_the_size_of_read_pieces(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, piece: int
 ) -> None:
     path = write(tmp_path / "it.pcapng", RTU[:40])

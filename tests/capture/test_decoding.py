@@ -35,7 +35,7 @@ def plant(directory: Path, model: str, framing: str) -> Plant:
     return load_plant(path)
 
 
-EXCHANGES = [  # model, framing, request and reply as documents print them, register and value
+EXCHANGES = [  # model, framing, request and reply as printed in manuals, register and value
     ("innovert-ibd", "rtu", "01 06 20 01 13 88 DE 9C", "frequency", 50),
     ("innovert-ibd", "rtu", "01 06 00 6B 00 C8 F9 80", "acceleration_time", 20),
     ("innovert-ibd", "ascii", "0106200113883D", "frequency", 50),
@@ -74,7 +74,7 @@ def test_each_register_of_a_block_gets_its_own_row(tmp_path: Path) -> None:
     ]
 
 
-def test_without_a_plant_rows_are_raw_registers(tmp_path: Path) -> None:
+def test_a_capture_without_a_plant_is_decoded_to_raw_registers(tmp_path: Path) -> None:
     exchange = next(each for each in RTU if _text(each.frame) == "01 03 08 01 00 01 F4 01 F4 00 32 25 C4")
     found = rows(write(tmp_path / "a.pcapng", [exchange]))
     assert [(row.drive, row.register, row.value) for row in found] == [
@@ -82,13 +82,13 @@ def test_without_a_plant_rows_are_raw_registers(tmp_path: Path) -> None:
     ]
 
 
-def test_an_exception_reply_is_a_miss_with_its_code(tmp_path: Path) -> None:
+def test_an_exception_reply_is_a_row_with_its_code_as_status(tmp_path: Path) -> None:
     exchange = next(each for each in RTU if _text(each.frame) == "01 83 03 01 31")
     found = rows(write(tmp_path / "a.pcapng", [exchange]))
     assert {(row.value, row.status) for row in found} == {(None, "exception 03")}
 
 
-def test_a_request_without_a_reply_is_a_miss_with_its_reason(tmp_path: Path) -> None:
+def test_an_unanswered_request_is_a_row_with_the_reason_as_status(tmp_path: Path) -> None:
     exchange = next(each for each in RTU if _text(each.frame) == "01 03 02 13 88 B5 12")
     with CaptureWriter(tmp_path / "a.pcapng") as capture:
         capture.write(exchange.request_frame, Side.ASKING, 1, "hall-1")
@@ -132,21 +132,21 @@ def frames_of(path: Path, exchanges: Iterable[tuple[Message, Message | None]]) -
 
 @pytest.mark.long
 @pytest.mark.parametrize(("data", "end"), usually((b"\0\7", (7, "ok")), (b"", (None, "no reply"))))
-def test_requests_beyond_the_cache_size_are_decoded_too(
+def test_requests_beyond_the_decoders_cache_size_are_decoded_too(
     tmp_path: Path, data: bytes, end: tuple[float | None, str]
 ) -> None:
     """The decoder's hash table of requests has 16384 places, and counts as full at 12288 requests."""
     asked = [Message(1 + number % 2, 3, number // 2, 1) for number in range(13_000)]
     replies = (Message(each.address, 3, each.start, 1, data) if data else None for each in asked)
     path = frames_of(tmp_path / "a.pcapng", zip(asked, replies, strict=True))
-    told = asked if data else asked[:-1]  # the last request is still pending, and may be answered later
+    told = asked if data else asked[:-1]  # the last request has no row, because its reply may still come
     assert [(row.drive, row.register, row.value, row.status) for row in rows(path)] == [
         (f"address {record.address}", f"holding_register_{record.start}", *end) for record in told
     ]
 
 
-def test_an_oversized_request_gets_rows_only_for_as_many_registers_as_a_reply_holds(tmp_path: Path) -> None:
-    """Because of noise or a faulty master, a request may name all registers. A reply has at most 125."""
+def test_a_request_for_too_many_registers_is_decoded_to_at_most_125_rows(tmp_path: Path) -> None:
+    """Noise or a faulty master may send a request for 65535 registers, but a reply has at most 125."""
     path = tmp_path / "a.pcapng"
     with CaptureWriter(path) as capture:
         for time, function in enumerate((3, 4, 1, 2, 3)):

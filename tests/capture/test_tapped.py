@@ -85,8 +85,8 @@ def echoing_wires() -> list[Wire]:
 def captured(
     capture: Path, make: Callable[[], list[Wire]], drives: list[PolledDrive], enough: Counter[str]
 ) -> tuple[list[Row], list[Row]]:
-    """Poll until each status has as many rows as in `enough`. Return the polled rows and the rows of the
-    capture.
+    """Poll until each status has as many rows as in `enough`. Return the polled rows, and the rows decoded
+    from the capture.
     """
     with served(make) as (path,):
         known = plant(line(path, *drives, name="hall-1"))
@@ -108,7 +108,9 @@ def captured(
 
 
 def by_exchange(rows: list[Row]) -> dict[int, list[tuple[object, ...]]]:
-    """Return the rows of requests that were sent, by request time, without their monotonic time."""
+    """Return the rows by the time of their request, without rows whose request was not sent. Rows have no
+    monotonic time.
+    """
     found: dict[int, list[tuple[object, ...]]] = {}
     for row in rows:
         if row.status not in NEVER_ON_THE_LINE:
@@ -117,18 +119,19 @@ def by_exchange(rows: list[Row]) -> dict[int, list[tuple[object, ...]]]:
     return {time: sorted(found[time], key=str) for time in found}
 
 
-IN_DOUBT_NS = 100_000_000  # longer than any timeout; a value this late may answer an earlier request
+IN_DOUBT_NS = 100_000_000  # longer than any timeout: a reply as late as this may belong to an earlier request
 
 
 def by_time(rows: list[Row]) -> dict[int, list[tuple[object, ...]]]:
-    """Return `by_exchange` of the rows, without values so late that they may answer an earlier request."""
+    """Return `by_exchange` of the rows, without rows whose reply was so late that it may belong to an earlier
+    request.
+    """
     return by_exchange([row for row in rows if (row.uncertainty_ns or 0) < IN_DOUBT_NS])
 
 
 def check(rows: list[Row], decoded: list[Row]) -> None:
     """Check that the capture has all exchanges of the poll, except the last one, which may be incomplete.
-
-    Only the capture has repeated requests, and probes that check for an echo or a late reply.
+    Repeated requests, and requests that test for an echo or a late reply, are only in the capture.
     """
     recorded = list(by_time(rows).items())
     read = by_exchange(decoded)
@@ -138,7 +141,7 @@ def check(rows: list[Row], decoded: list[Row]) -> None:
 
 @dataclass(frozen=True)
 class Mixed:
-    """A poll of all family variants, at the pace of a real line."""
+    """A captured poll of drives of all families and variants, at the pace of a real line."""
 
     drives: list[PolledDrive]
     capture: Path
@@ -235,7 +238,7 @@ def new_peer() -> Peer:
 
 
 def asking(peer: Peer | None = None) -> Exchange:
-    """Return an exchange with the request ASK, on a line at 9600 baud."""
+    """Return an exchange that sends the request ASK on a line at 9600 baud."""
     return Exchange(
         Framing.RTU, ASK, peer or new_peer(), baudrate=9600, format="8N1", character=1e-3, silence=4e-3
     )
@@ -259,7 +262,9 @@ def test_bytes_lost_from_a_full_capture_buffer_are_counted() -> None:
 
 
 def test_a_capture_has_the_noise_around_a_reply() -> None:
-    """The noise before the reply is longer than the line's buffer; more noise is received with the reply."""
+    """The noise before the reply is longer than the line's buffer. More noise comes together with the
+    reply.
+    """
     driver, tap = LineDriver(), Tap()
     driver.begin(asking())
     driver._line.tap = tap.c
@@ -281,7 +286,7 @@ def times_of(packets: bytes) -> list[int]:
     return found
 
 
-def test_frames_have_the_times_of_their_exchange_after_clock_changes() -> None:
+def test_captured_frames_have_correct_times_after_clock_changes() -> None:
     driver, tap, peer = LineDriver(), Tap(), new_peer()
     asked = []
     driver._line.tap = tap.c
@@ -374,7 +379,7 @@ def test_flight_recordings_of_a_faulty_line_do_not_fill_the_disk(
 
 
 @pytest.mark.parametrize("most_files", [0, -1])
-def test_a_flight_recorder_without_files_is_refused(tmp_path: Path, most_files: int) -> None:
+def test_a_flight_recorder_that_may_keep_no_file_is_refused(tmp_path: Path, most_files: int) -> None:
     with pytest.raises(ValueError, match=f"most_files = {most_files}: it must be 1 or more"):
         FlightRecorder(tmp_path, ["hall-1"], most_files=most_files)
 
@@ -389,7 +394,7 @@ def test_a_flight_recorder_keeps_its_limit_of_memory(tmp_path: Path, monkeypatch
     assert seconds == list(range(seconds[0], 1201))
 
 
-def test_pending_anomalies_are_written_when_the_recorder_is_closed(
+def test_closing_the_flight_recorder_writes_pending_anomalies(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one_flight = Flight(tmp_path, monkeypatch)
@@ -401,7 +406,7 @@ def test_pending_anomalies_are_written_when_the_recorder_is_closed(
     assert [seconds_in(path) for path in one_flight.recorder.written] == [list(range(1001, 1007))]
 
 
-def test_a_directory_that_cannot_be_made_raises_a_one_sentence_error(tmp_path: Path) -> None:
+def test_a_flight_recorder_in_an_impossible_directory_raises_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RecordingError, match="cannot be written"):
         FlightRecorder(tmp_path / "file" / "flights", [])
@@ -427,10 +432,9 @@ class Watched:
         return self.port
 
     def told(self, reply: bytes) -> list[str]:
-        """Carry out an exchange with this reply; return its anomalies.
-
-        The exchange starts 1 s after the previous one, so that no late reply to the previous one is
-        possible."""
+        """Carry out an exchange with this reply; return its anomalies. It starts 1 s after the previous
+        exchange, when a late reply can no longer come.
+        """
         self.line.now += 1000 * MS
         self.line.begin(self._exchange)
         self.line.wait_until_write()
@@ -440,7 +444,7 @@ class Watched:
         return list(self.watch.check())
 
 
-def test_damaged_and_late_replies_are_anomalies() -> None:
+def test_damaged_and_late_replies_are_reported_as_anomalies() -> None:
     pump = Watched()
     assert pump.told(GOOD) == []
     assert pump.told(GOOD[:-1]) == ["hall-1: pump-1: reply cut short"]
@@ -476,7 +480,7 @@ def test_a_lost_port_causes_one_anomaly() -> None:
 
 
 @pytest.mark.slow
-def test_a_poll_is_captured(tmp_path: Path, run: Run, mixed_plant: Path) -> None:
+def test_the_command_poll_writes_a_capture(tmp_path: Path, run: Run, mixed_plant: Path) -> None:
     capture = tmp_path / "a.pcapng"
     words = ["poll", mixed_plant, "--seconds", 1, "--capture", capture]
     status, out, err = run(*words, "--out", tmp_path / "polled.csv")

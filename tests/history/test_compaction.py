@@ -1,4 +1,4 @@
-"""Compaction: interrupted at each of its steps, killed, and repeated."""
+"""Compaction of a history loses no row if it is interrupted at any step, killed and repeated."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ def segments() -> list[list[Row]]:
 
 @pytest.fixture
 def rows(tmp_path: Path) -> list[list[Row]]:
-    """Record five segments in `tmp_path`; return their rows."""
+    """Record five segments in `tmp_path`, and return the rows of each."""
     made = segments()
     record(tmp_path, made)
     return made
 
 
 def check(folder: Path, rows: list[Row]) -> None:
-    """Check that all queries of the history return these rows."""
+    """Check that rows, exports and buckets of the history in this folder agree with these rows."""
     with History(folder) as history:
         assert sorted(rows_in(history)) == sorted(rows)
         for points in (6, 4000):
@@ -124,7 +124,7 @@ def test_ten_second_summaries_of_past_days_are_merged_into_one_file(
 
 @pytest.mark.long
 @pytest.mark.usefixtures("rows")
-def test_compaction_opens_one_database_and_only_if_there_is_work(
+def test_compaction_opens_a_database_once_and_only_if_needed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[str] = []
@@ -144,7 +144,7 @@ class BrokenOff(BaseException):
 
 
 class Breaker:
-    """Lets `calls` calls of the wrapped functions succeed, and raises BrokenOff at the next call."""
+    """Wraps functions. The first `calls` calls succeed, and the next call raises BrokenOff."""
 
     def __init__(self, calls: int) -> None:
         self.left = calls
@@ -159,8 +159,8 @@ class Breaker:
         return call
 
 
-# Every `apart`-th step of compaction is interrupted. Each of the five segments takes 10 steps. With 7, each
-# of these 10 steps is interrupted in some segment. With 23, the default, a few steps are interrupted.
+# Every `apart`-th step of a compaction of five segments is interrupted. A segment takes 10 steps. With
+# `apart` = 7, each kind of step is interrupted in some segment.
 @pytest.mark.long
 @pytest.mark.parametrize("apart", usually(23, 7))
 def test_compaction_interrupted_before_each_step_loses_no_row(
@@ -196,7 +196,8 @@ def test_compaction_interrupted_before_each_step_loses_no_row(
 @pytest.mark.long
 @pytest.mark.slow
 def test_compaction_killed_at_any_step_loses_no_row(tmp_path: Path, rows: list[list[Row]]) -> None:
-    # `-m multidrop.history.compact` would lower the process's priority, which takes long on a busy machine.
+    # Not `-m multidrop.history.compact`, because it runs at a low priority, which takes long on a busy
+    # machine.
     code = "import duckdb; from multidrop.history.compact import main; print(flush=True); main()"
     words = [sys.executable, "-c", code, str(tmp_path), "--below", "6"]
     dice, delay = random.Random(1), 0.05
@@ -232,7 +233,7 @@ def test_the_readable_part_of_a_damaged_segment_is_read(
 ) -> None:
     path = tmp_path / "rows.00000002.arrows"
     data = bytearray(path.read_bytes())
-    at = data.rindex(b"no reply")  # a text in the file's last status dictionary
+    at = data.rindex(b"no reply")  # this text is in the file's last dictionary
     data[at] = 0xFF
     path.write_bytes(data)
     whole = _readable(path)
@@ -261,7 +262,7 @@ def _readable(path: Path) -> list[Row]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("content", usually(b"\0" * 5000, b"", b"\xff\xff\xff\xff"))
-def test_a_segment_without_a_head_hides_no_other_segment(
+def test_segments_beside_an_empty_or_zeroed_segment_are_read(
     tmp_path: Path, rows: list[list[Row]], content: bytes
 ) -> None:
     """After a power cut a file may be empty or contain zeros."""
@@ -277,7 +278,7 @@ def test_a_segment_without_a_head_hides_no_other_segment(
 
 
 @pytest.mark.long
-def test_a_segment_is_kept_if_the_disk_is_full(tmp_path: Path, rows: list[list[Row]]) -> None:
+def test_compaction_keeps_a_segment_if_the_disk_is_full(tmp_path: Path, rows: list[list[Row]]) -> None:
     words = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (900, 900));"
     words += f"from multidrop.history.compact import main; main([{str(tmp_path)!r}, '--below', '6'])"
     ended = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""History: it returns the recorded rows, and its buckets equal those computed in plain Python."""
+"""A History returns the recorded rows, and its buckets equal those of a plain Python implementation."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ COMPACTED = pytest.mark.parametrize("compacted", usually(2, 0, 4), ids="{} compa
 
 @pytest.fixture(scope="module")
 def rows() -> list[list[Row]]:
-    """Return rows of four segments: two in succession, one after a gap, one after the clock was set back."""
+    """Return rows of four segments: the second follows the first, the third follows a gap, and the clock was
+    set back before the fourth.
+    """
     begins = (NOON, NOON + 80 * SECOND, NOON + 300 * SECOND, NOON + 60 * SECOND)
     made = [random_rows(seed, begin, 400) for seed, begin in enumerate(begins)]
     return [
@@ -61,13 +63,13 @@ def test_rows_come_in_the_order_of_recording(folder: Path, rows: list[list[Row]]
         found = history.read()
         assert found.metadata == METADATA
         assert [row for batch in found for row in batch] == flat(rows)
-        assert [row for batch in found for row in batch] == flat(rows)  # iterating again gives the same
+        assert [row for batch in found for row in batch] == flat(rows)  # also at a second iteration
         assert history.damage == []
 
 
 @pytest.mark.slow
 @COMPACTED
-def test_series_are_read_within_a_range(folder: Path, rows: list[list[Row]]) -> None:
+def test_history_reads_the_given_series_in_the_given_time_range(folder: Path, rows: list[list[Row]]) -> None:
     dice = random.Random(5)
     times = [row.time_ns for row in flat(rows)]
     with History(folder) as history:
@@ -102,7 +104,7 @@ def test_buckets_equal_those_of_plain_python(folder: Path, rows: list[list[Row]]
 
 @pytest.mark.slow
 @COMPACTED
-def test_buckets_without_rows_are_gaps(folder: Path) -> None:
+def test_buckets_without_rows_have_no_values(folder: Path) -> None:
     with History(folder) as history:
         found = history.buckets("pump-1.speed", NOON - 600 * SECOND, NOON + DAY, 10_000)["pump-1.speed"]
         nothing = history.buckets("pump-9.speed", NOON, NOON + DAY, 10)["pump-9.speed"]
@@ -115,7 +117,7 @@ def test_buckets_without_rows_are_gaps(folder: Path) -> None:
 
 @pytest.mark.slow
 @COMPACTED
-def test_an_export_equals_the_rows_read(folder: Path, rows: list[list[Row]]) -> None:
+def test_an_export_of_a_history_has_the_rows_that_read_returns(folder: Path, rows: list[list[Row]]) -> None:
     begin, end = NOON + 20 * SECOND, NOON + 320 * SECOND
     wanted = [row for row in flat(rows) if begin <= row.time_ns < end and row.drive == "pump-1"]
     names = ["pump-1.speed", "pump-1.current"]
@@ -148,7 +150,7 @@ def test_history_rows_convert_to_a_pandas_table(folder: Path, rows: list[list[Ro
     assert frame.value.dropna().tolist() == [row.value for row in mine if row.value is not None]
 
 
-def test_a_range_may_be_given_in_ns_or_datetimes(tmp_path: Path) -> None:
+def test_a_time_range_may_be_given_in_ns_or_as_datetimes(tmp_path: Path) -> None:
     rows = random_rows(1, NOON, 300)
     record(tmp_path, [rows])
     moment = datetime(2026, 11, 21, 12, 0, 20, tzinfo=UTC)
@@ -162,7 +164,7 @@ def test_a_range_may_be_given_in_ns_or_datetimes(tmp_path: Path) -> None:
             history.read(None, 1.5)  # type: ignore[arg-type]
 
 
-def test_invalid_queries_are_errors(tmp_path: Path) -> None:
+def test_invalid_queries_of_a_history_raise_errors(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         History(tmp_path / "none")
     with History(tmp_path) as history:
@@ -178,7 +180,7 @@ def test_invalid_queries_are_errors(tmp_path: Path) -> None:
             history.buckets("a.b", NOON, NOON + DAY, 0)
 
 
-def test_a_grid_covers_its_range() -> None:
+def test_buckets_cover_the_requested_range() -> None:
     dice = random.Random(7)
     for _ in range(examples(6700)):
         begin = NOON + dice.randrange(DAY)
@@ -224,7 +226,7 @@ def test_a_reader_sees_new_rows_exactly_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_replaced_files_lose_no_row_for_a_reader(tmp_path: Path) -> None:
+def test_a_reader_loses_no_row_when_files_are_compacted_meanwhile(tmp_path: Path) -> None:
     """Files are compacted after the reader has listed them and before it reads them. Each row is still read
     once.
     """
@@ -234,19 +236,19 @@ def test_replaced_files_lose_no_row_for_a_reader(tmp_path: Path) -> None:
     with History(tmp_path) as history:
         found = iter(history.read())
         first = list(next(found))
-        compact(tmp_path, 4)  # by now the reader has opened the first segment; the others are only listed
+        compact(tmp_path, 4)  # the reader has opened only the first segment
         assert first + [row for batch in found for row in batch] == flat(rows)
     with History(tmp_path) as history:
         found = iter(history.read())
         first = list(next(found))
         for path in tmp_path.glob("rows/00000003.*"):
-            path.unlink()  # removes the file, as if it were too old
+            path.unlink()  # as the recorder does with old files
         left = first + [row for batch in found for row in batch]
     assert left == flat([*rows[:2], rows[3]])
 
 
 @pytest.mark.slow
-def test_names_that_first_appear_in_a_later_segment_are_found(tmp_path: Path) -> None:
+def test_series_that_first_appear_in_a_later_segment_are_read(tmp_path: Path) -> None:
     rows = random_rows(1, NOON, 60)
     later = [row._replace(drive="насос, «новый»", register="torque") for row in random_rows(2, NOON, 60)]
     record(tmp_path, [[*rows, *later], later])
@@ -268,7 +270,7 @@ def test_segments_written_by_poll_are_read_as_a_history(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_damaged_segment_hides_no_other(tmp_path: Path) -> None:
+def test_segments_beside_a_damaged_segment_are_read(tmp_path: Path) -> None:
     rows = [
         random_rows(number, NOON + number * 60 * SECOND, count) for number, count in enumerate((20, 120, 20))
     ]
@@ -294,7 +296,7 @@ def test_a_damaged_segment_hides_no_other(tmp_path: Path) -> None:
 def test_an_incomplete_end_of_a_closed_segment_is_reported(tmp_path: Path) -> None:
     rows = [random_rows(number, NOON + number * 60 * SECOND, 120) for number in range(2)]
     record(tmp_path, rows)
-    for number in (2, 1):  # an incomplete end of the newest segment is not damage
+    for number in (2, 1):  # segment 2 may still grow, so only segment 1 is damaged
         path = tmp_path / f"rows.0000000{number}.arrows"
         path.write_bytes(path.read_bytes() + b"\0" * 7)
         with History(tmp_path) as history:
@@ -328,11 +330,11 @@ def test_export_without_duckdb_uses_pyarrow(tmp_path: Path, monkeypatch: pytest.
 
 @pytest.mark.slow
 @pytest.mark.parametrize("most", [0, 150, 100_000], ids="{} rows are kept".format)
-def test_plots_of_a_growing_segment_have_all_rows(
+def test_buckets_of_a_growing_segment_include_all_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
-    """Queries for varying series and ranges use the cache. Some ranges start before the cached rows, or long
-    after.
+    """Queries for changing series and ranges use cached rows. Some ranges start before the cached rows,
+    others long after them.
     """
     monkeypatch.setattr(growing, "MOST_KEPT", most)
     monkeypatch.setattr(growing, "MOST_TENS", 3 if most else 0)
@@ -352,7 +354,9 @@ def test_plots_of_a_growing_segment_have_all_rows(
                 assert end - begin < 8 * SECOND or grid_of(begin, end, 4).is_of_tens
 
 
-def test_cache_of_unknown_names_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_of_requests_for_unknown_series_is_limited(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(growing, "MOST_SERIES", 3)
     with SegmentWriter(tmp_path / "rows.arrows", METADATA, every=1e9) as writer, History(tmp_path) as history:
         writer.write(from_rows(random_rows(1, NOON, 200)))
@@ -372,7 +376,7 @@ def test_ten_second_summaries_are_computed_for_requested_series_only(tmp_path: P
             assert [".".join(one) for one in segment._tens] == SERIES[: number + 1][::-1]
 
 
-def test_duckdb_spills_into_a_private_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_duckdb_uses_a_private_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     database = Database("100MB")
@@ -384,10 +388,10 @@ def test_duckdb_spills_into_a_private_folder(tmp_path: Path, monkeypatch: pytest
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_slow_reader_outlasts_files_that_are_replaced_again_and_again(
+def test_a_reader_succeeds_although_files_are_replaced_repeatedly(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On a busy machine, each listed file may be replaced before it is read."""
+    """Each file that the reader lists is replaced before it is read, as may happen on a busy machine."""
     record(tmp_path, [random_rows(1, NOON, 100)])
     replaced = iter(range(20))
 

@@ -86,7 +86,7 @@ def test_closing_writes_all_rows(tmp_path: Path, writers: Callable[..., HistoryW
 
 
 def test_batches_of_two_pollers_are_recorded(tmp_path: Path, writers: Callable[..., HistoryWriter]) -> None:
-    """The two pollers use the same codes for different names."""
+    """In the batches of the two pollers, the same code stands for different names."""
     writer = writers(tmp_path)
     taken = [
         batch(Names([name]), 0, range(20), NOON, SECOND) for name in ("pump-1", "fan", "pump-1", "mixer")
@@ -98,7 +98,7 @@ def test_batches_of_two_pollers_are_recorded(tmp_path: Path, writers: Callable[.
         assert rows_in(history) == [row for one in taken for row in one]
 
 
-def test_the_writer_keeps_no_memory_of_the_core(
+def test_the_writer_copies_rows_out_of_the_cores_memory(
     tmp_path: Path, writers: Callable[..., HistoryWriter]
 ) -> None:
     """Rows are copied, because the core reuses a batch's memory."""
@@ -114,7 +114,7 @@ def test_the_writer_keeps_no_memory_of_the_core(
         assert rows_in(history) == expected
 
 
-def test_another_plant_starts_a_segment(tmp_path: Path, writers: Callable[..., HistoryWriter]) -> None:
+def test_a_changed_plant_starts_a_new_segment(tmp_path: Path, writers: Callable[..., HistoryWriter]) -> None:
     writer = writers(tmp_path)
     writer.take(some(0))
     until(lambda: writer.state().rows == 20)
@@ -269,7 +269,7 @@ def test_the_oldest_files_beyond_the_size_are_removed(
 
 
 @pytest.mark.long
-def test_a_failed_child_is_reported_and_started_again(
+def test_a_failed_compaction_is_reported_and_started_again(
     tmp_path: Path,
     writers: Callable[..., HistoryWriter],
     monkeypatch: pytest.MonkeyPatch,
@@ -288,7 +288,7 @@ def test_a_failed_child_is_reported_and_started_again(
         assert sorted(rows_in(history)) == sorted(rows)
 
 
-def test_any_bytes_in_a_child_s_output_are_reported(
+def test_error_output_of_a_compaction_that_is_not_utf_8_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     program = tmp_path / "python"
@@ -305,7 +305,7 @@ def test_any_bytes_in_a_child_s_output_are_reported(
     until(is_told)
 
 
-def test_file_names_have_numbers_and_times() -> None:
+def test_names_of_history_files_have_segment_numbers_and_times() -> None:
     name = file_name(7, 7, NOON + 1, NOON + 600 * SECOND)
     assert name == "00000007.20261121T120000Z-20261121T121000Z.parquet"
     assert file_name(7, 9, 0, 1) == "00000007-00000009.19700101T000000Z-19700101T000001Z.parquet"
@@ -332,12 +332,12 @@ def killed_recorder(folder: Path, run: int, dice: random.Random) -> int:
     here = {**os.environ, "PYTHONPATH": SUPPORT}
     with BoundProcess(words, stdout=subprocess.PIPE, text=True, env=here, start_new_session=True) as child:
         assert child.stdout is not None
-        assert child.stdout.readline()  # waits until the process records
-        with History(folder) as history:  # read during recording
+        assert child.stdout.readline()  # wait until the recorder writes
+        with History(folder) as history:  # read while the recorder writes
             check_runs(history, {}, NOON + run * RUN)
         time.sleep(dice.uniform(0, 1.2))
         if dice.random() < 0.5:
-            child.kill()  # kills only the recorder: compaction continues
+            child.kill()  # the recorder's child process still compacts
         else:
             os.killpg(child.pid, signal.SIGKILL)
         said = child.stdout.read().split("\n")[:-1]
@@ -370,7 +370,7 @@ def total_of_tens(history: History, runs: int) -> int:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kills", first_in_ci(3, 200))
-def test_kills_of_recorder_and_compaction_lose_no_row(tmp_path: Path, kills: int) -> None:
+def test_killing_the_recorder_and_compaction_loses_no_row(tmp_path: Path, kills: int) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")
     dice = random.Random(kills)
     written: dict[str, int] = {}
@@ -384,7 +384,7 @@ def test_kills_of_recorder_and_compaction_lose_no_row(tmp_path: Path, kills: int
                 total = check_runs(history, written)
                 assert total_of_tens(history, run + 1) == total
     assert sum(written.values()) > 100 * kills
-    for _ in range(1200):  # a remaining child of low priority may still compact
+    for _ in range(1200):  # the killed recorder's child may still compact
         compact([str(tmp_path), "--below", "99999999"])
         found = listing(tmp_path)
         if not found.segments:
@@ -392,7 +392,7 @@ def test_kills_of_recorder_and_compaction_lose_no_row(tmp_path: Path, kills: int
         time.sleep(0.1)
     assert not found.segments
     assert len(found.rows) > kills // 2
-    assert any(file.first < file.last for file in found.tens)  # ten-second summaries of a day were merged
+    assert any(file.first < file.last for file in found.tens)  # some summaries were merged
     assert not [*tmp_path.rglob("*.tmp"), *(tmp_path / "damaged").iterdir()]
     with History(tmp_path) as history:
         assert check_runs(history, written) == total
@@ -406,13 +406,15 @@ MS = 1_000_000
 
 
 def inside(folder: Path) -> SimpleNamespace:
-    """Return an object with those attributes of a gateway that a historian uses."""
+    """Return a fake gateway with the attributes that a Historian uses."""
     return SimpleNamespace(plant=Plant((), Path("plant.toml")), folder=folder)
 
 
 @asynccontextmanager
 async def historian_in(folder: Path) -> AsyncIterator[historian.Historian]:
-    """Yield a historian whose history is in this folder; it is closed at the end of the block."""
+    """Yield a Historian (the gateway's recorder) that records into this folder. It is closed after the
+    block.
+    """
     made = build(HistorySettings(), inside(folder))
     try:
         yield made
@@ -420,7 +422,7 @@ async def historian_in(folder: Path) -> AsyncIterator[historian.Historian]:
         await made.close()
 
 
-def test_all_mistakes_of_the_history_table_are_reported_together() -> None:
+def test_all_mistakes_in_the_table_history_are_reported_together() -> None:
     with pytest.raises(ValueError, match="invalid time") as failure:
         HistorySettings(keep="for ever", most="20", rotate="0 s")
     lines = str(failure.value).splitlines()
@@ -443,10 +445,10 @@ def test_infinity_and_nan_are_null_in_json() -> None:
     assert [found[key] for key in ("least", "mean", "most")] == [[None, 1.0], [None, 1.5], [None, 2.0]]
 
 
-async def test_large_answers_are_made_outside_the_event_loop_or_refused(
+async def test_large_history_queries_run_outside_the_event_loop_or_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Otherwise a stop, which needs the asyncio loop, would wait for the computation."""
+    """A stop command also needs the event loop, so it would wait for a computation there."""
     makers: list[int] = []
 
     def noted(made: Buckets) -> dict[str, Any]:
@@ -465,8 +467,10 @@ async def test_large_answers_are_made_outside_the_event_loop_or_refused(
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
-async def test_no_export_starts_in_the_event_loop(tmp_path: Path, kind: str) -> None:
-    """Otherwise, reading the metadata of thousands of files would block the loop for seconds."""
+async def test_exports_of_a_history_start_outside_the_event_loop(tmp_path: Path, kind: str) -> None:
+    """An export first reads the metadata of up to thousands of files, which would block the loop for
+    seconds.
+    """
     readers: list[int] = []
 
     class Noted(History):
@@ -490,7 +494,7 @@ async def test_unfinished_exports_of_a_killed_process_are_removed(tmp_path: Path
 
 
 @pytest.mark.slow
-async def test_the_historian_records_rows_and_answers_queries(tmp_path: Path) -> None:
+async def test_the_gateways_history_records_rows_and_answers_queries(tmp_path: Path) -> None:
     part = build(HistorySettings(folder="kept"), inside(tmp_path))
     running = asyncio.create_task(part.run())
     taken = batch(Names(["pump-1"]), 0, range(100), NOON, SECOND)
@@ -502,7 +506,7 @@ async def test_the_historian_records_rows_and_answers_queries(tmp_path: Path) ->
     assert found["step_ms"] == 10_000
     pump, fan = found["series"]["pump-1.speed"], found["series"]["fan.speed"]
     assert pump["time"] == [begin + 10_000 * number for number in range(10)]
-    assert pump["least"] == [10.0 * number for number in range(10)]  # every tenth row is a miss
+    assert pump["least"] == [10.0 * number for number in range(10)]  # every tenth row has no value
     assert pump["most"] == [10.0 * number + 8 for number in range(10)]
     assert pump["mean"] == [10.0 * number + 4 for number in range(10)]
     assert fan["mean"] == [None] * 10

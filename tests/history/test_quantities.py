@@ -1,4 +1,4 @@
-"""A register name that gets another unit in a new segment: values of two units are never mixed."""
+"""If a register has another unit in a new segment, values of the two units are never mixed."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ STATES, OTHER_STATES = {"values": {"RUN": 1, "STOP": 2}}, {"values": {"STOP": 1,
 
 
 def described(about: dict[str, Any]) -> dict[str, Any]:
-    """Return a plant's metadata. `about` describes the register `load` of pump-1; that of pump-2 is in
-    amperes.
+    """Return the metadata of a plant with two pumps. `about` describes the register `load` of pump-1; the
+    `load` of pump-2 is in amperes.
     """
     drives = {"pump-1": {"registers": {"load": about}}, "pump-2": {"registers": {"load": AMPERE}}}
     return {"drives": drives}
 
 
 def recorded(folder: Path, *segments: dict[str, Any]) -> None:
-    """Record a segment per quantity. Each has a different value, during the first 30 s of a different
-    minute.
+    """Record a segment for each description of the register. Each segment has its own value, in the first 30
+    s of its own minute.
     """
     with SegmentWriter(folder / "rows.arrows", {}, every=1e9) as writer:
         for number, about in enumerate(segments):
@@ -57,8 +57,8 @@ def how(request: pytest.FixtureRequest) -> str:
 
 
 def kept(folder: Path, how: str, count: int) -> None:
-    """Leave the segments as they are ("segments"), compact them ("files"), or also merge each day's summaries
-    ("days").
+    """Prepare the history as `how` says: "segments" leaves the recorded segments, "files" compacts them,
+    "days" also merges each day's summaries.
     """
     if how == "segments":
         return
@@ -74,14 +74,14 @@ def of(
     folder: Path, points: int, begin: int = NOON, end: int = NOON + 300 * SECOND
 ) -> tuple[Buckets, Buckets]:
     with History(folder) as history:
-        for _ in range(2):  # the second query uses cached facts about the files
+        for _ in range(2):  # the second query uses cached metadata
             found = history.buckets([SERIES, OTHER], begin, end, points)
     return found[SERIES], found[OTHER]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("points", [300, 30])
-def test_a_series_has_one_unit(tmp_path: Path, how: str, points: int) -> None:
+def test_buckets_of_a_register_have_only_its_newest_unit(tmp_path: Path, how: str, points: int) -> None:
     recorded(tmp_path, AMPERE, PERCENT, AMPERE, PERCENT)
     kept(tmp_path, how, 4)
     found, other = of(tmp_path, points)
@@ -91,7 +91,7 @@ def test_a_series_has_one_unit(tmp_path: Path, how: str, points: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_range_with_one_unit_has_that_unit(tmp_path: Path, how: str) -> None:
+def test_buckets_of_a_range_with_one_unit_have_that_unit(tmp_path: Path, how: str) -> None:
     recorded(tmp_path, AMPERE, PERCENT)
     kept(tmp_path, how, 2)
     before, _ = of(tmp_path, 40, end=NOON + 40 * SECOND)
@@ -103,14 +103,14 @@ def test_a_range_with_one_unit_has_that_unit(tmp_path: Path, how: str) -> None:
 @pytest.mark.parametrize(
     ("first", "second", "told"),
     [
-        (AMPERE, {"unit": "A", "step": 0.01}, ("A", 60, ())),  # a finer step is the same quantity
+        (AMPERE, {"unit": "A", "step": 0.01}, ("A", 60, ())),  # only the step differs: the same quantity
         (RAW, AMPERE, ("A", 30, ("raw count",))),
         (STATES, OTHER_STATES, ("names", 30, ("names",))),
         (STATES, STATES, ("names", 60, ())),
         ({}, AMPERE, ("A", 30, ("",))),
     ],
 )
-def test_equal_units_or_names_are_one_quantity(
+def test_values_with_equal_units_or_names_are_combined(
     tmp_path: Path, first: dict[str, Any], second: dict[str, Any], told: tuple[str, int, tuple[str, ...]]
 ) -> None:
     recorded(tmp_path, first, second)
@@ -118,7 +118,7 @@ def test_equal_units_or_names_are_one_quantity(
     assert (found.unit, sum(found.n), found.left_out) == told
 
 
-def test_empty_metadata_separates_no_quantities() -> None:
+def test_units_are_not_read_from_invalid_metadata() -> None:
     for strange in (
         None,
         [],
@@ -132,7 +132,7 @@ def test_empty_metadata_separates_no_quantities() -> None:
     }
 
 
-def test_rows_before_a_changed_plant_are_in_the_earlier_segment(tmp_path: Path) -> None:
+def test_rows_polled_before_a_plant_change_are_in_the_earlier_segment(tmp_path: Path) -> None:
     writer = HistoryWriter(tmp_path, {"drives": {"pump-1": {"registers": {"speed": AMPERE}}}})
     names = Names(["pump-1"])
     for first, unit in ((0, PERCENT), (10, AMPERE), (20, AMPERE)):
@@ -158,8 +158,10 @@ PARTED = {SERIES: {10.0, 1000.0}, f"{SERIES} [A]": {1.0, 100.0}, OTHER: {1.0, 10
 
 
 @pytest.mark.long
-def test_a_column_has_one_unit(tmp_path: Path, how: str) -> None:
-    """Rows of another quantity have a column with the unit in its name, in queries and in every export."""
+def test_rows_with_an_earlier_unit_have_a_separate_column(tmp_path: Path, how: str) -> None:
+    """Rows with an earlier unit are in a column with that unit in its name, in queries and in every
+    export.
+    """
     (tmp_path / "h").mkdir()
     recorded(tmp_path / "h", AMPERE, PERCENT, AMPERE, PERCENT)
     kept(tmp_path / "h", how, 4)
@@ -185,7 +187,7 @@ def test_a_column_has_one_unit(tmp_path: Path, how: str) -> None:
                 assert found.metadata["drives"]["pump-1"]["registers"]["load [A]"]["unit"] == "A"
 
 
-def test_columns_keep_their_quantity_while_the_history_grows(tmp_path: Path) -> None:
+def test_columns_keep_their_unit_while_the_history_grows(tmp_path: Path) -> None:
     recorded(tmp_path, AMPERE)
     with History(tmp_path) as history:
         rows = history.read(SERIES)
@@ -208,7 +210,7 @@ def test_registers_with_different_value_names_have_two_columns(tmp_path: Path) -
 
 
 @pytest.mark.long
-def test_compacted_rows_have_their_units(tmp_path: Path) -> None:
+def test_compacted_files_have_the_unit_of_each_row(tmp_path: Path) -> None:
     duckdb = pytest.importorskip("duckdb", reason="needs duckdb")
     recorded(tmp_path, AMPERE, RAW, STATES, {})
     kept(tmp_path, "days", 4)

@@ -1,5 +1,5 @@
-"""Compare the decoding of random frames, whole and damaged, with libmodbus and pymodbus; rules list
-differences.
+"""Compare the decoding of random frames, valid and damaged, with libmodbus and pymodbus. Each known
+difference has a rule.
 """
 
 from __future__ import annotations
@@ -99,7 +99,9 @@ def has_other_data(said: SampleFrame) -> bool:
 
 @dataclass(frozen=True)
 class Rule:
-    """A known difference: stricter (only we reject a frame), looser (the reverse), or decoded otherwise."""
+    """A known difference from another library: stricter (only multidrop rejects the frame), looser (only the
+    other library rejects it), or otherwise (both decode it, differently).
+    """
 
     kind: str
     judges: tuple[str, ...]
@@ -312,7 +314,7 @@ def test_requests_decode_as_in_libmodbus_server(libmodbus: Libmodbus) -> None:
         ours = message if isinstance(message, str) else expected(used, message)
         if isinstance(theirs, Understood) and isinstance(message, Message) and theirs.reply:
             used, _ = parse_reply(RTU, theirs.reply, message)
-            assert used == len(theirs.reply), said  # we accept libmodbus's encoding
+            assert used == len(theirs.reply), said  # we accept libmodbus's reply
             theirs = replace(theirs, reply=theirs.reply[1:-2])
             answers += 1
         differences += compare(said, ours, theirs)

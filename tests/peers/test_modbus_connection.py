@@ -24,7 +24,8 @@ BACKENDS = ("multidrop.modbus_connection", "modbus_connection.pymodbus", "modbus
 LATE_S, TIMEOUT_S = 0.6, 0.5
 READS, LATE_EVERY = 40, 4  # every fourth reply is late
 
-Answer = Callable[[bytes], bytes]  # takes a request's body, from the unit id on; returns the reply's body
+# takes a request from the unit id on, without checksum; returns a reply in the same form
+Answer = Callable[[bytes], bytes]
 
 
 def crc(data: bytes) -> bytes:
@@ -75,7 +76,9 @@ async def device(answer: Answer, framer: str, late: Iterator[bool]) -> AsyncIter
 
 
 class Registers:
-    """Registers that are read and written; `requests` are the bodies of all requests."""
+    """A simulated device whose registers can be read and written. `requests` has the bodies of all requests
+    so far.
+    """
 
     def __init__(self, held: Callable[[int], int]) -> None:
         self.held = held
@@ -99,7 +102,7 @@ class Registers:
 
 
 def own_value(address: int) -> int:
-    """Return the value of a register, which shows its address."""
+    """Return a register's value, which is different for each address."""
     return address * 257 & 0xFFFF
 
 
@@ -128,7 +131,7 @@ async def late_values(backend: str, framer: str) -> tuple[int, int, int]:
 
 
 @pytest.mark.skipif(find_spec("modbus_connection") is not None, reason="modbus-connection is installed")
-def test_without_the_package_one_sentence_says_what_to_install() -> None:
+def test_error_without_modbus_connection_says_what_to_install() -> None:
     with pytest.raises(ImportError, match=r"needs Python 3\.12 or newer .* modbus-connection: pip install"):
         import_module("multidrop.modbus_connection")
 
@@ -158,7 +161,7 @@ def run(use: Callable[[Any, Registers], Awaitable[None]], held: Callable[[int], 
 
 
 @needs_package
-def test_one_register_is_written_by_the_function_that_the_caller_chose() -> None:
+def test_one_register_is_written_with_the_function_code_of_the_caller() -> None:
     """Some devices know function 16 only, even for one register."""
 
     async def use(connection: Any, registers: Registers) -> None:
@@ -172,7 +175,7 @@ def test_one_register_is_written_by_the_function_that_the_caller_chose() -> None
 
 @needs_package
 def test_a_command_register_that_returns_to_0_raises_nothing(caplog: pytest.LogCaptureFixture) -> None:
-    """A caller that repeats a write after an error would repeat the command."""
+    """If this write raised an error, a caller might write again and so repeat the command."""
 
     async def use(connection: Any, registers: Registers) -> None:
         registers.written = type("Forgetful", (dict,), {"__ior__": lambda self, other: self})()
@@ -183,7 +186,7 @@ def test_a_command_register_that_returns_to_0_raises_nothing(caplog: pytest.LogC
 
 
 @needs_package
-def test_functions_and_parameters_that_are_not_supported_are_refused_in_one_sentence() -> None:
+def test_unsupported_functions_and_parameters_are_refused_in_one_sentence() -> None:
     neutral, ours = import_module("modbus_connection"), import_module("multidrop.modbus_connection")
     for params in (neutral.ModbusUdpParams(host="h"), neutral.ModbusTlsParams(host="h")):
         with pytest.raises(ValueError, match=r"multidrop does not support Modbus\w+Params: use"):

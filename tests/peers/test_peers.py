@@ -58,7 +58,7 @@ class Server(NamedTuple):
 
     @property
     def words(self) -> list[str]:
-        """Return the arguments that name the device in a command."""
+        """Return the command-line arguments that name this server."""
         framing = [] if self.framing is None else ["--framing", self.framing]
         return [self.port, DEVICE, str(ADDRESS), *framing]
 
@@ -105,15 +105,15 @@ def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Server]:
 
 @pytest.mark.slow
 @patient
-def test_registers_and_coils_are_read(server: Server) -> None:
+def test_registers_and_coils_of_other_servers_are_read(server: Server) -> None:
     with Bus(server.port) as bus:
         assert server.attach(bus).read_many(Device.registers.values()) == HELD
 
 
 @pytest.mark.slow
 @patient
-def test_undeclared_addresses_can_be_read(server: Server) -> None:
-    """Check that undeclared registers and coils have the values of the servers' sources."""
+def test_undeclared_registers_of_other_servers_can_be_read(server: Server) -> None:
+    """Check that undeclared registers and coils have the values that the server's source defines."""
     with Bus(server.port) as bus:
         device = server.attach(bus)
         for function in (3, 4):
@@ -141,7 +141,7 @@ def test_the_identity_of_a_server_can_be_read(server: Server) -> None:
 
 @pytest.mark.slow
 @patient
-def test_written_values_are_read_back(server: Server) -> None:
+def test_values_written_to_other_servers_are_read_back(server: Server) -> None:
     with Bus(server.port) as bus:
         device = server.attach(bus)
         for name, value in (("frequency", 28.5), ("energy", 1234567.89), ("relay", 0), ("relay", 1)):
@@ -161,7 +161,7 @@ def test_exception_code_raises_drive_exception(server: Server) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(
     "name", [name for name in COMMANDS if name != "libmodbus tcp"]
-)  # this server answers requests to any unit id
+)  # a server that answers requests to any unit id
 def test_a_read_from_an_address_without_a_device_times_out(name: str, tmp_path: Path) -> None:
     advice = r"name the port socket://127\.0\.0\.1:\d+" if "tcp" in name else "does not answer"
     with running(name, tmp_path) as server, Bus(server.port) as bus:
@@ -241,7 +241,7 @@ METER_HOLDS = {
 
 
 def family_file(folder: Path, *, stated: bool) -> Path:
-    """Write the meter's family file, with or without its read limits and gaps."""
+    """Write the meter's family file. With `stated`, it declares the meter's read limits and gaps."""
     lines = FAMILY.read_text("utf-8").splitlines(keepends=True)
     path = folder / ("meter.toml" if stated else "unstated.toml")
     path.write_text("".join(line for line in lines if stated or not line.startswith(STATED)), "utf-8")
@@ -276,7 +276,7 @@ def plant_file(folder: Path, port: str, family: Path, *polled: str) -> Path:
 @pytest.mark.long
 @pytest.mark.parametrize("stated", [True, False], ids=["gaps stated", "nothing stated"])
 def test_poll_reads_all_40_values_of_the_server(tmp_path: Path, stated: bool) -> None:
-    """Check all values; the server rejects undeclared registers."""
+    """The server rejects reads of undeclared registers."""
     assert len(METER_HOLDS) == 40
     family = family_file(tmp_path, stated=stated)
     rows: list[Row] = []
@@ -311,7 +311,7 @@ def test_plan_of_39_floats_at_9600_baud_prints_the_documented_table(
 @pytest.mark.parametrize(
     ("stated", "most"), [(True, "at most 80"), (False, "at most 125, the standard's limit")]
 )
-def test_models_prints_the_read_limit(
+def test_the_command_models_prints_the_read_limit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], stated: bool, most: str
 ) -> None:
     assert main(["models", str(family_file(tmp_path, stated=stated))]) == 0

@@ -1,7 +1,6 @@
-"""Kill clients at random while they poll, record and write: acknowledged data must be stored exactly once.
-
-A client acknowledges data after a call has returned: rows after `RecordingWriter.write`, and numbers after
-`Drive.write`. By default 20 clients are killed; more with `pytest tests/recording/test_crash.py --kills 200`.
+"""Kill clients (processes that poll, record and write) at random times: reported data must be stored exactly
+once. A client reports rows after `RecordingWriter.write` has returned, and numbers after `Drive.write` has
+returned. By default 20 clients are killed; more with `pytest tests/recording/test_crash.py --kills 200`.
 """
 
 from __future__ import annotations
@@ -29,8 +28,8 @@ from multidrop.sim import SimulatedDrive, Simulator, Wire
 from multidrop.sim.memory import MemoryCell
 
 SEED = 6
-MOST_TOLD = 9  # limit of lines that a client reports before it is killed
-LONGEST_WAIT = 0.03  # limit in s of the time from the last awaited line to the kill
+MOST_TOLD = 9  # largest number of reports for which the test waits before it kills a client
+LONGEST_WAIT = 0.03  # largest delay in s between the last of these reports and the kill
 
 
 class Counting(SimulatedDrive):
@@ -52,7 +51,7 @@ class Counting(SimulatedDrive):
 
 
 class Nursery:
-    """A process that starts clients as its children, which the test kills."""
+    """A process that starts clients as its children; the test kills the clients."""
 
     def __init__(self, port: str, directory: Path) -> None:
         self._port = port
@@ -104,10 +103,8 @@ def told(directory: Path, life: str) -> list[str]:
 
 
 def check_rows(rows: Sequence[Row]) -> None:
-    """Check that the count grows by one from value to value, and by at most one more for each row without a
-    value.
-
-    On a busy machine a drive may be treated as silent. Then some rows have a status "not asked".
+    """Check that each value is the previous value plus one, or plus up to one more for each row without a
+    value in between. On a busy machine the drive may count as silent: then rows have the status "not asked".
     """
     samples = [row for row in rows if row.value is not None]
     assert all(before.monotonic_ns < after.monotonic_ns for before, after in pairwise(samples))
@@ -121,11 +118,13 @@ def check_rows(rows: Sequence[Row]) -> None:
 
 
 def check_recordings(directory: Path, life: str, acknowledged: int | None) -> int:
-    """Check that both recordings open and have the acknowledged rows; return the number of these rows."""
+    """Check that both recordings can be opened and have at least the reported rows; return the number of
+    reported rows.
+    """
     for suffix in (".arrows", ".csv"):
         path = directory / f"{life}{suffix}"
         if acknowledged is None and (not path.exists() or not path.stat().st_size):
-            continue  # killed before the recording existed
+            continue  # the client was killed before the recording existed
         reader = open_recording(path)
         assert reader.metadata == METADATA
         rows = [row for batch in reader for row in batch]
@@ -147,8 +146,8 @@ def check_ledger(directory: Path, sent: int, lives: int) -> None:
 
 
 def check_audit(directory: Path, numbers: Sequence[int], acknowledged: Sequence[int], lives: int) -> None:
-    """Check that the audit log has each acknowledged write, as done, and neither a write twice nor an unsent
-    write.
+    """Check that the audit log has each reported write, no write twice, and no unsent write, and all as
+    "done".
     """
     path = audit(directory)
     records = list(read_audit(path)) if path.exists() else []
@@ -161,7 +160,7 @@ def check_audit(directory: Path, numbers: Sequence[int], acknowledged: Sequence[
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_reported_rows_of_a_killed_client_are_recorded_once(
+def test_rows_that_a_killed_client_reported_are_recorded_exactly_once(
     request: pytest.FixtureRequest, nursery: Nursery, counting: Counting, tmp_path: Path
 ) -> None:
     chance = random.Random(SEED)

@@ -1,4 +1,4 @@
-"""Exports as MDF4 and HDF5, read with asammdf and h5py, and compared with the recording's own table."""
+"""MDF4 and HDF5 exports of a recording, read with asammdf and h5py, have the same rows as the recording."""
 
 from __future__ import annotations
 
@@ -36,7 +36,9 @@ COMMENT = Row(UTC_0 + SECOND // 2, SECOND // 2, None, "event", "comment", None, 
 
 
 def rows(number: int) -> list[Row]:
-    """Return rows of two drives and a phase at irregular times; a tenth of the values is missed."""
+    """Return rows of two drives and of a test's phases, at irregular times; a tenth of the rows has no
+    value.
+    """
     chance, found, at = random.Random(number), [*phase_row(0, UTC_0, 0), COMMENT], 0.0
     for _ in range(number):
         at += chance.uniform(0.0005, 0.003)
@@ -50,7 +52,7 @@ def rows(number: int) -> list[Row]:
 
 
 def exported(path: Path, suffix: str, number: int = 400) -> tuple[Path, pa.Table]:
-    """Return an export, and the table of the recording that it was made from."""
+    """Return an exported file, and the table of the exported recording."""
     source, target = record(path / "run.arrows", rows(number), METADATA), path / f"run{suffix}"
     assert convert(source, target) == 3 * number + 3
     return target, pa.table(open_recording(source))
@@ -58,7 +60,7 @@ def exported(path: Path, suffix: str, number: int = 400) -> tuple[Path, pa.Table
 
 @pytest.fixture(params=[1 << 18, 100], ids=["one piece", "many pieces"])
 def _pieces(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Write the export in one piece, or in many."""
+    """Run each test twice: the export is written in one piece, and in many."""
     monkeypatch.setattr("multidrop.recording.series.PIECE_ROWS", request.param)
 
 
@@ -95,11 +97,11 @@ def test_mdf4_has_the_rows_of_the_recording(tmp_path: Path) -> None:
             assert value.unit == {"output_frequency": "Hz", "output_current": "raw count"}.get(register, "")
             statuses = [text.decode() for text in mdf.get(f"{name}.status").samples.tolist()]
             assert statuses == expected["status"]
-            uncertainty = mdf.get(f"{name}.uncertainty")  # it has no samples for misses
+            uncertainty = mdf.get(f"{name}.uncertainty")  # the signal has no samples for rows without a value
             known = [one / 1e9 for one in expected["uncertainty_ns"] if one is not None]
             assert uncertainty.samples.tolist() == pytest.approx(known)
         texts = {str(one, "utf-8") for one in mdf.get(f"pump.{STATE}").samples.tolist()}
-        assert texts == {"NONE", "OVERHEAT", "unnamed"}  # 77 has no name
+        assert texts == {"NONE", "OVERHEAT", "unnamed"}  # fault 77 has no name
         assert set(mdf.get("test.phase").samples.tolist()) == {b"start", b"stop"}
         events = {(one.name, one.comment, begin + round(one.value * 1e9)) for one in mdf.events}
         assert events == {
@@ -134,7 +136,7 @@ def test_hdf5_has_the_rows_of_the_recording(tmp_path: Path) -> None:
         assert json.loads(file["metadata"][()]) == METADATA
 
 
-def test_error_for_another_suffix_names_the_exports(tmp_path: Path) -> None:
+def test_error_for_an_unknown_suffix_lists_the_suffixes_of_exports(tmp_path: Path) -> None:
     source = record(tmp_path / "run.arrows", rows(1), METADATA)
     with pytest.raises(ValueError, match=r"must end in \.arrows, \.csv, \.parquet, \.mf4, \.h5"):
         convert(source, tmp_path / "run.xls")
@@ -143,7 +145,7 @@ def test_error_for_another_suffix_names_the_exports(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("suffix", "library", "extra"), [(".mf4", "asammdf", "mdf"), (".h5", "h5py", "hdf5")]
 )
-def test_missing_library_is_reported_with_its_extra(
+def test_error_for_a_missing_library_names_the_extra_to_install(
     suffix: str, library: str, extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = record(tmp_path / "run.arrows", rows(1), METADATA)
@@ -160,7 +162,7 @@ def test_missing_library_is_reported_with_its_extra(
 
 @pytest.mark.parametrize("suffix", [pytest.param(".mf4", marks=pytest.mark.slow), ".h5"])
 @pytest.mark.parametrize("time_ns", [-1, (1 << 63) - 1])
-def test_row_without_a_usable_time_is_reported(time_ns: int, suffix: str, tmp_path: Path) -> None:
+def test_an_export_refuses_rows_before_1970_or_after_2200(time_ns: int, suffix: str, tmp_path: Path) -> None:
     wrong = rows(1)[-1]._replace(time_ns=time_ns)
     source, target = record(tmp_path / "run.arrows", [*rows(1), wrong], METADATA), tmp_path / f"run{suffix}"
     with pytest.raises(ValueError, match=rf"run{suffix}: rows from before 1970 or after 2200 do not fit"):
@@ -169,7 +171,7 @@ def test_row_without_a_usable_time_is_reported(time_ns: int, suffix: str, tmp_pa
 
 
 @pytest.mark.parametrize("suffix", [pytest.param(".mf4", marks=pytest.mark.slow), ".h5"])
-def test_existing_file_is_kept_and_an_incomplete_one_is_removed(
+def test_export_keeps_an_existing_file_and_removes_an_incomplete_one(
     suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source, target = record(tmp_path / "run.arrows", rows(1), METADATA), tmp_path / f"run{suffix}"
@@ -204,7 +206,7 @@ def test_drives_and_registers_with_similar_names_have_separate_groups_in_hdf5(tm
         assert [group["value"][:].tolist() for group in groups] == [[1.0, 2.0]] * 4
 
 
-def test_interrupt_during_a_write_of_hdf5_leaves_no_file(
+def test_interrupt_during_a_write_of_an_hdf5_export_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from multidrop.recording.hdf5 import GuardedFile
@@ -227,8 +229,8 @@ def interrupted_once(
 ) -> Callable[..., Any]:
     """Return a function that at its first call sends SIGINT to the main thread, and then does the work.
 
-    The function catches all exceptions, as asammdf does. A signal is sent only when the main thread has
-    submitted work to the export's thread: first the step that calls `work`, then the removal of the file.
+    The function catches all exceptions, as asammdf does. It sends the signal only when the main thread waits
+    for the export's thread.
     """
     handled, steps, calls = Semaphore(0), Semaphore(0), count()
     submit = ThreadPoolExecutor.submit
@@ -271,10 +273,10 @@ def _usual_sigint() -> Iterator[None]:
 @pytest.mark.usefixtures("_usual_sigint")
 @pytest.mark.parametrize("interrupts", [1, 2])
 @pytest.mark.parametrize("step", ["attach", "append", "extend", "save"])
-def test_interrupt_in_a_step_of_mdf4_leaves_no_file(
+def test_two_interrupts_during_a_step_of_an_mdf4_export_leave_no_file(
     step: str, interrupts: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The second Ctrl-C interrupts the wait for the library, which then still removes its file."""
+    """A second Ctrl-C interrupts the wait for the library's thread. That thread still removes the file."""
     from multidrop.recording.mdf4 import MDF
 
     source = record(tmp_path / "run.arrows", rows(400), METADATA)
@@ -290,7 +292,9 @@ def test_interrupt_in_a_step_of_mdf4_leaves_no_file(
 def test_interrupt_between_two_steps_of_an_export_leaves_no_file(
     suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ctrl-C comes when a step is handed to the library's thread: in turn at each step of the export."""
+    """Ctrl-C comes when the main thread passes a step to the library's thread. The test repeats this for each
+    step.
+    """
     source, submit = record(tmp_path / "run.arrows", rows(400), METADATA), ThreadPoolExecutor.submit
     monkeypatch.setattr("multidrop.recording.series.PIECE_ROWS", 100)
     for last in count():
@@ -315,8 +319,10 @@ def test_interrupt_between_two_steps_of_an_export_leaves_no_file(
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit for a file's size")
 @pytest.mark.parametrize("suffix", [".mf4", ".h5"])
-def test_full_disk_leaves_no_file(suffix: str, tmp_path: Path) -> None:
-    """Files are limited to 20,000 bytes. A failed write that HDF5 noticed would crash the process."""
+def test_full_disk_leaves_no_exported_file(suffix: str, tmp_path: Path) -> None:
+    """The system limits files to 20,000 bytes. HDF5 would crash the process if it noticed the failed
+    write.
+    """
     import resource
 
     source = record(tmp_path / "run.arrows", rows(2000), METADATA)

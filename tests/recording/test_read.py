@@ -60,7 +60,7 @@ def test_pandas_and_polars_get_times_with_their_type(path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_wide_form_joins_rows_of_several_batches(path: Path) -> None:
+def test_the_wide_table_joins_rows_of_several_batches(path: Path) -> None:
     wide = multidrop.open_recording(path).wide("pump-1.output_frequency", "pump-1.motor_speed")
     table = pa.table(wide).drop(["time"]).to_pydict()
     expected = {
@@ -73,7 +73,7 @@ def test_the_wide_form_joins_rows_of_several_batches(path: Path) -> None:
             assert table[f"pump-1.{register}"][number] == expected.get((time, register))
 
 
-def test_a_column_in_the_metadata_may_have_no_rows(tmp_path: Path) -> None:
+def test_a_register_in_the_metadata_without_rows_is_an_empty_column(tmp_path: Path) -> None:
     path = record(tmp_path / "run.arrows", [row(1, "pump", "output_frequency", 50.0)], ABOUT)
     wide = multidrop.open_recording(path).wide("fan.output_current", PUMP)
     assert pa.table(wide).column("fan.output_current").to_pylist() == [None]
@@ -109,7 +109,7 @@ def test_a_file_that_is_not_a_recording_is_an_error(tmp_path: Path) -> None:
         multidrop.open_recording(3)  # type: ignore[arg-type]
 
 
-def test_steps_of_verb_scripts_are_public_names() -> None:
+def test_the_steps_of_command_scripts_are_public_names() -> None:
     assert next(steps.read(Toy.output_current)) == Read(Toy.output_current)
     assert next(steps.wait(2.0)) == Wait(2.0)
 
@@ -124,7 +124,7 @@ def test_a_writer_replaces_a_recording_only_when_asked(path: Path) -> None:
     assert sum(map(len, found)) == 0
 
 
-def test_a_recording_shows_its_rows_drives_and_span(tmp_path: Path) -> None:
+def test_repr_of_a_recording_shows_its_rows_drives_and_time_span(tmp_path: Path) -> None:
     about = r"^<recording .*run\.csv: 4 rows of 2 drives, 3\.000 s from .*>$"
     path = record(tmp_path / "run.csv", [row(at, f"pump-{at % 2}", "speed", 1.0) for at in range(4)])
     assert re.match(about, repr(multidrop.open_recording(path)))

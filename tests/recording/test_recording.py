@@ -64,7 +64,7 @@ def test_rows_are_read_as_they_were_written(tmp_path: Path, suffix: str) -> None
     assert reader.truncated == 0
     assert rows(reader) == RECORDED
     assert rows(reader) == RECORDED  # a second iteration gives the same rows
-    assert [*chain.from_iterable(reader)] == RECORDED  # each batch is dropped while its rows are read
+    assert [*chain.from_iterable(reader)] == RECORDED  # here no batch is kept while its rows are read
 
 
 @every_format
@@ -124,7 +124,7 @@ def test_a_reader_ends_where_the_recording_ended_when_it_was_opened(tmp_path: Pa
 # ---- opened by other programs ----
 
 
-def test_pyarrow_opens_arrows(tmp_path: Path) -> None:
+def test_pyarrow_opens_an_arrows_file(tmp_path: Path) -> None:
     with pa.ipc.open_stream(record(tmp_path / "a.arrows").read_bytes()) as stream:
         table = stream.read_all()
     table.validate(full=True)
@@ -329,7 +329,7 @@ def test_converting_keeps_rows_and_metadata(tmp_path: Path, suffix: str, target:
 @pytest.mark.slow
 @pytest.mark.long
 def test_converting_needs_memory_for_few_batches(tmp_path: Path) -> None:
-    """The conversion of 13 MB uses at most half as much memory."""
+    """Converting a recording of 13 MB uses at most 6.5 MB of memory."""
     tracemalloc = pytest.importorskip("tracemalloc")
     with open_writer(tmp_path / "a.arrows", {}) as writer:
         batch = counting(16384)
@@ -369,7 +369,7 @@ DAMAGED_AT = {".arrows": struct.pack("<6H", *(0, 1, 2) * 2), ".csv": b",ok", ".p
 @every_format
 @pytest.mark.parametrize("target", FORMATS)
 def test_a_failed_conversion_leaves_no_file(tmp_path: Path, suffix: str, target: str) -> None:
-    """The error's message names the recording, and has no words of the libraries that read it."""
+    """The error's message names the recording, and does not quote the library that read it."""
     path = record(tmp_path / f"a{suffix}")
     content = path.read_bytes()
     at = content.index(DAMAGED_AT[suffix], 0 if suffix == ".parquet" else len(content) // 2) + 4
@@ -384,7 +384,7 @@ def test_a_failed_conversion_leaves_no_file(tmp_path: Path, suffix: str, target:
 
 
 @every_format
-def test_an_interrupted_conversion_leaves_no_file(
+def test_a_conversion_interrupted_by_ctrl_c_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
 ) -> None:
     path = record(tmp_path / "a.csv")
@@ -405,7 +405,7 @@ def test_an_interrupted_conversion_leaves_no_file(
 
 @table("act", [lambda path: open_writer(path, {}), open_recording, repair])
 @table("name", ["a.xlsx", "a", "arrows", "a.arrow"])
-def test_an_unknown_suffix_is_refused(tmp_path: Path, act: object, name: str) -> None:
+def test_a_recording_with_an_unknown_suffix_is_refused(tmp_path: Path, act: object, name: str) -> None:
     assert callable(act)
     with pytest.raises(ValueError, match=rf"{name}: a recording's name must end in \.arrows, \.csv"):
         act(tmp_path / name)
@@ -432,7 +432,7 @@ def test_a_writer_may_be_closed_twice_and_later_writes_fail(tmp_path: Path, suff
 
 
 @pytest.mark.parametrize("act", [lambda path: open_writer(path, {}), open_recording])
-def test_parquet_without_pyarrow_names_the_extra(
+def test_error_for_parquet_without_pyarrow_names_the_extra_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, act: object
 ) -> None:
     assert callable(act)
@@ -443,7 +443,7 @@ def test_parquet_without_pyarrow_names_the_extra(
 
 
 @pytest.mark.parametrize("suffix", [".arrows", ".csv"])
-def test_neither_arrows_nor_csv_need_pyarrow(
+def test_arrows_and_csv_files_are_written_and_read_without_pyarrow(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
 ) -> None:
     for name in ("pyarrow", "numpy", "pandas", "polars"):
@@ -541,7 +541,7 @@ def test_more_statuses_than_a_byte_has_values_are_recorded(tmp_path: Path, count
 
 
 def test_all_exception_codes_are_recorded_in_one_batch(tmp_path: Path) -> None:
-    """The rows have the core's codes for all 255 exceptions, with good replies in between."""
+    """One batch has rows for all 255 exception codes, with good replies in between."""
     columns = Columns(1024)
     for code in range(512):
         reply = completion(code + 1, first_ns=code + 2, words=(7,), exception=code % 256)

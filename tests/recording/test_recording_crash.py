@@ -1,4 +1,4 @@
-"""Recordings after a kill or a full disk keep all complete data; other files are refused."""
+"""A killed writer or a full disk loses only incomplete batches. Files that are not recordings are refused."""
 
 from __future__ import annotations
 
@@ -45,7 +45,9 @@ SUPPORT = [str(folder) for folder in (Path(__file__).parents[1] / "support").ite
 
 
 def record(path: Path, batches: int) -> list[int]:
-    """Record batches of increasing numbers; return the file's length after its head and after each batch."""
+    """Record batches with increasing numbers. Return the file's length without batches, and after each
+    batch.
+    """
     lengths = []
     with open_writer(path, METADATA) as writer:
         lengths.append(path.stat().st_size)
@@ -59,7 +61,7 @@ def record(path: Path, batches: int) -> list[int]:
 
 
 @pytest.mark.long
-def test_random_cuts_of_arrows_lose_only_incomplete_batches(tmp_path: Path) -> None:
+def test_an_arrows_file_cut_at_any_byte_loses_only_the_incomplete_batch(tmp_path: Path) -> None:
     path = tmp_path / "a.arrows"
     lengths = record(path, 12)
     whole = path.read_bytes()
@@ -75,7 +77,7 @@ def test_random_cuts_of_arrows_lose_only_incomplete_batches(tmp_path: Path) -> N
 
 
 @pytest.mark.long
-def test_a_cut_between_dictionary_and_rows_is_readable(tmp_path: Path) -> None:
+def test_a_file_cut_between_a_dictionary_and_its_batch_is_readable(tmp_path: Path) -> None:
     """Dictionaries precede their batch, so a cut may leave some dictionaries without a batch."""
     polars = pytest.importorskip("polars", reason="needs polars")
     path = tmp_path / "a.arrows"
@@ -111,7 +113,7 @@ def test_names_of_a_failed_batch_are_written_with_the_next_batch(tmp_path: Path)
 
 
 def test_a_recording_appended_to_another_is_refused(tmp_path: Path) -> None:
-    """In a file with two recordings, codes in the second one stand for other names."""
+    """The second recording uses the same codes for other names."""
     first, second = tmp_path / "a.arrows", tmp_path / "b.arrows"
     record(first, 2)
     with open_writer(second, METADATA) as writer:
@@ -124,7 +126,7 @@ def test_a_recording_appended_to_another_is_refused(tmp_path: Path) -> None:
 def test_names_that_would_exceed_memory_are_reported_as_damage(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The test scales the limit and the data down by the same factor, 256."""
+    """The limit and the data are both smaller than in practice, by a factor of 256."""
     monkeypatch.setattr(arrow_decoder, "MOST_SPELLED", arrow_decoder.MOST_SPELLED // 256)
     path = tmp_path / "a.arrows"
     row = Row(1, 1, None, "x" * 2**12, "r", None, "no reply")
@@ -136,7 +138,7 @@ def test_names_that_would_exceed_memory_are_reported_as_damage(
 
 
 @pytest.mark.slow
-def test_random_cuts_of_csv_lose_only_the_last_line(tmp_path: Path) -> None:
+def test_a_csv_file_cut_at_any_byte_loses_only_the_last_line(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     lengths = record(path, 3)
     whole = path.read_bytes()
@@ -155,7 +157,7 @@ def test_a_drive_name_with_a_line_end_is_refused() -> None:
         Toy(1, name="pump\n1")
 
 
-def test_a_long_incomplete_line_of_csv_is_skipped(tmp_path: Path) -> None:
+def test_a_long_incomplete_line_of_a_csv_file_is_skipped(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     record(path, 1)
     with path.open("ab") as file:
@@ -298,7 +300,7 @@ def test_a_full_disk_refuses_a_recording(tmp_path: Path, suffix: str) -> None:
 
 
 @growing
-def test_recording_continues_when_there_is_room_again(tmp_path: Path, suffix: str) -> None:
+def test_recording_continues_when_the_disk_has_room_again(tmp_path: Path, suffix: str) -> None:
     """If a batch does not fit on the disk, no part of it remains between the batches before and after it."""
     path = tmp_path / f"a{suffix}"
     with open_writer(path, METADATA) as writer:
@@ -317,7 +319,7 @@ def test_recording_continues_when_there_is_room_again(tmp_path: Path, suffix: st
 def test_a_read_only_directory_raises_a_one_sentence_error(tmp_path: Path, suffix: str) -> None:
     open_writer(
         tmp_path / f"a{suffix}", METADATA
-    ).close()  # as root, import the modules that the writer needs
+    ).close()  # import the writer's modules before the child gives up root's rights
     with read_only_directory() as directory:
         path = directory / f"a{suffix}"
         with pytest.raises(RecordingError) as failure:
@@ -337,7 +339,7 @@ def test_a_missing_directory_or_file_raises_an_error(tmp_path: Path, suffix: str
 def test_an_incomplete_batch_is_cut_off_before_the_next_batch_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The disk fails for a while: files can be neither written nor truncated."""
+    """For a while, the simulated disk can neither write nor truncate files."""
     path = tmp_path / "a.arrows"
     with open_writer(path, METADATA) as writer:
         writer.write(counting(ROWS))
@@ -358,7 +360,7 @@ def _fail(file: AppendFile) -> None:
 
 @growing
 def test_an_interrupted_write_leaves_the_file_unchanged(tmp_path: Path, suffix: str) -> None:
-    """The operating system writes a piece in two parts, and Ctrl-C comes between them."""
+    """The system writes a batch in two parts, and Ctrl-C comes between the two."""
     path = tmp_path / f"a{suffix}"
     with open_writer(path, METADATA) as writer:
         writer.write(counting(ROWS))
@@ -391,7 +393,7 @@ class Halving:
 
 @pytest.mark.parametrize("room", range(0, 120, 10))
 def test_a_csv_with_a_header_has_its_metadata(tmp_path: Path, room: int) -> None:
-    """If the .csv has a header, its .csv.json is complete, at whatever byte the disk becomes full."""
+    """The disk becomes full after `room` bytes. If the .csv has a header, its .csv.json must be complete."""
     path = tmp_path / "a.csv"
     whole = {"plant": "p" * 60}
     try:
@@ -409,7 +411,7 @@ def test_a_csv_with_a_header_has_its_metadata(tmp_path: Path, room: int) -> None
 
 @table("suffix", FORMATS)
 def test_rows_keep_their_order_if_the_clock_is_set_back(tmp_path: Path, suffix: str) -> None:
-    """Rows stay in the order of `monotonic_ns`; `time` has the time of the clock that was set back."""
+    """Rows stay in the order of `monotonic_ns`, although `time` jumps back with the clock."""
     path = tmp_path / f"a{suffix}"
     offsets = (UTC_0, UTC_0 - 3600 * SECOND)
     with open_writer(path, METADATA) as writer:
@@ -463,9 +465,8 @@ def test_a_file_with_other_columns_is_refused_as_a_recording(tmp_path: Path, suf
 def test_parquet_file_that_unpacks_to_gigabytes_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, uses_dictionary: bool
 ) -> None:
-    """A few kilobytes of zstd can expand to gigabytes of names, with or without a dictionary.
-
-    The test scales the limits and the data down by the same factor.
+    """A few kilobytes of zstd can expand to gigabytes of names, with or without a dictionary. The limits and
+    the data are both smaller than in practice, by the same factor.
     """
     monkeypatch.setattr(parquet, "MOST_TEXT", parquet.MOST_TEXT // 1000)
     monkeypatch.setattr(parquet, "MOST_OF_GROUP", parquet.MOST_OF_GROUP // 1000)
@@ -519,8 +520,8 @@ def test_damaged_metadata_of_csv_is_named(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_damage_anywhere_raises_a_one_sentence_error(tmp_path: Path, suffix: str) -> None:
-    """After bytes are overwritten, a reader gives other values, only a part of the rows, or a one-sentence
-    error. It never crashes.
+    """Random bytes are overwritten. Then the reader may return wrong values or fewer rows, or raise a
+    one-sentence error, but never crash.
     """
     path = tmp_path / f"a{suffix}"
     record(path, 2)

@@ -55,9 +55,9 @@ def read(path: Path) -> list[Row]:
     return [found for batch in open_recording(path) for found in batch]
 
 
-def test_a_segment_starts_when_the_last_is_old_enough(tmp_path: Path, hand: Hand) -> None:
+def test_a_new_segment_starts_when_the_last_one_is_old_enough(tmp_path: Path, hand: Hand) -> None:
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=60) as writer:
-        assert names(tmp_path) == []  # without rows there is no file
+        assert names(tmp_path) == []  # no file is created before the first rows
         for number in range(5):
             writer.write(rows(number))
             hand.now += 30
@@ -91,7 +91,7 @@ def test_other_files_are_not_segments(tmp_path: Path) -> None:
     assert len([*tmp_path.iterdir()]) == 6  # the four files, a segment, and the lock file
 
 
-def test_other_metadata_starts_a_segment(tmp_path: Path) -> None:
+def test_changed_metadata_starts_a_new_segment(tmp_path: Path) -> None:
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=60) as writer:
         writer.write(rows(0))
         writer.rotate({"plant": "other.toml"})
@@ -112,7 +112,7 @@ def test_only_one_process_records_at_a_time(tmp_path: Path) -> None:
     SegmentWriter(path, ABOUT, every=60).close()
 
 
-def test_segments_are_arrows_files(tmp_path: Path) -> None:
+def test_a_recording_in_segments_needs_the_suffix_arrows(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"the name of a recording in segments must end in \.arrows"):
         SegmentWriter(tmp_path / "run.csv", ABOUT, every=60)
     with pytest.raises(RecordingError, match="cannot be written: No such file or directory"):
@@ -131,7 +131,7 @@ def test_an_incomplete_batch_of_a_killed_writer_is_cut_off(tmp_path: Path) -> No
     assert pa.ipc.open_stream(segment.read_bytes()).read_all().num_rows == 3  # pyarrow refuses a cut end
 
 
-def test_a_longer_damaged_end_is_never_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_unreadable_end_is_never_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(segments_module, "MOST_CUT", 100)
     path = tmp_path / "run.arrows"
     with SegmentWriter(path, ABOUT, every=60) as writer:
@@ -211,7 +211,7 @@ def test_files_beyond_the_limit_of_age_or_size_are_removed() -> None:
     assert gone(45.0, None, 250) == [1, 2]
     assert gone(45.0, 30.0, 250) == [1, 2]
     assert gone(45.0, None, 99) == [1, 2, 3, 4]
-    assert gone(5.0, 1.0, None) == []  # the clock was set back: no file is old
+    assert gone(5.0, 1.0, None) == []  # the clock was set back: all files count as new
 
 
 def test_a_clock_that_jumps_removes_no_segment() -> None:
@@ -222,11 +222,11 @@ def test_a_clock_that_jumps_removes_no_segment() -> None:
         return [file.number for file in files if file not in gone]
 
     assert left(8 * DAY, week) == [3, 4, 5, 6, 7]
-    assert left(4000 * DAY, week) == [2, 3, 4, 5, 6, 7]  # the clock jumped ahead: the jump is not counted
+    assert left(4000 * DAY, week) == [2, 3, 4, 5, 6, 7]  # the clock jumped ahead
     ahead = [*week, *(StoredFile(Path(str(n)), n, (4000 + n) * DAY, 100) for n in (8, 9))]
-    assert left(4010 * DAY, ahead) == [4, 5, 6, 7, 8, 9]  # since the jump, ages grow with the time
+    assert left(4010 * DAY, ahead) == [4, 5, 6, 7, 8, 9]  # ten days later, the oldest files are removed
     corrected = [*ahead, StoredFile(Path("10"), 10, 10 * DAY, 100)]
-    assert left(11 * DAY, corrected) == [6, 7, 8, 9, 10]  # clock corrected: up to 5 days old are left
+    assert left(11 * DAY, corrected) == [6, 7, 8, 9, 10]  # the clock was corrected
     assert left(16.5 * DAY, corrected) == [5, 6, 7, 8, 9, 10]  # recording paused for more than `keep`
     booted_in_1970 = [*week, StoredFile(Path("8"), 8, 60.0, 100)]
     assert left(9 * DAY, booted_in_1970) == [1, 2, 3, 4, 5, 6, 7, 8]

@@ -23,7 +23,9 @@ CONDITION = "output_current > 30"
 
 
 def batch(begin: int, end: int, true_at: range = range(0), key_at: int | None = None) -> Batch:
-    """Return a batch with two rows for each tenth of a second: a current, and the value of the condition."""
+    """Return a batch with two rows for each tenth of a second: a current, and the trigger's value (0 or
+    1).
+    """
     rows = []
     for at in range(begin, end):
         ns = at * SECOND // 10
@@ -47,7 +49,7 @@ def currents(path: Path) -> list[float | None]:
     return [row.value for row in recorded(path) if row.register == "output_current"]
 
 
-def test_each_trigger_has_a_file_with_the_rows_around_it(writer: TriggeredWriter) -> None:
+def test_each_trigger_is_recorded_in_its_own_file(writer: TriggeredWriter) -> None:
     for begin in range(0, 300, 7):
         writer.write(
             batch(begin, begin + 7, range(50, 60))
@@ -74,7 +76,7 @@ def test_a_condition_that_is_true_from_the_start_triggers_no_recording(writer: T
     assert writer.files == ()
 
 
-def test_overlapping_triggers_have_complete_files(writer: TriggeredWriter) -> None:
+def test_triggers_close_together_each_have_a_complete_file(writer: TriggeredWriter) -> None:
     writer.write(batch(0, 20, range(15, 16), key_at=18))
     writer.write(batch(20, 60))
     assert [currents(path) for path in writer.files] == [
@@ -84,7 +86,7 @@ def test_overlapping_triggers_have_complete_files(writer: TriggeredWriter) -> No
     assert open_recording(writer.files[1]).metadata["trigger"]["condition"] == "key t"
 
 
-def test_event_does_not_close_a_trigger_file_whose_rows_are_still_queued(writer: TriggeredWriter) -> None:
+def test_an_event_does_not_end_a_trigger_recording_early(writer: TriggeredWriter) -> None:
     writer.write(batch(0, 20, range(15, 16)))
     comment = AddedRow(UTC_0 + 60 * SECOND, 60 * SECOND, 0, 1, 0, status_code("late"), 0.0)
     writer.write(Batch(JoinedColumns(None, [comment]), DRIVES, REGISTERS))
@@ -92,7 +94,9 @@ def test_event_does_not_close_a_trigger_file_whose_rows_are_still_queued(writer:
     assert currents(writer.files[0]) == [float(at) for at in range(5, 36)]
 
 
-def test_all_files_are_closed_if_one_fails(writer: TriggeredWriter, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_trigger_recordings_are_closed_if_closing_one_fails(
+    writer: TriggeredWriter, monkeypatch: pytest.MonkeyPatch
+) -> None:
     writer.write(batch(0, 20, range(15, 16), key_at=18))
     first, last = (recording.writer for recording in writer._open)
     close_last, close_first, closed = last.close, first.close, list[str]()
@@ -108,14 +112,14 @@ def test_all_files_are_closed_if_one_fails(writer: TriggeredWriter, monkeypatch:
     assert closed == ["first"]
 
 
-def test_file_numbers_continue_after_those_of_existing_files(tmp_path: Path) -> None:
+def test_numbers_of_trigger_files_continue_after_existing_files(tmp_path: Path) -> None:
     (tmp_path / "trip.00000041.arrows").touch()
     with TriggeredWriter(tmp_path / "trip.arrows", {}, pre=1, post=1, conditions={}) as writer:
         writer.write(batch(0, 5, key_at=2))
     assert [path.name for path in writer.files] == ["trip.00000042.arrows"]
 
 
-def test_too_many_open_triggers_are_counted(writer: TriggeredWriter) -> None:
+def test_triggers_beyond_the_limit_of_open_recordings_are_counted(writer: TriggeredWriter) -> None:
     for at in range(1, MOST_OPEN + 4):
         writer.write(batch(at, at + 1, key_at=at))
     assert len(writer.files) == MOST_OPEN

@@ -1,6 +1,5 @@
-"""pytest plugin for the tests of modbus-connection: multidrop takes the place of the pymodbus backend.
-
-The tests then compare multidrop with the tmodbus backend, and with the tmodbus server.
+"""pytest plugin for the tests of the library modbus-connection: it replaces their pymodbus backend by
+multidrop. The tests then compare multidrop with the tmodbus backend and the tmodbus server.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import pytest
 
 from multidrop import modbus_connection as backend
 
-UNFIT = {  # parts of test names, and why these tests do not apply
+UNFIT = {  # part of a test's name: why the test does not apply to multidrop
     "udp": "multidrop does not support UDP",
     "tls": "multidrop does not support TLS",
     "accepts_the_full_matrix": "multidrop does not support UDP",
@@ -23,7 +22,7 @@ UNFIT = {  # parts of test names, and why these tests do not apply
 
 
 async def connect_tcp(host: str, *, port: int = 502, **options: Any) -> backend.ModbusConnection:
-    """Connect like the older function of this name in the other backends."""
+    """Connect with the arguments of the function of this name in modbus-connection's own backends."""
     connection = backend.ModbusConnection(modbus_connection.ModbusTcpParams(host=host, port=port), **options)
     await connection.connect()
     return connection
@@ -37,7 +36,7 @@ sys.modules["modbus_connection.pymodbus"] = modbus_connection.pymodbus = backend
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Keep the tests of the pymodbus backend, and the tests that compare both backends."""
+    """Select the tests of the pymodbus backend, and those that compare it with the tmodbus backend."""
     ours = [item for item in items if "pymodbus" in item.name or "parity" in item.name]
     unfit = [item for item in ours if any(part in item.nodeid for part in UNFIT)]
     config.hook.pytest_deselected(items=[item for item in items if item not in ours or item in unfit])
