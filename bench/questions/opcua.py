@@ -38,7 +38,7 @@ from multidrop.supervisor import supervisor
 LINES = (25, 25, 25, 25)  # numbers of drives on each line
 PERIOD_S = 0.1
 SLICE_S = 1.0
-SETTLE_S = 5.0  # time after the gateway's start in which it learns response delays and makes all nodes
+SETTLE_S = 5.0  # time after the gateway's start in which it learns response delays and makes its OPC UA nodes
 RUN_S = 0.5  # time for which motors run before a stop
 GREEDY = 5
 READER = Path(__file__).parents[1] / "players" / "opcua_reader.py"

@@ -59,7 +59,7 @@ poll = {poll}
 
 
 class Gateway:
-    """The command `multidrop serve`."""
+    """A running command `multidrop serve`."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_load_initial_conftests(early_config: pytest.Config) -> None:
-    """Keep pytest from rewriting multidrop's assertions. By default, it does so if a package has a plugin."""
+    """Keep pytest from rewriting multidrop's assertions, as it does by default in packages with a plugin."""
     hook: Any = early_config.pluginmanager.rewrite_hook
     getattr(hook, "_must_rewrite", set()).discard("multidrop")
 

@@ -191,7 +191,7 @@ def test_a_clamped_value_is_reported_with_status_1(run: Run, port: str) -> None:
     )
 
 
-def test_a_rounding_error_of_a_calculation_is_not_reported(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rounding_error_of_a_calculated_value_is_not_reported(capsys: pytest.CaptureFixture[str]) -> None:
     setpoint = InvtCHE.registers["setpoint"]
     assert nearest_value(setpoint, 22 / 1000 * 100) == 2.2
     assert capsys.readouterr().err == ""

@@ -135,7 +135,10 @@ def test_hazardous_and_unexplained_parameters_are_not_written(model: str, codes:
 
 
 def test_explained_parameters_of_a_delixi_e_are_written() -> None:
-    """DelixiCDIE100.cpp has these codes, and those of commands, motor identification and communication."""
+    """The file DelixiCDIE100.cpp explains these codes.
+
+    The other codes in it are for commands, motor identification and communication.
+    """
     named = [f"P0.0.{index:02}" for index in (7, 8, *range(11, 19))] + [
         "P0.0.02",
         "P1.0.00",

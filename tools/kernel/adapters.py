@@ -37,7 +37,8 @@ class Adapter(USBDevice):
         self.log: list[dict[str, Any]] = []
         self.is_stalled = False  # True: the adapter accepts no bytes from the guest
         self.broken = 0  # how many of the next transfers to the guest will fail
-        self.damaged: list[str] = []  # how the next replies will be damaged, one kind each
+        # kinds of damage: the first for the next reply, the second for the one after it
+        self.damaged: list[str] = []
         self.rts_missing = 0  # number of transfers at whose start RTS kept the transceiver from sending
         self.rts_lateness: list[float] = []  # s from each request's last bit to the fall of RTS; < 0: cut off
         self.rts_given_up = 0  # how often RTS fell although the adapter had not taken the request
@@ -75,7 +76,7 @@ class Adapter(USBDevice):
 
     def _taken(self, sequence: int, length: int) -> None:
         self._room_at = 0.0
-        if sequence in self.taken:  # otherwise the guest has called the transfer off
+        if sequence in self.taken:  # if not, the guest has called the transfer off meanwhile
             self.taken.remove(sequence)
             self.complete(sequence, 0, length=length)
         self.take()

@@ -251,7 +251,7 @@ class _Probe:
         return completion
 
     def found(self, families: Sequence[type[Drive]]) -> Found:
-        """Identify the drive's family, as far as reads can."""
+        """Identify the drive's family, as far as reads show it."""
         # The drive's response delay is known, so a short timeout is enough.
         known = max(LEAST_TIMEOUT, 4 * self.response_delay)
         drives, guess = self._identify(families, LEAST_TIMEOUT, known)

@@ -91,7 +91,7 @@ ADDRESSES = {
 
 
 def floats() -> dict[str, Register[float]]:
-    """Return the meter's float registers by name, as new objects for each class that declares them."""
+    """Return the meter's float registers by name: new objects at each call, one set for each class."""
     return {
         name: reading(address, table=INPUT, number_format=NumberFormat.F32)
         for name, address in ADDRESSES.items()

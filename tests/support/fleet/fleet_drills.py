@@ -159,7 +159,7 @@ class FleetDrill(FleetProcesses):
                 self.start(name)
 
     def are_leaders_home(self) -> bool:
-        """Return True if each node leads one bucket of each group: a lost node then takes one leader."""
+        """Return True if each node is the NATS leader of one bucket of each group."""
         leads = [node.leads() for node in self.nats.nodes]
         return all(
             sum(f"KV_{bucket}" in found for bucket in group) == 1

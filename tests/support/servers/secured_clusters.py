@@ -58,7 +58,7 @@ def certificates(folder: Path, host: str = "127.0.0.1") -> TlsFiles:
 
 
 def ports_with_routes(number: int) -> list[int]:
-    """Return free ports whose corresponding cluster ports are free too."""
+    """Return free ports, each with a free port ROUTE_PORTS above it for the cluster's routes."""
     found: list[int] = []
     while len(found) < number:
         with closing(socket.socket()) as one, closing(socket.socket()) as other:
@@ -169,7 +169,7 @@ class SecuredFleet:
         assert made.returncode == 0, made.stderr
 
     def start(self, name: str, kept: str = "", **environment: str) -> None:
-        """Start a gateway; `kept` names another folder to use."""
+        """Start a gateway; `kept` is the name of its folder if that is not `name`."""
         kept = kept or name
         self._started[kept] = (name, kept), environment
         words = ["fleet", "serve", name, "--folder", str(self._folder / kept)]

@@ -100,7 +100,7 @@ def polling_session(
         try:
             yield PollingSession(poller, interruption, hand_out, writer)
         finally:
-            hand_out()  # the rows that the poller delivered since the last call, even after a failure
+            hand_out()  # even after a failure, hand out the rows that the poller has delivered
 
 
 POINT_S = 0.25  # s between two points of a history
