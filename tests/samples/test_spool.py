@@ -245,7 +245,7 @@ def test_a_full_spool_removes_its_oldest_messages_and_counts_unsent_rows(
     assert "the spool is full at" in caplog.text
 
 
-def test_rows_removed_before_the_streams_first_answer_are_counted_later(folder: Path) -> None:
+def test_rows_removed_while_the_streams_position_is_unknown_are_counted_later(folder: Path) -> None:
     filled(folder, 6)
     spool = Spool(folder, GATEWAY, most=1)  # the newest message is kept even beyond the limit
     store(spool, 30, 5)

@@ -186,7 +186,7 @@ def test_a_polled_line_is_reported_when_its_port_is_lost_for_6_s() -> None:
     ("silent_s", "named_after_s"),
     [(2.0, 4.0), (REPLY_NS / SECOND, 3.0), (60.0, 6.0), (None, 6.0)],  # None: the line never had a reply
 )
-def test_the_6_s_until_a_lost_port_is_reported_start_at_its_last_reply(
+def test_a_line_is_reported_6_s_after_its_last_reply_if_its_port_is_lost(
     silent_s: float | None, named_after_s: float
 ) -> None:
     """A gateway notices a cut line only after seconds, so the 6 s start at the last reply before the cut."""
