@@ -50,7 +50,7 @@ struct md_engine {
     pthread_t thread;
     pthread_mutex_t mutex;  /* guards the fields below and the ports; the thread unlocks it only to wait */
     atomic_int callers;     /* clients that want the mutex */
-    pthread_cond_t changed; /* signals: an urgent request is done, a port opened or closed */
+    pthread_cond_t changed; /* signals the end of an urgent request, or that a port has opened or closed */
     int has_news;           /* 1: `changed` must be signalled */
     struct md_waiter *waiter;
     struct md_wakeup wakeup;
@@ -71,7 +71,7 @@ struct md_mastership {
     int64_t until_ns;         /* deadline by CLOCK_BOOTTIME; accessed atomically; 0: no right to send */
     int64_t guard_ns;         /* least time between the requests of two masters */
     uint32_t term;            /* number of the latest term; between two terms another process may be master */
-    struct md_engine *engine; /* the engine whose ports check it; NULL: no port yet */
+    struct md_engine *engine; /* the engine whose ports check this mastership; NULL: no port yet */
 #ifdef __linux__
     timer_t timer;
 #endif

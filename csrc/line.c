@@ -33,7 +33,7 @@ const int8_t md_line_follows[MD_LINE_STATES][MD_LINE_EVENTS] = {
  *
  * A stop does not wait: the motor must stop, even beside another master. */
 
-enum { LONGEST_RTU = 256 }; /* serial-line guide V1.02, 2.5.1 */
+enum { LONGEST_RTU = 256 }; /* bytes of the longest RTU frame (serial-line guide V1.02, 2.5.1) */
 
 /* The deadline allows one restart of the wait: a burst may be the last reply to a master that has left. */
 int md_listen_begin(struct md_line *line, int64_t now_ns, int64_t guard_ns)

@@ -17,7 +17,7 @@ enum md_number_format {
     MD_U16, MD_I16, MD_U32, MD_I32, MD_U32_EITHER, MD_F32, MD_BIT,
     MD_I8, /* the low byte of a 16-bit word */
     MD_U64, MD_I64, MD_F64, MD_BCD16, MD_BCD32, MD_F16,
-    MD_LOW_WORD_FIRST = 0x40, /* flag for formats of several 16-bit words */
+    MD_LOW_WORD_FIRST = 0x40, /* flag for formats of several 16-bit words: low word first */
     MD_LOW_BYTE_FIRST = 0x80  /* flag for all formats except MD_BIT: low byte first in each word */
 };
 
@@ -110,7 +110,7 @@ uint16_t md_greatest_code(const uint16_t *codes, size_t n);
 size_t md_find_codes(const uint16_t *drives, const uint16_t *registers, size_t n, uint16_t drive,
                      uint16_t reg, uint32_t *places);
 
-/* ---- row_queue.c: functions that return a pointer return NULL without rows, or without memory ---- */
+/* ---- row_queue.c: md_row_queue_new() returns NULL if memory is short, _take() if there are no rows ---- */
 
 /* Return a queue of up to `most_chunks` chunks of rows. While all chunks are full, new rows are dropped and
  * counted. */

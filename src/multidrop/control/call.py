@@ -162,7 +162,7 @@ class Call:
             self._due_ns += min(clock.boottime_ns() - begun_ns, round(seconds * 1e9))
 
     def look(self) -> AbstractContextManager[None]:
-        """Return a `step` block whose time limit is enough for one exchange with the drive."""
+        """Return a `with` block within which one exchange with the drive does not count as lateness."""
         drive = self.drive
         wire = 2 * drive.needed_silence() + MOST_CHARACTERS * drive.settings.character
         return self.step(drive.least_interval + drive.response_timeout + wire)

@@ -31,7 +31,7 @@ from multidrop.transport.line import Line
 
 T = TypeVar("T")
 
-OPENING_S = 5.0  # timeout for opening the file
+OPENING_S = 5.0  # s; timeout for opening the audit log
 
 _sync = getattr(os, "fdatasync", os.fsync)  # fsync on macOS, which has no fdatasync
 

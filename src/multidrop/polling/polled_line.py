@@ -148,7 +148,7 @@ class PolledLine:
         # by address: the peer of a removed drive, with which an exchange may still be in flight
         self._gone: dict[int, Peer] = {}
         self._polled: list[tuple[Drive, Peer]] = []  # the present drives that have jobs
-        # failures, late replies and whether it has answered, for each drive in `_polled`
+        # for each drive in `_polled`: its failures, the end of its late replies, whether it has answered
         self._observed: list[tuple[int, int, bool]] = []
         self._is_started = False
         self._learnt_ns = 0

@@ -193,7 +193,7 @@ class Exchanges:
                     into = read.spare.pop()
                 except IndexError:
                     into = None
-                try:  # kept short, so that a successful read is fast: see Completion
+                try:  # a successful read makes as few calls as possible, to be fast: see Completion
                     reply = self.peers.carry_out(drive, exchange, into=into)
                     if reply.count < 0:
                         reply = self._good(drive, exchange, attempts, self._settled(drive, exchange, reply))

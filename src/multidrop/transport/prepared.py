@@ -121,7 +121,7 @@ class PreparedRead:
 
 
 class ReadPlan:
-    """The reads that return the values of `wanted` (registers or their names), in reverse order.
+    """The reads that return the values of `wanted` (registers or their names), the last read first.
 
     `only` is the read that alone returns all of `wanted` in its order; None if there is no such read.
     """
