@@ -370,7 +370,7 @@ def test_a_stop_of_a_drive_that_a_reload_replaces_is_sent_to_the_new_drive(
         threads = [threading.Thread(target=lambda: told.append(reload(gateway)))]
         threads[0].start()
         assert changed.wait(PATIENCE)
-        assert old.bus is None  # the old drive no longer has a bus
+        assert old.bus is None
         threads += [
             threading.Thread(target=lambda drives=drives: told.append(gateway.post("/api/stop", drives).json))
             for drives in ({"drives": None}, {"drives": ["fan-1"]})

@@ -197,7 +197,7 @@ def test_alarms_are_sorted_by_kind_with_acknowledged_alarms_last() -> None:
     assert ("hall", "port", 4, 11) in seen(events)
 
 
-def test_an_alarm_of_the_first_observation_is_marked_as_possibly_older() -> None:
+def test_an_alarm_found_right_after_the_start_is_marked_as_possibly_older() -> None:
     events = Alarms()
     events.look(1, "pump-1", Shown("fault", "overheat"))
     events.look(1, "pump-2", RUNS)
@@ -267,7 +267,7 @@ def past_of(path: Path) -> list[Alarm]:
     return kept.past or []
 
 
-def test_the_last_line_of_each_alarm_in_the_alarm_file_is_used(tmp_path: Path) -> None:
+def test_of_several_lines_about_an_alarm_in_the_alarm_file_the_last_counts(tmp_path: Path) -> None:
     path = tmp_path / "alarms.jsonl"
     kept = started(path)
     for alarm in (ALARM, ALARM._replace(ended=5), ALARM._replace(time=9)):

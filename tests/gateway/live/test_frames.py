@@ -98,7 +98,7 @@ async def test_at_most_five_page_frames_are_made_per_second(
 async def test_rows_that_arrive_too_soon_for_a_page_frame_appear_in_the_next(
     frames: Frames, clock: Clock
 ) -> None:
-    """The next page frame is made without any further rows."""
+    """The next page frame is made even if no further rows arrive."""
     first = await frames.after(-1)
     assert first is not None
     frames.note_news()

@@ -343,7 +343,7 @@ def test_a_reopened_line_has_statistics_from_its_second_reading_on(recent: Recen
     assert recent.line("hall")["rate"] == 10.0
 
 
-def test_no_rate_becomes_negative_when_a_drive_is_removed(recent: RecentStatistics) -> None:
+def test_no_polling_rate_becomes_negative_when_a_drive_is_removed(recent: RecentStatistics) -> None:
     recent.tick(100.0, 100_000, {"hall": reading(100)})
     recent.tick(101.0, 101_000, {"hall": replace(reading(1), seconds=101.0)})
     assert recent.line("hall")["rate"] == 0.0

@@ -136,7 +136,7 @@ def test_closing_the_gateway_publishes_offline(broker: Broker, listener: Listene
     listener.wait_for(has("multidrop/gateway", b"online"))
     running.close()
     listener.wait_for(has("multidrop/gateway", b"offline"))
-    for drive in ("pump-1", FAN.name):  # for each drive, because the next plant file may not have it
+    for drive in ("pump-1", FAN.name):  # each drive goes offline, because the next plant file may not have it
         listener.wait_for(has(f"multidrop/{drive}/available", b"offline"))
 
 

@@ -441,7 +441,9 @@ def test_a_silent_drive_gets_a_birth_before_its_historical_values_are_sent(
     host.wait_for("DDEATH", "pump-1")
 
 
-def test_live_values_have_the_time_of_their_row(host: Host, row_node: tuple[Any, Any, Running]) -> None:
+def test_sparkplug_values_sent_live_have_the_time_of_their_poll(
+    host: Host, row_node: tuple[Any, Any, Running]
+) -> None:
     known, _, running = row_node
     host.wait_for("DBIRTH", FAN.name)
     known.hub.values["pump-1", "output_frequency"] = 48.0

@@ -43,7 +43,7 @@ def test_the_web_page_refers_to_all_its_files_and_to_no_others() -> None:
         imports = re.findall(r'from "(\.[\w./-]+)"', script.read_text("utf-8"))
         named |= {(script.parent / path).resolve().relative_to(PAGE.resolve()).as_posix() for path in imports}
     there = FILES.keys()
-    # for Prometheus and Grafana instead of the page
+    # files for Prometheus and Grafana, which the page does not use
     served = {"prometheus/alerts.yml", "prometheus/dashboard.json"}
     assert there - named == {"index.html", "texts.toml", "vendor/uPlot-LICENSE", *served}
     assert named - there == set()

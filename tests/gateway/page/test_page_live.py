@@ -29,7 +29,7 @@ def test_the_web_page_shows_live_values_of_all_drives(opened: Opener, gateway: F
     for _ in range(5):
         await_new_value(page, lambda: float(number.inner_text()))
     old = page.locator("tr.drive .old")
-    until_met(page, lambda: old.count() == 2)  # frequency and current of the silent drive
+    until_met(page, lambda: old.count() == 2)  # two old values: frequency and current of the silent drive
 
 
 def test_a_killed_gateway_is_reported(opened: Opener, gateway: FakeGateway) -> None:

@@ -167,7 +167,7 @@ class HtmlTexts(HTMLParser):
             self.texts.add(data.strip())
 
 
-# keys of the catalogue in the page's own scripts and HTML
+# texts that the page's own scripts and HTML take from the catalogue
 PAGE_TEXTS = {one.text for script in SCRIPTS.values() for one in literals(script) if one.is_key}
 PAGE_TEXTS |= HtmlTexts().texts
 
