@@ -159,7 +159,7 @@ def test_a_failed_message_is_sent_again_after_growing_pauses() -> None:
     assert (len(target.messages), target.sender.problem) == (1, "")
 
 
-def test_a_message_that_its_target_refuses_for_good_does_not_block_later_ones() -> None:
+def test_a_notification_that_its_target_refuses_for_good_does_not_block_later_ones() -> None:
     target = Clocked()
     target.sender.put(BEGUN)
     target.failure = ValueError("no JSON")
@@ -172,7 +172,7 @@ def test_a_message_that_its_target_refuses_for_good_does_not_block_later_ones() 
     ]
 
 
-def test_a_message_that_is_queued_just_before_the_shutdown_is_sent() -> None:
+def test_a_notification_that_is_queued_just_before_the_shutdown_is_sent() -> None:
     target = Clocked()
     thread = threading.Thread(target=target.sender.run)
     thread.start()
@@ -182,7 +182,7 @@ def test_a_message_that_is_queued_just_before_the_shutdown_is_sent() -> None:
     assert len(target.messages) == 1
 
 
-def test_a_hanging_target_does_not_delay_other_targets() -> None:
+def test_a_hanging_notification_target_does_not_delay_other_targets() -> None:
     hang, other = threading.Event(), Clocked()
     hanging = Sender("hanging", lambda message: hang.wait() and None, AlarmQueue(60, 0.0), described)
     threads = [threading.Thread(target=one.run, daemon=True) for one in (hanging, other.sender)]
@@ -306,7 +306,7 @@ def test_waiting_for_an_answer_that_arrives_byte_by_byte_has_a_limit(monkeypatch
         ("# https://hooks.example/T0K3N", "has no target"),
     ],
 )
-def test_an_invalid_target_is_refused_without_showing_its_secret(
+def test_an_invalid_notification_target_is_refused_without_showing_its_secret(
     tmp_path: Path, line: str, sentence: str
 ) -> None:
     (tmp_path / "targets").write_text(f"{line}\n")
@@ -314,7 +314,7 @@ def test_an_invalid_target_is_refused_without_showing_its_secret(
     assert (found, sentence in mistake, "T0K3N" in mistake) == ([], True, False)
 
 
-def test_the_shown_name_of_a_target_contains_no_secret(tmp_path: Path) -> None:
+def test_the_shown_name_of_a_notification_target_contains_no_secret(tmp_path: Path) -> None:
     (tmp_path / "targets").write_text("https://hooks.example/T0K3N?key=T0K3N\ntgram://T0K3N/1\n")
     found, _ = read_targets(tmp_path / "targets")
     assert [one.name for one in found] == [

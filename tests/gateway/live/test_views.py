@@ -87,7 +87,7 @@ def test_a_line_is_described_with_the_baud_rates_of_all_its_drives() -> None:
     assert [drive["speed"] for drive in told["drives"]] == ["38400 8N1", "9600 8N1", "9600 8N1"]
 
 
-def test_a_page_frame_has_a_time_for_each_value(gateway: Served) -> None:
+def test_a_page_frame_has_the_age_of_each_value(gateway: Served) -> None:
     gateway.sims["pump-1"]["output_current"] = 12.3
     frame: dict[str, Any] = {}
 

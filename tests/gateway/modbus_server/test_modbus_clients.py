@@ -605,7 +605,7 @@ async def test_a_request_that_waited_a_second_for_the_line_is_dropped() -> None:
     assert len(line.begun) == 1
 
 
-async def test_each_request_is_passed_on_with_the_time_left_until_it_expires() -> None:
+async def test_each_request_is_sent_to_the_line_with_the_time_left_until_it_expires() -> None:
     share, line = LineShare(), PacedLine(0.15)
     first, second = share.ask("one", line.ask), share.ask("one", line.ask)
     await asyncio.gather(first, second)

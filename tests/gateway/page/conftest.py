@@ -166,7 +166,7 @@ def note_problems(page: Any, problems: list[str]) -> None:
 
 
 def is_problem(said: Any) -> bool:
-    """Return True unless the message is about a failed request, which some tests cause."""
+    """Return True for errors and warnings, except about failed requests, which some tests cause."""
     return said.type in ("error", "warning") and "Failed to load resource" not in said.text
 
 
