@@ -200,7 +200,10 @@ class Leaving:
         _warn_of(self.found)
 
     def begin(self) -> None:
-        """Cancel all calls on the bus. If `stop_on_exit` was called, start to stop the drives."""
+        """Cancel all calls on the bus.
+
+        If `stop_on_exit` was called, also start to stop the drives, without waiting for the end of the stops.
+        """
         self._latches.shut()
         if self._last_act is not None:
             self._last_act.begin()

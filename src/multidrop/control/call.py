@@ -39,7 +39,7 @@ class Latches:
         self._stops: dict[object, tuple[int, frozenset[Drive]]] = {}
 
     def forked(self) -> None:
-        """Shut all latches in a forked child, and forget the parent's stops."""
+        """In a forked child, shut all latches, which cancels all calls, and forget the parent's stops."""
         self._stops = {}
         self.shut()
 
@@ -140,7 +140,7 @@ class Call:
         self._limit_ns = limit_ns
 
     def restarted(self) -> Call:
-        """Return a copy of the call that starts now. A stop called since the original call cancels it too."""
+        """Return a copy of this call. The copy starts now, but a stop since the original call cancels it."""
         return Call(self.drive, self.permit, self.expiry, self.verb, self._limit_ns)
 
     @property

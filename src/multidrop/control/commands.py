@@ -56,7 +56,10 @@ def carry_out_verb(drive: Drive, verb: str, arguments: Mapping[str, Any]) -> Com
 
 
 def write_register(drive: Drive, name: str, value: float | str) -> CommandResult:
-    """Write a register and return the result; never raise. A choice is given as its name or raw count."""
+    """Write a register and return the result; never raise.
+
+    If the register has named values (choices), `value` is a choice's name or its raw count.
+    """
     try:
         register = drive.register(name)
         typed = typed_value(register, value)

@@ -259,7 +259,7 @@ class PolledLine:
         self._row_queue.call(self.number)
 
     def forget(self, drive: Drive) -> None:
-        """Forget the jobs of a drive that was removed for good; its peer, which knows late replies, stays."""
+        """Forget the jobs of a drive that was removed for good, but keep its peer (timing, late replies)."""
         with self._lock:
             self._planned = {each: jobs for each, jobs in self._planned.items() if each.drive is not drive}
             self._maker.forget_drive(drive)
